@@ -1,0 +1,127 @@
+"""Argument checks: what is wrong (name, index, value), why, and what to type instead. Raised before Taichi sees anything."""
+
+import math
+import numbers
+
+import numpy as np
+
+
+def number(who: str, name: str, value, *, above=None, least=None, most=None, below=None) -> float:
+    """A finite real number within the bounds given."""
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (numbers.Real, np.generic, np.ndarray)):
+        raise TypeError(f"{who}: {name} = {value!r} is a {type(value).__name__}, but a number is needed.")
+    if np.ndim(value) or np.asarray(value).dtype.kind not in "iuf":
+        raise TypeError(f"{who}: {name} has shape {np.shape(value)}, but one real number is needed.")
+    value = float(value)
+    if not math.isfinite(value):
+        raise ValueError(f"{who}: {name} = {value}, but it must be finite.")
+    _bounds(who, name, np.array([value]), above, least, most, below, scalar=True)
+    return value
+
+
+def integer(who: str, name: str, value, *, least: int) -> int:
+    """An integer of at least `least`."""
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, numbers.Integral):
+        kind = type(value).__name__
+        raise TypeError(f"{who}: {name} = {value!r} is a {kind}, but an integer of at least {least} is needed.")
+    if value < least:
+        raise ValueError(f"{who}: {name} = {value}, but it must be at least {least}.")
+    return int(value)
+
+
+def per_item(who: str, name: str, value, count: int, *, infinite=False, **bounds) -> np.ndarray:
+    """A scalar or a (count,) array as a (count,) array of floats, finite (or +inf if allowed) and within bounds."""
+    array = _floats(who, name, value)
+    if array.ndim == 0:
+        array = np.full(count, float(array))
+    if array.shape != (count,):
+        raise ValueError(f"{who}: {name} has shape {array.shape}, but a number or an array of shape ({count},) is needed.")
+    bad = np.isnan(array) | (array == -np.inf) | (np.isinf(array) & (not infinite))
+    if bad.any():
+        i = int(np.argmax(bad))
+        raise ValueError(f"{who}: {name}[{i}] = {array[i]}, but it must be finite.")
+    _bounds(who, name, array, **bounds)
+    return array
+
+
+def points(who: str, name: str, value, *, dim: int | None = None, count: int | None = None) -> np.ndarray:
+    """A (n, dim) array of finite floats; dim 2 or 3 where it is not given."""
+    array = _floats(who, name, value)
+    if array.size == 0 and array.ndim != 2:
+        array = array.reshape(0, dim or 2)
+    dims = (dim,) if dim else (2, 3)
+    if array.ndim != 2 or array.shape[1] not in dims or (count is not None and len(array) != count):
+        n = "n" if count is None else count
+        want = " or ".join(f"({n}, {d})" for d in dims)
+        raise ValueError(f"{who}: {name} has shape {array.shape}, but {want} is needed, one row per point.")
+    finite(who, name, array)
+    return array
+
+
+def vector(who: str, name: str, value, dim: int, *, infinite=False) -> np.ndarray:
+    """A (dim,) array of finite floats."""
+    array = _floats(who, name, value)
+    if array.shape != (dim,):
+        raise ValueError(f"{who}: {name} has shape {array.shape}, but {dim} numbers are needed in a {dim}D world.")
+    if np.isnan(array).any() or (not infinite and np.isinf(array).any()):
+        finite(who, name, array)
+    return array
+
+
+def finite(who: str, name: str, array: np.ndarray) -> None:
+    """Raise for the first element that is NaN or infinite."""
+    bad = ~np.isfinite(array)
+    if bad.any():
+        at = np.unravel_index(int(np.argmax(bad)), array.shape)
+        place = ", ".join(str(int(k)) for k in at)
+        raise ValueError(f"{who}: {name}[{place}] = {array[at]}, but it must be finite.")
+
+
+def indices(who: str, name: str, value, count: int, *, arity: int | None = None) -> np.ndarray:
+    """Particle indices below `count`: (m,), or (m, arity) with distinct members in each row."""
+    array = np.asarray(value)
+    if array.size == 0:
+        return np.zeros((0, arity) if arity else (0,), dtype=np.int32)
+    if array.dtype.kind not in "iu":
+        raise TypeError(f"{who}: {name} has type {array.dtype}, but integers (particle indices) are needed.")
+    shape = f"(m, {arity})" if arity else "(m,)"
+    if array.ndim != (2 if arity else 1) or (arity and array.shape[1] != arity):
+        raise ValueError(f"{who}: {name} has shape {array.shape}, but {shape} is needed.")
+    bad = (array < 0) | (array >= count)
+    rows = bad.any(axis=1) if arity else bad
+    if rows.any():
+        i = int(np.argmax(rows))
+        raise ValueError(f"{who}: {name}[{i}] = {_show(array[i])}, but there are {count} particles (0 ... {count - 1}).")
+    if arity:
+        ordered = np.sort(array, axis=1)
+        same = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
+        if same.any():
+            i = int(np.argmax(same))
+            raise ValueError(f"{who}: {name}[{i}] = {_show(array[i])} names a particle twice; its members must differ.")
+    return np.ascontiguousarray(array, dtype=np.int32)
+
+
+def _show(row) -> str:
+    return str(tuple(int(v) for v in row)) if np.ndim(row) else str(int(row))
+
+
+def _floats(who: str, name: str, value) -> np.ndarray:
+    try:
+        array = np.asarray(value)
+    except ValueError:
+        raise ValueError(f"{who}: {name} is ragged; its rows must have the same length.") from None
+    if array.dtype.kind not in "iuf" and array.size:
+        raise TypeError(f"{who}: {name} has type {array.dtype}, but real numbers are needed.")
+    return np.array(array, dtype=np.float64)
+
+
+def _bounds(who, name, array, above=None, least=None, most=None, below=None, scalar=False) -> None:
+    rules = (
+        (above, lambda a: a > above, "above"), (least, lambda a: a >= least, "at least"),
+        (most, lambda a: a <= most, "at most"), (below, lambda a: a < below, "below"),
+    )  # fmt: skip
+    for bound, holds, words in rules:
+        if bound is not None and not (ok := holds(array)).all():
+            i = int(np.argmin(ok))
+            where = name if scalar else f"{name}[{i}]"
+            raise ValueError(f"{who}: {where} = {array[i]:g}, but it must be {words} {bound:g}.")

@@ -1,0 +1,142 @@
+"""Particles that do not overlap."""
+
+import numpy as np
+import taichi as ti
+
+from .. import checks
+from ..feature import Batch, Feature, Scene
+from ..grid import FARTHEST, Grid
+from ..particles import Particles
+
+
+class Contact(Feature):
+    """Discs and spheres do not overlap.
+
+    C(x) = |x_i - x_j| - (r_i + r_j) >= 0 for all pairs, grad_i C = n = (x_i - x_j) / |x_i - x_j|.
+
+    skin: how far beyond touching pairs are listed [m], "auto" for a fifth of the median radius; speed only, never the result.
+    push_out: pairs that overlap at the start of a step by more than they approached leave each other at this speed [m/s] at most.
+
+    A Jacobi pass: each pair wants C back along the current n, split by mass and by the number of overlapping pairs that each
+    particle has, p = -C / (n_i w_i + n_j w_j), which conserves momentum. Particles that are in the same place part in the
+    direction of a golden-ratio angle made from their indices. Linked particles (Distance, Rope, Spacer) do not touch.
+    """
+
+    def __init__(self, *, skin="auto", push_out=1.0):
+        if skin != "auto":
+            skin = checks.number("Contact", "skin", skin, above=0.0)
+        self.skin = skin
+        self.push_out = checks.number("Contact", "push_out", push_out, least=0.0)
+
+    matters = True
+
+    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Choose the skin, and refuse positions too far out for cells to be told apart."""
+        radius = particles.radius
+        some = radius[radius > 0]
+        self._on_size = 0.2 * float(np.median(some)) if len(some) else 1.0
+        if self.skin != "auto":
+            self._on_size = self.skin
+        ordered = np.sort(radius)[::-1]
+        self._on_reach = float(ordered[:2].sum())  # the two largest
+        self.matters = self._on_reach > 0
+        if self.matters:
+            self.check_range(particles.position)
+
+    def check_range(self, position: np.ndarray) -> None:
+        """Raise where coordinates are too large for the cells."""
+        cell = self._on_reach + self._on_size
+        far = np.abs(position) >= FARTHEST * cell
+        if far.any():
+            i, k = np.unravel_index(int(np.argmax(far)), far.shape)
+            raise ValueError(
+                f"Contact: position[{i}, {k}] = {position[i, k]:g} m is {abs(position[i, k]) / cell:.2g} cells of {cell:g} m "
+                f"from the origin, but f32 tells only {FARTHEST} apart. Shift the scene towards the origin."
+            )
+
+    def join(self, scene: Scene, batches: list[Batch], parallel: bool) -> Grid:
+        """Declare the fields, among them the grid's."""
+        n, dim = scene.particles.count, scene.particles.dim
+        pairs = [b.indices[:, [a, c]] for b in batches for a in range(b.arity) for c in range(a)]
+        linked = np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=np.int32)
+        self.scene = scene
+        self._on_state = scene.state
+        self._on_radius = scene.radius
+        self._on_move = scene.memory.field("Contact.move", n, width=dim)
+        self._on_active = scene.memory.field("Contact.active", n, kind=ti.i32)
+        self._on_fast = scene.memory.field("Contact.fast", None, kind=ti.i32)
+        self._on_grid = Grid(scene, self._on_radius, self._on_reach, self._on_size, linked, parallel)
+        return self._on_grid
+
+    @ti.func
+    def watch(self, i):
+        """Notice particles that outrun the list, or that cross more than their own size in one substep."""
+        self._on_grid.watch(i)
+        d = self._on_state.d[i]
+        limit = self._on_radius.stride(i)
+        if not (d.dot(d) <= limit * limit):
+            self._on_fast[None] = 1
+
+    @ti.func
+    def touch(self, i, j):
+        """Overlap of a pair [m] (negative where apart) and its direction, from j to i."""
+        r = self._on_state.apart(i, j)
+        far = self._on_radius.of(i) + self._on_radius.of(j)
+        rr = r.dot(r)
+        overlap, n = 0 * far - 1, 0 * r
+        if rr < far * far:
+            if rr > far * far * ti.static(2.0**-80):
+                length = ti.sqrt(rr)
+                overlap, n = far - length, r / length
+            else:
+                overlap, n = far, self.part(i, j, r)
+        return overlap, n
+
+    @ti.func
+    def part(self, i, j, r):
+        """A direction for two particles in the same place: opposite for (j, i), different for other pairs."""
+        low, high = ti.cast(ti.min(i, j), ti.u32), ti.cast(ti.max(i, j), ti.u32)
+        mixed = (low * ti.u32(2654435769)) ^ ((high + ti.u32(1)) * ti.u32(2246822519))
+        u = ti.cast(mixed * ti.u32(2654435769), ti.f64) / 4294967296.0
+        n = 0 * r
+        turn = ti.f64(6.283185307179586) * u
+        if ti.static(self._on_state.dim == 2):
+            n[0], n[1] = ti.cos(turn), ti.sin(turn)
+        else:
+            z = 2 * ti.cast(mixed * ti.u32(3242174889), ti.f64) / 4294967296.0 - 1
+            across = ti.sqrt(ti.max(1 - z * z, 0))
+            n[0], n[1], n[2] = across * ti.cos(turn), across * ti.sin(turn), z
+        if i > j:
+            n = -n
+        return n
+
+    @ti.func
+    def count(self, i):
+        """How many particles overlap particle i."""
+        active = 0
+        for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
+            overlap, _ = self.touch(i, self._on_grid.near[e])
+            if overlap > 0:
+                active += 1
+        self._on_active[i] = active
+
+    @ti.func
+    def relax(self, i, h):
+        """What the pairs of particle i want of it."""
+        total = 0 * self._on_state.x[i]
+        if self._on_active[i] > 0:
+            for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
+                j = self._on_grid.near[e]
+                overlap, n = self.touch(i, j)
+                if overlap > 0:
+                    leaving = (self._on_state.d[i] - self._on_state.d[j]).dot(n)
+                    push = ti.min(overlap, ti.max(self.push_out * h - leaving, 0))
+                    shared = self._on_active[i] * self._on_state.w[i] + self._on_active[j] * self._on_state.w[j]
+                    total += self._on_state.w[i] * push / shared * n
+        self._on_move[i] = total
+
+    @ti.func
+    def gather(self, i):
+        """Move particle i as its pairs want."""
+        if self._on_active[i] > 0 and self._on_state.w[i] > 0:
+            self._on_state.shift(i, self._on_move[i])

@@ -1,0 +1,51 @@
+"""Links of given length."""
+
+import numpy as np
+import taichi as ti
+
+from .. import checks
+from ..feature import Knob
+from ..scalar import Scalar
+
+
+class Link(Scalar):
+    """What Distance, Rope and Spacer share: the distance of a pair, f(x) = |x_i - x_j|, and its gradients.
+
+    Two particles in the same place have no direction between them; +x stands in for it.
+    """
+
+    arity = 2
+    rest = Knob(lambda f, v: checks.per_item(repr(f), f.rest_name, v, f.count, least=0.0), "Rest length [m].")
+
+    def rest_of(self, position: np.ndarray) -> np.ndarray:
+        """Lengths of the links."""
+        i, j = self.indices.T
+        return np.linalg.norm(position[i] - position[j], axis=1)
+
+    @ti.func
+    def measure(self, c, q):
+        """|r| and +- r / |r|, with r = x_0 - x_1."""
+        r = q[0, :] - q[1, :]
+        length = ti.sqrt(r.dot(r))
+        n = 0 * r
+        n[0] = 1
+        if length > 0:
+            n = r / length
+        return length, ti.Matrix.rows([n, -n])
+
+
+class Distance(Link):
+    """Links: two particles stay a given distance apart.
+
+    C(x) = |x_i - x_j| - rest,   grad_i C = (x_i - x_j) / |x_i - x_j| = -grad_j C.
+
+    pairs: (m, 2) particle indices.
+    rest: rest length, number or (m,) [m], at least 0; None takes the initial distances. Live.
+    compliance: inverse stiffness, number or (m,) [m/N]; 0 is rigid. A spring of k [N/m] has compliance 1 / k.
+    damping: of a dashpot beside the spring, number or (m,) [N s/m]; beside a rigid link there is nothing for it to do.
+
+    Second order in h, without artificial damping, for every compliance (see Scalar). `load` is the tension of each link [N].
+    """
+
+    def __init__(self, pairs, rest=None, *, compliance=0.0, damping=0.0):
+        self.setup(pairs, rest, compliance, damping)

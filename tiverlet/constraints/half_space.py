@@ -1,0 +1,62 @@
+"""A plane with particles on one side."""
+
+import numpy as np
+import taichi as ti
+
+from .. import checks
+from ..feature import Knob, Scene, Wall
+from ..particles import Particles
+
+
+class HalfSpace(Wall):
+    """Particles stay on the side of a plane to which the normal points: a floor, a slope.
+
+    C(x) = n . x - offset - radius >= 0, grad C = n.
+
+    normal: (dim,), any length above 0; offset: [m] along the unit normal, from the origin. offset is live: assign to it between
+    frames, and the plane moves there during the next frame. push_out: see Wall.
+
+    One-sided: a particle cannot pass at any speed.
+    """
+
+    offset = Knob(lambda f, v: checks.number("HalfSpace", "offset", v), "Of the plane along its normal [m].")
+
+    def __init__(self, normal, offset=0.0, *, push_out=1.0):
+        normal = np.asarray(normal, dtype=np.float64)
+        normal = checks.vector("HalfSpace", "normal", normal, normal.size)
+        length = float(np.linalg.norm(normal))
+        if length == 0:
+            raise ValueError("HalfSpace: normal = 0 has no direction; (0, 1) is a floor.")
+        self.normal = normal / length
+        self.normal.flags.writeable = False
+        self.offset = offset
+        self.push_out = checks.number("HalfSpace", "push_out", push_out, least=0.0)
+
+    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Check the normal's length."""
+        checks.vector("HalfSpace", "normal", self.normal, particles.dim)
+
+    def bind(self, scene: Scene) -> None:
+        """Normal, and the offsets at the start and the end of a frame."""
+        self.scene = scene
+        self._on_state = scene.state
+        self._on_normal = scene.memory.field("HalfSpace.normal", None, width=len(self.normal), values=self.normal)
+        self._on_offset = scene.memory.field("HalfSpace.offset", None, width=2, values=[self.offset] * 2, state=True)
+        self._on_aim = self.offset
+        self.changed = False
+
+    def upload(self) -> None:
+        """Move from the last offset to the new one."""
+        self._on_offset[None] = [self._on_aim, self.offset]
+        self._on_aim, self.moving = self.offset, True
+
+    def settle(self) -> None:
+        """Stay."""
+        self._on_offset[None] = [self.offset, self.offset]
+
+    @ti.func
+    def confine(self, i, radius, h, when):
+        """One plane."""
+        n, offset = self._on_normal[None], self._on_offset[None]
+        before, now = offset[0] * (1 - when[0]) + offset[1] * when[0], offset[0] * (1 - when[1]) + offset[1] * when[1]
+        self.press(i, now + radius - n.dot(self._on_state.place(i)), n, now - before, h)

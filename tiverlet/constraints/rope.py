@@ -1,0 +1,19 @@
+"""Links that pull and do not push."""
+
+from .distance import Link
+
+
+class Rope(Link):
+    """Links that are at most as long as given: taut they are a Distance, slack they are not there.
+
+    C(x) = |x_i - x_j| - length <= 0, gradients as in Distance; the multiplier may only pull.
+
+    pairs: (m, 2); length: number or (m,) [m], None takes the initial distances; compliance [m/N] and damping [N s/m] of
+    the taut rope. A rigid rope that becomes taut takes the impact inelastically. Assign to .rest to change the length.
+    """
+
+    side = 1
+    rest_name = "length"
+
+    def __init__(self, pairs, length=None, *, compliance=0.0, damping=0.0):
+        self.setup(pairs, length, compliance, damping)

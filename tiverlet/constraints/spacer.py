@@ -1,0 +1,19 @@
+"""Links that push and do not pull."""
+
+from .distance import Link
+
+
+class Spacer(Link):
+    """Pairs that stay at least `length` apart, contact or not.
+
+    C(x) = |x_i - x_j| - length >= 0, gradients as in Distance; the multiplier may only push.
+
+    pairs: (m, 2); length: number or (m,) [m]; compliance [m/N] and damping [N s/m] of the pushing spring.
+    Assign to .rest to change the length.
+    """
+
+    side = -1
+    rest_name = "length"
+
+    def __init__(self, pairs, length, *, compliance=0.0, damping=0.0):
+        self.setup(pairs, length, compliance, damping)

@@ -1,0 +1,213 @@
+"""What acts on particles: the contract that every force, constraint and wall keeps, and the guide to writing one.
+
+A feature is a batch of arrays and one small kernel function. It checks its arguments in Python, declares its own
+fields, and is absent from memory, from the kernels and from the clock when it is not in the scene. There are four
+kinds, told apart by what the substep asks of them:
+
+    Acceleration   acceleration(i, x, v, t) of one particle, and/or a linear drag rate
+    Batch          relax(c, ...) of one constraint: reads its particles, writes the moves it wants into slots
+    Scalar         (scalar.py) a Batch whose constraint is one number: give measure(c, q) = f and its gradients, and
+                   C = f - rest gets compliance, damping, mass splitting, residual and load from there
+    Wall           confine(i, s, ...) of one particle, with the last word
+
+A new constraint on k particles is one file with one Scalar subclass: `arity = k`, an __init__ that checks its arrays,
+`rest_of(position)` for a default rest value, and `measure`. See constraints/distance.py.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import taichi as ti
+
+from .particles import Particles, Radii, State
+from .runtime import Memory
+
+
+@dataclass
+class Scene:
+    """What a feature is bound to: the memory to declare fields in, and the particles they act on."""
+
+    memory: Memory
+    state: State
+    particles: Particles
+    inv_mass: np.ndarray  # (n,) after pins: 0 means that constraints cannot move it
+    radius: Radii | None = None  # where something asks for radii
+    slots: Any = None  # where constraints leave their moves
+
+    @property
+    def real(self):
+        """The Taichi type of the world's real numbers."""
+        return self.memory.real
+
+    @property
+    def size(self) -> float:
+        """A length that is typical of the scene [m], for relative residuals of things that have none of their own."""
+        x = self.particles.position
+        extent = float(np.ptp(x, axis=0).max()) if len(x) else 0.0
+        return extent or float(self.particles.radius.max(initial=0.0)) or 1.0
+
+
+class Knob:
+    """A live setting of a feature: checked when assigned, written to the device before the next frame.
+
+    check: a function (feature, value) -> value that raises for a wrong one.
+    """
+
+    def __init__(self, check: Callable, doc: str):
+        self.check = check
+        self.__doc__ = doc
+
+    def __set_name__(self, owner, name: str) -> None:
+        self.name = name
+
+    def __get__(self, feature, owner=None):
+        return self if feature is None else feature.__dict__[self.name]
+
+    def __set__(self, feature, value) -> None:
+        feature.__dict__[self.name] = self.check(feature, value)
+        feature.changed = True
+
+
+class Feature:
+    """Base of all. `changed` says that a knob waits to be uploaded, `moving` that a target is under way."""
+
+    changed = True
+    moving = False
+    scene: Scene | None = None
+
+    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Check the arguments against the particles; set inv_mass to 0 for those that this feature holds."""
+
+    def bind(self, scene: Scene) -> None:
+        """Declare fields with scene.memory.field(...). Called once, when the world is built."""
+
+    def upload(self) -> None:
+        """Write changed knobs to the device. Called before a frame when `changed`."""
+
+    def settle(self) -> None:
+        """End a motion: what was the target of the last frame is where the next one starts. Called when `moving`."""
+
+    def copy(self) -> "Feature":
+        """The same feature, unbound: same arrays and knobs, ready for another world."""
+        new = object.__new__(type(self))
+        device = ("scene", "changed", "moving") + tuple(k for k in vars(self) if k.startswith("_on_"))
+        new.__dict__.update((k, v) for k, v in vars(self).items() if k not in device)
+        return new
+
+    def __repr__(self) -> str:
+        return type(self).__name__
+
+
+class Acceleration(Feature):
+    """A force that acts on each particle by itself: gravity, drag, a field.
+
+    accelerates: acceleration() adds something (a pure drag leaves it False).
+    uniform: it is the same everywhere, so it has no stiffness.
+    uses_velocity: acceleration() reads v, which costs one more field to have it to second order.
+    conservative: potential() is known, so the energy report can account for it.
+    decays: it has a rate, a linear drag [1/s] that is solved exactly (exponential); several add up.
+    """
+
+    accelerates = True
+    uniform = False
+    uses_velocity = False
+    conservative = False
+    decays = False
+    rate = 0.0
+
+    @ti.func
+    def acceleration(self, i, x, v, t):
+        """Acceleration [m/s^2] of particle i at position x [m] with velocity v [m/s] at time t [s]."""
+        return 0.0 * x
+
+    @ti.func
+    def potential(self, i, x):
+        """Potential energy of particle i per unit of mass [J/kg] at x."""
+        return 0.0 * x[0]
+
+
+class Batch(Feature):
+    """m constraints of the same kind on `arity` particles each.
+
+    relax() writes, for each of its particles, the move that it wants, already multiplied by the inverse mass. What the
+    particles of constraint c are: self.members(c, k); where their moves go: self.push(c, k, move).
+    """
+
+    arity = 0
+    drives = False  # puts its particles in place instead of relaxing them
+    indices: np.ndarray  # (m, arity)
+
+    @property
+    def count(self) -> int:
+        """The number of constraints."""
+        return len(self.indices)
+
+    def bind(self, scene: Scene) -> None:
+        """Declare the particles and slots of each constraint."""
+        self.scene = scene
+        self._on_state = scene.state
+        self._on_slots = scene.slots
+        self._on_w = scene.state.w
+        self._on_members = scene.memory.field(
+            f"{self!r}.members", self.count, width=self.arity, kind=ti.i32, values=self.indices
+        )
+        if not self.drives:
+            self._on_places = scene.memory.field(
+                f"{self!r}.slots", self.count, width=self.arity, kind=ti.i32, values=scene.slots.places(self)
+            )
+
+    @ti.func
+    def member(self, c, k: ti.template()):  # type: ignore[valid-type]
+        """The particle at corner k of constraint c."""
+        return self._on_members[c][k]
+
+    @ti.func
+    def push(self, c, k: ti.template(), move):  # type: ignore[valid-type]
+        """Write the move of corner k into its slot; a particle that cannot move has none."""
+        place = self._on_places[c][k]
+        if place >= 0:
+            self._on_slots.move[place] = move
+
+    @ti.func
+    def relax(self, c, h, when, first, fresh):
+        """One Jacobi correction of constraint c in a substep of h [s]: pushes one move for each corner.
+
+        when: the fractions of the frame at the start and the end of the substep, for targets that move.
+        first: 1 in the first iteration of a substep. fresh: 1 in the first substep after a start.
+        """
+
+    @ti.func
+    def residual(self, c, h, when, fresh):
+        """How far constraint c is from fulfilled, relative to its size."""
+        return 0.0
+
+    @ti.func
+    def energy(self, c, back):
+        """Elastic energy [J] of constraint c at x - back d."""
+        return 0.0
+
+
+class Wall(Feature):
+    """Surroundings: each particle by itself is kept on one side, with the last word in every iteration.
+
+    push_out: a particle found inside by more than it moved in this substep is led out at this speed [m/s] at most.
+    """
+
+    push_out = 1.0
+
+    @ti.func
+    def confine(self, i, radius, h, when):
+        """Move particle i out of the wall, with self.press."""
+
+    @ti.func
+    def press(self, i, depth, n, u, h):
+        """Take particle i out of a wall that it entered by `depth` [m], along the normal n; the wall itself moved by u.
+
+        Inelastic and one-sided: what entered in this substep is taken back whole, at any speed; depth from before (a bad
+        start) is left at push_out, and so turns into no more than that velocity.
+        """
+        if depth > 0:
+            leaving = self._on_state.d[i].dot(n) - u
+            self._on_state.shift(i, ti.min(depth, ti.max(self.push_out * h - leaving, 0)) * n)

@@ -1,0 +1,9 @@
+"""What accelerates particles one by one."""
+
+from .attractor import Attractor
+from .drag import Drag
+from .force import Force
+from .gravity import Gravity
+from .wind import Wind
+
+__all__ = ["Attractor", "Drag", "Force", "Gravity", "Wind"]

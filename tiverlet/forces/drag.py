@@ -1,0 +1,20 @@
+"""Linear drag."""
+
+from .. import checks
+from ..feature import Acceleration, Knob
+
+
+class Drag(Acceleration):
+    """a = -rate v, solved exactly: in a time t without other forces, v falls by the factor exp(-rate t), whatever the step.
+
+    rate: [1/s], at least 0. Live: assign to .rate between frames.
+
+    With a constant acceleration a beside it, the displacements obey d' = exp(-z) d + h^2 a (1 - exp(-z)) / z, z = rate h.
+    """
+
+    accelerates = False
+    decays = True
+    rate = Knob(lambda f, v: checks.number("Drag", "rate", v, least=0.0), "Drag rate [1/s].")
+
+    def __init__(self, rate):
+        self.rate = rate

@@ -1,0 +1,55 @@
+"""Uniform gravity."""
+
+import numpy as np
+import taichi as ti
+
+from .. import checks
+from ..feature import Acceleration, Knob, Scene
+from ..particles import Particles
+
+
+def _vector(feature: "Gravity", g):
+    if np.ndim(g) == 0:
+        return checks.number("Gravity", "g", g)
+    return checks.vector("Gravity", "g", g, feature.dim or len(np.asarray(g)))
+
+
+class Gravity(Acceleration):
+    """a = g, the same for every particle. Position Verlet follows the parabola exactly, whatever the step.
+
+    g: a number [m/s^2] along -y, or a vector (dim,). Live: assign to .g between frames.
+    """
+
+    conservative = True
+    uniform = True
+    dim = 0
+    g = Knob(_vector, "Acceleration [m/s^2]: a number along -y, or a vector.")
+
+    def __init__(self, g=9.81):
+        self.g = g
+
+    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Check the vector's length."""
+        self.dim = particles.dim
+        self.g = self.g
+
+    def bind(self, scene: Scene) -> None:
+        """One vector on the device."""
+        self.scene = scene
+        self._on_g = scene.memory.field("Gravity.g", None, width=scene.particles.dim)
+
+    def upload(self) -> None:
+        """Write g."""
+        vector = np.zeros(self.dim)
+        vector[1] = -self.g if np.ndim(self.g) == 0 else 0.0
+        self._on_g[None] = list(vector if np.ndim(self.g) == 0 else self.g)
+
+    @ti.func
+    def acceleration(self, i, x, v, t):
+        """g."""
+        return self._on_g[None]
+
+    @ti.func
+    def potential(self, i, x):
+        """-g . x."""
+        return -self._on_g[None].dot(x)

@@ -1,0 +1,44 @@
+"""Wind: drag relative to moving air."""
+
+import numpy as np
+import taichi as ti
+
+from .. import checks
+from ..feature import Acceleration, Knob, Scene
+from ..particles import Particles
+
+
+class Wind(Acceleration):
+    """a = -rate (v - velocity): drag towards the velocity of the air, exact like Drag.
+
+    velocity: (dim,) [m/s]; rate: [1/s], at least 0. Both live.
+    """
+
+    velocity = Knob(lambda f, v: checks.vector("Wind", "velocity", v, f.dim or len(np.atleast_1d(v))), "Of the air [m/s].")
+    rate = Knob(lambda f, v: checks.number("Wind", "rate", v, least=0.0), "Drag rate [1/s].")
+    decays = True
+    uniform = True
+    dim = 0
+
+    def __init__(self, velocity, rate):
+        self.velocity = velocity
+        self.rate = rate
+
+    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Check the vector's length."""
+        self.dim = particles.dim
+        self.velocity = self.velocity
+
+    def bind(self, scene: Scene) -> None:
+        """One vector on the device: rate * velocity, the acceleration that is left when the drag is taken apart."""
+        self.scene = scene
+        self._on_push = scene.memory.field("Wind.push", None, width=self.dim)
+
+    def upload(self) -> None:
+        """Write rate * velocity."""
+        self._on_push[None] = list(self.rate * self.velocity)
+
+    @ti.func
+    def acceleration(self, i, x, v, t):
+        """rate * velocity; the part -rate v is in `rate`."""
+        return self._on_push[None]

@@ -1,0 +1,209 @@
+"""Neighbours: a spatial hash over an unbounded domain, and the list of near pairs that it yields.
+
+The hash folds space onto a torus of cells, cell (a, b, ...) to bucket (a mod A, b mod B, ...) with A, B powers of two
+of at least 4. The three cells around a particle along each axis thus fall into different buckets, so every bucket is read
+once and every pair is seen once, however many far cells share a bucket; those are told apart by the distance itself. Cells
+of a row stand side by side in memory. Counting sort with atomic counters; no cell has a capacity.
+
+The list holds, for each particle, all others closer than the sum of radii plus a skin, sorted by index. It stays valid until
+something has moved by half the skin, and no sum over it depends on when it was built, on the table, or on the skin.
+"""
+
+from typing import Any
+
+import numpy as np
+import taichi as ti
+
+from .feature import Scene
+from .runtime import Memory
+
+FARTHEST = 1 << 22  # cells from the origin: beyond it, f32 cannot tell a cell from the next
+
+
+class Grid:
+    """Cells, and the list of near pairs.
+
+    reach: the largest distance at which two particles can touch [m]. skin: what is listed beyond touching [m].
+    linked: (m, 2) pairs that are never listed.
+    """
+
+    def __init__(self, scene: Scene, radius, reach: float, skin: float, linked: np.ndarray, parallel: bool):
+        n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
+        self.n, self.dim, self.state, self.radius = n, dim, scene.state, radius
+        self.real = scene.real
+        self.reach, self.skin = reach, skin
+        self.cell = (reach + skin) * (1 + 2.0**-12)  # rounding of floor(x / cell) must not hide a neighbour
+        self.bits = max(2 * dim, int(np.ceil(np.log2(max(2 * n, 1)))))  # log2 of the number of buckets
+        self.buckets = 1 << self.bits
+        self.blocks = 16 if parallel else 1  # parts of the list, each filled by one thread
+        self.spread = 512 if parallel else 1  # Taichi gives each CPU thread at least 512 iterations of a loop
+        self.serial = True  # counting in order beats atomic counters in parallel on a CPU
+        self.edge = add("grid.edge", self.buckets + 2, kind=ti.i32)
+        self.sorted = add("grid.sorted", n, kind=ti.i32)
+        self.origin = add("grid.built_at", n, width=dim)
+        self.first = add("grid.first", n, kind=ti.i32)
+        self.number = add("grid.number", n, kind=ti.i32)
+        self.shape = add("grid.shape", None, width=dim, kind=ti.i32, values=_shares(np.ones(dim), self.bits))
+        self.stale = add("grid.stale", None, kind=ti.i32, values=1)
+        self.need = add("grid.need", None, kind=ti.i32)
+        self.linked = len(linked) > 0
+        if self.linked:
+            both = np.concatenate([linked, linked[:, ::-1]])
+            both = np.unique(both, axis=0)
+            begin = np.searchsorted(both[:, 0], np.arange(n + 1))
+            self.mates = add("grid.linked", len(both), kind=ti.i32, values=both[:, 1])
+            self.mates_begin = add("grid.linked_begin", n + 1, kind=ti.i32, values=begin)
+        self.near: Any = None
+        self.store: Memory | None = None
+        self._bits_now = _shares(np.ones(dim), self.bits)
+
+    def allocate(self, capacity: int) -> None:
+        """Room for `capacity` entries of the list, in a tree of its own, so that it can grow."""
+        if capacity > 2**31 - 1:
+            raise MemoryError(f"{capacity} near pairs exceed what a list can index; the particles overlap too much.")
+        if self.store:
+            self.store.destroy()
+        self.capacity = max(1, -(-capacity // self.blocks))  # of one block
+        self.store = Memory(self.real)
+        self.near = self.store.field("grid.near", self.capacity * self.blocks, kind=ti.i32)
+        self.store.place()
+
+    def grow(self) -> None:
+        """Make room for what the last build needed, and a quarter more."""
+        self.allocate(int(self.need[None] * 1.25 + 16) * self.blocks)
+        self.stale[None] = 1
+
+    def fit(self, extent: np.ndarray) -> None:
+        """Share the buckets among the axes in proportion to the extent of the particles [m]; affects speed only."""
+        bits = _shares(extent / self.cell, self.bits)
+        if bits != self._bits_now:
+            self.shape[None] = self._bits_now = bits
+            self.stale[None] = 1
+
+    def pairs(self) -> np.ndarray:
+        """The listed pairs (m, 2) with i < j, in order."""
+        assert self.store
+        first, number = (self.first.to_numpy()[: self.n], self.number.to_numpy()[: self.n])
+        near = self.store.read(self.near)
+        rows = [(i, j) for i in range(self.n) for j in near[first[i] : first[i] + number[i]] if i < j]
+        return np.array(rows, dtype=np.int64).reshape(-1, 2)
+
+    @ti.func
+    def watch(self, i):
+        """The list is stale once a particle has moved by half the skin."""
+        r = self.state.x[i] - self.origin[i]
+        if not (r.dot(r) <= ti.cast((0.49 * self.skin) ** 2, self.real)):  # "not <=" also catches NaN
+            self.stale[None] = 1
+
+    @ti.func
+    def home(self, i):
+        """The cell of particle i."""
+        return ti.floor(self.state.x[i] / ti.cast(self.cell, self.real), ti.i32)
+
+    @ti.func
+    def bucket(self, cell):
+        """The bucket of a cell; axis 0 varies fastest."""
+        bits = self.shape[None]
+        b = cell[self.dim - 1] & ((1 << bits[self.dim - 1]) - 1)
+        for k in ti.static(range(self.dim - 2, -1, -1)):
+            b = (b << bits[k]) | (cell[k] & ((1 << bits[k]) - 1))
+        return b
+
+    @ti.func
+    def build(self):
+        """Sort the particles into buckets, then list the near ones of each."""
+        for b in range(self.buckets + 2):
+            self.edge[b] = 0
+        ti.loop_config(serialize=self.serial)
+        for i in range(self.n):
+            ti.atomic_add(self.edge[self.bucket(self.home(i)) + 1], 1)
+        ti.loop_config(serialize=True)
+        for b in range(1, self.buckets + 2):
+            self.edge[b] += self.edge[b - 1]
+        ti.loop_config(serialize=self.serial)
+        for i in range(self.n):
+            # Filling a bucket from its end turns the end of each into its begin, and the next one's begin is its end.
+            k = ti.atomic_sub(self.edge[self.bucket(self.home(i)) + 1], 1) - 1
+            self.sorted[k] = i
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            self.need[None] = 0
+            self.stale[None] = 0
+        for t in range(self.blocks * self.spread):
+            if t % self.spread == 0:
+                self.fill(t // self.spread)
+        for i in range(self.n):
+            self.origin[i] = self.state.x[i]
+
+    @ti.func
+    def fill(self, block):
+        """List the neighbours of one block of particles, one after the other."""
+        start, room = block * self.capacity, self.capacity
+        size = (self.n + self.blocks - 1) // self.blocks
+        used = 0
+        for i in range(block * size, ti.min((block + 1) * size, self.n)):
+            self.first[i] = start + ti.min(used, room)
+            begin = used
+            used = self.collect(i, start, used, room)
+            self.number[i] = ti.max(ti.min(used, room) - begin, 0)
+            self.sort(self.first[i], self.number[i])
+        ti.atomic_max(self.need[None], used)
+
+    @ti.func
+    def collect(self, i, start, used, room):
+        """Append the neighbours of particle i; beyond the room they are only counted."""
+        cell, bits = self.home(i), self.shape[None]
+        mask = (1 << bits[0]) - 1
+        low = (cell[0] - 1) & mask
+        span = 1
+        if low + 2 <= mask:  # the three cells of a row stand side by side unless the torus wraps there
+            span = 3
+        for row in range(ti.static(3 ** (self.dim - 1))):
+            at = cell
+            rest = row
+            for k in ti.static(range(1, self.dim)):
+                at[k] += rest % 3 - 1
+                rest = rest // 3
+            at[0] = 0
+            base = self.bucket(at)
+            for part in range(3 // span):
+                b = base + ((low + part) & mask)
+                for e in range(self.edge[b + 1], self.edge[b + span + 1]):
+                    j = self.sorted[e]
+                    if j != i and self.listed(i, j):
+                        if used < room:
+                            self.near[start + used] = j
+                        used += 1
+        return used
+
+    @ti.func
+    def listed(self, i, j):
+        """Whether a pair belongs on the list: near, not both immovable, not linked."""
+        r = self.state.apart(i, j)
+        far = self.radius.of(i) + self.radius.of(j) + ti.cast(self.skin, self.real)
+        yes = r.dot(r) < far * far and self.state.w[i] + self.state.w[j] > 0
+        if ti.static(self.linked):
+            if yes:
+                for e in range(self.mates_begin[i], self.mates_begin[i + 1]):
+                    if self.mates[e] == j:
+                        yes = False
+        return yes
+
+    @ti.func
+    def sort(self, begin, count):
+        """Insertion sort by index: lists are short, and this makes every sum over them independent of the table."""
+        for a in range(1, count):
+            j = self.near[begin + a]
+            b = a
+            while b > 0 and self.near[begin + b - 1] > j:
+                self.near[begin + b] = self.near[begin + b - 1]
+                b -= 1
+            self.near[begin + b] = j
+
+
+def _shares(cells: np.ndarray, bits: int) -> list[int]:
+    """Split `bits` among the axes: at least 2 each, the rest where there are most cells per bucket."""
+    shares = np.full(len(cells), 2)
+    for _ in range(bits - 2 * len(cells)):
+        shares[int(np.argmax(np.nan_to_num(cells, nan=1.0, posinf=1e30) / 2.0**shares))] += 1
+    return [int(s) for s in shares]

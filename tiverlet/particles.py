@@ -1,0 +1,184 @@
+"""Particles: what the user gives (plain arrays), and the state that a world keeps of them on the device."""
+
+import numpy as np
+import taichi as ti
+
+from . import checks
+from .runtime import Memory
+
+LARGEST = 1e15  # [m] beyond this, squared lengths near 1e38 leave f32; nothing physical is that far
+
+
+class Particles:
+    """n point masses with optional radii: the initial state of a world, and its structure.
+
+    position: (n, dim) [m], dim 2 or 3; n = 0 is allowed.
+    velocity: 0, (dim,) or (n, dim) [m/s].
+    mass: number or (n,) [kg], above 0; inf means static: it never moves, and nothing moves it.
+    radius: number or (n,) [m], at least 0. A point (radius 0) touches discs and walls but not other points.
+    pinned: indices or a Boolean mask of particles that stay where they are, whatever their mass.
+    group: integer or (n,), for contact filters.
+
+    Raises ValueError or TypeError naming the first offending index. The arrays are read-only: mass, radius and links are
+    structure, fixed when a world is built. To move particles, assign to world.position and world.velocity.
+    """
+
+    def __init__(self, position, *, velocity=0.0, mass=1.0, radius=0.0, pinned=(), group=0):
+        who = "Particles"
+        self.position = checks.points(who, "position", position)
+        self.count, self.dim = self.position.shape
+        in_range(who, "position", self.position)
+        self.velocity = _velocity(who, velocity, self.position.shape)
+        self.mass = checks.per_item(who, "mass", mass, self.count, above=0.0, infinite=True)
+        self.radius = checks.per_item(who, "radius", radius, self.count, least=0.0)
+        self.pinned = _pinned(who, pinned, self.count)
+        self.group = np.broadcast_to(np.asarray(group), (self.count,)).copy()
+        if self.group.dtype.kind not in "iu" and self.count:
+            raise TypeError(f"Particles: group has type {self.group.dtype}, but integers are needed.")
+        with np.errstate(divide="ignore"):
+            self.inv_mass = np.where(self.pinned, 0.0, 1.0 / self.mass)
+        for array in vars(self).values():
+            if isinstance(array, np.ndarray):
+                array.flags.writeable = False
+        self._fixed = True
+
+    def __setattr__(self, name: str, value) -> None:
+        if getattr(self, "_fixed", False):
+            raise AttributeError(
+                f"Particles.{name} is structure, fixed when a world is built. Make new Particles for a new world; "
+                "to move particles assign to world.position or world.velocity."
+            )
+        object.__setattr__(self, name, value)
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __repr__(self) -> str:
+        return f"Particles({self.count} in {self.dim}D)"
+
+
+def in_range(who: str, name: str, position: np.ndarray) -> None:
+    """Refuse coordinates whose squares would overflow in f32."""
+    far = np.abs(position) > LARGEST
+    if far.any():
+        i, k = np.unravel_index(int(np.argmax(far)), far.shape)
+        raise ValueError(
+            f"{who}: {name}[{i}, {k}] = {position[i, k]:g} m is out of range (at most {LARGEST:g} m). "
+            "Shift the scene towards the origin or use larger units."
+        )
+
+
+def _velocity(who: str, velocity, shape: tuple[int, int]) -> np.ndarray:
+    array = np.asarray(velocity)
+    if array.ndim == 0:
+        checks.number(who, "velocity", velocity)
+        if float(velocity) != 0.0:
+            raise ValueError(f"{who}: velocity = {velocity}; a single number other than 0 has no direction.")
+        return np.zeros(shape)
+    if array.ndim == 1:
+        return np.broadcast_to(checks.vector(who, "velocity", velocity, shape[1]), shape).copy()
+    return checks.points(who, "velocity", velocity, dim=shape[1], count=shape[0])
+
+
+def _pinned(who: str, pinned, count: int) -> np.ndarray:
+    array = np.asarray(pinned)
+    if array.dtype == bool:
+        if array.shape != (count,):
+            raise ValueError(f"{who}: pinned has shape {array.shape}, but a mask of shape ({count},) is needed.")
+        return array.copy()
+    mask = np.zeros(count, dtype=bool)
+    mask[checks.indices(who, "pinned", array, count)] = True
+    return mask
+
+
+class State:
+    """The moving state on the device: position x, displacement d of the last substep, inverse mass w.
+
+    Displacement form (numerics: "summed" Verlet): every correction goes to x and to d alike, so that x - d is the
+    start of the substep and d / h the velocity half a substep ago, without the cancellation of x_n - x_(n-1).
+    With `compensated`, the sum in x carries its rounding error along in `low` (two-sum, Knuth).
+    """
+
+    def __init__(self, memory: Memory, particles: Particles, inv_mass: np.ndarray, compensated: bool):
+        n, dim = particles.count, particles.dim
+        self.compensated = compensated
+        self.dim = dim
+        self.x = memory.field("position", n, width=dim, values=particles.position, state=True)
+        self.d = memory.field("displacement", n, width=dim, values=particles.velocity, state=True)
+        self.w = memory.field("inv_mass", n, values=inv_mass)
+        if compensated:
+            high = particles.position.astype(np.float32)
+            low = particles.position - high
+            self.low = memory.field("position_low", n, width=dim, values=low, state=True)
+
+    def put(self, memory: Memory, position: np.ndarray) -> None:
+        """Overwrite the positions."""
+        memory.write(self.x, position)
+        if self.compensated:
+            memory.write(self.low, position - position.astype(np.float32))
+
+    @ti.func
+    def apart(self, i, j):
+        """x_i - x_j, with the low words where there are any."""
+        r = self.x[i] - self.x[j]
+        if ti.static(self.compensated):
+            r += self.low[i] - self.low[j]
+        return r
+
+    @ti.func
+    def place(self, i):
+        """x_i as one number per axis."""
+        x = self.x[i]
+        if ti.static(self.compensated):
+            x += self.low[i]
+        return x
+
+    @ti.func
+    def advance(self, i, d):
+        """x_i += d."""
+        x = self.x[i]
+        s = x + d
+        if ti.static(self.compensated):
+            b = s - x
+            low = self.low[i] + ((x - (s - b)) + (d - b))
+            t = s + low
+            self.low[i] = low - (t - s)
+            s = t
+        self.x[i] = s
+
+    @ti.func
+    def shift(self, i, move):
+        """A correction: the same move to x_i and to d_i, so that x - d stays the start of the substep."""
+        self.d[i] += move
+        self.advance(i, move)
+
+
+class Radii:
+    """Radii on the device: a constant of the kernel where all are equal, a field otherwise."""
+
+    def __init__(self, memory: Memory, radius: np.ndarray):
+        self.real = memory.real
+        self.uniform = bool(len(radius) == 0 or (radius == radius[0]).all())
+        self.constant = float(radius[0]) if len(radius) else 0.0
+        positive = radius[radius > 0]
+        self.least = float(positive.min()) if len(positive) else 0.0
+        self.points = bool((radius == 0).any())
+        if not self.uniform:
+            self.field = memory.field("radius", len(radius), values=radius)
+
+    @ti.func
+    def of(self, i):
+        """Radius of particle i."""
+        r = ti.cast(self.constant, self.real)
+        if ti.static(not self.uniform):
+            r = self.field[i]
+        return r
+
+    @ti.func
+    def stride(self, i):
+        """The longest step with which particle i cannot pass another: two such steps never exceed r_i + r_j."""
+        least = ti.cast(self.least, self.real)
+        step = least / 2
+        if ti.static(not self.points):
+            step = (self.of(i) + least) / 2
+        return step

@@ -1,0 +1,309 @@
+"""The one door to Taichi: starting it, asking about it, and holding memory in it.
+
+Taichi 1.7.4 ends the process, without an exception, when a field outlives its runtime, when 512 trees of fields are
+alive, when a field has no elements or when a child made by fork launches a kernel. The checks here turn each of
+these into an error that says what to do, so that no other module has to know.
+"""
+
+import contextlib
+import io
+import os
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+# Quiet and offline: no banner, no version check over the network. Taichi reads these when it is imported.
+os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
+os.environ.setdefault("TI_LOG_LEVEL", "error")
+
+import numpy as np
+import taichi as ti
+from taichi.lang import impl
+
+ARCHITECTURES = ("cpu", "cuda", "metal", "vulkan")
+MAX_TREES = 400  # Taichi holds at most 511 trees of fields and does not check; the rest is left to the user's own fields.
+
+_started: dict = {}  # what init() was asked for, and by which process and thread
+_trees = 0  # live trees of fields, of this runtime
+
+
+def init(arch: str = "cpu", threads: int | None = None, debug: bool = False, seed: int = 0) -> None:
+    """Start Taichi. Optional: the first World does it with these defaults.
+
+    arch: "cpu", "cuda", "metal" or "vulkan". One that this machine lacks is an error, never a fallback.
+    threads: number of CPU threads; None for all cores. The bits of a simulation do not depend on it.
+    debug: Taichi checks array bounds in kernels (slow).
+    seed: of Taichi's random numbers; tiverlet itself uses none.
+
+    A Taichi that the user has started is used as it is. Calling init again with the same settings does nothing; with
+    other settings it raises RuntimeError, because starting Taichi anew would destroy the fields of every live world.
+    """
+    if arch not in ARCHITECTURES:
+        raise ValueError(f"init: arch = {arch!r}, but it must be one of {', '.join(map(repr, ARCHITECTURES))}.")
+    if threads is not None and (isinstance(threads, bool) or not isinstance(threads, int) or threads < 1):
+        raise ValueError(f"init: threads = {threads!r}, but it must be an integer of at least 1, or None for all cores.")
+    wanted = {"arch": arch, "threads": threads, "debug": debug, "seed": seed}
+    if ti.cfg is not None:
+        if _started.get("runtime") is impl.get_runtime() and wanted == _started["wanted"]:
+            return
+        raise RuntimeError(
+            f"init: Taichi already runs (arch {architecture()}), and starting it again would destroy every live "
+            "world's fields. Call tv.init before the first World and before any ti.init, or leave it out."
+        )
+    if arch != "cpu" and not _available(arch):
+        offer = ", ".join(repr(a) for a in ARCHITECTURES if a == "cpu" or _available(a))
+        raise RuntimeError(f'init: arch "{arch}" is not available on this machine. Available: {offer}.')
+    options = {} if threads is None else {"cpu_max_num_threads": threads}
+    with contextlib.redirect_stdout(io.StringIO()):  # ti.init prints its banner whatever the log level
+        ti.init(
+            arch=getattr(ti, arch), default_fp=ti.f32, fast_math=False, debug=debug, random_seed=seed,
+            log_level=ti.ERROR, **options,
+        )  # fmt: skip
+    if architecture() != arch:
+        found = architecture()
+        ti.reset()
+        raise RuntimeError(f'init: arch "{arch}" was asked for, but Taichi started "{found}". Use tv.init(arch="cpu").')
+    _started.update(wanted=wanted)
+    _adopt()
+
+
+def architecture() -> str:
+    """The architecture that Taichi runs on, by the names of init()."""
+    name = str(ti.cfg.arch).rsplit(".", 1)[-1]
+    return "cpu" if name in ("x64", "arm64") else name
+
+
+def threads() -> int:
+    """The number of CPU threads that Taichi may use."""
+    return int(ti.cfg.cpu_max_num_threads)
+
+
+def fast_math() -> bool:
+    """Whether the running Taichi may reorder arithmetic; tiverlet's own start says no."""
+    return bool(ti.cfg.fast_math)
+
+
+def ensure_started() -> None:
+    """Start Taichi with the defaults if it does not run, and refuse where building fields would crash."""
+    if ti.cfg is None:
+        init()
+    if _started.get("runtime") is not impl.get_runtime():
+        _adopt()
+    if _started["pid"] != os.getpid():
+        raise RuntimeError(
+            "Taichi was started before this process was forked, and hangs in the child. Use the start method "
+            '"spawn": multiprocessing.get_context("spawn").'
+        )
+    if _started["thread"] != threading.get_ident():
+        raise RuntimeError("A World must be built in the thread that started Taichi; stepping it elsewhere is fine.")
+
+
+def _available(arch: str) -> bool:
+    with contextlib.suppress(Exception):
+        return bool(getattr(ti._lib.core, f"with_{arch}")())
+    return False
+
+
+def _adopt() -> None:
+    global _trees
+    _trees = 0
+    _started.update(runtime=impl.get_runtime(), pid=os.getpid(), thread=threading.get_ident())
+
+
+@contextlib.contextmanager
+def literals(real) -> Iterator[None]:
+    """Compile kernels with `real` as the type of their literals.
+
+    Taichi rounds the literal 0.1 to its default type even next to f64 operands; a world of precision "f64" (and the
+    user's own functions in it) must not lose half of the digits that way. Kernels compile at their first launch.
+    """
+    runtime = impl.get_runtime()
+    before = runtime.default_fp
+    runtime.set_default_fp(real)
+    try:
+        yield
+    finally:
+        runtime.set_default_fp(before)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One field: its place in memory, and what explain() says of it."""
+
+    name: str
+    field: Any
+    width: int  # components of one element; 0 for a scalar
+    length: int  # elements; 0 for a single one
+    kind: np.dtype
+    state: bool  # part of the exact state, hence of hash() and clone()
+
+    @property
+    def bytes(self) -> int:
+        """Size in memory [bytes]."""
+        return self.kind.itemsize * max(1, self.width) * max(1, self.length)
+
+
+class Memory:
+    """The fields of one world: declared first, then placed together in one tree, freed together.
+
+    `real` is ti.f32 or ti.f64. Every method that touches the fields checks first that they still exist.
+    """
+
+    def __init__(self, real):
+        self.real = real
+        self.entries: list[Entry] = []
+        self._later: list[tuple[Entry, np.ndarray]] = []
+        self._builder = ti.FieldsBuilder()
+        self._tree = None
+        self._runtime = impl.get_runtime()
+        self._transfers: dict[tuple, _Transfer] = {}  # compiled once, since that costs more than running them
+
+    def field(self, name: str, length: int | None, *, width: int = 0, kind=None, values=None, state: bool = False):
+        """Declare a field of `length` elements (None: a single one, of 0 dimensions) and give it its first values."""
+        kind = self.real if kind is None else kind
+        made = ti.Vector.field(width, kind) if width else ti.field(kind)
+        if length is None:
+            self._builder.place(made)
+        else:
+            self._builder.dense(ti.i, max(1, length)).place(made)  # a field of 0 elements poisons the runtime
+        entry = Entry(name, made, width, length or 0, np.dtype(_NUMPY[kind]), state)
+        self.entries.append(entry)
+        if values is not None:
+            self._later.append((entry, np.asarray(values, dtype=np.float64)))
+        return made
+
+    def place(self) -> None:
+        """Allocate what was declared and write the first values (everything else is zero)."""
+        global _trees
+        if not self.entries:
+            return
+        if _trees >= MAX_TREES:
+            raise RuntimeError(
+                f"{_trees} worlds are alive, and Taichi crashes near 512. Close worlds that you no longer need: "
+                "world.close(), or `with tv.World(...) as world:`."
+            )
+        self._tree = self._builder.finalize()
+        _trees += 1
+        if self._later:
+            self._load([entry for entry, _ in self._later], [values for _, values in self._later])
+            self._later.clear()
+
+    @property
+    def closed(self) -> bool:
+        """Whether the fields are gone."""
+        return self._tree is None
+
+    def check(self) -> None:
+        """Raise RuntimeError when the fields are gone or belong to a runtime that is."""
+        if impl.get_runtime() is not self._runtime:
+            raise RuntimeError(
+                "Taichi was started again after this world was built, which destroyed its fields. Build the world anew."
+            )
+        if self._tree is None:
+            raise RuntimeError("This world is closed; build a new one.")
+        if _started["pid"] != os.getpid():
+            raise RuntimeError('This world was built before a fork and cannot run in the child; use "spawn".')
+
+    def destroy(self) -> None:
+        """Free the fields. Calling it twice, or after another ti.init, does nothing."""
+        global _trees
+        if self._tree is not None and impl.get_runtime() is self._runtime and _started["pid"] == os.getpid():
+            self._tree.destroy()
+            _trees -= 1
+        self._tree = None
+
+    def write(self, field, values) -> None:
+        """Overwrite a whole field."""
+        self.check()
+        self._load([self._find(field)], [np.asarray(values, dtype=np.float64)])
+
+    def read(self, field) -> np.ndarray:
+        """A copy of a whole field, in its own type."""
+        self.check()
+        entry = self._find(field)
+        return self._dump([entry])[0]
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Copies of the fields that make up the exact state, by name."""
+        self.check()
+        chosen = [e for e in self.entries if e.state]
+        return dict(zip((e.name for e in chosen), self._dump(chosen), strict=True))
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Write back what state() returned, bit for bit."""
+        self.check()
+        chosen = [e for e in self.entries if e.state]
+        self._load(chosen, [state[e.name] for e in chosen])
+
+    def _find(self, field) -> Entry:
+        return next(e for e in self.entries if e.field is field)
+
+    def _load(self, entries: list[Entry], arrays: list[np.ndarray]) -> None:
+        # Every number that we hold (f32, f64, i32) is exact in f64, so one kernel and one flat array serve all.
+        flat = np.concatenate([np.broadcast_to(a, _shape(e)).ravel() for e, a in zip(entries, arrays, strict=True)])
+        self._transfer(entries).load(np.ascontiguousarray(flat, dtype=np.float64))
+
+    def _transfer(self, entries: list[Entry]) -> "_Transfer":
+        key = tuple(id(e) for e in entries)
+        return self._transfers.setdefault(key, _Transfer(entries))
+
+    def _dump(self, entries: list[Entry]) -> list[np.ndarray]:
+        sizes = [e.bytes // e.kind.itemsize for e in entries]
+        flat = np.empty(max(1, sum(sizes)), dtype=np.float64)
+        if entries:
+            self._transfer(entries).dump(flat)
+        parts = np.split(flat[: sum(sizes)], np.cumsum(sizes)[:-1]) if entries else []
+        return [p.astype(e.kind).reshape(_shape(e)) for p, e in zip(parts, entries, strict=True)]
+
+
+_NUMPY = {ti.f32: np.float32, ti.f64: np.float64, ti.i32: np.int32}
+
+
+def _shape(entry: Entry) -> tuple[int, ...]:
+    return (max(1, entry.length),) + ((entry.width,) if entry.width else ())
+
+
+@ti.data_oriented
+class _Transfer:
+    """Kernels between a list of fields and one flat f64 array."""
+
+    def __init__(self, entries: list[Entry]):
+        offset = 0
+        self.plan = []
+        for e in entries:
+            self.plan.append((e.field, e.field.dtype, max(1, e.length), e.width, bool(e.length), offset))
+            offset += e.bytes // e.kind.itemsize
+
+    @ti.kernel
+    def load(self, flat: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
+        for field, kind, length, width, many, offset in ti.static(self.plan):
+            for i in range(length):
+                if ti.static(width == 0):
+                    if ti.static(many):
+                        field[i] = ti.cast(flat[offset + i], kind)
+                    else:
+                        field[None] = ti.cast(flat[offset], kind)
+                else:
+                    for k in ti.static(range(width)):
+                        if ti.static(many):
+                            field[i][k] = ti.cast(flat[offset + i * width + k], kind)
+                        else:
+                            field[None][k] = ti.cast(flat[offset + k], kind)
+
+    @ti.kernel
+    def dump(self, flat: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
+        for field, kind, length, width, many, offset in ti.static(self.plan):
+            for i in range(length):
+                if ti.static(width == 0):
+                    if ti.static(many):
+                        flat[offset + i] = field[i]
+                    else:
+                        flat[offset] = field[None]
+                else:
+                    for k in ti.static(range(width)):
+                        if ti.static(many):
+                            flat[offset + i * width + k] = field[i][k]
+                        else:
+                            flat[offset + k] = field[None][k]

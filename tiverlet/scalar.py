@@ -1,0 +1,217 @@
+"""Constraints that are one number, C = f - rest: what all of them share, from soft to rigid."""
+
+import warnings
+
+import numpy as np
+import taichi as ti
+
+from . import checks
+from .feature import Batch, Scene
+from .particles import Particles
+
+
+class Scalar(Batch):
+    """Constraints C(x) = f(x) - rest = 0, >= 0 or <= 0, soft or rigid, from `measure`. numerics: one formula for all.
+
+        theta = s^4 / (1 + s^4), s^2 = (omega h)^2 = w h^2 / alpha     0: resolved by the step, 1: rigid
+        C*    = (1 - theta) (C_(n+1) + 2 C_n + C_(n-1)) / 4 + theta C_(n+1)
+        dlam  = -(A C + B + alpha' lam) / (A W + alpha'),  A = (1 - theta)/4 + theta,  alpha' = alpha / h^2
+        dx_j  = w_j dlam grad_j C(x_n)
+
+    W = sum_j n_j w_j grad_j C(x_(n+1)) . grad_j C(x_n) is the mass-split weight: particle j belongs to n_j constraints, and
+    gives each an n_j-th of its mass (Tonge 2012), which keeps the sum of all corrections stable and conserves momentum.
+    The direction is that at the start of the step, x_n (SHAKE, Ryckaert 1977): second order and no loss of energy. When a
+    constraint turns by more than 41 degrees in a step, or has no direction at x_n, the current direction takes its place.
+
+    In the first substep after a start (`fresh`) the force acts for half a kick: alpha' doubles, C* starts from C_n.
+    """
+
+    side = 0  # 0: C = 0;  1: C <= 0, pulls when f > rest;  -1: C >= 0, pushes when f < rest
+    rest: np.ndarray
+    compliance: np.ndarray
+    damping: np.ndarray
+
+    def setup(self, indices, rest, compliance, damping) -> None:
+        """Keep the arguments of __init__; what depends on the particles is checked in prepare()."""
+        self.indices = checks.indices(repr(self), self.index_name, indices, 2**31 - 1, arity=self.arity)
+        _warn_duplicates(repr(self), self.index_name, self.indices)
+        m = self.count
+        self._rest_given = rest
+        self.compliance = checks.per_item(repr(self), "compliance", compliance, m, least=0.0)
+        self.damping = checks.per_item(repr(self), "damping", damping, m, least=0.0)
+        for array in (self.indices, self.compliance, self.damping):
+            array.flags.writeable = False
+
+    index_name = "pairs"
+    rest_name = "rest"
+
+    def rest_of(self, position: np.ndarray) -> np.ndarray:
+        """f at the given positions, (m,): the rest value when none is given."""
+        raise NotImplementedError
+
+    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Check indices against the number of particles and settle the rest values."""
+        checks.indices(repr(self), self.index_name, self.indices, particles.count, arity=self.arity)
+        if "rest" not in self.__dict__:
+            if self._rest_given is None:
+                self.__dict__["rest"] = self.rest_of(particles.position)
+            else:
+                self.rest = self._rest_given
+
+    @property
+    def soft(self) -> bool:
+        """Whether any constraint of the batch has compliance."""
+        return bool((self.compliance > 0).any())
+
+    def bind(self, scene: Scene) -> None:
+        """Declare rest values, multipliers, and for soft ones the memory that the averaged constraint needs."""
+        Batch.bind(self, scene)
+        self._on_real = scene.real
+        self._on_soft = self.soft
+        self._on_damped = self.soft and bool((self.damping > 0).any())
+        start = self.rest_of(scene.particles.position) if self.count else np.zeros(0)
+        self._on_scale = float(np.abs(start).mean()) if np.any(start) else scene.size
+        name, m, add = repr(self), self.count, scene.memory.field
+        self._on_rest = add(f"{name}.rest", m, values=self.rest)
+        self._on_lam = add(f"{name}.multiplier", m, state=True)
+        if self._on_soft:
+            self._on_alpha = add(f"{name}.compliance", m, values=self.compliance)
+            self._on_last = add(f"{name}.last", m, values=start, state=True)
+            self._on_history = add(f"{name}.history", m)
+        if self._on_damped:
+            self._on_damping = add(f"{name}.damping", m, values=self.damping)
+        self.changed = False
+
+    def upload(self) -> None:
+        """Write new rest values."""
+        if self.scene and self.count:
+            self.scene.memory.write(self._on_rest, self.rest)
+
+    @ti.func
+    def measure(self, c, q):
+        """f and its (arity, dim) gradients at corners q (arity, dim), which are relative to corner 0."""
+        return 0.0, q
+
+    @ti.func
+    def corners(self, c, back):
+        """Corners of constraint c relative to the first, at x - back d: near the origin, so nothing is lost in f32."""
+        i = self.member(c, 0)
+        q = ti.Matrix.zero(self._on_real, self.arity, self._on_state.dim)
+        for k in ti.static(range(1, self.arity)):
+            j = self.member(c, k)
+            r = self._on_state.apart(j, i) - back * (self._on_state.d[j] - self._on_state.d[i])
+            for a in ti.static(range(self._on_state.dim)):
+                q[k, a] = r[a]
+        return q
+
+    @ti.func
+    def law(self, c, h, w, fresh):
+        """The coefficients of C_(n+1), C_n, C_(n-1) in C* (with damping), and alpha'. w: sum of inverse masses."""
+        alpha = self._on_alpha[c] / (h * h)
+        ratio = alpha / w  # 1 / s^2; s^4 would overflow in f32
+        rigid = 1 / (1 + ratio * ratio)
+        A, now, last = (1 + 3 * rigid) / 4, (1 - rigid) / 2, (1 - rigid) / 4
+        if ti.static(self._on_damped):  # + alpha c dC/dt: central where resolved, backward where stiff
+            gamma = self._on_damping[c] * self._on_alpha[c] / h
+            A += gamma * (1 + rigid) / 2
+            now -= gamma * rigid
+            last -= gamma * (1 - rigid) / 2
+        if fresh != 0:
+            A, now, last = rigid, 1 - rigid, 0 * rigid
+            if ti.static(self._on_damped):
+                gamma = self._on_damping[c] * self._on_alpha[c] / h
+                A += gamma
+                now -= gamma
+            alpha *= 2
+        return A, now, last, alpha
+
+    @ti.func
+    def bounded(self, value):
+        """`value` on the side on which the constraint acts, 0 on the other."""
+        if ti.static(self.side != 0):
+            value = ti.max(self.side * value, 0) * self.side
+        return value
+
+    @ti.func
+    def solve(self, c, h, first, fresh):
+        """One Jacobi solution of constraint c.
+
+        Returns the multiplier before and after, the size of the violation that this removes, and the direction (arity, dim).
+        """
+        f, g = self.measure(c, self.corners(c, 0))
+        f0, n = self.measure(c, self.corners(c, 1))
+        w = ti.cast(0, self._on_real)  # sum of w |grad|^2, then mass-split: along both, current, start
+        both, here, there = ti.cast(0, self._on_real), ti.cast(0, self._on_real), ti.cast(0, self._on_real)
+        for k in ti.static(range(self.arity)):
+            i = self.member(c, k)
+            gg = g[k, :].dot(g[k, :])
+            w += self._on_w[i] * gg
+            both += self._on_slots.split[i] * g[k, :].dot(n[k, :])
+            here += self._on_slots.split[i] * gg
+            there += self._on_slots.split[i] * n[k, :].dot(n[k, :])
+        turned = both < 0.75 * ti.sqrt(here * there) or there == 0
+        if turned:
+            n, both = g, here
+        C, A, B, alpha = f - self._on_rest[c], ti.cast(1, self._on_real), ti.cast(0, self._on_real), ti.cast(0, self._on_real)
+        lam = self._on_lam[c]
+        if first != 0:
+            lam = 0
+        new, violation = lam, ti.cast(0, self._on_real)
+        if here > 0:
+            if ti.static(self._on_soft):
+                A, now, last, alpha = self.law(c, h, w, fresh)
+                if first != 0:
+                    rest = self._on_rest[c]
+                    B = now * self.bounded(f0 - rest) + last * self.bounded(self._on_last[c] - rest)
+                    self._on_history[c] = B
+                    self._on_last[c] = f0
+                else:
+                    B = self._on_history[c]
+            new = lam - self._on_slots.relaxation * (A * C + B + alpha * lam) / (A * both + alpha)
+            if ti.static(self.side != 0):
+                new = -self.bounded(-new)
+            violation = ti.abs(new - lam) * (A * both + alpha) / self._on_slots.relaxation
+            if turned and new != lam:
+                self._on_slots.turned[None] = 1
+        return lam, new, violation, n
+
+    @ti.func
+    def relax(self, c, h, when, first, fresh):
+        """Move each corner by w_j dlam grad_j C."""
+        lam, new, _, n = self.solve(c, h, first, fresh)
+        self._on_lam[c] = new
+        for k in ti.static(range(self.arity)):
+            self.push(c, k, self._on_w[self.member(c, k)] * (new - lam) * n[k, :])
+
+    @ti.func
+    def residual(self, c, h, when, fresh):
+        """The violation that is left, relative to the rest value (to the batch's mean f where that is 0)."""
+        _, _, violation, _ = self.solve(c, h, 0, fresh)
+        size = ti.abs(self._on_rest[c])
+        if size == 0:
+            size = ti.cast(self._on_scale, self._on_real)
+        return violation / size
+
+    @ti.func
+    def energy(self, c, back):
+        """C^2 / (2 alpha) at x - back d."""
+        out = ti.cast(0, ti.f64)
+        if ti.static(self._on_soft):
+            alpha = self._on_alpha[c]
+            if alpha > 0:
+                f, _ = self.measure(c, self.corners(c, back))
+                C = self.bounded(f - self._on_rest[c])
+                out = C * C / (2 * alpha)
+        return out
+
+
+def _warn_duplicates(who: str, name: str, indices: np.ndarray) -> None:
+    ordered = np.sort(indices, axis=1)
+    unique, counts = np.unique(ordered, axis=0, return_counts=True)
+    if len(unique) < len(ordered):
+        first = tuple(int(v) for v in unique[int(np.argmax(counts > 1))])
+        warnings.warn(
+            f"{who}: {len(ordered) - len(unique)} of the {name} are duplicates, the first of them {first}. They act "
+            "together: the same result where rigid, stiffer by their number where compliant.",
+            stacklevel=4,
+        )

@@ -1,0 +1,5 @@
+"""Ways to relax constraints."""
+
+from .jacobi import Jacobi
+
+__all__ = ["Jacobi"]

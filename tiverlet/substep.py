@@ -1,0 +1,292 @@
+"""The substep on the device: the bodies of its phases, and two ways to run them that give the same bits.
+
+fused: a whole frame in one serial launch, for small scenes, where launching and waking threads costs more than the work.
+parallel: a few launches per substep, one static chunk of each loop per thread.
+"""
+
+import numpy as np
+import taichi as ti
+
+from .feature import Acceleration, Batch, Scene, Wall
+
+# The golden ratio as a fraction of 2**32: its multiples, taken mod 1, are the most even sequence there is.
+GOLDEN = 2654435769
+
+
+@ti.data_oriented
+class Substep:
+    """Kernels of one world. `accelerations, batches, walls, drivers` are its features; contact and grid may be None."""
+
+    def __init__(self, scene: Scene, accelerations: list[Acceleration], batches: list[Batch], drivers, contact, grid, walls, parallel: bool):
+        self.parallel = parallel
+        self.scene, self.state, self.slots = scene, scene.state, scene.slots
+        self.n, self.dim, self.real = scene.particles.count, scene.particles.dim, scene.real
+        self.accelerations = [f for f in accelerations if f.accelerates]
+        self.uses_velocity = any(f.uses_velocity for f in accelerations)
+        self.drags = [f for f in accelerations if f.decays]
+        self.decays = bool(self.drags)
+        self.batches: list[Batch] = [b for b in batches if b.count]
+        self.drivers = drivers
+        self.contacts = [contact] if contact else []
+        self.grid, self.hashes = grid, bool(grid)
+        self.walls: list[Wall] = walls
+        self.radius = scene.radius
+        self.dithers = scene.real == ti.f32
+        add = scene.memory.field
+        if self.uses_velocity:
+            self.earlier = add("displacement_before", self.n, width=self.dim, state=True)
+        if self.decays:
+            self.decay = add("decay", None, width=4)
+        if walls or contact:
+            self.thrust = add("thrust", self.n, width=self.dim, state=True)
+        if grid:
+            self.halt = add("halt", None, width=3, kind=ti.i32)
+
+    # The bodies: what happens to one particle, one constraint.
+
+    @ti.func
+    def accelerate(self, i, x, v, t):
+        """The sum of what accelerates particle i."""
+        a = 0 * x
+        for f in ti.static(self.accelerations):
+            a += f.acceleration(i, x, v, t)
+        return a
+
+    @ti.func
+    def velocity_before(self, i, h, fresh):
+        """v_n to second order, from the displacements of the last two substeps; at a start, d is the velocity itself."""
+        v = self.state.d[i]
+        if ti.static(self.uses_velocity):
+            if fresh == 0:
+                v = (3 * self.state.d[i] - self.earlier[i]) / (2 * h)
+        return v
+
+    @ti.func
+    def kick(self, d, k, tick):
+        """d + k. In f32 the rounding of this sum, always to the same side for a constant k, would be the largest error of all.
+
+        It is dithered by the golden sequence: added to k is a fraction in (-1/2, 1/2) of the last digit of d, so that the rounded
+        sums follow the true one on average, with an error that grows like the logarithm of the number of steps, not like it.
+        """
+        if ti.static(self.dithers):
+            u = ti.cast(ti.cast(tick, ti.u32) * ti.u32(GOLDEN), ti.f32) * ti.static(2.0**-32) - 0.5
+            for a in ti.static(range(self.dim)):
+                exponent = ti.bit_cast(d[a], ti.u32) & ti.u32(0x7F800000)
+                digit = ti.bit_cast(exponent, ti.f32) * ti.static(2.0**-23)
+                d[a] += k[a] + u * digit * ti.math.sign(k[a])
+        else:
+            d += k
+        return d
+
+    @ti.func
+    def integrate(self, i, h, t, tick, fresh):
+        """d += h^2 a, x += d; at a start (d is v) x += h v + h^2 a / 2. Linear drag is exact in both."""
+        if self.state.w[i] > 0:
+            v = self.velocity_before(i, h, fresh)
+            a = self.accelerate(i, self.state.place(i), v, t)
+            d = self.state.d[i]
+            if ti.static(self.uses_velocity):
+                self.earlier[i] = d
+                if fresh != 0:
+                    self.earlier[i] = h * v - h * h / 2 * a
+            if fresh != 0:
+                if ti.static(self.decays):
+                    d = self.decay[None][1] * h * v + self.decay[None][2] * h * h * a
+                else:
+                    d = h * v + h * h / 2 * a
+            else:
+                if ti.static(self.decays):
+                    d = self.kick(self.decay[None][0] * d, self.decay[None][1] * h * h * a, tick)
+                elif ti.static(len(self.accelerations) > 0):
+                    d = self.kick(d, h * h * a, tick)
+            self.state.d[i] = d
+            self.state.advance(i, d)
+        elif fresh != 0:
+            self.state.d[i] = 0 * self.state.d[i]
+        for c in ti.static(self.contacts):
+            c.watch(i)
+
+    @ti.func
+    def confine(self, i, h, when):
+        """The walls, which have the last word."""
+        for f in ti.static(self.walls):
+            if self.state.w[i] > 0:
+                f.confine(i, self.radius.of(i), h, when)
+
+    # The phases: loops over the bodies, serial inside the fused kernel and parallel at the top of the others.
+
+    @ti.func
+    def predict(self, h, t, tick, fresh, when):
+        """1 Integrate; 2 put driven particles on their targets."""
+        for i in range(self.n):
+            self.integrate(i, h, t, tick, fresh)
+        for f in ti.static(self.drivers):
+            for c in range(f.count):
+                f.drive(c, when[1])
+                for k in ti.static(self.contacts):
+                    k.watch(f.member(c, 0))
+
+    @ti.func
+    def relax(self, h, when, first, fresh, final):
+        """3 One pass: constraints into slots, particles gather them; contacts; walls."""
+        for f in ti.static(self.batches):
+            for c in range(f.count):
+                f.relax(c, h, when, first, fresh)
+        for c in ti.static(self.contacts):
+            if ti.static(len(self.batches) > 0):
+                for i in range(self.n):
+                    self.slots.gather(i, first, final)
+            for i in range(self.n):
+                c.count(i)
+            for i in range(self.n):
+                c.relax(i, h)
+        if ti.static(len(self.batches) > 0 or len(self.contacts) > 0 or len(self.walls) > 0):
+            for i in range(self.n):
+                if ti.static(len(self.batches) > 0 and len(self.contacts) == 0):
+                    self.slots.gather(i, first, final)
+                before = self.state.d[i]
+                for c in ti.static(self.contacts):
+                    c.gather(i)
+                if ti.static(len(self.walls) > 0):
+                    self.confine(i, h, when)
+                for c in ti.static(self.contacts):
+                    self.grid.watch(i)
+                if ti.static(len(self.walls) > 0 or len(self.contacts) > 0):
+                    if final != 0:
+                        if first != 0:
+                            self.thrust[i] = self.state.d[i] - before
+                        else:
+                            self.thrust[i] += self.state.d[i] - before
+
+    @ti.func
+    def clock(self, s, substeps):
+        """The fractions of the frame at the start and the end of substep s."""
+        return ti.Vector([ti.cast(s, self.real) / substeps, ti.cast(s + 1, self.real) / substeps])
+
+    # The kernels. `skip` says that substep `begin` stopped before iteration `it0` to have the list grown.
+
+    @ti.kernel
+    def fused(
+        self, h64: ti.f64, t: ti.f64, tick: ti.i32, fresh: ti.i32, substeps: ti.i32, iterations: ti.i32,
+        begin: ti.i32, it0: ti.i32, skip: ti.i32,
+    ):  # fmt: skip
+        """All substeps of a frame, in one thread."""
+        ti.loop_config(serialize=True)
+        for s in range(begin, substeps):
+            h = ti.cast(h64, self.real)
+            when = self.clock(s, substeps)
+            starts = fresh if s == 0 else 0
+            resumed = skip if s == begin else 0
+            going = True
+            if ti.static(self.hashes):
+                going = self.halt[None][0] == 0
+            if going:
+                if resumed == 0:
+                    self.predict(h, ti.cast(t + s * h64, self.real), tick + s, starts, when)
+                for it in range(it0 if resumed != 0 else 0, iterations):
+                    if ti.static(self.hashes):
+                        if self.halt[None][0] == 0 and self.grid.stale[None] != 0:
+                            self.grid.build()
+                            if self.grid.need[None] > self.grid.capacity:
+                                self.halt[None] = [1, s, it]
+                        if self.halt[None][0] == 0:
+                            self.relax(h, when, ti.cast(it == 0, ti.i32), starts, ti.cast(s == substeps - 1, ti.i32))
+                    else:
+                        self.relax(h, when, ti.cast(it == 0, ti.i32), starts, ti.cast(s == substeps - 1, ti.i32))
+
+    @ti.kernel
+    def predicted(self, h64: ti.f64, t: ti.f64, tick: ti.i32, fresh: ti.i32, s: ti.i32, substeps: ti.i32) -> ti.i32:
+        """Phases 1 and 2 of substep s; returns whether the neighbour list is stale."""
+        h = ti.cast(h64, self.real)
+        self.predict(h, ti.cast(t + s * h64, self.real), tick + s, fresh, self.clock(s, substeps))
+        return self.is_stale()
+
+    @ti.kernel
+    def relaxed(
+        self, h64: ti.f64, s: ti.i32, substeps: ti.i32, first: ti.i32, fresh: ti.i32, final: ti.i32
+    ) -> ti.i32:
+        """One pass of phase 3; returns whether the neighbour list is stale."""
+        self.relax(ti.cast(h64, self.real), self.clock(s, substeps), first, fresh, final)
+        return self.is_stale()
+
+    @ti.func
+    def is_stale(self):
+        """1 when the neighbour list has to be built anew."""
+        out = 0
+        if ti.static(self.hashes):
+            out = self.grid.stale[None]
+        return out
+
+    @ti.kernel
+    def listed(self) -> ti.i32:
+        """Build the neighbour list; returns the largest number of entries that a block needs."""
+        self.grid.build()
+        return self.grid.need[None]
+
+    @ti.func
+    def velocity_after(self, i, h, t, whole):
+        """v_n = d / h + h (a + constraint acceleration) / 2, or with drag what the exact solution makes of it.
+
+        whole: 1 adds half of what contacts and walls did, as far as it balances the rest (a body at rest has velocity 0, but
+        one that has just bounced is not credited with half of the blow).
+        """
+        d = self.state.d[i]
+        v = d / h
+        if self.state.w[i] > 0:
+            if ti.static(self.uses_velocity):
+                v = (3 * d - self.earlier[i]) / (2 * h)
+            force = h * h * self.accelerate(i, self.state.place(i), v, t)
+            bond = 0 * d
+            if ti.static(len(self.batches) > 0):
+                bond = self.slots.pull[i]
+            if ti.static(len(self.walls) > 0 or len(self.contacts) > 0):
+                if whole != 0:
+                    push = self.thrust[i]
+                    limit, size = (force + bond).norm(), push.norm()
+                    if size > limit:
+                        push *= limit / size
+                    bond += push
+            if ti.static(self.decays):
+                v = (d + self.decay[None][3] * (force + bond)) * self.decay[None][0] / (self.decay[None][1] * h)
+            else:
+                v = (d + (force + bond) / 2) / h
+        return v
+
+    @ti.kernel
+    def to_velocity(self, h64: ti.f64, t: ti.f64):
+        """Turn displacements into velocities, for a start with another h or another state."""
+        for i in range(self.n):
+            self.state.d[i] = self.velocity_after(i, ti.cast(h64, self.real), ti.cast(t, self.real), 0)
+
+    @ti.kernel
+    def velocities(self, h64: ti.f64, t: ti.f64, fresh: ti.i32, out: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
+        """Velocities as the user sees them."""
+        for i in range(self.n):
+            v = self.state.d[i]
+            if fresh == 0:
+                v = self.velocity_after(i, ti.cast(h64, self.real), ti.cast(t, self.real), 1)
+            for k in ti.static(range(self.dim)):
+                out[i, k] = v[k]
+
+    @ti.kernel
+    def positions(self, out: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
+        """Positions, low words added in f64."""
+        for i in range(self.n):
+            for k in ti.static(range(self.dim)):
+                out[i, k] = self.state.x[i][k]
+                if ti.static(self.state.compensated):
+                    out[i, k] += self.state.low[i][k]
+
+
+def decay(rate: float, h: float) -> list[float]:
+    """exp(-z), phi1 = (1 - exp(-z)) / z, phi2 = (z - 1 + exp(-z)) / z^2 and psi2 = (exp(z) - 1 - z) / z^2, for z = rate h."""
+    z = rate * h
+    if z < 1e-3:  # series: the closed forms cancel
+        phi1 = 1 - z / 2 + z * z / 6 - z**3 / 24
+        phi2 = 1 / 2 - z / 6 + z * z / 24 - z**3 / 120
+        psi2 = 1 / 2 + z / 6 + z * z / 24 + z**3 / 120
+    else:
+        phi1 = -np.expm1(-z) / z
+        phi2 = (z + np.expm1(-z)) / z**2
+        psi2 = (np.expm1(min(z, 700.0)) - z) / z**2
+    return [float(np.exp(-z)), float(phi1), float(phi2), float(psi2)]

@@ -1,0 +1,239 @@
+"""What a frame came to: one pass over the state when it ends, and the report that the user gets."""
+
+import copy
+from dataclasses import dataclass, field
+
+import numpy as np
+import taichi as ti
+
+from .particles import LARGEST
+from .substep import Substep
+
+BLOCKS = 64  # partial sums: their number is fixed, so the total has the same bits on any number of threads
+STIFF = 4.0  # (omega h)^2 beyond which Verlet diverges
+
+
+Figures = ti.types.vector(13, ti.f64)
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """The frame that world.step() has just finished.
+
+    residual: worst violation of a constraint, relative to its rest value. overlap: of the worst contact, in radii of the smaller
+    particle. contacts: number of overlapping pairs. energy: kinetic and potential energy [J], of what has a potential, half a substep
+    ago; energy_change: since the frame before [J]. bad: index of the first particle whose state is not finite, or None.
+
+    flags: words for what the user should know; notes: one sentence for each, with the cause and a remedy.
+        "non-finite"        a position or displacement is NaN or infinite
+        "out-of-range"      a coordinate is too large for the precision, or for the cells of the contact grid
+        "tunnelling-risk"   a particle moved by more than its own size in one substep, so it may have passed another
+        "stiff-force"       a force changes too fast for the substep (omega h > 2) and makes energy grow
+        "turned"            a constraint turned by more than 41 degrees in a substep and lost its second order there
+    """
+
+    time: float
+    substeps: int
+    iterations: int
+    residual: float = 0.0
+    overlap: float = 0.0
+    contacts: int = 0
+    energy: float = 0.0
+    energy_change: float = 0.0
+    flags: frozenset[str] = frozenset()
+    notes: tuple[str, ...] = field(default=(), repr=False)
+    bad: int | None = None
+
+    @property
+    def clean(self) -> bool:
+        """Whether nothing was flagged."""
+        return not self.flags
+
+    def worse(self, other: "StepReport") -> "StepReport":
+        """The later of two reports, with the worst figures of both."""
+        first, last = (self, other) if self.time <= other.time else (other, self)
+        return StepReport(
+            last.time, max(first.substeps, last.substeps), max(first.iterations, last.iterations),
+            max(first.residual, last.residual), max(first.overlap, last.overlap), max(first.contacts, last.contacts),
+            last.energy, first.energy_change + last.energy_change, first.flags | last.flags,
+            tuple(dict.fromkeys(first.notes + last.notes)), last.bad if first.bad is None else first.bad,
+        )  # fmt: skip
+
+
+@ti.data_oriented
+class Survey:
+    """The kernel behind a StepReport."""
+
+    def __init__(self, substep: Substep):
+        self.sub = substep
+        self.n, self.dim, self.state = substep.n, substep.dim, substep.state
+        self.batches = substep.batches
+        self.contacts = substep.contacts
+        self.single = substep.real == ti.f32
+        self.farthest = LARGEST
+        if substep.grid:
+            self.farthest = min(LARGEST, substep.grid.cell * (1 << 22))
+        self.probes = [f for f in substep.accelerations if not f.uniform]
+        self.spread = 512 if substep.parallel else 1  # Taichi gives each CPU thread at least 512 iterations
+        add = substep.scene.memory.field
+        self.parts = add("survey.figures", BLOCKS, width=6, kind=ti.f64)
+        self.low = add("survey.low", BLOCKS, width=self.dim, kind=ti.f64)
+        self.high = add("survey.high", BLOCKS, width=self.dim, kind=ti.f64)
+        self.flags = add("survey.flags", None, kind=ti.i32)
+
+    def of(self, substep: Substep) -> "Survey":
+        """The same fields, with kernels for another Substep."""
+        new = copy.copy(self)
+        new.sub = substep
+        return new
+
+    @ti.func
+    def finite(self, x):
+        """By the bits of the exponent: comparisons with NaN are not to be trusted in Taichi."""
+        out = 1
+        for k in ti.static(range(self.dim)):
+            if ti.static(self.single):
+                if ti.bit_cast(x[k], ti.u32) & ti.u32(0x7F800000) == ti.u32(0x7F800000):
+                    out = 0
+            else:
+                mask = ti.u64(0x7FF0000000000000)
+                if ti.bit_cast(x[k], ti.u64) & mask == mask:
+                    out = 0
+        return out
+
+    @ti.func
+    def energy(self, i, x, scale, back):
+        """Kinetic and potential energy at x - back d, f64; at the middle of a substep, where d / h is the velocity, second order."""
+        d = ti.cast(self.state.d[i], ti.f64)
+        out = ti.cast(0, ti.f64)
+        if self.state.w[i] > 0:
+            out = 0.5 * scale * scale * d.dot(d)
+            for f in ti.static(self.sub.accelerations):
+                if ti.static(f.conservative):
+                    out += f.potential(i, ti.cast(x, ti.f64) - back * d)
+            out /= self.state.w[i]
+        return out
+
+    @ti.func
+    def stiffness(self, i, x, h, t):
+        """(omega h)^2 of the motion that dominates: the force's Rayleigh quotient along the last move."""
+        d = self.state.d[i]
+        dd, out = d.dot(d), ti.cast(0, ti.f64)
+        if dd > 0 and self.state.w[i] > 0:
+            change = 0 * d
+            for f in ti.static(self.probes):
+                change += f.acceleration(i, x, d / h, t) - f.acceleration(i, x - d, d / h, t)
+            out = -change.dot(d) / dd * h * h
+        return out
+
+    @ti.func
+    def contact(self, c, i):
+        """Number of contacts of particle i with later ones, and the worst overlap in radii."""
+        touching, worst = 0, ti.cast(0, ti.f64)
+        for e in range(c._on_grid.first[i], c._on_grid.first[i] + c._on_grid.number[i]):
+            j = c._on_grid.near[e]
+            if j > i:
+                overlap, _ = c.touch(i, j)
+                if overlap > 0:
+                    small, large = ti.min(self.sub.radius.of(i), self.sub.radius.of(j)), ti.max(self.sub.radius.of(i), self.sub.radius.of(j))
+                    worst = ti.max(worst, overlap / (small if small > 0 else large))
+                    touching += 1
+        return touching, worst
+
+    @ti.func
+    def block(self, b, h, t, when, fresh, begin):
+        """One block of particles and constraints. Returns energy, residual, overlap, stiffness, contacts, bad; low, high."""
+        figures = ti.Vector([0, 0, 0, 0, 0, 2.0**31], ti.f64)
+        low, high = ti.Vector.zero(ti.f64, self.dim) + ti.math.inf, ti.Vector.zero(ti.f64, self.dim) - ti.math.inf
+        scale, back = ti.cast(1, ti.f64), ti.cast(0, self.sub.real)
+        if begin == 0:
+            scale, back = 1 / ti.cast(h, ti.f64), ti.cast(0.5, self.sub.real)
+        size = (self.n + BLOCKS - 1) // BLOCKS
+        for i in range(b * size, ti.min((b + 1) * size, self.n)):
+            x = self.state.place(i)
+            if self.finite(x) == 0 or self.finite(self.state.d[i]) == 0:
+                figures[5] = ti.min(figures[5], ti.cast(i, ti.f64))
+            else:
+                low, high = ti.min(low, ti.cast(x, ti.f64)), ti.max(high, ti.cast(x, ti.f64))
+                figures[0] += self.energy(i, x, scale, back)
+                if ti.static(len(self.probes) > 0):
+                    if begin == 0:
+                        figures[3] = ti.max(figures[3], self.stiffness(i, x, h, t))
+                for c in ti.static(self.contacts):
+                    touching, worst = self.contact(c, i)
+                    figures[2] = ti.max(figures[2], worst)
+                    figures[4] += touching
+        for f in ti.static(self.batches):
+            part = (f.count + BLOCKS - 1) // BLOCKS
+            for c in range(b * part, ti.min((b + 1) * part, f.count)):
+                figures[0] += f.energy(c, back)
+                if begin == 0:
+                    figures[1] = ti.max(figures[1], ti.cast(f.residual(c, h, when, fresh), ti.f64))
+        return figures, low, high
+
+    @ti.kernel
+    def measure(self, h64: ti.f64, t64: ti.f64, fresh: ti.i32, begin: ti.i32) -> Figures:
+        """All figures; fresh: the last substep was a start; begin: d holds velocities, no step was made yet."""
+        for thread in range(BLOCKS * self.spread):
+            if thread % self.spread == 0:
+                h, t = ti.cast(h64, self.sub.real), ti.cast(t64, self.sub.real)
+                b = thread // self.spread
+                self.parts[b], self.low[b], self.high[b] = self.block(b, h, t, self.sub.clock(0, 1), fresh, begin)
+        out = ti.Vector.zero(ti.f64, 13)
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            for b in range(1, BLOCKS):
+                part, total = self.parts[b], self.parts[0]
+                total[0] += part[0]
+                total[4] += part[4]
+                for k in ti.static(range(1, 4)):
+                    total[k] = ti.max(total[k], part[k])
+                total[5] = ti.min(total[5], part[5])
+                self.parts[0] = total
+                self.low[0] = ti.min(self.low[0], self.low[b])
+                self.high[0] = ti.max(self.high[0], self.high[b])
+            flags = 0
+            for c in ti.static(self.contacts):
+                flags += c._on_fast[None]
+                c._on_fast[None] = 0
+            if ti.static(len(self.batches) > 0):
+                flags += 2 * self.sub.slots.turned[None]
+                self.sub.slots.turned[None] = 0
+            self.flags[None] = flags
+        for k in ti.static(range(6)):
+            out[k] = self.parts[0][k]
+        out[6] = self.flags[None]
+        for k in ti.static(range(self.dim)):
+            out[7 + k], out[10 + k] = self.low[0][k], self.high[0][k]
+        return out
+
+    def report(self, time: float, h: float, substeps: int, iterations: int, fresh: bool, begin: bool) -> tuple[StepReport, np.ndarray]:
+        """The report of a frame (without energy_change), and the size of the bounding box [m]."""
+        out = np.array(self.measure(h, time, int(fresh), int(begin)))
+        energy, residual, overlap, stiff, contacts, bad, flags = (float(v) for v in out[:7])
+        low, high = out[7 : 7 + self.dim], out[10 : 10 + self.dim]
+        notes = {}
+        first = int(bad) if bad < self.n else None
+        if first is not None:
+            notes["non-finite"] = f"The state of particle {first} is not finite (the first of them); go back and use a smaller step."
+        reach = float(np.abs([low, high]).max()) if (high >= low).all() else 0.0
+        if reach >= self.farthest:
+            notes["out-of-range"] = (
+                f"A coordinate reached {reach:g} m, beyond {self.farthest:g} m, where the precision no longer tells neighbours apart."
+            )
+        if int(flags) & 1:
+            notes["tunnelling-risk"] = (
+                "A particle moved by more than its own size in one substep and may have passed another; use more substeps."
+            )
+        if int(flags) & 2:
+            notes["turned"] = "A constraint turned by more than 41 degrees in one substep and is damped there; use more substeps."
+        if stiff > STIFF:
+            need = int(np.ceil(substeps * np.sqrt(stiff / STIFF))) + 1
+            notes["stiff-force"] = (
+                f"A force changes too fast for the substep: omega h = {np.sqrt(stiff):.3g}, stable below 2. "
+                f"Use at least {need} substeps."
+            )
+        done = StepReport(
+            time, substeps, iterations, residual, overlap, int(contacts), energy, 0.0, frozenset(notes), tuple(notes.values()), first
+        )
+        return done, np.where(high >= low, high - low, 0.0)

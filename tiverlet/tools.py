@@ -1,0 +1,116 @@
+"""The article's small tools. Each works on numbers, on NumPy arrays and inside Taichi kernels and functions alike."""
+
+import colorsys
+import functools
+from collections.abc import Callable
+
+import numpy as np
+import taichi as ti
+from taichi.lang import impl
+
+# x**(d + 1) = x + 1 has one positive root, the golden ratio of dimension d (Roberts 2018, the R_d sequence). Its
+# inverse powers are the steps along each axis. As odd 32-bit integers, i * step mod 2**32 visits every value once,
+# which makes the sequence exact in f64 and gives it an inverse.
+_BITS = 1 << 32
+
+
+@functools.cache
+def _steps(dim: int) -> tuple[int, ...]:
+    root = 2.0
+    for _ in range(64):
+        root = (1.0 + root) ** (1.0 / (dim + 1))
+    return tuple(int(_BITS / root ** (k + 1)) | 1 for k in range(dim))
+
+
+def _both(kernel: Callable) -> Callable[[Callable], Callable]:
+    """Use `kernel`, a ti.func, when called while a kernel is compiled, and the decorated function otherwise."""
+
+    def decorate(python: Callable) -> Callable:
+        @functools.wraps(python)
+        def chosen(*args, **kwargs):
+            return kernel(*args, **kwargs) if impl.inside_kernel() else python(*args, **kwargs)
+
+        # Taichi asks for these two before it calls a function from a kernel without a warning.
+        chosen._is_taichi_function = True  # type: ignore[attr-defined]
+        chosen.func = kernel.func  # type: ignore[attr-defined]
+        return chosen
+
+    return decorate
+
+
+@ti.pyfunc
+def mix(a, b, amount):
+    """From a (amount 0) to b (amount 1), in a straight line; exact at both ends.
+
+    The article's form, a (1 - amount) + b amount: the shorter a + (b - a) amount misses b by a rounding error.
+    """
+    return a * (1 - amount) + b * amount
+
+
+@ti.pyfunc
+def clamp(value, lower, upper):
+    """`value`, but no less than `lower` and no more than `upper`."""
+    return ti.min(ti.max(value, lower), upper)
+
+
+@ti.pyfunc
+def smoothstep(lower, upper, value):
+    """0 up to `lower`, 1 from `upper` on, and t^2 (3 - 2 t) between, with level ends."""
+    t = ti.min(ti.max((value - lower) / (upper - lower), 0), 1)
+    return t * t * (3 - 2 * t)
+
+
+@ti.pyfunc
+def approach(value, target, rate, dt):
+    """Exponential smoothing: move `value` towards `target` with `rate` [1/s] for a time dt [s].
+
+    value' = target + (value - target) exp(-rate dt), the solution of x' = rate (target - x), so the result does not
+    depend on how the time is cut into frames.
+    """
+    return target + (value - target) * ti.exp(-rate * dt)
+
+
+@ti.func
+def _golden_kernel(i, dim: ti.template() = 1):  # type: ignore[valid-type]
+    out = ti.Vector([ti.cast(ti.cast(i, ti.u32) * ti.u32(s), ti.f64) / 4294967296.0 for s in ti.static(_steps(dim))])
+    return out if ti.static(dim > 1) else out[0]
+
+
+@_both(_golden_kernel)
+def golden(i, dim: int = 1):
+    """The i-th point of the golden-ratio sequence: evenly spread over [0, 1)^dim however many are taken.
+
+    i: integer or integer array, 0 <= i < 2**32. Returns a number (dim 1) or dim numbers, added as the last axis.
+    In 1 dimension i / phi mod 1; in more the R_d sequence (Roberts 2018).
+    """
+    index = np.asarray(i)
+    if index.dtype.kind not in "iu":
+        raise TypeError(f"golden: i has type {index.dtype}, but integers are needed.")
+    if index.size and (index.min() < 0 or index.max() >= _BITS):
+        raise ValueError("golden: i must be at least 0 and below 2**32.")
+    steps = np.array(_steps(dim), dtype=np.uint64)
+    out = ((index.astype(np.uint64)[..., None] * steps) & np.uint64(_BITS - 1)) / _BITS
+    out = out if dim > 1 else out[..., 0]
+    return float(out) if out.ndim == 0 else out
+
+
+def golden_index(value, dim: int = 1):
+    """The inverse of golden: the i whose point is `value` (dim 1) or has `value` as its first coordinate.
+
+    Exact for every value that golden returns; for others, the index of the nearest multiple of 2**-32.
+    """
+    array = np.asarray(value, dtype=np.float64)
+    if dim > 1:
+        array = array[..., 0]
+    if not ((array >= 0) & (array < 1)).all():
+        raise ValueError("golden_index: values must be at least 0 and below 1.")
+    inverse = np.uint64(pow(_steps(dim)[0], -1, _BITS))
+    index = (np.rint(array * _BITS).astype(np.uint64) * inverse) & np.uint64(_BITS - 1)
+    return int(index) if index.ndim == 0 else index.astype(np.int64)
+
+
+def golden_colors(count: int, saturation: float = 0.62, value: float = 0.95) -> np.ndarray:
+    """`count` colours with hues at golden-ratio steps: (count, 3) uint8, red, green and blue."""
+    hues = golden(np.arange(count))
+    rgb = [colorsys.hsv_to_rgb(hue, saturation, value) for hue in np.atleast_1d(hues)]
+    return np.array(np.rint(np.array(rgb).reshape(count, 3) * 255), dtype=np.uint8)
