@@ -1,11 +1,19 @@
 """tiverlet: a particle engine on Taichi. Position Verlet, a spatial hash, and Jacobi constraints from soft to rigid."""
 
 from . import runtime  # first: it sets what Taichi reads when it is imported  # isort: skip
+from . import measure, shapes
 from .constraints import Box, Contact, Distance, HalfSpace, Pin, Rope, Spacer
 from .forces import Attractor, Drag, Force, Gravity, Wind
 from .particles import Particles
+from .recording import Recorder
 from .runtime import init
 from .solvers import Jacobi
 from .survey import StepReport
 from .tools import approach, clamp, golden, golden_colors, golden_index, mix, smoothstep
 from .world import World
+
+__all__ = [
+    "Attractor", "Box", "Contact", "Distance", "Drag", "Force", "Gravity", "HalfSpace", "Jacobi", "Particles", "Pin", "Recorder",
+    "Rope", "Spacer", "StepReport", "Wind", "World", "approach", "clamp", "golden", "golden_colors", "golden_index", "init",
+    "measure", "mix", "runtime", "shapes", "smoothstep",
+]  # fmt: skip

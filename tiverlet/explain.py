@@ -1,2 +1,79 @@
 """What a world is made of: the text behind world.explain()."""
-def explain(world): return ""
+
+from typing import TYPE_CHECKING
+
+from . import runtime
+from .feature import Acceleration, Batch, Wall
+
+if TYPE_CHECKING:
+    from .world import World
+
+
+def explain(world: "World") -> str:
+    """Particles, features, what was left out, launches and memory, as text of a few lines."""
+    p, sub = world.particles, world._sub
+    lines = [
+        f"{len(p)} particles in {p.dim}D, {int((p.inv_mass == 0).sum())} static; {world.precision} on "
+        f"{runtime.architecture()}, {runtime.threads()} threads",
+        f"{world.substeps} substeps x {world.iterations} iterations, path {world.path}: {_launches(world)}",
+        "In the kernels:",
+        *(f"    {line}" for line in _present(world)),
+        "Left out, at no cost:",
+        *(f"    {line}" for line in _absent(world)),
+    ]
+    entries = [*world._memory.entries, *(e for store in _stores(world) for e in store.entries)]
+    total = sum(e.bytes for e in entries)
+    lines.append(f"Memory: {len(entries)} fields, {total} bytes, {total / max(1, len(p)):.0f} per particle")
+    for e in entries:
+        shape = " x ".join(str(k) for k in (e.length or 1, e.width or 1))
+        lines.append(f"    {e.name:28s} {shape:>14s} {e.kind.name:8s} {e.bytes:>12d} bytes")
+    if sub.batches:
+        lines.append(f"Constraint corners that can move: {sub.slots.total} of {sum(b.indices.size for b in sub.batches)}")
+    return "\n".join(lines)
+
+
+def _stores(world: "World") -> list[runtime.Memory]:
+    contact = [c._on_store for c in world._sub.contacts]
+    return [s for s in [world._grid.store if world._grid else None, *contact] if s is not None]
+
+
+def _launches(world: "World") -> str:
+    if world.path == "fused":
+        return "2 launches per frame (all substeps, then the survey)"
+    passes = world.iterations if world._sub.batches or world._grid or world._sub.walls else 0
+    more = ", and one for each neighbour list" if world._grid else ""
+    return f"{world.substeps * (1 + passes) + 1} launches per frame{more}"
+
+
+def _present(world: "World") -> list[str]:
+    out = []
+    for f in world.features:
+        if isinstance(f, Batch):
+            held = world._scene.inv_mass[f.indices]
+            idle = int((held == 0).all(axis=1).sum()) if f.count and not f.drives else 0
+            note = f", {idle} of them between particles that cannot move" if idle else ""
+            out.append(f"{f!r}: {f.count} {'driven particles' if f.drives else 'constraints'}{note}")
+        elif isinstance(f, Acceleration):
+            out.append(f"{f!r}: in the loop over particles")
+        elif isinstance(f, Wall):
+            out.append(f"{f!r}: in the loop over particles, last")
+        else:
+            out.append(f"{f!r}: grid of {world._grid.cell:.3g} m cells, list with a skin of {world._grid.skin:.3g} m" if world._grid
+                       else f"{f!r}: nothing, since all radii are 0")  # fmt: skip
+    return out or ["motion in a straight line"]
+
+
+def _absent(world: "World") -> list[str]:
+    sub = world._sub
+    rows = [
+        (not world._grid, "grid, neighbour list, contacts: no Contact between particles with radii"),
+        (not sub.batches, "slots and gathers: no constraint on particles that can move"),
+        (not sub.walls, "wall pass: no wall"),
+        (not sub.accelerations, "accelerations: no force"),
+        (not sub.decays, "exponential drag: no Drag or Wind"),
+        (not sub.uses_velocity, "second displacement: no force reads velocities"),
+        (not any(getattr(b, "soft", False) for b in sub.batches), "compliance and its history: every constraint is rigid"),
+        (sub.radius is None or sub.radius.uniform, "field of radii: all are equal or none is needed"),
+        (world.precision != "f32-compensated", "low words of positions: precision is not f32-compensated"),
+    ]
+    return [text for missing, text in rows if missing] or ["nothing"]

@@ -105,6 +105,7 @@ class Substep:
             self.state.d[i] = 0 * self.state.d[i]
         for c in ti.static(self.contacts):
             c.watch(i)
+            c.grow(i, h)
 
     @ti.func
     def confine(self, i, h, when):
@@ -139,7 +140,7 @@ class Substep:
             for i in range(self.n):
                 c.count(i)
             for i in range(self.n):
-                c.relax(i, h)
+                c.relax(i)
         if ti.static(len(self.batches) > 0 or len(self.contacts) > 0 or len(self.walls) > 0):
             for i in range(self.n):
                 if ti.static(len(self.batches) > 0 and len(self.contacts) == 0):
@@ -222,6 +223,13 @@ class Substep:
         """Build the neighbour list; returns the largest number of entries that a block needs."""
         self.grid.build()
         return self.grid.need[None]
+
+    @ti.kernel
+    def shrunk(self):
+        """Make overlapping particles small enough to fit, from where they grow back."""
+        for c in ti.static(self.contacts):
+            for i in range(self.n):
+                c.shrink(i)
 
     @ti.func
     def velocity_after(self, i, h, t, whole):

@@ -23,6 +23,7 @@ class StepReport:
     residual: worst violation of a constraint, relative to its rest value. overlap: of the worst contact, in radii of the smaller
     particle. contacts: number of overlapping pairs. energy: kinetic and potential energy [J], of what has a potential, half a substep
     ago; energy_change: since the frame before [J]. bad: index of the first particle whose state is not finite, or None.
+    seconds: what the frame took.
 
     flags: words for what the user should know; notes: one sentence for each, with the cause and a remedy.
         "non-finite"        a position or displacement is NaN or infinite
@@ -43,6 +44,7 @@ class StepReport:
     flags: frozenset[str] = frozenset()
     notes: tuple[str, ...] = field(default=(), repr=False)
     bad: int | None = None
+    seconds: float = field(default=0.0, compare=False)
 
     @property
     def clean(self) -> bool:
@@ -57,6 +59,7 @@ class StepReport:
             max(first.residual, last.residual), max(first.overlap, last.overlap), max(first.contacts, last.contacts),
             last.energy, first.energy_change + last.energy_change, first.flags | last.flags,
             tuple(dict.fromkeys(first.notes + last.notes)), last.bad if first.bad is None else first.bad,
+            max(first.seconds, last.seconds),
         )  # fmt: skip
 
 
@@ -127,20 +130,6 @@ class Survey:
         return out
 
     @ti.func
-    def contact(self, c, i):
-        """Number of contacts of particle i with later ones, and the worst overlap in radii."""
-        touching, worst = 0, ti.cast(0, ti.f64)
-        for e in range(c._on_grid.first[i], c._on_grid.first[i] + c._on_grid.number[i]):
-            j = c._on_grid.near[e]
-            if j > i:
-                overlap, _ = c.touch(i, j)
-                if overlap > 0:
-                    small, large = ti.min(self.sub.radius.of(i), self.sub.radius.of(j)), ti.max(self.sub.radius.of(i), self.sub.radius.of(j))
-                    worst = ti.max(worst, overlap / (small if small > 0 else large))
-                    touching += 1
-        return touching, worst
-
-    @ti.func
     def block(self, b, h, t, when, fresh, begin):
         """One block of particles and constraints. Returns energy, residual, overlap, stiffness, contacts, bad; low, high."""
         figures = ti.Vector([0, 0, 0, 0, 0, 2.0**31], ti.f64)
@@ -160,7 +149,7 @@ class Survey:
                     if begin == 0:
                         figures[3] = ti.max(figures[3], self.stiffness(i, x, h, t))
                 for c in ti.static(self.contacts):
-                    touching, worst = self.contact(c, i)
+                    touching, worst = c.overlaps(i)
                     figures[2] = ti.max(figures[2], worst)
                     figures[4] += touching
         for f in ti.static(self.batches):

@@ -4,6 +4,7 @@ import copy
 import hashlib
 from collections.abc import Iterable
 from dataclasses import replace
+from time import perf_counter
 
 import numpy as np
 import taichi as ti
@@ -57,9 +58,12 @@ class World:
             )
         self._path = _chosen(path, particles, self._features)
         self._time, self._tick, self._h = 0.0, 0, 0.0
+        self._frame = (0.0, 0.0, 0)  # when frames of the present length began, their length, their number
+        self._last: StepReport | None = None
         self._fresh, self._started = True, False  # d holds velocities; the last substep was the first after a start
         self._drag: list[float] | None = None
         self._energy: float | None = None
+        self._placed = True  # by the user, and not looked at yet
         self._build(inv_mass)
 
     def _build(self, inv_mass: np.ndarray) -> None:
@@ -96,17 +100,26 @@ class World:
         """
         self._memory.check()
         dt = checks.number("World.step", "dt", dt, above=0.0)
+        clock = perf_counter()
         with runtime.literals(self._scene.real):
             self._begin(dt / self.substeps)
             if len(self._particles):
                 (self._fused if self._path == "fused" else self._parallel)()
             self._tick = (self._tick + self.substeps) % 2**31
-            self._time += dt
+            self._pass(dt)
             self._started, self._fresh = self._fresh and self.substeps == 1, False
             report = self._look()
-        report = replace(report, energy_change=report.energy - self._energy)
-        self._energy = report.energy
-        return report
+        change = report.energy - self._energy  # type: ignore[operator]
+        self._energy, self._last = report.energy, replace(report, energy_change=change, seconds=perf_counter() - clock)
+        return self._last
+
+    def _pass(self, dt: float) -> None:
+        """Advance the clock: frames of the same length are counted, not summed, so that they add no rounding errors."""
+        if dt != self._frame[1]:
+            self._frame = (self._time, dt, 0)
+        since, _, count = self._frame
+        self._frame = (since, dt, count + 1)
+        self._time = since + (count + 1) * dt
 
     def _begin(self, h: float) -> None:
         """Bring h and the knobs to the device; where they change what displacements mean, start anew from velocities."""
@@ -125,7 +138,11 @@ class World:
                 feature.changed = False
                 feature.upload()
         if self._energy is None:
-            self._energy = self._look(begin=True).energy
+            report = self._look(begin=True)
+            self._energy = report.energy
+            if report.overlap > 0 and self._placed:
+                self._ease()
+        self._placed = False
 
     def _restart(self) -> None:
         """Turn displacements into velocities, so that the next substep starts from the state at this time."""
@@ -166,6 +183,18 @@ class World:
         """More room for near pairs, and kernels that know of it. Nothing is lost: what did not fit was counted."""
         assert self._grid
         self._grid.grow()
+        self._renew()
+
+    def _ease(self) -> None:
+        """Let particles that the user put into each other part gently."""
+        contact = self._sub.contacts[0]
+        if not contact._on_eases:
+            contact.ease()
+            self._renew()
+        self._sub.shrunk()
+
+    def _renew(self) -> None:
+        """Kernels that know of a new field; Taichi compiles them for each Substep anew."""
         self._sub = copy.copy(self._sub)
         self._survey = self._survey.of(self._sub)
 
@@ -214,7 +243,7 @@ class World:
         with runtime.literals(self._scene.real):
             self._restart()
             self._scene.state.put(self._memory, value)
-        self._energy = None
+        self._energy, self._placed = None, True
         if self._grid:
             self._grid.stale[None] = 1
 
@@ -243,6 +272,11 @@ class World:
     def time(self) -> float:
         """Simulated time [s]."""
         return self._time
+
+    @property
+    def last(self) -> StepReport | None:
+        """The report of the last step; None before the first."""
+        return self._last
 
     @property
     def particles(self) -> Particles:
@@ -305,7 +339,8 @@ class World:
         new._time, new._tick = self._time, self._tick
         if new._precision == self._precision:
             new._memory.restore(self._memory.state())
-            new._h, new._fresh, new._started, new._drag = self._h, self._fresh, self._started, self._drag
+            new._h, new._fresh, new._started, new._frame = self._h, self._fresh, self._started, self._frame
+            new._placed = self._placed
         else:
             new.position, new.velocity = self.position, self.velocity
         return new

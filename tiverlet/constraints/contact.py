@@ -7,6 +7,7 @@ from .. import checks
 from ..feature import Batch, Feature, Scene
 from ..grid import FARTHEST, Grid
 from ..particles import Particles
+from ..runtime import Memory
 
 
 class Contact(Feature):
@@ -15,7 +16,8 @@ class Contact(Feature):
     C(x) = |x_i - x_j| - (r_i + r_j) >= 0 for all pairs, grad_i C = n = (x_i - x_j) / |x_i - x_j|.
 
     skin: how far beyond touching pairs are listed [m], "auto" for a fifth of the median radius; speed only, never the result.
-    push_out: pairs that overlap at the start of a step by more than they approached leave each other at this speed [m/s] at most.
+    push_out: particles that overlap at the start, or after positions were assigned, part at this speed [m/s] at most: they act
+    as if they were small enough to fit, and grow back.
 
     A Jacobi pass: each pair wants C back along the current n, split by mass and by the number of overlapping pairs that each
     particle has, p = -C / (n_i w_i + n_j w_j), which conserves momentum. Particles that are in the same place part in the
@@ -65,8 +67,42 @@ class Contact(Feature):
         self._on_move = scene.memory.field("Contact.move", n, width=dim)
         self._on_active = scene.memory.field("Contact.active", n, kind=ti.i32)
         self._on_fast = scene.memory.field("Contact.fast", None, kind=ti.i32)
+        self._on_eases, self._on_store = False, None
         self._on_grid = Grid(scene, self._on_radius, self._on_reach, self._on_size, linked, parallel)
         return self._on_grid
+
+    def ease(self) -> None:
+        """From now on particles may be smaller than they are; the field for it exists only once it is needed."""
+        if not self._on_eases:
+            self._on_store = Memory(self.scene.real)
+            self._on_less = self._on_store.field("Contact.shrunk", self.scene.particles.count, state=True)
+            self._on_store.place()
+            self._on_eases = True
+
+    @ti.func
+    def shrink(self, i):
+        """Make particle i small enough: each pair gives up its overlap in proportion to the radii."""
+        less = ti.cast(0, self.scene.real)
+        for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
+            j = self._on_grid.near[e]
+            far = self._on_radius.of(i) + self._on_radius.of(j)
+            overlap, _ = self.touch(i, j, far)
+            less = ti.max(less, overlap * self._on_radius.of(i) / far)
+        self._on_less[i] = less
+
+    @ti.func
+    def grow(self, i, h):
+        """Let particle i grow back."""
+        if ti.static(self._on_eases):
+            self._on_less[i] = ti.max(self._on_less[i] - self.push_out * h / 2, 0)
+
+    @ti.func
+    def far(self, i, j):
+        """The distance at which particles i and j touch."""
+        far = self._on_radius.of(i) + self._on_radius.of(j)
+        if ti.static(self._on_eases):
+            far -= self._on_less[i] + self._on_less[j]
+        return far
 
     @ti.func
     def watch(self, i):
@@ -78,10 +114,9 @@ class Contact(Feature):
             self._on_fast[None] = 1
 
     @ti.func
-    def touch(self, i, j):
-        """Overlap of a pair [m] (negative where apart) and its direction, from j to i."""
+    def touch(self, i, j, far):
+        """Overlap [m] of a pair that touches at a distance `far` (negative where apart) and its direction, from j to i."""
         r = self._on_state.apart(i, j)
-        far = self._on_radius.of(i) + self._on_radius.of(j)
         rr = r.dot(r)
         overlap, n = 0 * far - 1, 0 * r
         if rr < far * far:
@@ -115,24 +150,23 @@ class Contact(Feature):
         """How many particles overlap particle i."""
         active = 0
         for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
-            overlap, _ = self.touch(i, self._on_grid.near[e])
+            j = self._on_grid.near[e]
+            overlap, _ = self.touch(i, j, self.far(i, j))
             if overlap > 0:
                 active += 1
         self._on_active[i] = active
 
     @ti.func
-    def relax(self, i, h):
+    def relax(self, i):
         """What the pairs of particle i want of it."""
         total = 0 * self._on_state.x[i]
         if self._on_active[i] > 0:
             for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
                 j = self._on_grid.near[e]
-                overlap, n = self.touch(i, j)
+                overlap, n = self.touch(i, j, self.far(i, j))
                 if overlap > 0:
-                    leaving = (self._on_state.d[i] - self._on_state.d[j]).dot(n)
-                    push = ti.min(overlap, ti.max(self.push_out * h - leaving, 0))
                     shared = self._on_active[i] * self._on_state.w[i] + self._on_active[j] * self._on_state.w[j]
-                    total += self._on_state.w[i] * push / shared * n
+                    total += self._on_state.w[i] * overlap / shared * n
         self._on_move[i] = total
 
     @ti.func
@@ -140,3 +174,20 @@ class Contact(Feature):
         """Move particle i as its pairs want."""
         if self._on_active[i] > 0 and self._on_state.w[i] > 0:
             self._on_state.shift(i, self._on_move[i])
+
+    @ti.func
+    def overlaps(self, i):
+        """For the report: contacts of particle i with later ones, and the worst overlap in radii of the smaller."""
+        touching, worst = 0, ti.cast(0, ti.f64)
+        for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
+            j = self._on_grid.near[e]
+            if j > i:
+                a, b = self._on_radius.of(i), self._on_radius.of(j)
+                overlap, _ = self.touch(i, j, a + b)
+                if overlap > 0:
+                    small = ti.min(a, b)
+                    if small == 0:
+                        small = ti.max(a, b)
+                    worst = ti.max(worst, overlap / small)
+                    touching += 1
+        return touching, worst

@@ -1,0 +1,115 @@
+"""The article's scene: discs of golden-ratio sizes, places and hues fall onto a rope bridge and a chain in a box.
+
+    python demos/article.py [article.rrd]
+
+What to look for: nothing overlaps, nothing leaves the box, the chain keeps its length, and a disc is led along a path by
+exponential smoothing, through all the others. Watch the recording with `rerun article.rrd`.
+"""
+
+import sys
+from dataclasses import dataclass
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+import tiverlet as tv
+
+DT = 1 / 60
+SECONDS = 8.0
+WIDTH, HEIGHT = 8.0, 7.0
+
+
+@dataclass
+class Scene:
+    """The world, and what main() needs of it."""
+
+    world: tv.World
+    hand: tv.Pin
+    chain: np.ndarray
+
+
+def build(discs: int = 360, **settings) -> Scene:
+    """Discs above, a bridge of ropes below them, a chain from the ceiling, and a hand that holds one disc."""
+    spots = tv.golden(np.arange(discs), dim=3)
+    falling = tv.mix(np.array([0.3, 3.3]), np.array([WIDTH - 0.3, HEIGHT - 0.3]), spots[:, :2])
+    sizes = tv.mix(0.045, 0.125, tv.smoothstep(0.0, 1.0, spots[:, 2]))
+    bridge = tv.shapes.rope((0.07, 1.9), (WIDTH - 0.07, 1.9), points=51)
+    chain = tv.shapes.rope((2.0, HEIGHT - 1.0), (4.4, HEIGHT - 1.0), points=13)
+    both, (on_bridge, on_chain) = tv.shapes.join(bridge, chain)
+    position = np.concatenate([both.position, [_path(0.0)], falling])
+    radius = np.concatenate([np.full(51, 0.07), np.full(13, 0.09), [0.22], sizes])
+    # Discs that the hand, the bridge or the chain would start inside of make room.
+    keep = np.ones(len(position), dtype=bool)
+    pairs, _ = tv.measure.overlapping(position, radius * 1.02)
+    keep[[j for i, j in pairs if i < 65 <= j]] = False
+    particles = tv.Particles(
+        position[keep], radius=radius[keep], mass=300 * np.pi * radius[keep] ** 2, pinned=[0, 50, on_chain.start]
+    )
+    hand = tv.Pin([64], _path(0.0), compliance=2e-5, damping=200.0)
+    links = both.links
+    features = [
+        tv.Gravity(9.81),
+        tv.Drag(0.02),
+        tv.Rope(links[:50], length=0.168),
+        tv.Distance(links[50:]),
+        hand,
+        tv.Contact(),
+        tv.Box((0, 0), (WIDTH, HEIGHT)),
+    ]
+    return Scene(tv.World(particles, features, **{"substeps": 20, "iterations": 2, **settings}), hand, links[50:])
+
+
+def _path(time: float) -> np.ndarray:
+    """Where the hand is drawn to at a given time: a figure of eight through the heap."""
+    return np.array([WIDTH / 2 + 2.9 * np.sin(0.8 * time), 2.4 + 1.3 * np.sin(1.6 * time)])
+
+
+def lead(scene: Scene) -> None:
+    """Move the hand a little of the way to the path: the article's exponential smoothing."""
+    target = tv.approach(scene.hand.target[0], _path(scene.world.time + DT), rate=6.0, dt=DT)
+    scene.hand.target = target[None]
+
+
+def check(scene: Scene, worst: tv.StepReport) -> None:
+    """What must be true at the end."""
+    x, r = scene.world.position, scene.world.particles.radius[:, None]
+    if not ((x - r > -1e-5) & (x + r < np.array([WIDTH, HEIGHT]) + 1e-5)).all():
+        raise SystemExit("a disc left the box")
+    if worst.bad is not None or worst.overlap > 0.35:
+        raise SystemExit(f"overlap of {worst.overlap:.2f} radii: {worst.notes}")
+
+
+def main(path: str = "article.rrd") -> None:
+    """Simulate, record, and say how it went."""
+    scene = build()
+    world, worst, first, times, stretch = scene.world, None, None, [], 0.0
+    rest = np.linalg.norm(np.diff(world.position[scene.chain], axis=1)[:, 0], axis=1)
+    with tv.Recorder(path, world) as recorder:
+        for _ in track(range(round(SECONDS / DT)), description=f"{len(world.particles)} particles"):
+            lead(scene)
+            report = world.step(DT)
+            recorder.log()
+            worst = report if worst is None else worst.worse(report)
+            first = report.energy - report.energy_change if first is None else first
+            times.append(report.seconds)
+            stretch = max(stretch, float(np.abs(tv.measure.strain(world, scene.chain, rest)).max()))
+    check(scene, worst)
+    table = Table(title=f"{path}: {len(world.particles)} particles, {world.substeps} substeps x {world.iterations} iterations")
+    table.add_column("figure")
+    table.add_column("value", justify="right")
+    table.add_row("frames", str(len(times)))
+    table.add_row("time per frame, median (ms)", f"{1e3 * float(np.median(times)):.2f}")
+    table.add_row("worst overlap (radii of the smaller disc)", f"{worst.overlap:.3f}")
+    table.add_row("overlap at the end (radii)", f"{world.last.overlap:.4f}")
+    table.add_row("worst stretch of the chain", f"{stretch:.2%}")
+    table.add_row("energy drift (J): lost in contacts and drag, added by the hand", f"{world.last.energy - first:.1f}")
+    table.add_row("flags", ", ".join(sorted(worst.flags)) or "none")
+    Console().print(table)
+    for note in worst.notes:
+        print(note)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:2])

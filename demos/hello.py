@@ -1,0 +1,19 @@
+"""A rope that hangs from one end and swings: the ten lines of the README.
+
+    python demos/hello.py
+
+What to look for: the links keep their length, and the energy stays what it was.
+"""
+
+import tiverlet as tv
+
+rope = tv.shapes.rope((0, 2), (1, 2), points=40)
+world = tv.World(
+    tv.Particles(rope.position, mass=0.01, radius=0.01, pinned=[0]),
+    [tv.Gravity(9.81), tv.Distance(rope.links), tv.Box((-2, 0), (2, 3)), tv.Contact()],
+    substeps=20,
+)
+with tv.Recorder("rope.rrd", world) as recorder:
+    report = world.run(5.0, recorder=recorder)
+print(world.explain())
+print(report)
