@@ -179,6 +179,10 @@ class Batch(Feature):
         """
 
     @ti.func
+    def kick(self, c, h):
+        """Push what the constraint's spring, if it has one, adds to h^2 a at the present positions; for starts."""
+
+    @ti.func
     def residual(self, c, h, when, fresh):
         """How far constraint c is from fulfilled, relative to its size."""
         return 0.0

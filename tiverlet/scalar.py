@@ -184,6 +184,28 @@ class Scalar(Batch):
             self.push(c, k, self._on_w[self.member(c, k)] * (new - lam) * n[k, :])
 
     @ti.func
+    def kick(self, c, h):
+        """h^2 w_j F grad_j C with F = -(1 - theta) (C / alpha + damping dC/dt); rigid links find their force in the next substep."""
+        f, g = self.measure(c, self.corners(c, 0))
+        force = ti.cast(0, self._on_real)
+        if ti.static(self._on_soft):
+            w = ti.cast(0, self._on_real)
+            for k in ti.static(range(self.arity)):
+                w += self._on_w[self.member(c, k)] * g[k, :].dot(g[k, :])
+            alpha = self._on_alpha[c]
+            if w > 0 and alpha > 0:
+                ratio = alpha / (h * h * w)
+                resolved = 1 - 1 / (1 + ratio * ratio)
+                C = self.bounded(f - self._on_rest[c])
+                force = -resolved * C / alpha
+                if ti.static(self._on_damped):
+                    f0, _ = self.measure(c, self.corners(c, 1))
+                    if ti.static(self.side == 0) or C != 0:
+                        force -= resolved * self._on_damping[c] * (f - f0) / h
+        for k in ti.static(range(self.arity)):
+            self.push(c, k, h * h * self._on_w[self.member(c, k)] * force * g[k, :])
+
+    @ti.func
     def residual(self, c, h, when, fresh):
         """The violation that is left, relative to the rest value (to the batch's mean f where that is 0)."""
         _, _, violation, _ = self.solve(c, h, 0, fresh)

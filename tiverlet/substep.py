@@ -31,6 +31,7 @@ class Substep:
         self.grid, self.hashes = grid, bool(grid)
         self.walls: list[Wall] = walls
         self.radius = scene.radius
+        self.springs = any(b.soft for b in self.batches)
         self.dithers = scene.real == ti.f32
         add = scene.memory.field
         if self.uses_velocity:
@@ -232,39 +233,60 @@ class Substep:
                 c.shrink(i)
 
     @ti.func
-    def velocity_after(self, i, h, t, whole):
-        """v_n = d / h + h (a + constraint acceleration) / 2, or with drag what the exact solution makes of it.
+    def velocity_after(self, i, h, t, bond):
+        """v_n from d_n and the acceleration at x_n: d / h + (h a + bond / h) / 2, or what the exact solution with drag makes of it.
 
-        whole: 1 adds half of what contacts and walls did, as far as it balances the rest (a body at rest has velocity 0, but
-        one that has just bounced is not credited with half of the blow).
+        bond: h^2 times the acceleration by constraints.
         """
         d = self.state.d[i]
         v = d / h
         if self.state.w[i] > 0:
             if ti.static(self.uses_velocity):
                 v = (3 * d - self.earlier[i]) / (2 * h)
-            force = h * h * self.accelerate(i, self.state.place(i), v, t)
-            bond = 0 * d
-            if ti.static(len(self.batches) > 0):
-                bond = self.slots.pull[i]
-            if ti.static(len(self.walls) > 0 or len(self.contacts) > 0):
-                if whole != 0:
-                    push = self.thrust[i]
-                    limit, size = (force + bond).norm(), push.norm()
-                    if size > limit:
-                        push *= limit / size
-                    bond += push
+            force = h * h * self.accelerate(i, self.state.place(i), v, t) + bond
             if ti.static(self.decays):
-                v = (d + self.decay[None][3] * (force + bond)) * self.decay[None][0] / (self.decay[None][1] * h)
+                v = (d + self.decay[None][3] * force) * self.decay[None][0] / (self.decay[None][1] * h)
             else:
-                v = (d + (force + bond) / 2) / h
+                v = (d + force / 2) / h
         return v
 
     @ti.kernel
     def to_velocity(self, h64: ti.f64, t: ti.f64):
-        """Turn displacements into velocities, for a start with another h or another state."""
+        """Turn displacements into velocities, for a start with another h or another state.
+
+        Springs count with their force at x_n. Rigid links do not: the part of v_n along them is what the next substep corrects,
+        and across them d / h + h a / 2 is what RATTLE has, so nothing is lost to second order nor to any other.
+        """
+        h = ti.cast(h64, self.real)
+        if ti.static(self.springs):
+            for f in ti.static(self.batches):
+                for c in range(f.count):
+                    f.kick(c, h)
         for i in range(self.n):
-            self.state.d[i] = self.velocity_after(i, ti.cast(h64, self.real), ti.cast(t, self.real), 0)
+            bond = 0 * self.state.d[i]
+            if ti.static(self.springs):
+                bond = self.slots.total_of(i)
+            self.state.d[i] = self.velocity_after(i, h, ti.cast(t, self.real), bond)
+
+    @ti.func
+    def felt(self, i, h, t):
+        """h^2 times what constraints, contacts and walls did to particle i in the last substep, for its velocity.
+
+        Contacts and walls count as far as they balance the rest: a body at rest has velocity 0, but one that has just bounced is
+        not credited with half of the blow.
+        """
+        bond = 0 * self.state.d[i]
+        if ti.static(len(self.batches) > 0):
+            bond = self.slots.pull[i]
+        if ti.static(len(self.walls) > 0 or len(self.contacts) > 0):
+            push = self.thrust[i]
+            v = self.state.d[i] / h
+            limit = (h * h * self.accelerate(i, self.state.place(i), v, t) + bond).norm()
+            size = push.norm()
+            if size > limit:
+                push *= limit / size
+            bond += push
+        return bond
 
     @ti.kernel
     def velocities(self, h64: ti.f64, t: ti.f64, fresh: ti.i32, out: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
@@ -272,7 +294,8 @@ class Substep:
         for i in range(self.n):
             v = self.state.d[i]
             if fresh == 0:
-                v = self.velocity_after(i, ti.cast(h64, self.real), ti.cast(t, self.real), 1)
+                h, time = ti.cast(h64, self.real), ti.cast(t, self.real)
+                v = self.velocity_after(i, h, time, self.felt(i, h, time))
             for k in ti.static(range(self.dim)):
                 out[i, k] = v[k]
 

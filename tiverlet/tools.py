@@ -71,9 +71,17 @@ def approach(value, target, rate, dt):
 
 
 @ti.func
+def _golden_axis(i, step: ti.template()):  # type: ignore[valid-type]
+    turned = ti.cast(i, ti.u32) * ti.u32(step)
+    return ti.cast(turned, ti.f64) / 4294967296.0
+
+
+@ti.func
 def _golden_kernel(i, dim: ti.template() = 1):  # type: ignore[valid-type]
-    out = ti.Vector([ti.cast(ti.cast(i, ti.u32) * ti.u32(s), ti.f64) / 4294967296.0 for s in ti.static(_steps(dim))])
-    return out if ti.static(dim > 1) else out[0]
+    if ti.static(dim == 1):
+        return _golden_axis(i, ti.static(_steps(1)[0]))
+    else:
+        return ti.Vector([_golden_axis(i, step) for step in ti.static(_steps(dim))])
 
 
 @_both(_golden_kernel)

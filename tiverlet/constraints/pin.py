@@ -134,6 +134,17 @@ class Pin(Batch):
         self.push(c, 0, self._on_w[self.member(c, 0)] * (new - lam))
 
     @ti.func
+    def kick(self, c, h):
+        """As in Scalar, for each axis: towards the target, which is at rest at the end of a frame."""
+        i = self.member(c, 0)
+        w, alpha = self._on_w[i], self._on_alpha[c]
+        if w > 0:
+            ratio = alpha / (h * h * w)
+            resolved = 1 - 1 / (1 + ratio * ratio)
+            C = self._on_state.place(i) - self.aim(c, 1)
+            self.push(c, 0, -h * h * w * resolved * (C / alpha + self._on_damping[c] * self._on_state.d[i] / h))
+
+    @ti.func
     def residual(self, c, h, when, fresh):
         """What is left, relative to the size of the scene."""
         _, _, size = self.solve(c, h, when, 0, fresh)

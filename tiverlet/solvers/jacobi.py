@@ -66,13 +66,18 @@ class Slots:
         return self._places[id(batch)]
 
     @ti.func
+    def total_of(self, i):
+        """The sum of the moves in the slots of particle i, in order."""
+        total = 0 * self.state.x[i]
+        for s in range(self.begin[i], self.begin[i + 1]):
+            total += self.move[s]
+        return total
+
+    @ti.func
     def gather(self, i, first, final):
         """Add up what the constraints want of particle i. `pull` keeps the sum of a frame's last substep."""
-        a, b = self.begin[i], self.begin[i + 1]
-        if b > a:
-            total = self.move[a]
-            for s in range(a + 1, b):
-                total += self.move[s]
+        if self.begin[i + 1] > self.begin[i]:
+            total = self.total_of(i)
             self.state.shift(i, total)
             if final != 0:
                 if first != 0:

@@ -1,0 +1,81 @@
+"""One Taichi for the whole run; worlds are closed after each test."""
+
+import json
+import pathlib
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+
+HERE = pathlib.Path(__file__).parent
+CASES = {c["id"]: c for c in json.loads((HERE / "reference" / "cases.json").read_text())["cases"]}
+
+
+@pytest.fixture(scope="session", autouse=True)
+def taichi():
+    tv.init()
+
+
+@pytest.fixture
+def world():
+    """tv.World, for worlds that are closed when the test ends."""
+    made = []
+
+    def build(*args, **kwargs):
+        made.append(tv.World(*args, **kwargs))
+        return made[-1]
+
+    yield build
+    for w in made:
+        w.close()
+
+
+def case(name: str) -> dict:
+    """An entry of reference/cases.json."""
+    return CASES[name]
+
+
+def pendulums(name: str):
+    """The chain of a D case: position, mass, pairs; particle 0 is the anchor."""
+    p = case(name)["params"]
+    angle = np.radians(p["theta0_deg"])
+    steps = np.stack([np.sin(angle), -np.cos(angle)], axis=1) * np.array(p["lengths"])[:, None]
+    k = np.arange(len(angle))
+    return np.vstack([[0, 0], np.cumsum(steps, axis=0)]), np.r_[1.0, p["masses"]], np.stack([k, k + 1], axis=1)
+
+
+def figures(name: str, t: float, substeps: int) -> dict[str, float]:
+    """RMS errors [m] of the prototypes of a case at time t, by method."""
+    rows = case(name)["prototype_errors"]
+    return next(r["rms_error_m"] for r in rows if r["t"] == t and r["substeps_per_frame_60hz"] == substeps)
+
+
+def rms(position, reference) -> float:
+    """Root mean square distance [m]."""
+    return float(np.sqrt(np.mean(np.sum((np.asarray(position) - np.asarray(reference)) ** 2, axis=-1))))
+
+
+def order(errors, factor: float = 2.0) -> float:
+    """Fitted order of convergence, for errors at h, h / factor, h / factor^2, ..."""
+    k = np.arange(len(errors)) * np.log(factor)
+    return float(-np.polyfit(k, np.log(errors), 1)[0])
+
+
+def python(code: str, *, check: bool = True, timeout: float = 120.0, **env) -> subprocess.CompletedProcess:
+    """Run code in a fresh interpreter, from a file, since Taichi reads the source of kernels."""
+    import os
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = pathlib.Path(folder) / "script.py"
+        path.write_text(code)
+        done = subprocess.run(
+            [sys.executable, "-W", "error", "-W", "ignore::DeprecationWarning", str(path)],
+            capture_output=True, text=True, timeout=timeout, env={**os.environ, **env}, cwd=folder,
+        )  # fmt: skip
+    if check and done.returncode:
+        raise AssertionError(f"exit status {done.returncode}\n{done.stdout}\n{done.stderr}")
+    return done

@@ -1,0 +1,82 @@
+"""The article's small tools, in Python and in kernels."""
+
+import numpy as np
+import pytest
+import taichi as ti
+
+import tiverlet as tv
+
+
+def test_mix_is_exact_at_both_ends():
+    a, b = 0.1, 1e17 + 0.3
+    assert tv.mix(a, b, 0) == a and tv.mix(a, b, 1) == b
+    np.testing.assert_array_equal(tv.mix(np.array([1.0, 2.0]), np.array([3.0, 6.0]), 0.5), [2.0, 4.0])
+
+
+def test_clamp_and_smoothstep():
+    np.testing.assert_array_equal(tv.clamp(np.array([-2.0, 0.5, 7.0]), 0.0, 1.0), [0.0, 0.5, 1.0])
+    # t^2 (3 - 2 t): 0, 1/2 and 1 at the ends and the middle, level at both ends.
+    np.testing.assert_allclose(tv.smoothstep(1.0, 3.0, np.array([0.0, 1.0, 2.0, 3.0, 9.0])), [0, 0, 0.5, 1, 1])
+    assert tv.smoothstep(0.0, 1.0, 1e-4) < 4e-8
+
+
+def test_approach_does_not_depend_on_how_time_is_cut():
+    # x' = rate (target - x): x(t) = target + (x0 - target) exp(-rate t)
+    exact = 5 + (1 - 5) * np.exp(-3 * 0.7)
+    x = 1.0
+    for dt in (0.1, 0.25, 0.05, 0.3):
+        x = tv.approach(x, 5.0, 3.0, dt)
+    assert x == pytest.approx(exact, rel=1e-14) and tv.approach(1.0, 5.0, 3.0, 0.7) == pytest.approx(exact, rel=1e-15)
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_golden_is_even_and_has_an_inverse(dim):
+    n = 4096
+    u = tv.golden(np.arange(n), dim=dim).reshape(n, dim)
+    assert ((u >= 0) & (u < 1)).all()
+    for k in range(dim):
+        # Each of n/16 equal cells of an axis holds 16 points, give or take the discrepancy; random points scatter by 4.
+        counts = np.histogram(u[:, k], bins=n // 16, range=(0, 1))[0]
+        assert counts.std() < 2 and np.abs(counts - 16).max() <= (3 if dim == 1 else 6)
+    many = np.array([0, 1, 2, 3, 1000, 2**31, 2**32 - 1])
+    np.testing.assert_array_equal(tv.golden_index(tv.golden(many, dim=dim), dim=dim), many)
+    with pytest.raises(ValueError, match="at least 0"):
+        tv.golden(-1)
+
+
+def test_golden_steps_are_the_golden_ratio_and_its_kin():
+    # d = 1: 1 / phi; d = 2: inverse powers of the plastic number, x^3 = x + 1 (Roberts 2018).
+    phi, plastic = (1 + 5**0.5) / 2, 1.32471795724474602596
+    assert tv.golden(1) == pytest.approx(1 / phi, abs=2**-31)
+    np.testing.assert_allclose(tv.golden(1, dim=2), [1 / plastic, 1 / plastic**2], atol=2**-31)
+
+
+def test_colors_differ():
+    colors = tv.golden_colors(12)
+    assert colors.shape == (12, 3) and colors.dtype == np.uint8
+    assert len(np.unique(colors, axis=0)) == 12
+    assert tv.golden_colors(0).shape == (0, 3)
+
+
+def test_tools_work_inside_kernels():
+    out = ti.field(ti.f64, 8)
+
+    @ti.kernel
+    def run(third: ti.f64):
+        out[0] = tv.mix(third, ti.f64(2.0), ti.f64(0.25))
+        out[1] = tv.clamp(third, 0, 1)
+        out[2] = tv.smoothstep(ti.f64(0.0), ti.f64(1.0), third)
+        out[3] = tv.approach(third, ti.f64(2.0), ti.f64(3.0), ti.f64(0.5))
+        out[4] = tv.golden(12345)
+        uv = tv.golden(12345, 2)
+        out[5], out[6] = uv[0], uv[1]
+        v = tv.mix(ti.Vector([third, third]), ti.Vector([third, 2 * third]), ti.f64(0.5))
+        out[7] = v[1]
+
+    third = 1 / 3
+    run(third)
+    want = [
+        tv.mix(third, 2.0, 0.25), third, tv.smoothstep(0.0, 1.0, third), tv.approach(third, 2.0, 3.0, 0.5), tv.golden(12345),
+        *tv.golden(12345, dim=2), 1.5 * third,
+    ]  # fmt: skip
+    np.testing.assert_allclose(out.to_numpy(), want, rtol=1e-15)
