@@ -5,50 +5,48 @@ import pytest
 
 import tiverlet as tv
 
-from .conftest import case, figures, order, pendulums, rms
+from .conftest import case, figures, order, pendulums, rerun, rms
 
 FRAME = 1 / 60
 
 
-def swing(world, name, t, substeps, iterations, **settings):
+def hang(world, name, **settings):
+    """The chain of a D case, hung up at its anchor."""
     x, mass, pairs = pendulums(name)
-    g = case(name)["params"]["g"]
-    features = [tv.Gravity(g), tv.Distance(pairs)]
-    w = world(
-        tv.Particles(x, mass=mass, pinned=[0]), features, substeps=substeps, iterations=iterations,
-        **{"precision": "f64", **settings},
-    )  # fmt: skip
-    w.run(t, dt=FRAME)
-    return w
-
-
-def single(world, substeps, t, degrees=90, precision="f64"):
-    a = np.radians(degrees)
-    start = tv.Particles([[0, 0], [np.sin(a), -np.cos(a)]], pinned=[0])
-    w = world(start, [tv.Gravity(9.81), tv.Distance([[0, 1]])], substeps=substeps, precision=precision)
-    w.run(t, dt=FRAME)
-    return w
+    start = tv.Particles(x, mass=mass, pinned=[0])
+    return world(start, [tv.Gravity(case(name)["params"]["g"]), tv.Distance(pairs)], **{"precision": "f64", **settings})
 
 
 def test_pendulum_state(world):
+    # Three pendulums in one world, released from 10, 90 and 150 degrees.
+    degrees = (10, 90, 150)
+    a = np.radians(degrees)
+    x = np.concatenate([np.zeros((3, 2)), np.stack([np.sin(a), -np.cos(a)], axis=1)])
+    features = [tv.Gravity(9.81), tv.Distance([[0, 3], [1, 4], [2, 5]])]
+    w = world(tv.Particles(x, pinned=[0, 1, 2]), features, precision="f64")
     values = case("R06b_pendulum_state")["values"]
-    for degrees in (10, 90, 150):
-        v = values[f"{degrees}deg_t5"]
-        errors = [rms(single(world, n, 5.0, degrees).position[1], [v["x"], v["y"]]) for n in (10, 20, 40)]
-        assert 1.9 <= order(errors) <= 2.1
+    want = np.array([[values[f"{k}deg_t5"][c] for c in "xy"] for k in degrees])
+    errors = np.array([np.linalg.norm(rerun(w, 5.0, substeps=n).position[3:] - want, axis=1) for n in (10, 20, 40)])
+    for k in range(3):
+        assert 1.9 <= order(errors[:, k]) <= 2.1
+    rerun(w, 10.0, substeps=10)
     v = values["90deg_t10"]
-    w = single(world, 10, 10.0)
-    assert rms(w.position[1], [v["x"], v["y"]]) <= 1.75e-4  # numerics 4.6: 1.7e-4 at h = 1/600
-    # Energy: zero at the start, and never lost; it swings by m g L (omega h)^2 at most, omega^2 = 2 g / L at the bottom.
-    assert abs(w.last.energy) <= 9.81 * 2 * 9.81 / 600**2 and w.last.residual <= 1e-12
+    assert rms(w.position[4], [v["x"], v["y"]]) <= 1.75e-4  # numerics 4.6: 1.7e-4 at h = 1/600
+    # Energy is never lost; at half steps it swings by m v^2 (omega h)^2 at most, (omega h)^2 = 2 g h^2 (1 - cos) of each.
+    energy = -9.81 * np.cos(a).sum()
+    assert abs(w.last.energy - energy) <= (2 * 9.81 * 9.81 * (1 - np.cos(a)) / 600**2).sum() and w.last.residual <= 1e-12
+    assert w.features[1].load[1] == pytest.approx(9.81 * v["tension_over_mg"], rel=1e-2)  # half a step late
 
 
-def test_pendulum_in_f32_stays_near_f64(world):
+@pytest.mark.parametrize("precision", ["f32", "f32-compensated"])
+def test_pendulum_in_f32_stays_near_f64(world, precision):
     v = case("R06b_pendulum_state")["values"]["90deg_t10"]
-    for precision in ("f32", "f32-compensated"):
-        w = single(world, 10, 10.0, precision=precision)
-        assert rms(w.position[1], [v["x"], v["y"]]) <= 3e-4
-        assert rms(w.position, single(world, 10, 10.0).position) <= 2e-4  # row 68: the floor of f32, numerics 4.6
+    made = []
+    for p in (precision, "f64"):
+        w = world(tv.Particles([[0, 0], [1.0, 0]], pinned=[0]), [tv.Gravity(9.81), tv.Distance([[0, 1]])], precision=p)
+        made.append(rerun(w, 10.0, substeps=10).position)
+    assert rms(made[0][1], [v["x"], v["y"]]) <= 3e-4
+    assert rms(made[0], made[1]) <= 2e-4  # row 68: the floor of f32, numerics 4.6
 
 
 @pytest.mark.parametrize("h", [1 / 600, 1 / 2400])
@@ -66,26 +64,27 @@ def test_compensated_pendulum_far_from_the_origin(world, h):
 
 
 def test_double_pendulum(world):
-    ref = np.array(case("D01_double_pendulum")["values"]["t2.0"]["xy"])
-    errors = [rms(swing(world, "D01_double_pendulum", 2.0, n, 30).position[1:], ref) for n in (20, 40, 80)]
+    name = "D01_double_pendulum"
+    ref, late = (np.array(case(name)["values"][t]["xy"]) for t in ("t2.0", "t5.0"))
+    w = hang(world, name)
+    errors = [rms(rerun(w, 2.0, substeps=n, iterations=30).position[1:], ref) for n in (20, 40, 80)]
     assert 1.9 <= order(errors) <= 2.1
-    known = figures("D01_double_pendulum", 2.0, 20)
+    known = figures(name, 2.0, 20)
     assert errors[0] <= known["SHAKE-direct"] and errors[0] * 100 <= known["XPBD-GS"]
-    one = swing(world, "D01_double_pendulum", 5.0, 20, 1)
-    ref = case("D01_double_pendulum")["values"]["t5.0"]["xy"]
-    assert rms(one.position[1:], ref) <= 6.3e-4  # numerics 4.4, SHAKE-Jacobi
+    assert rms(rerun(w, 5.0, substeps=20, iterations=1).position[1:], late) <= 6.3e-4  # numerics 4.4, SHAKE-Jacobi
 
 
-@pytest.mark.parametrize("substeps, figure", [(20, 2.6e-2), (50, 4.1e-3), (100, 1.0e-3)])
-def test_triple_pendulum_with_one_jacobi_pass(world, substeps, figure):
-    w = swing(world, "D03_mueller_triple", 1.0, substeps, 1)
-    error = rms(w.position[1:], case("D03_mueller_triple")["values"]["t1.0"]["xy"])
-    assert float(f"{error:.1e}") <= figure  # numerics 4.4 gives two digits
+def test_triple_pendulum_with_one_jacobi_pass(world):
+    name = "D03_mueller_triple"
+    w = hang(world, name)
+    for substeps, figure in ((20, 2.6e-2), (50, 4.1e-3), (100, 1.0e-3)):
+        error = rms(rerun(w, 1.0, substeps=substeps).position[1:], case(name)["values"]["t1.0"]["xy"])
+        assert float(f"{error:.1e}") <= figure  # numerics 4.4 gives two digits
 
 
 def test_triple_pendulum_keeps_its_energy(world):
     # The public challenge: XPBD keeps 52 % after 10 s, of what is above the lowest state, all links hanging down.
-    w = swing(world, "D03_mueller_triple", 10.0, 50, 1)
+    w = rerun(hang(world, "D03_mueller_triple"), 10.0, substeps=50)
     p = case("D03_mueller_triple")["params"]
     lowest = -p["g"] * np.array(p["masses"]) @ np.cumsum(p["lengths"])
     assert 0.995 <= (w.last.energy - lowest) / (p["energy0"] - lowest) <= 1.0
@@ -94,11 +93,8 @@ def test_triple_pendulum_keeps_its_energy(world):
 def test_spherical_pendulum(world):
     p, values = case("S01_spherical_pendulum")["params"], case("S01_spherical_pendulum")["values"]
     start = tv.Particles([[0, 0, 0], p["x0"]], velocity=[[0, 0, 0], p["v0"]], pinned=[0])
-    errors = []
-    for n in (20, 40, 80):
-        w = world(start, [tv.Gravity(p["g"]), tv.Distance([[0, 1]])], substeps=n, precision="f64")
-        w.run(10.0, dt=FRAME)
-        errors.append(rms(w.position[1], values["t10.0"]["xyz"]))
+    w = world(start, [tv.Gravity(p["g"]), tv.Distance([[0, 1]])], precision="f64")
+    errors = [rms(rerun(w, 10.0, substeps=n).position[1], values["t10.0"]["xyz"]) for n in (20, 40, 80)]
     assert 1.9 <= order(errors) <= 2.1
     known = figures("S01_spherical_pendulum", 10.0, 20)
     assert errors[0] <= known["SHAKE-direct"] and errors[0] * 100 <= known["XPBD-GS"]
@@ -123,10 +119,10 @@ def test_spherical_pendulum_for_a_million_steps(world):
 def test_elastic_pendulum(world):
     c = case("S04_spring_pendulum")
     p, errors, speeds = c["params"], [], []
+    link = tv.Distance([[0, 1]], rest=p["L"], compliance=p["alpha"])
+    w = world(tv.Particles([[0, 0], p["x0"]], pinned=[0]), [tv.Gravity(p["g"]), link], precision="f64")
     for n in (20, 40, 80):
-        link = tv.Distance([[0, 1]], rest=p["L"], compliance=p["alpha"])
-        w = world(tv.Particles([[0, 0], p["x0"]], pinned=[0]), [tv.Gravity(p["g"]), link], substeps=n, precision="f64")
-        w.run(5.0, dt=FRAME)
+        rerun(w, 5.0, substeps=n)
         errors.append(rms(w.position[1], c["values"]["t5.0"]["xy"]))
         speeds.append(rms(w.velocity[1], c["values"]["t5.0"]["v"]))
     assert 1.9 <= order(errors) <= 2.1 and 1.9 <= order(speeds) <= 2.1
@@ -168,13 +164,11 @@ def test_a_thousand_radians_per_second(world):
 
 def test_changing_substeps_in_a_swing_costs_no_order(world):
     # Row 14: the restart after each change of h is second order too.
-    x, mass, pairs = pendulums("D01_double_pendulum")
     ref = case("D01_double_pendulum")["values"]["t2.0"]["xy"]
     errors = []
+    w = hang(world, "D01_double_pendulum", iterations=30)
     for n in (20, 40, 80):
-        w = world(
-            tv.Particles(x, mass=mass, pinned=[0]), [tv.Gravity(9.81), tv.Distance(pairs)], iterations=30, precision="f64"
-        )
+        w.position, w.velocity = w.particles.position, w.particles.velocity
         for k in range(120):
             w.substeps = n + (k % 2) * n // 4
             w.step(FRAME)

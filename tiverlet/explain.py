@@ -21,7 +21,7 @@ def explain(world: "World") -> str:
         "Left out, at no cost:",
         *(f"    {line}" for line in _absent(world)),
     ]
-    entries = [*world._memory.entries, *(e for store in _stores(world) for e in store.entries)]
+    entries = [e for memory in world._memories for e in memory.entries]
     total = sum(e.bytes for e in entries)
     lines.append(f"Memory: {len(entries)} fields, {total} bytes, {total / max(1, len(p)):.0f} per particle")
     for e in entries:
@@ -30,11 +30,6 @@ def explain(world: "World") -> str:
     if sub.batches:
         lines.append(f"Constraint corners that can move: {sub.slots.total} of {sum(b.indices.size for b in sub.batches)}")
     return "\n".join(lines)
-
-
-def _stores(world: "World") -> list[runtime.Memory]:
-    contact = [c._on_store for c in world._sub.contacts]
-    return [s for s in [world._grid.store if world._grid else None, *contact] if s is not None]
 
 
 def _launches(world: "World") -> str:

@@ -35,6 +35,7 @@ class Scene:
     inv_mass: np.ndarray  # (n,) after pins: 0 means that constraints cannot move it
     radius: Radii | None = None  # where something asks for radii
     slots: Any = None  # where constraints leave their moves
+    hh: float = 0.0  # [s^2] what an acceleration added to the displacement in the last substep, see Batch.relax
 
     @property
     def real(self):
@@ -171,9 +172,10 @@ class Batch(Feature):
             self._on_slots.move[place] = move
 
     @ti.func
-    def relax(self, c, h, when, first, fresh):
+    def relax(self, c, h, hh, when, first, fresh):
         """One Jacobi correction of constraint c in a substep of h [s]: pushes one move for each corner.
 
+        hh: what a constant acceleration adds to the displacement, per m/s^2: h^2, half of it at a start, less with drag [s^2].
         when: the fractions of the frame at the start and the end of the substep, for targets that move.
         first: 1 in the first iteration of a substep. fresh: 1 in the first substep after a start.
         """
@@ -183,7 +185,7 @@ class Batch(Feature):
         """Push what the constraint's spring, if it has one, adds to h^2 a at the present positions; for starts."""
 
     @ti.func
-    def residual(self, c, h, when, fresh):
+    def residual(self, c, h, hh, when, fresh):
         """How far constraint c is from fulfilled, relative to its size."""
         return 0.0
 

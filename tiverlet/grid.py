@@ -121,8 +121,10 @@ class Grid:
         for b in range(1, self.buckets + 2):
             self.edge[b] += self.edge[b - 1]
         ti.loop_config(serialize=self.serial)
-        for i in range(self.n):
-            # Filling a bucket from its end turns the end of each into its begin, and the next one's begin is its end.
+        for back in range(self.n):
+            # Filling a bucket from its end turns the end of each into its begin, and the next one's begin is its end. From the
+            # last particle on, so that each bucket comes out in order (on one thread) and leaves little to sort.
+            i = self.n - 1 - back
             k = ti.atomic_sub(self.edge[self.bucket(self.home(i)) + 1], 1) - 1
             self.sorted[k] = i
         ti.loop_config(serialize=True)

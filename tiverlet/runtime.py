@@ -168,6 +168,8 @@ class Memory:
             self._builder.place(made)
         else:
             self._builder.dense(ti.i, max(1, length)).place(made)  # a field of 0 elements poisons the runtime
+        same = sum(e.name == name or e.name.startswith(f"{name} #") for e in self.entries)
+        name = f"{name} #{same + 1}" if same else name  # two batches of a kind
         entry = Entry(name, made, width, length or 0, np.dtype(_NUMPY[kind]), state)
         self.entries.append(entry)
         if values is not None:
@@ -235,7 +237,8 @@ class Memory:
         """Write back what state() returned, bit for bit."""
         self.check()
         chosen = [e for e in self.entries if e.state]
-        self._load(chosen, [state[e.name] for e in chosen])
+        if chosen:
+            self._load(chosen, [state[e.name] for e in chosen])
 
     def _find(self, field) -> Entry:
         return next(e for e in self.entries if e.field is field)

@@ -23,7 +23,8 @@ class Scalar(Batch):
     The direction is that at the start of the step, x_n (SHAKE, Ryckaert 1977): second order and no loss of energy. When a
     constraint turns by more than 41 degrees in a step, or has no direction at x_n, the current direction takes its place.
 
-    In the first substep after a start (`fresh`) the force acts for half a kick: alpha' doubles, C* starts from C_n.
+    In the first substep after a start (`fresh`) the force acts for half a kick, alpha' = alpha / (h^2 / 2), and C* starts from C_n.
+    With drag, alpha' = alpha / (phi h^2) with the factor phi that the exact solution gives every other acceleration.
     """
 
     side = 0  # 0: C = 0;  1: C <= 0, pulls when f > rest;  -1: C >= 0, pushes when f < rest
@@ -82,6 +83,14 @@ class Scalar(Batch):
             self._on_damping = add(f"{name}.damping", m, values=self.damping)
         self.changed = False
 
+    @property
+    def load(self) -> np.ndarray:
+        """The force in each constraint during the last substep [N], (m,); positive where it pulls (f above rest)."""
+        if self.scene is None:
+            raise RuntimeError(f"{self!r}.load: there is none before a world has been stepped with it.")
+        scale = 1 / self.scene.hh if self.scene.hh else 0.0
+        return -scale * self.scene.memory.read(self._on_lam)[: self.count].astype(np.float64)
+
     def upload(self) -> None:
         """Write new rest values."""
         if self.scene and self.count:
@@ -105,10 +114,9 @@ class Scalar(Batch):
         return q
 
     @ti.func
-    def law(self, c, h, w, fresh):
+    def law(self, c, h, hh, w, fresh):
         """The coefficients of C_(n+1), C_n, C_(n-1) in C* (with damping), and alpha'. w: sum of inverse masses."""
-        alpha = self._on_alpha[c] / (h * h)
-        ratio = alpha / w  # 1 / s^2; s^4 would overflow in f32
+        ratio = self._on_alpha[c] / (h * h * w)  # 1 / s^2; s^4 would overflow in f32
         rigid = 1 / (1 + ratio * ratio)
         A, now, last = (1 + 3 * rigid) / 4, (1 - rigid) / 2, (1 - rigid) / 4
         if ti.static(self._on_damped):  # + alpha c dC/dt: central where resolved, backward where stiff
@@ -122,8 +130,7 @@ class Scalar(Batch):
                 gamma = self._on_damping[c] * self._on_alpha[c] / h
                 A += gamma
                 now -= gamma
-            alpha *= 2
-        return A, now, last, alpha
+        return A, now, last, self._on_alpha[c] / hh
 
     @ti.func
     def bounded(self, value):
@@ -133,7 +140,7 @@ class Scalar(Batch):
         return value
 
     @ti.func
-    def solve(self, c, h, first, fresh):
+    def solve(self, c, h, hh, first, fresh):
         """One Jacobi solution of constraint c.
 
         Returns the multiplier before and after, the size of the violation that this removes, and the direction (arity, dim).
@@ -159,7 +166,7 @@ class Scalar(Batch):
         new, violation = lam, ti.cast(0, self._on_real)
         if here > 0:
             if ti.static(self._on_soft):
-                A, now, last, alpha = self.law(c, h, w, fresh)
+                A, now, last, alpha = self.law(c, h, hh, w, fresh)
                 if first != 0:
                     rest = self._on_rest[c]
                     B = now * self.bounded(f0 - rest) + last * self.bounded(self._on_last[c] - rest)
@@ -176,9 +183,9 @@ class Scalar(Batch):
         return lam, new, violation, n
 
     @ti.func
-    def relax(self, c, h, when, first, fresh):
+    def relax(self, c, h, hh, when, first, fresh):
         """Move each corner by w_j dlam grad_j C."""
-        lam, new, _, n = self.solve(c, h, first, fresh)
+        lam, new, _, n = self.solve(c, h, hh, first, fresh)
         self._on_lam[c] = new
         for k in ti.static(range(self.arity)):
             self.push(c, k, self._on_w[self.member(c, k)] * (new - lam) * n[k, :])
@@ -206,9 +213,9 @@ class Scalar(Batch):
             self.push(c, k, h * h * self._on_w[self.member(c, k)] * force * g[k, :])
 
     @ti.func
-    def residual(self, c, h, when, fresh):
+    def residual(self, c, h, hh, when, fresh):
         """The violation that is left, relative to the rest value (to the batch's mean f where that is 0)."""
-        _, _, violation, _ = self.solve(c, h, 0, fresh)
+        _, _, violation, _ = self.solve(c, h, hh, 0, fresh)
         size = ti.abs(self._on_rest[c])
         if size == 0:
             size = ti.cast(self._on_scale, self._on_real)

@@ -11,6 +11,7 @@ from .feature import Acceleration, Batch, Scene, Wall
 
 # The golden ratio as a fraction of 2**32: its multiples, taken mod 1, are the most even sequence there is.
 GOLDEN = 2654435769
+SWEEPS = 8  # rounds over the walls, for particles that several of them push
 
 
 @ti.data_oriented
@@ -110,10 +111,15 @@ class Substep:
 
     @ti.func
     def confine(self, i, h, when):
-        """The walls, which have the last word."""
-        for f in ti.static(self.walls):
-            if self.state.w[i] > 0:
-                f.confine(i, self.radius.of(i), h, when)
+        """The walls, which have the last word; several take turns until they agree, or for SWEEPS rounds in a sharp corner."""
+        if self.state.w[i] > 0:
+            moving = True
+            for _ in range(ti.static(SWEEPS if len(self.walls) > 1 else 1)):
+                if moving:
+                    before = self.state.d[i]
+                    for f in ti.static(self.walls):
+                        f.confine(i, self.radius.of(i), h, when)
+                    moving = (self.state.d[i] != before).any()
 
     # The phases: loops over the bodies, serial inside the fused kernel and parallel at the top of the others.
 
@@ -131,9 +137,10 @@ class Substep:
     @ti.func
     def relax(self, h, when, first, fresh, final):
         """3 One pass: constraints into slots, particles gather them; contacts; walls."""
+        hh = self.reach(h, fresh)
         for f in ti.static(self.batches):
             for c in range(f.count):
-                f.relax(c, h, when, first, fresh)
+                f.relax(c, h, hh, when, first, fresh)
         for c in ti.static(self.contacts):
             if ti.static(len(self.batches) > 0):
                 for i in range(self.n):
@@ -159,6 +166,16 @@ class Substep:
                             self.thrust[i] = self.state.d[i] - before
                         else:
                             self.thrust[i] += self.state.d[i] - before
+
+    @ti.func
+    def reach(self, h, fresh):
+        """What a constant acceleration adds to the displacement in a substep, per m/s^2: h^2, half of it at a start."""
+        hh = h * h
+        if ti.static(self.decays):
+            hh *= self.decay[None][2] if fresh != 0 else self.decay[None][1]
+        elif fresh != 0:
+            hh /= 2
+        return hh
 
     @ti.func
     def clock(self, s, substeps):

@@ -157,7 +157,7 @@ class Survey:
             for c in range(b * part, ti.min((b + 1) * part, f.count)):
                 figures[0] += f.energy(c, back)
                 if begin == 0:
-                    figures[1] = ti.max(figures[1], ti.cast(f.residual(c, h, when, fresh), ti.f64))
+                    figures[1] = ti.max(figures[1], ti.cast(f.residual(c, h, self.sub.reach(h, fresh), when, fresh), ti.f64))
         return figures, low, high
 
     @ti.kernel

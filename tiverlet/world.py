@@ -108,6 +108,8 @@ class World:
             self._tick = (self._tick + self.substeps) % 2**31
             self._pass(dt)
             self._started, self._fresh = self._fresh and self.substeps == 1, False
+            _, phi1, phi2, _ = self._drag or decay(0.0, self._h)
+            self._scene.hh = self._h**2 * (phi2 if self._started else phi1)
             report = self._look()
         change = report.energy - self._energy  # type: ignore[operator]
         self._energy, self._last = report.energy, replace(report, energy_change=change, seconds=perf_counter() - clock)
@@ -127,6 +129,16 @@ class World:
         turned = any(f.changed and isinstance(f, Acceleration) for f in self._features)
         if h != self._h or drag != self._drag or turned:
             self._restart()
+        self._upload(h, drag)
+        if self._energy is None:
+            report = self._look(begin=True)
+            self._energy = report.energy
+            if report.overlap > 0 and self._placed:
+                self._ease()
+        self._placed = False
+
+    def _upload(self, h: float, drag: list[float] | None) -> None:
+        """Write what was changed in Python since the last frame."""
         if drag and drag != self._drag:
             self._sub.decay[None] = drag
         self._h, self._drag = h, drag
@@ -137,12 +149,6 @@ class World:
             if feature.changed:
                 feature.changed = False
                 feature.upload()
-        if self._energy is None:
-            report = self._look(begin=True)
-            self._energy = report.energy
-            if report.overlap > 0 and self._placed:
-                self._ease()
-        self._placed = False
 
     def _restart(self) -> None:
         """Turn displacements into velocities, so that the next substep starts from the state at this time."""
@@ -176,8 +182,9 @@ class World:
     def _list(self) -> None:
         """Build the neighbour list, growing it until everything fits."""
         assert self._grid
-        while self._sub.listed() > self._grid.capacity:
-            self._grow()
+        with runtime.literals(self._scene.real):
+            while self._sub.listed() > self._grid.capacity:
+                self._grow()
 
     def _grow(self) -> None:
         """More room for near pairs, and kernels that know of it. Nothing is lost: what did not fit was counted."""
@@ -202,7 +209,8 @@ class World:
         """Survey the state."""
         if self._grid and self._grid.stale[None]:
             self._list()
-        report, extent = self._survey.report(self._time, self._h, self.substeps, self.iterations, self._started, begin)
+        with runtime.literals(self._scene.real):
+            report, extent = self._survey.report(self._time, self._h, self.substeps, self.iterations, self._started, begin)
         if self._grid:
             self._grid.fit(extent)
         return report
@@ -319,10 +327,20 @@ class World:
     def hash(self) -> str:
         """SHA-256 of the exact state: equal if and only if two worlds of the same scene will go on alike, bit for bit."""
         digest = hashlib.sha256(repr((self._time, self._tick, self._h, self._fresh)).encode())
-        for name, values in self._memory.state().items():
+        for name, values in self._state().items():
             digest.update(name.encode())
             digest.update(values.tobytes())
         return digest.hexdigest()
+
+    def _state(self) -> dict[str, np.ndarray]:
+        """Every field that the future depends on."""
+        return {k: v for memory in self._memories for k, v in memory.state().items()}
+
+    @property
+    def _memories(self) -> list[runtime.Memory]:
+        """The trees of fields: one from the start, others where a list or a need has grown."""
+        grown = [self._grid.store if self._grid else None, *(c._on_store for c in self._sub.contacts)]
+        return [self._memory, *(m for m in grown if m)]
 
     def explain(self) -> str:
         """What was compiled and what was left out, with fields, bytes and launches."""
@@ -335,24 +353,30 @@ class World:
         )  # fmt: skip
         if unknown := set(changes) - set(settings):
             raise TypeError(f"World.clone: {sorted(unknown)[0]} cannot be changed; one of {', '.join(settings)} can.")
+        self._memory.check()
         new = World(self._particles, [f.copy() for f in self._features], **{**settings, **changes})
-        new._time, new._tick = self._time, self._tick
-        if new._precision == self._precision:
-            new._memory.restore(self._memory.state())
-            new._h, new._fresh, new._started, new._frame = self._h, self._fresh, self._started, self._frame
-            new._placed = self._placed
-        else:
+        new._time, new._tick, new._frame = self._time, self._tick, self._frame
+        if new._precision != self._precision:
             new.position, new.velocity = self.position, self.velocity
+            return new
+        new._upload(self._h, self._drag)
+        if any(c._on_eases for c in self._sub.contacts):
+            new._sub.contacts[0].ease()
+            new._renew()
+        state = self._state()
+        for memory in new._memories:
+            memory.restore(state)
+        for ours, theirs in zip(self._features, new._features, strict=True):
+            theirs.changed, theirs.moving = ours.changed, ours.moving
+        new._fresh, new._started, new._placed, new._energy = self._fresh, self._started, self._placed, self._energy
         return new
 
     def close(self) -> None:
         """Free the memory on the device. Using the world afterwards raises RuntimeError."""
-        if self._memory is not None:
-            self._memory.destroy()
-            if self._grid and self._grid.store:
-                self._grid.store.destroy()
-            for feature in self._features:
-                feature.scene = None
+        for memory in self._memories:
+            memory.destroy()
+        for feature in self._features:
+            feature.scene = None
 
     def __enter__(self) -> "World":
         return self

@@ -64,7 +64,9 @@ class Pin(Batch):
         """Targets at the start and the end of a frame; for a spring, its multiplier and history."""
         Batch.bind(self, scene)
         m, dim, add = self.count, self.dim, scene.memory.field
-        here = scene.particles.position[self.indices[:, 0]]
+        # A driven particle sets out from where it is; a spring is anchored at the target from the start.
+        here = scene.particles.position[self.indices[:, 0]] if self.drives else self.target
+        self.changed = self.drives
         self._on_from = add("Pin.from", m, width=dim, values=here, state=True)
         self._on_to = add("Pin.to", m, width=dim, values=here, state=True)
         if self.soft:
@@ -100,7 +102,7 @@ class Pin(Batch):
         self._on_state.advance(i, d)
 
     @ti.func
-    def solve(self, c, h, when, first, fresh):
+    def solve(self, c, h, hh, when, first, fresh):
         """The formula of Scalar for each axis alike: multiplier before and after, and the violation that this removes."""
         i = self.member(c, 0)
         x = self._on_state.place(i)
@@ -110,14 +112,14 @@ class Pin(Batch):
             lam = 0 * lam
         new, size = lam, 0 * self._on_state.w[i]
         if self._on_state.w[i] > 0:
-            alpha = self._on_alpha[c] / (h * h)
+            alpha = self._on_alpha[c] / hh
             gamma = self._on_damping[c] * self._on_alpha[c] / h
-            ratio = alpha / self._on_state.w[i]
+            ratio = self._on_alpha[c] / (h * h * self._on_state.w[i])
             rigid = 1 / (1 + ratio * ratio)
             A = (1 + 3 * rigid) / 4 + gamma * (1 + rigid) / 2
             now, last = (1 - rigid) / 2 - gamma * rigid, (1 - rigid) / 4 - gamma * (1 - rigid) / 2
             if fresh != 0:
-                A, now, last, alpha = rigid + gamma, 1 - rigid - gamma, 0 * rigid, 2 * alpha
+                A, now, last = rigid + gamma, 1 - rigid - gamma, 0 * rigid
             if first != 0:
                 self._on_history[c] = now * C0 + last * self._on_last[c]
                 self._on_last[c] = C0
@@ -127,9 +129,9 @@ class Pin(Batch):
         return lam, new, size
 
     @ti.func
-    def relax(self, c, h, when, first, fresh):
+    def relax(self, c, h, hh, when, first, fresh):
         """Draw the particle towards the target."""
-        lam, new, _ = self.solve(c, h, when, first, fresh)
+        lam, new, _ = self.solve(c, h, hh, when, first, fresh)
         self._on_lam[c] = new
         self.push(c, 0, self._on_w[self.member(c, 0)] * (new - lam))
 
@@ -145,9 +147,9 @@ class Pin(Batch):
             self.push(c, 0, -h * h * w * resolved * (C / alpha + self._on_damping[c] * self._on_state.d[i] / h))
 
     @ti.func
-    def residual(self, c, h, when, fresh):
+    def residual(self, c, h, hh, when, fresh):
         """What is left, relative to the size of the scene."""
-        _, _, size = self.solve(c, h, when, 0, fresh)
+        _, _, size = self.solve(c, h, hh, when, 0, fresh)
         return size / self._on_size
 
     @ti.func

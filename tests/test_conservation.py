@@ -1,0 +1,135 @@
+"""Momentum, angular momentum, and the symmetries of the equations of motion."""
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+
+from .test_links import net
+
+
+@pytest.mark.parametrize("precision, limit", [("f64", 1e-12), ("f32", 1e-6)])
+def test_momentum_is_conserved_for_ten_thousand_steps(world, precision, limit):
+    # Masses 1 ... 100, links from rigid to soft, contacts: all internal forces are equal and opposite.
+    x, v, mass, pairs, rest, alpha, damping = net(2, seed=4)
+    features = [tv.Distance(pairs, rest, compliance=alpha, damping=damping), tv.Contact()]
+    w = world(tv.Particles(x, velocity=v, mass=mass, radius=0.15), features, substeps=100, precision=precision)
+    touched = 0
+
+    def moving():
+        d = w._memory.state()["displacement"].astype(np.float64)
+        return mass @ d / w._h, np.abs(mass @ np.abs(d)).sum() / w._h
+
+    w.step(1 / 60)
+    start, size = moving()
+    for _ in range(100):  # 1e4 substeps
+        touched += w.step(1 / 60).contacts
+    assert touched > 0 and np.isfinite(w.position).all()
+    assert np.abs(moving()[0] - start).max() <= limit * max(size, moving()[1])
+
+
+def test_momentum_is_not_conserved_by_averaging_here(world):
+    # The test above can fail: dividing each particle's sum by its number of links (not its mass) breaks the balance.
+    x, v, mass, pairs, *_ = net(2, seed=4)
+    count = np.bincount(pairs.ravel(), minlength=len(x))
+    i, j = pairs.T
+    r = x[i] - x[j]
+    C = np.linalg.norm(r, axis=1) - 1.0
+    push = -(C / (1 / mass[i] + 1 / mass[j]))[:, None] * r / np.linalg.norm(r, axis=1)[:, None]
+    move = np.zeros_like(x)
+    np.add.at(move, i, push / mass[i][:, None])
+    np.add.at(move, j, -push / mass[j][:, None])
+    assert np.abs(mass @ move).max() < 1e-12 < np.abs(mass @ (move / np.maximum(count, 1)[:, None])).max()
+
+
+def scene(world, change=lambda x: x, dim=2, precision="f64", frames=30, mass=1.0, compliance=1.0, boost=0.0):
+    x, v, m, pairs, rest, alpha, damping = net(dim, seed=2)
+    g = np.array([1.0, -9.81, 0.5][:dim])
+    links = tv.Distance(pairs, rest, compliance=alpha * compliance, damping=damping * mass)
+    w = world(
+        tv.Particles(change(x), velocity=change(v) + boost, mass=m * mass), [tv.Gravity(change(g)), links], substeps=10,
+        iterations=2, precision=precision,
+    )  # fmt: skip
+    w.run(frames / 60)
+    return w.position
+
+
+def test_metamorphic_symmetries(world):
+    plain = scene(world)
+    quarter = np.array([[0.0, -1.0], [1.0, 0.0]])
+    a = np.radians(37)
+    turn = np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])
+    np.testing.assert_array_equal(scene(world, lambda x: x @ quarter.T), plain @ quarter.T)  # the same bits, up to sign
+    np.testing.assert_allclose(scene(world, lambda x: x @ turn.T), plain @ turn.T, atol=1e-9)
+    np.testing.assert_allclose(scene(world, boost=[3.0, -2.0]), plain + 0.5 * np.array([3.0, -2.0]), atol=1e-9)
+    np.testing.assert_allclose(scene(world, mass=7.0, compliance=1 / 7), plain, atol=1e-9)
+    # In f32, 90 degrees still give the same bits: the dither has the sign of the kick.
+    single = scene(world, precision="f32")
+    np.testing.assert_array_equal(scene(world, lambda x: x @ quarter.T, precision="f32"), single @ quarter.T)
+
+
+def test_a_flat_scene_is_the_same_in_3d(world):
+    x, v, m, pairs, rest, alpha, damping = net(2, seed=2)
+    made = []
+    for dim in (2, 3):
+        flat = np.zeros((len(x), dim))
+        fast = np.zeros((len(x), dim))
+        flat[:, :2], fast[:, :2] = x, v
+        links = tv.Distance(pairs, rest, compliance=alpha, damping=damping)
+        w = world(
+            tv.Particles(flat, velocity=fast, mass=m, radius=0.2), [tv.Gravity(9.81), links, tv.Contact(), tv.HalfSpace([0, 1, 0][:dim], -2)],
+            precision="f64",
+        )  # fmt: skip
+        w.run(0.5)
+        made.append(w.position)
+    np.testing.assert_allclose(made[1][:, :2], made[0], atol=1e-12)
+    np.testing.assert_array_equal(made[1][:, 2], 0.0)
+
+
+def test_motion_is_reversible(world):
+    # Turn the displacements round, x_(n+1) <-> x_n: the discrete motion with rigid links retraces its steps.
+    n = 6
+    k = np.arange(n - 1)
+    start = tv.Particles(np.stack([np.arange(n) * 0.3, np.zeros(n)], axis=1), pinned=[0])
+    w = world(start, [tv.Gravity(9.81), tv.Distance(np.stack([k, k + 1], 1))], substeps=25, iterations=600, precision="f64")
+    w.step(1 / 60)
+    begin = w._memory.state()
+    for _ in range(12):
+        w.step(1 / 60)
+    s = w._memory.state()
+    s["position"], s["displacement"] = s["position"] - s["displacement"], -s["displacement"]
+    w._memory.restore(s)
+    for _ in range(12):
+        w.step(1 / 60)
+    s = w._memory.state()
+    np.testing.assert_allclose(s["position"] - 0 * s["displacement"], begin["position"] - begin["displacement"], atol=1e-8)
+
+
+def test_splitting_a_run_changes_nothing(world):
+    x, v, m, pairs, rest, alpha, damping = net(2, seed=2)
+    hashes = []
+    for parts in ((30,), (7, 23)):
+        links = tv.Distance(pairs, rest, compliance=alpha, damping=damping)
+        w = world(tv.Particles(x, velocity=v, mass=m, radius=0.1), [tv.Gravity(9.81), links, tv.Contact()])
+        for frames in parts:
+            w.run(frames / 60)
+        hashes.append(w.hash())
+    assert hashes[0] == hashes[1]
+
+
+@pytest.mark.parametrize("precision", ["f32", "f32-compensated", "f64"])
+def test_clones_go_on_alike(world, precision):
+    x, v, m, pairs, rest, alpha, damping = net(3, seed=5)
+    hand = tv.Pin([0], (0.0, 0.0, 0.0), compliance=1e-3)
+    features = [tv.Gravity(9.81), tv.Drag(0.1), tv.Distance(pairs, rest, compliance=alpha), hand, tv.Contact(), tv.HalfSpace((0, 1, 0), -3)]
+    w = world(tv.Particles(x, velocity=v, mass=m, radius=0.3), features, precision=precision)
+    w.run(0.2)
+    twin = w.clone()
+    assert twin.hash() == w.hash()
+    w.run(0.3)
+    twin.run(0.3)
+    assert twin.hash() == w.hash()
+    other = w.clone(precision="f64", substeps=40)
+    np.testing.assert_allclose(other.position, w.position, atol=1e-6)
+    twin.close()
+    other.close()

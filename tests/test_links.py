@@ -1,0 +1,233 @@
+"""Links from soft to rigid: against the NumPy prototype, in physical units, and at every extreme of compliance."""
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+
+from .conftest import case, order, rerun, rms
+from .prototype import Prototype
+
+
+def net(dim, seed=0):
+    """A small random net with masses 1 ... 100, static corners, and links from rigid to soft."""
+    rng = np.random.default_rng(seed)
+    n = 12
+    x = rng.normal(size=(n, dim))
+    pairs = np.array([(i, j) for i in range(n) for j in range(i + 1, n) if rng.random() < 0.35])
+    mass = np.exp(rng.uniform(0, np.log(100), n))
+    rest = np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1) * rng.uniform(0.98, 1.02, len(pairs))
+    alpha = np.where(rng.random(len(pairs)) < 0.4, 0.0, 10.0 ** rng.uniform(-9, -1, len(pairs)))
+    damping = np.where(rng.random(len(pairs)) < 0.5, 0.0, rng.uniform(0, 3, len(pairs)))
+    return x, rng.normal(size=(n, dim)), mass, pairs, rest, alpha, damping
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("iterations", [1, 4])
+def test_kernels_agree_with_the_prototype(world, dim, iterations):
+    x, v, mass, pairs, rest, alpha, damping = net(dim)
+    g = np.array([0.5, -9.81, 1.0][:dim])
+    w = np.where(np.arange(len(x)) < 2, 0.0, 1 / mass)
+    v[:2] = 0
+    plain = Prototype(x, v, w, pairs, rest, alpha, damping, g)
+    links = tv.Distance(pairs, rest, compliance=alpha, damping=damping)
+    made = world(
+        tv.Particles(x, velocity=v, mass=mass, pinned=[0, 1]), [links, tv.Gravity(g)], substeps=10, iterations=iterations,
+        precision="f64",
+    )  # fmt: skip
+    for _ in range(12):
+        made.step(1 / 60)
+        for _ in range(10):
+            plain.substep(1 / 600, iterations)
+        np.testing.assert_allclose(made.position, plain.x, atol=1e-10)
+    np.testing.assert_array_equal(made.position[:2], x[:2])
+
+
+@pytest.mark.parametrize("name, efforts", [("N10_alpha1e-3", ((20, 4), (20, 16), (50, 4))), ("N100_alpha1e-5", ((50, 40), (100, 20)))])
+def test_static_elongation_is_alpha_times_load(world, name, efforts):
+    # Link k from the bottom carries k m g, so it is longer by alpha k m g, whatever the substeps and iterations once they converge.
+    c = case(f"R11_elastic_rope_{name}")
+    p, n = c["params"], c["params"]["links"]
+    k = np.arange(n)
+    loads = p["m"] * p["g"] * (n - k)
+    depth = np.concatenate([[0.0], np.cumsum(p["rest"] + p["alpha"] * loads * (1 + 1e-3))])
+    link = tv.Distance(np.stack([k, k + 1], axis=1), p["rest"], compliance=p["alpha"])
+    start = tv.Particles(np.stack([np.zeros(n + 1), -depth], axis=1), mass=p["m"], pinned=[0])
+    w = world(start, [tv.Gravity(p["g"]), link, tv.Drag(10.0)], precision="f64")
+    for substeps, iterations in efforts:
+        rerun(w, 6.0, substeps=substeps, iterations=iterations)
+        total = -w.position[-1, 1] - n * p["rest"]
+        assert total == pytest.approx(c["values"]["total_elongation"], rel=1e-6)
+        np.testing.assert_allclose(link.load, loads, rtol=1e-5)
+
+
+def test_compliance_from_1e_minus_12_to_1e12(world):
+    # Rows 8 and 9: finite at all; a link under its load of 9.81 N is longer by alpha F, and the softest fall freely. One pendulum each.
+    alpha = np.array([0.0, *10.0 ** np.arange(-12, 13)])
+    m = len(alpha)
+    x = np.zeros((2 * m, 2))
+    x[:, 0] = np.tile(np.arange(m), 2)
+    x[m:, 1] = -1.0
+    link = tv.Distance(np.stack([np.arange(m), m + np.arange(m)], axis=1), rest=1.0, compliance=alpha)
+    start = tv.Particles(x, pinned=np.arange(m))
+    for precision in ("f64", "f32"):
+        w = world(start, [tv.Gravity(9.81), link.copy(), tv.Drag(20.0)], substeps=20, iterations=4, precision=precision)
+        w.run(2.0)
+        stretch = -w.position[m:, 1] - 1.0
+        assert np.isfinite(w.position).all() and not w.last.flags and (np.diff(stretch) >= -2e-7).all()
+        sure = alpha <= 1e-3
+        # In f32 a position near 1 m stops following once d < ulp / 2 = 6e-8: speeds below 7e-5 m/s, drag below 1.4e-3 N.
+        rtol, atol = (1e-6, 1e-12) if precision == "f64" else (1.5e-3 / 9.81, 4e-7)
+        np.testing.assert_allclose(stretch[sure], 9.81 * alpha[sure], rtol=rtol, atol=atol)
+        free = 9.81 / 20 * (2 - (1 - np.exp(-40)) / 20)
+        np.testing.assert_allclose(stretch[-6:], free, rtol=1e-5)
+
+
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+def test_every_compliance_is_stable(world, precision):
+    # numerics 6: kinetic energy never exceeds what gravity has supplied, with one Jacobi pass, from rigid to soft. One chain each.
+    n, alphas = 21, (0.0, 1e-12, 1e-9, 1e-6, 1e-5, 1e-4, 1e-3, 1e-1, 1e12)
+    x = np.concatenate([np.stack([np.arange(n) * 0.05, np.full(n, 10.0 * c)], axis=1) for c in range(len(alphas))])
+    k = np.concatenate([np.arange(n - 1) + n * c for c in range(len(alphas))])
+    link = tv.Distance(np.stack([k, k + 1], axis=1), compliance=np.repeat(alphas, n - 1))
+    start = tv.Particles(x, mass=0.1, pinned=np.arange(len(alphas)) * n)
+    w = world(start, [tv.Gravity(9.81), link], substeps=4, precision=precision)
+    for _ in range(360):
+        w.step(1 / 60)
+        supplied = 0.1 * 9.81 * (x - w.position)[:, 1].reshape(-1, n).sum(axis=1)
+        speed = w._memory.state()["displacement"].astype(np.float64) * 240
+        kinetic = 0.05 * (speed**2).sum(axis=1).reshape(-1, n).sum(axis=1)
+        assert (kinetic <= supplied * 1.001 + 1e-4).all()
+
+
+def test_dashpot(world):
+    # x'' = -(k x + c x') / m: x = x0 e^(-z w t) (cos + z w / wd sin), second order.
+    p, want = case("R05_damped_oscillator")["params"], case("R05_damped_oscillator")["values"]
+    link = tv.Distance([[0, 1]], rest=5.0, compliance=1 / p["k"], damping=p["c"])
+    w = world(tv.Particles([[0.0, 0], [5 + p["x0"], 0]], mass=[1, p["m"]], pinned=[0]), [link], iterations=3, precision="f64")
+    errors = [abs(rerun(w, p["T"], substeps=n).position[1, 0] - 5 - want["x_T"]) for n in (10, 20, 40)]
+    assert 1.9 <= order(errors) <= 2.1 and errors[1] <= 1e-4
+
+
+def test_compliance_does_not_damp(world):
+    # R04b: backward Euler (XPBD) keeps 0.7 % of the amplitude in these 1000 steps.
+    link = tv.Distance([[0, 1]], rest=2.0, compliance=0.01)
+    w = world(tv.Particles([[0.0, 0], [2.5, 0]], pinned=[0]), [link], substeps=10, iterations=3, precision="f64")
+    largest = 0.0
+    for k in range(100):
+        w.step(0.1)
+        if k >= 90:
+            largest = max(largest, abs(w.position[1, 0] - 2))
+    assert w.last.energy == pytest.approx(0.5 * 100 * 0.5**2, rel=5e-3) and largest <= 0.5 * (1 + 1e-2)
+
+
+def test_ropes_pull_and_spacers_push(world):
+    # A rope lets its end fall freely until it is taut, then stops it; after that it swings as a rigid link does.
+    rope = tv.Rope([[0, 1]], length=1.0)
+    w = world(tv.Particles([[0, 0], [0.0, -0.5]], pinned=[0]), [tv.Gravity(9.81), rope], substeps=100, precision="f64")
+    w.run(0.3, dt=0.01)
+    assert w.position[1, 1] == pytest.approx(-0.5 - 9.81 * 0.3**2 / 2, rel=1e-12)
+    w.run(1.0, dt=0.01)
+    assert w.position[1, 1] == pytest.approx(-1.0, abs=1e-6) and rope.load[0] == pytest.approx(9.81, rel=1e-3)
+    swings = [
+        world(tv.Particles([[0, 0], [1.0, 0]], pinned=[0]), [tv.Gravity(9.81), f], substeps=20, precision="f64")
+        for f in (tv.Rope([[0, 1]]), tv.Distance([[0, 1]]))
+    ]
+    for s in swings:
+        s.run(1.0)
+    np.testing.assert_allclose(swings[0].position, swings[1].position, atol=1e-9)
+    spacer = tv.Spacer([[0, 1]], 1.0)
+    w = world(tv.Particles([[0, 0], [0.0, 2.0]], pinned=[0]), [tv.Gravity(9.81), spacer], substeps=50, precision="f64")
+    w.run(2.0)
+    assert w.position[1, 1] == pytest.approx(1.0, abs=1e-5) and spacer.load[0] == pytest.approx(-9.81, rel=1e-3)
+    # A soft rope is a bungee: from rest at its length it falls to twice its static stretch, and comes back.
+    w = world(
+        tv.Particles([[0, 0], [0.0, -1.0]], pinned=[0]), [tv.Gravity(9.81), tv.Rope([[0, 1]], 1.0, compliance=0.01)], substeps=40,
+        iterations=4, precision="f64",
+    )  # fmt: skip
+    low = min(float(w.step(1 / 60) and w.position[1, 1]) for _ in range(120))
+    assert low == pytest.approx(-1 - 2 * 9.81 * 0.01, rel=2e-3)
+    assert w.last.energy == pytest.approx(-9.81, rel=1e-3)
+
+
+def test_rest_lengths_are_live(world):
+    link = tv.Distance([[0, 1]])
+    w = world(tv.Particles([[0, 0], [0, -1.0]], pinned=[0]), [tv.Gravity(9.81), link, tv.Drag(20.0)], precision="f64")
+    w.run(0.5)
+    link.rest = 0.5
+    w.run(2.0)
+    assert w.position[1, 1] == pytest.approx(-0.5, abs=1e-4)
+    with pytest.raises(ValueError, match=r"Distance: rest\[0\] = -1"):
+        link.rest = -1
+
+
+def test_driven_pins_follow_their_targets(world):
+    hand = tv.Pin([0], (0.0, 0.0))
+    w = world(tv.Particles([[0.0, 0], [0, -1]]), [tv.Gravity(9.81), tv.Distance([[0, 1]]), hand], substeps=40, iterations=10, precision="f64")
+    for k in range(60):
+        hand.target = [[0.01 * (k + 1), 0.0]]
+        w.step(1 / 60)
+        np.testing.assert_allclose(w.position[0], [0.01 * (k + 1), 0.0], atol=1e-15)
+    # Row 69: ten metres in one frame. It stays bounded, the link recovers, and the work done is reported.
+    hand.target = (10.0, 0.0)
+    report = w.step(1 / 60)
+    assert report.energy_change > 1e3 and np.isfinite(w.position).all()
+    w.run(1.0)
+    assert w.last.residual < 1e-3 and np.abs(w.position - [10.0, 0]).max() <= 1.1
+
+
+def test_soft_pins_are_springs(world):
+    # m x'' = -k (x - target): like the oscillator, along both axes; and it follows a moving target at the static distance.
+    k = 100.0
+    w = world(tv.Particles([[0.5, 0.25]]), [tv.Pin([0], (0.0, 0.0), compliance=1 / k)], iterations=3, precision="f64")
+    want = np.array([0.5, 0.25]) * np.cos(20.0)
+    errors = [rms(rerun(w, 2.0, substeps=n).position[0], want) for n in (10, 20, 40)]
+    assert 1.9 <= order(errors) <= 2.1
+    hand = tv.Pin([0], (0.0, 0.0), compliance=1 / k, damping=20.0)
+    w = world(tv.Particles([[0.0, 0.0]]), [tv.Gravity(9.81), hand], iterations=4, precision="f64")
+    w.run(3.0)
+    np.testing.assert_allclose(w.position[0], [0, -9.81 / k], atol=1e-7)
+
+
+def test_redundant_and_contradictory_links(world):
+    # Row 22: doubled rigid links change nothing once they converge. Row 21: a triangle 1, 1, 3 cannot close.
+    x = np.array([[0, 0], [1.0, 0], [2.0, 0], [3.0, 0]])
+    pairs = np.array([[0, 1], [1, 2], [2, 3]])
+    made = []
+    with pytest.warns(UserWarning, match="duplicates"):
+        doubled = tv.Distance(np.concatenate([pairs, pairs]))
+    for f in (tv.Distance(pairs), doubled):
+        w = world(tv.Particles(x, pinned=[0]), [tv.Gravity(9.81), f], iterations=200, precision="f64")
+        w.run(0.5)
+        made.append(w.position)
+    np.testing.assert_allclose(made[0], made[1], atol=1e-6)
+    links = tv.Distance([[0, 1], [1, 2], [0, 2]], [1.0, 1.0, 3.0])
+    w = world(tv.Particles([[0.0, 0], [1, 0.1], [2.2, 0]]), [links], substeps=50, precision="f64")
+    energies = []
+    for _ in range(2000):  # 1e5 substeps
+        report = w.step(1 / 60)
+        energies.append(report.energy)
+    assert np.isfinite(w.position).all() and energies[-1] <= energies[0] + 1e-6
+    # Least squares with equal weights: all three lie on a line, lengths 4/3, 4/3, 8/3, off by 1/3 each.
+    assert report.residual == pytest.approx(1 / 3, abs=0.02)
+    assert sorted(np.abs(tv.measure.strain(w, [[0, 1], [1, 2], [0, 2]], [1, 1, 3]))) == pytest.approx([1 / 9, 1 / 3, 1 / 3], abs=0.02)
+
+
+def test_over_constrained_and_hub(world):
+    # Row 23: ten particles, all 45 distances; angular momentum stays. Row 24: a thousand links on one particle.
+    rng = np.random.default_rng(3)
+    x = rng.normal(size=(10, 3))
+    x -= x.mean(axis=0)
+    v = np.cross([0.0, 0.0, 1.0], x)
+    pairs = np.array([(i, j) for i in range(10) for j in range(i)])
+    w = world(tv.Particles(x, velocity=v), [tv.Distance(pairs)], iterations=20, precision="f64")
+    start = tv.measure.angular_momentum(w)
+    w.run(2.0)
+    np.testing.assert_allclose(tv.measure.angular_momentum(w), start, rtol=1e-3)
+    assert w.last.residual < 1e-4
+    a = 2 * np.pi * tv.golden(np.arange(1000))
+    star = np.concatenate([[[0.0, 0.0]], np.stack([np.cos(a), np.sin(a)], axis=1)])
+    spokes = np.stack([np.zeros(1000, dtype=int), np.arange(1, 1001)], axis=1)
+    w = world(tv.Particles(star, velocity=rng.normal(size=(1001, 2))), [tv.Distance(spokes)], precision="f64")
+    report = w.run(5.0)
+    assert np.isfinite(w.position).all() and report.energy <= 1001 * 1.1 and w.last.residual < 0.1
