@@ -45,7 +45,10 @@ def build(discs: int = 360, **settings) -> Scene:
     pairs, _ = tv.measure.overlapping(position, radius * 1.02)
     keep[[j for i, j in pairs if i < 65 <= j]] = False
     particles = tv.Particles(
-        position[keep], radius=radius[keep], mass=300 * np.pi * radius[keep] ** 2, pinned=[0, 50, on_chain.start]
+        position[keep],
+        radius=radius[keep],
+        mass=300 * np.pi * radius[keep] ** 2,
+        pinned=[0, 50, on_chain.start],
     )
     hand = tv.Pin([64], _path(0.0), compliance=2e-5, damping=200.0)
     links = both.links

@@ -77,7 +77,8 @@ def test_a_flat_scene_is_the_same_in_3d(world):
         flat[:, :2], fast[:, :2] = x, v
         links = tv.Distance(pairs, rest, compliance=alpha, damping=damping)
         w = world(
-            tv.Particles(flat, velocity=fast, mass=m, radius=0.2), [tv.Gravity(9.81), links, tv.Contact(), tv.HalfSpace([0, 1, 0][:dim], -2)],
+            tv.Particles(flat, velocity=fast, mass=m, radius=0.2),
+            [tv.Gravity(9.81), links, tv.Contact(), tv.HalfSpace([0, 1, 0][:dim], -2)],
             precision="f64",
         )  # fmt: skip
         w.run(0.5)
@@ -91,7 +92,13 @@ def test_motion_is_reversible(world):
     n = 6
     k = np.arange(n - 1)
     start = tv.Particles(np.stack([np.arange(n) * 0.3, np.zeros(n)], axis=1), pinned=[0])
-    w = world(start, [tv.Gravity(9.81), tv.Distance(np.stack([k, k + 1], 1))], substeps=25, iterations=600, precision="f64")
+    w = world(
+        start,
+        [tv.Gravity(9.81), tv.Distance(np.stack([k, k + 1], 1))],
+        substeps=25,
+        iterations=600,
+        precision="f64",
+    )
     w.step(1 / 60)
     begin = w._memory.state()
     for _ in range(12):
@@ -121,7 +128,14 @@ def test_splitting_a_run_changes_nothing(world):
 def test_clones_go_on_alike(world, precision):
     x, v, m, pairs, rest, alpha, damping = net(3, seed=5)
     hand = tv.Pin([0], (0.0, 0.0, 0.0), compliance=1e-3)
-    features = [tv.Gravity(9.81), tv.Drag(0.1), tv.Distance(pairs, rest, compliance=alpha), hand, tv.Contact(), tv.HalfSpace((0, 1, 0), -3)]
+    features = [
+        tv.Gravity(9.81),
+        tv.Drag(0.1),
+        tv.Distance(pairs, rest, compliance=alpha),
+        hand,
+        tv.Contact(),
+        tv.HalfSpace((0, 1, 0), -3),
+    ]
     w = world(tv.Particles(x, velocity=v, mass=m, radius=0.3), features, precision=precision)
     w.run(0.2)
     twin = w.clone()

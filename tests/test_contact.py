@@ -28,11 +28,19 @@ def clouds():
     yield "mixed radii", rng.uniform(-5, 5, (500, 2)), rng.choice([0.0, 0.02, 0.1, 1.0], 500)
     yield "negative", rng.uniform(-900, -890, (400, 3)), rng.uniform(0.1, 0.4, 400)
     yield "one cell", rng.uniform(0, 0.1, (1000, 2)), 0.5
-    yield "lattice on cell borders", np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0)), -1).reshape(-1, 2), 0.5
+    yield (
+        "lattice on cell borders",
+        np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0)), -1).reshape(-1, 2),
+        0.5,
+    )
     # Spacing that folds everything onto the same few buckets: clusters at multiples of large powers of two of the cell.
     far = rng.integers(-40, 40, (500, 2)) * 64.0 * 1.1 + rng.normal(size=(500, 2)) * 0.4
     yield "one bucket", far, 0.5
-    yield "far outliers", np.concatenate([rng.uniform(-1, 1, (300, 3)), [[1e5, -1e5, 3e5], [1e5, -1e5, 3e5 + 0.3]]]), 0.1
+    yield (
+        "far outliers",
+        np.concatenate([rng.uniform(-1, 1, (300, 3)), [[1e5, -1e5, 3e5], [1e5, -1e5, 3e5 + 0.3]]]),
+        0.1,
+    )
     yield "two", np.array([[0.0, 0], [0.5, 0]]), 0.3
 
 
@@ -74,7 +82,11 @@ def test_a_list_that_is_too_small_grows_and_nothing_is_lost(world, path):
     position = rng.uniform(-1, 1, (200, 2))
     hashes = []
     for capacity in (1, 100_000):
-        w = world(tv.Particles(position, radius=0.1), [tv.Gravity(9.81), tv.Contact(), tv.Box((-1.2, -1.2), (1.2, 3))], path=path)
+        w = world(
+            tv.Particles(position, radius=0.1),
+            [tv.Gravity(9.81), tv.Contact(), tv.Box((-1.2, -1.2), (1.2, 3))],
+            path=path,
+        )
         w._grid.allocate(capacity)
         w._renew()
         w.run(0.2)
@@ -88,7 +100,10 @@ def test_the_skin_changes_no_bit(world):
     position = rng.uniform(0, 4, (300, 2))
     hashes = set()
     for skin in ("auto", 0.001, 0.3):
-        w = world(tv.Particles(position, radius=0.08), [tv.Gravity(9.81), tv.Contact(skin=skin), tv.Box((0, 0), (4, 8))])
+        w = world(
+            tv.Particles(position, radius=0.08),
+            [tv.Gravity(9.81), tv.Contact(skin=skin), tv.Box((0, 0), (4, 8))],
+        )
         w.run(0.5)
         hashes.add(w.hash())
     assert len(hashes) == 1
@@ -98,7 +113,11 @@ def test_a_heap_comes_to_rest_without_overlap(world):
     n = 150
     spots = tv.golden(np.arange(n), dim=2) * [3.0, 6.0] + [0.2, 0.2]
     radius = 0.06 + 0.1 * tv.golden(np.arange(n))
-    w = world(tv.Particles(spots, radius=radius, mass=radius**2), [tv.Gravity(9.81), tv.Contact(), tv.Box((0, 0), (3.4, 9))], substeps=40)
+    w = world(
+        tv.Particles(spots, radius=radius, mass=radius**2),
+        [tv.Gravity(9.81), tv.Contact(), tv.Box((0, 0), (3.4, 9))],
+        substeps=40,
+    )
     w.run(4.0)
     assert w.last.overlap < 0.02 and w.last.contacts > n
     x, r = w.position, radius[:, None]
@@ -125,7 +144,12 @@ def test_momentum_in_collisions(world):
 def test_coincident_particles_part_gently(world, count, dim):
     # Row 16: a direction made from the indices, equal and opposite. Row 48: at push_out, whatever the depth.
     speed = 0.25
-    w = world(tv.Particles(np.zeros((count, dim)), radius=0.01), [tv.Contact(push_out=speed)], precision="f64", substeps=5)
+    w = world(
+        tv.Particles(np.zeros((count, dim)), radius=0.01),
+        [tv.Contact(push_out=speed)],
+        precision="f64",
+        substeps=5,
+    )
     made = []
     for _ in range(2):
         w.position, w.velocity = np.zeros((count, dim)), np.zeros((count, dim))
@@ -144,7 +168,12 @@ def test_coincident_particles_part_gently(world, count, dim):
 
 def test_deep_overlap_leaves_at_no_more_than_push_out(world):
     for speed in (0.5, 1.0):
-        w = world(tv.Particles([[0.0, 0], [0.05, 0]], radius=0.1), [tv.Contact(push_out=speed)], substeps=10, precision="f64")
+        w = world(
+            tv.Particles([[0.0, 0], [0.05, 0]], radius=0.1),
+            [tv.Contact(push_out=speed)],
+            substeps=10,
+            precision="f64",
+        )
         w.run(1.0)
         apart = w.velocity[1] - w.velocity[0]
         assert 0.9 * speed <= apart[0] <= speed * (1 + 1e-12) and w.position[1, 0] - w.position[0, 0] >= 0.2 - 1e-12
@@ -156,7 +185,9 @@ def test_deep_overlap_leaves_at_no_more_than_push_out(world):
 
 def test_linked_particles_do_not_touch(world):
     w = world(
-        tv.Particles([[0.0, 0], [0.1, 0], [0.25, 0]], radius=0.1), [tv.Distance([[0, 1]]), tv.Contact()], precision="f64"
+        tv.Particles([[0.0, 0], [0.1, 0], [0.25, 0]], radius=0.1),
+        [tv.Distance([[0, 1]]), tv.Contact()],
+        precision="f64",
     )
     w.run(0.5)
     assert np.linalg.norm(w.position[0] - w.position[1]) == pytest.approx(0.1, abs=1e-6)
@@ -167,8 +198,8 @@ def test_a_column_obeys_the_overlap_law(world):
     # R21: one mass-split pass per substep acts like springs m / (4 h^2): the k-th contact from the top overlaps by 4 k g h^2.
     n, h = 10, 1 / 600
     x = np.stack([np.full(n, 0.5), 0.5 + np.arange(n) * 1.0], axis=1)
-    w = world(tv.Particles(x, radius=0.5), [tv.Gravity(9.81), tv.Drag(8.0), tv.Contact(), tv.Box((0, 0), (1, np.inf))], substeps=10,
-              precision="f64")  # fmt: skip
+    features = [tv.Gravity(9.81), tv.Drag(8.0), tv.Contact(), tv.Box((0, 0), (1, np.inf))]
+    w = world(tv.Particles(x, radius=0.5), features, substeps=10, precision="f64")
     w.run(6.0)
     overlap = 1 - np.diff(w.position[:, 1])
     k = np.arange(n - 1, 0, -1)
@@ -181,8 +212,8 @@ def test_a_column_obeys_the_overlap_law(world):
 
 def test_idle_columns_do_not_creep(world):
     # Row 43: 1e5 substeps at rest on the floor.
-    w = world(tv.Particles([[0.5, 0.5], [0.5, 1.499]], radius=0.5), [tv.Gravity(9.81), tv.Drag(1.0), tv.Contact(), tv.Box((0, 0), (1, 9))],
-              substeps=20)  # fmt: skip
+    features = [tv.Gravity(9.81), tv.Drag(1.0), tv.Contact(), tv.Box((0, 0), (1, 9))]
+    w = world(tv.Particles([[0.5, 0.5], [0.5, 1.499]], radius=0.5), features, substeps=20)
     w.run(20.0)
     before = w.position
     w.substeps = 200

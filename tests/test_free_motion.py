@@ -15,7 +15,10 @@ def test_free_fall_is_exact_for_any_step(world, name, dim):
     # y = y0 + v0 t - g t^2 / 2 at every step of position Verlet with half a kick at the start.
     p, want = case(name)["params"], case(name)["values"]
     w = world(
-        tv.Particles([[0, p["y0"], 0][:dim]], velocity=[0, p["v0"], 0][:dim]), [tv.Gravity(p["g"])], substeps=1, precision="f64"
+        tv.Particles([[0, p["y0"], 0][:dim]], velocity=[0, p["v0"], 0][:dim]),
+        [tv.Gravity(p["g"])],
+        substeps=1,
+        precision="f64",
     )
     for _ in range(p["steps"]):
         w.step(p["dt"])
@@ -32,7 +35,12 @@ def test_projectile(world):
     p, want = case("R02_projectile")["params"], case("R02_projectile")["values"]
     e, a = np.radians(p["elevation_deg"]), np.radians(p["azimuth_deg"])
     v = p["speed"] * np.array([np.cos(e) * np.cos(a), np.sin(e), np.cos(e) * np.sin(a)])
-    w = world(tv.Particles([[0, p["y0"], 0]], velocity=v), [tv.Gravity((0, -p["g"], 0))], substeps=7, precision="f64")
+    w = world(
+        tv.Particles([[0, p["y0"], 0]], velocity=v),
+        [tv.Gravity((0, -p["g"], 0))],
+        substeps=7,
+        precision="f64",
+    )
     for _ in range(20):
         w.step(want["t_flight"] / 20)
     np.testing.assert_allclose(w.position[0], [want["x_end"], 0, want["z_end"]], atol=1e-11)
@@ -73,7 +81,12 @@ def test_f32_free_fall_keeps_six_digits(world):
 
 
 def test_f32_compensated_falls_far_from_the_origin_in_tiny_steps(world):
-    w = world(tv.Particles([[0.0, 1000.0], [-1000.0, 1000.0]]), [tv.Gravity(9.81)], substeps=100, precision="f32-compensated")
+    w = world(
+        tv.Particles([[0.0, 1000.0], [-1000.0, 1000.0]]),
+        [tv.Gravity(9.81)],
+        substeps=100,
+        precision="f32-compensated",
+    )
     w.run(1.0, dt=0.01)  # h = 1e-4
     drop = 9.81 / 2
     assert np.abs(w.position[:, 1] - 1000 + drop).max() <= 1e-6 * drop  # asked: 1e-3
@@ -145,7 +158,12 @@ def test_forces_that_read_velocities_are_second_order(world):
     exact = (np.exp(a * t) - 1) / a  # z' = a z, z'(0) = 1, z = x + i y
     errors = []
     for substeps in (4, 8, 16, 32):
-        w = world(tv.Particles([[0.0, 0.0]], velocity=(1, 0)), [tv.Force(lorentz)], substeps=substeps, precision="f64")
+        w = world(
+            tv.Particles([[0.0, 0.0]], velocity=(1, 0)),
+            [tv.Force(lorentz)],
+            substeps=substeps,
+            precision="f64",
+        )
         w.run(t, dt=1 / 16)
         errors.append(abs(complex(*w.position[0]) - exact))
     assert 1.9 <= order(errors) <= 2.1 and errors[-1] < 2e-5

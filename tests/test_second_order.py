@@ -43,7 +43,11 @@ def test_pendulum_in_f32_stays_near_f64(world, precision):
     v = case("R06b_pendulum_state")["values"]["90deg_t10"]
     made = []
     for p in (precision, "f64"):
-        w = world(tv.Particles([[0, 0], [1.0, 0]], pinned=[0]), [tv.Gravity(9.81), tv.Distance([[0, 1]])], precision=p)
+        w = world(
+            tv.Particles([[0, 0], [1.0, 0]], pinned=[0]),
+            [tv.Gravity(9.81), tv.Distance([[0, 1]])],
+            precision=p,
+        )
         made.append(rerun(w, 10.0, substeps=10).position)
     assert rms(made[0][1], [v["x"], v["y"]]) <= 3e-4
     assert rms(made[0], made[1]) <= 2e-4  # row 68: the floor of f32, numerics 4.6
@@ -136,7 +140,13 @@ def test_a_free_rod_spins_for_ever(world, omega, h, t, dim):
     # Row 44 and S09: PBD's direction loses 60 to 76 % of the spin in these times.
     x = np.array([[0.25, 0, 0], [-0.75, 0, 0]])[:, :dim]
     v = np.array([[0, 0.25 * omega, 0], [0, -0.75 * omega, 0]])[:, :dim]
-    w = world(tv.Particles(x, velocity=v, mass=[3.0, 1.0]), [tv.Distance([[0, 1]])], substeps=10, iterations=3, precision="f64")
+    w = world(
+        tv.Particles(x, velocity=v, mass=[3.0, 1.0]),
+        [tv.Distance([[0, 1]])],
+        substeps=10,
+        iterations=3,
+        precision="f64",
+    )
     w.step(10 * h)
     turn = []
     for _ in range(2):

@@ -2,16 +2,18 @@
 
 import math
 import numbers
+from typing import Any
 
 import numpy as np
 
 
-def number(who: str, name: str, value, *, above=None, least=None, most=None, below=None) -> float:
+def number(who: str, name: str, value: Any, *, above=None, least=None, most=None, below=None) -> float:
     """A finite real number within the bounds given."""
-    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (numbers.Real, np.generic, np.ndarray)):
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (numbers.Real, np.ndarray)):
         raise TypeError(f"{who}: {name} = {value!r} is a {type(value).__name__}, but a number is needed.")
-    if np.ndim(value) or np.asarray(value).dtype.kind not in "iuf":
-        raise TypeError(f"{who}: {name} has shape {np.shape(value)}, but one real number is needed.")
+    array = np.asarray(value)
+    if array.ndim or array.dtype.kind not in "iuf":
+        raise TypeError(f"{who}: {name} has shape {array.shape}, but one real number is needed.")
     value = float(value)
     if not math.isfinite(value):
         raise ValueError(f"{who}: {name} = {value}, but it must be finite.")

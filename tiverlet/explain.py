@@ -52,9 +52,11 @@ def _present(world: "World") -> list[str]:
             out.append(f"{f!r}: in the loop over particles")
         elif isinstance(f, Wall):
             out.append(f"{f!r}: in the loop over particles, last")
+        elif world._grid:
+            grid = world._grid
+            out.append(f"{f!r}: grid of {grid.cell:.3g} m cells, neighbour list with a skin of {grid.skin:.3g} m")
         else:
-            out.append(f"{f!r}: grid of {world._grid.cell:.3g} m cells, list with a skin of {world._grid.skin:.3g} m" if world._grid
-                       else f"{f!r}: nothing, since all radii are 0")  # fmt: skip
+            out.append(f"{f!r}: nothing, since all radii are 0")
     return out or ["motion in a straight line"]
 
 
@@ -67,7 +69,10 @@ def _absent(world: "World") -> list[str]:
         (not sub.accelerations, "accelerations: no force"),
         (not sub.decays, "exponential drag: no Drag or Wind"),
         (not sub.uses_velocity, "second displacement: no force reads velocities"),
-        (not any(getattr(b, "soft", False) for b in sub.batches), "compliance and its history: every constraint is rigid"),
+        (
+            not any(getattr(b, "soft", False) for b in sub.batches),
+            "compliance and its history: every constraint is rigid",
+        ),
         (sub.radius is None or sub.radius.uniform, "field of radii: all are equal or none is needed"),
         (world.precision != "f32-compensated", "low words of positions: precision is not f32-compensated"),
     ]

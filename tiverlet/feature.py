@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from .particles import Particles, Radii, State
+from .particles import Particles, State
 from .runtime import Memory
 
 
@@ -33,7 +33,7 @@ class Scene:
     state: State
     particles: Particles
     inv_mass: np.ndarray  # (n,) after pins: 0 means that constraints cannot move it
-    radius: Radii | None = None  # where something asks for radii
+    radius: Any = None  # where something asks for radii
     slots: Any = None  # where constraints leave their moves
     hh: float = 0.0  # [s^2] what an acceleration added to the displacement in the last substep, see Batch.relax
 
@@ -63,7 +63,7 @@ class Knob:
     def __set_name__(self, owner, name: str) -> None:
         self.name = name
 
-    def __get__(self, feature, owner=None):
+    def __get__(self, feature, owner=None) -> Any:
         return self if feature is None else feature.__dict__[self.name]
 
     def __set__(self, feature, value) -> None:
@@ -76,10 +76,13 @@ class Feature:
 
     changed = True
     moving = False
-    scene: Scene | None = None
+    scene: Any = None  # Scene, from bind() on
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the arguments against the particles; set inv_mass to 0 for those that this feature holds."""
+
+    def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Warn of what makes no sense, once it is settled which particles can move."""
 
     def bind(self, scene: Scene) -> None:
         """Declare fields with scene.memory.field(...). Called once, when the world is built."""
@@ -137,6 +140,7 @@ class Batch(Feature):
     """
 
     arity = 0
+    soft = False  # has springs, which act at a start
     drives = False  # puts its particles in place instead of relaxing them
     indices: np.ndarray  # (m, arity)
 
@@ -151,9 +155,7 @@ class Batch(Feature):
         self._on_state = scene.state
         self._on_slots = scene.slots
         self._on_w = scene.state.w
-        self._on_members = scene.memory.field(
-            f"{self!r}.members", self.count, width=self.arity, kind=ti.i32, values=self.indices
-        )
+        self._on_members = scene.memory.field(f"{self!r}.members", self.count, width=self.arity, kind=ti.i32, values=self.indices)
         if not self.drives:
             self._on_places = scene.memory.field(
                 f"{self!r}.slots", self.count, width=self.arity, kind=ti.i32, values=scene.slots.places(self)
@@ -202,6 +204,7 @@ class Wall(Feature):
     """
 
     push_out = 1.0
+    _on_state: State
 
     @ti.func
     def confine(self, i, radius, h, when):

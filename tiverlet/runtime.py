@@ -23,6 +23,7 @@ import taichi as ti
 from taichi.lang import impl
 
 ARCHITECTURES = ("cpu", "cuda", "metal", "vulkan")
+GROUP = 16  # fields that one transfer kernel serves; Taichi unrolls the loop over them
 MAX_TREES = 400  # Taichi holds at most 511 trees of fields and does not check; the rest is left to the user's own fields.
 
 _started: dict = {}  # what init() was asked for, and by which process and thread
@@ -55,7 +56,7 @@ def init(arch: str = "cpu", threads: int | None = None, debug: bool = False, see
     if arch != "cpu" and not _available(arch):
         offer = ", ".join(repr(a) for a in ARCHITECTURES if a == "cpu" or _available(a))
         raise RuntimeError(f'init: arch "{arch}" is not available on this machine. Available: {offer}.')
-    options = {} if threads is None else {"cpu_max_num_threads": threads}
+    options: dict[str, Any] = {} if threads is None else {"cpu_max_num_threads": threads}
     with contextlib.redirect_stdout(io.StringIO()):  # ti.init prints its banner whatever the log level
         ti.init(
             arch=getattr(ti, arch), default_fp=ti.f32, fast_math=False, debug=debug, random_seed=seed,
@@ -65,24 +66,23 @@ def init(arch: str = "cpu", threads: int | None = None, debug: bool = False, see
         found = architecture()
         ti.reset()
         raise RuntimeError(f'init: arch "{arch}" was asked for, but Taichi started "{found}". Use tv.init(arch="cpu").')
-    _started.update(wanted=wanted)
-    _adopt()
+    _adopt(wanted)
 
 
 def architecture() -> str:
     """The architecture that Taichi runs on, by the names of init()."""
-    name = str(ti.cfg.arch).rsplit(".", 1)[-1]
+    name = str(_config().arch).rsplit(".", 1)[-1]
     return "cpu" if name in ("x64", "arm64") else name
 
 
 def threads() -> int:
     """The number of CPU threads that Taichi may use."""
-    return int(ti.cfg.cpu_max_num_threads)
+    return int(_config().cpu_max_num_threads)
 
 
 def fast_math() -> bool:
     """Whether the running Taichi may reorder arithmetic; tiverlet's own start says no."""
-    return bool(ti.cfg.fast_math)
+    return bool(_config().fast_math)
 
 
 def ensure_started() -> None:
@@ -100,16 +100,22 @@ def ensure_started() -> None:
         raise RuntimeError("A World must be built in the thread that started Taichi; stepping it elsewhere is fine.")
 
 
+def _config() -> Any:
+    return ti.cfg
+
+
 def _available(arch: str) -> bool:
     with contextlib.suppress(Exception):
-        return bool(getattr(ti._lib.core, f"with_{arch}")())
+        library: Any = ti._lib
+        return bool(getattr(library.core, f"with_{arch}")())
     return False
 
 
-def _adopt() -> None:
+def _adopt(wanted: dict | None = None) -> None:
+    """Remember the running Taichi, and what it was asked for if it was started here."""
     global _trees
     _trees = 0
-    _started.update(runtime=impl.get_runtime(), pid=os.getpid(), thread=threading.get_ident())
+    _started.update(runtime=impl.get_runtime(), pid=os.getpid(), thread=threading.get_ident(), wanted=wanted)
 
 
 @contextlib.contextmanager
@@ -152,6 +158,11 @@ class Memory:
     """
 
     def __init__(self, real):
+        if _trees >= MAX_TREES:
+            raise RuntimeError(
+                f"{_trees} worlds are alive, and Taichi crashes near 512. Close worlds that you no longer need: "
+                "world.close(), or `with tv.World(...) as world:`."
+            )
         self.real = real
         self.entries: list[Entry] = []
         self._later: list[tuple[Entry, np.ndarray]] = []
@@ -160,7 +171,7 @@ class Memory:
         self._runtime = impl.get_runtime()
         self._transfers: dict[tuple, _Transfer] = {}  # compiled once, since that costs more than running them
 
-    def field(self, name: str, length: int | None, *, width: int = 0, kind=None, values=None, state: bool = False):
+    def field(self, name: str, length: int | None, *, width: int = 0, kind=None, values=None, state: bool = False) -> Any:
         """Declare a field of `length` elements (None: a single one, of 0 dimensions) and give it its first values."""
         kind = self.real if kind is None else kind
         made = ti.Vector.field(width, kind) if width else ti.field(kind)
@@ -170,32 +181,26 @@ class Memory:
             self._builder.dense(ti.i, max(1, length)).place(made)  # a field of 0 elements poisons the runtime
         same = sum(e.name == name or e.name.startswith(f"{name} #") for e in self.entries)
         name = f"{name} #{same + 1}" if same else name  # two batches of a kind
-        entry = Entry(name, made, width, length or 0, np.dtype(_NUMPY[kind]), state)
+        entry = Entry(name, made, width, 0 if length is None else max(1, length), np.dtype(_NUMPY[kind]), state)
         self.entries.append(entry)
-        if values is not None:
+        if values is not None and np.size(values):
             self._later.append((entry, np.asarray(values, dtype=np.float64)))
         return made
 
     def place(self) -> None:
         """Allocate what was declared and write the first values (everything else is zero)."""
         global _trees
-        if not self.entries:
-            return
-        if _trees >= MAX_TREES:
-            raise RuntimeError(
-                f"{_trees} worlds are alive, and Taichi crashes near 512. Close worlds that you no longer need: "
-                "world.close(), or `with tv.World(...) as world:`."
-            )
         self._tree = self._builder.finalize()
         _trees += 1
         if self._later:
             self._load([entry for entry, _ in self._later], [values for _, values in self._later])
             self._later.clear()
 
-    @property
-    def closed(self) -> bool:
-        """Whether the fields are gone."""
-        return self._tree is None
+    def abandon(self) -> None:
+        """Give up before place(): a builder that is never finished would poison everything that Taichi does later."""
+        if self._tree is None:
+            self.field("abandoned", None)
+            self._builder.finalize().destroy()
 
     def check(self) -> None:
         """Raise RuntimeError when the fields are gone or belong to a runtime that is."""
@@ -219,7 +224,8 @@ class Memory:
     def write(self, field, values) -> None:
         """Overwrite a whole field."""
         self.check()
-        self._load([self._find(field)], [np.asarray(values, dtype=np.float64)])
+        if np.size(values):
+            self._load([self._find(field)], [np.asarray(values, dtype=np.float64)])
 
     def read(self, field) -> np.ndarray:
         """A copy of a whole field, in its own type."""
@@ -245,20 +251,27 @@ class Memory:
 
     def _load(self, entries: list[Entry], arrays: list[np.ndarray]) -> None:
         # Every number that we hold (f32, f64, i32) is exact in f64, so one kernel and one flat array serve all.
-        flat = np.concatenate([np.broadcast_to(a, _shape(e)).ravel() for e, a in zip(entries, arrays, strict=True)])
-        self._transfer(entries).load(np.ascontiguousarray(flat, dtype=np.float64))
+        for k in range(0, len(entries), GROUP):
+            some = entries[k : k + GROUP]
+            parts = [np.broadcast_to(a, _shape(e)).ravel() for e, a in zip(some, arrays[k : k + GROUP], strict=True)]
+            self._transfer(some).load(np.concatenate(parts).astype(np.float64))
+
+    def _dump(self, entries: list[Entry]) -> list[np.ndarray]:
+        out = []
+        for k in range(0, len(entries), GROUP):
+            some = entries[k : k + GROUP]
+            sizes = [e.bytes // e.kind.itemsize for e in some]
+            flat = np.empty(sum(sizes), dtype=np.float64)
+            self._transfer(some).dump(flat)
+            parts = np.split(flat, np.cumsum(sizes)[:-1])
+            out += [p.astype(e.kind).reshape(_shape(e)) for p, e in zip(parts, some, strict=True)]
+        return out
 
     def _transfer(self, entries: list[Entry]) -> "_Transfer":
         key = tuple(id(e) for e in entries)
-        return self._transfers.setdefault(key, _Transfer(entries))
-
-    def _dump(self, entries: list[Entry]) -> list[np.ndarray]:
-        sizes = [e.bytes // e.kind.itemsize for e in entries]
-        flat = np.empty(max(1, sum(sizes)), dtype=np.float64)
-        if entries:
-            self._transfer(entries).dump(flat)
-        parts = np.split(flat[: sum(sizes)], np.cumsum(sizes)[:-1]) if entries else []
-        return [p.astype(e.kind).reshape(_shape(e)) for p, e in zip(parts, entries, strict=True)]
+        if key not in self._transfers:
+            self._transfers[key] = _Transfer(entries)
+        return self._transfers[key]
 
 
 _NUMPY = {ti.f32: np.float32, ti.f64: np.float64, ti.i32: np.int32}
@@ -273,8 +286,7 @@ class _Transfer:
     """Kernels between a list of fields and one flat f64 array."""
 
     def __init__(self, entries: list[Entry]):
-        offset = 0
-        self.plan = []
+        offset, self.plan = 0, []
         for e in entries:
             self.plan.append((e.field, e.field.dtype, max(1, e.length), e.width, bool(e.length), offset))
             offset += e.bytes // e.kind.itemsize

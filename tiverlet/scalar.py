@@ -1,6 +1,7 @@
 """Constraints that are one number, C = f - rest: what all of them share, from soft to rigid."""
 
 import warnings
+from typing import Any
 
 import numpy as np
 import taichi as ti
@@ -23,12 +24,13 @@ class Scalar(Batch):
     The direction is that at the start of the step, x_n (SHAKE, Ryckaert 1977): second order and no loss of energy. When a
     constraint turns by more than 41 degrees in a step, or has no direction at x_n, the current direction takes its place.
 
-    In the first substep after a start (`fresh`) the force acts for half a kick, alpha' = alpha / (h^2 / 2), and C* starts from C_n.
+    In the first substep after a start (`fresh`) the force acts for half a kick, alpha' = alpha / (h^2 / 2), and C* is made of
+    C_(n+1) and C_n.
     With drag, alpha' = alpha / (phi h^2) with the factor phi that the exact solution gives every other acceleration.
     """
 
     side = 0  # 0: C = 0;  1: C <= 0, pulls when f > rest;  -1: C >= 0, pushes when f < rest
-    rest: np.ndarray
+    rest: Any  # a Knob in each constraint: (m,) array
     compliance: np.ndarray
     damping: np.ndarray
 
@@ -58,6 +60,23 @@ class Scalar(Batch):
                 self.__dict__["rest"] = self.rest_of(particles.position)
             else:
                 self.rest = self._rest_given
+
+    def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Warn of constraints that are violated between particles that cannot move."""
+        stuck = (inv_mass[self.indices] == 0).all(axis=1)
+        if stuck.any():
+            C = self.rest_of(particles.position) - self.rest
+            wrong = stuck & (
+                np.abs(C if self.side == 0 else np.maximum(self.side * C, 0)) > 1e-6 * np.maximum(np.abs(self.rest), 1e-6)
+            )
+            if wrong.any():
+                k = int(np.argmax(wrong))
+                at = tuple(int(i) for i in self.indices[k])
+                warnings.warn(
+                    f"{self!r}: {self.index_name}[{k}] = {at} is off by {C[k]:g}, but its particles cannot move "
+                    f"({int(wrong.sum())} such in all). They are skipped.",
+                    stacklevel=3,
+                )
 
     @property
     def soft(self) -> bool:
@@ -159,7 +178,12 @@ class Scalar(Batch):
         turned = both < 0.75 * ti.sqrt(here * there) or there == 0
         if turned:
             n, both = g, here
-        C, A, B, alpha = f - self._on_rest[c], ti.cast(1, self._on_real), ti.cast(0, self._on_real), ti.cast(0, self._on_real)
+        C, A, B, alpha = (
+            f - self._on_rest[c],
+            ti.cast(1, self._on_real),
+            ti.cast(0, self._on_real),
+            ti.cast(0, self._on_real),
+        )
         lam = self._on_lam[c]
         if first != 0:
             lam = 0
@@ -192,7 +216,10 @@ class Scalar(Batch):
 
     @ti.func
     def kick(self, c, h):
-        """h^2 w_j F grad_j C with F = -(1 - theta) (C / alpha + damping dC/dt); rigid links find their force in the next substep."""
+        """h^2 w_j F grad_j C with F = -(1 - theta) (C / alpha + damping dC/dt).
+
+        Rigid links find their force in the next substep.
+        """
         f, g = self.measure(c, self.corners(c, 0))
         force = ti.cast(0, self._on_real)
         if ti.static(self._on_soft):

@@ -18,7 +18,17 @@ SWEEPS = 8  # rounds over the walls, for particles that several of them push
 class Substep:
     """Kernels of one world. `accelerations, batches, walls, drivers` are its features; contact and grid may be None."""
 
-    def __init__(self, scene: Scene, accelerations: list[Acceleration], batches: list[Batch], drivers, contact, grid, walls, parallel: bool):
+    def __init__(
+        self,
+        scene: Scene,
+        accelerations: list[Acceleration],
+        batches: list[Batch],
+        drivers,
+        contact,
+        grid,
+        walls,
+        parallel: bool,
+    ):
         self.parallel = parallel
         self.scene, self.state, self.slots = scene, scene.state, scene.slots
         self.n, self.dim, self.real = scene.particles.count, scene.particles.dim, scene.real
@@ -221,9 +231,7 @@ class Substep:
         return self.is_stale()
 
     @ti.kernel
-    def relaxed(
-        self, h64: ti.f64, s: ti.i32, substeps: ti.i32, first: ti.i32, fresh: ti.i32, final: ti.i32
-    ) -> ti.i32:
+    def relaxed(self, h64: ti.f64, s: ti.i32, substeps: ti.i32, first: ti.i32, fresh: ti.i32, final: ti.i32) -> ti.i32:
         """One pass of phase 3; returns whether the neighbour list is stale."""
         self.relax(ti.cast(h64, self.real), self.clock(s, substeps), first, fresh, final)
         return self.is_stale()
@@ -251,7 +259,7 @@ class Substep:
 
     @ti.func
     def velocity_after(self, i, h, t, bond):
-        """v_n from d_n and the acceleration at x_n: d / h + (h a + bond / h) / 2, or what the exact solution with drag makes of it.
+        """v_n from d_n and the acceleration at x_n: d / h + (h a + bond / h) / 2, or what the solution with drag makes of it.
 
         bond: h^2 times the acceleration by constraints.
         """

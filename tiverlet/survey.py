@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import taichi as ti
@@ -20,10 +21,10 @@ Figures = ti.types.vector(13, ti.f64)
 class StepReport:
     """The frame that world.step() has just finished.
 
-    residual: worst violation of a constraint, relative to its rest value. overlap: of the worst contact, in radii of the smaller
-    particle. contacts: number of overlapping pairs. energy: kinetic and potential energy [J], of what has a potential, half a substep
-    ago; energy_change: since the frame before [J]. bad: index of the first particle whose state is not finite, or None.
-    seconds: what the frame took.
+    residual: worst violation of a constraint, relative to its rest value. overlap: of the worst contact, in radii of the
+    smaller particle. contacts: number of overlapping pairs. energy: kinetic and potential energy [J], of what has a potential,
+    half a substep ago; energy_change: since the frame before [J]. bad: index of the first particle whose state is not finite,
+    or None. seconds: what the frame took.
 
     flags: words for what the user should know; notes: one sentence for each, with the cause and a remedy.
         "non-finite"        a position or displacement is NaN or infinite
@@ -68,7 +69,7 @@ class Survey:
     """The kernel behind a StepReport."""
 
     def __init__(self, substep: Substep):
-        self.sub = substep
+        self.sub: Any = substep
         self.n, self.dim, self.state = substep.n, substep.dim, substep.state
         self.batches = substep.batches
         self.contacts = substep.contacts
@@ -106,8 +107,8 @@ class Survey:
 
     @ti.func
     def energy(self, i, x, scale, back):
-        """Kinetic and potential energy at x - back d, f64; at the middle of a substep, where d / h is the velocity, second order."""
-        d = ti.cast(self.state.d[i], ti.f64)
+        """Kinetic and potential energy at x - back d, f64: second order at the middle of a substep, where d / h is v."""
+        d = self.state.d[i] * ti.cast(1, ti.f64)
         out = ti.cast(0, ti.f64)
         if self.state.w[i] > 0:
             out = 0.5 * scale * scale * d.dot(d)
@@ -133,7 +134,10 @@ class Survey:
     def block(self, b, h, t, when, fresh, begin):
         """One block of particles and constraints. Returns energy, residual, overlap, stiffness, contacts, bad; low, high."""
         figures = ti.Vector([0, 0, 0, 0, 0, 2.0**31], ti.f64)
-        low, high = ti.Vector.zero(ti.f64, self.dim) + ti.math.inf, ti.Vector.zero(ti.f64, self.dim) - ti.math.inf
+        low, high = (
+            ti.Vector.zero(ti.f64, self.dim) + ti.math.inf,
+            ti.Vector.zero(ti.f64, self.dim) - ti.math.inf,
+        )
         scale, back = ti.cast(1, ti.f64), ti.cast(0, self.sub.real)
         if begin == 0:
             scale, back = 1 / ti.cast(h, ti.f64), ti.cast(0.5, self.sub.real)
@@ -196,7 +200,9 @@ class Survey:
             out[7 + k], out[10 + k] = self.low[0][k], self.high[0][k]
         return out
 
-    def report(self, time: float, h: float, substeps: int, iterations: int, fresh: bool, begin: bool) -> tuple[StepReport, np.ndarray]:
+    def report(
+        self, time: float, h: float, substeps: int, iterations: int, fresh: bool, begin: bool
+    ) -> tuple[StepReport, np.ndarray]:
         """The report of a frame (without energy_change), and the size of the bounding box [m]."""
         out = np.array(self.measure(h, time, int(fresh), int(begin)))
         energy, residual, overlap, stiff, contacts, bad, flags = (float(v) for v in out[:7])
@@ -204,12 +210,12 @@ class Survey:
         notes = {}
         first = int(bad) if bad < self.n else None
         if first is not None:
-            notes["non-finite"] = f"The state of particle {first} is not finite (the first of them); go back and use a smaller step."
+            notes["non-finite"] = (
+                f"The state of particle {first} is not finite (the first of them); go back and use a smaller step."
+            )
         reach = float(np.abs([low, high]).max()) if (high >= low).all() else 0.0
         if reach >= self.farthest:
-            notes["out-of-range"] = (
-                f"A coordinate reached {reach:g} m, beyond {self.farthest:g} m, where the precision no longer tells neighbours apart."
-            )
+            notes["out-of-range"] = f"A coordinate reached {reach:g} m, beyond {self.farthest:g} m, where the precision fails."
         if int(flags) & 1:
             notes["tunnelling-risk"] = (
                 "A particle moved by more than its own size in one substep and may have passed another; use more substeps."
@@ -223,6 +229,16 @@ class Survey:
                 f"Use at least {need} substeps."
             )
         done = StepReport(
-            time, substeps, iterations, residual, overlap, int(contacts), energy, 0.0, frozenset(notes), tuple(notes.values()), first
+            time,
+            substeps,
+            iterations,
+            residual,
+            overlap,
+            int(contacts),
+            energy,
+            0.0,
+            frozenset(notes),
+            tuple(notes.values()),
+            first,
         )
         return done, np.where(high >= low, high - low, 0.0)

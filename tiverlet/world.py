@@ -5,6 +5,7 @@ import hashlib
 from collections.abc import Iterable
 from dataclasses import replace
 from time import perf_counter
+from typing import Any, TypeVar
 
 import numpy as np
 import taichi as ti
@@ -19,6 +20,7 @@ from .solvers.jacobi import Jacobi, Slots
 from .substep import Substep, decay
 from .survey import StepReport, Survey
 
+T = TypeVar("T", bound=Feature)
 PRECISIONS = {"f32": ti.f32, "f32-compensated": ti.f32, "f64": ti.f64}
 PATHS = ("auto", "fused", "parallel")
 CROSSOVER = 4000  # particles, constraints or both, from which waking threads pays
@@ -50,6 +52,8 @@ class World:
         inv_mass = particles.inv_mass.copy()
         for feature in self._features:
             feature.prepare(particles, inv_mass)
+        for feature in self._features:
+            feature.review(particles, inv_mass)
         runtime.ensure_started()
         if precision == "f32-compensated" and runtime.fast_math():
             raise ValueError(
@@ -60,35 +64,48 @@ class World:
         self._time, self._tick, self._h = 0.0, 0, 0.0
         self._frame = (0.0, 0.0, 0)  # when frames of the present length began, their length, their number
         self._last: StepReport | None = None
-        self._fresh, self._started = True, False  # d holds velocities; the last substep was the first after a start
+        self._fresh, self._started = (
+            True,
+            False,
+        )  # d holds velocities; the last substep was the first after a start
         self._drag: list[float] | None = None
         self._energy: float | None = None
         self._placed = True  # by the user, and not looked at yet
-        self._build(inv_mass)
+        self._memory = runtime.Memory(PRECISIONS[precision])
+        try:
+            self._build(inv_mass)
+        except BaseException:
+            self._memory.abandon()
+            for feature in self._features:
+                feature.scene = None
+            raise
 
     def _build(self, inv_mass: np.ndarray) -> None:
         """Declare every field in one tree, then place it."""
-        self._memory = memory = runtime.Memory(PRECISIONS[self._precision])
+        memory = self._memory
         state = State(memory, self._particles, inv_mass, self._precision == "f32-compensated")
         scene = Scene(memory, state, self._particles, inv_mass)
-        kinds = {kind: [f for f in self._features if isinstance(f, kind)] for kind in (Acceleration, Batch, Wall, Contact)}
-        drivers = [f for f in kinds[Batch] if f.drives and f.count]
-        batches = [f for f in kinds[Batch] if not f.drives and f.count and (inv_mass[f.indices] > 0).any()]
-        contact = next((c for c in kinds[Contact] if c.matters), None)
-        if contact or kinds[Wall]:
+        accelerations, walls = self._of(Acceleration), self._of(Wall)
+        drivers = [f for f in self._of(Batch) if f.drives and f.count]
+        batches = [f for f in self._of(Batch) if not f.drives and (inv_mass[f.indices] > 0).any()]
+        contact = next((c for c in self._of(Contact) if c.matters), None)
+        if contact or walls:
             scene.radius = Radii(memory, self._particles.radius)
         if batches:
             scene.slots = Slots(memory, state, batches, inv_mass, self._solver)
         parallel = self._path == "parallel"
         self._grid = contact.join(scene, batches, parallel) if contact else None
-        for feature in kinds[Acceleration] + drivers + batches + kinds[Wall]:
+        for feature in [*accelerations, *drivers, *batches, *walls]:
             feature.bind(scene)
         self._scene, self._batches = scene, batches
-        self._sub = Substep(scene, kinds[Acceleration], batches, drivers, contact, self._grid, kinds[Wall], parallel)
+        self._sub = Substep(scene, accelerations, batches, drivers, contact, self._grid, walls, parallel)
         self._survey = Survey(self._sub)
         memory.place()
         if self._grid:
             self._grid.allocate(len(self._particles) * (12 if self._particles.dim == 2 else 32) + 64)
+
+    def _of(self, kind: type[T]) -> list[T]:
+        return [f for f in self._features if isinstance(f, kind)]
 
     # The step.
 
@@ -112,7 +129,10 @@ class World:
             self._scene.hh = self._h**2 * (phi2 if self._started else phi1)
             report = self._look()
         change = report.energy - self._energy  # type: ignore[operator]
-        self._energy, self._last = report.energy, replace(report, energy_change=change, seconds=perf_counter() - clock)
+        self._energy, self._last = (
+            report.energy,
+            replace(report, energy_change=change, seconds=perf_counter() - clock),
+        )
         return self._last
 
     def _pass(self, dt: float) -> None:
@@ -222,7 +242,7 @@ class World:
         """
         seconds = checks.number("World.run", "seconds", seconds, above=0.0)
         dt = checks.number("World.run", "dt", dt, above=0.0)
-        frames: Iterable[int] = range(max(1, round(seconds / dt)))
+        frames: Any = range(max(1, round(seconds / dt)))
         if progress:
             frames = track(frames, description=f"{len(self._particles)} particles")
         worst = None
@@ -298,12 +318,12 @@ class World:
 
     @property
     def precision(self) -> str:
-        """"f32", "f32-compensated" or "f64"."""
+        """ "f32", "f32-compensated" or "f64"."""
         return self._precision
 
     @property
     def path(self) -> str:
-        """"fused" or "parallel"."""
+        """ "fused" or "parallel"."""
         return self._path
 
     @property
@@ -368,7 +388,12 @@ class World:
             memory.restore(state)
         for ours, theirs in zip(self._features, new._features, strict=True):
             theirs.changed, theirs.moving = ours.changed, ours.moving
-        new._fresh, new._started, new._placed, new._energy = self._fresh, self._started, self._placed, self._energy
+        new._fresh, new._started, new._placed, new._energy = (
+            self._fresh,
+            self._started,
+            self._placed,
+            self._energy,
+        )
         return new
 
     def close(self) -> None:

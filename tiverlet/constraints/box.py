@@ -59,7 +59,12 @@ class Box(Wall):
         self._on_state = scene.state
         self._on_corners = [
             scene.memory.field(f"Box.{name}", None, width=self.dim, values=value, state=True)
-            for name, value in (("lower_from", self.lower), ("lower", self.lower), ("upper_from", self.upper), ("upper", self.upper))
+            for name, value in (
+                ("lower_from", self.lower),
+                ("lower", self.lower),
+                ("upper_from", self.upper),
+                ("upper", self.upper),
+            )
         ]
         self._on_aim = (self.lower, self.upper)
         self.changed = False

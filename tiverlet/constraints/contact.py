@@ -36,9 +36,8 @@ class Contact(Feature):
         """Choose the skin, and refuse positions too far out for cells to be told apart."""
         radius = particles.radius
         some = radius[radius > 0]
-        self._on_size = 0.2 * float(np.median(some)) if len(some) else 1.0
-        if self.skin != "auto":
-            self._on_size = self.skin
+        auto = 0.2 * float(np.median(some)) if len(some) else 1.0
+        self._on_size = auto if self.skin == "auto" else float(self.skin)
         ordered = np.sort(radius)[::-1]
         self._on_reach = float(ordered[:2].sum())  # the two largest
         self.matters = self._on_reach > 0

@@ -58,5 +58,8 @@ class HalfSpace(Wall):
     def confine(self, i, radius, h, when):
         """One plane."""
         n, offset = self._on_normal[None], self._on_offset[None]
-        before, now = offset[0] * (1 - when[0]) + offset[1] * when[0], offset[0] * (1 - when[1]) + offset[1] * when[1]
+        before, now = (
+            offset[0] * (1 - when[0]) + offset[1] * when[0],
+            offset[0] * (1 - when[1]) + offset[1] * when[1],
+        )
         self.press(i, now + radius - n.dot(self._on_state.place(i)), n, now - before, h)

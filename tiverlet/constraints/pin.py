@@ -24,8 +24,8 @@ class Pin(Batch):
 
     indices: (m,) particles; target: (m, dim) or (dim,) [m]; None holds them where they start. Live: assign to .target between
     frames, and the particles go there in a straight line during the next frame.
-    compliance: number or (m,) [m/N]. 0 takes the particles out of the solver and drives them, whatever pulls at them; above 0 they
-    are drawn by a spring of stiffness 1 / compliance, as by a mouse. damping: [N s/m], of that spring.
+    compliance: number or (m,) [m/N]. 0 takes the particles out of the solver and drives them, whatever pulls at them; above 0
+    they are drawn by a spring of stiffness 1 / compliance, as by a mouse. damping: [N s/m], of that spring.
     """
 
     arity = 1

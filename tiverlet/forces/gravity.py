@@ -40,9 +40,8 @@ class Gravity(Acceleration):
 
     def upload(self) -> None:
         """Write g."""
-        vector = np.zeros(self.dim)
-        vector[1] = -self.g if np.ndim(self.g) == 0 else 0.0
-        self._on_g[None] = list(vector if np.ndim(self.g) == 0 else self.g)
+        down = [0.0, -1.0, 0.0][: self.dim]
+        self._on_g[None] = [self.g * c for c in down] if np.ndim(self.g) == 0 else list(np.asarray(self.g))
 
     @ti.func
     def acceleration(self, i, x, v, t):

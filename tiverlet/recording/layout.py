@@ -21,14 +21,13 @@ def blueprint(low: np.ndarray, high: np.ndarray) -> rrb.Blueprint:
     if len(low) == 2:
         edge = 0.05 * size.max()
         bounds = rrb.VisualBounds2D(
-            x_range=[float(low[0] - edge), float(high[0] + edge)], y_range=[float(-high[1] - edge), float(-low[1] + edge)]
+            x_range=[float(low[0] - edge), float(high[0] + edge)],
+            y_range=[float(-high[1] - edge), float(-low[1] + edge)],
         )
         view = rrb.Spatial2DView(origin="world", name="Scene", visual_bounds=bounds, background=[18, 20, 26])
     else:
         middle, far = (low + high) / 2, 1.4 * float(np.linalg.norm(size))
-        eye = rrb.EyeControls3D(
-            position=middle + far * np.array([0.45, 0.35, 0.82]), look_target=middle, eye_up=(0.0, 1.0, 0.0)
-        )
+        eye = rrb.EyeControls3D(position=middle + far * np.array([0.45, 0.35, 0.82]), look_target=middle, eye_up=(0.0, 1.0, 0.0))
         view = rrb.Spatial3DView(origin="world", name="Scene", eye_controls=eye, background=[18, 20, 26])
     curves = [rrb.TimeSeriesView(origin=f"figures/{name}", name=title) for name, (title, _) in CURVES.items()]
     side = rrb.Vertical(*curves, rrb.TextDocumentView(origin="about", name="About"), row_shares=[1, 1, 1, 1, 1.4])

@@ -44,7 +44,7 @@ class Recorder:
             raise ValueError(f"Recorder: the folder {folder} does not exist. Make it first: os.makedirs({folder!r}).")
         self.frames = self._calls = 0
         self._worst = None
-        self._stream = rr.RecordingStream(f"tiverlet_{world.particles.dim}d", recording_id=uuid.uuid4())
+        self._stream: Any = rr.RecordingStream(f"tiverlet_{world.particles.dim}d", recording_id=uuid.uuid4())
         self._open()
 
     def __enter__(self) -> "Recorder":
@@ -70,7 +70,7 @@ class Recorder:
         radii = np.where(p.radius > 0, p.radius, POINT)
         self._static(PARTICLES, self._points.from_fields(radii=radii, colors=colors))
         self._links = [(k, f) for k, f in enumerate(world.features) if isinstance(f, Batch) and f.arity == 2 and f.count]
-        for k, f in self._links:
+        for k, _ in self._links:
             self._static(f"{SCENE}/links/{k}", self._strips.from_fields(colors=[[205, 205, 215]], radii=[-0.75]))
         for name, (title, color) in CURVES.items():
             self._static(f"figures/{name}", rr.SeriesLines(names=[title], colors=[color]))
@@ -182,7 +182,13 @@ def _outline(wall, world: "World") -> np.ndarray | None:
 
 
 def _about(world: "World", worst=None, frames: int = 0) -> str:
-    rows = [f"# {len(world.particles)} particles in {world.particles.dim}D", "", "```", world.explain(), "```"]
+    rows = [
+        f"# {len(world.particles)} particles in {world.particles.dim}D",
+        "",
+        "```",
+        world.explain(),
+        "```",
+    ]
     if worst is not None:
         rows[1:1] = [
             "", f"{frames} frames, {world.time:.4g} s simulated.", "",

@@ -1,0 +1,30 @@
+"""The demos run, and the README tells the truth about the first of them."""
+
+import pathlib
+import re
+
+from .conftest import python
+
+ROOT = pathlib.Path(__file__).parent.parent
+
+
+def test_hello_is_the_readmes_example_and_runs(tmp_path):
+    script = (ROOT / "demos" / "hello.py").read_text()
+    shown = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
+    assert shown and shown.group(1).strip() == script.split('"""', 2)[2].strip()
+    done = python(script, timeout=120)
+    assert "40 particles in 2D" in done.stdout and "StepReport(" in done.stdout
+
+
+def test_article_runs_and_checks_itself():
+    code = f"""
+import sys
+sys.path.insert(0, {str(ROOT / "demos")!r})
+import article
+article.SECONDS = 2.0
+article.main("article.rrd")
+import os
+assert os.path.getsize("article.rrd") > 100_000
+"""
+    done = python(code)
+    assert "frames" in done.stdout and "120" in done.stdout and "worst overlap" in done.stdout

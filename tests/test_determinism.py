@@ -1,0 +1,170 @@
+"""The same bits on any number of threads and on either path; and what is absent costs nothing."""
+
+import pathlib
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+
+from .conftest import python
+
+DEMOS = pathlib.Path(__file__).parent.parent / "demos"
+
+
+def test_the_articles_scene_has_the_same_bits_on_1_2_and_8_threads():
+    code = """
+import sys
+sys.path.insert(0, {demos!r})
+import tiverlet as tv
+tv.init(threads={threads})
+import article
+scene = article.build(path={path!r})
+for _ in range(200):
+    article.lead(scene)
+    scene.world.step(1 / 60)
+print(scene.world.hash())
+"""
+    runs = [(1, "parallel"), (2, "parallel"), (8, "parallel"), (2, "parallel"), (1, "fused"), (2, "fused")]
+    hashes = [python(code.format(demos=str(DEMOS), threads=t, path=p)).stdout.strip() for t, p in runs]
+    assert len(hashes[0]) == 64 and len(set(hashes)) == 1
+
+
+@pytest.mark.parametrize("precision", ["f32", "f32-compensated", "f64"])
+def test_both_paths_have_the_same_bits(world, precision):
+    rng = np.random.default_rng(0)
+    n = 300
+    x = rng.uniform(0, 3, (n, 3))
+    pairs = np.stack([np.arange(0, n - 1, 2), np.arange(1, n, 2)], axis=1)
+    hashes = []
+    for path in ("fused", "parallel"):
+        features = [
+            tv.Gravity(9.81), tv.Drag(0.1),
+            tv.Distance(pairs, compliance=np.where(np.arange(n // 2) % 2, 1e-4, 0.0), damping=1.0),
+            tv.Rope(pairs[:20] + 100, 0.5), tv.Contact(), tv.Box((0, 0, 0), (3, 9, 3)), tv.HalfSpace((0.2, 1, 0.1), 0.1),
+            tv.Pin([0], (1, 1, 1), compliance=1e-3), tv.Pin([5], (2, 2, 2)),
+        ]  # fmt: skip
+        w = world(
+            tv.Particles(x, radius=rng.uniform(0.05, 0.1, n) * 0 + 0.08, mass=1 + np.arange(n) % 5), features, path=path,
+            precision=precision, substeps=7, iterations=2,
+        )  # fmt: skip
+        w.run(0.3)
+        w.substeps = 9
+        w.run(0.2)
+        hashes.append((w.hash(), w.last.energy, w.last.residual, w.last.overlap))
+    assert hashes[0] == hashes[1]
+
+
+def test_what_is_absent_has_no_field_and_no_kernel(world):
+    # A point in free flight: position, displacement, mass, and the survey. Each feature adds its own fields and nothing else.
+    plain = world(tv.Particles(np.zeros((10, 2))), [])
+    names = {e.name.split(".")[0] for m in plain._memories for e in m.entries}
+    assert names == {"position", "displacement", "inv_mass", "survey"}
+    adds = {
+        "Gravity": ([tv.Gravity(1.0)], {"Gravity"}),
+        "Drag": ([tv.Drag(1.0)], {"decay"}),
+        "Wind": ([tv.Wind((1, 0), 1.0)], {"Wind", "decay"}),
+        "Box": ([tv.Box((-1, -1), (1, 1))], {"Box", "thrust"}),
+        "HalfSpace": ([tv.HalfSpace((0, 1), -1)], {"HalfSpace", "thrust"}),
+        "Pin": ([tv.Pin([0])], {"Pin"}),
+        "Distance": ([tv.Distance([[0, 1]], 0.1)], {"Distance", "slots"}),
+        "empty Distance": ([tv.Distance(np.zeros((0, 2), int))], set()),
+        "Contact of points": ([tv.Contact()], set()),
+    }
+    for name, (features, fields) in adds.items():
+        w = world(tv.Particles(np.zeros((10, 2))), features)
+        assert {e.name.split(".")[0] for m in w._memories for e in m.entries} - names == fields, name
+    rigid = world(tv.Particles(np.zeros((10, 2))), [tv.Distance([[0, 1]], 0.1)])
+    soft = world(tv.Particles(np.zeros((10, 2))), [tv.Distance([[0, 1]], 0.1, compliance=1.0)])
+    only = {e.name for e in soft._memory.entries} - {e.name for e in rigid._memory.entries}
+    assert only == {"Distance.compliance", "Distance.last", "Distance.history"}
+    mixed = world(tv.Particles(np.arange(20.0).reshape(10, 2), radius=np.arange(10) + 1.0), [tv.Contact()])
+    assert "radius" in {e.name for e in mixed._memory.entries}
+    assert "Contact.shrunk" not in {e.name for m in mixed._memories for e in m.entries}
+
+
+def test_launches_count_what_the_scene_needs(world):
+    # Kernel launches of a frame, counted at Taichi's door: one per substep without constraints, one more per pass with them.
+    import taichi.lang.kernel_impl as impl
+
+    launches = []
+    original = impl.Kernel.launch_kernel
+
+    def counted(self, *args):
+        launches.append(self.func.__name__)
+        return original(self, *args)
+
+    impl.Kernel.launch_kernel = counted
+    try:
+        for features, path, expected in (
+            ([tv.Gravity(1.0)], "parallel", ["predicted"] * 5 + ["measure"]),
+            (
+                [tv.Gravity(1.0), tv.Distance([[0, 1]])],
+                "parallel",
+                ["predicted", "relaxed", "relaxed"] * 5 + ["measure"],
+            ),
+            ([tv.Gravity(1.0), tv.Distance([[0, 1]])], "fused", ["fused", "measure"]),
+        ):
+            w = world(tv.Particles([[0.0, 0], [1, 0]]), features, path=path, substeps=5, iterations=2)
+            w.step(0.01)
+            launches.clear()
+            w.step(0.01)
+            assert launches == expected
+    finally:
+        impl.Kernel.launch_kernel = original
+
+
+def test_unused_files_change_no_bit(tmp_path):
+    # The same scene with the files of every other feature deleted from the package, and their names from the lists.
+    import shutil
+
+    package = pathlib.Path(tv.__file__).parent
+    bare = tmp_path / "bare" / "tiverlet"
+    shutil.copytree(package, bare, ignore=shutil.ignore_patterns("__pycache__"))
+    gone = {"forces": ["attractor", "drag", "force", "wind"], "constraints": ["rope", "spacer"]}
+    for folder, files in gone.items():
+        init = bare / folder / "__init__.py"
+        text = init.read_text()
+        for name in files:
+            (bare / folder / f"{name}.py").unlink()
+            title = name.title().replace("_", "")
+            text = text.replace(f"from .{name} import {title}\n", "").replace(f'"{title}", ', "").replace(f', "{title}"', "")
+        init.write_text(text)
+    init = bare / "__init__.py"
+    text = init.read_text()
+    for title in ("Attractor", "Drag", "Force", "Wind", "Rope", "Spacer"):
+        text = text.replace(f'"{title}", ', "").replace(f"{title}, ", "").replace(f", {title}\n", "\n")
+    init.write_text(text)
+    code = """
+import sys
+sys.path.insert(0, {path!r})
+import numpy as np
+import tiverlet as tv
+assert tv.__file__.startswith({path!r})
+i = np.arange(39)
+x = np.stack([np.arange(40) * 0.05, np.zeros(40)], axis=1)
+w = tv.World(tv.Particles(x, radius=0.02, pinned=[0]), [tv.Gravity(9.81), tv.Distance(np.stack([i, i + 1], 1)), tv.Contact(),
+             tv.Box((-3, -1), (3, 3))])
+w.run(1.0)
+print(w.hash())
+"""
+    whole = python(code.format(path=str(package.parent))).stdout
+    assert len(whole.strip()) == 64
+    assert whole == python(code.format(path=str(bare.parent))).stdout
+
+
+def test_explain_names_what_is_in_and_what_is_out(world):
+    w = world(
+        tv.Particles([[0.0, 0], [1, 0], [2, 0]], pinned=[0, 1]),
+        [tv.Gravity(), tv.Distance([[0, 1], [1, 2]])],
+        iterations=3,
+    )
+    text = w.explain()
+    for part in (
+        "3 particles in 2D, 2 static; f32 on cpu", "20 substeps x 3 iterations, path fused: 2 launches per frame",
+        "Distance: 2 constraints, 1 of them between particles that cannot move", "grid, neighbour list, contacts: no Contact",
+        "every constraint is rigid", "Constraint corners that can move: 1 of 4",
+    ):  # fmt: skip
+        assert part in text
+    stated = int(text.split(" fields, ")[1].split(" bytes")[0])
+    assert stated == sum(e.bytes for m in w._memories for e in m.entries)

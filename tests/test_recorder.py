@@ -1,0 +1,77 @@
+"""Recordings: what is read back is what the world was."""
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+
+
+def read(path, entity: str, column: str):
+    """All rows of a column of an entity, by frame (None for static data)."""
+    import rerun as rr
+
+    out = {}
+    for chunk in rr.chunk.RrdReader(str(path)).stream():
+        if chunk.entity_path != entity:
+            continue
+        batch = chunk.to_record_batch()
+        if column not in batch.schema.names:
+            continue
+        values = batch.column(column)
+        frames = [None] * len(values) if chunk.is_static else batch.column("frame").to_numpy(zero_copy_only=False)
+        for frame, row in zip(frames, values.to_pylist(), strict=True):
+            out[frame] = row
+    return out
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_every_frame_reads_back(world, tmp_path, dim):
+    rng = np.random.default_rng(0)
+    x = rng.uniform(0, 1, (30, dim))
+    links = np.stack([np.arange(29), np.arange(1, 30)], axis=1)
+    box = tv.Box([0] * dim, [1] * dim)
+    features = [tv.Gravity(9.81), tv.Distance(links), tv.Contact(), box, tv.HalfSpace([0, 1, 0][:dim], 0.01)]
+    w = world(tv.Particles(x, radius=np.r_[0.0, np.full(29, 0.02)], pinned=[0]), features)
+    path = tmp_path / "a.rrd"
+    seen = [w.position]
+    energy = []
+    with tv.Recorder(path, w) as recorder:
+        for _ in range(12):
+            energy.append(w.step(1 / 60).energy)
+            recorder.log()
+            seen.append(w.position)
+    kind = f"{dim}D"
+    frames = read(path, "/world/scene/particles", f"Points{kind}:positions")
+    assert sorted(frames) == list(range(13))
+    for k, position in enumerate(seen):
+        np.testing.assert_array_equal(np.array(frames[k], dtype=np.float32), position.astype(np.float32))
+    strips = read(path, "/world/scene/links/1", f"LineStrips{kind}:strips")
+    np.testing.assert_array_equal(np.array(strips[12], np.float32), seen[12].astype(np.float32)[links])
+    radii = read(path, "/world/scene/particles", f"Points{kind}:radii")
+    assert list(radii) == [None] and radii[None][0] < 0 and radii[None][1] == np.float32(0.02)
+    curve = read(path, "/figures/energy", "Scalars:scalars")
+    assert [curve[k + 1][0] for k in range(12)] == energy
+    about = read(path, "/about", "TextDocument:text")[None][0]
+    assert "13 frames, 0.2 s simulated" in about and "constraint violation" in about
+    assert set(read(path, "/world/scene/walls/3", f"LineStrips{kind}:strips")) == {0}  # a wall that stands is written once
+
+
+def test_every_and_misuse(world, tmp_path):
+    w = world(tv.Particles([[0.0, 0.0]]), [tv.Gravity(1.0)])
+    with tv.Recorder(tmp_path / "b.rrd", w, every=3) as recorder:
+        w.run(10 / 60, recorder=recorder)
+    assert sorted(read(tmp_path / "b.rrd", "/world/scene/particles", "Points2D:positions")) == [0, 3, 6, 9]
+    with pytest.raises(RuntimeError, match="closed"):
+        recorder.log()
+    recorder.close()
+    with pytest.raises(ValueError, match="does not exist"):
+        tv.Recorder(tmp_path / "no" / "c.rrd", w)
+    with pytest.raises(ValueError, match="every = 0"):
+        tv.Recorder(tmp_path / "c.rrd", w, every=0)
+
+
+def test_an_empty_world_can_be_recorded(world, tmp_path):
+    w = world(tv.Particles(np.zeros((0, 2))), [tv.Gravity()])
+    with tv.Recorder(tmp_path / "d.rrd", w) as recorder:
+        w.run(0.1, recorder=recorder)
+    assert len(read(tmp_path / "d.rrd", "/world/scene/particles", "Points2D:positions")) == 7

@@ -1,0 +1,208 @@
+"""What would end the process without an exception ends with a message instead. Each case in a process of its own."""
+
+import pytest
+
+from .conftest import python
+
+START = """
+import numpy as np
+import tiverlet as tv
+def world(**kwargs):
+    return tv.World(tv.Particles([[0.0, 1.0], [1.0, 1.0]]), [tv.Gravity(9.81), tv.Distance([[0, 1]])], **kwargs)
+def expect(error, words, run):
+    try:
+        run()
+    except error as e:
+        assert words in str(e), str(e)
+    else:
+        raise SystemExit("no error")
+"""
+
+
+def test_import_is_quiet_and_starts_nothing():
+    done = python(
+        """
+import sys
+import tiverlet as tv
+import taichi as ti
+assert ti.cfg is None, "started at import"
+assert "rerun" not in sys.modules and "matplotlib" not in sys.modules
+assert not any(n.startswith("rerun") for n in sys.modules)
+w = tv.World(tv.Particles([[0.0, 0.0]]), [tv.Gravity()])
+w.step(0.1)
+assert ti.cfg.fast_math == 0 and ti.cfg.default_fp == ti.f32
+"""
+    )
+    assert done.stdout == "" and done.stderr == ""
+
+
+def test_no_connection_at_import_or_start():
+    # Every attempt to open a socket raises here, in Python and in the threads that it starts.
+    python(
+        """
+import socket, threading
+def refused(*a, **k):
+    import os
+    os._exit(7)
+socket.socket.connect = refused
+socket.create_connection = refused
+socket.getaddrinfo = refused
+import tiverlet as tv
+tv.World(tv.Particles([[0.0, 0.0]]), [tv.Gravity()]).step(0.1)
+import time
+time.sleep(0.5)
+"""
+    )
+
+
+def test_a_second_start_is_an_error_not_a_crash():
+    python(
+        START
+        + """
+import taichi as ti
+w = world()
+w.step(0.1)
+expect(RuntimeError, "already runs", lambda: tv.init(threads=1))
+tv.init()  # the same settings: nothing happens
+w.step(0.1)
+ti.init(arch=ti.cpu, log_level=ti.ERROR)
+x = w.particles.position
+for run in (lambda: w.step(0.1), lambda: w.position, lambda: w.velocity, w.hash, lambda: setattr(w, "position", x),
+            lambda: setattr(w, "velocity", x), w.clone):
+    expect(RuntimeError, "started again", run)
+w.close()
+new = world()
+new.step(0.1)
+assert new.position[0, 1] < 1
+expect(RuntimeError, "already runs", tv.init)  # the user's own start is used as it is
+"""
+    )
+
+
+def test_reset_and_close():
+    python(
+        START
+        + """
+import taichi as ti
+w = world()
+with world() as other:
+    other.step(0.1)
+for run in (lambda: other.step(0.1), lambda: other.position, other.hash):
+    expect(RuntimeError, "closed", run)
+other.close()
+ti.reset()
+expect(RuntimeError, "started again", lambda: w.step(0.1))
+w2 = world()
+w2.step(0.1)
+"""
+    )
+
+
+def test_a_users_own_start_is_used_as_it_is():
+    python(
+        START
+        + """
+import taichi as ti
+ti.init(arch=ti.cpu, default_fp=ti.f64, fast_math=True, log_level=ti.ERROR)
+w = world(precision="f64")
+w.run(1.0)
+assert abs(w.position[0, 1] - (1 - 9.81 / 2)) < 1e-11
+expect(ValueError, "fast_math=True", lambda: world(precision="f32-compensated"))
+assert tv.runtime.fast_math()
+"""
+    )
+
+
+def test_worlds_are_capped_and_freed():
+    python(
+        START
+        + """
+import tiverlet.runtime as runtime
+tv.init()
+point = tv.Particles([[0.0, 0.0]])
+runtime.MAX_TREES = 12  # the rule, without the minutes that 400 worlds take
+many = [tv.World(point) for _ in range(12)]
+expect(RuntimeError, "worlds are alive", lambda: tv.World(point))
+for w in many:
+    w.close()
+class Broken(tv.Gravity):
+    def bind(self, scene):
+        scene.memory.field("half", 3)
+        raise KeyError("a feature that fails half-way")
+expect(KeyError, "half-way", lambda: tv.World(point, [Broken()]))
+for _ in range(30):
+    tv.World(point).close()
+tv.World(point).step(0.1)
+"""
+    )
+
+
+def test_memory_of_closed_worlds_is_returned():
+    python(
+        """
+import gc
+import numpy as np
+import resource
+import tiverlet as tv
+x = np.zeros((1_000_000, 2))
+peak = []
+for _ in range(14):
+    tv.World(tv.Particles(x), [tv.Gravity()]).close()
+    gc.collect()
+    peak.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+# 20 MB of fields each: nine of them at once would be 180 MB.
+assert peak[-1] - peak[4] < 60, peak
+"""
+    )
+
+
+@pytest.mark.parametrize("arch", ["cuda", "metal", "vulkan"])
+def test_missing_architectures_are_errors_by_name(arch):
+    done = python(
+        f"""
+import tiverlet as tv
+try:
+    tv.init(arch="{arch}")
+except RuntimeError as e:
+    assert '"{arch}" is not available' in str(e) and "Available: 'cpu'" in str(e), e
+    tv.World(tv.Particles([[0.0, 0.0]])).step(0.1)
+    assert tv.runtime.architecture() == "cpu"
+else:
+    assert tv.runtime.architecture() == "{arch}"
+""",
+        check=True,
+    )
+    assert done.stdout == ""
+
+
+def test_forked_children_and_other_threads_are_told():
+    python(
+        START
+        + """
+import os, threading
+w = world()
+pid = os.fork()
+if pid == 0:
+    try:
+        expect(RuntimeError, "fork", lambda: w.step(0.1))
+        expect(RuntimeError, "fork", world)
+    except BaseException:
+        os._exit(1)
+    os._exit(0)
+assert os.waitpid(pid, 0)[1] == 0
+caught = []
+def build():
+    try:
+        world()
+    except RuntimeError as e:
+        caught.append(str(e))
+t = threading.Thread(target=build)
+t.start()
+t.join()
+assert "thread that started Taichi" in caught[0]
+t = threading.Thread(target=lambda: w.step(0.1))
+t.start()
+t.join()
+assert w.time == 0.1
+"""
+    )
