@@ -2,7 +2,7 @@
 
     python demos/hello.py
 
-What to look for: the links keep their length, and the energy stays what it was.
+What to look for: the report of the worst frame, and what the scene is made of. Watch the recording with `rerun rope.rrd`.
 """
 
 import tiverlet as tv
@@ -15,5 +15,5 @@ world = tv.World(
 )
 with tv.Recorder("rope.rrd", world) as recorder:
     report = world.run(5.0, recorder=recorder)
-print(world.explain())
 print(report)
+print(world.explain())

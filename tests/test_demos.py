@@ -12,8 +12,16 @@ def test_hello_is_the_readmes_example_and_runs(tmp_path):
     script = (ROOT / "demos" / "hello.py").read_text()
     shown = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
     assert shown and shown.group(1).strip() == script.split('"""', 2)[2].strip()
-    done = python(script, timeout=120)
-    assert "40 particles in 2D" in done.stdout and "StepReport(" in done.stdout
+    done = python(script)
+    printed = (ROOT / "README.md").read_text().split("```\n")
+    block = next(b for b in printed if b.startswith("StepReport("))
+    # The report's figures may differ between processors; what the scene is made of may not, but for the number of threads.
+    want, got = (re.sub(r"\d+ threads", "threads", text).strip().splitlines() for text in (block, done.stdout))
+    assert want[1:] == got[1:] and got[0].startswith("StepReport(time=5.0, substeps=20, iterations=1, residual=0.2")
+
+
+def test_pay_finds_that_features_only_add():
+    assert "bytes per particle" in python((ROOT / "demos" / "pay.py").read_text()).stdout
 
 
 def test_article_runs_and_checks_itself():

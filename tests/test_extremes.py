@@ -117,7 +117,7 @@ def test_37_a_million_particles(world):
     w = world(tv.Particles(x, radius=0.5), [tv.Gravity(), tv.Contact(), tv.Box((0, 0), (1100, 1200))], substeps=2)
     report = w.step(1 / 60)
     assert report.clean and w.path == ("parallel" if tv.runtime.threads() > 1 else "fused")
-    assert sum(e.bytes for m in w._memories for e in m.entries) <= 200 * len(x)
+    assert sum(w.fields.values()) <= 200 * len(x)
 
 
 def test_48_deep_overlap_does_not_explode(world):

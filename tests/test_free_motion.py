@@ -80,6 +80,18 @@ def test_f32_free_fall_keeps_six_digits(world):
     assert not w.last.flags
 
 
+def test_f32_keeps_uniform_motion_and_terminal_velocity(world):
+    # x + d with a constant d rounds the same way each time: without the dither, up to h / (2 d) ulp(x) = 1.5e-4 of the way.
+    v = np.array([0.5, 0.3, -0.7, 0.123])
+    start = np.stack([np.full(4, 1.1), np.full(4, -3.0)], axis=1)
+    w = world(tv.Particles(start, velocity=np.stack([v, -v], axis=1)))
+    w.run(5.0)
+    np.testing.assert_allclose(w.position - start, 5 * np.stack([v, -v], axis=1), rtol=2e-6)
+    w = world(tv.Particles([[0.0, 5.0]]), [tv.Gravity(9.81), tv.Drag(20.0)])
+    w.run(4.0)
+    np.testing.assert_allclose(5.0 - w.position[0, 1], 9.81 / 20 * (4 - (1 - np.exp(-80)) / 20), rtol=2e-6)
+
+
 def test_f32_compensated_falls_far_from_the_origin_in_tiny_steps(world):
     w = world(
         tv.Particles([[0.0, 1000.0], [-1000.0, 1000.0]]),

@@ -1,5 +1,6 @@
 """What a world is made of: the text behind world.explain()."""
 
+from itertools import groupby
 from typing import TYPE_CHECKING
 
 from . import runtime
@@ -21,15 +22,19 @@ def explain(world: "World") -> str:
         "Left out, at no cost:",
         *(f"    {line}" for line in _absent(world)),
     ]
-    entries = [e for memory in world._memories for e in memory.entries]
-    total = sum(e.bytes for e in entries)
-    lines.append(f"Memory: {len(entries)} fields, {total} bytes, {total / max(1, len(p)):.0f} per particle")
-    for e in entries:
-        shape = " x ".join(str(k) for k in (e.length or 1, e.width or 1))
-        lines.append(f"    {e.name:28s} {shape:>14s} {e.kind.name:8s} {e.bytes:>12d} bytes")
+    total = sum(world.fields.values())
+    lines.append(f"Memory: {len(world.fields)} fields, {total} bytes, {total / max(1, len(p)):.0f} per particle")
+    for owner, own in groupby(sorted(world.fields, key=_owner), key=_owner):
+        names = list(own)
+        size = sum(world.fields[name] for name in names)
+        lines.append(f"    {owner:10s} {size:>9d} bytes: {', '.join(n.partition('.')[2] or n for n in names)}")
     if sub.batches:
         lines.append(f"Constraint corners that can move: {sub.slots.total} of {sum(b.indices.size for b in sub.batches)}")
     return "\n".join(lines)
+
+
+def _owner(field: str) -> str:
+    return field.partition(".")[0] if "." in field else "particles"
 
 
 def _launches(world: "World") -> str:

@@ -8,9 +8,10 @@ import numpy as np
 import taichi as ti
 
 from .feature import Acceleration, Batch, Scene, Wall
+from .tools import golden_steps
 
-# The golden ratio as a fraction of 2**32: its multiples, taken mod 1, are the most even sequence there is.
-GOLDEN = 2654435769
+# Multiples of the golden ratio of two dimensions, mod 1, are the most even sequence of pairs: one for each of the two sums.
+DITHER = golden_steps(2)
 SWEEPS = 8  # rounds over the walls, for particles that several of them push
 
 
@@ -48,7 +49,7 @@ class Substep:
         if self.uses_velocity:
             self.earlier = add("displacement_before", self.n, width=self.dim, state=True)
         if self.decays:
-            self.decay = add("decay", None, width=4)
+            self.decay = add("decay", None, width=5)
         if walls or contact:
             self.thrust = add("thrust", self.n, width=self.dim, state=True)
         if grid:
@@ -74,21 +75,21 @@ class Substep:
         return v
 
     @ti.func
-    def kick(self, d, k, tick):
-        """d + k. In f32 the rounding of this sum, always to the same side for a constant k, would be the largest error of all.
+    def dithered(self, big, small, tick, step: ti.template()):  # type: ignore[valid-type]
+        """`small`, to be added to `big`.
 
-        It is dithered by the golden sequence: added to k is a fraction in (-1/2, 1/2) of the last digit of d, so that the rounded
-        sums follow the true one on average, with an error that grows like the logarithm of the number of steps, not like it.
+        In f32 the rounding of such a sum, always to the same side while `small` is constant, would be the largest error of all:
+        of a free fall, and of a body in uniform motion. So `small` is dithered: it gets a fraction in (-1/2, 1/2) of the last
+        digit of `big`, taken from the golden sequence. The rounded sums then follow the true one, with an error that grows like
+        the logarithm of the number of steps instead of that number.
         """
         if ti.static(self.dithers):
-            u = ti.cast(ti.cast(tick, ti.u32) * ti.u32(GOLDEN), ti.f32) * ti.static(2.0**-32) - 0.5
+            u = ti.cast(ti.cast(tick, ti.u32) * ti.u32(step), ti.f32) * ti.static(2.0**-32) - 0.5
             for a in ti.static(range(self.dim)):
-                exponent = ti.bit_cast(d[a], ti.u32) & ti.u32(0x7F800000)
+                exponent = ti.bit_cast(big[a], ti.u32) & ti.u32(0x7F800000)
                 digit = ti.bit_cast(exponent, ti.f32) * ti.static(2.0**-23)
-                d[a] += k[a] + u * digit * ti.math.sign(k[a])
-        else:
-            d += k
-        return d
+                small[a] += u * digit * ti.math.sign(small[a])
+        return small
 
     @ti.func
     def integrate(self, i, h, t, tick, fresh):
@@ -108,11 +109,16 @@ class Substep:
                     d = h * v + h * h / 2 * a
             else:
                 if ti.static(self.decays):
-                    d = self.kick(self.decay[None][0] * d, self.decay[None][1] * h * h * a, tick)
+                    # d' = exp(-z) d + phi1 h^2 a, as a small change of d, which f32 holds to more digits.
+                    k = self.decay[None][1] * h * h * a - self.decay[None][4] * d
+                    d += self.dithered(d, k, tick, DITHER[0])
                 elif ti.static(len(self.accelerations) > 0):
-                    d = self.kick(d, h * h * a, tick)
+                    d += self.dithered(d, h * h * a, tick, DITHER[0])
             self.state.d[i] = d
-            self.state.advance(i, d)
+            if ti.static(self.state.compensated):
+                self.state.advance(i, d)
+            else:
+                self.state.advance(i, self.dithered(self.state.x[i], d, tick, DITHER[1]))
         elif fresh != 0:
             self.state.d[i] = 0 * self.state.d[i]
         for c in ti.static(self.contacts):
@@ -335,7 +341,10 @@ class Substep:
 
 
 def decay(rate: float, h: float) -> list[float]:
-    """exp(-z), phi1 = (1 - exp(-z)) / z, phi2 = (z - 1 + exp(-z)) / z^2 and psi2 = (exp(z) - 1 - z) / z^2, for z = rate h."""
+    """What drag makes of a substep, for z = rate h.
+
+    exp(-z), phi1 = (1 - exp(-z)) / z, phi2 = (z - 1 + exp(-z)) / z^2, psi2 = (exp(z) - 1 - z) / z^2, 1 - exp(-z).
+    """
     z = rate * h
     if z < 1e-3:  # series: the closed forms cancel
         phi1 = 1 - z / 2 + z * z / 6 - z**3 / 24
@@ -345,4 +354,4 @@ def decay(rate: float, h: float) -> list[float]:
         phi1 = -np.expm1(-z) / z
         phi2 = (z + np.expm1(-z)) / z**2
         psi2 = (np.expm1(min(z, 700.0)) - z) / z**2
-    return [float(np.exp(-z)), float(phi1), float(phi2), float(psi2)]
+    return [float(np.exp(-z)), float(phi1), float(phi2), float(psi2), float(-np.expm1(-z))]

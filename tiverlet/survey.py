@@ -45,7 +45,7 @@ class StepReport:
     flags: frozenset[str] = frozenset()
     notes: tuple[str, ...] = field(default=(), repr=False)
     bad: int | None = None
-    seconds: float = field(default=0.0, compare=False)
+    seconds: float = field(default=0.0, compare=False, repr=False)
 
     @property
     def clean(self) -> bool:

@@ -15,7 +15,8 @@ _BITS = 1 << 32
 
 
 @functools.cache
-def _steps(dim: int) -> tuple[int, ...]:
+def golden_steps(dim: int) -> tuple[int, ...]:
+    """The step of the golden sequence along each of `dim` axes, as odd multiples of 2**-32."""
     root = 2.0
     for _ in range(64):
         root = (1.0 + root) ** (1.0 / (dim + 1))
@@ -79,9 +80,9 @@ def _golden_axis(i, step: ti.template()):  # type: ignore[valid-type]
 @ti.func
 def _golden_kernel(i, dim: ti.template() = 1):  # type: ignore[valid-type]
     if ti.static(dim == 1):
-        return _golden_axis(i, ti.static(_steps(1)[0]))
+        return _golden_axis(i, ti.static(golden_steps(1)[0]))
     else:
-        return ti.Vector([_golden_axis(i, step) for step in ti.static(_steps(dim))])
+        return ti.Vector([_golden_axis(i, step) for step in ti.static(golden_steps(dim))])
 
 
 @_both(_golden_kernel)
@@ -96,7 +97,7 @@ def golden(i, dim: int = 1):
         raise TypeError(f"golden: i has type {index.dtype}, but integers are needed.")
     if index.size and (index.min() < 0 or index.max() >= _BITS):
         raise ValueError("golden: i must be at least 0 and below 2**32.")
-    steps = np.array(_steps(dim), dtype=np.uint64)
+    steps = np.array(golden_steps(dim), dtype=np.uint64)
     out = ((index.astype(np.uint64)[..., None] * steps) & np.uint64(_BITS - 1)) / _BITS
     out = out if dim > 1 else out[..., 0]
     return float(out) if out.ndim == 0 else out
@@ -112,7 +113,7 @@ def golden_index(value, dim: int = 1):
         array = array[..., 0]
     if not ((array >= 0) & (array < 1)).all():
         raise ValueError("golden_index: values must be at least 0 and below 1.")
-    inverse = np.uint64(pow(_steps(dim)[0], -1, _BITS))
+    inverse = np.uint64(pow(golden_steps(dim)[0], -1, _BITS))
     index = (np.rint(array * _BITS).astype(np.uint64) * inverse) & np.uint64(_BITS - 1)
     return int(index) if index.ndim == 0 else index.astype(np.int64)
 

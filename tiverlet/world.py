@@ -125,7 +125,7 @@ class World:
             self._tick = (self._tick + self.substeps) % 2**31
             self._pass(dt)
             self._started, self._fresh = self._fresh and self.substeps == 1, False
-            _, phi1, phi2, _ = self._drag or decay(0.0, self._h)
+            _, phi1, phi2, *_ = self._drag or decay(0.0, self._h)
             self._scene.hh = self._h**2 * (phi2 if self._started else phi1)
             report = self._look()
         change = report.energy - self._energy  # type: ignore[operator]
@@ -217,7 +217,7 @@ class World:
         contact = self._sub.contacts[0]
         if not contact._on_eases:
             contact.ease()
-            self._renew()
+            self._sub = copy.copy(self._sub)  # kernels that know of the new field; the survey has no use for it
         self._sub.shrunk()
 
     def _renew(self) -> None:
@@ -343,6 +343,11 @@ class World:
     @iterations.setter
     def iterations(self, value: int) -> None:
         self._iterations = checks.integer("World", "iterations", value, least=1)
+
+    @property
+    def fields(self) -> dict[str, int]:
+        """Every field on the device, by name, and its size [bytes]."""
+        return {e.name: e.bytes for memory in self._memories for e in memory.entries}
 
     def hash(self) -> str:
         """SHA-256 of the exact state: equal if and only if two worlds of the same scene will go on alike, bit for bit."""
