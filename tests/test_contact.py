@@ -44,6 +44,7 @@ def clouds():
     yield "two", np.array([[0.0, 0], [0.5, 0]]), 0.3
 
 
+@pytest.mark.filterwarnings("ignore:.*near pairs per particle")
 @pytest.mark.parametrize("name, position, radius", list(clouds()))
 @pytest.mark.parametrize("path", ["fused", "parallel"])
 def test_pairs_equal_brute_force(world, name, position, radius, path):
@@ -140,6 +141,7 @@ def test_momentum_in_collisions(world):
     assert (w.velocity[0] - w.velocity[1]) @ n >= -1e-9
 
 
+@pytest.mark.filterwarnings("ignore:.*near pairs per particle")
 @pytest.mark.parametrize("count, dim", [(2, 2), (2, 3), (100, 2), (1000, 2), (1000, 3)])
 def test_coincident_particles_part_gently(world, count, dim):
     # Row 16: a direction made from the indices, equal and opposite. Row 48: at push_out, whatever the depth.

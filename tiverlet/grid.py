@@ -9,6 +9,7 @@ The list holds, for each particle, all others closer than the sum of radii plus 
 something has moved by half the skin, and no sum over it depends on when it was built, on the table, or on the skin.
 """
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ import taichi as ti
 from .feature import Scene
 from .runtime import Memory
 
+CROWDED = 300  # near pairs per particle beyond which the user is told
 FARTHEST = 1 << 22  # cells from the origin: beyond it, f32 cannot tell a cell from the next
 
 
@@ -70,6 +72,13 @@ class Grid:
 
     def grow(self) -> None:
         """Make room for what the last build needed, and a quarter more."""
+        each = self.need[None] * self.blocks / self.n
+        if each > CROWDED:
+            warnings.warn(
+                f"Contact: up to {each:.0f} near pairs per particle, so steps cost as the square of their number. Particles "
+                "overlap each other, or one is much larger than the rest.",
+                stacklevel=2,
+            )
         self.allocate(int(self.need[None] * 1.25 + 16) * self.blocks)
         self.stale[None] = 1
 
