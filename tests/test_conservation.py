@@ -13,7 +13,7 @@ def test_momentum_is_conserved_for_ten_thousand_steps(world, precision, limit):
     # Masses 1 ... 100, links from rigid to soft, contacts: all internal forces are equal and opposite.
     x, v, mass, pairs, rest, alpha, damping = net(2, seed=4)
     features = [tv.Distance(pairs, rest, compliance=alpha, damping=damping), tv.Contact()]
-    w = world(tv.Particles(x, velocity=v, mass=mass, radius=0.15), features, substeps=100, precision=precision)
+    w = world(tv.Particles(x, velocity=v, mass=mass, radius=0.3), features, substeps=100, precision=precision)
     touched = 0
 
     def moving():

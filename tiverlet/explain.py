@@ -4,7 +4,8 @@ from itertools import groupby
 from typing import TYPE_CHECKING
 
 from . import runtime
-from .feature import Acceleration, Batch, Wall
+from .feature import Acceleration, Batch
+from .wall import Wall
 
 if TYPE_CHECKING:
     from .world import World

@@ -8,7 +8,7 @@ kinds, told apart by what the substep asks of them:
     Batch          relax(c, ...) of one constraint: reads its particles, writes the moves it wants into slots
     Scalar         (scalar.py) a Batch whose constraint is one number: give measure(c, q) = f and its gradients, and
                    C = f - rest gets compliance, damping, mass splitting, residual and load from there
-    Wall           confine(i, s, ...) of one particle, with the last word
+    Wall           (wall.py) confine(i, ...) of one particle, with the last word
 
 A new constraint on k particles is one file with one Scalar subclass: `arity = k`, an __init__ that checks its arrays,
 `rest_of(position)` for a default rest value, and `measure`. See constraints/distance.py.
@@ -195,28 +195,3 @@ class Batch(Feature):
     def energy(self, c, back):
         """Elastic energy [J] of constraint c at x - back d."""
         return 0.0
-
-
-class Wall(Feature):
-    """Surroundings: each particle by itself is kept on one side, with the last word in every iteration.
-
-    push_out: a particle found inside by more than it moved in this substep is led out at this speed [m/s] at most.
-    """
-
-    push_out = 1.0
-    _on_state: State
-
-    @ti.func
-    def confine(self, i, radius, h, when):
-        """Move particle i out of the wall, with self.press."""
-
-    @ti.func
-    def press(self, i, depth, n, u, h):
-        """Take particle i out of a wall that it entered by `depth` [m], along the normal n; the wall itself moved by u.
-
-        Inelastic and one-sided: what entered in this substep is taken back whole, at any speed; depth from before (a bad
-        start) is left at push_out, and so turns into no more than that velocity.
-        """
-        if depth > 0:
-            leaving = self._on_state.d[i].dot(n) - u
-            self._on_state.shift(i, ti.min(depth, ti.max(self.push_out * h - leaving, 0)) * n)

@@ -16,6 +16,7 @@ import numpy as np
 import taichi as ti
 
 from .feature import Scene
+from .material import Table
 from .runtime import Memory
 
 CROWDED = 300  # near pairs per particle beyond which the user is told
@@ -26,12 +27,16 @@ class Grid:
     """Cells, and the list of near pairs.
 
     reach: the largest distance at which two particles can touch [m]. skin: what is listed beyond touching [m].
-    linked: (m, 2) pairs that are never listed.
+    linked: (m, 2) pairs that are never listed. table: which groups touch. carries: each pair has a vector, `slip`, that moves
+    along when the list is built anew. aims: each has another, `aim`, for one substep.
     """
 
-    def __init__(self, scene: Scene, radius, reach: float, skin: float, linked: np.ndarray, parallel: bool):
+    def __init__(
+        self, scene: Scene, reach: float, skin: float, linked: np.ndarray, table: Table, carries: bool, aims: bool, parallel: bool
+    ):
         n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
-        self.n, self.dim, self.state, self.radius = n, dim, scene.state, radius
+        self.n, self.dim, self.state, self.radius = n, dim, scene.state, scene.radius
+        self.table, self.carries, self.aims = table, carries, aims
         self.real = scene.real
         self.reach, self.skin = reach, skin
         self.cell = (reach + skin) * (1 + 2.0**-12)  # rounding of floor(x / cell) must not hide a neighbour
@@ -55,6 +60,10 @@ class Grid:
             begin = np.searchsorted(both[:, 0], np.arange(n + 1))
             self.mates = add("grid.linked", len(both), kind=ti.i32, values=both[:, 1])
             self.mates_begin = add("grid.linked_begin", n + 1, kind=ti.i32, values=begin)
+        if carries:
+            self.old_first = add("grid.old_first", n, kind=ti.i32)
+            self.old_number = add("grid.old_number", n, kind=ti.i32)
+            self.kept = add("grid.kept", None, kind=ti.i32)
         self.near: Any = None
         self.store: Memory | None = None
         self._bits_now = _shares(np.ones(dim), self.bits)
@@ -68,6 +77,12 @@ class Grid:
         self.capacity = max(1, -(-capacity // self.blocks))  # of one block
         self.store = Memory(self.real)
         self.near = self.store.field("grid.near", self.capacity * self.blocks, kind=ti.i32)
+        if self.carries:
+            self.slip = self.store.field("grid.slip", self.capacity * self.blocks, width=self.dim)
+            self.old_near = self.store.field("grid.old_near", self.capacity * self.blocks, kind=ti.i32)
+            self.old_slip = self.store.field("grid.old_slip", self.capacity * self.blocks, width=self.dim)
+        if self.aims:
+            self.aim = self.store.field("grid.aim", self.capacity * self.blocks, width=self.dim)
         self.store.place()
 
     def grow(self) -> None:
@@ -79,7 +94,13 @@ class Grid:
                 "overlap each other, or one is much larger than the rest.",
                 stacklevel=2,
             )
+        kept = [self.store.read(f) for f in (self.old_near, self.old_slip)] if self.carries and self.store else []
         self.allocate(int(self.need[None] * 1.25 + 16) * self.blocks)
+        if kept and self.store:
+            for field, values in zip((self.old_near, self.old_slip), kept, strict=True):
+                room = np.zeros((self.capacity * self.blocks, *values.shape[1:]), dtype=values.dtype)
+                room[: len(values)] = values
+                self.store.write(field, room)
         self.stale[None] = 1
 
     def fit(self, extent: np.ndarray) -> None:
@@ -96,6 +117,56 @@ class Grid:
         near = self.store.read(self.near)
         rows = [(i, j) for i in range(self.n) for j in near[first[i] : first[i] + number[i]] if i < j]
         return np.array(rows, dtype=np.int64).reshape(-1, 2)
+
+    def slips(self) -> tuple[np.ndarray, np.ndarray]:
+        """Every listed pair (i, j) whose slip is not 0, in order, and the slips: the same whatever the list's layout."""
+        assert self.store
+        aside = bool(self.kept[None])  # given by restore(), and not built into a list yet
+        first, number = (self.old_first, self.old_number) if aside else (self.first, self.number)
+        near, slips = (self.old_near, self.old_slip) if aside else (self.near, self.slip)
+        first, number = first.to_numpy()[: self.n], number.to_numpy()[: self.n]
+        i = np.repeat(np.arange(self.n), number)
+        at = np.repeat(first, number) + np.arange(len(i)) - np.repeat(np.cumsum(number) - number, number)
+        slip = self.store.read(slips)[at]
+        some = (slip != 0).any(axis=1)
+        return np.stack([i[some], self.store.read(near)[at][some]], axis=1), slip[some]
+
+    def restore(self, pairs: np.ndarray, slip: np.ndarray) -> None:
+        """Give the slips of slips() to the next list that is built."""
+        if len(pairs) > self.capacity * self.blocks:
+            self.allocate(len(pairs))
+        assert self.store
+        counts = np.bincount(pairs[:, 0], minlength=max(1, self.n))
+        room = self.capacity * self.blocks
+        near, slips = np.zeros(room, dtype=np.int32), np.zeros((room, self.dim))
+        near[: len(pairs)], slips[: len(pairs)] = pairs[:, 1], slip
+        self.store.write(self.old_near, near)
+        self.store.write(self.old_slip, slips)
+        self.old_first.from_numpy((np.cumsum(counts) - counts).astype(np.int32))
+        self.old_number.from_numpy(counts.astype(np.int32))
+        self.kept[None] = self.stale[None] = 1
+
+    @ti.func
+    def keep(self):
+        """Put the list aside with its slips, unless one is there already, from a build that did not fit."""
+        kept = self.kept[None]
+        for i in range(self.n):
+            if kept == 0:
+                self.old_first[i], self.old_number[i] = self.first[i], self.number[i]
+                for e in range(self.first[i], self.first[i] + self.number[i]):
+                    self.old_near[e], self.old_slip[e] = self.near[e], self.slip[e]
+
+    @ti.func
+    def carry(self, i):
+        """Give each neighbour of particle i the slip that it had in the old list; both are sorted."""
+        old, end = self.old_first[i], self.old_first[i] + self.old_number[i]
+        for e in range(self.first[i], self.first[i] + self.number[i]):
+            j = self.near[e]
+            while old < end and self.old_near[old] < j:
+                old += 1
+            self.slip[e] = 0 * self.slip[e]
+            if old < end and self.old_near[old] == j:
+                self.slip[e] = self.old_slip[old]
 
     @ti.func
     def watch(self, i):
@@ -121,6 +192,8 @@ class Grid:
     @ti.func
     def build(self):
         """Sort the particles into buckets, then list the near ones of each."""
+        if ti.static(self.carries):
+            self.keep()
         for b in range(self.buckets + 2):
             self.edge[b] = 0
         ti.loop_config(serialize=self.serial)
@@ -140,11 +213,18 @@ class Grid:
         for _ in range(1):
             self.need[None] = 0
             self.stale[None] = 0
+            if ti.static(self.carries):
+                self.kept[None] = 1
         for t in range(self.blocks * self.spread):
             if t % self.spread == 0:
                 self.fill(t // self.spread)
         for i in range(self.n):
             self.origin[i] = self.state.x[i]
+        if ti.static(self.carries):
+            ti.loop_config(serialize=True)
+            for _ in range(1):
+                if self.need[None] <= self.capacity:
+                    self.kept[None] = 0
 
     @ti.func
     def fill(self, block):
@@ -158,6 +238,8 @@ class Grid:
             used = self.collect(i, start, used, room)
             self.number[i] = ti.max(ti.min(used, room) - begin, 0)
             self.sort(self.first[i], self.number[i])
+            if ti.static(self.carries):
+                self.carry(i)
         ti.atomic_max(self.need[None], used)
 
     @ti.func
@@ -193,6 +275,9 @@ class Grid:
         r = self.state.apart(i, j)
         far = self.radius.of(i) + self.radius.of(j) + ti.cast(self.skin, self.real)
         yes = r.dot(r) < far * far and self.state.w[i] + self.state.w[j] > 0
+        if ti.static(not self.table.uniform):
+            if yes:
+                yes = self.table.of(i, j)[3] > 0
         if ti.static(self.linked):
             if yes:
                 for e in range(self.mates_begin[i], self.mates_begin[i + 1]):

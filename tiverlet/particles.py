@@ -102,7 +102,9 @@ class State:
     def __init__(self, memory: Memory, particles: Particles, inv_mass: np.ndarray, compensated: bool):
         n, dim = particles.count, particles.dim
         self.compensated = compensated
-        self.dim = dim
+        self.double = memory.real == ti.f64
+        self.count, self.dim = n, dim
+        self.starts = self.befores = False
         self.x = memory.field("position", n, width=dim, values=particles.position, state=True)
         self.d = memory.field("displacement", n, width=dim, values=particles.velocity, state=True)
         self.w = memory.field("inv_mass", n, values=inv_mass)
@@ -132,6 +134,33 @@ class State:
         if ti.static(self.compensated):
             x += self.low[i]
         return x
+
+    def remember(self, memory: Memory, start: bool, before: bool) -> None:
+        """Declare what friction and restitution need: the position and the displacement at the start of the substep."""
+        self.starts, self.befores = start, before
+        if start:
+            self.x0 = memory.field("position_at_start", self.count, width=self.dim)
+            if self.compensated:
+                self.low0 = memory.field("position_low_at_start", self.count, width=self.dim)
+        if before:
+            self.before = memory.field("displacement_at_start", self.count, width=self.dim)
+
+    @ti.func
+    def digits(self, i):
+        """What the last two binary digits of the coordinates of particle i amount to [m]."""
+        x = self.x[i]
+        size = ti.abs(x[0])
+        for k in ti.static(range(1, self.dim)):
+            size = ti.max(size, ti.abs(x[k]))
+        return ti.static(2.0**-50 if self.double else 2.0**-21) * size
+
+    @ti.func
+    def restart(self, i):
+        """x = start + d in one sum: a particle whose d has come to nothing is where it was, to the bit."""
+        self.x[i] = self.x0[i]
+        if ti.static(self.compensated):
+            self.low[i] = self.low0[i]
+        self.advance(i, self.d[i])
 
     @ti.func
     def advance(self, i, d):

@@ -7,11 +7,13 @@ parallel: a few launches per substep, one static chunk of each loop per thread.
 import numpy as np
 import taichi as ti
 
-from .feature import Acceleration, Batch, Scene, Wall
+from .feature import Acceleration, Batch, Scene
 from .tools import golden_steps
+from .wall import Wall
 
 # Multiples of the golden ratio of two dimensions, mod 1, are the most even sequence of pairs: one for each of the two sums.
 DITHER = golden_steps(2)
+REBOUNDS = 8  # passes of restitution in a substep in which a pair bounces
 SWEEPS = 8  # rounds over the walls, for particles that several of them push
 
 
@@ -41,6 +43,7 @@ class Substep:
         self.drivers = drivers
         self.contacts = [contact] if contact else []
         self.grid, self.hashes = grid, bool(grid)
+        self.concludes = any(c.rubs or c.bounces for c in self.contacts)
         self.walls: list[Wall] = walls
         self.radius = scene.radius
         self.springs = any(b.soft for b in self.batches)
@@ -94,10 +97,18 @@ class Substep:
     @ti.func
     def integrate(self, i, h, t, tick, fresh):
         """d += h^2 a, x += d; at a start (d is v) x += h v + h^2 a / 2. Linear drag is exact in both."""
+        if ti.static(self.state.starts):
+            self.state.x0[i] = self.state.x[i]
+            if ti.static(self.state.compensated):
+                self.state.low0[i] = self.state.low[i]
         if self.state.w[i] > 0:
             v = self.velocity_before(i, h, fresh)
             a = self.accelerate(i, self.state.place(i), v, t)
             d = self.state.d[i]
+            if ti.static(self.state.befores):
+                self.state.before[i] = d
+                if fresh != 0:
+                    self.state.before[i] = h * v - h * h / 2 * a
             if ti.static(self.uses_velocity):
                 self.earlier[i] = d
                 if fresh != 0:
@@ -126,7 +137,7 @@ class Substep:
             c.grow(i, h)
 
     @ti.func
-    def confine(self, i, h, when):
+    def confine(self, i, h, when, last):
         """The walls, which have the last word; several take turns until they agree, or for SWEEPS rounds in a sharp corner."""
         if self.state.w[i] > 0:
             moving = True
@@ -134,7 +145,7 @@ class Substep:
                 if moving:
                     before = self.state.d[i]
                     for f in ti.static(self.walls):
-                        f.confine(i, self.radius.of(i), h, when)
+                        f.confine(i, self.radius.of(i), h, when, last)
                     moving = (self.state.d[i] != before).any()
 
     # The phases: loops over the bodies, serial inside the fused kernel and parallel at the top of the others.
@@ -151,7 +162,7 @@ class Substep:
                     k.watch(f.member(c, 0))
 
     @ti.func
-    def relax(self, h, when, first, fresh, final):
+    def relax(self, h, when, first, last, fresh, final):
         """3 One pass: constraints into slots, particles gather them; contacts; walls."""
         hh = self.reach(h, fresh)
         for f in ti.static(self.batches):
@@ -164,16 +175,16 @@ class Substep:
             for i in range(self.n):
                 c.count(i)
             for i in range(self.n):
-                c.relax(i)
+                c.relax(i, first)
         if ti.static(len(self.batches) > 0 or len(self.contacts) > 0 or len(self.walls) > 0):
             for i in range(self.n):
                 if ti.static(len(self.batches) > 0 and len(self.contacts) == 0):
                     self.slots.gather(i, first, final)
                 before = self.state.d[i]
                 for c in ti.static(self.contacts):
-                    c.gather(i)
+                    c.gather(i, last)
                 if ti.static(len(self.walls) > 0):
-                    self.confine(i, h, when)
+                    self.confine(i, h, when, last)
                 for c in ti.static(self.contacts):
                     self.grid.watch(i)
                 if ti.static(len(self.walls) > 0 or len(self.contacts) > 0):
@@ -182,6 +193,44 @@ class Substep:
                             self.thrust[i] = self.state.d[i] - before
                         else:
                             self.thrust[i] += self.state.d[i] - before
+
+    @ti.func
+    def rebound(self):
+        """4 One pass of restitution, over displacements alone. Several let pairs that are struck at once agree."""
+        for c in ti.static(self.contacts):
+            if ti.static(c.bounces):
+                for i in range(self.n):
+                    c.rebound(i)
+                for i in range(self.n):
+                    if self.state.w[i] > 0:
+                        self.state.d[i] += c._on_kick[i]
+
+    @ti.func
+    def remember(self):
+        """The end of a substep with contacts that rub or bounce."""
+        for c in ti.static(self.contacts):
+            if ti.static(c.rubs):
+                for i in range(self.n):
+                    c.remember(i)
+            if ti.static(c.bounces):
+                ti.loop_config(serialize=True)
+                for _ in range(1):
+                    c._on_hit[None] = 0
+
+    @ti.func
+    def struck(self):
+        """1 when a pair bounces in this substep."""
+        out = 0
+        for c in ti.static(self.contacts):
+            if ti.static(c.bounces):
+                out = c._on_hit[None]
+        return out
+
+    @ti.func
+    def pass_(self, h, when, it, iterations, fresh, s, substeps):
+        """Pass `it` of substep s."""
+        first, last = ti.cast(it == 0, ti.i32), ti.cast(it == iterations - 1, ti.i32)
+        self.relax(h, when, first, last, fresh, ti.cast(s == substeps - 1, ti.i32))
 
     @ti.func
     def reach(self, h, fresh):
@@ -225,9 +274,15 @@ class Substep:
                             if self.grid.need[None] > self.grid.capacity:
                                 self.halt[None] = [1, s, it]
                         if self.halt[None][0] == 0:
-                            self.relax(h, when, ti.cast(it == 0, ti.i32), starts, ti.cast(s == substeps - 1, ti.i32))
+                            self.pass_(h, when, it, iterations, starts, s, substeps)
                     else:
-                        self.relax(h, when, ti.cast(it == 0, ti.i32), starts, ti.cast(s == substeps - 1, ti.i32))
+                        self.pass_(h, when, it, iterations, starts, s, substeps)
+                if ti.static(self.concludes):
+                    if self.halt[None][0] == 0:
+                        if self.struck() != 0:
+                            for _ in range(REBOUNDS):
+                                self.rebound()
+                        self.remember()
 
     @ti.kernel
     def predicted(self, h64: ti.f64, t: ti.f64, tick: ti.i32, fresh: ti.i32, s: ti.i32, substeps: ti.i32) -> ti.i32:
@@ -237,10 +292,20 @@ class Substep:
         return self.is_stale()
 
     @ti.kernel
-    def relaxed(self, h64: ti.f64, s: ti.i32, substeps: ti.i32, first: ti.i32, fresh: ti.i32, final: ti.i32) -> ti.i32:
-        """One pass of phase 3; returns whether the neighbour list is stale."""
-        self.relax(ti.cast(h64, self.real), self.clock(s, substeps), first, fresh, final)
-        return self.is_stale()
+    def relaxed(self, h64: ti.f64, s: ti.i32, substeps: ti.i32, it: ti.i32, iterations: ti.i32, fresh: ti.i32) -> ti.i32:
+        """One pass of phase 3; returns whether the neighbour list is stale, and 2 more if a pair bounces."""
+        self.pass_(ti.cast(h64, self.real), self.clock(s, substeps), it, iterations, fresh, s, substeps)
+        return self.is_stale() + 2 * self.struck()
+
+    @ti.kernel
+    def rebounded(self):
+        """One pass of phase 4."""
+        self.rebound()
+
+    @ti.kernel
+    def remembered(self):
+        """The end of a substep with contacts that rub or bounce."""
+        self.remember()
 
     @ti.func
     def is_stale(self):

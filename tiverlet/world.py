@@ -14,11 +14,12 @@ from rich.progress import track
 from . import checks, runtime
 from .constraints.contact import Contact
 from .explain import explain
-from .feature import Acceleration, Batch, Feature, Scene, Wall
+from .feature import Acceleration, Batch, Feature, Scene
 from .particles import Particles, Radii, State, in_range
 from .solvers.jacobi import Jacobi, Slots
-from .substep import Substep, decay
+from .substep import REBOUNDS, Substep, decay
 from .survey import StepReport, Survey
+from .wall import Wall
 
 T = TypeVar("T", bound=Feature)
 PRECISIONS = {"f32": ti.f32, "f32-compensated": ti.f32, "f64": ti.f64}
@@ -91,6 +92,8 @@ class World:
         contact = next((c for c in self._of(Contact) if c.matters), None)
         if contact or walls:
             scene.radius = Radii(memory, self._particles.radius)
+        surfaces = [*walls, *([contact] if contact else [])]
+        state.remember(memory, any(f.rubs for f in surfaces), any(f.bounces for f in surfaces))
         if batches:
             scene.slots = Slots(memory, state, batches, inv_mass, self._solver)
         parallel = self._path == "parallel"
@@ -193,11 +196,17 @@ class World:
         h, n, relaxes = self._h, self.substeps, self._batches or self._grid or self._sub.walls
         for s in range(n):
             fresh = int(self._fresh and s == 0)
+            struck = 0
             stale = self._sub.predicted(h, self._time, self._tick, fresh, s, n)
             for it in range(self.iterations if relaxes else 0):
                 if stale:
                     self._list()
-                stale = self._sub.relaxed(h, s, n, int(it == 0), fresh, int(s == n - 1))
+                state = self._sub.relaxed(h, s, n, it, self.iterations, fresh)
+                stale, struck = state & 1, state & 2
+            if self._sub.concludes:
+                for _ in range(REBOUNDS if struck else 0):
+                    self._sub.rebounded()
+                self._sub.remembered()
 
     def _list(self) -> None:
         """Build the neighbour list, growing it until everything fits."""
@@ -359,7 +368,10 @@ class World:
 
     def _state(self) -> dict[str, np.ndarray]:
         """Every field that the future depends on."""
-        return {k: v for memory in self._memories for k, v in memory.state().items()}
+        state = {k: v for memory in self._memories for k, v in memory.state().items()}
+        if self._grid and self._grid.carries:
+            state["Contact.pairs"], state["Contact.slips"] = self._grid.slips()
+        return state
 
     @property
     def _memories(self) -> list[runtime.Memory]:
@@ -391,6 +403,9 @@ class World:
         state = self._state()
         for memory in new._memories:
             memory.restore(state)
+        if new._grid and new._grid.carries:
+            new._grid.restore(state["Contact.pairs"], state["Contact.slips"])
+            new._renew()
         for ours, theirs in zip(self._features, new._features, strict=True):
             theirs.changed, theirs.moving = ours.changed, ours.moving
         new._fresh, new._started, new._placed, new._energy = (

@@ -4,8 +4,9 @@ import numpy as np
 import taichi as ti
 
 from .. import checks
-from ..feature import Knob, Scene, Wall
+from ..feature import Knob, Scene
 from ..particles import Particles
+from ..wall import Wall
 
 
 def _corner(name: str):
@@ -32,7 +33,8 @@ class Box(Wall):
     C(x) = x_k - lower_k - radius >= 0 and upper_k - x_k - radius >= 0, with unit gradients along axis k.
 
     lower, upper: (dim,) [m]; -inf and inf leave a side open. Live: assign to .lower or .upper between frames, and the walls move
-    there during the next frame (to or from an open side they jump). push_out: see Wall.
+    there during the next frame (to or from an open side they jump). friction, restitution, push_out:
+    see Wall.
 
     One-sided: a particle cannot leave at any speed.
     """
@@ -42,10 +44,10 @@ class Box(Wall):
     lower = Knob(_corner("lower"), "Lower corner [m].")
     upper = Knob(_corner("upper"), "Upper corner [m].")
 
-    def __init__(self, lower, upper, *, push_out=1.0):
+    def __init__(self, lower, upper, *, friction=0.0, restitution=0.0, push_out=1.0):
         self.lower = lower
         self.upper = upper
-        self.push_out = checks.number("Box", "push_out", push_out, least=0.0)
+        self.surface(friction, restitution, push_out)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the corners against the dimension and the widest particle."""
@@ -55,8 +57,7 @@ class Box(Wall):
 
     def bind(self, scene: Scene) -> None:
         """Corners at the start and the end of a frame."""
-        self.scene = scene
-        self._on_state = scene.state
+        Wall.bind(self, scene)
         self._on_corners = [
             scene.memory.field(f"Box.{name}", None, width=self.dim, values=value, state=True)
             for name, value in (
@@ -83,7 +84,7 @@ class Box(Wall):
         self._on_corners[2][None] = list(self.upper)
 
     @ti.func
-    def confine(self, i, radius, h, when):
+    def confine(self, i, radius, h, when, last):
         """Two planes per axis."""
         for k in ti.static(range(self.dim)):
             for s in ti.static(range(2)):
@@ -93,5 +94,6 @@ class Box(Wall):
                     wall = a * (1 - when[1]) + b * when[1]
                     shift = (b - a) * (when[1] - when[0])
                 n = 0 * self._on_state.x[i]
-                n[k] = 1 - 2 * s
-                self.press(i, (1 - 2 * s) * (wall - self._on_state.place(i)[k]) + radius, n, (1 - 2 * s) * shift, h)
+                moved = n
+                n[k], moved[k] = 1 - 2 * s, shift
+                self.press(i, (1 - 2 * s) * (wall - self._on_state.place(i)[k]) + radius, n, moved, h, last)

@@ -6,6 +6,7 @@ import taichi as ti
 from .. import checks
 from ..feature import Batch, Feature, Scene
 from ..grid import FARTHEST, Grid
+from ..material import Table
 from ..particles import Particles
 from ..runtime import Memory
 
@@ -15,22 +16,39 @@ class Contact(Feature):
 
     C(x) = |x_i - x_j| - (r_i + r_j) >= 0 for all pairs, grad_i C = n = (x_i - x_j) / |x_i - x_j|.
 
-    skin: how far beyond touching pairs are listed [m], "auto" for a fifth of the median radius; speed only, never the result.
-    push_out: particles that overlap at the start, or after positions were assigned, part at this speed [m/s] at most: they act
-    as if they were small enough to fit, and grow back.
+    friction: Coulomb, a number or (static, dynamic), or a mapping from pairs of groups to these: {(0, 1): 0.5}. restitution:
+    0 to 1, or such a mapping. groups: the pairs of groups that touch, None for all. skin: how far beyond touching pairs are
+    listed [m], "auto" for a fifth of the median radius; speed only, never the result. push_out: particles that overlap at the
+    start, or after positions were assigned, part at this speed [m/s] at most: they act as if they were small enough to fit, and
+    grow back.
 
     A Jacobi pass: each pair wants C back along the current n, split by mass and by the number of overlapping pairs that each
     particle has, p = -C / (n_i w_i + n_j w_j), which conserves momentum. Particles that are in the same place part in the
     direction of a golden-ratio angle made from their indices. Linked particles (Distance, Rope, Spacer) do not touch.
+
+    Friction wants back the slip s of a pair, up to friction times the overlap: what a pair has moved across its normal since it
+    touched, kept as long as it touches (Cundall and Strack 1979). Restitution gives the pair the normal velocity -e times the one
+    that it had before the substep, and reflects the overlap. Neither depends on h. Particles do not spin.
     """
 
-    def __init__(self, *, skin="auto", push_out=1.0):
+    def __init__(self, friction=0.0, restitution=0.0, *, skin="auto", groups=None, push_out=1.0):
         if skin != "auto":
             skin = checks.number("Contact", "skin", skin, above=0.0)
         self.skin = skin
+        self.table = Table("Contact", friction, restitution, groups)
         self.push_out = checks.number("Contact", "push_out", push_out, least=0.0)
 
     matters = True
+
+    @property
+    def rubs(self) -> bool:
+        """Whether any pair has friction."""
+        return self.table.rubs
+
+    @property
+    def bounces(self) -> bool:
+        """Whether any pair has restitution."""
+        return self.table.bounces
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Choose the skin, and refuse positions too far out for cells to be told apart."""
@@ -67,7 +85,14 @@ class Contact(Feature):
         self._on_active = scene.memory.field("Contact.active", n, kind=ti.i32)
         self._on_fast = scene.memory.field("Contact.fast", None, kind=ti.i32)
         self._on_eases, self._on_store = False, None
-        self._on_grid = Grid(scene, self._on_radius, self._on_reach, self._on_size, linked, parallel)
+        self._on_rubs, self._on_bounces = self.rubs, self.bounces
+        if self.bounces:
+            self._on_struck = scene.memory.field("Contact.struck", n, kind=ti.i32)
+            self._on_kick = scene.memory.field("Contact.kick", n, width=dim)
+            self._on_lift = scene.memory.field("Contact.lift", n, width=dim)
+            self._on_hit = scene.memory.field("Contact.hit", None, kind=ti.i32)
+        self.table.bind(scene)
+        self._on_grid = Grid(scene, self._on_reach, self._on_size, linked, self.table, self.rubs, self.bounces, parallel)
         return self._on_grid
 
     def ease(self) -> None:
@@ -127,6 +152,27 @@ class Contact(Feature):
         return overlap, n
 
     @ti.func
+    def meet(self, i, j, far):
+        """As touch(), but a pair that came together in this substep has the direction that it had when it met.
+
+        |r0 + s d| = far, with r0 at the start and d the relative displacement; what is left of d along n is the overlap. This is
+        exact for free flight, where the direction at the end is off by the way that a pair slides past each other.
+        """
+        overlap, n = self.touch(i, j, far)
+        if overlap > 0:
+            d = self._on_state.d[i] - self._on_state.d[j]
+            r = self._on_state.apart(i, j) - d
+            c = r.dot(r) - far * far
+            if c > 0:
+                a, b = d.dot(d), r.dot(d)
+                root = ti.sqrt(ti.max(b * b - a * c, 0)) - b
+                if b < 0 and root > 0:
+                    s = ti.min(c / root, 1)
+                    n = (r + s * d) / far
+                    overlap = ti.max((s - 1) * d.dot(n), 0)
+        return overlap, n
+
+    @ti.func
     def part(self, i, j, r):
         """A direction for two particles in the same place: opposite for (j, i), different for other pairs."""
         low, high = ti.cast(ti.min(i, j), ti.u32), ti.cast(ti.max(i, j), ti.u32)
@@ -156,23 +202,105 @@ class Contact(Feature):
         self._on_active[i] = active
 
     @ti.func
-    def relax(self, i):
+    def relax(self, i, first):
         """What the pairs of particle i want of it."""
-        total = 0 * self._on_state.x[i]
+        total, lifts = 0 * self._on_state.x[i], 0 * self._on_state.x[i]
         if self._on_active[i] > 0:
             for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
                 j = self._on_grid.near[e]
-                overlap, n = self.touch(i, j, self.far(i, j))
+                overlap, n = self.meet(i, j, self.far(i, j))
+                kick = 0 * overlap
+                if ti.static(self._on_bounces):
+                    if first != 0:
+                        self._on_grid.aim[e] = 0 * n
                 if overlap > 0:
-                    shared = self._on_active[i] * self._on_state.w[i] + self._on_active[j] * self._on_state.w[j]
-                    total += self._on_state.w[i] * overlap / shared * n
+                    share = self._on_state.w[i] / self.shared(i, j)
+                    if ti.static(self._on_bounces):
+                        if first != 0:
+                            aim, kick, lift = self.bounce(i, j, n, overlap)
+                            lifts += share * lift * n
+                            if kick > 0:
+                                self._on_grid.aim[e] = aim * n
+                                self._on_hit[None] = 1
+                    want = overlap * n
+                    if ti.static(self._on_rubs):
+                        want -= self.rub(i, j, n, overlap + kick, self._on_grid.slip[e])
+                    total += share * want
         self._on_move[i] = total
+        if ti.static(self._on_bounces):
+            if first != 0:
+                self._on_lift[i] = lifts
+                self._on_struck[i] = self._on_active[i]
 
     @ti.func
-    def gather(self, i):
-        """Move particle i as its pairs want."""
-        if self._on_active[i] > 0 and self._on_state.w[i] > 0:
-            self._on_state.shift(i, self._on_move[i])
+    def shared(self, i, j):
+        """The mass-split weight of a pair."""
+        return self._on_active[i] * self._on_state.w[i] + self._on_active[j] * self._on_state.w[j]
+
+    @ti.func
+    def bounce(self, i, j, n, overlap):
+        """How a pair should leave: the normal displacement to aim at, what it lacks after the overlap is taken back, and how far
+        beyond touching it is by the end of the substep.
+
+        It came together by a before the substep and by `here` in it, and aims at restitution * a. Where there was a gap before,
+        the overlap is reflected.
+        """
+        restitution = self.table.of(i, j)[2]
+        a = -(self._on_state.before[i] - self._on_state.before[j]).dot(n)
+        here = -(self._on_state.d[i] - self._on_state.d[j]).dot(n)
+        aim, kick, lift = restitution * ti.max(a, 0), 0 * overlap, 0 * overlap
+        if a > 0:
+            kick = ti.max(aim - (overlap - here), 0)
+            if overlap <= here:
+                lift = restitution * overlap
+        return aim, kick, lift
+
+    @ti.func
+    def rebound(self, i):
+        """One Jacobi pass over displacements alone: what the pairs of particle i that bounce lack."""
+        total = 0 * self._on_state.x[i]
+        if self._on_struck[i] > 0:
+            for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
+                aim = self._on_grid.aim[e]
+                size = aim.norm()
+                if size > 0:
+                    j, n = self._on_grid.near[e], aim / size
+                    lack = size - (self._on_state.d[i] - self._on_state.d[j]).dot(n)
+                    if lack > 0:
+                        shared = self._on_struck[i] * self._on_state.w[i] + self._on_struck[j] * self._on_state.w[j]
+                        total += self._on_state.w[i] * lack / shared * n
+        self._on_kick[i] = total
+
+    @ti.func
+    def rub(self, i, j, n, normal, slip):
+        """The part of a pair's slip, with the present displacements, that friction takes back for a normal displacement."""
+        s = slip + self._on_state.d[i] - self._on_state.d[j]
+        s -= s.dot(n) * n
+        row, size = self.table.of(i, j), s.norm()
+        if size > row[0] * normal:
+            s *= row[1] * normal / size
+        return s
+
+    @ti.func
+    def gather(self, i, last):
+        """Move particle i as its pairs want; what bounced rises at the end of the substep."""
+        if self._on_state.w[i] > 0:
+            if self._on_active[i] > 0:
+                self._on_state.shift(i, self._on_move[i])
+            if ti.static(self._on_bounces):
+                if last != 0:
+                    self._on_state.advance(i, self._on_lift[i])
+
+    @ti.func
+    def remember(self, i):
+        """At the end of a substep: add to each pair's slip what it has moved, as far as friction can hold it."""
+        for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
+            j = self._on_grid.near[e]
+            overlap, n = self.touch(i, j, self.far(i, j))
+            slip = 0 * self._on_state.x[i]
+            if overlap > 0:
+                slip = self.rub(i, j, n, overlap, self._on_grid.slip[e])
+            self._on_grid.slip[e] = slip
 
     @ti.func
     def overlaps(self, i):

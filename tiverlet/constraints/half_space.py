@@ -4,8 +4,9 @@ import numpy as np
 import taichi as ti
 
 from .. import checks
-from ..feature import Knob, Scene, Wall
+from ..feature import Knob, Scene
 from ..particles import Particles
+from ..wall import Wall
 
 
 class HalfSpace(Wall):
@@ -14,14 +15,14 @@ class HalfSpace(Wall):
     C(x) = n . x - offset - radius >= 0, grad C = n.
 
     normal: (dim,), any length above 0; offset: [m] along the unit normal, from the origin. offset is live: assign to it between
-    frames, and the plane moves there during the next frame. push_out: see Wall.
+    frames, and the plane moves there during the next frame. friction, restitution, push_out: see Wall.
 
     One-sided: a particle cannot pass at any speed.
     """
 
     offset = Knob(lambda f, v: checks.number("HalfSpace", "offset", v), "Of the plane along its normal [m].")
 
-    def __init__(self, normal, offset=0.0, *, push_out=1.0):
+    def __init__(self, normal, offset=0.0, *, friction=0.0, restitution=0.0, push_out=1.0):
         normal = np.asarray(normal, dtype=np.float64)
         normal = checks.vector("HalfSpace", "normal", normal, normal.size)
         length = float(np.linalg.norm(normal))
@@ -30,7 +31,7 @@ class HalfSpace(Wall):
         self.normal = normal / length
         self.normal.flags.writeable = False
         self.offset = offset
-        self.push_out = checks.number("HalfSpace", "push_out", push_out, least=0.0)
+        self.surface(friction, restitution, push_out)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the normal's length."""
@@ -38,8 +39,7 @@ class HalfSpace(Wall):
 
     def bind(self, scene: Scene) -> None:
         """Normal, and the offsets at the start and the end of a frame."""
-        self.scene = scene
-        self._on_state = scene.state
+        Wall.bind(self, scene)
         self._on_normal = scene.memory.field("HalfSpace.normal", None, width=len(self.normal), values=self.normal)
         self._on_offset = scene.memory.field("HalfSpace.offset", None, width=2, values=[self.offset] * 2, state=True)
         self._on_aim = self.offset
@@ -55,11 +55,11 @@ class HalfSpace(Wall):
         self._on_offset[None] = [self.offset, self.offset]
 
     @ti.func
-    def confine(self, i, radius, h, when):
+    def confine(self, i, radius, h, when, last):
         """One plane."""
         n, offset = self._on_normal[None], self._on_offset[None]
         before, now = (
             offset[0] * (1 - when[0]) + offset[1] * when[0],
             offset[0] * (1 - when[1]) + offset[1] * when[1],
         )
-        self.press(i, now + radius - n.dot(self._on_state.place(i)), n, now - before, h)
+        self.press(i, now + radius - n.dot(self._on_state.place(i)), n, (now - before) * n, h, last)

@@ -1,0 +1,212 @@
+"""Restitution and friction against closed forms, between particles and on walls, in 2D and 3D, for any step."""
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+
+from .conftest import case, rerun
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("precision, limit", [("f64", 1e-12), ("f32", 1e-6)])
+def test_head_on_collisions(world, dim, precision, limit):
+    # R14: v1 = (m1 u1 + m2 u2 - m2 e (u1 - u2)) / (m1 + m2), mass ratios 1 ... 1000. One pair per row, a group for each e.
+    rows = [
+        (m1, m2, u1, u2, k)
+        for m1, m2, u1, u2 in ((1, 1, 2, 0), (1, 3, 2, -1), (1, 1000, 5, 0), (1000, 1, 5, 0))
+        for k in range(3)
+    ]
+    m1, m2, u1, u2, k = np.array(rows, dtype=float).T
+    e = np.array([0.0, 0.5, 1.0])[k.astype(int)]
+    n = len(rows)
+    x, v = np.zeros((2 * n, dim)), np.zeros((2 * n, dim))
+    x[:n, 0], x[n:, 0], x[:, 1] = -0.3, 0.3, np.tile(np.arange(n), 2)
+    v[:n, 0], v[n:, 0] = u1, u2
+    group = np.tile(k.astype(int), 2)
+    contact = tv.Contact(restitution={(0, 0): 0.0, (1, 1): 0.5, (2, 2): 1.0}, groups=[(0, 0), (1, 1), (2, 2)])
+    start = tv.Particles(x, velocity=v, mass=np.r_[m1, m2], radius=0.1, group=group)
+    w = world(start, [contact], precision=precision)
+    want1 = (m1 * u1 + m2 * u2 - m2 * e * (u1 - u2)) / (m1 + m2)
+    for substeps in (3, 7, 40):
+        rerun(w, 0.8, substeps=substeps)
+        got = w.velocity[:, 0]
+        # In f32 an overlap is known to an ulp of the position, 3e-8 m, which makes a velocity of 3e-8 / h.
+        atol = 1e-11 if precision == "f64" else 6e-8 * 60 * substeps + 5e-6
+        np.testing.assert_allclose(got[:n], want1, atol=atol)
+        np.testing.assert_allclose(got[n:], want1 + e * (u1 - u2), atol=atol)
+        momentum = m1 * got[:n] + m2 * got[n:]
+        np.testing.assert_allclose(momentum, m1 * u1 + m2 * u2, rtol=limit)
+
+
+@pytest.mark.parametrize("e, key", [(1.0, "e1"), (0.5, "e0.5"), (0.0, "e0")])
+def test_oblique_discs(world, e, key):
+    # R15: v1 = u - (1 + e)/2 (u . n) n, direction to 1e-3 rad at v h / r = 0.01.
+    p, want = case("R15_oblique_discs")["params"], case("R15_oblique_discs")["values"][key]
+    start = tv.Particles([[-0.4, p["b"]], [0.0, 0.0]], velocity=[[p["u"], 0], [0, 0]], radius=p["r"])
+    w = world(start, [tv.Contact(restitution=e)], precision="f64", substeps=33)
+    w.run(0.6)
+    for got, ref in zip(w.velocity, (want["v1"], want["v2"]), strict=True):
+        ref = np.array(ref) * [1, 1 if np.sign(ref[1]) == np.sign(got[1]) else -1]  # the case counts b downwards
+        assert abs(np.arctan2(got[1], got[0]) - np.arctan2(ref[1], ref[0])) < 1e-3
+        np.testing.assert_allclose(got, ref, atol=2e-3)
+
+
+@pytest.mark.parametrize("e", [0.5, 0.8, 0.9])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_bouncing_ball(world, e, dim):
+    # R16: heights h0 e^(2 n), at rest at t_rest; never gains. h = 1/600.
+    want = case(f"R16_bounce_e{e}")["values"]
+    start = tv.Particles([[0.0, 1.1, 0.0][:dim]], radius=0.1)
+    walls = {2: tv.Box((-1, 0), (1, 9), restitution=e), 3: tv.HalfSpace((0, 1, 0), restitution=e)}
+    w = world(start, [tv.Gravity(9.81), walls[dim]], precision="f64", substeps=1)
+    heights, t_rest, energy = [], 0.0, 9.81 * 1.1
+    for _ in range(int(600 * want["t_rest"] * 1.1)):
+        energy_now = w.step(1 / 600).energy
+        assert energy_now <= energy + 9.81**2 / 600**2  # half-step energies swing by m (g h)^2
+        heights.append(w.position[0, 1] - 0.1)
+        t_rest = w.time if heights[-1] > 1e-9 else t_rest
+    y = np.array(heights)
+    peaks = y[1:-1][(y[1:-1] >= y[:-2]) & (y[1:-1] > y[2:])]
+    np.testing.assert_allclose(peaks[:5], want["heights"], rtol=1e-2)
+    assert t_rest == pytest.approx(want["t_rest"], rel=0.05) and np.abs(w.velocity).max() < 2 * 9.81 / 600
+
+
+def test_newtons_cradle(world):
+    # R17: pair by pair, with a gap and touching; the last ball carries on with all of it.
+    for gap, e in ((0.001, 1.0), (0.001, 0.9), (0.0, 1.0)):
+        p, want = case("R17_newton_cradle")["params"], case("R17_newton_cradle")["values"]
+        x = np.zeros((p["n"], 2))
+        x[:, 0] = np.arange(p["n"]) * (2 * p["r"] + gap)
+        x[0, 0] -= 0.1
+        start = tv.Particles(x, velocity=[[1.0, 0]] + [[0, 0]] * 4, radius=p["r"])
+        w = world(start, [tv.Contact(restitution=e)], precision="f64")
+        w.run(0.13)
+        np.testing.assert_allclose(w.velocity[:, 0], want["v_final"] if e == 1 else want["e0p9_v_final"], atol=1e-9)
+        assert tv.measure.momentum(w)[0] == pytest.approx(1.0, rel=1e-12)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+def test_incline(world, dim, precision):
+    # R18: a = g (sin - mu cos); it stops after v^2 / (2 g (mu cos - sin)) and stays to the bit if tan < mu. h = 1/600.
+    for key, v in case("R18_incline_friction")["values"].items():
+        degrees, mu, speed = (float(part.lstrip("degmuv")) for part in key.replace("deg", "").split("_"))
+        a = np.radians(degrees)
+        n, t = np.zeros(dim), np.zeros(dim)
+        n[:2], t[:2] = (np.sin(a), np.cos(a)), (np.cos(a), -np.sin(a))
+        start = tv.Particles([0.1 * n], velocity=speed * t, radius=0.1)
+        w = world(start, [tv.Gravity(9.81), tv.HalfSpace(n, friction=mu)], precision=precision, substeps=10)
+        if v["state"] == "slides":
+            w.run(1.0)
+            assert (w.position[0] - 0.1 * n) @ t == pytest.approx(v["distance_1s"], rel=1e-2 if precision == "f32" else 1e-9)
+            continue
+        w.run(3.0)
+        stopped = w.position
+        assert (stopped[0] - 0.1 * n) @ t == pytest.approx(v["stop_distance"], rel=1e-4, abs=1e-6)
+        w.substeps = 600
+        w.run(1e5 / 600, dt=1.0)
+        assert np.abs(w.position - stopped).max() <= 1e-6 * 1e5 / 600
+        np.testing.assert_allclose(w.velocity, 0.0, atol=1e-9 if precision == "f64" else 2.4e-7 * 600)  # an ulp of x per h
+
+
+def test_slip_threshold_and_two_coefficients(world):
+    # Sticks below the static coefficient, slides with the dynamic one: to 0.1 degrees.
+    mu_s, mu_d = 0.5, 0.3
+    for degrees, slides in ((np.degrees(np.arctan(mu_s)) - 0.1, False), (np.degrees(np.arctan(mu_s)) + 0.1, True)):
+        a = np.radians(degrees)
+        slope = tv.HalfSpace((np.sin(a), np.cos(a)), friction=(mu_s, mu_d))
+        w = world(tv.Particles([[0.0, 0.1 / np.cos(a)]], radius=0.1), [tv.Gravity(9.81), slope], precision="f64")
+        w.run(1.0)
+        way = 9.81 * (np.sin(a) - mu_d * np.cos(a)) / 2 if slides else 0.0
+        assert np.hypot(*(w.position[0] - [0, 0.1 / np.cos(a)])) == pytest.approx(way, rel=1e-9, abs=1e-12)
+
+
+def test_friction_between_particles(world):
+    # Row 59: a disc on a fixed disc, on the slope of its tangent. Below the threshold it stays; mu = 0 slides, mu = 1e6 sticks.
+    a = np.radians(20.0)
+    top = np.array([np.sin(a), np.cos(a)])
+    for mu, stays in ((0.0, False), (np.tan(a) * 0.95, False), (np.tan(a) * 1.05, True), (1e6, True)):
+        start = tv.Particles([[0.0, 0.0], top], radius=0.5, pinned=[0])
+        w = world(start, [tv.Gravity(9.81), tv.Contact(friction=mu)], precision="f64")
+        w.run(0.5)
+        moved = np.hypot(*(w.position[1] - top))
+        assert (moved < 1e-9) == stays
+    for friction, error in ((-0.1, "at least 0"), (float("nan"), "finite"), ((0.2, 0.5), "must not exceed")):
+        with pytest.raises(ValueError, match=error):
+            tv.Contact(friction=friction)
+    for e in (1.5, -0.1):  # row 60
+        with pytest.raises(ValueError, match="restitution"):
+            tv.Contact(restitution=e)
+        with pytest.raises(ValueError, match="restitution"):
+            tv.Box((0, 0), (1, 1), restitution=e)
+
+
+def test_a_moving_wall_drags_along(world):
+    # Row 70, with a piston that has friction along a second wall: what rests on it moves with it, in the right direction.
+    floor = tv.HalfSpace((0, 1), friction=0.5)
+    box = tv.Box((0, -9), (20, 9))
+    w = world(tv.Particles([[0.5, 0.5]], radius=0.5), [tv.Gravity(9.81), floor, box], precision="f64")
+    for k in range(60):
+        box.lower = (0.05 * (k + 1), -9)
+        w.step(1 / 60)
+    assert w.position[0, 0] == pytest.approx(3.5, abs=1e-9)
+    w.run(0.5)  # the piston stops: at 3 m/s, friction needs v^2 / (2 mu g) = 0.917 m
+    w.run(1.0)
+    assert w.position[0, 0] == pytest.approx(3.5 + 9 / (2 * 0.5 * 9.81), rel=1e-2)
+
+
+def test_leaving_a_sphere(world):
+    # R19: a point that slides off a smooth sphere leaves it at cos = 2/3.
+    want = case("R19_sphere_departure")["values"]
+    for dim in (2, 3):
+        x = np.zeros((2, dim))
+        x[1, 0], x[1, 1] = np.sin(0.05), np.cos(0.05)
+        start = tv.Particles(x, radius=[0.9, 0.1], pinned=[0])
+        w = world(start, [tv.Gravity(9.81), tv.Contact()], precision="f64", substeps=20)
+        while w.position[1, 1] > 0.0:
+            w.step(1 / 60)
+        # In free flight v_x = v cos(angle) of the departure, and there v^2 = g R cos(angle): cos = (v_x^2 / (g R))^(1/3).
+        # It starts at 0.05 rad, so it leaves where cos = 2/3 cos 0.05.
+        angle = np.arccos(np.cbrt(w.velocity[1, 0] ** 2 / 9.81))
+        assert np.degrees(angle) == pytest.approx(np.degrees(np.arccos(np.cos(0.05) * want["cos_theta"])), abs=0.3)
+        assert tv.measure.kinetic_energy(w) + 9.81 * w.position[1, 1] == pytest.approx(9.81 * np.cos(0.05), rel=1e-3)
+
+
+def heap(world, friction, n=60):
+    """Discs that run down from a column onto a rough floor; returns the height that is left, in diameters."""
+    k = np.arange(n)
+    x = np.stack([(k % 4 - 1.5) * 0.205 + k // 4 % 2 * 0.05, 0.1 + k // 4 * 0.2], axis=1)
+    features = [tv.Gravity(9.81), tv.Contact(friction=friction), tv.HalfSpace((0, 1), friction=friction)]
+    w = world(tv.Particles(x, radius=0.1), features, substeps=20)
+    w.run(4.0)
+    assert np.isfinite(w.position).all() and w.last.overlap < 0.1
+    near = np.abs(w.position[:, 0]) < 3
+    return float(w.position[near, 1].max(initial=0.1) / 0.2)
+
+
+def test_heaps_are_steeper_with_friction_and_flat_without(world):
+    heights = [heap(world, mu) for mu in (0.0, 0.2, 0.6)]
+    assert heights[0] <= 1.0 and heights[0] < heights[1] < heights[2]
+
+
+def test_friction_and_restitution_have_the_same_bits_on_both_paths(world):
+    rng = np.random.default_rng(3)
+    k = np.arange(200)
+    x = np.stack([k % 14 * 0.21, 0.2 + k // 14 * 0.21], axis=1) + rng.uniform(0, 0.005, (200, 2))
+    hashes = []
+    for path, skin in (("fused", "auto"), ("parallel", 0.05)):
+        features = [
+            tv.Gravity(9.81), tv.Contact(friction=(0.6, 0.4), restitution=0.3, skin=skin),
+            tv.Box((-0.2, 0), (3.2, 9), friction=0.5, restitution=0.3),
+        ]  # fmt: skip
+        w = world(tv.Particles(x, radius=0.08 + 0.02 * tv.golden(k)), features, path=path, substeps=10)
+        w.run(0.5)
+        hashes.append(w.hash())
+    assert hashes[0] == hashes[1]
+    twin = w.clone()
+    assert twin.hash() == w.hash()
+    w.run(0.2)
+    twin.run(0.2)
+    assert twin.hash() == w.hash()
+    twin.close()

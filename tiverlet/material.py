@@ -1,0 +1,87 @@
+"""Friction and restitution: what users give, checked, and as tables for kernels."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+import taichi as ti
+
+from . import checks
+from .feature import Scene
+
+
+def friction_of(who: str, name: str, value: Any) -> tuple[float, float]:
+    """A coefficient of Coulomb friction, or (static, dynamic), as (static, dynamic)."""
+    both = value if isinstance(value, (tuple, list)) else (value, value)
+    if len(both) != 2:
+        raise ValueError(f"{who}: {name} = {value!r}, but a number or (static, dynamic) is needed.")
+    static = checks.number(who, f"{name} (static)", both[0], least=0.0)
+    dynamic = checks.number(who, f"{name} (dynamic)", both[1], least=0.0)
+    if dynamic > static:
+        raise ValueError(f"{who}: {name} = {value!r}: dynamic friction must not exceed static friction.")
+    return static, dynamic
+
+
+def restitution_of(who: str, name: str, value: Any) -> float:
+    """A coefficient of restitution, 0 (inelastic) to 1 (elastic)."""
+    return checks.number(who, name, value, least=0.0, most=1.0)
+
+
+class Table:
+    """For each pair of groups: static friction, dynamic friction, restitution, and whether they touch.
+
+    friction, restitution: one value for all, or a mapping from pairs of groups to values, with 0 for pairs that are not in it.
+    touching: None for all, or the pairs of groups that touch.
+    """
+
+    def __init__(self, who: str, friction: Any, restitution: Any, touching: Iterable | None):
+        self.who, self.friction, self.restitution = who, friction, restitution
+        self.touching = None if touching is None else [self._pair("groups", p) for p in touching]
+        single = not isinstance(friction, Mapping) and not isinstance(restitution, Mapping)
+        self.uniform = single and touching is None
+        values = friction.values() if isinstance(friction, Mapping) else [friction]
+        self.rubs = any(friction_of(who, "friction", v)[0] > 0 for v in values)
+        values = restitution.values() if isinstance(restitution, Mapping) else [restitution]
+        self.bounces = any(restitution_of(who, "restitution", v) > 0 for v in values)
+
+    def rows(self, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The rank of each particle's group, (n,), and the table, (ranks * ranks, 4)."""
+        names, rank = np.unique(group, return_inverse=True)
+        at = {int(name): k for k, name in enumerate(names)}
+        m = len(names)
+        table = np.zeros((m, m, 4))
+        table[..., 3] = self.touching is None
+        for a, b in self.touching or []:
+            if a in at and b in at:
+                table[at[a], at[b], 3] = table[at[b], at[a], 3] = 1
+        for columns, given, parse in ((slice(0, 2), self.friction, friction_of), (2, self.restitution, restitution_of)):
+            if not isinstance(given, Mapping):
+                table[..., columns] = parse(self.who, "friction" if parse is friction_of else "restitution", given)
+                continue
+            for pair, value in given.items():
+                a, b = self._pair("friction" if parse is friction_of else "restitution", pair)
+                if a in at and b in at:
+                    table[at[a], at[b], columns] = table[at[b], at[a], columns] = parse(self.who, f"value of {pair}", value)
+        return rank, table.reshape(m * m, 4)
+
+    def bind(self, scene: Scene) -> None:
+        """Declare the table and the groups, where they differ; one value for all is a constant of the kernel."""
+        self._on_real = scene.real
+        rank, self._on_rows = self.rows(scene.particles.group)
+        self.groups = int(rank.max(initial=0)) + 1
+        if not self.uniform:
+            self._on_rank = scene.memory.field("Contact.group", len(rank), kind=ti.i32, values=rank)
+            self._on_table = scene.memory.field("Contact.table", len(self._on_rows), width=4, values=self._on_rows)
+
+    @ti.func
+    def of(self, i, j):
+        """Static friction, dynamic friction and restitution of particles i and j, and 1 if they touch."""
+        row = ti.Vector([ti.cast(v, self._on_real) for v in ti.static(self._on_rows[0].tolist())])
+        if ti.static(not self.uniform):
+            row = self._on_table[self._on_rank[i] * self.groups + self._on_rank[j]]
+        return row
+
+    def _pair(self, name: str, pair: Any) -> tuple[int, int]:
+        if not (isinstance(pair, (tuple, list)) and len(pair) == 2 and all(isinstance(k, (int, np.integer)) for k in pair)):
+            raise TypeError(f"{self.who}: {name} has the key {pair!r}, but a pair of groups such as (0, 1) is needed.")
+        return int(pair[0]), int(pair[1])

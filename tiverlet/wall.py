@@ -1,0 +1,111 @@
+"""Surroundings: what every wall shares, from the first touch to the bounce."""
+
+from typing import Any
+
+import taichi as ti
+
+from . import checks
+from .feature import Feature, Scene
+from .material import friction_of, restitution_of
+
+
+class Wall(Feature):
+    """Each particle by itself is kept on one side, with the last word in every iteration.
+
+    A wall's confine() finds how deep a particle is, and calls press(). One-sided: what entered in this substep is taken back
+    whole, at any speed. Depth from before (a bad start) is left at `push_out` [m/s], and gives no more velocity than that.
+
+    friction: Coulomb, a number or (static, dynamic). The tangential displacement relative to the wall is taken back, up to
+    friction times the normal displacement that the wall gave, so neither coefficient depends on h. What sticks goes back to
+    where it was at the start of the substep, to the bit, so it does not creep.
+    restitution: 0 ... 1. The moment of the impact within the substep is solved for, with the acceleration in it; the particle
+    leaves at restitution times its velocity then, and is placed where it would be at the end of the substep.
+    """
+
+    push_out = 1.0
+    static, dynamic, restitution = 0.0, 0.0, 0.0
+
+    def surface(self, friction: Any, restitution: Any, push_out: float) -> None:
+        """Check and keep the arguments that all walls have."""
+        self.static, self.dynamic = friction_of(repr(self), "friction", friction)
+        self.restitution = restitution_of(repr(self), "restitution", restitution)
+        self.push_out = checks.number(repr(self), "push_out", push_out, least=0.0)
+
+    @property
+    def rubs(self) -> bool:
+        """Whether there is friction."""
+        return self.static > 0
+
+    @property
+    def bounces(self) -> bool:
+        """Whether there is restitution."""
+        return self.restitution > 0
+
+    def bind(self, scene: Scene) -> None:
+        """Keep the state at hand."""
+        self.scene = scene
+        self._on_state = scene.state
+        self._on_real = scene.real
+        self._on_rubs, self._on_bounces = self.rubs, self.bounces
+
+    @ti.func
+    def confine(self, i, radius, h, when, last):
+        """Move particle i out of the wall, with self.press. last: 1 in the last iteration of a substep."""
+
+    @ti.func
+    def press(self, i, depth, n, moved, h, last):
+        """Take particle i out of a wall that it entered by `depth` [m], along the normal n; the wall itself moved by `moved`.
+
+        What comes as close as the last digits of the position can tell touches: it does not sink, or slip, by these digits.
+        """
+        d = self._on_state.d[i] - moved
+        leaving = d.dot(n)
+        close = self._on_state.digits(i)
+        if depth > -close:
+            depth = ti.max(depth, ti.min(-leaving, close))
+        if depth > 0:
+            move = ti.min(depth, ti.max(self.push_out * h - leaving, 0))
+            after = leaving + move  # normal displacement after the substep
+            rise = 0 * depth
+            if ti.static(self._on_bounces):
+                gap = -depth - leaving
+                if last != 0 and gap >= 0 and leaving < 0:
+                    rise, after = self.bounce(gap, leaving, (self._on_state.before[i] - moved).dot(n), after)
+            change = (after - leaving) * n
+            shift = (move + rise) * n
+            stuck = False
+            if ti.static(self._on_rubs):
+                slip = d - leaving * n
+                size, given = slip.norm(), after - leaving
+                if size > self.static * given:
+                    slip *= self.dynamic * given / size
+                else:
+                    stuck = rise == 0
+                change -= slip
+                shift -= slip
+            self._on_state.d[i] += change
+            if ti.static(self._on_rubs):
+                if stuck:
+                    self._on_state.restart(i)
+            if not stuck:
+                self._on_state.advance(i, shift)
+
+    @ti.func
+    def bounce(self, gap, leaving, before, after):
+        """What is above the wall at the end of the substep, and the normal displacement that carries the velocity then.
+
+        In units of the substep, the height is gap + v s + k s^2 / 2, with k the acceleration and v = leaving - k / 2; the impact
+        is at its root s. A bounce that would end below the wall has come to rest.
+        """
+        k = leaving - before
+        v = leaving - k / 2
+        root = ti.sqrt(ti.max(v * v - 2 * k * gap, 0)) - v
+        rise = 0 * gap
+        if root > 0:
+            s = ti.min(2 * gap / root, 1)
+            out = -self.restitution * (v + k * s)
+            height = (1 - s) * (out + k / 2 * (1 - s))
+            if height > 0 and out > 0:
+                rise = height
+                after = out + k * (1 - s) - k / 2
+        return rise, after
