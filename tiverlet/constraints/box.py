@@ -58,42 +58,37 @@ class Box(Wall):
     def bind(self, scene: Scene) -> None:
         """Corners at the start and the end of a frame."""
         Wall.bind(self, scene)
-        self._on_corners = [
-            scene.memory.field(f"Box.{name}", None, width=self.dim, values=value, state=True)
-            for name, value in (
-                ("lower_from", self.lower),
-                ("lower", self.lower),
-                ("upper_from", self.upper),
-                ("upper", self.upper),
-            )
-        ]
+        sides = np.concatenate([self.lower, self.upper])
+        self._on_sides = scene.memory.field("Box.sides", len(sides), width=2, values=np.stack([sides, sides], 1), state=True)
         self._on_aim = (self.lower, self.upper)
         self.changed = False
 
     def upload(self) -> None:
         """Move from the last corners to the new ones."""
-        for k, (old, new) in enumerate(zip(self._on_aim, (self.lower, self.upper), strict=True)):
-            jump = np.isinf(old) | np.isinf(new)
-            self._on_corners[2 * k][None] = list(np.where(jump, new, old))
-            self._on_corners[2 * k + 1][None] = list(new)
+        old, new = np.concatenate(self._on_aim), np.concatenate([self.lower, self.upper])
+        jump = np.isinf(old) | np.isinf(new)
+        self.scene.memory.write(self._on_sides, np.stack([np.where(jump, new, old), new], axis=1))
         self._on_aim, self.moving = (self.lower, self.upper), True
 
     def settle(self) -> None:
         """Stay."""
-        self._on_corners[0][None] = list(self.lower)
-        self._on_corners[2][None] = list(self.upper)
+        sides = np.concatenate([self.lower, self.upper])
+        self.scene.memory.write(self._on_sides, np.stack([sides, sides], axis=1))
 
     @ti.func
     def confine(self, i, radius, h, when, last):
-        """Two planes per axis."""
-        for k in ti.static(range(self.dim)):
-            for s in ti.static(range(2)):
-                a, b = self._on_corners[2 * s][None][k], self._on_corners[2 * s + 1][None][k]
-                wall, shift = b, 0 * b
-                if a != b:
-                    wall = a * (1 - when[1]) + b * when[1]
-                    shift = (b - a) * (when[1] - when[0])
-                n = 0 * self._on_state.x[i]
-                moved = n
-                n[k], moved[k] = 1 - 2 * s, shift
-                self.press(i, (1 - 2 * s) * (wall - self._on_state.place(i)[k]) + radius, n, moved, h, last)
+        """Two planes per axis, lower ones first."""
+        for side in range(ti.static(2 * self.dim)):
+            a, b = self._on_sides[side][0], self._on_sides[side][1]
+            wall, shift = b, ti.cast(0, self._on_real)
+            if a != b:
+                wall = a * (1 - when[1]) + b * when[1]
+                shift = (b - a) * (when[1] - when[0])
+            x, n, moved = self._on_state.place(i), 0 * self._on_state.x[i], 0 * self._on_state.x[i]
+            depth = ti.cast(0, self._on_real)
+            for k in ti.static(range(self.dim)):
+                if side == k:
+                    n[k], moved[k], depth = 1, shift, wall + radius - x[k]
+                elif side == k + self.dim:
+                    n[k], moved[k], depth = -1, shift, x[k] + radius - wall
+            self.press(i, depth, n, moved, h, last)

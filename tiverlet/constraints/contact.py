@@ -196,8 +196,8 @@ class Contact(Feature):
         active = 0
         for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
             j = self._on_grid.near[e]
-            overlap, _ = self.touch(i, j, self.far(i, j))
-            if overlap > 0:
+            r, far = self._on_state.apart(i, j), self.far(i, j)
+            if r.dot(r) < far * far:
                 active += 1
         self._on_active[i] = active
 
