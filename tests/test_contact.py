@@ -26,6 +26,10 @@ def clouds():
     yield "plane", rng.uniform(-5, 5, (600, 2)), 0.15
     yield "space", rng.uniform(-2, 2, (600, 3)), 0.15
     yield "mixed radii", rng.uniform(-5, 5, (500, 2)), rng.choice([0.0, 0.02, 0.1, 1.0], 500)
+    # Row 25: radii from 1 to 1000 in one scene, large ones among crowds of small ones.
+    wide = 10.0 ** rng.uniform(-3, 0, 1500)
+    yield "radii 1:1000", rng.uniform(-3, 3, (1500, 2)), wide
+    yield "radii 1:1000 in space", rng.uniform(-1.5, 1.5, (1500, 3)), wide
     yield "negative", rng.uniform(-900, -890, (400, 3)), rng.uniform(0.1, 0.4, 400)
     yield "one cell", rng.uniform(0, 0.1, (1000, 2)), 0.5
     yield (

@@ -60,7 +60,8 @@ def _present(world: "World") -> list[str]:
             out.append(f"{f!r}: in the loop over particles, last")
         elif world._grid:
             grid = world._grid
-            out.append(f"{f!r}: grid of {grid.cell:.3g} m cells, neighbour list with a skin of {grid.skin:.3g} m")
+            sizes = ", ".join(f"{size:.3g}" for size in grid.cells.sizes)
+            out.append(f"{f!r}: grid with cells of {sizes} m, neighbour list with a skin of {grid.skin:.3g} m")
         else:
             out.append(f"{f!r}: nothing, since all radii are 0")
     return out or ["motion in a straight line"]

@@ -1,12 +1,7 @@
-"""Neighbours: a spatial hash over an unbounded domain, and the list of near pairs that it yields.
-
-The hash folds space onto a torus of cells, cell (a, b, ...) to bucket (a mod A, b mod B, ...) with A, B powers of two
-of at least 4. The three cells around a particle along each axis thus fall into different buckets, so every bucket is read
-once and every pair is seen once, however many far cells share a bucket; those are told apart by the distance itself. Cells
-of a row stand side by side in memory. Counting sort with atomic counters; no cell has a capacity.
+"""Neighbours: the list of near pairs.
 
 The list holds, for each particle, all others closer than the sum of radii plus a skin, sorted by index. It stays valid until
-something has moved by half the skin, and no sum over it depends on when it was built, on the table, or on the skin.
+something has moved by half the skin, and no sum over it depends on when it was built, on the hash, or on the skin.
 """
 
 import warnings
@@ -15,42 +10,36 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
+from .cells import Cells
 from .feature import Scene
 from .material import Table
 from .runtime import Memory
 
 CROWDED = 300  # near pairs per particle beyond which the user is told
 FARTHEST = 1 << 22  # cells from the origin: beyond it, f32 cannot tell a cell from the next
+APPEND, COUNT, FILL = range(3)  # what a scan of the cells around a particle does with the neighbours that it finds
 
 
 class Grid:
-    """Cells, and the list of near pairs.
+    """The list of near pairs, and what pairs carry along.
 
-    reach: the largest distance at which two particles can touch [m]. skin: what is listed beyond touching [m].
-    linked: (m, 2) pairs that are never listed. table: which groups touch. carries: each pair has a vector, `slip`, that moves
-    along when the list is built anew. aims: each has another, `aim`, for one substep.
+    skin: what is listed beyond touching [m]. linked: (m, 2) pairs that are never listed. table: which groups touch. carries: each
+    pair has a vector, `slip`, that moves along when the list is built anew. aims: each has another, `aim`, for one substep.
     """
 
-    def __init__(
-        self, scene: Scene, reach: float, skin: float, linked: np.ndarray, table: Table, carries: bool, aims: bool, parallel: bool
-    ):
+    def __init__(self, scene: Scene, skin: float, linked: np.ndarray, table: Table, carries: bool, aims: bool, parallel: bool):
         n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
         self.n, self.dim, self.state, self.radius = n, dim, scene.state, scene.radius
         self.table, self.carries, self.aims = table, carries, aims
-        self.real = scene.real
-        self.reach, self.skin = reach, skin
-        self.cell = (reach + skin) * (1 + 2.0**-12)  # rounding of floor(x / cell) must not hide a neighbour
-        self.bits = max(2 * dim, int(np.ceil(np.log2(max(2 * n, 1)))))  # log2 of the number of buckets
-        self.buckets = 1 << self.bits
+        self.real, self.skin = scene.real, skin
+        self.cells = Cells(scene, scene.particles.radius, skin)
+        self.several = self.cells.levels > 1
+        parallel = parallel and not self.several  # lists of several levels have parts of any length, in one piece
         self.blocks = 16 if parallel else 1  # parts of the list, each filled by one thread
         self.spread = 512 if parallel else 1  # Taichi gives each CPU thread at least 512 iterations of a loop
-        self.serial = True  # counting in order beats atomic counters in parallel on a CPU
-        self.edge = add("grid.edge", self.buckets + 2, kind=ti.i32)
-        self.sorted = add("grid.sorted", n, kind=ti.i32)
         self.origin = add("grid.built_at", n, width=dim)
         self.first = add("grid.first", n, kind=ti.i32)
         self.number = add("grid.number", n, kind=ti.i32)
-        self.shape = add("grid.shape", None, width=dim, kind=ti.i32, values=_shares(np.ones(dim), self.bits))
         self.stale = add("grid.stale", None, kind=ti.i32, values=1)
         self.need = add("grid.need", None, kind=ti.i32)
         self.linked = len(linked) > 0
@@ -66,7 +55,6 @@ class Grid:
             self.kept = add("grid.kept", None, kind=ti.i32)
         self.near: Any = None
         self.store: Memory | None = None
-        self._bits_now = _shares(np.ones(dim), self.bits)
 
     def allocate(self, capacity: int) -> None:
         """Room for `capacity` entries of the list, in a tree of its own, so that it can grow."""
@@ -103,11 +91,14 @@ class Grid:
                 self.store.write(field, room)
         self.stale[None] = 1
 
+    @property
+    def finest(self) -> float:
+        """The size of the smallest cells [m]."""
+        return float(self.cells.sizes.min())
+
     def fit(self, extent: np.ndarray) -> None:
-        """Share the buckets among the axes in proportion to the extent of the particles [m]; affects speed only."""
-        bits = _shares(extent / self.cell, self.bits)
-        if bits != self._bits_now:
-            self.shape[None] = self._bits_now = bits
+        """Shape the hash for the extent of the particles [m]; affects speed only."""
+        if self.cells.fit(extent):
             self.stale[None] = 1
 
     def pairs(self) -> np.ndarray:
@@ -176,48 +167,23 @@ class Grid:
             self.stale[None] = 1
 
     @ti.func
-    def home(self, i):
-        """The cell of particle i."""
-        return ti.floor(self.state.x[i] / ti.cast(self.cell, self.real), ti.i32)
-
-    @ti.func
-    def bucket(self, cell):
-        """The bucket of a cell; axis 0 varies fastest."""
-        bits = self.shape[None]
-        b = cell[self.dim - 1] & ((1 << bits[self.dim - 1]) - 1)
-        for k in ti.static(range(self.dim - 2, -1, -1)):
-            b = (b << bits[k]) | (cell[k] & ((1 << bits[k]) - 1))
-        return b
-
-    @ti.func
     def build(self):
-        """Sort the particles into buckets, then list the near ones of each."""
+        """Sort the particles into cells, then list the near ones of each."""
         if ti.static(self.carries):
             self.keep()
-        for b in range(self.buckets + 2):
-            self.edge[b] = 0
-        ti.loop_config(serialize=self.serial)
-        for i in range(self.n):
-            ti.atomic_add(self.edge[self.bucket(self.home(i)) + 1], 1)
-        ti.loop_config(serialize=True)
-        for b in range(1, self.buckets + 2):
-            self.edge[b] += self.edge[b - 1]
-        ti.loop_config(serialize=self.serial)
-        for back in range(self.n):
-            # Filling a bucket from its end turns the end of each into its begin, and the next one's begin is its end. From the
-            # last particle on, so that each bucket comes out in order (on one thread) and leaves little to sort.
-            i = self.n - 1 - back
-            k = ti.atomic_sub(self.edge[self.bucket(self.home(i)) + 1], 1) - 1
-            self.sorted[k] = i
+        self.cells.sort()
         ti.loop_config(serialize=True)
         for _ in range(1):
             self.need[None] = 0
             self.stale[None] = 0
             if ti.static(self.carries):
                 self.kept[None] = 1
-        for t in range(self.blocks * self.spread):
-            if t % self.spread == 0:
-                self.fill(t // self.spread)
+        if ti.static(self.several):
+            self.pair_up()
+        else:
+            for t in range(self.blocks * self.spread):
+                if t % self.spread == 0:
+                    self.fill(t // self.spread)
         for i in range(self.n):
             self.origin[i] = self.state.x[i]
         if ti.static(self.carries):
@@ -228,46 +194,74 @@ class Grid:
 
     @ti.func
     def fill(self, block):
-        """List the neighbours of one block of particles, one after the other."""
+        """One level: list the neighbours of a block of particles, one after the other. Beyond the room they are only counted."""
         start, room = block * self.capacity, self.capacity
         size = (self.n + self.blocks - 1) // self.blocks
         used = 0
         for i in range(block * size, ti.min((block + 1) * size, self.n)):
             self.first[i] = start + ti.min(used, room)
             begin = used
-            used = self.collect(i, start, used, room)
+            used = self.scan(i, APPEND, start, used)
             self.number[i] = ti.max(ti.min(used, room) - begin, 0)
-            self.sort(self.first[i], self.number[i])
-            if ti.static(self.carries):
-                self.carry(i)
+            self.finish(i)
         ti.atomic_max(self.need[None], used)
 
     @ti.func
-    def collect(self, i, start, used, room):
-        """Append the neighbours of particle i; beyond the room they are only counted."""
-        cell, bits = self.home(i), self.shape[None]
-        mask = (1 << bits[0]) - 1
-        low = (cell[0] - 1) & mask
-        span = 1
-        if low + 2 <= mask:  # the three cells of a row stand side by side unless the torus wraps there
-            span = 3
-        for row in range(ti.static(3 ** (self.dim - 1))):
-            at = cell
-            rest = row
-            for k in ti.static(range(1, self.dim)):
-                at[k] += rest % 3 - 1
-                rest = rest // 3
-            at[0] = 0
-            base = self.bucket(at)
-            for part in range(3 // span):
-                b = base + ((low + part) & mask)
-                for e in range(self.edge[b + 1], self.edge[b + span + 1]):
-                    j = self.sorted[e]
-                    if j != i and self.listed(i, j):
-                        if used < room:
-                            self.near[start + used] = j
-                        used += 1
+    def pair_up(self):
+        """Several levels: count, then list each pair that one of the two finds with both."""
+        for i in range(self.n):
+            self.number[i] = 0
+        ti.loop_config(serialize=self.cells.serial)
+        for i in range(self.n):
+            self.scan(i, COUNT, 0, 0)
+        ti.loop_config(serialize=True)
+        for i in range(self.n):
+            self.first[i] = self.need[None]
+            self.need[None] += self.number[i]
+            self.number[i] = 0
+        ti.loop_config(serialize=self.cells.serial)
+        for i in range(self.n):
+            if self.need[None] <= self.capacity:
+                self.scan(i, FILL, 0, 0)
+        for i in range(self.n):
+            self.finish(i)
+
+    @ti.func
+    def finish(self, i):
+        """Put the list of particle i in order."""
+        self.order(self.first[i], self.number[i])
+        if ti.static(self.carries):
+            self.carry(i)
+
+    @ti.func
+    def scan(self, i, what: ti.template(), start, used):  # type: ignore[valid-type]
+        """Look for neighbours in the cells around particle i, at its own level and the coarser ones."""
+        own = self.cells.level_of(i)
+        for m in range(own + 1):
+            cell = self.cells.home(i, m)
+            for r in range(ti.static(3 ** (self.dim - 1))):
+                base, low, mask, span = self.cells.row(cell, m, r)
+                for part in range(3 // span):
+                    b = base + ((low + part) & mask)
+                    for e in range(self.cells.edge[b + 1], self.cells.edge[b + span + 1]):
+                        j = self.cells.sorted[e]
+                        if j != i and self.listed(i, j):
+                            if ti.static(what == APPEND):
+                                if used < self.capacity:
+                                    self.near[start + used] = j
+                                used += 1
+                            else:
+                                self.note(i, j, what)
+                                if m < own:
+                                    self.note(j, i, what)
         return used
+
+    @ti.func
+    def note(self, i, j, what: ti.template()):  # type: ignore[valid-type]
+        """Count j among the neighbours of i, and list it."""
+        k = ti.atomic_add(self.number[i], 1)
+        if ti.static(what == FILL):
+            self.near[self.first[i] + k] = j
 
     @ti.func
     def listed(self, i, j):
@@ -286,7 +280,7 @@ class Grid:
         return yes
 
     @ti.func
-    def sort(self, begin, count):
+    def order(self, begin, count):
         """Insertion sort by index: lists are short, and this makes every sum over them independent of the table."""
         for a in range(1, count):
             j = self.near[begin + a]
@@ -295,11 +289,3 @@ class Grid:
                 self.near[begin + b] = self.near[begin + b - 1]
                 b -= 1
             self.near[begin + b] = j
-
-
-def _shares(cells: np.ndarray, bits: int) -> list[int]:
-    """Split `bits` among the axes: at least 2 each, the rest where there are most cells per bucket."""
-    shares = np.full(len(cells), 2)
-    for _ in range(bits - 2 * len(cells)):
-        shares[int(np.argmax(np.nan_to_num(cells, nan=1.0, posinf=1e30) / 2.0**shares))] += 1
-    return [int(s) for s in shares]

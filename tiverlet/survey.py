@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
+from .grid import FARTHEST
 from .particles import LARGEST
 from .substep import Substep
 
@@ -76,7 +77,7 @@ class Survey:
         self.single = substep.real == ti.f32
         self.farthest = LARGEST
         if substep.grid:
-            self.farthest = min(LARGEST, substep.grid.cell * (1 << 22))
+            self.farthest = min(LARGEST, substep.grid.finest * FARTHEST)
         self.probes = [f for f in substep.accelerations if not f.uniform]
         self.spread = 512 if substep.parallel else 1  # Taichi gives each CPU thread at least 512 iterations
         add = substep.scene.memory.field

@@ -56,15 +56,14 @@ class Contact(Feature):
         some = radius[radius > 0]
         auto = 0.2 * float(np.median(some)) if len(some) else 1.0
         self._on_size = auto if self.skin == "auto" else float(self.skin)
-        ordered = np.sort(radius)[::-1]
-        self._on_reach = float(ordered[:2].sum())  # the two largest
-        self.matters = self._on_reach > 0
+        self._on_finest = float(radius.min(initial=np.inf))
+        self.matters = len(some) > 0
         if self.matters:
             self.check_range(particles.position)
 
     def check_range(self, position: np.ndarray) -> None:
         """Raise where coordinates are too large for the cells."""
-        cell = self._on_reach + self._on_size
+        cell = 2 * self._on_finest + self._on_size
         far = np.abs(position) >= FARTHEST * cell
         if far.any():
             i, k = np.unravel_index(int(np.argmax(far)), far.shape)
@@ -92,7 +91,7 @@ class Contact(Feature):
             self._on_lift = scene.memory.field("Contact.lift", n, width=dim)
             self._on_hit = scene.memory.field("Contact.hit", None, kind=ti.i32)
         self.table.bind(scene)
-        self._on_grid = Grid(scene, self._on_reach, self._on_size, linked, self.table, self.rubs, self.bounces, parallel)
+        self._on_grid = Grid(scene, self._on_size, linked, self.table, self.rubs, self.bounces, parallel)
         return self._on_grid
 
     def ease(self) -> None:

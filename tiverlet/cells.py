@@ -1,0 +1,132 @@
+"""A spatial hash over an unbounded domain, for particles of any sizes.
+
+The hash folds space onto a torus of cells, cell (a, b, ...) to bucket (a mod A, b mod B, ...) with A, B powers of two
+of at least 4. The three cells around a particle along each axis thus fall into different buckets, so every bucket is read
+once and every pair is seen once, however many far cells share a bucket; those are told apart by the distance itself. Cells
+of a row stand side by side in memory. Counting sort with atomic counters; no cell has a capacity.
+
+Particles whose radii differ by more than a factor of two stand in tables of their own, with cells of their size: level 0 holds
+the largest, each next level radii down to half of those before. A particle looks at its own level and at the coarser ones, where
+its neighbours are in the 3^dim cells around it; of the finer ones it hears when they find it.
+"""
+
+import numpy as np
+import taichi as ti
+
+from .feature import Scene
+
+LEVELS = 14  # the last one holds all that are smaller, down to points
+
+
+class Cells:
+    """The tables. radius: (n,) [m]. skin: what is added to the distance at which two touch [m]."""
+
+    def __init__(self, scene: Scene, radius: np.ndarray, skin: float):
+        n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
+        self.n, self.dim, self.state, self.real = n, dim, scene.state, scene.real
+        self.serial = True  # counting in order, on one thread, beats atomic counters in parallel on a CPU
+        with np.errstate(divide="ignore"):
+            level = np.minimum(np.floor(np.log2(radius.max() / radius)), LEVELS - 1).astype(int)
+        used, level = np.unique(level, return_inverse=True)
+        self.levels = len(used)
+        largest = np.array([radius[level == m].max() for m in range(self.levels)])
+        # Rounding of floor(x / size) must not hide a neighbour.
+        self.sizes = (2 * largest + skin) * (1 + 2.0**-12)
+        counts = np.bincount(level, minlength=self.levels)
+        self.bits = np.maximum(2 * dim, np.ceil(np.log2(np.maximum(2 * counts, 1)))).astype(int)
+        offsets = np.concatenate([[0], np.cumsum(1 << self.bits)])
+        self.buckets = int(offsets[-1])
+        self._shapes = self.shapes(np.ones(dim))
+        self.edge = add("grid.edge", self.buckets + 2, kind=ti.i32)
+        self.sorted = add("grid.sorted", n, kind=ti.i32)
+        self.shape = add("grid.shape", self.levels, width=dim, kind=ti.i32, values=self._shapes)
+        if self.levels > 1:
+            self.level = add("grid.level", n, kind=ti.i32, values=level)
+            self.size = add("grid.size", self.levels, values=self.sizes)
+            self.offset = add("grid.offset", self.levels, kind=ti.i32, values=offsets[:-1])
+
+    def shapes(self, extent: np.ndarray) -> np.ndarray:
+        """Bits of each axis of each table, (levels, dim): at least 2, the rest where there are most cells per bucket."""
+        out = np.full((self.levels, self.dim), 2)
+        for m in range(self.levels):
+            cells = np.nan_to_num(extent / self.sizes[m], nan=1.0, posinf=1e30)
+            for _ in range(self.bits[m] - 2 * self.dim):
+                out[m, int(np.argmax(cells / 2.0 ** out[m]))] += 1
+        return out
+
+    def fit(self, extent: np.ndarray) -> bool:
+        """Shape the tables for particles that fill a box of this size [m]; affects speed only. Returns whether they changed."""
+        shapes = self.shapes(extent)
+        changed = not np.array_equal(shapes, self._shapes)
+        if changed:
+            self._shapes = shapes
+            for m in range(self.levels):
+                self.shape[m] = shapes[m].tolist()
+        return changed
+
+    @ti.func
+    def level_of(self, i):
+        """The level of particle i."""
+        m = 0
+        if ti.static(self.levels > 1):
+            m = self.level[i]
+        return m
+
+    @ti.func
+    def home(self, i, m):
+        """The cell of particle i at level m."""
+        size = ti.cast(self.sizes[0], self.real)
+        if ti.static(self.levels > 1):
+            size = self.size[m]
+        return ti.floor(self.state.x[i] / size, ti.i32)
+
+    @ti.func
+    def bucket(self, cell, m):
+        """The bucket of a cell at level m; axis 0 varies fastest."""
+        bits = self.shape[m]
+        b = cell[self.dim - 1] & ((1 << bits[self.dim - 1]) - 1)
+        for k in ti.static(range(self.dim - 2, -1, -1)):
+            b = (b << bits[k]) | (cell[k] & ((1 << bits[k]) - 1))
+        if ti.static(self.levels > 1):
+            b += self.offset[m]
+        return b
+
+    @ti.func
+    def where(self, i):
+        """The bucket of particle i."""
+        m = self.level_of(i)
+        return self.bucket(self.home(i, m), m)
+
+    @ti.func
+    def sort(self):
+        """Sort the particles into buckets."""
+        for b in range(self.buckets + 2):
+            self.edge[b] = 0
+        ti.loop_config(serialize=self.serial)
+        for i in range(self.n):
+            ti.atomic_add(self.edge[self.where(i) + 1], 1)
+        ti.loop_config(serialize=True)
+        for b in range(1, self.buckets + 2):
+            self.edge[b] += self.edge[b - 1]
+        ti.loop_config(serialize=self.serial)
+        for back in range(self.n):
+            # Filling a bucket from its end turns the end of each into its begin, and the next one's begin is its end. From the
+            # last particle on, so that each bucket comes out in order (on one thread) and leaves little to sort.
+            i = self.n - 1 - back
+            k = ti.atomic_sub(self.edge[self.where(i) + 1], 1) - 1
+            self.sorted[k] = i
+
+    @ti.func
+    def row(self, cell, m, r):
+        """Row r of the 3^(dim - 1) around a cell at level m: its first bucket, how far along its three cells begin, the mask of
+        their axis, and 3 where they stand side by side, 1 where the torus wraps between them."""
+        mask = (1 << self.shape[m][0]) - 1
+        at, rest = cell, r
+        for k in ti.static(range(1, self.dim)):
+            at[k] += rest % 3 - 1
+            rest = rest // 3
+        at[0] = 0
+        low, span = (cell[0] - 1) & mask, 1
+        if low + 2 <= mask:
+            span = 3
+        return self.bucket(at, m), low, mask, span
