@@ -104,10 +104,15 @@ class Grid:
     def pairs(self) -> np.ndarray:
         """The listed pairs (m, 2) with i < j, in order."""
         assert self.store
-        first, number = (self.first.to_numpy()[: self.n], self.number.to_numpy()[: self.n])
-        near = self.store.read(self.near)
-        rows = [(i, j) for i in range(self.n) for j in near[first[i] : first[i] + number[i]] if i < j]
-        return np.array(rows, dtype=np.int64).reshape(-1, 2)
+        i, at = self._entries(self.first, self.number)
+        j = self.store.read(self.near)[at]
+        return np.stack([i, j], axis=1)[i < j].astype(np.int64)
+
+    def _entries(self, first, number) -> tuple[np.ndarray, np.ndarray]:
+        """For every entry of the lists, whose it is and where it is."""
+        first, number = first.to_numpy()[: self.n], number.to_numpy()[: self.n]
+        i = np.repeat(np.arange(self.n), number)
+        return i, np.repeat(first, number) + np.arange(len(i)) - np.repeat(np.cumsum(number) - number, number)
 
     def slips(self) -> tuple[np.ndarray, np.ndarray]:
         """Every listed pair (i, j) whose slip is not 0, in order, and the slips: the same whatever the list's layout."""
@@ -115,9 +120,7 @@ class Grid:
         aside = bool(self.kept[None])  # given by restore(), and not built into a list yet
         first, number = (self.old_first, self.old_number) if aside else (self.first, self.number)
         near, slips = (self.old_near, self.old_slip) if aside else (self.near, self.slip)
-        first, number = first.to_numpy()[: self.n], number.to_numpy()[: self.n]
-        i = np.repeat(np.arange(self.n), number)
-        at = np.repeat(first, number) + np.arange(len(i)) - np.repeat(np.cumsum(number) - number, number)
+        i, at = self._entries(first, number)
         slip = self.store.read(slips)[at]
         some = (slip != 0).any(axis=1)
         return np.stack([i[some], self.store.read(near)[at][some]], axis=1), slip[some]

@@ -2,11 +2,15 @@
 
 from typing import Any
 
+import numpy as np
 import taichi as ti
 
 from . import checks
 from .feature import Feature, Scene
 from .material import friction_of, restitution_of
+from .runtime import Memory
+
+TOUCH = 2.0**-20  # of the size of a wall: a start that is no deeper inside than this counts as on the surface
 
 
 class Wall(Feature):
@@ -109,3 +113,30 @@ class Wall(Feature):
                 rise = height
                 after = out + k * (1 - s) - k / 2
         return rise, after
+
+
+class Track:
+    """A point of a wall that goes where it is sent during a frame, in a straight line."""
+
+    def __init__(self, memory: Memory, name: str, value: np.ndarray):
+        self._memory, self._value = memory, np.array(value)
+        self.ends = memory.field(name, 2, width=len(value), values=[value, value], state=True)
+
+    def aim(self, value: np.ndarray) -> None:
+        """Go to `value` during the next frame."""
+        self._memory.write(self.ends, [self._value, value])
+        self._value = np.array(value)
+
+    def settle(self) -> None:
+        """Stay there."""
+        self._memory.write(self.ends, [self._value, self._value])
+
+    @ti.func
+    def at(self, when):
+        """Where it is at the fraction `when` of the frame."""
+        return self.ends[0] * (1 - when) + self.ends[1] * when
+
+    @ti.func
+    def step(self, when):
+        """How far it goes in a substep."""
+        return (self.ends[1] - self.ends[0]) * (when[1] - when[0])

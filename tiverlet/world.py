@@ -16,6 +16,7 @@ from .constraints.contact import Contact
 from .explain import explain
 from .feature import Acceleration, Batch, Feature, Scene
 from .particles import Particles, Radii, State, in_range
+from .queries import Contacts, Search, near_by_all, nearest
 from .solvers.jacobi import Jacobi, Slots
 from .substep import REBOUNDS, Substep, decay
 from .survey import StepReport, Survey
@@ -65,6 +66,7 @@ class World:
         self._time, self._tick, self._h = 0.0, 0, 0.0
         self._frame = (0.0, 0.0, 0)  # when frames of the present length began, their length, their number
         self._last: StepReport | None = None
+        self._search: Search | None = None  # compiled when it is first asked
         self._fresh, self._started = (
             True,
             False,
@@ -304,6 +306,48 @@ class World:
         out = out[: len(self._particles)]
         out.flags.writeable = False
         return out
+
+    def near(self, points, radius) -> np.ndarray:
+        """The particles whose centers are within `radius` [m] of points: (m, 2), rows of `points` and particles, in order.
+
+        points: (k, dim) [m]. radius: number or (k,), at least 0. With a Contact in the world its grid is used; without, all are
+        compared.
+        """
+        points = checks.points("World.near", "points", points, dim=self._particles.dim)
+        radius = checks.per_item("World.near", "radius", radius, len(points), least=0.0)
+        self._memory.check()
+        if not len(points) or not len(self._particles):
+            return np.zeros((0, 2), dtype=np.int64)
+        if not self._grid:
+            return near_by_all(self.position, points, radius)
+        self._list()
+        with runtime.literals(self._scene.real):
+            self._search = self._search or Search(self._grid)
+            return self._search.near(points, radius)
+
+    def nearest(self, points) -> tuple[np.ndarray, np.ndarray]:
+        """Index of, and distance [m] to, the particle whose center is nearest to each point; of equally near ones the first."""
+        points = checks.points("World.nearest", "points", points, dim=self._particles.dim)
+        if not len(self._particles):
+            raise ValueError("World.nearest: there are no particles.")
+        position = self.position
+        start = self._grid.finest if self._grid else 2 * float(np.abs(position).max() + np.abs(points).max(initial=1.0))
+        return nearest(self.near, position, points, start)
+
+    @property
+    def contacts(self) -> Contacts:
+        """The pairs that overlap now, as arrays. Empty without a Contact."""
+        x, r = self.position, self._particles.radius
+        pairs = np.zeros((0, 2), dtype=np.int64)
+        if self._grid:
+            self._list()
+            pairs = self._grid.pairs()
+        d = x[pairs[:, 0]] - x[pairs[:, 1]]
+        length = np.linalg.norm(d, axis=1)
+        overlap = r[pairs].sum(axis=1) - length
+        some = overlap > 0
+        normal = d[some] / np.where(length > 0, length, 1.0)[some, None]
+        return Contacts(pairs[some], overlap[some], normal)
 
     @property
     def time(self) -> float:

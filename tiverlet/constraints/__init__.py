@@ -1,6 +1,8 @@
 """What keeps particles where they should be: links, pins, walls and contacts."""
 
+from .ball import Ball
 from .box import Box
+from .capsule import Capsule
 from .contact import Contact
 from .distance import Distance
 from .half_space import HalfSpace
@@ -8,4 +10,4 @@ from .pin import Pin
 from .rope import Rope
 from .spacer import Spacer
 
-__all__ = ["Box", "Contact", "Distance", "HalfSpace", "Pin", "Rope", "Spacer"]
+__all__ = ["Ball", "Box", "Capsule", "Contact", "Distance", "HalfSpace", "Pin", "Rope", "Spacer"]

@@ -1,0 +1,43 @@
+"""Queries against brute force."""
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("kind", ["one size", "many sizes", "no contacts"])
+def test_near_and_nearest_equal_brute_force(world, dim, kind):
+    rng = np.random.default_rng(5)
+    x = rng.uniform(-3, 3, (400, dim))
+    radius = 10.0 ** rng.uniform(-2.5, -0.5, 400) if kind == "many sizes" else 0.05
+    features = [] if kind == "no contacts" else [tv.Contact()]
+    w = world(tv.Particles(x, radius=radius), [tv.Gravity(9.81), *features], precision="f64")
+    w.run(0.05)
+    x = w.position
+    points = np.concatenate([rng.uniform(-3.5, 3.5, (50, dim)), x[:5], [[40.0] * dim]])
+    for reach in (0.0, 0.3, 2.0, 100.0):
+        distance = np.linalg.norm(x[None] - points[:, None], axis=-1)
+        np.testing.assert_array_equal(w.near(points, reach), np.argwhere(distance <= reach))
+    index, length = w.nearest(points)
+    np.testing.assert_array_equal(index, distance.argmin(axis=1))
+    np.testing.assert_allclose(length, distance.min(axis=1), atol=1e-14)
+    assert w.near(np.zeros((0, dim)), 1.0).shape == (0, 2)
+    with pytest.raises(ValueError, match=r"radius\[0\] = -1"):
+        w.near(points, -1.0)
+    with pytest.raises(ValueError, match="points has shape"):
+        w.nearest(np.zeros((3, 5 - dim)))
+
+
+def test_contacts_are_arrays(world):
+    rng = np.random.default_rng(6)
+    x, radius = rng.uniform(-1, 1, (300, 3)), rng.uniform(0.02, 0.2, 300)
+    w = world(tv.Particles(x, radius=radius), [tv.Contact()], precision="f64")
+    pairs, depth = tv.measure.overlapping(x, radius)
+    contacts = w.contacts
+    np.testing.assert_array_equal(contacts.pairs, pairs)
+    np.testing.assert_allclose(contacts.overlap, depth, rtol=1e-12)
+    d = x[pairs[:, 0]] - x[pairs[:, 1]]
+    np.testing.assert_allclose(contacts.normal, d / np.linalg.norm(d, axis=1)[:, None], rtol=1e-12)
+    assert len(world(tv.Particles(x, radius=radius)).contacts) == 0

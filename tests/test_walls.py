@@ -1,0 +1,142 @@
+"""Surroundings of every shape: nothing is inside, nothing passes, and what they do is one law."""
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+
+
+def scenes(dim):
+    """Walls, with a function that says how far a point is outside of each."""
+    e = np.eye(dim)
+    a, b = -0.6 * e[0], 0.6 * e[0] + 0.2 * e[1]
+
+    def rod(x):
+        t = np.clip((x - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
+        return np.linalg.norm(x - (a + t[:, None] * (b - a)), axis=1) - 0.15
+
+    n = np.array([1.0, 2.0, 0.5][:dim])
+    return {
+        "box": (lambda **k: tv.Box([-1.0] * dim, [1.0] * dim, **k), lambda x: 1 - np.abs(x).max(axis=1)),
+        "plane": (lambda **k: tv.HalfSpace(n, -0.5, **k), lambda x: x @ n / np.linalg.norm(n) + 0.5),
+        "ball": (lambda **k: tv.Ball(0 * e[0], 0.5, **k), lambda x: np.linalg.norm(x, axis=1) - 0.5),
+        "bowl": (lambda **k: tv.Ball(0 * e[0], 1.5, True, **k), lambda x: 1.5 - np.linalg.norm(x, axis=1)),
+        "rod": (lambda **k: tv.Capsule(a, b, 0.15, **k), rod),
+    }
+
+
+@pytest.mark.parametrize("name", scenes(2))
+@pytest.mark.parametrize("dim", [2, 3])
+def test_no_particle_is_ever_inside(world, name, dim):
+    # Rows 45 and 46: thrown at speeds up to v h / r = 100, with and without restitution, and never inside after a step.
+    make, outside = scenes(dim)[name]
+    rng = np.random.default_rng(1)
+    x = rng.uniform(-0.9, 0.9, (400, dim))
+    x = x[outside(x) > 0.06][:150]
+    aim = rng.uniform(-0.3, 0.3, x.shape) - x
+    h, r = 1 / 600, 0.05
+    speed = 10.0 ** rng.uniform(-2, 2, len(x)) * r / h
+    v = aim / np.linalg.norm(aim, axis=1)[:, None] * speed[:, None]
+    for restitution in (0.0, 0.7):
+        start = tv.Particles(x, velocity=v, radius=r)
+        w = world(start, [tv.Gravity(9.81), make(restitution=restitution)], precision="f64", substeps=1)
+        energy = tv.measure.kinetic_energy(w)
+        for _ in range(30):
+            report = w.step(h)
+            assert (outside(w.position) >= r - 1e-9).all()
+            assert report.energy <= energy + 9.81 * len(x) * 3
+
+
+def test_nothing_passes_a_thin_rod(world):
+    # Row 46: a rod of 1 mm, points at v h = 0.1 ... 1000 mm; all end on the side that they came from.
+    n = 200
+    rng = np.random.default_rng(2)
+    x = np.stack([rng.uniform(-0.9, 0.9, n), np.full(n, 0.5)], axis=1)
+    v = np.stack([np.zeros(n), -(10.0 ** rng.uniform(-4, 0, n)) * 600], axis=1)
+    rod = tv.Capsule((-1.0, 0.0), (1.0, 0.0), 0.0005)
+    w = world(tv.Particles(x, velocity=v), [rod, tv.Gravity(9.81)], precision="f64", substeps=1)
+    for _ in range(600):
+        w.step(1 / 600)
+        assert (w.position[:, 1] >= 0.0005 - 1e-9).all()
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_ball_stops_what_would_fly_through_it(world, dim):
+    # v h = 20 diameters of the ball: caught on the side where it came from; with restitution 1 it goes back where it came from.
+    x = np.zeros((2, dim))
+    x[:, 0], x[1, 1] = -2.0, 0.3
+    v = np.zeros((2, dim))
+    v[:, 0] = 1200.0
+    for restitution in (0.0, 1.0):
+        ball = tv.Ball([0.0] * dim, 0.5, restitution=restitution)
+        w = world(tv.Particles(x, velocity=v, radius=0.0), [ball], precision="f64", substeps=1)
+        w.step(1 / 60)
+        assert (np.linalg.norm(w.position, axis=1) >= 0.5 - 1e-9).all() and w.position[0, 0] <= -0.5 + 1e-9
+        if not restitution:  # what is left of the way to the ball is left of the displacement: caught again, and at rest
+            w.step(1 / 60)
+            assert w.position[0, 0] <= -0.5 + 1e-9 and abs(w.velocity[0, 0]) < 1e-9
+        if restitution:
+            np.testing.assert_allclose(w.velocity[0], -v[0], atol=1e-9)
+            # Reflected about the normal where it met the ball: v' = v - 2 (v . n) n.
+            n = np.zeros(dim)
+            n[:2] = -0.8, 0.6
+            np.testing.assert_allclose(w.velocity[1], v[1] - 2 * (v[1] @ n) * n, atol=1e-6)
+
+
+def test_pendulum_in_a_bowl(world):
+    # A point that slides in a smooth bowl is a pendulum: second order is not asked of a contact, but energy to 1 % is.
+    w = world(tv.Particles([[0.8, 0.0]]), [tv.Gravity(9.81), tv.Ball((0, 0), 0.8, inside=True)], precision="f64", substeps=100)
+    lowest, energies = 0.0, []
+    for _ in range(60):
+        energies.append(w.step(1 / 60).energy)
+        lowest = min(lowest, w.position[0, 1])
+    assert lowest == pytest.approx(-0.8, abs=1e-3) and min(energies) > -0.02 * 9.81 * 0.8 and max(energies) < 1e-3
+
+
+def test_moving_balls_and_rods_carry_what_they_meet(world):
+    ball = tv.Ball((-1.0, 0.0), 0.3)
+    rod = tv.Capsule((3.0, -1.0), (3.0, 1.0), 0.1)
+    w = world(tv.Particles([[0.0, 0.0], [2.0, 0.0]], radius=0.2), [ball, rod], precision="f64", substeps=10)
+    for k in range(60):
+        ball.center = (-1.0 + 0.02 * (k + 1), 0.0)
+        rod.a, rod.b = (3.0 - 0.02 * (k + 1), -1.0), (3.0 - 0.02 * (k + 1), 1.0)
+        w.step(1 / 60)
+    assert w.position[0, 0] == pytest.approx(0.2 + 0.5, abs=1e-9) and w.position[1, 0] == pytest.approx(1.8 - 0.3, abs=1e-9)
+    np.testing.assert_allclose(w.velocity[:, 0], [1.2, -1.2], atol=1e-6)
+
+
+def test_friction_on_every_wall_holds_and_slides(world):
+    # On top of a ball and of a rod, where both are level: a horizontal velocity v is used up after v^2 / (2 mu g).
+    for wall in (
+        tv.HalfSpace((0, 1), 0.0, friction=0.5),
+        tv.Capsule((-9, -1), (9, -1), 1.0, friction=0.5),
+        tv.Box((-9, 0), (9, 9), friction=0.5),
+    ):
+        w = world(tv.Particles([[0.0, 0.1]], velocity=(2.0, 0.0), radius=0.1), [tv.Gravity(9.81), wall], precision="f64")
+        w.run(1.0)
+        assert w.position[0, 0] == pytest.approx(4 / (2 * 0.5 * 9.81), rel=1e-3)
+        np.testing.assert_allclose(w.velocity, 0.0, atol=1e-9)
+
+
+def test_bad_walls_are_named():
+    for make, words in (
+        (lambda: tv.Ball((0, 0), 0.0), "radius = 0, but it must be above 0"),
+        (lambda: tv.Capsule((0, 0), (1, 0), -1.0), "radius = -1"),
+        (lambda: tv.World(tv.Particles([[0.0, 0.0]], radius=2.0), [tv.Ball((0, 0), 1.0, inside=True)]), "does not fit inside"),
+        (lambda: tv.World(tv.Particles([[0.0, 0.0, 0.0]]), [tv.Ball((0, 0), 1.0)]), r"center has shape \(2,\)"),
+        (lambda: tv.Box((0, 0), (1, 1), friction=-1), r"friction \(static\) = -1"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            make()
+
+
+def test_a_conveyor_takes_along_what_lies_on_it(world):
+    # Row 70: a long rod that runs along its own axis at 1 m/s. Friction brings a disc up to its speed after v / (mu g), then holds.
+    belt = tv.Capsule((-50.0, -1.0), (50.0, -1.0), 1.0, friction=0.4)
+    w = world(tv.Particles([[0.0, 0.1]], radius=0.1), [tv.Gravity(9.81), belt], precision="f64")
+    for k in range(90):
+        shift = (k + 1) / 60
+        belt.a, belt.b = (-50.0 + shift, -1.0), (50.0 + shift, -1.0)
+        w.step(1 / 60)
+    slip = 1.0 / (0.4 * 9.81)  # until then it has gone v t / 2 instead of v t
+    assert w.position[0, 0] == pytest.approx(1.5 - slip / 2, abs=2e-3) and w.velocity[0, 0] == pytest.approx(1.0, abs=1e-9)

@@ -1,0 +1,86 @@
+"""A ball with particles outside, or inside."""
+
+import numpy as np
+import taichi as ti
+
+from .. import checks
+from ..feature import Knob, Scene
+from ..particles import Particles
+from ..wall import TOUCH, Track, Wall
+
+
+class Ball(Wall):
+    """Particles stay outside of a disc or ball, or inside.
+
+    C(x) = |x - center| - (R + r) >= 0 outside, R - r - |x - center| >= 0 inside; grad C = +- (x - center) / |x - center|.
+
+    center: (dim,) [m], live: assign to it between frames, and the ball moves there during the next frame. radius: R [m]. inside:
+    keep particles in. friction, restitution, push_out: see Wall.
+
+    What passes through in one substep is caught on the way in: the moment when it met the surface is solved for, as for pairs.
+    """
+
+    dim = 0
+    center = Knob(lambda f, v: checks.vector("Ball", "center", v, f.dim or len(np.atleast_1d(v))), "Middle of the ball [m].")
+
+    def __init__(self, center, radius, inside=False, *, friction=0.0, restitution=0.0, push_out=1.0):
+        self.center = center
+        self.radius = checks.number("Ball", "radius", radius, above=0.0)
+        self.inside = bool(inside)
+        self.surface(friction, restitution, push_out)
+
+    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Check the dimension, and that particles fit in."""
+        self.dim = particles.dim
+        self.center = self.center
+        wide = particles.radius >= self.radius
+        if self.inside and wide.any():
+            i = int(np.argmax(wide))
+            raise ValueError(f"Ball: particle {i} of radius {particles.radius[i]:g} m does not fit inside {self.radius:g} m.")
+
+    def bind(self, scene: Scene) -> None:
+        """The center at the start and the end of a frame."""
+        Wall.bind(self, scene)
+        self._on_center = Track(scene.memory, "Ball.center", self.center)
+        self.changed = False
+
+    def upload(self) -> None:
+        """Move to the new center."""
+        self._on_center.aim(self.center)
+        self.moving = True
+
+    def settle(self) -> None:
+        """Stay."""
+        self._on_center.settle()
+
+    @ti.func
+    def confine(self, i, radius, h, when, last):
+        """The surface where it was met, or where it is nearest."""
+        center, moved = self._on_center.at(when[1]), self._on_center.step(when)
+        r = self._on_state.place(i) - center
+        far = ti.cast(self.radius, self._on_real)
+        depth, n = self.nearest(r, far, radius)
+        if ti.static(not self.inside):
+            d = self._on_state.d[i] - moved
+            start = r - d
+            far += radius
+            c, b, a = start.dot(start) - far * far, start.dot(d), d.dot(d)
+            root = b * b - a * c
+            if c > -TOUCH * far * far and b < 0 and root > 0:
+                s = ti.max(c, 0) / (ti.sqrt(root) - b)
+                if s < 1:
+                    n = (start + s * d).normalized()
+                    depth = (s - 1) * d.dot(n)
+        self.press(i, depth, n, moved, h, last)
+
+    @ti.func
+    def nearest(self, r, far, radius):
+        """Depth in the surface and its normal at r from the middle; a particle right there goes along +x."""
+        length, n = r.norm(), 0 * r
+        n[0] = 1
+        if length > 0:
+            n = r / length
+        depth = far + radius - length
+        if ti.static(self.inside):
+            depth, n = length + radius - far, -n
+        return depth, n
