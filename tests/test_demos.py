@@ -36,3 +36,8 @@ assert os.path.getsize("article.rrd") > 100_000
 """
     done = python(code)
     assert "frames" in done.stdout and "120" in done.stdout and "worst overlap" in done.stdout
+
+
+def test_contact_demos_check_themselves():
+    assert "formula" in python((ROOT / "demos" / "cradle.py").read_text()).stdout
+    assert "through the neck" in python((ROOT / "demos" / "hourglass.py").read_text()).stdout

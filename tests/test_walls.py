@@ -131,7 +131,7 @@ def test_bad_walls_are_named():
 
 
 def test_a_conveyor_takes_along_what_lies_on_it(world):
-    # Row 70: a long rod that runs along its own axis at 1 m/s. Friction brings a disc up to its speed after v / (mu g), then holds.
+    # Row 70: a long rod runs along its own axis at 1 m/s. Friction brings a disc up to its speed after v / (mu g), then holds.
     belt = tv.Capsule((-50.0, -1.0), (50.0, -1.0), 1.0, friction=0.4)
     w = world(tv.Particles([[0.0, 0.1]], radius=0.1), [tv.Gravity(9.81), belt], precision="f64")
     for k in range(90):

@@ -52,6 +52,10 @@ class Wall(Feature):
         self._on_real = scene.real
         self._on_rubs, self._on_bounces = self.rubs, self.bounces
 
+    def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
+        """For pictures of a scene between two corners: line strips (m, k, dim), and half their width [m], 0 for a thin line."""
+        return np.zeros((0, 2, len(low))), 0.0
+
     @ti.func
     def confine(self, i, radius, h, when, last):
         """Move particle i out of the wall, with self.press. last: 1 in the last iteration of a substep."""

@@ -1,31 +1,23 @@
 """The world: a scene, and its step."""
 
 import copy
-import hashlib
 from collections.abc import Iterable
 from dataclasses import replace
 from time import perf_counter
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
-import taichi as ti
 from rich.progress import track
 
-from . import checks, runtime
-from .constraints.contact import Contact
+from . import checks, runtime, snapshot
+from .assembly import assemble, check_settings, checked_features
 from .explain import explain
-from .feature import Acceleration, Batch, Feature, Scene
-from .particles import Particles, Radii, State, in_range
+from .feature import Acceleration, Feature
+from .particles import Particles, in_range
 from .queries import Contacts, Search, near_by_all, nearest
-from .solvers.jacobi import Jacobi, Slots
-from .substep import REBOUNDS, Substep, decay
-from .survey import StepReport, Survey
-from .wall import Wall
-
-T = TypeVar("T", bound=Feature)
-PRECISIONS = {"f32": ti.f32, "f32-compensated": ti.f32, "f64": ti.f64}
-PATHS = ("auto", "fused", "parallel")
-CROSSOVER = 4000  # particles, constraints or both, from which waking threads pays
+from .solvers.jacobi import Jacobi
+from .substep import REBOUNDS, decay
+from .survey import StepReport
 
 
 class World:
@@ -47,70 +39,21 @@ class World:
     ):  # fmt: skip
         if not isinstance(particles, Particles):
             raise TypeError(f"World: particles = {particles!r} is a {type(particles).__name__}; use tv.Particles(position).")
-        _settings(precision, path)
-        self._particles, self._features = particles, _features(features)
+        check_settings(precision, path)
+        self._particles, self._features = particles, checked_features(features)
         self.substeps, self.iterations = substeps, iterations
         self._solver, self._precision = solver or Jacobi(), precision
-        inv_mass = particles.inv_mass.copy()
-        for feature in self._features:
-            feature.prepare(particles, inv_mass)
-        for feature in self._features:
-            feature.review(particles, inv_mass)
-        runtime.ensure_started()
-        if precision == "f32-compensated" and runtime.fast_math():
-            raise ValueError(
-                'World: precision = "f32-compensated" needs exact rounding, but Taichi was started with fast_math=True. '
-                "Use tv.init(), or ti.init(fast_math=False)."
-            )
-        self._path = _chosen(path, particles, self._features)
+        parts = assemble(particles, self._features, self._solver, precision, path)
+        self._memory, self._scene, self._batches = parts.memory, parts.scene, parts.batches
+        self._grid, self._sub, self._survey, self._path = parts.grid, parts.substep, parts.survey, parts.path
         self._time, self._tick, self._h = 0.0, 0, 0.0
         self._frame = (0.0, 0.0, 0)  # when frames of the present length began, their length, their number
-        self._last: StepReport | None = None
-        self._search: Search | None = None  # compiled when it is first asked
-        self._fresh, self._started = (
-            True,
-            False,
-        )  # d holds velocities; the last substep was the first after a start
+        self._fresh, self._started = True, False  # d holds velocities; the last substep was the first after a start
+        self._placed = True  # by the user, and not looked at yet
         self._drag: list[float] | None = None
         self._energy: float | None = None
-        self._placed = True  # by the user, and not looked at yet
-        self._memory = runtime.Memory(PRECISIONS[precision])
-        try:
-            self._build(inv_mass)
-        except BaseException:
-            self._memory.abandon()
-            for feature in self._features:
-                feature.scene = None
-            raise
-
-    def _build(self, inv_mass: np.ndarray) -> None:
-        """Declare every field in one tree, then place it."""
-        memory = self._memory
-        state = State(memory, self._particles, inv_mass, self._precision == "f32-compensated")
-        scene = Scene(memory, state, self._particles, inv_mass)
-        accelerations, walls = self._of(Acceleration), self._of(Wall)
-        drivers = [f for f in self._of(Batch) if f.drives and f.count]
-        batches = [f for f in self._of(Batch) if not f.drives and (inv_mass[f.indices] > 0).any()]
-        contact = next((c for c in self._of(Contact) if c.matters), None)
-        if contact or walls:
-            scene.radius = Radii(memory, self._particles.radius)
-        surfaces = [*walls, *([contact] if contact else [])]
-        state.remember(memory, any(f.rubs for f in surfaces), any(f.bounces for f in surfaces))
-        if batches:
-            scene.slots = Slots(memory, state, batches, inv_mass, self._solver)
-        parallel = self._path == "parallel"
-        self._grid = contact.join(scene, batches, parallel) if contact else None
-        for feature in [*accelerations, *drivers, *batches, *walls]:
-            feature.bind(scene)
-        self._scene, self._batches = scene, batches
-        self._sub = Substep(scene, accelerations, batches, drivers, contact, self._grid, walls, parallel)
-        self._survey = Survey(self._sub)
-        memory.place()
-        if self._grid:
-            self._grid.allocate(len(self._particles) * (12 if self._particles.dim == 2 else 32) + 64)
-
-    def _of(self, kind: type[T]) -> list[T]:
-        return [f for f in self._features if isinstance(f, kind)]
+        self._last: StepReport | None = None
+        self._search: Search | None = None  # compiled when it is first asked
 
     # The step.
 
@@ -404,18 +347,7 @@ class World:
 
     def hash(self) -> str:
         """SHA-256 of the exact state: equal if and only if two worlds of the same scene will go on alike, bit for bit."""
-        digest = hashlib.sha256(repr((self._time, self._tick, self._h, self._fresh)).encode())
-        for name, values in self._state().items():
-            digest.update(name.encode())
-            digest.update(values.tobytes())
-        return digest.hexdigest()
-
-    def _state(self) -> dict[str, np.ndarray]:
-        """Every field that the future depends on."""
-        state = {k: v for memory in self._memories for k, v in memory.state().items()}
-        if self._grid and self._grid.carries:
-            state["Contact.pairs"], state["Contact.slips"] = self._grid.slips()
-        return state
+        return snapshot.digest(self)
 
     @property
     def _memories(self) -> list[runtime.Memory]:
@@ -429,35 +361,13 @@ class World:
 
     def clone(self, **changes) -> "World":
         """The same scene in the same state, with other substeps, iterations, solver, precision or path."""
-        settings = dict(
-            substeps=self.substeps, iterations=self.iterations, solver=self._solver, precision=self._precision, path=self._path
-        )  # fmt: skip
+        settings = {"substeps": self.substeps, "iterations": self.iterations, "solver": self._solver}
+        settings |= {"precision": self._precision, "path": self._path}
         if unknown := set(changes) - set(settings):
             raise TypeError(f"World.clone: {sorted(unknown)[0]} cannot be changed; one of {', '.join(settings)} can.")
         self._memory.check()
         new = World(self._particles, [f.copy() for f in self._features], **{**settings, **changes})
-        new._time, new._tick, new._frame = self._time, self._tick, self._frame
-        if new._precision != self._precision:
-            new.position, new.velocity = self.position, self.velocity
-            return new
-        new._upload(self._h, self._drag)
-        if any(c._on_eases for c in self._sub.contacts):
-            new._sub.contacts[0].ease()
-            new._renew()
-        state = self._state()
-        for memory in new._memories:
-            memory.restore(state)
-        if new._grid and new._grid.carries:
-            new._grid.restore(state["Contact.pairs"], state["Contact.slips"])
-            new._renew()
-        for ours, theirs in zip(self._features, new._features, strict=True):
-            theirs.changed, theirs.moving = ours.changed, ours.moving
-        new._fresh, new._started, new._placed, new._energy = (
-            self._fresh,
-            self._started,
-            self._placed,
-            self._energy,
-        )
+        snapshot.transfer(self, new)
         return new
 
     def close(self) -> None:
@@ -484,37 +394,3 @@ class World:
     def __repr__(self) -> str:
         names = ", ".join(map(repr, self._features))
         return f"World({self._particles!r}, [{names}], substeps={self.substeps}, iterations={self.iterations})"
-
-
-def _features(features: Iterable[Feature]) -> tuple[Feature, ...]:
-    features = tuple(features)
-    for k, feature in enumerate(features):
-        if not isinstance(feature, Feature):
-            hint = f"; write {feature.__name__}(...)" if isinstance(feature, type) else ""
-            raise TypeError(f"World: features[{k}] = {feature!r} is not a force, constraint or wall{hint}.")
-        if feature.scene is not None:
-            raise ValueError(
-                f"World: features[{k}] = {feature!r} already acts in another world. Make a new one, or use feature.copy()."
-            )
-    if len({id(f) for f in features}) < len(features):
-        raise ValueError("World: the same feature is listed twice.")
-    if sum(isinstance(f, Contact) for f in features) > 1:
-        raise ValueError("World: more than one Contact; one covers all particles.")
-    return features
-
-
-def _settings(precision: str, path: str) -> None:
-    if precision not in PRECISIONS:
-        raise ValueError(f"World: precision = {precision!r}, but it must be one of {', '.join(map(repr, PRECISIONS))}.")
-    if path not in PATHS:
-        raise ValueError(f"World: path = {path!r}, but it must be one of {', '.join(map(repr, PATHS))}.")
-
-
-def _chosen(path: str, particles: Particles, features: tuple[Feature, ...]) -> str:
-    """The path for "auto": fused on one CPU thread while waking the others would cost more than their work."""
-    if path != "auto":
-        return path
-    if runtime.architecture() != "cpu":
-        return "parallel"
-    work = len(particles) + sum(f.count for f in features if isinstance(f, Batch))
-    return "fused" if work < CROSSOVER or runtime.threads() == 1 else "parallel"

@@ -53,6 +53,18 @@ class Ball(Wall):
         """Stay."""
         self._on_center.settle()
 
+    def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
+        """A circle in 2D, three in 3D."""
+        turn = np.linspace(0, 2 * np.pi, 65)
+        circles = []
+        for a in range(self.dim):
+            for b in range(a):
+                circle = np.tile(self.center, (len(turn), 1))
+                circle[:, a] += self.radius * np.cos(turn)
+                circle[:, b] += self.radius * np.sin(turn)
+                circles.append(circle)
+        return np.array(circles), 0.0
+
     @ti.func
     def confine(self, i, radius, h, when, last):
         """The surface where it was met, or where it is nearest."""

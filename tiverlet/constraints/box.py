@@ -75,6 +75,15 @@ class Box(Wall):
         sides = np.concatenate([self.lower, self.upper])
         self.scene.memory.write(self._on_sides, np.stack([sides, sides], axis=1))
 
+    def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
+        """The edges, if all sides are closed."""
+        if not (np.isfinite(self.lower).all() and np.isfinite(self.upper).all()):
+            return Wall.outline(self, low, high)
+        bits = np.array([[(c >> k) & 1 for k in range(self.dim)] for c in range(2**self.dim)])
+        corners = np.where(bits, self.upper, self.lower)
+        edges = [(a, b) for a in range(len(bits)) for b in range(a) if np.abs(bits[a] - bits[b]).sum() == 1]
+        return corners[np.array(edges)], 0.0
+
     @ti.func
     def confine(self, i, radius, h, when, last):
         """Two planes per axis, lower ones first."""

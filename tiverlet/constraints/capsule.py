@@ -57,6 +57,10 @@ class Capsule(Wall):
         self._on_a.settle()
         self._on_b.settle()
 
+    def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
+        """The axis, as thick as the rod."""
+        return np.array([[self.a, self.b]]), self.radius
+
     @ti.func
     def nearest(self, x, a, b):
         """Where on the axis, from 0 at a to 1 at b, the point nearest to x is, the distance to it, and the direction from it."""

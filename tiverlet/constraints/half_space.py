@@ -54,6 +54,13 @@ class HalfSpace(Wall):
         """Stay."""
         self._on_offset[None] = [self.offset, self.offset]
 
+    def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
+        """Lines across the scene: one in 2D, two at right angles in 3D."""
+        middle, reach = (low + high) / 2, float(np.linalg.norm(high - low)) or 1.0
+        foot = middle - (self.normal @ middle - self.offset) * self.normal
+        across = np.linalg.svd(self.normal[None])[2][1:]  # an orthonormal basis of the plane
+        return np.stack([foot - reach * across, foot + reach * across], axis=1), 0.0
+
     @ti.func
     def confine(self, i, radius, h, when, last):
         """One plane."""

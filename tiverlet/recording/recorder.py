@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import checks
-from ..constraints import Box, HalfSpace
+from ..constraints import Box
 from ..feature import Batch
 from ..tools import golden_colors
+from ..wall import Wall
 
 if TYPE_CHECKING:
     from ..world import World
@@ -109,7 +110,7 @@ class Recorder:
         for k, f in self._links:
             self._stream.log(f"{SCENE}/links/{k}", self._strips.from_fields(strips=x[f.indices]), strict=True)
         for k, f in enumerate(world.features):
-            if isinstance(f, (Box, HalfSpace)):
+            if isinstance(f, Wall):
                 self._wall(k, f)
         if number and world.last is not None:
             for name, value in _figures(world, number).items():
@@ -118,12 +119,13 @@ class Recorder:
 
     def _wall(self, k: int, wall) -> None:
         """Walls are drawn when they have changed."""
-        corners = _outline(wall, self._world)
-        key = b"" if corners is None else corners.tobytes()
-        if corners is not None and self._walls.get(k) != key:
+        strips, thickness = wall.outline(*_bounds(self._world))
+        key = strips.tobytes()
+        if len(strips) and self._walls.get(k) != key:
             self._walls[k] = key
-            strips = self._strips(corners, colors=[[120, 125, 140]], radii=[-1.5])
-            self._stream.log(f"{SCENE}/walls/{k}", strips, strict=True)
+            radius = thickness if thickness else -1.5  # half the width in the scene, or pixels
+            drawn = self._strips(strips, colors=[[120, 125, 140]], radii=[radius])
+            self._stream.log(f"{SCENE}/walls/{k}", drawn, strict=True)
 
     def close(self) -> None:
         """Write the summary and finish the file. Calling it twice does nothing."""
@@ -154,31 +156,6 @@ def _bounds(world: "World") -> tuple[np.ndarray, np.ndarray]:
             low = np.where(np.isfinite(f.lower), np.minimum(low, f.lower), low)
             high = np.where(np.isfinite(f.upper), np.maximum(high, f.upper), high)
     return low, high
-
-
-def _outline(wall, world: "World") -> np.ndarray | None:
-    """Line strips of a wall, (m, k, dim); None where it has no finite outline."""
-    dim = world.particles.dim
-    if isinstance(wall, Box):
-        if not (np.isfinite(wall.lower).all() and np.isfinite(wall.upper).all()):
-            return None
-        bits = np.array([[(c >> k) & 1 for k in range(dim)] for c in range(2**dim)])
-        corners = np.where(bits, wall.upper, wall.lower)
-        edges = [(a, b) for a in range(2**dim) for b in range(a) if np.abs(bits[a] - bits[b]).sum() == 1]
-        return corners[np.array(edges)]
-    low, high = _bounds(world)
-    middle, reach = (low + high) / 2, float(np.linalg.norm(high - low)) or 1.0
-    foot = middle - (wall.normal @ middle - wall.offset) * wall.normal
-    across = [a for a in np.eye(dim)]
-    across = [a - (a @ wall.normal) * wall.normal for a in across]
-    across = sorted(across, key=lambda a: -np.linalg.norm(a))[: dim - 1]
-    if dim == 3:  # two directions at right angles in the plane
-        u = across[0] / np.linalg.norm(across[0])
-        across = [u, np.cross(wall.normal, u)]
-    else:
-        across = [across[0] / np.linalg.norm(across[0])]
-    lines = [[foot - reach * a, foot + reach * a] for a in across]
-    return np.array(lines)
 
 
 def _about(world: "World", worst=None, frames: int = 0) -> str:

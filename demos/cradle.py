@@ -1,0 +1,72 @@
+"""Newton's cradle, a ball that bounces, and a disc on a slope: what is exact about contacts, next to the formulas.
+
+    python demos/cradle.py
+
+What to look for: restitution and friction do not depend on the step. Writes cradle.rrd.
+"""
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import tiverlet as tv
+
+
+def cradle(substeps: int, restitution: float) -> float:
+    """Speed of the last of five touching balls after the first was swung into the row."""
+    hang = tv.shapes.join(*(tv.shapes.rope((0.1 * k, 1.0), (0.1 * k, 0.0), points=2) for k in range(5)))[0]
+    position = hang.position.copy()
+    position[1] = [-np.sin(0.5), 1 - np.cos(0.5)]  # the first ball is pulled aside
+    radius = np.where(np.arange(10) % 2, 0.05, 0.0)
+    features = [tv.Gravity(9.81), tv.Distance(hang.links), tv.Contact(restitution=restitution)]
+    with tv.World(tv.Particles(position, radius=radius, pinned=np.arange(0, 10, 2)), features, substeps=substeps) as world:
+        with tv.Recorder("cradle.rrd", world) as recorder:
+            speed = 0.0
+            for _ in range(60):
+                world.step(1 / 60)
+                recorder.log()
+                speed = max(speed, float(np.linalg.norm(world.velocity[9])))
+    return speed
+
+
+def bounce(substeps: int, restitution: float) -> float:
+    """Height of the third bounce of a ball dropped from 1 m."""
+    floor = tv.HalfSpace((0, 1), restitution=restitution)
+    with tv.World(tv.Particles([[0.0, 1.0]]), [tv.Gravity(9.81), floor], substeps=substeps, precision="f64") as world:
+        heights = [1.0]
+        while len(heights) < 2000 and world.time < 4.0:
+            world.step(1 / 600)
+            heights.append(world.position[0, 1])
+    y = np.array(heights)
+    return float(y[1:-1][(y[1:-1] >= y[:-2]) & (y[1:-1] > y[2:])][2])
+
+
+def slide(substeps: int, friction: float) -> float:
+    """How far a disc slides on level ground at 2 m/s."""
+    floor = tv.HalfSpace((0, 1), friction=friction)
+    start = tv.Particles([[0.0, 0.1]], radius=0.1, velocity=(2.0, 0.0))
+    with tv.World(start, [tv.Gravity(9.81), floor], substeps=substeps) as world:
+        world.run(2.0)
+        return float(world.position[0, 0])
+
+
+def main() -> None:
+    """Print each figure for two steps, and its formula."""
+    table = Table(title="contacts against formulas")
+    for name in ("what", "4 substeps", "40 substeps", "formula"):
+        table.add_column(name, justify="left" if name == "what" else "right")
+    swung = np.sqrt(2 * 9.81 * (1 - np.cos(0.5)))
+    rows = (
+        ("cradle, speed of the last ball [m/s]", [cradle(n, 1.0) for n in (4, 40)], swung, 0.02),
+        ("third bounce, e = 0.8 [m]", [bounce(n, 0.8) for n in (1, 10)], 0.8**6, 0.01),
+        ("sliding at 2 m/s, friction 0.4 [m]", [slide(n, 0.4) for n in (4, 40)], 4 / (2 * 0.4 * 9.81), 0.03),
+    )
+    for name, figures, formula, limit in rows:
+        table.add_row(name.replace("[", "\\["), *(f"{v:.4f}" for v in figures), f"{formula:.4f}")
+        if abs(figures[1] / formula - 1) > limit:
+            raise SystemExit(f"{name}: {figures[1]} instead of {formula}")
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,124 @@
+"""Building a world: what of its scene exists on the device, and in which order it comes to be."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TypeVar
+
+import taichi as ti
+
+from . import runtime
+from .constraints.contact import Contact
+from .feature import Acceleration, Batch, Feature, Scene
+from .grid import Grid
+from .particles import Particles, Radii, State
+from .solvers.jacobi import Jacobi, Slots
+from .substep import Substep
+from .survey import Survey
+from .wall import Wall
+
+T = TypeVar("T", bound=Feature)
+PRECISIONS = {"f32": ti.f32, "f32-compensated": ti.f32, "f64": ti.f64}
+PATHS = ("auto", "fused", "parallel")
+CROSSOVER = 4000  # particles, constraints or both, from which waking threads pays
+
+
+@dataclass
+class Assembly:
+    """The parts of a world on the device."""
+
+    path: str
+    memory: runtime.Memory
+    scene: Scene
+    batches: list[Batch]
+    grid: Grid | None
+    substep: Substep
+    survey: Survey
+
+
+def assemble(particles: Particles, features: tuple[Feature, ...], solver: Jacobi, precision: str, path: str) -> Assembly:
+    """Check the features against the particles and each other, then declare and place every field, in one tree."""
+    inv_mass = particles.inv_mass.copy()
+    for feature in features:
+        feature.prepare(particles, inv_mass)
+    for feature in features:
+        feature.review(particles, inv_mass)
+    runtime.ensure_started()
+    if precision == "f32-compensated" and runtime.fast_math():
+        raise ValueError(
+            'World: precision = "f32-compensated" needs exact rounding, but Taichi was started with fast_math=True. '
+            "Use tv.init(), or ti.init(fast_math=False)."
+        )
+    path = _chosen(path, particles, features)
+    memory = runtime.Memory(PRECISIONS[precision])
+    try:
+        state = State(memory, particles, inv_mass, precision == "f32-compensated")
+        return _bind(Scene(memory, state, particles, inv_mass), features, solver, path)
+    except BaseException:
+        memory.abandon()
+        for feature in features:
+            feature.scene = None
+        raise
+
+
+def _bind(scene: Scene, features: tuple[Feature, ...], solver: Jacobi, path: str) -> Assembly:
+    memory, state, particles = scene.memory, scene.state, scene.particles
+
+    def of(kind: type[T]) -> list[T]:
+        return [f for f in features if isinstance(f, kind)]
+
+    accelerations, walls = of(Acceleration), of(Wall)
+    drivers = [f for f in of(Batch) if f.drives and f.count]
+    batches = [f for f in of(Batch) if not f.drives and (scene.inv_mass[f.indices] > 0).any()]
+    contact = next((c for c in of(Contact) if c.matters), None)
+    if contact or walls:
+        scene.radius = Radii(memory, particles.radius)
+    surfaces = [*walls, *([contact] if contact else [])]
+    state.remember(memory, any(f.rubs for f in surfaces), any(f.bounces for f in surfaces))
+    if batches:
+        scene.slots = Slots(memory, state, batches, scene.inv_mass, solver)
+    parallel = path == "parallel"
+    grid = contact.join(scene, batches, parallel) if contact else None
+    for feature in [*accelerations, *drivers, *batches, *walls]:
+        feature.bind(scene)
+    substep = Substep(scene, accelerations, batches, drivers, contact, grid, walls, parallel)
+    survey = Survey(substep)
+    memory.place()
+    if grid:
+        grid.allocate(len(particles) * (12 if particles.dim == 2 else 32) + 64)
+    return Assembly(path, memory, scene, batches, grid, substep, survey)
+
+
+def checked_features(features: Iterable[Feature]) -> tuple[Feature, ...]:
+    """The features of a new world, each free and listed once."""
+    features = tuple(features)
+    for k, feature in enumerate(features):
+        if not isinstance(feature, Feature):
+            hint = f"; write {feature.__name__}(...)" if isinstance(feature, type) else ""
+            raise TypeError(f"World: features[{k}] = {feature!r} is not a force, constraint or wall{hint}.")
+        if feature.scene is not None:
+            raise ValueError(
+                f"World: features[{k}] = {feature!r} already acts in another world. Make a new one, or use feature.copy()."
+            )
+    if len({id(f) for f in features}) < len(features):
+        raise ValueError("World: the same feature is listed twice.")
+    if sum(isinstance(f, Contact) for f in features) > 1:
+        raise ValueError("World: more than one Contact; one covers all particles.")
+    return features
+
+
+def check_settings(precision: str, path: str) -> None:
+    """Refuse names that do not exist."""
+    if precision not in PRECISIONS:
+        raise ValueError(f"World: precision = {precision!r}, but it must be one of {', '.join(map(repr, PRECISIONS))}.")
+    if path not in PATHS:
+        raise ValueError(f"World: path = {path!r}, but it must be one of {', '.join(map(repr, PATHS))}.")
+
+
+def _chosen(path: str, particles: Particles, features: tuple[Feature, ...]) -> str:
+    """The path for "auto": fused on one CPU thread while waking the others would cost more than their work."""
+    if path != "auto":
+        return path
+    if runtime.architecture() != "cpu":
+        return "parallel"
+    work = len(particles) + sum(f.count for f in features if isinstance(f, Batch))
+    return "fused" if work < CROSSOVER or runtime.threads() == 1 else "parallel"
