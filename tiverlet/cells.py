@@ -30,7 +30,7 @@ class Cells:
         used, level = np.unique(level, return_inverse=True)
         self.levels = len(used)
         largest = np.array([radius[level == m].max() for m in range(self.levels)])
-        # Rounding of floor(x / size) must not hide a neighbour.
+        # Rounding of floor(x * scale) must not hide a neighbour.
         self.sizes = (2 * largest + skin) * (1 + 2.0**-12)
         counts = np.bincount(level, minlength=self.levels)
         self.bits = np.maximum(2 * dim, np.ceil(np.log2(np.maximum(2 * counts, 1)))).astype(int)
@@ -42,7 +42,7 @@ class Cells:
         self.shape = add("grid.shape", self.levels, width=dim, kind=ti.i32, values=self._shapes)
         if self.levels > 1:
             self.level = add("grid.level", n, kind=ti.i32, values=level)
-            self.size = add("grid.size", self.levels, values=self.sizes)
+            self.per_meter = add("grid.cells_per_meter", self.levels, values=1 / self.sizes)
             self.offset = add("grid.offset", self.levels, kind=ti.i32, values=offsets[:-1])
 
     def shapes(self, extent: np.ndarray) -> np.ndarray:
@@ -75,10 +75,15 @@ class Cells:
     @ti.func
     def home(self, i, m):
         """The cell of particle i at level m."""
-        size = ti.cast(self.sizes[0], self.real)
+        return ti.floor(self.state.x[i] * self.scale(m), ti.i32)
+
+    @ti.func
+    def scale(self, m):
+        """Cells per meter at level m."""
+        scale = ti.cast(1 / self.sizes[0], self.real)
         if ti.static(self.levels > 1):
-            size = self.size[m]
-        return ti.floor(self.state.x[i] / size, ti.i32)
+            scale = self.per_meter[m]
+        return scale
 
     @ti.func
     def bucket(self, cell, m):

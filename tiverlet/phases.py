@@ -83,8 +83,9 @@ class Phases:
             u = ti.cast(ti.cast(tick, ti.u32) * ti.u32(step), ti.f32) * ti.static(2.0**-32) - 0.5
             for a in ti.static(range(self.dim)):
                 exponent = ti.bit_cast(big[a], ti.u32) & ti.u32(0x7F800000)
-                digit = ti.bit_cast(exponent, ti.f32) * ti.static(2.0**-23)
-                small[a] += u * digit * ti.math.sign(small[a])
+                sign = ti.bit_cast(small[a], ti.u32) & ti.u32(0x80000000)
+                digit = ti.bit_cast(exponent | sign, ti.f32) * (u * ti.static(2.0**-23))
+                small[a] += ti.select(small[a] == 0, ti.cast(0, ti.f32), digit)
         return small
 
     @ti.func

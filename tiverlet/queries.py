@@ -32,11 +32,9 @@ class Search:
     def visit(self, point, radius, row, number, at, out: ti.template(), fill: ti.template()):  # type: ignore[valid-type]
         """Count the particles within `radius` of a point; with `fill` write (row, particle) from `at` on."""
         for m in range(self.levels):
-            size = ti.cast(self.cells.sizes[0], self.real)
-            if ti.static(self.levels > 1):
-                size = self.cells.size[m]
-            low = ti.floor((point - radius) / size, ti.i32) - 1  # one more on each side for what has rounded across
-            count = ti.floor((point + radius) / size, ti.i32) + 2 - low
+            scale = self.cells.scale(m)
+            low = ti.floor((point - radius) * scale, ti.i32) - 1  # one more on each side for what has rounded across
+            count = ti.floor((point + radius) * scale, ti.i32) + 2 - low
             total = 1
             for k in ti.static(range(self.dim)):
                 count[k] = ti.min(count[k], 1 << self.cells.shape[m][k])  # round the torus once

@@ -18,7 +18,7 @@ class Contact(Feature):
 
     friction: Coulomb, a number or (static, dynamic), or a mapping from pairs of groups to these: {(0, 1): 0.5}. restitution:
     0 to 1, or such a mapping. groups: the pairs of groups that touch, None for all. skin: how far beyond touching pairs are
-    listed [m], "auto" for a fifth of the median radius; speed only, never the result. push_out: particles that overlap at the
+    listed [m], "auto" for 0.3 of the median radius; speed only, never the result. push_out: particles that overlap at the
     start, or after positions were assigned, part at this speed [m/s] at most: they act as if they were small enough to fit, and
     grow back.
 
@@ -54,7 +54,7 @@ class Contact(Feature):
         """Choose the skin, and refuse positions too far out for cells to be told apart."""
         radius = particles.radius
         some = radius[radius > 0]
-        auto = 0.2 * float(np.median(some)) if len(some) else 1.0
+        auto = 0.3 * float(np.median(some)) if len(some) else 1.0
         self._on_size = auto if self.skin == "auto" else float(self.skin)
         self._on_finest = float(radius.min(initial=np.inf))
         self.matters = len(some) > 0
