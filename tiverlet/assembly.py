@@ -19,7 +19,9 @@ from .wall import Wall
 T = TypeVar("T", bound=Feature)
 PRECISIONS = {"f32": ti.f32, "f32-compensated": ti.f32, "f64": ti.f64}
 PATHS = ("auto", "fused", "parallel")
-CROSSOVER = 4000  # particles, constraints or both, from which waking threads pays
+# Particles and constraints from which waking threads pays. A falling pile of discs took, fused and on 2 threads, 3.0 and 5.4 ms a
+# frame with 10 000 of them, 13.5 and 13.9 with 100 000.
+CROSSOVER = 100_000
 
 
 @dataclass
