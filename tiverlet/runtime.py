@@ -293,6 +293,7 @@ class _Transfer:
 
     @ti.kernel
     def load(self, flat: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
+        """From the array to the fields."""
         for field, kind, length, width, many, offset in ti.static(self.plan):
             for i in range(length):
                 if ti.static(width == 0):
@@ -309,6 +310,7 @@ class _Transfer:
 
     @ti.kernel
     def dump(self, flat: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
+        """From the fields to the array."""
         for field, kind, length, width, many, offset in ti.static(self.plan):
             for i in range(length):
                 if ti.static(width == 0):

@@ -77,10 +77,8 @@ class World:
             self._scene.hh = self._h**2 * (phi2 if self._started else phi1)
             report = self._look()
         change = report.energy - self._energy  # type: ignore[operator]
-        self._energy, self._last = (
-            report.energy,
-            replace(report, energy_change=change, seconds=perf_counter() - clock),
-        )
+        self._energy = report.energy
+        self._last = replace(report, energy_change=change, seconds=perf_counter() - clock)
         return self._last
 
     def _pass(self, dt: float) -> None:
