@@ -37,7 +37,7 @@ def build(discs: int = 360, **settings) -> Scene:
     sizes = tv.mix(0.045, 0.125, tv.smoothstep(0.0, 1.0, spots[:, 2]))
     bridge = tv.shapes.rope((0.07, 1.9), (WIDTH - 0.07, 1.9), points=51)
     chain = tv.shapes.rope((2.0, HEIGHT - 1.0), (4.4, HEIGHT - 1.0), points=13)
-    both, (on_bridge, on_chain) = tv.shapes.join(bridge, chain)
+    both, (_, on_chain) = tv.shapes.join(bridge, chain)
     position = np.concatenate([both.position, [_path(0.0)], falling])
     radius = np.concatenate([np.full(51, 0.07), np.full(13, 0.09), [0.22], sizes])
     # Discs that the hand, the bridge or the chain would start inside of make room.

@@ -6,7 +6,6 @@ import taichi as ti
 
 import tiverlet as tv
 
-X = np.zeros((4, 2))
 NAN, INF = float("nan"), float("inf")
 
 

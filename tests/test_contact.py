@@ -225,7 +225,6 @@ def test_idle_columns_do_not_creep(world):
     w.substeps = 200
     w.run(5.0)
     w.substeps = 20
-    rest = []
     for _ in range(5000):
         w.step(1 / 60)
     rest = w.position

@@ -45,7 +45,7 @@ def test_both_paths_have_the_same_bits(world):
             tv.Pin([0], (1, 1, 1), compliance=1e-3), tv.Pin([5], (2, 2, 2)),
         ]  # fmt: skip
         w = world(
-            tv.Particles(x, radius=rng.uniform(0.05, 0.1, n) * 0 + 0.08, mass=1 + np.arange(n) % 5), features, path=path,
+            tv.Particles(x, radius=0.08, mass=1 + np.arange(n) % 5), features, path=path,
             precision="f32-compensated", substeps=7, iterations=2,
         )  # fmt: skip
         w.run(0.3)

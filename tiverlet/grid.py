@@ -24,8 +24,11 @@ class Grid:
     """The list of near pairs, and what pairs carry along.
 
     skin: what is listed beyond touching [m]. linked: (m, 2) pairs that are never listed. table: which groups touch. carries: each
-    pair has a vector, `slip`, that moves along when the list is built anew. aims: each has another, `aim`, for one substep.
+    pair has a vector, `slip`. aims: each has another, `aim`, for one substep. Both move along when the list is built anew.
     """
+
+    slip: Any
+    aim: Any
 
     def __init__(self, scene: Scene, skin: float, linked: np.ndarray, table: Table, carries: bool, aims: bool, parallel: bool):
         n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
@@ -49,7 +52,8 @@ class Grid:
             begin = np.searchsorted(both[:, 0], np.arange(n + 1))
             self.mates = add("grid.linked", len(both), kind=ti.i32, values=both[:, 1])
             self.mates_begin = add("grid.linked_begin", n + 1, kind=ti.i32, values=begin)
-        if carries:
+        self.moves = carries or aims  # whether pairs carry anything along
+        if self.moves:
             self.old_first = add("grid.old_first", n, kind=ti.i32)
             self.old_number = add("grid.old_number", n, kind=ti.i32)
             self.kept = add("grid.kept", None, kind=ti.i32)
@@ -64,13 +68,15 @@ class Grid:
             self.store.destroy()
         self.capacity = max(1, -(-capacity // self.blocks))  # of one block
         self.store = Memory(self.real)
-        self.near = self.store.field("grid.near", self.capacity * self.blocks, kind=ti.i32)
-        if self.carries:
-            self.slip = self.store.field("grid.slip", self.capacity * self.blocks, width=self.dim)
-            self.old_near = self.store.field("grid.old_near", self.capacity * self.blocks, kind=ti.i32)
-            self.old_slip = self.store.field("grid.old_slip", self.capacity * self.blocks, width=self.dim)
-        if self.aims:
-            self.aim = self.store.field("grid.aim", self.capacity * self.blocks, width=self.dim)
+        room = self.capacity * self.blocks
+        self.near = self.store.field("grid.near", room, kind=ti.i32)
+        self.payload = []  # what pairs carry along: the field, and where it is kept while the list is built anew
+        for name in (["slip"] if self.carries else []) + (["aim"] if self.aims else []):
+            pair = [self.store.field(f"grid.{kept}{name}", room, width=self.dim) for kept in ("", "old_")]
+            self.payload.append(tuple(pair))
+            setattr(self, name, pair[0])
+        if self.payload:
+            self.old_near = self.store.field("grid.old_near", room, kind=ti.i32)
         self.store.place()
 
     def grow(self) -> None:
@@ -82,14 +88,17 @@ class Grid:
                 "overlap each other, or one is much larger than the rest.",
                 stacklevel=2,
             )
-        kept = [self.store.read(f) for f in (self.old_near, self.old_slip)] if self.carries and self.store else []
+        kept = [self.store.read(field) for field in self._kept()] if self.store else []
         self.allocate(int(self.need[None] * 1.25 + 16) * self.blocks)
-        if kept and self.store:
-            for field, values in zip((self.old_near, self.old_slip), kept, strict=True):
-                room = np.zeros((self.capacity * self.blocks, *values.shape[1:]), dtype=values.dtype)
-                room[: len(values)] = values
-                self.store.write(field, room)
+        for field, values in zip(self._kept(), kept, strict=True):
+            room = np.zeros((self.capacity * self.blocks, *values.shape[1:]), dtype=values.dtype)
+            room[: len(values)] = values
+            self.store.write(field, room)  # type: ignore[union-attr]
         self.stale[None] = 1
+
+    def _kept(self) -> list:
+        """The fields of the list that is put aside."""
+        return [self.old_near, *(old for _, old in self.payload)] if self.payload else []
 
     @property
     def finest(self) -> float:
@@ -119,7 +128,7 @@ class Grid:
         assert self.store
         aside = bool(self.kept[None])  # given by restore(), and not built into a list yet
         first, number = (self.old_first, self.old_number) if aside else (self.first, self.number)
-        near, slips = (self.old_near, self.old_slip) if aside else (self.near, self.slip)
+        near, slips = (self.old_near, self.payload[0][1]) if aside else (self.near, self.slip)
         i, at = self._entries(first, number)
         slip = self.store.read(slips)[at]
         some = (slip != 0).any(axis=1)
@@ -135,7 +144,7 @@ class Grid:
         near, slips = np.zeros(room, dtype=np.int32), np.zeros((room, self.dim))
         near[: len(pairs)], slips[: len(pairs)] = pairs[:, 1], slip
         self.store.write(self.old_near, near)
-        self.store.write(self.old_slip, slips)
+        self.store.write(self.payload[0][1], slips)
         self.old_first.from_numpy((np.cumsum(counts) - counts).astype(np.int32))
         self.old_number.from_numpy(counts.astype(np.int32))
         self.kept[None] = self.stale[None] = 1
@@ -148,19 +157,22 @@ class Grid:
             if kept == 0:
                 self.old_first[i], self.old_number[i] = self.first[i], self.number[i]
                 for e in range(self.first[i], self.first[i] + self.number[i]):
-                    self.old_near[e], self.old_slip[e] = self.near[e], self.slip[e]
+                    self.old_near[e] = self.near[e]
+                    for field, old in ti.static(self.payload):
+                        old[e] = field[e]
 
     @ti.func
     def carry(self, i):
-        """Give each neighbour of particle i the slip that it had in the old list; both are sorted."""
+        """Give each neighbour of particle i what it carried in the old list; both are sorted."""
         old, end = self.old_first[i], self.old_first[i] + self.old_number[i]
         for e in range(self.first[i], self.first[i] + self.number[i]):
             j = self.near[e]
             while old < end and self.old_near[old] < j:
                 old += 1
-            self.slip[e] = 0 * self.slip[e]
-            if old < end and self.old_near[old] == j:
-                self.slip[e] = self.old_slip[old]
+            for field, kept in ti.static(self.payload):
+                field[e] = 0 * field[e]
+                if old < end and self.old_near[old] == j:
+                    field[e] = kept[old]
 
     @ti.func
     def watch(self, i):
@@ -172,14 +184,14 @@ class Grid:
     @ti.func
     def build(self):
         """Sort the particles into cells, then list the near ones of each."""
-        if ti.static(self.carries):
+        if ti.static(self.moves):
             self.keep()
         self.cells.sort()
         ti.loop_config(serialize=True)
         for _ in range(1):
             self.need[None] = 0
             self.stale[None] = 0
-            if ti.static(self.carries):
+            if ti.static(self.moves):
                 self.kept[None] = 1
         if ti.static(self.several):
             self.pair_up()
@@ -189,7 +201,7 @@ class Grid:
                     self.fill(t // self.spread)
         for i in range(self.n):
             self.origin[i] = self.state.x[i]
-        if ti.static(self.carries):
+        if ti.static(self.moves):
             ti.loop_config(serialize=True)
             for _ in range(1):
                 if self.need[None] <= self.capacity:
@@ -233,7 +245,7 @@ class Grid:
     def finish(self, i):
         """Put the list of particle i in order."""
         self.order(self.first[i], self.number[i])
-        if ti.static(self.carries):
+        if ti.static(self.moves):
             self.carry(i)
 
     @ti.func

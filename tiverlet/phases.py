@@ -250,6 +250,14 @@ class Phases:
         return out
 
     @ti.func
+    def halted(self):
+        """1 when the frame waits for a longer list."""
+        out = 0
+        if ti.static(self.hashes):
+            out = self.halt[None][0]
+        return out
+
+    @ti.func
     def velocity_after(self, i, h, t, bond):
         """v_n from d_n and the acceleration at x_n: d / h + (h a + bond / h) / 2, or what the solution with drag makes of it.
 

@@ -7,6 +7,7 @@ import numpy as np
 import taichi as ti
 
 from . import checks
+from .compliance import law, stiff
 from .feature import Batch, Scene
 from .particles import Particles
 
@@ -133,23 +134,12 @@ class Scalar(Batch):
         return q
 
     @ti.func
-    def law(self, c, h, hh, w, fresh):
-        """The coefficients of C_(n+1), C_n, C_(n-1) in C* (with damping), and alpha'. w: sum of inverse masses."""
-        ratio = self._on_alpha[c] / (h * h * w)  # 1 / s^2; s^4 would overflow in f32
-        rigid = 1 / (1 + ratio * ratio)
-        A, now, last = (1 + 3 * rigid) / 4, (1 - rigid) / 2, (1 - rigid) / 4
-        if ti.static(self._on_damped):  # + alpha c dC/dt: central where resolved, backward where stiff
-            gamma = self._on_damping[c] * self._on_alpha[c] / h
-            A += gamma * (1 + rigid) / 2
-            now -= gamma * rigid
-            last -= gamma * (1 - rigid) / 2
-        if fresh != 0:
-            A, now, last = rigid, 1 - rigid, 0 * rigid
-            if ti.static(self._on_damped):
-                gamma = self._on_damping[c] * self._on_alpha[c] / h
-                A += gamma
-                now -= gamma
-        return A, now, last, self._on_alpha[c] / hh
+    def dashpot(self, c):
+        """Damping of constraint c."""
+        out = ti.cast(0, self._on_real)
+        if ti.static(self._on_damped):
+            out = self._on_damping[c]
+        return out
 
     @ti.func
     def bounded(self, value):
@@ -178,19 +168,16 @@ class Scalar(Batch):
         turned = both < 0.75 * ti.sqrt(here * there) or there == 0
         if turned:
             n, both = g, here
-        C, A, B, alpha = (
-            f - self._on_rest[c],
-            ti.cast(1, self._on_real),
-            ti.cast(0, self._on_real),
-            ti.cast(0, self._on_real),
-        )
+        C, A = f - self._on_rest[c], ti.cast(1, self._on_real)
+        B, alpha = ti.cast(0, self._on_real), ti.cast(0, self._on_real)
         lam = self._on_lam[c]
         if first != 0:
             lam = 0
         new, violation = lam, ti.cast(0, self._on_real)
         if here > 0:
             if ti.static(self._on_soft):
-                A, now, last, alpha = self.law(c, h, hh, w, fresh)
+                A, now, last = law(self._on_alpha[c], self.dashpot(c), h, w, fresh)
+                alpha = self._on_alpha[c] / hh
                 if first != 0:
                     rest = self._on_rest[c]
                     B = now * self.bounded(f0 - rest) + last * self.bounded(self._on_last[c] - rest)
@@ -228,8 +215,7 @@ class Scalar(Batch):
                 w += self._on_w[self.member(c, k)] * g[k, :].dot(g[k, :])
             alpha = self._on_alpha[c]
             if w > 0 and alpha > 0:
-                ratio = alpha / (h * h * w)
-                resolved = 1 - 1 / (1 + ratio * ratio)
+                resolved = 1 - stiff(alpha, h, w)
                 C = self.bounded(f - self._on_rest[c])
                 force = -resolved * C / alpha
                 if ti.static(self._on_damped):

@@ -28,24 +28,19 @@ class Substep(Phases):
             when = self.clock(s, substeps)
             starts = fresh if s == 0 else 0
             resumed = skip if s == begin else 0
-            going = True
-            if ti.static(self.hashes):
-                going = self.halt[None][0] == 0
-            if going:
+            if self.halted() == 0:
                 if resumed == 0:
                     self.predict(h, ti.cast(t + s * h64, self.real), tick + s, starts, when)
                 for it in range(it0 if resumed != 0 else 0, iterations):
                     if ti.static(self.hashes):
-                        if self.halt[None][0] == 0 and self.grid.stale[None] != 0:
+                        if self.halted() == 0 and self.is_stale() != 0:
                             self.grid.build()
                             if self.grid.need[None] > self.grid.capacity:
                                 self.halt[None] = [1, s, it]
-                        if self.halt[None][0] == 0:
-                            self.pass_(h, when, it, iterations, starts, s, substeps)
-                    else:
+                    if self.halted() == 0:
                         self.pass_(h, when, it, iterations, starts, s, substeps)
                 if ti.static(self.concludes):
-                    if self.halt[None][0] == 0:
+                    if self.halted() == 0:
                         if self.struck() != 0:
                             for _ in range(REBOUNDS):
                                 self.rebound()

@@ -4,6 +4,7 @@ import numpy as np
 import taichi as ti
 
 from .. import checks
+from ..compliance import law, stiff
 from ..feature import Batch, Knob, Scene
 from ..particles import Particles, in_range
 
@@ -113,13 +114,7 @@ class Pin(Batch):
         new, size = lam, 0 * self._on_state.w[i]
         if self._on_state.w[i] > 0:
             alpha = self._on_alpha[c] / hh
-            gamma = self._on_damping[c] * self._on_alpha[c] / h
-            ratio = self._on_alpha[c] / (h * h * self._on_state.w[i])
-            rigid = 1 / (1 + ratio * ratio)
-            A = (1 + 3 * rigid) / 4 + gamma * (1 + rigid) / 2
-            now, last = (1 - rigid) / 2 - gamma * rigid, (1 - rigid) / 4 - gamma * (1 - rigid) / 2
-            if fresh != 0:
-                A, now, last = rigid + gamma, 1 - rigid - gamma, 0 * rigid
+            A, now, last = law(self._on_alpha[c], self._on_damping[c], h, self._on_state.w[i], fresh)
             if first != 0:
                 self._on_history[c] = now * C0 + last * self._on_last[c]
                 self._on_last[c] = C0
@@ -141,8 +136,7 @@ class Pin(Batch):
         i = self.member(c, 0)
         w, alpha = self._on_w[i], self._on_alpha[c]
         if w > 0:
-            ratio = alpha / (h * h * w)
-            resolved = 1 - 1 / (1 + ratio * ratio)
+            resolved = 1 - stiff(alpha, h, w)
             C = self._on_state.place(i) - self.aim(c, 1)
             self.push(c, 0, -h * h * w * resolved * (C / alpha + self._on_damping[c] * self._on_state.d[i] / h))
 
