@@ -20,20 +20,27 @@ FARTHEST = 1 << 22  # cells from the origin: beyond it, f32 cannot tell a cell f
 APPEND, COUNT, FILL = range(3)  # what a scan of the cells around a particle does with the neighbours that it finds
 
 
+class Luggage:
+    """What each pair carries along: a number, or a vector of `width`. lasting: it is part of the state, beyond a substep."""
+
+    field: Any
+
+    def __init__(self, name: str, width: int, lasting: bool):
+        self.name, self.width, self.lasting = name, width, lasting
+
+
 class Grid:
     """The list of near pairs, and what pairs carry along.
 
-    skin: what is listed beyond touching [m]. linked: (m, 2) pairs that are never listed. table: which groups touch. carries: each
-    pair has a vector, `slip`. aims: each has another, `aim`, for one substep. Both move along when the list is built anew.
+    skin: what is listed beyond touching [m]. linked: (m, 2) pairs that are never listed. table: which groups touch. luggage: what
+    the entries of the list carry along when it is built anew.
     """
 
-    slip: Any
-    aim: Any
-
-    def __init__(self, scene: Scene, skin: float, linked: np.ndarray, table: Table, carries: bool, aims: bool, parallel: bool):
+    def __init__(self, scene: Scene, skin: float, linked: np.ndarray, table: Table, luggage: list["Luggage"], parallel: bool):
         n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
         self.n, self.dim, self.state, self.radius = n, dim, scene.state, scene.radius
-        self.table, self.carries, self.aims = table, carries, aims
+        self.table, self.luggage = table, luggage
+        self.lasting = [piece for piece in luggage if piece.lasting]
         self.real, self.skin = scene.real, skin
         self.cells = Cells(scene, scene.particles.radius, skin)
         self.several = self.cells.levels > 1
@@ -52,31 +59,25 @@ class Grid:
             begin = np.searchsorted(both[:, 0], np.arange(n + 1))
             self.mates = add("grid.linked", len(both), kind=ti.i32, values=both[:, 1])
             self.mates_begin = add("grid.linked_begin", n + 1, kind=ti.i32, values=begin)
-        self.moves = carries or aims  # whether pairs carry anything along
-        if self.moves:
-            self.old_first = add("grid.old_first", n, kind=ti.i32)
-            self.old_number = add("grid.old_number", n, kind=ti.i32)
-            self.kept = add("grid.kept", None, kind=ti.i32)
+        self.old_first = add("grid.old_first", n, kind=ti.i32)
+        self.old_number = add("grid.old_number", n, kind=ti.i32)
+        self.kept = add("grid.kept", None, kind=ti.i32)  # 1: the old list is put aside for the one that is being built
+        self.half = add("grid.half", None, kind=ti.i32)  # of the entries, in which the list is; the old one is in the other
         self.near: Any = None
         self.store: Memory | None = None
 
     def allocate(self, capacity: int) -> None:
         """Room for `capacity` entries of the list, in a tree of its own, so that it can grow."""
-        if capacity > 2**31 - 1:
+        if 2 * capacity > 2**31 - 1:
             raise MemoryError(f"{capacity} near pairs exceed what a list can index; the particles overlap too much.")
         if self.store:
             self.store.destroy()
         self.capacity = max(1, -(-capacity // self.blocks))  # of one block
+        self.room = self.capacity * self.blocks  # of one list
         self.store = Memory(self.real)
-        room = self.capacity * self.blocks
-        self.near = self.store.field("grid.near", room, kind=ti.i32)
-        self.payload = []  # what pairs carry along: the field, and where it is kept while the list is built anew
-        for name in (["slip"] if self.carries else []) + (["aim"] if self.aims else []):
-            pair = [self.store.field(f"grid.{kept}{name}", room, width=self.dim) for kept in ("", "old_")]
-            self.payload.append(tuple(pair))
-            setattr(self, name, pair[0])
-        if self.payload:
-            self.old_near = self.store.field("grid.old_near", room, kind=ti.i32)
+        self.near = self.store.field("grid.near", 2 * self.room, kind=ti.i32)
+        for piece in self.luggage:
+            piece.field = self.store.field(f"grid.{piece.name}", 2 * self.room, width=piece.width)
         self.store.place()
 
     def grow(self) -> None:
@@ -88,17 +89,23 @@ class Grid:
                 "overlap each other, or one is much larger than the rest.",
                 stacklevel=2,
             )
-        kept = [self.store.read(field) for field in self._kept()] if self.store else []
+        assert self.store
+        before, old = self.room, 1 - self.half[None]
+        kept = [self.store.read(field)[old * before :][:before] for field in self._fields()]
         self.allocate(int(self.need[None] * 1.25 + 16) * self.blocks)
-        for field, values in zip(self._kept(), kept, strict=True):
-            room = np.zeros((self.capacity * self.blocks, *values.shape[1:]), dtype=values.dtype)
-            room[: len(values)] = values
-            self.store.write(field, room)  # type: ignore[union-attr]
+        for field, values in zip(self._fields(), kept, strict=True):
+            self._aside(field, values)
+        self.old_first.from_numpy(self.old_first.to_numpy() + np.int32(old * (self.room - before)))
         self.stale[None] = 1
 
-    def _kept(self) -> list:
-        """The fields of the list that is put aside."""
-        return [self.old_near, *(old for _, old in self.payload)] if self.payload else []
+    def _fields(self) -> list:
+        return [self.near, *(piece.field for piece in self.luggage)]
+
+    def _aside(self, field, values: np.ndarray) -> None:
+        """Write the entries of the old list."""
+        room = np.zeros((2 * self.room, *values.shape[1:]), dtype=values.dtype)
+        room[(1 - self.half[None]) * self.room :][: len(values)] = values
+        self.store.write(field, room)  # type: ignore[union-attr]
 
     @property
     def finest(self) -> float:
@@ -110,12 +117,18 @@ class Grid:
         if self.cells.fit(extent):
             self.stale[None] = 1
 
-    def pairs(self) -> np.ndarray:
-        """The listed pairs (m, 2) with i < j, in order."""
+    def pairs(self) -> tuple[np.ndarray, np.ndarray]:
+        """The listed pairs (m, 2) with i < j, in order, and where they are in the list."""
         assert self.store
         i, at = self._entries(self.first, self.number)
-        j = self.store.read(self.near)[at]
-        return np.stack([i, j], axis=1)[i < j].astype(np.int64)
+        pairs = np.stack([i, self.store.read(self.near)[at]], axis=1).astype(np.int64)
+        some = pairs[:, 0] < pairs[:, 1]
+        return pairs[some], at[some]
+
+    def read(self, piece: Luggage, at: np.ndarray) -> np.ndarray:
+        """What some entries of the list carry."""
+        assert self.store
+        return self.store.read(piece.field)[at].astype(np.float64)
 
     def _entries(self, first, number) -> tuple[np.ndarray, np.ndarray]:
         """For every entry of the lists, whose it is and where it is."""
@@ -123,43 +136,46 @@ class Grid:
         i = np.repeat(np.arange(self.n), number)
         return i, np.repeat(first, number) + np.arange(len(i)) - np.repeat(np.cumsum(number) - number, number)
 
-    def slips(self) -> tuple[np.ndarray, np.ndarray]:
-        """Every listed pair (i, j) whose slip is not 0, in order, and the slips: the same whatever the list's layout."""
+    def carried(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Every listed pair (i, j) that carries something lasting other than 0, in order, and what: the same whatever the list's
+        layout."""
         assert self.store
         aside = bool(self.kept[None])  # given by restore(), and not built into a list yet
         first, number = (self.old_first, self.old_number) if aside else (self.first, self.number)
-        near, slips = (self.old_near, self.payload[0][1]) if aside else (self.near, self.slip)
         i, at = self._entries(first, number)
-        slip = self.store.read(slips)[at]
-        some = (slip != 0).any(axis=1)
-        return np.stack([i[some], self.store.read(near)[at][some]], axis=1), slip[some]
+        near = self.store.read(self.near)[at]
+        values = {piece.name: self.store.read(piece.field)[at] for piece in self.lasting}
+        some = np.zeros(len(i), dtype=bool)
+        for value in values.values():
+            some |= (value != 0) if value.ndim == 1 else (value != 0).any(axis=1)
+        return np.stack([i[some], near[some]], axis=1), {name: value[some] for name, value in values.items()}
 
-    def restore(self, pairs: np.ndarray, slip: np.ndarray) -> None:
-        """Give the slips of slips() to the next list that is built."""
-        if len(pairs) > self.capacity * self.blocks:
+    def restore(self, pairs: np.ndarray, values: dict[str, np.ndarray]) -> None:
+        """Give what carried() returned to the next list that is built."""
+        if len(pairs) > self.room:
             self.allocate(len(pairs))
-        assert self.store
+        self._aside(self.near, pairs[:, 1].astype(np.int32))
+        for piece in self.lasting:
+            self._aside(piece.field, values[piece.name])
         counts = np.bincount(pairs[:, 0], minlength=max(1, self.n))
-        room = self.capacity * self.blocks
-        near, slips = np.zeros(room, dtype=np.int32), np.zeros((room, self.dim))
-        near[: len(pairs)], slips[: len(pairs)] = pairs[:, 1], slip
-        self.store.write(self.old_near, near)
-        self.store.write(self.payload[0][1], slips)
-        self.old_first.from_numpy((np.cumsum(counts) - counts).astype(np.int32))
+        begin = (1 - self.half[None]) * self.room
+        self.old_first.from_numpy((begin + np.cumsum(counts) - counts).astype(np.int32))
         self.old_number.from_numpy(counts.astype(np.int32))
         self.kept[None] = self.stale[None] = 1
 
     @ti.func
     def keep(self):
-        """Put the list aside with its slips, unless one is there already, from a build that did not fit."""
+        """Put the list aside, unless one is there already, from a build that did not fit."""
         kept = self.kept[None]
         for i in range(self.n):
             if kept == 0:
                 self.old_first[i], self.old_number[i] = self.first[i], self.number[i]
-                for e in range(self.first[i], self.first[i] + self.number[i]):
-                    self.old_near[e] = self.near[e]
-                    for field, old in ti.static(self.payload):
-                        old[e] = field[e]
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            if self.kept[None] == 0:
+                self.half[None] = 1 - self.half[None]
+            self.kept[None] = 1
+            self.need[None] = 0
 
     @ti.func
     def carry(self, i):
@@ -167,12 +183,12 @@ class Grid:
         old, end = self.old_first[i], self.old_first[i] + self.old_number[i]
         for e in range(self.first[i], self.first[i] + self.number[i]):
             j = self.near[e]
-            while old < end and self.old_near[old] < j:
+            while old < end and self.near[old] < j:
                 old += 1
-            for field, kept in ti.static(self.payload):
-                field[e] = 0 * field[e]
-                if old < end and self.old_near[old] == j:
-                    field[e] = kept[old]
+            for piece in ti.static(self.luggage):
+                piece.field[e] = ti.zero(piece.field[e])  # 0 times what is there could be -0
+                if old < end and self.near[old] == j:
+                    piece.field[e] = piece.field[old]
 
     @ti.func
     def watch(self, i):
@@ -184,15 +200,8 @@ class Grid:
     @ti.func
     def build(self):
         """Sort the particles into cells, then list the near ones of each."""
-        if ti.static(self.moves):
-            self.keep()
+        self.keep()
         self.cells.sort()
-        ti.loop_config(serialize=True)
-        for _ in range(1):
-            self.need[None] = 0
-            self.stale[None] = 0
-            if ti.static(self.moves):
-                self.kept[None] = 1
         if ti.static(self.several):
             self.pair_up()
         else:
@@ -201,16 +210,16 @@ class Grid:
                     self.fill(t // self.spread)
         for i in range(self.n):
             self.origin[i] = self.state.x[i]
-        if ti.static(self.moves):
-            ti.loop_config(serialize=True)
-            for _ in range(1):
-                if self.need[None] <= self.capacity:
-                    self.kept[None] = 0
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            self.stale[None] = 0
+            if self.need[None] <= self.capacity:
+                self.kept[None] = 0
 
     @ti.func
     def fill(self, block):
         """One level: list the neighbours of a block of particles, one after the other. Beyond the room they are only counted."""
-        start, room = block * self.capacity, self.capacity
+        start, room = self.half[None] * self.room + block * self.capacity, self.capacity
         size = (self.n + self.blocks - 1) // self.blocks
         used = 0
         for i in range(block * size, ti.min((block + 1) * size, self.n)):
@@ -231,7 +240,7 @@ class Grid:
             self.scan(i, COUNT, 0, 0)
         ti.loop_config(serialize=True)
         for i in range(self.n):
-            self.first[i] = self.need[None]
+            self.first[i] = self.half[None] * self.room + self.need[None]
             self.need[None] += self.number[i]
             self.number[i] = 0
         ti.loop_config(serialize=self.cells.serial)
@@ -245,8 +254,7 @@ class Grid:
     def finish(self, i):
         """Put the list of particle i in order."""
         self.order(self.first[i], self.number[i])
-        if ti.static(self.moves):
-            self.carry(i)
+        self.carry(i)
 
     @ti.func
     def scan(self, i, what: ti.template(), start, used):  # type: ignore[valid-type]

@@ -104,7 +104,7 @@ class State:
         self.compensated = compensated
         self.double = memory.real == ti.f64
         self.count, self.dim = n, dim
-        self.starts = self.befores = False
+        self.starts = self.befores = self.leans = False
         self.x = memory.field("position", n, width=dim, values=particles.position, state=True)
         self.d = memory.field("displacement", n, width=dim, values=particles.velocity, state=True)
         self.w = memory.field("inv_mass", n, values=inv_mass)
@@ -135,9 +135,12 @@ class State:
             x += self.low[i]
         return x
 
-    def remember(self, memory: Memory, start: bool, before: bool) -> None:
-        """Declare what friction and restitution need: the position and the displacement at the start of the substep."""
-        self.starts, self.befores = start, before
+    def remember(self, memory: Memory, start: bool, before: bool, lean: bool) -> None:
+        """Declare what friction and restitution need, the position and the displacement at the start of the substep, and how far
+        walls have pushed since then."""
+        self.starts, self.befores, self.leans = start, before, lean
+        if lean:
+            self.lean = memory.field("lean", self.count, width=self.dim)
         if start:
             self.x0 = memory.field("position_at_start", self.count, width=self.dim)
             if self.compensated:

@@ -95,6 +95,8 @@ class Phases:
             self.state.x0[i] = self.state.x[i]
             if ti.static(self.state.compensated):
                 self.state.low0[i] = self.state.low[i]
+        if ti.static(self.state.leans):
+            self.state.lean[i] = 0 * self.state.x[i]
         if self.state.w[i] > 0:
             v = self.velocity_before(i, h, fresh)
             a = self.accelerate(i, self.state.place(i), v, t)
@@ -167,9 +169,9 @@ class Phases:
                 for i in range(self.n):
                     self.slots.gather(i, first, final)
             for i in range(self.n):
-                c.count(i)
+                c.count(i, first)
             for i in range(self.n):
-                c.relax(i, first)
+                c.relax(i, first, fresh)
         if ti.static(len(self.batches) > 0 or len(self.contacts) > 0 or len(self.walls) > 0):
             for i in range(self.n):
                 if ti.static(len(self.batches) > 0 and len(self.contacts) == 0):
@@ -210,6 +212,15 @@ class Phases:
                 ti.loop_config(serialize=True)
                 for _ in range(1):
                     c._on_hit[None] = 0
+
+    @ti.func
+    def calm(self, k):
+        """5 Now and then: pass k of taking the sound out of loaded contacts."""
+        for c in ti.static(self.contacts):
+            for i in range(self.n):
+                c._on_calm.want(i, k)
+            for i in range(self.n):
+                c._on_calm.move(i)
 
     @ti.func
     def struck(self):

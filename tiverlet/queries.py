@@ -10,11 +10,13 @@ from .grid import Grid
 
 @dataclass(frozen=True)
 class Contacts:
-    """The pairs that overlap now. pairs: (m, 2), i < j. overlap: (m,) [m]. normal: (m, dim), from j to i."""
+    """The pairs that overlap now. pairs: (m, 2), i < j. overlap: (m,) [m]. normal: (m, dim), from j to i. impulse: (m,) [N s]
+    along the normal in the last substep, without what a bounce adds; divided by the substep it is the force."""
 
     pairs: np.ndarray
     overlap: np.ndarray
     normal: np.ndarray
+    impulse: np.ndarray
 
     def __len__(self) -> int:
         return len(self.pairs)

@@ -10,16 +10,17 @@ if TYPE_CHECKING:
 
 
 def state(world: "World") -> dict[str, np.ndarray]:
-    """Every field that the future depends on: not what the neighbour list looks like, but the slips of its pairs."""
+    """Every field that the future depends on: not what the neighbour list looks like, but what its pairs carry."""
     out = {name: values for memory in world._memories for name, values in memory.state().items()}
-    if world._grid and world._grid.carries:
-        out["Contact.pairs"], out["Contact.slips"] = world._grid.slips()
+    if world._grid:
+        out["Contact.pairs"], carried = world._grid.carried()
+        out.update((f"Contact.{name}", values) for name, values in carried.items())
     return out
 
 
 def digest(world: "World") -> str:
     """SHA-256 of the exact state and the clock."""
-    out = hashlib.sha256(repr((world._time, world._tick, world._h, world._fresh)).encode())
+    out = hashlib.sha256(repr((world._time, world._tick, world._since, world._h, world._fresh)).encode())
     for name, values in state(world).items():
         out.update(name.encode())
         out.update(values.tobytes())
@@ -28,7 +29,7 @@ def digest(world: "World") -> str:
 
 def transfer(old: "World", new: "World") -> None:
     """Take over the state, bit for bit where both have the same precision."""
-    new._time, new._tick, new._frame = old._time, old._tick, old._frame
+    new._time, new._tick, new._since, new._frame = old._time, old._tick, old._since, old._frame
     if new._precision != old._precision:
         new.position, new.velocity = old.position, old.velocity
         return
@@ -39,8 +40,8 @@ def transfer(old: "World", new: "World") -> None:
     values = state(old)
     for memory in new._memories:
         memory.restore(values)
-    if new._grid and new._grid.carries:
-        new._grid.restore(values["Contact.pairs"], values["Contact.slips"])
+    if new._grid:
+        new._grid.restore(values["Contact.pairs"], {piece.name: values[f"Contact.{piece.name}"] for piece in new._grid.lasting})
         new._renew()
     for ours, theirs in zip(old.features, new.features, strict=True):
         theirs.changed, theirs.moving = ours.changed, ours.moving

@@ -7,6 +7,7 @@ parallel: a few launches per substep, one static chunk of each loop per thread.
 import numpy as np
 import taichi as ti
 
+from .calm import EVERY, PASSES
 from .phases import Phases
 
 REBOUNDS = 8  # passes of restitution in a substep in which a pair bounces
@@ -18,7 +19,7 @@ class Substep(Phases):
 
     @ti.kernel
     def fused(
-        self, h64: ti.f64, t: ti.f64, tick: ti.i32, fresh: ti.i32, substeps: ti.i32, iterations: ti.i32,
+        self, h64: ti.f64, t: ti.f64, tick: ti.i32, since: ti.i32, fresh: ti.i32, substeps: ti.i32, iterations: ti.i32,
         begin: ti.i32, it0: ti.i32, skip: ti.i32,
     ):  # fmt: skip
         """All substeps of a frame, in one thread."""
@@ -45,6 +46,10 @@ class Substep(Phases):
                             for _ in range(REBOUNDS):
                                 self.rebound()
                         self.remember()
+                if ti.static(self.hashes):
+                    if self.halted() == 0 and (since + s) % EVERY == EVERY - 1:
+                        for k in range(PASSES):
+                            self.calm(k)
 
     @ti.kernel
     def predicted(self, h64: ti.f64, t: ti.f64, tick: ti.i32, fresh: ti.i32, s: ti.i32, substeps: ti.i32) -> ti.i32:
@@ -68,6 +73,11 @@ class Substep(Phases):
     def remembered(self):
         """The end of a substep with contacts that rub or bounce."""
         self.remember()
+
+    @ti.kernel
+    def calmed(self, k: ti.i32):
+        """Pass k of phase 5."""
+        self.calm(k)
 
     @ti.kernel
     def listed(self) -> ti.i32:

@@ -80,6 +80,8 @@ class Wall(Feature):
                 if last != 0 and gap >= 0 and leaving < 0:
                     rise, after = self.bounce(gap, leaving, (self._on_state.before[i] - moved).dot(n), after)
             change = (after - leaving) * n
+            if ti.static(self._on_state.leans):
+                self._on_state.lean[i] += change
             shift = (move + rise) * n
             stuck = False
             if ti.static(self._on_rubs):

@@ -11,6 +11,7 @@ from rich.progress import track
 
 from . import checks, runtime, snapshot
 from .assembly import assemble, check_settings, checked_features
+from .calm import EVERY, PASSES
 from .explain import explain
 from .feature import Acceleration, Feature
 from .particles import Particles, in_range
@@ -47,6 +48,7 @@ class World:
         self._memory, self._scene, self._batches = parts.memory, parts.scene, parts.batches
         self._grid, self._sub, self._survey, self._path = parts.grid, parts.substep, parts.survey, parts.path
         self._time, self._tick, self._h = 0.0, 0, 0.0
+        self._since = 0  # substeps since the last start
         self._frame = (0.0, 0.0, 0)  # when frames of the present length began, their length, their number
         self._fresh, self._started = True, False  # d holds velocities; the last substep was the first after a start
         self._placed = True  # by the user, and not looked at yet
@@ -71,6 +73,7 @@ class World:
             if len(self._particles):
                 (self._fused if self._path == "fused" else self._parallel)()
             self._tick = (self._tick + self.substeps) % 2**31
+            self._since = (self._since + self.substeps) % 2**31
             self._pass(dt)
             self._started, self._fresh = self._fresh and self.substeps == 1, False
             _, phi1, phi2, *_ = self._drag or decay(0.0, self._h)
@@ -95,6 +98,8 @@ class World:
         turned = any(f.changed and isinstance(f, Acceleration) for f in self._features)
         if h != self._h or drag != self._drag or turned:
             self._restart()
+        if self._fresh:
+            self._since = 0
         self._upload(h, drag)
         if self._energy is None:
             report = self._look(begin=True)
@@ -127,7 +132,8 @@ class World:
         begin = it0 = skip = 0
         while True:
             fresh = int(self._fresh)
-            self._sub.fused(self._h, self._time, self._tick, fresh, self.substeps, self.iterations, begin, it0, skip)
+            clock = self._time, self._tick, self._since
+            self._sub.fused(self._h, *clock, fresh, self.substeps, self.iterations, begin, it0, skip)
             if not self._grid or not self._sub.halt[None][0]:
                 return
             (_, begin, it0), skip = (int(v) for v in self._sub.halt[None]), 1
@@ -150,6 +156,9 @@ class World:
                 for _ in range(REBOUNDS if struck else 0):
                     self._sub.rebounded()
                 self._sub.remembered()
+            if self._grid and (self._since + s) % EVERY == EVERY - 1:
+                for k in range(PASSES):
+                    self._sub.calmed(k)
 
     def _list(self) -> None:
         """Build the neighbour list, growing it until everything fits."""
@@ -279,16 +288,17 @@ class World:
     def contacts(self) -> Contacts:
         """The pairs that overlap now, as arrays. Empty without a Contact."""
         x, r = self.position, self._particles.radius
-        pairs = np.zeros((0, 2), dtype=np.int64)
+        pairs, push = np.zeros((0, 2), dtype=np.int64), np.zeros(0)
         if self._grid:
             self._list()
-            pairs = self._grid.pairs()
+            pairs, at = self._grid.pairs()
+            push = self._grid.read(self._sub.contacts[0]._on_push, at)
         d = x[pairs[:, 0]] - x[pairs[:, 1]]
         length = np.linalg.norm(d, axis=1)
         overlap = r[pairs].sum(axis=1) - length
         some = overlap > 0
         normal = d[some] / np.where(length > 0, length, 1.0)[some, None]
-        return Contacts(pairs[some], overlap[some], normal)
+        return Contacts(pairs[some], overlap[some], normal, push[some] / (self._h or 1.0))
 
     @property
     def time(self) -> float:

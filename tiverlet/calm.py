@@ -1,0 +1,79 @@
+"""Quiet piles: what takes the sound out of loaded contacts."""
+
+from typing import Any
+
+import numpy as np
+import taichi as ti
+
+EVERY = 32  # substeps from one projection to the next
+PASSES = 32
+CONDITION = 400.0  # modes with an eigenvalue of at least 1 / CONDITION keep 1 / T(PASSES) = 8 % of their velocity
+
+
+class Calm:
+    """Pairs that bear a load move neither towards nor away from each other.
+
+    With one pass per substep loaded contacts are springs, and sound in them decays by half its eigenvalue L per substep, which
+    for the longest wave in a column of N is (pi / 4 N)^2. So every EVERY substeps the displacements are projected onto those
+    that keep the lengths of loaded pairs, (d_i - d_j) . n = 0, by PASSES Jacobi passes with Chebyshev's acceleration: the slow
+    modes lose PASSES^2 L of their velocity, not PASSES L. The polynomial is within -1 ... 1 on all eigenvalues 0 ... 1, so no
+    energy is made; moves come in pairs, so momentum is conserved. Particles that lean on a wall do not move into it or off it.
+
+    It is what inelastic rigid discs do: there is no sound in them. Pairs that bounce (restitution) are left out.
+    """
+
+    def __init__(self, contact: Any):
+        scene = contact.scene
+        self.contact, self.state, self.real = contact, scene.state, scene.real
+        self.earlier = contact._on_move  # is free at the end of a substep
+        self.factors = scene.memory.field("Contact.chebyshev", PASSES, values=chebyshev(PASSES, CONDITION))
+
+    @ti.func
+    def bears(self, i, e):
+        """Whether entry e in the list of particle i is a pair that bears a load."""
+        out = self.contact._on_push.field[e] > 0
+        if ti.static(self.contact._on_bounces):
+            if self.contact._on_struck[i] > 0:
+                aim = self.contact._on_aim.field[e]
+                out = out and aim.dot(aim) == 0
+        return out
+
+    @ti.func
+    def want(self, i, k):
+        """Pass k for particle i: d' = factor (d + 2 / (1 + 1 / CONDITION) want - earlier) + earlier, put where `earlier` was."""
+        want, w = 0 * self.state.d[i], self.state.w[i]
+        if self.contact._on_split[i] > 0:
+            for e in range(self.contact._on_grid.first[i], self.contact._on_grid.first[i] + self.contact._on_grid.number[i]):
+                if self.bears(i, e):
+                    j = self.contact._on_grid.near[e]
+                    r = self.state.apart(i, j)
+                    rr = r.dot(r)
+                    if rr > 0:
+                        rate = (self.state.d[i] - self.state.d[j]).dot(r) / rr
+                        want -= w * rate / (self.contact._on_split[i] + self.contact._on_split[j]) * r
+            if ti.static(self.state.leans):
+                lean = self.state.lean[i]
+                size = lean.dot(lean)
+                if size > 0:
+                    want -= want.dot(lean) / size * lean
+            d, earlier = self.state.d[i], self.earlier[i]
+            if k == 0:
+                earlier = d
+            self.earlier[i] = self.factors[k] * (d + ti.static(2 / (1 + 1 / CONDITION)) * want - earlier) + earlier
+
+    @ti.func
+    def move(self, i):
+        """d becomes d', `earlier` becomes d."""
+        if self.contact._on_split[i] > 0:
+            d = self.state.d[i]
+            self.state.d[i] = self.earlier[i]
+            self.earlier[i] = d
+
+
+def chebyshev(passes: int, condition: float) -> np.ndarray:
+    """The factors of a semi-iteration for eigenvalues 1 / condition ... 1 (Golub and Varga 1961)."""
+    rho = (condition - 1) / (condition + 1)
+    out = [1.0, 2 / (2 - rho * rho)]
+    while len(out) < passes:
+        out.append(4 / (4 - rho * rho * out[-1]))
+    return np.array(out[:passes])

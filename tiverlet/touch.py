@@ -1,0 +1,121 @@
+"""Which particles touch, how deep and in which direction."""
+
+from typing import Any
+
+import taichi as ti
+
+from .feature import Feature
+from .runtime import Memory
+
+
+class Touch(Feature):
+    """The geometry of pairs. Particles that the user put into each other may be smaller than they are, for a while."""
+
+    push_out: float
+    _on_grid: Any
+    _on_state: Any
+    _on_radius: Any
+    _on_eases, _on_store = False, None
+
+    @ti.func
+    def far(self, i, j):
+        """The distance at which particles i and j touch."""
+        far = self._on_radius.of(i) + self._on_radius.of(j)
+        if ti.static(self._on_eases):
+            far -= self._on_less[i] + self._on_less[j]
+        return far
+
+    @ti.func
+    def touch(self, i, j, far):
+        """Overlap [m] of a pair that touches at a distance `far` (negative where apart) and its direction, from j to i."""
+        r = self._on_state.apart(i, j)
+        rr = r.dot(r)
+        overlap, n = 0 * far - 1, 0 * r
+        if rr < far * far:
+            if rr > far * far * ti.static(2.0**-80):
+                length = ti.sqrt(rr)
+                overlap, n = far - length, r / length
+            else:
+                overlap, n = far, self.part(i, j, r)
+        return overlap, n
+
+    @ti.func
+    def meet(self, i, j, far):
+        """As touch(), but a pair that came together in this substep has the direction that it had when it met.
+
+        |r0 + s d| = far, with r0 at the start and d the relative displacement; what is left of d along n is the overlap. This is
+        exact for free flight, where the direction at the end is off by the way that a pair slides past each other.
+        """
+        overlap, n = self.touch(i, j, far)
+        if overlap > 0:
+            d = self._on_state.d[i] - self._on_state.d[j]
+            r = self._on_state.apart(i, j) - d
+            c = r.dot(r) - far * far
+            if c > 0:
+                a, b = d.dot(d), r.dot(d)
+                root = ti.sqrt(ti.max(b * b - a * c, 0)) - b
+                if b < 0 and root > 0:
+                    s = ti.min(c / root, 1)
+                    n = (r + s * d) / far
+                    overlap = ti.max((s - 1) * d.dot(n), 0)
+        return overlap, n
+
+    @ti.func
+    def part(self, i, j, r):
+        """A direction for two particles in the same place: opposite for (j, i), different for other pairs."""
+        low, high = ti.cast(ti.min(i, j), ti.u32), ti.cast(ti.max(i, j), ti.u32)
+        mixed = (low * ti.u32(2654435769)) ^ ((high + ti.u32(1)) * ti.u32(2246822519))
+        u = ti.cast(mixed * ti.u32(2654435769), ti.f64) / 4294967296.0
+        n = 0 * r
+        turn = ti.f64(6.283185307179586) * u
+        if ti.static(self._on_state.dim == 2):
+            n[0], n[1] = ti.cos(turn), ti.sin(turn)
+        else:
+            z = 2 * ti.cast(mixed * ti.u32(3242174889), ti.f64) / 4294967296.0 - 1
+            across = ti.sqrt(ti.max(1 - z * z, 0))
+            n[0], n[1], n[2] = across * ti.cos(turn), across * ti.sin(turn), z
+        if i > j:
+            n = -n
+        return n
+
+    def ease(self) -> None:
+        """From now on particles may be smaller than they are; the field for it exists only once it is needed."""
+        if not self._on_eases:
+            self._on_store = Memory(self.scene.real)
+            self._on_less = self._on_store.field("Contact.shrunk", self.scene.particles.count, state=True)
+            self._on_store.place()
+            self._on_eases = True
+
+    @ti.func
+    def shrink(self, i):
+        """Make particle i small enough: each pair gives up its overlap in proportion to the radii."""
+        less = ti.cast(0, self.scene.real)
+        for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
+            j = self._on_grid.near[e]
+            far = self._on_radius.of(i) + self._on_radius.of(j)
+            overlap, _ = self.touch(i, j, far)
+            less = ti.max(less, overlap * self._on_radius.of(i) / far)
+        self._on_less[i] = less
+
+    @ti.func
+    def grow(self, i, h):
+        """Let particle i grow back."""
+        if ti.static(self._on_eases):
+            self._on_less[i] = ti.max(self._on_less[i] - self.push_out * h / 2, 0)
+
+    @ti.func
+    def overlaps(self, i):
+        """For the report: contacts of particle i with later ones, and the worst overlap in radii of the smaller."""
+        touching, worst = 0, ti.cast(0, ti.f64)
+        for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
+            j = self._on_grid.near[e]
+            if j > i:
+                a, b = self._on_radius.of(i), self._on_radius.of(j)
+                overlap, _ = self.touch(i, j, a + b)
+                if overlap > 0:
+                    small = ti.min(a, b)
+                    if small == 0:
+                        small = ti.max(a, b)
+                    worst = ti.max(worst, overlap / small)
+                    touching += 1
+        return touching, worst
