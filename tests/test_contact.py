@@ -231,14 +231,15 @@ def test_settled_piles_are_quiet(world):
         w = world(tv.Particles(x, radius=0.5), [tv.Gravity(9.81), contact, box], substeps=8, precision="f64")
         w.run(12.0)
         assert tv.measure.kinetic_energy(w) / len(k) <= 1e-6 * 9.81 * 0.5
-        # The floor bears the weight: the sum of vertical impulses on what lies above any height is the weight of it.
+        # What lies above some height is borne by the contacts with what lies below, but for the sound that is left: a velocity of
+        # sqrt(2e-6 g r) = 3 mm/s at 30 rad/s is 1 % of g.
         height = w.position[:, 1]
         level = np.quantile(height, 0.5) + 1e-9
         i, j = w.contacts.pairs.T
         across = (height[i] > level) != (height[j] > level)
         up = np.where(height[i] > level, 1, -1) * w.contacts.normal[:, 1] * w.contacts.impulse * 480
         if not contact.rubs:
-            assert up[across].sum() == pytest.approx(9.81 * (height > level).sum(), rel=1e-3)
+            assert up[across].sum() == pytest.approx(9.81 * (height > level).sum(), rel=1e-2)
 
 
 def test_idle_columns_do_not_creep(world):
