@@ -149,10 +149,11 @@ class Scalar(Batch):
         return value
 
     @ti.func
-    def solve(self, c, h, hh, first, fresh):
-        """One Jacobi solution of constraint c.
+    def known(self, c, h, hh, first, fresh):
+        """What every solver knows of constraint c in a pass; of the state it writes nothing but the memory of soft constraints.
 
-        Returns the multiplier before and after, the size of the violation that this removes, and the direction (arity, dim).
+        Returns the violation A C + B + alpha' lam, A, alpha', lam, the mass-split weight W (0: no corner can move), directions n
+        and gradients g, both (arity, dim), and whether n had to be g because the constraint turned too far.
         """
         f, g = self.measure(c, self.corners(c, 0))
         f0, n = self.measure(c, self.corners(c, 1))
@@ -173,9 +174,8 @@ class Scalar(Batch):
         lam = self._on_lam[c]
         if first != 0:
             lam = 0
-        new, violation = lam, ti.cast(0, self._on_real)
-        if here > 0:
-            if ti.static(self._on_soft):
+        if ti.static(self._on_soft):
+            if both > 0:
                 A, now, last = law(self._on_alpha[c], self.dashpot(c), h, w, fresh)
                 alpha = self._on_alpha[c] / hh
                 if first != 0:
@@ -185,13 +185,24 @@ class Scalar(Batch):
                     self._on_last[c] = f0
                 else:
                     B = self._on_history[c]
-            new = lam - self._on_slots.relaxation * (A * C + B + alpha * lam) / (A * both + alpha)
+        return A * C + B + alpha * lam, A, alpha, lam, both, n, g, turned
+
+    @ti.func
+    def solve(self, c, h, hh, first, fresh):
+        """One Jacobi solution of constraint c.
+
+        Returns the multiplier before and after, the size of the violation that this removes, and the direction (arity, dim).
+        """
+        violation, A, alpha, lam, W, n, _, turned = self.known(c, h, hh, first, fresh)
+        new, size = lam, ti.cast(0, self._on_real)
+        if W > 0:
+            new = lam - self._on_slots.relaxation * violation / (A * W + alpha)
             if ti.static(self.side != 0):
                 new = -self.bounded(-new)
-            violation = ti.abs(new - lam) * (A * both + alpha) / self._on_slots.relaxation
+            size = ti.abs(new - lam) * (A * W + alpha) / self._on_slots.relaxation
             if turned and new != lam:
                 self._on_slots.turned[None] = 1
-        return lam, new, violation, n
+        return lam, new, size, n
 
     @ti.func
     def relax(self, c, h, hh, when, first, fresh):
