@@ -66,6 +66,7 @@ def test_what_is_absent_has_no_field_and_no_kernel(world):
         "Wind": ([tv.Wind((1, 0), 1.0)], {"Wind", "decay"}),
         "Box": ([tv.Box((-1, -1), (1, 1))], {"Box", "thrust"}),
         "HalfSpace": ([tv.HalfSpace((0, 1), -1)], {"HalfSpace", "thrust"}),
+        "Polygon": ([tv.Polygon([[1, 1], [2, 1], [1, 2]])], {"Polygon", "thrust", "position_at_start"}),
         "Pin": ([tv.Pin([0])], {"Pin"}),
         "Distance": ([tv.Distance([[0, 1]], 0.1)], {"Distance", "slots"}),
         "empty Distance": ([tv.Distance(np.zeros((0, 2), int))], set()),

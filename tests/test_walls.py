@@ -2,8 +2,17 @@
 
 import numpy as np
 import pytest
+import taichi as ti
 
 import tiverlet as tv
+
+from .test_solids import CUBE, CUBE_FACES, SQUARE
+
+
+@ti.func
+def round_rod(p):
+    """Distance from a disc, or from a rod along z."""
+    return ti.Vector([p[0] - 0.2, p[1]]).norm() - 0.5
 
 
 def scenes(dim):
@@ -22,6 +31,11 @@ def scenes(dim):
         "ball": (lambda **k: tv.Ball(0 * e[0], 0.5, **k), lambda x: np.linalg.norm(x, axis=1) - 0.5),
         "bowl": (lambda **k: tv.Ball(0 * e[0], 1.5, True, **k), lambda x: 1.5 - np.linalg.norm(x, axis=1)),
         "rod": (lambda **k: tv.Capsule(a, b, 0.15, **k), rod),
+        "hollow": (
+            lambda **k: tv.Polygon(SQUARE, True, **k) if dim == 2 else tv.Mesh(CUBE, CUBE_FACES, True, **k),
+            lambda x: 1 - np.abs(x).max(axis=1),
+        ),
+        "sdf": (lambda **k: tv.Sdf(round_rod, **k), lambda x: np.linalg.norm(x[:, :2] - [0.2, 0], axis=1) - 0.5),
     }
 
 

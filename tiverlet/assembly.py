@@ -77,7 +77,8 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Jacobi, path: str
     if contact or walls:
         scene.radius = Radii(memory, particles.radius)
     surfaces = [*walls, *([contact] if contact else [])]
-    state.remember(memory, any(f.rubs for f in surfaces), any(f.bounces for f in surfaces), bool(contact and walls))
+    starts = any(f.rubs for f in surfaces) or any(w.sweeps for w in walls)
+    state.remember(memory, starts, any(f.bounces for f in surfaces), bool(contact and walls))
     if batches:
         scene.slots = Slots(memory, state, batches, scene.inv_mass, solver)
     parallel = path == "parallel"

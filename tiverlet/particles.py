@@ -135,8 +135,16 @@ class State:
             x += self.low[i]
         return x
 
+    @ti.func
+    def begin(self, i):
+        """Where particle i was at the start of the substep, as one number per axis."""
+        x = self.x0[i]
+        if ti.static(self.compensated):
+            x += self.low0[i]
+        return x
+
     def remember(self, memory: Memory, start: bool, before: bool, lean: bool) -> None:
-        """Declare what friction and restitution need, the position and the displacement at the start of the substep, and how far
+        """Declare what friction, swept walls and bounces need, position and displacement at the start of the substep, and how far
         walls have pushed since then."""
         self.starts, self.befores, self.leans = start, before, lean
         if lean:

@@ -38,6 +38,7 @@ class Phases:
         self.grid, self.hashes = grid, bool(grid)
         self.concludes = any(c.rubs or c.bounces for c in self.contacts)
         self.walls: list[Wall] = walls
+        self.posed = [w for w in walls if w.poses]
         self.radius = scene.radius
         self.springs = any(b.soft for b in self.batches)
         self.dithers = scene.real == ti.f32
@@ -148,7 +149,11 @@ class Phases:
 
     @ti.func
     def predict(self, h, t, tick, fresh, when):
-        """1 Integrate; 2 put driven particles on their targets."""
+        """1 Integrate, and move what walls are made of; 2 put driven particles on their targets."""
+        for w in ti.static(self.posed):
+            ti.loop_config(serialize=True)
+            for _ in range(1):
+                w.pose(when)
         for i in range(self.n):
             self.integrate(i, h, t, tick, fresh)
         for f in ti.static(self.drivers):

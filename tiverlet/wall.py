@@ -28,6 +28,8 @@ class Wall(Feature):
 
     push_out = 1.0
     static, dynamic, restitution = 0.0, 0.0, 0.0
+    sweeps = False  # needs the exact position at the start of the substep
+    poses = False  # has a pose(when) to be worked out once for each substep, before any confine()
 
     def surface(self, friction: Any, restitution: Any, push_out: float) -> None:
         """Check and keep the arguments that all walls have."""
@@ -65,8 +67,10 @@ class Wall(Feature):
         """Take particle i out of a wall that it entered by `depth` [m], along the normal n; the wall itself moved by `moved`.
 
         What comes as close as the last digits of the position can tell touches: it does not sink, or slip, by these digits.
+        Returns how the position was shifted.
         """
         d = self._on_state.d[i] - moved
+        shift = 0 * d
         leaving = d.dot(n)
         close = self._on_state.digits(i)
         if depth > -close:
@@ -99,6 +103,7 @@ class Wall(Feature):
                     self._on_state.restart(i)
             if not stuck:
                 self._on_state.advance(i, shift)
+        return shift
 
     @ti.func
     def bounce(self, gap, leaving, before, after):
@@ -124,23 +129,23 @@ class Wall(Feature):
 class Track:
     """A point of a wall that goes where it is sent during a frame, in a straight line."""
 
-    def __init__(self, memory: Memory, name: str, value: np.ndarray):
-        self._memory, self._value = memory, np.array(value)
-        self.ends = memory.field(name, 2, width=len(value), values=[value, value], state=True)
+    def __init__(self, memory: Memory, name: str, value: np.ndarray, kind=None):
+        self._memory = memory
+        self.ends = memory.field(name, 2, width=len(value), kind=kind, values=[value, value], state=True)
 
     def aim(self, value: np.ndarray) -> None:
         """Go to `value` during the next frame."""
-        self._memory.write(self.ends, [self._value, value])
-        self._value = np.array(value)
+        self._memory.write(self.ends, [self._memory.read(self.ends)[1], value])
 
     def settle(self) -> None:
-        """Stay there."""
-        self._memory.write(self.ends, [self._value, self._value])
+        """Stay where the last frame ended."""
+        self._memory.write(self.ends, [self._memory.read(self.ends)[1]] * 2)
 
     @ti.func
     def at(self, when):
-        """Where it is at the fraction `when` of the frame."""
-        return self.ends[0] * (1 - when) + self.ends[1] * when
+        """Where it is at the fraction `when` of the frame; what stands is where it stands, to the bit."""
+        a, b = self.ends[0], self.ends[1]
+        return ti.select(a == b, a, a * (1 - when) + b * when)
 
     @ti.func
     def step(self, when):

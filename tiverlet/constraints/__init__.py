@@ -6,8 +6,11 @@ from .capsule import Capsule
 from .contact import Contact
 from .distance import Distance
 from .half_space import HalfSpace
+from .mesh import Mesh
 from .pin import Pin
+from .polygon import Polygon
 from .rope import Rope
+from .sdf import Sdf
 from .spacer import Spacer
 
-__all__ = ["Ball", "Box", "Capsule", "Contact", "Distance", "HalfSpace", "Pin", "Rope", "Spacer"]
+__all__ = ["Ball", "Box", "Capsule", "Contact", "Distance", "HalfSpace", "Mesh", "Pin", "Polygon", "Rope", "Sdf", "Spacer"]

@@ -60,19 +60,18 @@ class Box(Wall):
         Wall.bind(self, scene)
         sides = np.concatenate([self.lower, self.upper])
         self._on_sides = scene.memory.field("Box.sides", len(sides), width=2, values=np.stack([sides, sides], 1), state=True)
-        self._on_aim = (self.lower, self.upper)
         self.changed = False
 
     def upload(self) -> None:
         """Move from the last corners to the new ones."""
-        old, new = np.concatenate(self._on_aim), np.concatenate([self.lower, self.upper])
+        old, new = self.scene.memory.read(self._on_sides)[:, 1], np.concatenate([self.lower, self.upper])
         jump = np.isinf(old) | np.isinf(new)
         self.scene.memory.write(self._on_sides, np.stack([np.where(jump, new, old), new], axis=1))
-        self._on_aim, self.moving = (self.lower, self.upper), True
+        self.moving = True
 
     def settle(self) -> None:
         """Stay."""
-        sides = np.concatenate([self.lower, self.upper])
+        sides = self.scene.memory.read(self._on_sides)[:, 1]
         self.scene.memory.write(self._on_sides, np.stack([sides, sides], axis=1))
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:

@@ -42,17 +42,16 @@ class HalfSpace(Wall):
         Wall.bind(self, scene)
         self._on_normal = scene.memory.field("HalfSpace.normal", None, width=len(self.normal), values=self.normal)
         self._on_offset = scene.memory.field("HalfSpace.offset", None, width=2, values=[self.offset] * 2, state=True)
-        self._on_aim = self.offset
         self.changed = False
 
     def upload(self) -> None:
         """Move from the last offset to the new one."""
-        self._on_offset[None] = [self._on_aim, self.offset]
-        self._on_aim, self.moving = self.offset, True
+        self._on_offset[None] = [self._on_offset[None][1], self.offset]
+        self.moving = True
 
     def settle(self) -> None:
         """Stay."""
-        self._on_offset[None] = [self.offset, self.offset]
+        self._on_offset[None] = [self._on_offset[None][1]] * 2
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
         """Lines across the scene: one in 2D, two at right angles in 3D."""
