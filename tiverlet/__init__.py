@@ -2,7 +2,23 @@
 
 from . import runtime  # first: it sets what Taichi reads when it is imported  # isort: skip
 from . import measure, shapes
-from .constraints import Ball, Box, Capsule, Contact, Distance, HalfSpace, Mesh, Pin, Polygon, Rope, Sdf, Spacer
+from .constraints import (
+    AngleLimit,
+    Ball,
+    Bend,
+    Box,
+    Capsule,
+    Contact,
+    Dihedral,
+    Distance,
+    HalfSpace,
+    Mesh,
+    Pin,
+    Polygon,
+    Rope,
+    Sdf,
+    Spacer,
+)
 from .forces import Attractor, Drag, Force, Gravity, Wind
 from .particles import Particles
 from .recording import Recorder
@@ -13,7 +29,8 @@ from .tools import approach, clamp, golden, golden_colors, golden_index, mix, sm
 from .world import World
 
 __all__ = [
-    "Attractor", "Ball", "Box", "Capsule", "Contact", "Distance", "Drag", "Force", "Gravity", "HalfSpace", "Jacobi", "Mesh",
-    "Particles", "Pin", "Polygon", "Recorder", "Rope", "Sdf", "Spacer", "StepReport", "Wind", "World", "approach", "clamp",
-    "golden", "golden_colors", "golden_index", "init", "measure", "mix", "runtime", "shapes", "smoothstep",
+    "AngleLimit", "Attractor", "Ball", "Bend", "Box", "Capsule", "Contact", "Dihedral", "Distance", "Drag", "Force", "Gravity",
+    "HalfSpace", "Jacobi", "Mesh", "Particles", "Pin", "Polygon", "Recorder", "Rope", "Sdf", "Spacer", "StepReport", "Wind",
+    "World", "approach", "clamp", "golden", "golden_colors", "golden_index", "init", "measure", "mix", "runtime", "shapes",
+    "smoothstep",
 ]  # fmt: skip

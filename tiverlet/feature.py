@@ -35,6 +35,7 @@ class Scene:
     inv_mass: np.ndarray  # (n,) after pins: 0 means that constraints cannot move it
     radius: Any = None  # where something asks for radii
     slots: Any = None  # where constraints leave their moves
+    residuals: Any = None  # batch -> what the last substep left of each of its violations
     hh: float = 0.0  # [s^2] what an acceleration added to the displacement in the last substep, see Batch.relax
 
     @property
@@ -141,6 +142,7 @@ class Batch(Feature):
 
     arity = 0
     soft = False  # has springs, which act at a start
+    breaks = False  # has constraints that a load can break
     drives = False  # puts its particles in place instead of relaxing them
     indices: np.ndarray  # (m, arity)
 
@@ -148,6 +150,11 @@ class Batch(Feature):
     def count(self) -> int:
         """The number of constraints."""
         return len(self.indices)
+
+    @property
+    def broken(self) -> np.ndarray:
+        """Which constraints have broken so far, Boolean (m,)."""
+        return np.zeros(self.count, dtype=bool)
 
     def bind(self, scene: Scene) -> None:
         """Declare the particles and slots of each constraint."""
@@ -187,7 +194,7 @@ class Batch(Feature):
         """Push what the constraint's spring, if it has one, adds to h^2 a at the present positions; for starts."""
 
     @ti.func
-    def residual(self, c, h, hh, when, fresh):
+    def miss(self, c, h, hh, when, fresh):
         """How far constraint c is from fulfilled, relative to its size."""
         return 0.0
 

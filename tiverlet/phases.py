@@ -1,5 +1,7 @@
 """What happens in a substep: the bodies for one particle or one constraint, and the phases that loop over them."""
 
+from typing import Any
+
 import taichi as ti
 
 from .feature import Acceleration, Batch, Scene
@@ -36,7 +38,8 @@ class Phases:
         self.drivers = drivers
         self.contacts = [contact] if contact else []
         self.grid, self.hashes = grid, bool(grid)
-        self.concludes = any(c.rubs or c.bounces for c in self.contacts)
+        self.breakers: list[Any] = [b for b in self.batches if b.breaks]
+        self.concludes = any(c.rubs or c.bounces for c in self.contacts) or bool(self.breakers)
         self.walls: list[Wall] = walls
         self.posed = [w for w in walls if w.poses]
         self.radius = scene.radius
@@ -207,8 +210,11 @@ class Phases:
                         self.state.d[i] += c._on_kick[i]
 
     @ti.func
-    def remember(self):
-        """The end of a substep with contacts that rub or bounce."""
+    def remember(self, h, fresh, tick):
+        """The end of a substep with constraints that break, or contacts that rub or bounce."""
+        for f in ti.static(self.breakers):
+            for c in range(f.count):
+                f.tear(c, self.reach(h, fresh), tick)
         for c in ti.static(self.contacts):
             if ti.static(c.rubs):
                 for i in range(self.n):

@@ -11,6 +11,8 @@ from .compliance import law, stiff
 from .feature import Batch, Scene
 from .particles import Particles
 
+BREAKS = 2**30  # substeps after which the number of one comes again
+
 
 class Scalar(Batch):
     """Constraints C(x) = f(x) - rest = 0, >= 0 or <= 0, soft or rigid, from `measure`. numerics: one formula for all.
@@ -35,23 +37,33 @@ class Scalar(Batch):
     compliance: np.ndarray
     damping: np.ndarray
 
-    def setup(self, indices, rest, compliance, damping) -> None:
+    index_name = "pairs"
+    rest_name = "rest"
+    exchangeable: tuple[tuple[int, ...], ...] | None = None  # groups of corners that may swap; None: all of them
+    unit: float | None = None  # what residuals are relative to; None: the rest value
+
+    def setup(self, indices, rest, compliance, damping, break_at=None) -> None:
         """Keep the arguments of __init__; what depends on the particles is checked in prepare()."""
         self.indices = checks.indices(repr(self), self.index_name, indices, 2**31 - 1, arity=self.arity)
-        _warn_duplicates(repr(self), self.index_name, self.indices)
+        self._warn_duplicates()
         m = self.count
+        self.break_at = None
+        if break_at is not None:
+            self.break_at = checks.per_item(repr(self), "break_at", break_at, m, above=0.0, infinite=True)
+            self.break_at.flags.writeable = False
         self._rest_given = rest
         self.compliance = checks.per_item(repr(self), "compliance", compliance, m, least=0.0)
         self.damping = checks.per_item(repr(self), "damping", damping, m, least=0.0)
         for array in (self.indices, self.compliance, self.damping):
             array.flags.writeable = False
 
-    index_name = "pairs"
-    rest_name = "rest"
-
     def rest_of(self, position: np.ndarray) -> np.ndarray:
         """f at the given positions, (m,): the rest value when none is given."""
         raise NotImplementedError
+
+    def violation(self, position: np.ndarray) -> np.ndarray:
+        """C at the given positions, (m,)."""
+        return self.rest_of(position) - self.rest
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check indices against the number of particles and settle the rest values."""
@@ -66,7 +78,7 @@ class Scalar(Batch):
         """Warn of constraints that are violated between particles that cannot move."""
         stuck = (inv_mass[self.indices] == 0).all(axis=1)
         if stuck.any():
-            C = self.rest_of(particles.position) - self.rest
+            C = self.violation(particles.position)
             wrong = stuck & (
                 np.abs(C if self.side == 0 else np.maximum(self.side * C, 0)) > 1e-6 * np.maximum(np.abs(self.rest), 1e-6)
             )
@@ -78,6 +90,24 @@ class Scalar(Batch):
                     f"({int(wrong.sum())} such in all). They are skipped.",
                     stacklevel=3,
                 )
+
+    def _warn_duplicates(self) -> None:
+        ordered = self.indices.copy()
+        for group in [range(self.arity)] if self.exchangeable is None else self.exchangeable:
+            ordered[:, group] = np.sort(ordered[:, group], axis=1)
+        unique, counts = np.unique(ordered, axis=0, return_counts=True)
+        if len(unique) < len(ordered):
+            first = tuple(int(v) for v in unique[int(np.argmax(counts > 1))])
+            warnings.warn(
+                f"{self!r}: {len(ordered) - len(unique)} of the {self.index_name} are duplicates, the first of them {first}. "
+                "They act together: the same result where rigid, stiffer by their number where compliant.",
+                stacklevel=4,
+            )
+
+    @property
+    def breaks(self) -> bool:
+        """Whether a load can break constraints of the batch."""
+        return self.break_at is not None
 
     @property
     def soft(self) -> bool:
@@ -91,7 +121,7 @@ class Scalar(Batch):
         self._on_soft = self.soft
         self._on_damped = self.soft and bool((self.damping > 0).any())
         start = self.rest_of(scene.particles.position) if self.count else np.zeros(0)
-        self._on_scale = float(np.abs(start).mean()) if np.any(start) else scene.size
+        self._on_scale = self.unit or (float(np.abs(start).mean()) if np.any(start) else scene.size)
         name, m, add = repr(self), self.count, scene.memory.field
         self._on_rest = add(f"{name}.rest", m, values=self.rest)
         self._on_lam = add(f"{name}.multiplier", m, state=True)
@@ -101,15 +131,39 @@ class Scalar(Batch):
             self._on_history = add(f"{name}.history", m)
         if self._on_damped:
             self._on_damping = add(f"{name}.damping", m, values=self.damping)
+        if self.breaks:
+            self._on_strength = add(f"{name}.break_at", m, values=self.break_at)
+            self._on_broken = add(f"{name}.broken", m, kind=ti.i32, state=True)
         self.changed = False
 
     @property
     def load(self) -> np.ndarray:
-        """The force in each constraint during the last substep [N], (m,); positive where it pulls (f above rest)."""
+        """The force in each constraint during the last substep [N], (m,); positive where it pulls (f above rest).
+
+        More exactly the force along grad f: newtons where f is a length, N m where it is an angle.
+        """
         if self.scene is None:
             raise RuntimeError(f"{self!r}.load: there is none before a world has been stepped with it.")
         scale = 1 / self.scene.hh if self.scene.hh else 0.0
         return -scale * self.scene.memory.read(self._on_lam)[: self.count].astype(np.float64)
+
+    @property
+    def residual(self) -> np.ndarray:
+        """What the last substep left of each violation, (m,), relative as in StepReport.residual; 0 where it is broken."""
+        if self.scene is None:
+            raise RuntimeError(f"{self!r}.residual: there is none before a world has been stepped with it.")
+        return self.scene.residuals(self)
+
+    @property
+    def broken(self) -> np.ndarray:
+        """Which constraints have broken so far, Boolean (m,)."""
+        return self.stamps() > 0
+
+    def stamps(self) -> np.ndarray:
+        """When each constraint broke, (m,): the number of the substep from 1 on, modulo BREAKS; 0 where it holds."""
+        if not self.breaks or self.scene is None or not self.count:
+            return np.zeros(self.count, dtype=np.int32)
+        return self.scene.memory.read(self._on_broken)
 
     def upload(self) -> None:
         """Write new rest values."""
@@ -120,6 +174,15 @@ class Scalar(Batch):
     def measure(self, c, q):
         """f and its (arity, dim) gradients at corners q (arity, dim), which are relative to corner 0."""
         return 0.0, q
+
+    @ti.func
+    def near(self, f, other):
+        """Of the values that mean the same as f, the one nearest to `other`; more than one only for angles."""
+        return f
+
+    @ti.func
+    def begin(self, c, fresh):
+        """Before the first pass of a substep: what `measure` has to remember of its start."""
 
     @ti.func
     def corners(self, c, back):
@@ -149,14 +212,33 @@ class Scalar(Batch):
         return value
 
     @ti.func
+    def holds(self, c):
+        """Whether constraint c has not broken."""
+        out = True
+        if ti.static(self.breaks):
+            out = self._on_broken[c] == 0
+        return out
+
+    @ti.func
+    def tear(self, c, hh, tick):
+        """Break constraint c if its load in this substep was too large; it acts no more from the next one on."""
+        if self._on_broken[c] == 0 and ti.abs(self._on_lam[c]) > self._on_strength[c] * hh:
+            self._on_broken[c] = tick % ti.static(BREAKS) + 1
+            self._on_slots.broken[None] += 1
+
+    @ti.func
     def known(self, c, h, hh, first, fresh):
         """What every solver knows of constraint c in a pass; of the state it writes nothing but the memory of soft constraints.
 
         Returns the violation A C + B + alpha' lam, A, alpha', lam, the mass-split weight W (0: no corner can move), directions n
         and gradients g, both (arity, dim), and whether n had to be g because the constraint turned too far.
         """
+        if first != 0:
+            self.begin(c, fresh)
         f, g = self.measure(c, self.corners(c, 0))
         f0, n = self.measure(c, self.corners(c, 1))
+        f0 = self.near(f0, self._on_rest[c])
+        f = self.near(f, f0)
         w = ti.cast(0, self._on_real)  # sum of w |grad|^2, then mass-split: along both, current, start
         both, here, there = ti.cast(0, self._on_real), ti.cast(0, self._on_real), ti.cast(0, self._on_real)
         for k in ti.static(range(self.arity)):
@@ -169,6 +251,9 @@ class Scalar(Batch):
         turned = both < 0.75 * ti.sqrt(here * there) or there == 0
         if turned:
             n, both = g, here
+        if ti.static(self.breaks):
+            if not self.holds(c):
+                both = 0
         C, A = f - self._on_rest[c], ti.cast(1, self._on_real)
         B, alpha = ti.cast(0, self._on_real), ti.cast(0, self._on_real)
         lam = self._on_lam[c]
@@ -180,7 +265,7 @@ class Scalar(Batch):
                 alpha = self._on_alpha[c] / hh
                 if first != 0:
                     rest = self._on_rest[c]
-                    B = now * self.bounded(f0 - rest) + last * self.bounded(self._on_last[c] - rest)
+                    B = now * self.bounded(f0 - rest) + last * self.bounded(self.near(self._on_last[c], f0) - rest)
                     self._on_history[c] = B
                     self._on_last[c] = f0
                 else:
@@ -219,30 +304,32 @@ class Scalar(Batch):
         Rigid links find their force in the next substep.
         """
         f, g = self.measure(c, self.corners(c, 0))
+        f = self.near(f, self._on_rest[c])
         force = ti.cast(0, self._on_real)
         if ti.static(self._on_soft):
             w = ti.cast(0, self._on_real)
             for k in ti.static(range(self.arity)):
                 w += self._on_w[self.member(c, k)] * g[k, :].dot(g[k, :])
             alpha = self._on_alpha[c]
-            if w > 0 and alpha > 0:
+            if w > 0 and alpha > 0 and self.holds(c):
                 resolved = 1 - stiff(alpha, h, w)
                 C = self.bounded(f - self._on_rest[c])
                 force = -resolved * C / alpha
                 if ti.static(self._on_damped):
                     f0, _ = self.measure(c, self.corners(c, 1))
                     if ti.static(self.side == 0) or C != 0:
-                        force -= resolved * self._on_damping[c] * (f - f0) / h
+                        force -= resolved * self._on_damping[c] * (f - self.near(f0, f)) / h
         for k in ti.static(range(self.arity)):
             self.push(c, k, h * h * self._on_w[self.member(c, k)] * force * g[k, :])
 
     @ti.func
-    def residual(self, c, h, hh, when, fresh):
+    def miss(self, c, h, hh, when, fresh):
         """The violation that is left, relative to the rest value (to the batch's mean f where that is 0)."""
         _, _, violation, _ = self.solve(c, h, hh, 0, fresh)
-        size = ti.abs(self._on_rest[c])
-        if size == 0:
-            size = ti.cast(self._on_scale, self._on_real)
+        size = ti.cast(self._on_scale, self._on_real)
+        if ti.static(not self.unit):
+            if self._on_rest[c] != 0:
+                size = ti.abs(self._on_rest[c])
         return violation / size
 
     @ti.func
@@ -251,20 +338,8 @@ class Scalar(Batch):
         out = ti.cast(0, ti.f64)
         if ti.static(self._on_soft):
             alpha = self._on_alpha[c]
-            if alpha > 0:
+            if alpha > 0 and self.holds(c):
                 f, _ = self.measure(c, self.corners(c, back))
-                C = self.bounded(f - self._on_rest[c])
+                C = self.bounded(self.near(f, self._on_rest[c]) - self._on_rest[c])
                 out = C * C / (2 * alpha)
         return out
-
-
-def _warn_duplicates(who: str, name: str, indices: np.ndarray) -> None:
-    ordered = np.sort(indices, axis=1)
-    unique, counts = np.unique(ordered, axis=0, return_counts=True)
-    if len(unique) < len(ordered):
-        first = tuple(int(v) for v in unique[int(np.argmax(counts > 1))])
-        warnings.warn(
-            f"{who}: {len(ordered) - len(unique)} of the {name} are duplicates, the first of them {first}. They act "
-            "together: the same result where rigid, stiffer by their number where compliant.",
-            stacklevel=4,
-        )

@@ -15,7 +15,7 @@ BLOCKS = 64  # partial sums: their number is fixed, so the total has the same bi
 STIFF = 4.0  # (omega h)^2 beyond which Verlet diverges
 
 
-Figures = ti.types.vector(13, ti.f64)
+Figures = ti.types.vector(14, ti.f64)
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class StepReport:
     residual: worst violation of a constraint, relative to its rest value. overlap: of the worst contact, in radii of the
     smaller particle. contacts: number of overlapping pairs. energy: kinetic and potential energy [J], of what has a potential,
     half a substep ago; energy_change: since the frame before [J]. bad: index of the first particle whose state is not finite,
-    or None. seconds: what the frame took.
+    or None. broken: number of constraints that broke; world.broken has them. seconds: what the frame took.
 
     flags: words for what the user should know; notes: one sentence for each, with the cause and a remedy.
         "non-finite"        a position or displacement is NaN or infinite
@@ -46,6 +46,7 @@ class StepReport:
     flags: frozenset[str] = frozenset()
     notes: tuple[str, ...] = field(default=(), repr=False)
     bad: int | None = None
+    broken: int = 0
     seconds: float = field(default=0.0, compare=False, repr=False)
 
     @property
@@ -61,7 +62,7 @@ class StepReport:
             max(first.residual, last.residual), max(first.overlap, last.overlap), max(first.contacts, last.contacts),
             last.energy, first.energy_change + last.energy_change, first.flags | last.flags,
             tuple(dict.fromkeys(first.notes + last.notes)), last.bad if first.bad is None else first.bad,
-            max(first.seconds, last.seconds),
+            first.broken + last.broken, max(first.seconds, last.seconds),
         )  # fmt: skip
 
 
@@ -85,11 +86,12 @@ class Survey:
         self.low = add("survey.low", BLOCKS, width=self.dim, kind=ti.f64)
         self.high = add("survey.high", BLOCKS, width=self.dim, kind=ti.f64)
         self.flags = add("survey.flags", None, kind=ti.i32)
+        self.details: dict[int, Residuals] = {}  # compiled when asked for
 
     def of(self, substep: Substep) -> "Survey":
         """The same fields, with kernels for another Substep."""
         new = copy.copy(self)
-        new.sub = substep
+        new.sub, new.details = substep, {}
         return new
 
     @ti.func
@@ -162,7 +164,7 @@ class Survey:
             for c in range(b * part, ti.min((b + 1) * part, f.count)):
                 figures[0] += f.energy(c, back)
                 if begin == 0:
-                    figures[1] = ti.max(figures[1], ti.cast(f.residual(c, h, self.sub.reach(h, fresh), when, fresh), ti.f64))
+                    figures[1] = ti.max(figures[1], ti.cast(f.miss(c, h, self.sub.reach(h, fresh), when, fresh), ti.f64))
         return figures, low, high
 
     @ti.kernel
@@ -173,7 +175,7 @@ class Survey:
                 h, t = ti.cast(h64, self.sub.real), ti.cast(t64, self.sub.real)
                 b = thread // self.spread
                 self.parts[b], self.low[b], self.high[b] = self.block(b, h, t, self.sub.clock(0, 1), fresh, begin)
-        out = ti.Vector.zero(ti.f64, 13)
+        out = ti.Vector.zero(ti.f64, 14)
         ti.loop_config(serialize=True)
         for _ in range(1):
             for b in range(1, BLOCKS):
@@ -197,9 +199,20 @@ class Survey:
         for k in ti.static(range(6)):
             out[k] = self.parts[0][k]
         out[6] = self.flags[None]
+        if ti.static(len(self.sub.breakers) > 0):
+            out[13] = self.sub.slots.broken[None]
+            self.sub.slots.broken[None] = 0
         for k in ti.static(range(self.dim)):
             out[7 + k], out[10 + k] = self.low[0][k], self.high[0][k]
         return out
+
+    def residuals(self, batch, h: float, fresh: bool) -> np.ndarray:
+        """What the last substep left of each violation in a batch, (m,)."""
+        out = np.zeros(max(1, batch.count))
+        if id(batch) not in self.details:
+            self.details[id(batch)] = Residuals(self, batch)
+        self.details[id(batch)].measure(h, int(fresh), out)
+        return out[: batch.count]
 
     def report(
         self, time: float, h: float, substeps: int, iterations: int, fresh: bool, begin: bool
@@ -241,5 +254,21 @@ class Survey:
             frozenset(notes),
             tuple(notes.values()),
             first,
+            int(out[13]),
         )
         return done, np.where(high >= low, high - low, 0.0)
+
+
+@ti.data_oriented
+class Residuals:
+    """The kernel behind the residual of one batch."""
+
+    def __init__(self, survey: Survey, batch):
+        self.sub, self.batch = survey.sub, batch
+
+    @ti.kernel
+    def measure(self, h64: ti.f64, fresh: ti.i32, out: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
+        """Of every constraint."""
+        for c in range(self.batch.count):
+            h = ti.cast(h64, self.sub.real)
+            out[c] = self.batch.miss(c, h, self.sub.reach(h, fresh), self.sub.clock(0, 1), fresh)

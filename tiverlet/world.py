@@ -16,6 +16,7 @@ from .explain import explain
 from .feature import Acceleration, Feature
 from .particles import Particles, in_range
 from .queries import Contacts, Search, near_by_all, nearest
+from .scalar import BREAKS
 from .solvers.jacobi import Jacobi
 from .substep import REBOUNDS, decay
 from .survey import StepReport
@@ -47,6 +48,7 @@ class World:
         parts = assemble(particles, self._features, self._solver, precision, path)
         self._memory, self._scene, self._batches = parts.memory, parts.scene, parts.batches
         self._grid, self._sub, self._survey, self._path = parts.grid, parts.substep, parts.survey, parts.path
+        parts.scene.residuals = self._residuals
         self._time, self._tick, self._h = 0.0, 0, 0.0
         self._since = 0  # substeps since the last start
         self._frame = (0.0, 0.0, 0)  # when frames of the present length began, their length, their number
@@ -155,7 +157,7 @@ class World:
             if self._sub.concludes:
                 for _ in range(REBOUNDS if struck else 0):
                     self._sub.rebounded()
-                self._sub.remembered()
+                self._sub.remembered(h, fresh, self._tick + s)
             if self._grid and (self._since + s) % EVERY == EVERY - 1:
                 for k in range(PASSES):
                     self._sub.calmed(k)
@@ -195,6 +197,14 @@ class World:
         if self._grid:
             self._grid.fit(extent)
         return report
+
+    def _residuals(self, batch) -> np.ndarray:
+        """What the last substep left of each violation in a batch."""
+        self._memory.check()
+        if not self._h:
+            raise RuntimeError(f"{batch!r}.residual: there is none before the world has been stepped.")
+        with runtime.literals(self._scene.real):
+            return self._survey.residuals(batch, self._h, self._started)
 
     def run(self, seconds: float, dt: float = 1 / 60, recorder=None, progress: bool = False) -> StepReport:
         """Step for `seconds` [s] in frames of dt [s]; returns the worst figures of all frames.
@@ -299,6 +309,18 @@ class World:
         some = overlap > 0
         normal = d[some] / np.where(length > 0, length, 1.0)[some, None]
         return Contacts(pairs[some], overlap[some], normal, push[some] / (self._h or 1.0))
+
+    @property
+    def broken(self) -> list[tuple[Feature, np.ndarray]]:
+        """What broke in the last frame: features, and the indices of their constraints. Those of all frames: feature.broken."""
+        out = []
+        if self._last and self._last.broken:
+            for f in self._sub.breakers:
+                stamps = f.stamps()
+                recent = (stamps > 0) & ((self._tick - stamps) % BREAKS < self._last.substeps)
+                if recent.any():
+                    out.append((f, np.flatnonzero(recent)))
+        return out
 
     @property
     def time(self) -> float:

@@ -43,9 +43,11 @@ class Distance(Link):
     rest: rest length, number or (m,) [m], at least 0; None takes the initial distances. Live.
     compliance: inverse stiffness, number or (m,) [m/N]; 0 is rigid. A spring of k [N/m] has compliance 1 / k.
     damping: of a dashpot beside the spring, number or (m,) [N s/m]; beside a rigid link there is nothing for it to do.
+    break_at: load beyond which a link breaks, pulled or pushed, number or (m,) [N]; None for never. It acts no more from the next
+    substep on; see world.broken and .broken.
 
     Second order in h, without artificial damping, for every compliance (see Scalar). `load` is the tension of each link [N].
     """
 
-    def __init__(self, pairs, rest=None, *, compliance=0.0, damping=0.0):
-        self.setup(pairs, rest, compliance, damping)
+    def __init__(self, pairs, rest=None, *, compliance=0.0, damping=0.0, break_at=None):
+        self.setup(pairs, rest, compliance, damping, break_at)

@@ -141,7 +141,7 @@ class Pin(Batch):
             self.push(c, 0, -h * h * w * resolved * (C / alpha + self._on_damping[c] * self._on_state.d[i] / h))
 
     @ti.func
-    def residual(self, c, h, hh, when, fresh):
+    def miss(self, c, h, hh, when, fresh):
         """What is left, relative to the size of the scene."""
         _, _, size = self.solve(c, h, hh, when, 0, fresh)
         return size / self._on_size

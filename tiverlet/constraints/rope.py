@@ -9,11 +9,12 @@ class Rope(Link):
     C(x) = |x_i - x_j| - length <= 0, gradients as in Distance; the multiplier may only pull.
 
     pairs: (m, 2); length: number or (m,) [m], None takes the initial distances; compliance [m/N] and damping [N s/m] of
-    the taut rope. A rigid rope that becomes taut takes the impact inelastically. Assign to .rest to change the length.
+    the taut rope. A rigid rope that becomes taut takes the impact inelastically. break_at: tension beyond which it
+    breaks, number or (m,) [N]. Assign to .rest to change the length.
     """
 
     side = 1
     rest_name = "length"
 
-    def __init__(self, pairs, length=None, *, compliance=0.0, damping=0.0):
-        self.setup(pairs, length, compliance, damping)
+    def __init__(self, pairs, length=None, *, compliance=0.0, damping=0.0, break_at=None):
+        self.setup(pairs, length, compliance, damping, break_at)

@@ -8,12 +8,13 @@ class Spacer(Link):
 
     C(x) = |x_i - x_j| - length >= 0, gradients as in Distance; the multiplier may only push.
 
-    pairs: (m, 2); length: number or (m,) [m]; compliance [m/N] and damping [N s/m] of the pushing spring.
+    pairs: (m, 2); length: number or (m,) [m]; compliance [m/N] and damping [N s/m] of the pushing spring; break_at: load
+    beyond which it breaks, number or (m,) [N].
     Assign to .rest to change the length.
     """
 
     side = -1
     rest_name = "length"
 
-    def __init__(self, pairs, length, *, compliance=0.0, damping=0.0):
-        self.setup(pairs, length, compliance, damping)
+    def __init__(self, pairs, length, *, compliance=0.0, damping=0.0, break_at=None):
+        self.setup(pairs, length, compliance, damping, break_at)

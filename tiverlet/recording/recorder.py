@@ -108,7 +108,8 @@ class Recorder:
         x = world.position.astype(np.float32)
         self._stream.log(PARTICLES, self._points.from_fields(positions=x), strict=True)
         for k, f in self._links:
-            self._stream.log(f"{SCENE}/links/{k}", self._strips.from_fields(strips=x[f.indices]), strict=True)
+            whole = f.indices[~f.broken] if f.breaks else f.indices
+            self._stream.log(f"{SCENE}/links/{k}", self._strips.from_fields(strips=x[whole]), strict=True)
         for k, f in enumerate(world.features):
             if isinstance(f, Wall):
                 self._wall(k, f)

@@ -60,6 +60,8 @@ class Slots:
         self.split = memory.field("slots.split_mass", n, values=degree * inv_mass)
         self.pull = memory.field("slots.pull", n, width=state.dim, state=True)
         self.turned = memory.field("slots.turned", None, kind=ti.i32)
+        if any(b.breaks for b in batches):
+            self.broken = memory.field("slots.broken", None, kind=ti.i32)
 
     def places(self, batch: Batch) -> np.ndarray:
         """The slot of each corner of a batch, -1 where it cannot move."""

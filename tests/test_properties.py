@@ -1,0 +1,257 @@
+"""What every constraint that is one number must do, for all of them at once: a new one is one row of ROWS.
+
+Each row makes one world of many blocks, the same corners again and again, each with something else to show; they do not touch.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+
+from .conftest import order, rms
+
+
+@dataclass(frozen=True)
+class Row:
+    """A kind of constraint, and corners at which it shows all that it can.
+
+    make: (corners (m, arity), rest (m,), **options) -> feature, violated by f(points) - rest.
+    points: (arity, dim) [m] in general position. off: how far f is to be from rest, on the violated side.
+    internal: it moves no center of mass and turns nothing; False for constraints to the surroundings.
+    bilateral: holds on both sides, so that it is second order.
+    """
+
+    make: Callable
+    points: np.ndarray
+    off: float
+    internal: bool = True
+    bilateral: bool = True
+
+
+LINK = np.array([[0.1, 0.2, -0.1], [0.7, -0.3, 0.4]])
+PATH = np.array([[-0.4, 0.3, 0.1], [0.1, -0.2, 0.0], [0.6, 0.4, 0.3]])
+WINGS = np.array([[0.0, -0.1, 0.0], [0.9, 0.1, 0.1], [0.3, 0.8, 0.2], [0.5, -0.6, 0.4]])
+
+
+def limit(corners, rest, **options):
+    """Corners that turn at most so far."""
+    return tv.AngleLimit(corners, np.zeros(len(corners)), rest, **options)
+
+
+ROWS = {
+    "Distance 2D": Row(tv.Distance, LINK[:, :2], 0.1),
+    "Distance 3D": Row(tv.Distance, LINK, -0.1),
+    "Rope 3D": Row(tv.Rope, LINK, 0.1, bilateral=False),
+    "Spacer 2D": Row(tv.Spacer, LINK[:, :2], -0.1, bilateral=False),
+    "Bend 2D": Row(tv.Bend, PATH[:, :2], 0.3),
+    "Bend 3D": Row(tv.Bend, PATH, -0.3),
+    "AngleLimit 2D": Row(limit, PATH[:, :2], 0.3, bilateral=False),
+    "AngleLimit 3D": Row(limit, PATH, 0.3, bilateral=False),
+    "Dihedral 3D": Row(tv.Dihedral, WINGS, 0.3),
+}
+
+BLOCKS = ("met", "off", "turned", "held", "stuck", "soft", "free", "swing", "loaded", "weak")
+SPLIT = ("Distance 2D", "Bend 2D")  # those built again in smaller batches and cloned, which takes a while to compile
+MASS = np.array([1.0, 2.5, 0.7, 4.0])
+
+
+class Scene:
+    """The blocks of one row, in one batch or in two."""
+
+    def __init__(self, world, row: Row, batches: int = 1):
+        self.row, (self.arity, self.dim) = row, row.points.shape
+        a = 0.6
+        self.turn = np.eye(self.dim)
+        self.turn[:2, :2] = [[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]
+        if self.dim == 3:
+            self.turn = np.roll(np.roll(self.turn, 1, axis=0), 1, axis=1) @ self.turn
+        k, m = self.arity, len(BLOCKS)
+        self.corners = np.arange(m * k).reshape(m, k)
+        x = np.tile(row.points, (m, 1, 1))
+        x[BLOCKS.index("turned")] = x[0] @ self.turn.T + 0.5
+        v = np.zeros_like(x)
+        spin = np.random.default_rng(1).normal(size=x[0].shape) * 0.7
+        v[BLOCKS.index("free")] = v[BLOCKS.index("swing")] = spin
+        self.mass = np.tile(MASS[:k], m)
+        pinned = np.zeros((m, k), dtype=bool)
+        pinned[BLOCKS.index("held"), 0] = pinned[BLOCKS.index("stuck")] = True
+        pinned[[BLOCKS.index(b) for b in ("loaded", "weak")], :-1] = True
+        alpha, damping, strength = np.zeros(m), np.zeros(m), np.full(m, np.inf)
+        alpha[[BLOCKS.index(b) for b in ("soft", "swing", "loaded", "weak")]] = 1e-2, 2e-2, 1e-2, 1e-2
+        load = abs(row.off) / 10 / 1e-2
+        strength[BLOCKS.index("loaded")], strength[BLOCKS.index("weak")] = 1.1 * load, 0.9 * load
+        damping[BLOCKS.index("soft")] = 3.0
+        self.compliance, self.x, self.v = alpha, x.reshape(-1, self.dim), v.reshape(-1, self.dim)
+        probe = row.make(self.corners, np.zeros(m))
+        probe.prepare(tv.Particles(self.x), np.ones(m * k))
+        f = probe.violation(self.x)  # f - 0, as every block sees it
+        rest = f.copy()
+        rest[[BLOCKS.index(b) for b in ("off", "turned", "held", "soft")]] -= row.off
+        rest[[BLOCKS.index(b) for b in ("loaded", "weak")]] -= row.off / 10
+        parts = np.array_split(np.arange(m), batches)
+        self.features = [
+            row.make(self.corners[p], rest[p], compliance=alpha[p], damping=damping[p], break_at=strength[p]) for p in parts
+        ]
+        self.gravity = tv.Gravity(np.zeros(self.dim))
+        start = tv.Particles(self.x, velocity=self.v, mass=self.mass, pinned=pinned.ravel())
+        self.world = world(start, [self.gravity, *self.features], substeps=1, precision="f64")
+
+    def again(self, substeps: int = 1, iterations: int = 1) -> None:
+        """Put everything back to where it started."""
+        self.world.position, self.world.velocity = self.x, self.v
+        self.world.substeps, self.world.iterations = substeps, iterations
+
+    def block(self, name: str, array=None) -> np.ndarray:
+        """The rows of one block."""
+        array = self.world.position if array is None else array
+        return np.asarray(array)[self.corners[BLOCKS.index(name)]]
+
+    def C(self, name: str) -> float:
+        """The violation of a block, by the host."""
+        f = self.features[0]
+        return float(f.violation(self.world.position)[BLOCKS.index(name)])
+
+    @cached_property
+    def gradient(self) -> np.ndarray:
+        """grad C of the block "off" at the start, (arity, dim), by central differences of the host's formula."""
+        out, step, c = np.zeros((self.arity, self.dim)), 1e-6, BLOCKS.index("off")
+        for k in range(self.arity):
+            for a in range(self.dim):
+                pair = []
+                for s in (1, -1):
+                    x = self.x.copy()
+                    x[self.corners[c, k], a] += s * step
+                    pair.append(self.features[0].violation(x)[c])
+                out[k, a] = (pair[0] - pair[1]) / (2 * step)
+        return out
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_a_constraint_does_what_all_constraints_do(world, name):
+    row = ROWS[name]
+    scene = Scene(world, row)
+    w, x0, dt = scene.world, scene.x, 1e-2
+
+    # One pass from rest: nothing where C = 0 or where all are held; elsewhere -w grad C times C / sum w |grad C|^2.
+    w.step(dt)
+    move = w.position - x0
+    assert np.abs(scene.block("met", move)).max() <= 1e-15 and (scene.block("stuck", move) == 0).all()
+    inverse = 1 / MASS[: scene.arity, None]
+    g = scene.gradient
+    want = -inverse * g * row.off / (inverse * g**2).sum()
+    np.testing.assert_allclose(scene.block("off", move), want, atol=1e-7 * np.abs(want).max())
+    held = inverse * (np.arange(scene.arity) > 0)[:, None]
+    want = -held * g * row.off / (held * g**2).sum()
+    np.testing.assert_allclose(scene.block("held", move), want, atol=1e-7 * np.abs(want).max())
+    assert (scene.block("held", move)[0] == 0).all()
+
+    # More passes leave less of it, and what is left is what residual says.
+    left, scale = [abs(row.off)], abs(row.off)
+    for iterations in (1, 2, 4, 8):
+        scene.again(iterations=iterations)
+        w.step(dt)
+        left.append(abs(scene.C("off")))
+        size = (scene.features[0].unit or abs(scene.features[0].rest[1])) * (1 + 1e-9)
+        assert scene.features[0].residual[1] * size == pytest.approx(left[-1], rel=1e-6, abs=1e-12)
+    assert (np.diff(left) <= 1e-15).all() and left[-1] <= 1e-3 * scale
+
+    # Momentum and angular momentum, sum m x_(n-1) x x_n, of the free blocks; covariance under rotations and translations.
+    scene.again(iterations=3)
+    history = []
+    for _ in range(20):
+        w.step(dt)
+        s = w._memory.state()
+        now = [scene.block(b, a) for b in ("free", "swing") for a in (s["position"], s["displacement"])]
+        m = MASS[: scene.arity, None]
+        history.append([])
+        for x, d in (now[:2], now[2:]):
+            turn = [m[:, 0] @ (x[:, a] * d[:, b] - x[:, b] * d[:, a]) for a in range(scene.dim) for b in range(a)]
+            history[-1] += [*(m * d).sum(axis=0), *turn]
+        np.testing.assert_allclose(scene.block("turned"), scene.block("off") @ scene.turn.T + 0.5 * row.internal, atol=1e-11)
+    if row.internal:
+        assert np.ptp(history, axis=0).max() <= 1e-14 * 20
+    assert np.isfinite(w.position).all() and (scene.block("stuck") == scene.block("stuck", x0)).all()
+
+    # Rigid and soft alike converge with h^2.
+    if row.bilateral:
+        ends = []
+        for substeps in (10, 20, 40, 80):
+            scene.again(substeps, 8)
+            w.run(0.3, dt=0.1)
+            ends.append([scene.block("free"), scene.block("swing")])
+        for k in range(2):
+            steps = [rms(a[k], b[k]) for a, b in zip(ends[1:], ends[:-1], strict=True)]
+            assert 1.9 <= order(steps) <= 2.1, (name, k, steps)
+
+    # One of two equal springs is too weak for the load that they bear, and is gone before the first frame ends.
+    f, c = scene.features[0], BLOCKS.index("loaded")
+    assert np.flatnonzero(f.broken).tolist() == [c + 1] and f.load[c + 1] == f.residual[c + 1] == 0
+
+    # Under a load F along grad_k f the spring gives way by alpha F / |grad_k f|: there it is in balance, and says so.
+    last = scene.gradient[-1]
+    force = (row.off / 10) / scene.compliance[c] * last  # F = (C / alpha) grad_k f
+    scene.again(20, 4)
+    scene.gravity.g = force / MASS[scene.arity - 1]
+    w.run(0.5, dt=0.1)
+    np.testing.assert_allclose(scene.block("loaded"), scene.block("loaded", x0), atol=2e-7)
+    assert f.load[c] == pytest.approx(row.off / 10 / scene.compliance[c], rel=1e-5)
+
+    # One batch of many is many batches, and a clone goes on alike: the same bits.
+    if name in SPLIT:
+        twin, parts = w.clone(), Scene(world, row, batches=2)
+        assert twin.hash() == w.hash() and (twin.features[1].broken == f.broken).all()
+        ends = []
+        for one in (scene, parts):
+            one.gravity.g = np.zeros(scene.dim)
+            one.again(10, 2)
+            one.world.run(0.2, dt=0.1)
+            ends.append(one.world.position[: -row.points.shape[0]])  # all but "weak", which is broken only here
+        np.testing.assert_array_equal(ends[0], ends[1])
+        twin.features[0].g = np.zeros(scene.dim)
+        twin.position, twin.velocity, twin.substeps, twin.iterations = scene.x, scene.v, 10, 2
+        twin.run(0.2, dt=0.1)
+        assert twin.hash() == w.hash()
+        twin.close()
+
+
+def degenerate(row: Row) -> np.ndarray:
+    """Corners in every special position, (blocks, arity, dim)."""
+    k, dim = row.points.shape
+    line = np.arange(k)[:, None] * np.eye(dim)[0]
+    pair = row.points.copy()
+    pair[1] = pair[0]
+    last = row.points.copy()
+    last[-1] = last[0]
+    folded = line.copy()
+    folded[-1] = line[0] + 0.3 * np.eye(dim)[0]
+    flat = row.points.copy()
+    flat[:, -1] = 0
+    cases = [0 * line, 0 * line + 7.3, line, -line, folded, pair, last, flat, row.points + 1e6, row.points - 1e12]
+    return np.stack(cases + [row.points * s for s in (1e-30, 1e-20, 1e-13, 1e-11, 1e-6, 1e6, 1e14)])
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_nothing_explodes_where_a_constraint_has_no_direction(world, name):
+    # Rows 15, 17, 54, 56: no NaN, and no particle goes further than its corners are apart, or than the constraint asks.
+    row = ROWS[name]
+    k, dim = row.points.shape
+    x = np.concatenate([degenerate(row)] * 2)
+    m = len(x)
+    corners = np.arange(m * k).reshape(m, k)
+    probe = row.make(corners[:1], np.zeros(1))
+    probe.prepare(tv.Particles(row.points), np.ones(k))
+    rest = float(probe.violation(row.points)[0]) - row.off
+    alpha = np.repeat([0.0, 1e-3], m // 2)
+    feature = row.make(corners, np.full(m, rest), compliance=alpha, damping=np.where(alpha > 0, 1e-3, 0))
+    w = world(tv.Particles(x.reshape(-1, dim)), [feature], substeps=1, iterations=3)
+    for frame in range(20):
+        report = w.step(1 / 60)
+        assert "non-finite" not in report.flags and np.isfinite(report.residual) and np.isfinite(feature.load).all()
+        if frame == 0:  # later, what a violent correction has set in motion flies on
+            size = np.ptp(x, axis=1).max(axis=1) + (0 if feature.unit else abs(rest)) + 1e-6 * np.abs(x).max(axis=(1, 2))
+            moved = np.abs(w.position.reshape(x.shape) - x).max(axis=(1, 2))
+            assert (moved <= 5 * size).all(), (np.argmax(moved / (size + 1e-300)), np.c_[moved, size])

@@ -1,0 +1,93 @@
+"""Limbs and hinges: corners that turn only so far."""
+
+import numpy as np
+import taichi as ti
+
+from .. import checks
+from ..feature import Knob, Scene
+from ..particles import Particles
+from .bend import TURN, Turning
+
+
+class AngleLimit(Turning):
+    """Corners that are free between two angles: elbows, knees, doors.
+
+    C(x) = |f(x) - (lower + upper) / 2| - (upper - lower) / 2 <= 0, with the angle f [rad] of Bend, taken within half a turn of
+    the middle; gradients those of f, with the sign of the side on which it is.
+
+    triples: (m, 3) particle indices, the corner in the middle; 0 is straight.
+    lower, upper: number or (m,) [rad], lower <= upper and at most a turn apart; in 2D signed, positive to the left, in 3D in
+    [0, pi]. Live.
+    compliance: number or (m,) [rad/(N m)] of the stops; 0 is rigid. damping: [N m s/rad], while at a stop. break_at: [N m].
+
+    A rigid stop takes the impact inelastically. `load` is the moment at either stop [N m].
+    """
+
+    side = 1
+    lower = Knob(lambda f, v: f._bound("lower", v), "The smaller limit [rad].")
+    upper = Knob(lambda f, v: f._bound("upper", v), "The larger limit [rad].")
+
+    def __init__(self, triples, lower, upper, *, compliance=0.0, damping=0.0, break_at=None):
+        self.setup(triples, None, compliance, damping, break_at)
+        self.lower, self.upper = lower, upper
+
+    def _bound(self, name: str, value) -> np.ndarray:
+        value = checks.per_item("AngleLimit", name, value, self.count, least=-TURN, most=TURN)
+        low = value if name == "lower" else self.__dict__.get("lower", value)
+        high = value if name == "upper" else self.__dict__.get("upper", value)
+        for wrong, why in ((low > high, "lower must not exceed upper"), (high - low > TURN, "they are more than a turn apart")):
+            if wrong.any():
+                i = int(np.argmax(wrong))
+                raise ValueError(f"AngleLimit: lower[{i}] = {low[i]:g} and upper[{i}] = {high[i]:g}, but {why}.")
+        return value
+
+    @property
+    def middle(self) -> np.ndarray:
+        """Halfway between the limits [rad], (m,)."""
+        return (self.lower + self.upper) / 2
+
+    @property
+    def rest(self) -> np.ndarray:
+        """Half of the free range [rad], (m,)."""
+        return (self.upper - self.lower) / 2
+
+    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Check the indices, and the limits against the dimension."""
+        checks.indices("AngleLimit", self.index_name, self.indices, particles.count, arity=3)
+        for name, value in (("lower", self.lower), ("upper", self.upper)):
+            if particles.dim == 3:
+                checks.per_item("AngleLimit", f"{name} (in 3D)", value, self.count, least=0.0, most=np.pi)
+
+    def rest_of(self, position: np.ndarray) -> np.ndarray:
+        """How far the angles are from the middle."""
+        f = Turning.rest_of(self, position) - self.middle
+        return np.abs(f - TURN * np.round(f / TURN))
+
+    def violation(self, position: np.ndarray) -> np.ndarray:
+        """C at the given positions."""
+        return self.rest_of(position) - self.rest
+
+    def bind(self, scene: Scene) -> None:
+        """The middle of each range."""
+        self._on_middle = scene.memory.field("AngleLimit.middle", self.count, values=self.middle)
+        Turning.bind(self, scene)
+
+    def upload(self) -> None:
+        """Write new limits."""
+        if self.scene and self.count:
+            self.scene.memory.write(self._on_rest, self.rest)
+            self.scene.memory.write(self._on_middle, self.middle)
+
+    @ti.func
+    def near(self, f, other):
+        """A distance from the middle: it has no other value."""
+        return f
+
+    @ti.func
+    def measure(self, c, q):
+        """See the class."""
+        f, g = self.turning(c, q)
+        middle = self._on_middle[c]
+        f = Turning.near(self, f, middle) - middle
+        side = ti.select(f < 0, ti.cast(-1, self._on_real), ti.cast(1, self._on_real))
+        return side * f, side * g
