@@ -210,11 +210,14 @@ class Phases:
                         self.state.d[i] += c._on_kick[i]
 
     @ti.func
-    def remember(self, h, fresh, tick):
-        """The end of a substep with constraints that break, or contacts that rub or bounce."""
+    def remember(self, h, tick):
+        """The end of a substep with constraints that break, or contacts that rub or bounce.
+
+        A rigid constraint may find a whole kick in a start that follows another step, so loads are never taken for half a kick.
+        """
         for f in ti.static(self.breakers):
             for c in range(f.count):
-                f.tear(c, self.reach(h, fresh), tick)
+                f.tear(c, self.reach(h, 0), tick)
         for c in ti.static(self.contacts):
             if ti.static(c.rubs):
                 for i in range(self.n):

@@ -140,7 +140,8 @@ class Scalar(Batch):
     def load(self) -> np.ndarray:
         """The force in each constraint during the last substep [N], (m,); positive where it pulls (f above rest).
 
-        More exactly the force along grad f: newtons where f is a length, N m where it is an angle.
+        More exactly the force along grad f: newtons where f is a length, N m where it is an angle. In f32, rounding of
+        positions is felt as about m ulp(x) / h^2: 1 N for 1 kg some 10 m from the origin at 1200 substeps/s; use f64 where that matters.
         """
         if self.scene is None:
             raise RuntimeError(f"{self!r}.load: there is none before a world has been stepped with it.")

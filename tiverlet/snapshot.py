@@ -32,6 +32,8 @@ def transfer(old: "World", new: "World") -> None:
     new._time, new._tick, new._since, new._frame = old._time, old._tick, old._since, old._frame
     if new._precision != old._precision:
         new.position, new.velocity = old.position, old.velocity
+        for ours, theirs in zip(old._sub.breakers, new._sub.breakers, strict=True):
+            new._memory.write(theirs._on_broken, ours.stamps())
         return
     new._upload(old._h, old._drag)
     if any(c._on_eases for c in old._sub.contacts):

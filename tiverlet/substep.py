@@ -45,7 +45,7 @@ class Substep(Phases):
                         if self.struck() != 0:
                             for _ in range(REBOUNDS):
                                 self.rebound()
-                        self.remember(h, starts, tick + s)
+                        self.remember(h, tick + s)
                 if ti.static(self.hashes):
                     if self.halted() == 0 and (since + s) % EVERY == EVERY - 1:
                         for k in range(PASSES):
@@ -70,9 +70,9 @@ class Substep(Phases):
         self.rebound()
 
     @ti.kernel
-    def remembered(self, h64: ti.f64, fresh: ti.i32, tick: ti.i32):
+    def remembered(self, h64: ti.f64, tick: ti.i32):
         """The end of a substep with constraints that break, or contacts that rub or bounce."""
-        self.remember(ti.cast(h64, self.real), fresh, tick)
+        self.remember(ti.cast(h64, self.real), tick)
 
     @ti.kernel
     def calmed(self, k: ti.i32):

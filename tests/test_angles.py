@@ -1,0 +1,130 @@
+"""Bend, AngleLimit and Dihedral: signs, straight and folded, limits that stop; and that constraints break as told."""
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+
+from .test_references import line
+
+
+def triples(n: int) -> np.ndarray:
+    """Corners of a chain of n particles."""
+    k = np.arange(n - 2)
+    return np.stack([k, k + 1, k + 2], axis=1)
+
+
+def test_a_rod_swings_through_straight_in_3d_as_in_2d(world):
+    # Row 56. An unsigned angle has a kink there; the remembered side makes it smooth, and nothing counts as turned.
+    n, made = 6, []
+    for dim in (2, 3):
+        x, v = np.zeros((n, dim)), np.zeros((n, dim))
+        x[:, 0], v[:, 1] = 0.1 * np.arange(n), 0.5 * np.sin(3.0 * np.arange(n))
+        bend = tv.Bend(triples(n), 0.0, compliance=[0.0, 1e-3, 1e-1, 10.0])
+        w = world(tv.Particles(x, velocity=v, mass=0.1), [tv.Distance(line(n - 1)), bend], iterations=4, precision="f64")
+        flags = set()
+        for _ in range(60):
+            flags |= w.step(1 / 60).flags
+        assert not flags
+        made.append((w.position, bend.load))
+    np.testing.assert_allclose(made[1][0][:, :2], made[0][0], atol=1e-9)
+    np.testing.assert_array_equal(made[1][0][:, 2], 0.0)
+    np.testing.assert_allclose(np.abs(made[1][1]), np.abs(made[0][1]), atol=1e-6)
+
+
+def test_angles_have_signs_and_wrap(world):
+    # In 2D positive is to the left. From 3 rad to -3 rad it is 0.28 rad, through folded, not 6 through straight.
+    a = np.array([0.5, -0.5, 3.0, -3.0])
+    x = np.zeros((4, 3, 2))
+    x[:, 0, 0], x[:, 2, 0], x[:, 2, 1] = -1.0, np.cos(a), np.sin(a)
+    x = (x + 10 * np.arange(4)[:, None, None]).reshape(-1, 2)
+    corners = np.arange(12).reshape(4, 3)
+    bend, want = tv.Bend(corners, compliance=1e-3, damping=80.0), np.array([-0.5, 0.5, -3.0, 3.0])
+    links = tv.Distance(np.concatenate([corners[:, :2], corners[:, 1:]]))
+    w = world(tv.Particles(x, pinned=corners[:, :2].ravel()), [links, bend], iterations=4, precision="f64")
+    np.testing.assert_allclose(bend.rest, a)
+    bend.rest = want
+    angles = []
+    for _ in range(120):
+        w.step(1 / 60)
+        angles.append(bend.rest_of(w.position))
+    np.testing.assert_allclose(angles[-1], want, atol=1e-6)
+    assert (np.abs(np.array(angles)[:, :2]) < 0.51).all() and (np.abs(np.array(angles)[:, 2:]) > 2.99).all()
+    assert not w.last.flags
+    with pytest.raises(ValueError, match=r"Bend: rest\[1\] = 9"):
+        bend.rest = [0.0, 9.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_limbs_stop_at_their_limits(world, dim):
+    # A forearm on a held upper arm falls to the upper limit, rests there with the moment m g l cos; between them it is free.
+    x = np.zeros((6, dim))
+    x[:3, 0] = -1.0, 0.0, 1.0  # falls, turning right in 2D
+    x[3:, 0] = -1.0, 0.0, 1.0
+    x[3:, 1] = 5.0
+    low, high = (-1.2, 2.5) if dim == 2 else (0.0, 1.2)
+    limit = tv.AngleLimit([[0, 1, 2]], low, high)
+    features = [tv.Gravity(9.81), tv.Distance([[1, 2], [4, 5]]), limit, tv.Drag(3.0)]
+    w = world(tv.Particles(x, pinned=[0, 1, 3, 4]), features, substeps=40, iterations=8, precision="f64")
+    w.run(0.2)
+    np.testing.assert_allclose(w.position[2], w.position[5] - [0, 5, 0][:dim], atol=1e-12)  # no limit reached: as without
+    assert limit.load[0] == 0
+    w.run(5.0)
+    angle = np.arctan2(w.position[2, 1], w.position[2, 0])
+    assert angle == pytest.approx(-1.2, abs=1e-4) and w.position[5, 1] < 4.01
+    assert limit.load[0] == pytest.approx(9.81 * np.cos(1.2), rel=1e-3)
+    limit.upper, limit.lower = 1.5 if dim == 3 else 2.5, -1.5 if dim == 2 else 0.0
+    w.run(3.0)
+    assert np.arctan2(w.position[2, 1], w.position[2, 0]) == pytest.approx(-1.5, abs=1e-4)
+    with pytest.raises(ValueError, match=r"lower\[0\] = 3 and upper\[0\] = .*lower must not exceed upper"):
+        limit.lower = 3.0
+
+
+def test_hinged_triangles_fold_to_either_side(world):
+    # Positive towards e x p: with the edge along x and a wing at +y, towards +z. Flat and folded are as smooth as the rest.
+    wings = np.array([[0.0, 0, 0], [1, 0, 0], [0.5, 1, 0], [0.5, -1, 0]])
+    x = np.concatenate([wings + [0, 0, 3.0 * k] for k in range(4)])
+    quads = np.arange(16).reshape(4, 4)
+    want = np.array([0.8, -0.8, 3.1, 0.0])
+    bend = tv.Dihedral(quads, want, compliance=1e-2, damping=20.0)
+    sides = np.concatenate([quads[:, [a, 3]] for a in (0, 1)])
+    w = world(tv.Particles(x, pinned=quads[:, :3].ravel()), [bend, tv.Distance(sides)], iterations=4, precision="f64")
+    w.run(6.0, dt=1 / 30)
+    np.testing.assert_allclose(bend.rest_of(w.position), want, atol=1e-5)
+    z = w.position.reshape(4, 4, 3)[:, 3, 2] - 3 * np.arange(4)
+    np.testing.assert_allclose(z, np.sin(want), atol=1e-5)
+    with pytest.raises(ValueError, match="Dihedral: there is no angle"):
+        world(tv.Particles(np.zeros((4, 2))), [tv.Dihedral([[0, 1, 2, 3]])])
+
+
+@pytest.mark.parametrize("path", ["fused", "parallel"])
+def test_a_rope_tears_where_it_is_told_to(world, path):
+    # Link k of a hanging chain of 8 carries (8 - k) m g = 9.81 (8 - k) N. Only the one of 4 with break_at = 45 is too weak: 49 N.
+    strength = np.full(8, 200.0)
+    strength[[3, 6]] = 45.0, 25.0
+    rope = tv.Distance(line(8), 1.0, break_at=strength)
+    plain = tv.Distance(line(8), 1.0)
+    y = np.stack([np.zeros(9), -np.arange(9.0)], axis=1)
+    w = world(tv.Particles(y, pinned=[0]), [tv.Gravity(0.0), rope, tv.Drag(5.0)], iterations=30, path=path, precision="f64")
+    events, gravity = [], w.features[0]
+    for frame in range(120):
+        gravity.g = (0.0, -9.81 * min(1.0, frame / 60))  # slowly, so that nothing swings
+        report = w.step(1 / 60)
+        assert report.broken == sum(len(at) for _, at in w.broken)
+        events += [(frame, f, at.tolist()) for f, at in w.broken]
+    assert [(f is rope, at) for _, f, at in events] == [(True, [3])] and rope.broken.tolist() == [k == 3 for k in range(8)]
+    assert events[0][0] == pytest.approx(60 * 45 / (5 * 9.81), abs=3)  # the link that carries 5 of 8
+    assert w.position[4, 1] < -4.5 and rope.load[3] == 0 and rope.residual[3] == 0
+    np.testing.assert_allclose(rope.load[:3], 9.81 * np.array([3, 2, 1]), rtol=1e-2)
+    twin, other = w.clone(), w.clone(precision="f32")
+    assert twin.hash() == w.hash() and (other.features[1].broken == rope.broken).all() and not twin.features[1].copy().scene
+    w.step(1 / 60)
+    twin.step(1 / 60)
+    assert twin.hash() == w.hash() and w.last.broken == 0 and w.broken == []
+    twin.close()
+    other.close()
+    assert "Distance.broken" in w.fields and "slots.broken" in w.fields
+    bare = world(tv.Particles(y, pinned=[0]), [tv.Gravity(9.81), plain])
+    assert not any("broken" in name or "break_at" in name for name in bare.fields) and not plain.broken.any()
+    with pytest.raises(ValueError, match=r"Distance: break_at\[2\] = 0, but it must be above 0"):
+        tv.Distance(line(3), break_at=[1.0, 1.0, 0.0])
