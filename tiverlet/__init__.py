@@ -8,6 +8,7 @@ from .constraints import (
     Bend,
     Box,
     Capsule,
+    Constraint,
     Contact,
     Dihedral,
     Distance,
@@ -29,8 +30,8 @@ from .tools import approach, clamp, golden, golden_colors, golden_index, mix, sm
 from .world import World
 
 __all__ = [
-    "AngleLimit", "Attractor", "Ball", "Bend", "Box", "Capsule", "Contact", "Dihedral", "Distance", "Drag", "Force", "Gravity",
-    "HalfSpace", "Jacobi", "Mesh", "Particles", "Pin", "Polygon", "Recorder", "Rope", "Sdf", "Spacer", "StepReport", "Wind",
-    "World", "approach", "clamp", "golden", "golden_colors", "golden_index", "init", "measure", "mix", "runtime", "shapes",
-    "smoothstep",
+    "AngleLimit", "Attractor", "Ball", "Bend", "Box", "Capsule", "Constraint", "Contact", "Dihedral", "Distance", "Drag",
+    "Force", "Gravity", "HalfSpace", "Jacobi", "Mesh", "Particles", "Pin", "Polygon", "Recorder", "Rope", "Sdf", "Spacer",
+    "StepReport", "Wind", "World", "approach", "clamp", "golden", "golden_colors", "golden_index", "init", "measure", "mix",
+    "runtime", "shapes", "smoothstep",
 ]  # fmt: skip

@@ -7,14 +7,13 @@ import numpy as np
 import taichi as ti
 
 from . import checks
+from .breaking import Breaking
 from .compliance import law, stiff
 from .feature import Batch, Scene
 from .particles import Particles
 
-BREAKS = 2**30  # substeps after which the number of one comes again
 
-
-class Scalar(Batch):
+class Scalar(Breaking):
     """Constraints C(x) = f(x) - rest = 0, >= 0 or <= 0, soft or rigid, from `measure`. numerics: one formula for all.
 
         theta = s^4 / (1 + s^4), s^2 = (omega h)^2 = w h^2 / alpha     0: resolved by the step, 1: rigid
@@ -47,10 +46,7 @@ class Scalar(Batch):
         self.indices = checks.indices(repr(self), self.index_name, indices, 2**31 - 1, arity=self.arity)
         self._warn_duplicates()
         m = self.count
-        self.break_at = None
-        if break_at is not None:
-            self.break_at = checks.per_item(repr(self), "break_at", break_at, m, above=0.0, infinite=True)
-            self.break_at.flags.writeable = False
+        self.strengthen(break_at)
         self._rest_given = rest
         self.compliance = checks.per_item(repr(self), "compliance", compliance, m, least=0.0)
         self.damping = checks.per_item(repr(self), "damping", damping, m, least=0.0)
@@ -105,11 +101,6 @@ class Scalar(Batch):
             )
 
     @property
-    def breaks(self) -> bool:
-        """Whether a load can break constraints of the batch."""
-        return self.break_at is not None
-
-    @property
     def soft(self) -> bool:
         """Whether any constraint of the batch has compliance."""
         return bool((self.compliance > 0).any())
@@ -131,40 +122,8 @@ class Scalar(Batch):
             self._on_history = add(f"{name}.history", m)
         if self._on_damped:
             self._on_damping = add(f"{name}.damping", m, values=self.damping)
-        if self.breaks:
-            self._on_strength = add(f"{name}.break_at", m, values=self.break_at)
-            self._on_broken = add(f"{name}.broken", m, kind=ti.i32, state=True)
+        self.bind_strength(scene)
         self.changed = False
-
-    @property
-    def load(self) -> np.ndarray:
-        """The force in each constraint during the last substep [N], (m,); positive where it pulls (f above rest).
-
-        More exactly the force along grad f: newtons where f is a length, N m where it is an angle. In f32, rounding of
-        positions is felt as about m ulp(x) / h^2: 1 N for 1 kg some 10 m from the origin at 1200 substeps/s; use f64 where that matters.
-        """
-        if self.scene is None:
-            raise RuntimeError(f"{self!r}.load: there is none before a world has been stepped with it.")
-        scale = 1 / self.scene.hh if self.scene.hh else 0.0
-        return -scale * self.scene.memory.read(self._on_lam)[: self.count].astype(np.float64)
-
-    @property
-    def residual(self) -> np.ndarray:
-        """What the last substep left of each violation, (m,), relative as in StepReport.residual; 0 where it is broken."""
-        if self.scene is None:
-            raise RuntimeError(f"{self!r}.residual: there is none before a world has been stepped with it.")
-        return self.scene.residuals(self)
-
-    @property
-    def broken(self) -> np.ndarray:
-        """Which constraints have broken so far, Boolean (m,)."""
-        return self.stamps() > 0
-
-    def stamps(self) -> np.ndarray:
-        """When each constraint broke, (m,): the number of the substep from 1 on, modulo BREAKS; 0 where it holds."""
-        if not self.breaks or self.scene is None or not self.count:
-            return np.zeros(self.count, dtype=np.int32)
-        return self.scene.memory.read(self._on_broken)
 
     def upload(self) -> None:
         """Write new rest values."""
@@ -211,21 +170,6 @@ class Scalar(Batch):
         if ti.static(self.side != 0):
             value = ti.max(self.side * value, 0) * self.side
         return value
-
-    @ti.func
-    def holds(self, c):
-        """Whether constraint c has not broken."""
-        out = True
-        if ti.static(self.breaks):
-            out = self._on_broken[c] == 0
-        return out
-
-    @ti.func
-    def tear(self, c, hh, tick):
-        """Break constraint c if its load in this substep was too large; it acts no more from the next one on."""
-        if self._on_broken[c] == 0 and ti.abs(self._on_lam[c]) > self._on_strength[c] * hh:
-            self._on_broken[c] = tick % ti.static(BREAKS) + 1
-            self._on_slots.broken[None] += 1
 
     @ti.func
     def known(self, c, h, hh, first, fresh):

@@ -11,12 +11,12 @@ from rich.progress import track
 
 from . import checks, runtime, snapshot
 from .assembly import assemble, check_settings, checked_features
+from .breaking import BREAKS
 from .calm import EVERY, PASSES
 from .explain import explain
 from .feature import Acceleration, Feature
 from .particles import Particles, in_range
 from .queries import Contacts, Search, near_by_all, nearest
-from .scalar import BREAKS
 from .solvers.jacobi import Jacobi
 from .substep import REBOUNDS, decay
 from .survey import StepReport

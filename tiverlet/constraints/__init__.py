@@ -5,6 +5,7 @@ from .ball import Ball
 from .bend import Bend
 from .box import Box
 from .capsule import Capsule
+from .constraint import Constraint
 from .contact import Contact
 from .dihedral import Dihedral
 from .distance import Distance
@@ -17,6 +18,6 @@ from .sdf import Sdf
 from .spacer import Spacer
 
 __all__ = [
-    "AngleLimit", "Ball", "Bend", "Box", "Capsule", "Contact", "Dihedral", "Distance", "HalfSpace", "Mesh", "Pin", "Polygon",
-    "Rope", "Sdf", "Spacer",
+    "AngleLimit", "Ball", "Bend", "Box", "Capsule", "Constraint", "Contact", "Dihedral", "Distance", "HalfSpace", "Mesh",
+    "Pin", "Polygon", "Rope", "Sdf", "Spacer",
 ]  # fmt: skip

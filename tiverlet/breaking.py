@@ -1,0 +1,84 @@
+"""What a constraint bears, and when it breaks."""
+
+from typing import Any
+
+import numpy as np
+import taichi as ti
+
+from . import checks
+from .feature import Batch, Scene
+
+BREAKS = 2**30  # substeps after which the number of one comes again
+
+
+class Breaking(Batch):
+    """A batch with one multiplier per constraint, `_on_lam`: its load, what is left of its violation, and where it breaks.
+
+    A constraint whose load exceeds break_at at the end of a substep acts no more from the next one on. It keeps its share of the
+    masses that are split between constraints, which is safe, if slower than need be, until the world is built anew.
+    """
+
+    break_at: np.ndarray | None = None
+    _on_lam: Any
+
+    def strengthen(self, break_at) -> None:
+        """Keep the argument of __init__."""
+        if break_at is not None:
+            self.break_at = checks.per_item(repr(self), "break_at", break_at, self.count, above=0.0, infinite=True)
+            self.break_at.flags.writeable = False
+
+    def bind_strength(self, scene: Scene) -> None:
+        """Declare what breaking needs, if anything can break."""
+        if self.breaks:
+            self._on_strength = scene.memory.field(f"{self!r}.break_at", self.count, values=self.break_at)
+            self._on_broken = scene.memory.field(f"{self!r}.broken", self.count, kind=ti.i32, state=True)
+
+    @property
+    def breaks(self) -> bool:
+        """Whether a load can break constraints of the batch."""
+        return self.break_at is not None
+
+    @property
+    def load(self) -> np.ndarray:
+        """The force in each constraint during the last substep [N], (m,); positive where it pulls (f above rest).
+
+        More exactly the force along grad f: newtons where f is a length, N m where it is an angle. In f32, rounding of positions
+        is felt as about m ulp(x) / h^2, 1 N for 1 kg some 10 m from the origin at 1200 substeps/s; use f64 where that matters.
+        """
+        if self.scene is None:
+            raise RuntimeError(f"{self!r}.load: there is none before a world has been stepped with it.")
+        scale = 1 / self.scene.hh if self.scene.hh else 0.0
+        return -scale * self.scene.memory.read(self._on_lam)[: self.count].astype(np.float64)
+
+    @property
+    def residual(self) -> np.ndarray:
+        """What the last substep left of each violation, (m,), relative as in StepReport.residual; 0 where it is broken."""
+        if self.scene is None:
+            raise RuntimeError(f"{self!r}.residual: there is none before a world has been stepped with it.")
+        return self.scene.residuals(self)
+
+    @property
+    def broken(self) -> np.ndarray:
+        """Which constraints have broken so far, Boolean (m,)."""
+        return self.stamps() > 0
+
+    def stamps(self) -> np.ndarray:
+        """When each constraint broke, (m,): the number of the substep from 1 on, modulo BREAKS; 0 where it holds."""
+        if not self.breaks or self.scene is None or not self.count:
+            return np.zeros(self.count, dtype=np.int32)
+        return self.scene.memory.read(self._on_broken)
+
+    @ti.func
+    def holds(self, c):
+        """Whether constraint c has not broken."""
+        out = True
+        if ti.static(self.breaks):
+            out = self._on_broken[c] == 0
+        return out
+
+    @ti.func
+    def tear(self, c, hh, tick):
+        """Break constraint c if its load in this substep was too large; it acts no more from the next one on."""
+        if self._on_broken[c] == 0 and ti.abs(self._on_lam[c]) > self._on_strength[c] * hh:
+            self._on_broken[c] = tick % ti.static(BREAKS) + 1
+            self._on_slots.broken[None] += 1

@@ -1,0 +1,166 @@
+"""The user's own constraint."""
+
+import inspect
+from typing import Any
+
+import numpy as np
+import taichi as ti
+
+from .. import checks
+from ..differences import Slopes
+from ..feature import Knob, Scene
+from ..particles import Particles
+from ..scalar import Scalar
+from ..tools import golden
+
+WRONG = 1e-4  # relative difference between a gradient and differences of the function that is not rounding
+
+
+class Constraint(Scalar):
+    """C(x) = function(x_0, x_1, ...) - rest = 0, or <= 0, or >= 0: the user's own constraint, soft or rigid like all others.
+
+    function: takes the corners as vectors [m], as many as the constraint has, and, if it names one more, the number of the
+    constraint (to look up parameters in Taichi fields); returns one number. It is in Taichi's language: arithmetic, ti.sqrt and
+    its like, v.norm(), a.cross(b), if and for; decorated with @ti.func or not. Numbers that it reads from Python are frozen.
+    indices: (m, arity) particle indices, or (m,) for constraints on one particle each.
+    rest: number or (m,); None takes the initial values of function. Live.
+    gradient: takes the same, returns the gradient by each corner, as many vectors. None: central differences.
+    side: 0 for C = 0; 1 for function at most rest; -1 for at least.
+    origin: the corners are relative to this point [m]. None: to the first corner, which is exact in f32 anywhere, and conserves
+    momentum; for a single corner, (0, ..., 0). Put it near the scene where coordinates are large.
+    unit: what the reported residual is relative to; None: the rest value, or the mean initial |function| where that is 0.
+    compliance: [F m / N] for a function in units of F; 0 is rigid. damping, break_at: see Distance.
+
+        def bead(x):  # on a circle of 2 m around the origin
+            return x.norm()
+
+        tv.Constraint(bead, [0], rest=2.0)
+
+    Differences are taken in f64 whatever the world's precision, with a step of 1e-6 of the distance between corners.
+    A gradient that is given is compared with differences when the world is built: ValueError names the corner and the axis.
+    Where function or gradient are not finite, as between coincident corners, the constraint does not act.
+    """
+
+    index_name = "indices"
+    exchangeable = ()
+    rest = Knob(lambda f, v: checks.per_item(repr(f), "rest", v, f.count), "What function should be.")
+
+    def __init__(
+        self, function, indices, rest=0.0, *, gradient=None, side=0, origin=None, unit=None, compliance=0.0, damping=0.0,
+        break_at=None,
+    ):  # fmt: skip
+        self.name = getattr(function, "__name__", "?")
+        indices = np.asarray(indices)
+        if indices.ndim == 1:
+            indices = indices[:, None]
+        self.arity = indices.shape[1] if indices.ndim == 2 else 0
+        self.function = self._taken("function", function)
+        self.gradient = None if gradient is None else self._taken("gradient", gradient)
+        if side not in (-1, 0, 1):
+            raise ValueError(f"{self!r}: side = {side!r}, but it must be 0 (equal), 1 (at most) or -1 (at least).")
+        self.side = side
+        self.origin: Any = origin
+        self.unit = None if unit is None else checks.number(repr(self), "unit", unit, above=0.0)
+        self.setup(indices, rest, compliance, damping, break_at)
+
+    def __repr__(self) -> str:
+        return f"Constraint({self.name})"
+
+    def _taken(self, name: str, function) -> Any:
+        """The function for kernels, and whether it takes the number of the constraint."""
+        if not callable(function):
+            raise TypeError(f"Constraint: {name} = {function!r} is not a function.")
+        plain = function.func.func if getattr(function, "_is_taichi_function", False) else function
+        names = list(inspect.signature(plain).parameters)
+        if self.arity and len(names) not in (self.arity, self.arity + 1):
+            raise TypeError(
+                f"{self!r}: {name} takes {names}, but each constraint has {self.arity} corners. It must take one vector for "
+                "each, and may take the number of the constraint after them."
+            )
+        if plain.__name__ == "<lambda>":
+            raise TypeError(f"{self!r}: {name} is a lambda, which Taichi cannot read. Use def.")
+        return function if plain is not function else ti.func(function), len(names) > self.arity
+
+    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Check the indices and the gradient, and settle the rest values."""
+        checks.indices(repr(self), self.index_name, self.indices, particles.count, arity=self.arity)
+        if self.origin is not None or self.arity == 1:
+            origin = np.zeros(particles.dim) if self.origin is None else self.origin
+            self.origin = checks.vector(repr(self), "origin", origin, particles.dim)
+            high = self.origin.astype(np.float32).astype(np.float64)  # two words: in f32 too, the origin is where it was put
+            self._on_origin = [high.tolist(), (self.origin - high).tolist()]
+        self.size = Scene(None, None, particles, inv_mass).size  # type: ignore[arg-type]
+        self._on_known: tuple[Any, Any] = (None, None)
+        self._on_fixed = int(self.origin is None)
+        self._on_slopes = Slopes(self.function, self.gradient, self.arity, particles.dim, self._on_fixed, self.size)
+        Scalar.prepare(self, particles, inv_mass)
+        values = self.rest_of(particles.position)
+        self._on_known = (particles.position, values)
+        if not np.isfinite(values).all():
+            i = int(np.argmin(np.isfinite(values)))
+            raise ValueError(f"{self!r}: the function is {values[i]} for {self.index_name}[{i}] at its initial position.")
+        if self.gradient is not None and self.count:
+            self._check_gradient(particles.position)
+
+    def _check_gradient(self, position: np.ndarray) -> None:
+        """Compare with differences at the initial positions and near by; two of four must agree, since there may be kinks."""
+        wrong, found = np.zeros((self.count, self.arity, position.shape[1]), dtype=int), []
+        for k in range(4):
+            q = self._corners(position)
+            q = q + k * 0.01 * self.size * (golden(np.arange(1, q.size + 1) + 1000 * k).reshape(q.shape) - 0.5)
+            _, given, differences = self._on_slopes(q)
+            size = np.abs(differences).max(axis=(1, 2), keepdims=True)
+            off = ~(np.abs(given - differences) <= WRONG * size + 1e-9 * np.abs(given))
+            wrong += off & np.isfinite(differences)
+            found.append((given, differences))
+        if (wrong > 2).any():
+            c, k, a = (int(v) for v in np.unravel_index(int(np.argmax(wrong)), wrong.shape))
+            given, differences = found[1]
+            raise ValueError(
+                f"{self!r}: gradient is wrong for corner {k} along {'xyz'[a]}: {given[c, k, a]:g} near {self.index_name}[{c}], "
+                f"but differences of function give {differences[c, k, a]:g}. Correct it, or leave gradient out."
+            )
+
+    def _corners(self, position: np.ndarray) -> np.ndarray:
+        """What function takes, (m, arity, dim)."""
+        q = position[self.indices]
+        return q - (q[:, :1] if self.origin is None else self.origin)
+
+    def rest_of(self, position: np.ndarray) -> np.ndarray:
+        """The values of function."""
+        known, values = self._on_known
+        if position is known:  # while the world's fields are being declared, Taichi cannot launch kernels
+            return values
+        return self._on_slopes(self._corners(position))[0] if self.count else np.zeros(0)
+
+    @ti.func
+    def corners(self, c, back):
+        """Corners at x - back d, relative to the origin or to the first."""
+        q = ti.Matrix.zero(self._on_real, self.arity, self._on_state.dim)
+        for k in ti.static(range(self.arity)):
+            i = self.member(c, k)
+            r = -back * self._on_state.d[i]
+            if ti.static(self._on_fixed == 0):
+                for a in ti.static(range(self._on_state.dim)):
+                    r[a] += (self._on_state.x[i][a] - ti.static(self._on_origin[0][a])) - ti.static(self._on_origin[1][a])
+                if ti.static(self._on_state.compensated):
+                    r += self._on_state.low[i]
+            else:
+                j = self.member(c, 0)
+                r += self._on_state.apart(i, j) + back * self._on_state.d[j]
+            for a in ti.static(range(self._on_state.dim)):
+                q[k, a] = r[a]
+        return q
+
+    @ti.func
+    def measure(self, c, q):
+        """The function and its gradient; nothing where they are not finite."""
+        f, g = self._on_slopes.both(c, ti.cast(q, ti.f64))
+        total = f
+        for k, a in ti.static(ti.ndrange(self.arity, self._on_state.dim)):
+            total += g[k, a] * g[k, a]
+        good = not (ti.math.isnan(total) or ti.math.isinf(total))
+        n = ti.Matrix.zero(self._on_real, self.arity, self._on_state.dim)
+        for k, a in ti.static(ti.ndrange(self.arity, self._on_state.dim)):
+            n[k, a] = ti.select(good, ti.cast(g[k, a], self._on_real), 0)
+        return ti.select(good, ti.cast(f, self._on_real), 0), n
