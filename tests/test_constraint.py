@@ -1,0 +1,96 @@
+"""The user's own constraint: against built-in ones and closed forms, far from the origin, and the errors that it raises."""
+
+import numpy as np
+import pytest
+import taichi as ti
+
+import tiverlet as tv
+
+from .conftest import case, order, rerun, rms
+
+
+def length(a, b):
+    """The function of Distance."""
+    return (a - b).norm()
+
+
+def directions(a, b):
+    """Its gradient."""
+    n = (a - b) / (a - b).norm()
+    return n, -n
+
+
+def radius(x):
+    """Distance from the origin."""
+    return x.norm()
+
+
+def height(x, c):
+    """How far constraint c is above a parabola of its own."""
+    return x[1] - 0.5 * x[0] * x[0] * (c + 1)
+
+
+def test_a_length_of_ones_own_is_a_distance(world):
+    # The double pendulum D01, by Distance, by the user's function with a gradient, and with differences.
+    angle = np.radians(case("D01_double_pendulum")["params"]["theta0_deg"])
+    size = np.array(case("D01_double_pendulum")["params"]["lengths"])
+    steps = np.stack([np.sin(angle), -np.cos(angle)], axis=1) * size[:, None]
+    start = tv.Particles(np.vstack([[0.0, 0.0], np.cumsum(steps, axis=0)]), pinned=[0])
+    pairs, made = [[0, 1], [1, 2]], []
+    for f in (tv.Distance(pairs), tv.Constraint(length, pairs, None, gradient=directions), tv.Constraint(length, pairs, size)):
+        w = world(start, [tv.Gravity(9.81), f], iterations=10, precision="f64")
+        made.append((rerun(w, 1.0).position, f.load, f.residual))
+    for other in made[1:]:
+        for a, b, tolerance in zip(made[0], other, (1e-8, 1e-5, 1e-12), strict=True):
+            np.testing.assert_allclose(b, a, atol=tolerance)
+
+
+def test_a_bead_on_a_wire(world):
+    # On a circle it is the pendulum R06b. Down y = (c + 1) x^2 / 2 from rest, energy is kept and the wire never left.
+    v = case("R06b_pendulum_state")["values"]["90deg_t5"]
+    ring = tv.Constraint(radius, [0], 1.0)
+    parabola = tv.Constraint(height, [1, 2])
+    x = [[1.0, 0.0], [-1.0, 0.5], [1.0, 1.0]]
+    w = world(tv.Particles(x), [tv.Gravity(9.81), ring, parabola], iterations=4, precision="f64")
+    errors = [rms(rerun(w, 5.0, substeps=n).position[0], [v["x"], v["y"]]) for n in (10, 20, 40)]
+    assert 1.9 <= order(errors) <= 2.1
+    y = w.position
+    np.testing.assert_allclose(y[1:, 1], 0.5 * y[1:, 0] ** 2 * [1, 2], atol=1e-8)
+    assert w.last.energy == pytest.approx(9.81 * 1.5, rel=1e-4)
+    assert parabola.load.shape == (2,) and np.abs(parabola.residual).max() < 1e-7
+
+
+def test_far_from_the_origin_the_origin_moves_along(world):
+    # At 1e5 m an ulp of f32 is 8 mm. Relative to a point near the scene a compensated world resolves micrometres.
+    v = case("R06b_pendulum_state")["values"]["90deg_t5"]
+    far = np.array([1e5 + 0.3, -1e5 - 0.7])
+    ring = tv.Constraint(radius, [0], 1.0, origin=far)
+    w = world(tv.Particles([far + [1.0, 0.0]]), [tv.Gravity(9.81), ring], substeps=40, precision="f32-compensated")
+    w.run(5.0)
+    assert rms(w.position[0] - far, [v["x"], v["y"]]) <= 2e-4
+
+
+def test_what_is_wrong_is_named(world):
+    start = tv.Particles([[0.0, 0.0], [0.6, 0.8], [1.0, 3.0]])
+
+    def flipped(a, b):
+        n = (a - b) / (a - b).norm()
+        return n, ti.Vector([-n[0], n[1]])
+
+    def shapeless(a, b):
+        return ti.log((a - b).norm() - 1.0)
+
+    with pytest.raises(ValueError, match=r"Constraint\(length\): gradient is wrong for corner 1 along y: .* differences of func"):
+        world(start, [tv.Constraint(length, [[0, 1], [1, 2]], None, gradient=flipped)])
+    with pytest.raises(ValueError, match=r"Constraint\(shapeless\): the function is -inf for indices\[0\]"):
+        world(start, [tv.Constraint(shapeless, [[0, 1]])])
+    with pytest.raises(TypeError, match=r"takes \['a', 'b'\], but each constraint has 3 corners"):
+        tv.Constraint(length, [[0, 1, 2]])
+    with pytest.raises(TypeError, match="lambda"):
+        tv.Constraint(lambda a, b: (a - b).norm(), [[0, 1]])
+    with pytest.raises(TypeError, match="is not a function"):
+        tv.Constraint(7, [[0, 1]])
+    with pytest.raises(ValueError, match="side = 2"):
+        tv.Constraint(length, [[0, 1]], side=2)
+    with pytest.raises(ValueError, match=r"indices\[0\] = \(0, 3\)"):
+        world(start, [tv.Constraint(length, [[0, 3]])])
