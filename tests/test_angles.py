@@ -14,22 +14,35 @@ def triples(n: int) -> np.ndarray:
     return np.stack([k, k + 1, k + 2], axis=1)
 
 
-def test_a_rod_swings_through_straight_in_3d_as_in_2d(world):
-    # Row 56. An unsigned angle has a kink there; the remembered side makes it smooth, and nothing counts as turned.
-    n, made = 6, []
+def test_rods_swing_through_straight_and_every_compliance_is_stable(world):
+    # Row 56: an unsigned angle has a kink at straight; the remembered side makes a free rod in 3D move as in 2D, without a flag.
+    # Rows 8, 9, 12: clamped beams from rigid to soft, one pass: kinetic energy never exceeds what there was and gravity supplied.
+    n, alphas, made = 21, (0.0, 1e-12, 1e-6, 1e-3, 1e-1, 1.0, 1e3, 1e12), []
+    m, rod = len(alphas), 6
     for dim in (2, 3):
-        x, v = np.zeros((n, dim)), np.zeros((n, dim))
-        x[:, 0], v[:, 1] = 0.1 * np.arange(n), 0.5 * np.sin(3.0 * np.arange(n))
-        bend = tv.Bend(triples(n), 0.0, compliance=[0.0, 1e-3, 1e-1, 10.0])
-        w = world(tv.Particles(x, velocity=v, mass=0.1), [tv.Distance(line(n - 1)), bend], iterations=4, precision="f64")
-        flags = set()
-        for _ in range(60):
-            flags |= w.step(1 / 60).flags
-        assert not flags
-        made.append((w.position, bend.load))
+        x, v = np.zeros((m, n, dim)), np.zeros((m, n, dim))
+        x[:, :, 0], x[:, :, 1] = 0.05 * np.arange(n), 10.0 * np.arange(m)[:, None]
+        v[:, 2:, -1] = 0.3 * np.sin(7.0 * np.arange(2, n))
+        y, u = np.zeros((rod, dim)), np.zeros((rod, dim))
+        y[:, 0], u[:, 1] = 0.1 * np.arange(rod) - 1, 0.5 * np.sin(3.0 * np.arange(rod))
+        corners = np.concatenate([triples(n) + n * c for c in range(m)] + [triples(rod) + m * n])
+        links = np.concatenate([line(n - 1) + n * c for c in range(m)] + [line(rod - 1) + m * n])
+        bend = tv.Bend(corners, 0.0, compliance=[*np.repeat(alphas, n - 2), 0.0, 1e-3, 1e-1, 10.0])
+        held = np.arange(m * n).reshape(m, n)[:, :2].ravel()
+        start = tv.Particles(
+            np.concatenate([x.reshape(-1, dim), y]), velocity=np.concatenate([v.reshape(-1, dim), u]), mass=0.1, pinned=held
+        )
+        w = world(start, [tv.Gravity(9.81), tv.Distance(links), bend], substeps=4, precision="f64")
+        begin = 0.05 * (v**2).sum(axis=(1, 2))
+        for _ in range(180):
+            w.step(1 / 60)
+            supplied = 0.1 * 9.81 * (x[..., 1] - w.position[:-rod].reshape(x.shape)[..., 1]).sum(axis=1)
+            speed = w._memory.state()["displacement"][:-rod].reshape(x.shape) * 240
+            assert (0.05 * (speed**2).sum(axis=(1, 2)) <= begin + supplied * 1.001 + 1e-4).all()
+        made.append((w.position[-rod:], np.abs(bend.load[-rod + 2 :])))
     np.testing.assert_allclose(made[1][0][:, :2], made[0][0], atol=1e-9)
     np.testing.assert_array_equal(made[1][0][:, 2], 0.0)
-    np.testing.assert_allclose(np.abs(made[1][1]), np.abs(made[0][1]), atol=1e-6)
+    np.testing.assert_allclose(made[1][1], made[0][1], atol=1e-6)
 
 
 def test_angles_have_signs_and_wrap(world):
@@ -55,29 +68,27 @@ def test_angles_have_signs_and_wrap(world):
         bend.rest = [0.0, 9.0, 0.0, 0.0]
 
 
-@pytest.mark.parametrize("dim", [2, 3])
-def test_limbs_stop_at_their_limits(world, dim):
-    # A forearm on a held upper arm falls to the upper limit, rests there with the moment m g l cos; between them it is free.
-    x = np.zeros((6, dim))
-    x[:3, 0] = -1.0, 0.0, 1.0  # falls, turning right in 2D
-    x[3:, 0] = -1.0, 0.0, 1.0
-    x[3:, 1] = 5.0
-    low, high = (-1.2, 2.5) if dim == 2 else (0.0, 1.2)
-    limit = tv.AngleLimit([[0, 1, 2]], low, high)
+def test_limbs_stop_at_their_limits(world):
+    # A forearm on a held upper arm falls to its limit, rests there with the moment m g l cos; between the limits it is free.
+    x = np.array([[-1.0, 0.0], [0.0, 0.0], [1.0, 0.0], [-1.0, 5.0], [0.0, 5.0], [1.0, 5.0]])
+    limit = tv.AngleLimit([[0, 1, 2]], -1.2, 2.5)
     features = [tv.Gravity(9.81), tv.Distance([[1, 2], [4, 5]]), limit, tv.Drag(3.0)]
     w = world(tv.Particles(x, pinned=[0, 1, 3, 4]), features, substeps=40, iterations=8, precision="f64")
     w.run(0.2)
-    np.testing.assert_allclose(w.position[2], w.position[5] - [0, 5, 0][:dim], atol=1e-12)  # no limit reached: as without
+    np.testing.assert_allclose(w.position[2], w.position[5] - [0, 5], atol=1e-12)  # no limit reached: as without
     assert limit.load[0] == 0
     w.run(5.0)
-    angle = np.arctan2(w.position[2, 1], w.position[2, 0])
-    assert angle == pytest.approx(-1.2, abs=1e-4) and w.position[5, 1] < 4.01
+    assert np.arctan2(w.position[2, 1], w.position[2, 0]) == pytest.approx(-1.2, abs=1e-4) and w.position[5, 1] < 4.01
     assert limit.load[0] == pytest.approx(9.81 * np.cos(1.2), rel=1e-3)
-    limit.upper, limit.lower = 1.5 if dim == 3 else 2.5, -1.5 if dim == 2 else 0.0
+    limit.lower = -1.5
     w.run(3.0)
     assert np.arctan2(w.position[2, 1], w.position[2, 0]) == pytest.approx(-1.5, abs=1e-4)
-    with pytest.raises(ValueError, match=r"lower\[0\] = 3 and upper\[0\] = .*lower must not exceed upper"):
+    with pytest.raises(ValueError, match=r"lower\[0\] = 3 and upper\[0\] = 2.5, but lower must not exceed upper"):
         limit.lower = 3.0
+    with pytest.raises(ValueError, match="more than a turn apart"):
+        tv.AngleLimit([[0, 1, 2]], -4.0, 4.0)
+    with pytest.raises(ValueError, match=r"lower \(in 3D\)\[0\] = -1, but it must be at least 0"):
+        world(tv.Particles(np.eye(3)), [tv.AngleLimit([[0, 1, 2]], -1.0, 1.0)])
 
 
 def test_hinged_triangles_fold_to_either_side(world):
@@ -105,24 +116,27 @@ def test_a_rope_tears_where_it_is_told_to(world, path):
     rope = tv.Distance(line(8), 1.0, break_at=strength)
     plain = tv.Distance(line(8), 1.0)
     y = np.stack([np.zeros(9), -np.arange(9.0)], axis=1)
-    w = world(tv.Particles(y, pinned=[0]), [tv.Gravity(0.0), rope, tv.Drag(5.0)], iterations=30, path=path, precision="f64")
+    w = world(
+        tv.Particles(y, pinned=[0]), [tv.Gravity(0.0), rope, tv.Drag(5.0)], substeps=10, iterations=12, path=path, precision="f64"
+    )
     events, gravity = [], w.features[0]
-    for frame in range(120):
-        gravity.g = (0.0, -9.81 * min(1.0, frame / 60))  # slowly, so that nothing swings
+    for frame in range(30):
+        gravity.g = (0.0, -9.81 * min(1.0, frame / 15))  # slowly, so that nothing swings
         report = w.step(1 / 60)
         assert report.broken == sum(len(at) for _, at in w.broken)
         events += [(frame, f, at.tolist()) for f, at in w.broken]
     assert [(f is rope, at) for _, f, at in events] == [(True, [3])] and rope.broken.tolist() == [k == 3 for k in range(8)]
-    assert events[0][0] == pytest.approx(60 * 45 / (5 * 9.81), abs=3)  # the link that carries 5 of 8
-    assert w.position[4, 1] < -4.5 and rope.load[3] == 0 and rope.residual[3] == 0
+    assert events[0][0] == pytest.approx(15 * 45 / (5 * 9.81), abs=1.01)  # the link that carries 5 of 8
+    assert w.position[4, 1] < -4.05 and rope.load[3] == 0 and rope.residual[3] == 0
     np.testing.assert_allclose(rope.load[:3], 9.81 * np.array([3, 2, 1]), rtol=1e-2)
-    twin, other = w.clone(), w.clone(precision="f32")
-    assert twin.hash() == w.hash() and (other.features[1].broken == rope.broken).all() and not twin.features[1].copy().scene
-    w.step(1 / 60)
-    twin.step(1 / 60)
-    assert twin.hash() == w.hash() and w.last.broken == 0 and w.broken == []
-    twin.close()
-    other.close()
+    if path == "fused":
+        twin, other = w.clone(), w.clone(precision="f32")
+        assert twin.hash() == w.hash() and (other.features[1].broken == rope.broken).all() and not twin.features[1].copy().scene
+        w.step(1 / 60)
+        twin.step(1 / 60)
+        assert twin.hash() == w.hash() and w.last.broken == 0 and w.broken == []
+        twin.close()
+        other.close()
     assert "Distance.broken" in w.fields and "slots.broken" in w.fields
     bare = world(tv.Particles(y, pinned=[0]), [tv.Gravity(9.81), plain])
     assert not any("broken" in name or "break_at" in name for name in bare.fields) and not plain.broken.any()
