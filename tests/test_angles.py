@@ -142,3 +142,20 @@ def test_a_rope_tears_where_it_is_told_to(world, path):
     assert not any("broken" in name or "break_at" in name for name in bare.fields) and not plain.broken.any()
     with pytest.raises(ValueError, match=r"Distance: break_at\[2\] = 0, but it must be above 0"):
         tv.Distance(line(3), break_at=[1.0, 1.0, 0.0])
+
+
+def test_wrong_angles_are_named():
+    # Rows 10, 19, 20. The three corners of a triangle are three constraints; a corner read backwards is the same one.
+    with pytest.raises(ValueError, match=r"Bend: compliance\[1\] = -1"):
+        tv.Bend([[0, 1, 2], [1, 2, 3]], compliance=[0.0, -1.0])
+    with pytest.raises(ValueError, match=r"Bend: rest\[0\] = nan"):
+        tv.World(tv.Particles(np.eye(3)), [tv.Bend([[0, 1, 2]], np.nan)])
+    with pytest.raises(ValueError, match=r"Bend: triples\[0\] = \(0, 1, 0\) names a particle twice"):
+        tv.Bend([[0, 1, 0]])
+    with pytest.raises(ValueError, match=r"Dihedral: quads has shape \(1, 3\), but \(m, 4\)"):
+        tv.Dihedral([[0, 1, 2]])
+    with pytest.raises(ValueError, match=r"AngleLimit: triples\[0\] = \(0, 1, 3\), but there are 3 particles"):
+        tv.World(tv.Particles(np.eye(3)), [tv.AngleLimit([[0, 1, 3]], 0.0, 1.0)])
+    tv.Bend([[0, 1, 2], [1, 2, 0], [2, 0, 1]])
+    with pytest.warns(UserWarning, match=r"Bend: 1 of the triples are duplicates, the first of them \(0, 1, 2\)"):
+        tv.Bend([[0, 1, 2], [2, 1, 0]])

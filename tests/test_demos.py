@@ -38,6 +38,7 @@ assert os.path.getsize("article.rrd") > 100_000
     assert "frames" in done.stdout and "120" in done.stdout and "worst overlap" in done.stdout
 
 
-def test_contact_demos_check_themselves():
+def test_other_demos_check_themselves():
     assert "formula" in python((ROOT / "demos" / "cradle.py").read_text()).stdout
+    assert "carries 1.0" in python((ROOT / "demos" / "net.py").read_text()).stdout
     assert "through the neck" in python((ROOT / "demos" / "hourglass.py").read_text()).stdout

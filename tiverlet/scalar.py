@@ -141,6 +141,11 @@ class Scalar(Breaking):
         return f
 
     @ti.func
+    def distinct(self, f, f0):
+        """Whether the direction is clear enough at f and f0, now and at the start, for a turn of 41 degrees to mean something."""
+        return True
+
+    @ti.func
     def begin(self, c, fresh):
         """Before the first pass of a substep: what `measure` has to remember of its start."""
 
@@ -215,7 +220,7 @@ class Scalar(Breaking):
                     self._on_last[c] = f0
                 else:
                     B = self._on_history[c]
-        return A * C + B + alpha * lam, A, alpha, lam, both, n, g, turned
+        return A * C + B + alpha * lam, A, alpha, lam, both, n, g, turned and self.distinct(f, f0)
 
     @ti.func
     def solve(self, c, h, hh, first, fresh):

@@ -20,7 +20,8 @@ class AngleLimit(Turning):
     [0, pi]. Live.
     compliance: number or (m,) [rad/(N m)] of the stops; 0 is rigid. damping: [N m s/rad], while at a stop. break_at: [N m].
 
-    A rigid stop takes the impact inelastically. `load` is the moment at either stop [N m].
+    A rigid stop takes the impact inelastically. Moved in a jump it throws what it meets: move it bit by bit, or make it soft.
+    `load` is the moment at either stop [N m].
     """
 
     side = 1
@@ -82,6 +83,11 @@ class AngleLimit(Turning):
     def near(self, f, other):
         """A distance from the middle: it has no other value."""
         return f
+
+    @ti.func
+    def distinct(self, f, f0):
+        """A limit at straight acts on neither side of it."""
+        return True
 
     @ti.func
     def measure(self, c, q):

@@ -58,6 +58,14 @@ class Turning(Angle):
         return ti.cast(1, self._on_real), 0 * normal
 
     @ti.func
+    def distinct(self, f, f0):
+        """In 3D, the plane of a nearly straight path turns at the least motion."""
+        out = True
+        if ti.static(self._on_state.dim == 3):
+            out = ti.max(ti.abs(f), ti.abs(f0)) > 0.1
+        return out
+
+    @ti.func
     def faint(self):
         """|u x v| below which the normal is lost in rounding."""
         return ti.cast(ti.static(1e-13 if self._on_state.double else 1e-6), self._on_real)
