@@ -1,0 +1,235 @@
+"""Ready-made bodies: counts, lengths, orientation, closedness; files there and back; and who is refused."""
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+from tiverlet.shapes.people import NAMES
+from tiverlet.shapes.shape import INDICES
+
+from .conftest import case
+
+S = tv.shapes
+STAR = [[np.cos(t) * r, np.sin(t) * r] for t, r in zip(np.arange(10) * np.pi / 5, [1.0, 0.5] * 5, strict=True)]
+# A long straight side with a notch next to it on one side and a spike on the other.
+MOUTH = [[0, 0], [1.9, 0], [2, 0.9], [2.1, 0], [4, 0], [4, 1], [0.5, 1], [0.5, 2], [1.9, 2], [2, 1.1], [2.1, 2], [4, 2], [4, 3],
+         [0, 3]]  # fmt: skip
+BODIES = {
+    "rope": S.rope((0, 2), (1, 2), 11),
+    "chain": S.chain((0, 0, 0), (1, 0.5, 1), 3.0, 21),
+    "bridge": S.bridge((0, 0), (6, 0), 6, 1.0),
+    "tree 2D": S.tree((0, 0), 2.0, levels=4, branches=3),
+    "tree 3D": S.tree((0, 0, 0), 2.0),
+    "cloth 2D": S.cloth((0, 0), (0, 1), (2, 0), (4, 6)),
+    "cloth 3D": S.cloth((0, 1, 0), (1, 0, 0), (0, 0, 1), (5, 5)),
+    "net": S.net((0, 0, 0), (1, 0, 0), (0, 1, 0), (3, 3)),
+    "ball 2D": S.ball((1, 2), 0.5, 4),
+    "ball 3D": S.ball((1, 2, 3), 0.5, 3),
+    "balloon": S.balloon((0, 0, 0), 2.0, 2),
+    "blob": S.blob(STAR, 0.15),
+    "polygon": S.polygon((0, 0), 1.0, 12),
+    "truss 2D": S.truss((0, 0), (4, 1), (4, 1)),
+    "truss 3D": S.truss((0, 0, 0), (3, 2, 1), (3, 2, 1)),
+    "ragdoll 2D": S.ragdoll((0, 0)),
+    "ragdoll 3D": S.ragdoll((0, 0, 0)),
+    "pile": S.pile((0, 0), (1, 1), (0.02, 0.05)),
+}
+
+
+def volumes(shape):
+    """Areas of the faces in 2D, volumes of the tetrahedra in 3D."""
+    cells = shape.faces if shape.position.shape[1] == 2 else shape.tetrahedra
+    edges = shape.position[cells[:, 1:]] - shape.position[cells[:, :1]]
+    return np.linalg.det(edges) / (2 if cells.shape[1] == 3 else 6)
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_every_body_is_sound(name):
+    body = BODIES[name]
+    n, dim = body.position.shape
+    assert np.isfinite(body.position).all() and body.radius.shape == (n,)
+    assert len(np.unique(body.position.round(9), axis=0)) == n
+    for field in INDICES:
+        tuples = getattr(body, field)
+        assert tuples.dtype.kind == "i" and ((tuples >= 0) & (tuples < n)).all()
+        ordered = np.sort(tuples, axis=1)
+        assert (ordered[:, 1:] > ordered[:, :-1]).all()  # no member twice
+        same = np.unique(ordered, axis=0)
+        assert len(same) == len(ordered)
+    both = np.sort(np.concatenate([body.links, body.braces]), axis=1)
+    assert len(np.unique(both, axis=0)) == len(both)
+    assert (volumes(body) > 0).all()
+    for loop in body.loops:
+        x, y = body.position[loop].T
+        assert np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y) > 0 and len(np.unique(loop)) == len(loop)
+    if dim == 3 and (len(body.tetrahedra) or name == "balloon"):
+        shell = tv.Volume(body.faces)  # refuses what is open
+        shell.prepare(tv.Particles(body.position), np.ones(n))
+        assert shell.count == 1 and np.array_equal(shell.faces, body.faces)  # seen from outside already
+        if len(body.tetrahedra):
+            assert shell.rest[0] == pytest.approx(volumes(body).sum())
+    if len(body.tetrahedra) or len(body.loops):
+        # Euler: as many parts as make a ball or a disc.
+        edges, faces, cells = len(np.unique(both, axis=0)), len(body.faces), len(body.tetrahedra)
+        if dim == 2 and faces:
+            assert n - edges + faces == 1
+        if dim == 3:
+            assert n - edges + (4 * cells + faces) // 2 - cells == 1
+    turned = body.moved(np.arange(dim)).turned(0.7)
+    a, b = body.position[body.links], turned.position[turned.links]
+    np.testing.assert_allclose(np.linalg.norm(a[:, 0] - a[:, 1], axis=1), np.linalg.norm(b[:, 0] - b[:, 1], axis=1), atol=1e-12)
+
+
+def test_counts_and_sizes():
+    assert len(BODIES["ball 2D"]) == 1 + 3 * 4 * 5 and len(BODIES["ball 3D"]) == 7**3
+    for name, radius in (("ball 2D", 0.5), ("ball 3D", 0.5)):
+        rim = np.unique(np.concatenate([*BODIES[name].loops, BODIES[name].faces.ravel()] if "3D" in name else BODIES[name].loops))
+        center = np.arange(1, 4)[: BODIES[name].position.shape[1]]
+        np.testing.assert_allclose(np.linalg.norm(BODIES[name].position[rim] - center, axis=1), radius)
+    assert volumes(BODIES["ball 2D"]).sum() == pytest.approx(0.25 * 12 * np.sin(np.pi / 12))  # 24 sides, R = 1/2
+    assert 0.8 < volumes(BODIES["ball 3D"]).sum() / (np.pi / 6) < 1
+    assert volumes(BODIES["blob"]).sum() == pytest.approx(5 * np.sin(np.pi / 5) * 0.5)
+    assert volumes(BODIES["truss 3D"]).sum() == pytest.approx(6) and len(BODIES["truss 3D"].tetrahedra) == 36
+    assert len(BODIES["balloon"]) == 10 * 16 + 2 and len(BODIES["balloon"].faces) == 320
+    assert len(BODIES["cloth 3D"].links) == 40 and len(BODIES["cloth 3D"].braces) == 32 + 30
+    assert len(BODIES["cloth 3D"].quads) == 40 - 16 + 16 and len(BODIES["net"].braces) == 0
+    assert len(BODIES["bridge"]) == 13 and len(BODIES["bridge"].links) == 6 + 5 + 12
+    assert len(BODIES["tree 2D"]) == 1 + 4 * (1 + 3 + 9 + 27) and len(BODIES["tree 2D"].links) == len(BODIES["tree 2D"]) - 1
+    assert len(BODIES["ragdoll 3D"]) == len(NAMES) == 16
+
+
+def test_a_chain_hangs_on_its_catenary():
+    # R10: its sag; and whatever the ends, its length, and that it is a catenary.
+    p, values = case("R10_catenary")["params"], case("R10_catenary")["values"]
+    assert -S.chain((0, 0), (p["span"], 0), p["length"], 1001).position[:, 1].min() == pytest.approx(values["sag"], rel=1e-12)
+    for start, end, length in (((0, 0), (1, 0), 1.2), ((0, 0), (1, 0.7), 1.25), ((0, 0, 0), (2, -1, 3), 9), ((0, 0), (0, 1), 2)):
+        c = S.chain(start, end, length, 2001)
+        steps = np.linalg.norm(np.diff(c.position, axis=0), axis=1)
+        assert steps.sum() == pytest.approx(length, rel=1e-5)
+        np.testing.assert_allclose(c.position[[0, -1]], [start, end], atol=1e-9)
+        if start[0] != end[0]:  # its slope grows evenly with the length: sinh
+            flat = np.linalg.norm(np.delete(np.diff(c.position, axis=0), 1, axis=1), axis=1)
+            slope = np.diff(c.position[:, 1]) / flat
+            np.testing.assert_allclose(np.diff(slope, 2), 0, atol=1e-6)
+    tight = S.chain((0, 0), (1, 0), 1 + 1e-9, 5)
+    np.testing.assert_allclose(tight.position[:, 1], 0, atol=1e-4)
+
+
+def test_piles_do_not_touch():
+    for body in (BODIES["pile"], S.pile((0, 0, 0), (1, 1, 1), 0.1)):
+        pairs, depths = tv.measure.overlapping(body.position, body.radius)
+        assert len(pairs) == 0 and len(body) > 50
+    assert BODIES["pile"].radius.min() < 0.021 and BODIES["pile"].radius.max() > 0.049
+
+
+def test_ragdolls_stand_within_their_limits():
+    for dim in (2, 3):
+        doll = BODIES[f"ragdoll {dim}D"]
+        i, j, k = doll.position[doll.limits.T]
+        a, b = j - i, k - j
+        if dim == 2:
+            turn = np.arctan2(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], (a * b).sum(axis=1))
+        else:
+            turn = np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(axis=1))
+        assert ((turn >= doll.lower - 1e-9) & (turn <= doll.upper + 1e-9)).all()
+        assert doll.position[:, 1].max() == pytest.approx(0.93 * 1.8, abs=0.02)
+
+
+def test_joining():
+    body, parts = S.join(BODIES["ball 3D"], BODIES["balloon"].moved((5, 0, 0)))
+    assert [p.stop - p.start for p in parts] == [343, 162]
+    assert tv.Volume(body.faces).count == 2
+    body, parts = S.join(BODIES["polygon"], BODIES["blob"])
+    assert body.loops[1].min() == 12 and len(body.loops) == 2 and body.faces.min() == 12
+    with pytest.raises(ValueError, match="some shapes are in 2D"):
+        S.join(BODIES["rope"], BODIES["net"])
+    with pytest.raises(ValueError, match="nothing to join"):
+        S.join()
+
+
+@pytest.mark.parametrize("name", ["ball 3D", "balloon", "blob", "rope", "cloth 3D"])
+@pytest.mark.parametrize("ending, binary", [("obj", False), ("ply", False), ("ply", True)])
+def test_files_there_and_back(tmp_path, name, ending, binary):
+    body, path = BODIES[name], tmp_path / f"body.{ending}"
+    S.save(path, body, binary=binary)
+    back = S.load(path, dim=body.position.shape[1])
+    np.testing.assert_array_equal(back.position, body.position)
+    np.testing.assert_array_equal(back.links, body.links)
+    np.testing.assert_array_equal(back.faces, body.faces)
+    if ending == "ply":
+        np.testing.assert_array_equal(back.tetrahedra, body.tetrahedra)
+
+
+def test_files_of_others(tmp_path):
+    # Quads in fans, indices from the end, textures and comments; big-endian PLY with colours, short lists and another name.
+    path = tmp_path / "a.OBJ"
+    path.write_text("# cube side\nvn 0 0 1\nv 0 0 0 1.0\nv 1 0 0\nv 1 1 0\nv 0 1 0\ng side\nf 1/1/1 2//1 3 -1 # quad\ns off\n")
+    side = S.load(path)
+    np.testing.assert_array_equal(side.faces, [[0, 1, 2], [0, 2, 3]])
+    assert len(side.links) == 5 and len(side.quads) == 1
+    path = tmp_path / "b.ply"
+    head = (
+        "ply\nformat binary_big_endian 1.0\ncomment by hand\nelement vertex 4\n"
+        "property float x\nproperty float y\nproperty float z\n"
+        "property uchar red\nelement face 1\nproperty list uchar short vertex_index\nelement tet 1\n"
+        "property list uchar int vertex_indices\nend_header\n"
+    )
+    kind = np.dtype([("p", ">f4", 3), ("red", "u1")])
+    points = np.array([((0, 0, 0), 7), ((1, 0, 0), 8), ((0, 1, 0), 9), ((0, 0, 1), 9)], dtype=kind)
+    face = b"\x04" + np.array([0, 1, 2, 3], dtype=">i2").tobytes()
+    path.write_bytes(head.encode() + points.tobytes() + face + b"\x04" + np.array([0, 1, 2, 3], dtype=">i4").tobytes())
+    body = S.load(path)
+    np.testing.assert_array_equal(body.position, points["p"])
+    np.testing.assert_array_equal(body.faces, [[0, 1, 2], [0, 2, 3]])
+    np.testing.assert_array_equal(body.tetrahedra, [[0, 1, 2, 3]])
+
+
+XYZ = "".join(f"property float {c}\n" for c in "xyz")
+
+
+@pytest.mark.parametrize(
+    "name, text, message",
+    [
+        ("a.obj", "v 1 2\n", r"line 1: 'v 1 2' cannot"),
+        ("a.obj", "v 1 2 3\nf 1 2 3\n", r"face 0 is \(0, 1, 2\), but there are 1 vertices"),
+        ("a.obj", "v 1 2 3\nf 0 1 1\n", r"face 0 is \(-1, 0, 0\)"),
+        ("a.obj", "v 1 2 nan\n", r"vertices of .*\[0, 2\] = nan"),
+        ("a.ply", "obj", "no header"),
+        ("a.ply", "ply\nformat ascii 1.0\nelement vertex two\nend_header\n", "'element vertex two' in the header"),
+        ("a.ply", "ply\nformat zip 1.0\nend_header\n", "format 'zip'"),
+        ("a.ply", "ply\nformat ascii 1.0\nelement vertex 2\n" + XYZ + "end_header\n1 2 3\n4",
+         "vertex 1 of 2 is incomplete"),
+        ("a.ply", "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", "no vertices with x, y and z"),
+        ("a.stl", "", "ends with '.stl'"),
+    ],
+)  # fmt: skip
+def test_files_that_are_refused(tmp_path, name, text, message):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(ValueError, match=message):
+        S.load(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda: S.rope((0, 0), (0, 0), 3), "same point"),
+        (lambda: S.rope((0, 0), (1, 0), 1), "points = 1"),
+        (lambda: S.chain((0, 0), (1, 0), 0.9, 3), "length = 0.9, but it must be above 1"),
+        (lambda: S.cloth((0, 0), (1, 0), (2, 0), (3, 3)), "span no area"),
+        (lambda: S.cloth((0, 0), (1, 0), (0, 1), (3, 1)), r"points\[1\] = 1"),
+        (lambda: S.ball((0, 0), -1.0), "radius = -1"),
+        (lambda: S.ball((0, 0), 1.0, 0), "rings = 0"),
+        (lambda: S.blob([[0, 0], [1, 0], [2, 0]], 0.1), "no area"),
+        (lambda: S.blob(MOUTH, 5.0), "make it smaller"),
+        (lambda: S.truss((0, 0), (1, -1), 2), r"upper\[1\] = -1"),
+        (lambda: S.pile((0, 0), (1, 1), 2.0), "no particle of radius 2 fits"),
+        (lambda: S.pile((0, 0), (1, 1), (0.2, 0.1)), "smallest comes first"),
+        (lambda: S.tree((0, 0), 1.0, levels=0), "levels = 0"),
+        (lambda: S.ragdoll((0, 0), 0.0), "height = 0"),
+        (lambda: S.polygon((0, 0), 1.0, 2), "sides = 2"),
+        (lambda: S.polygon((0, 0), 1.0, 3).turned(np.nan), "angle = nan"),
+    ],
+)
+def test_bodies_that_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

@@ -1,0 +1,28 @@
+"""Ready-made bodies as plain arrays: positions to put into Particles, and index tuples to put into constraints."""
+
+from .files import load, save
+from .lines import bridge, chain, rope, tree
+from .people import ragdoll
+from .shape import Shape, join
+from .sheets import cloth, net
+from .solids import ball, balloon, blob, pile, polygon, truss
+
+__all__ = [
+    "Shape",
+    "ball",
+    "balloon",
+    "blob",
+    "bridge",
+    "chain",
+    "cloth",
+    "join",
+    "load",
+    "net",
+    "pile",
+    "polygon",
+    "ragdoll",
+    "rope",
+    "save",
+    "tree",
+    "truss",
+]

@@ -1,0 +1,181 @@
+"""Meshes from and to OBJ and PLY files. Both formats are short enough to need no library."""
+
+import os
+
+import numpy as np
+
+from .. import checks
+from .shape import Shape, edges_of, quads_of
+
+_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
+    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
+}  # fmt: skip
+
+
+def load(path, dim: int = 3) -> Shape:
+    """A body from an .obj or .ply file (ascii or binary): vertices, edges, faces, and tetrahedra where there are any.
+
+    Faces of more than three corners are cut into fans. links: the edges that are given, or else those of faces and tetrahedra.
+    PLY: elements vertex (x, y, z), edge (vertex1, vertex2), face, and tetrahedron, tetra, tet or cell (lists of indices).
+    OBJ: v, l and f; what else there is, is passed over. dim = 2 drops z. Vertices that nothing uses are kept.
+    ValueError, with the line or the element, for what cannot be understood.
+    """
+    name = os.fspath(path)
+    kind = os.path.splitext(name)[1].lower()
+    if kind not in (".obj", ".ply"):
+        raise ValueError(f"load: {name} ends with {kind!r}, but .obj and .ply are what can be read.")
+    if dim not in (2, 3):
+        raise ValueError(f"load: dim = {dim!r}, but it must be 2 or 3.")
+    with open(name, "rb") as file:
+        data = file.read()
+    position, edges, faces, cells = (_obj if kind == ".obj" else _ply)(name, data)
+    checks.finite("load", f"vertices of {name}", position)
+    for what, tuples in (("edge", edges), ("face", faces), ("tetrahedron", cells)):
+        wrong = ((tuples < 0) | (tuples >= len(position))).any(axis=1)
+        if wrong.any():
+            k = int(np.argmax(wrong))
+            raise ValueError(f"load: {name}: {what} {k} is {tuple(tuples[k].tolist())}, but there are {len(position)} vertices.")
+    if not len(edges):
+        edges = edges_of(cells) if len(cells) else edges_of(faces)
+    quads = quads_of(faces) if dim == 3 else np.zeros((0, 4), dtype=np.int64)
+    return Shape(position[:, :dim], edges, faces=faces, quads=quads, tetrahedra=cells)
+
+
+def save(path, shape: Shape, binary: bool = True) -> None:
+    """Write a body to an .obj or .ply file: position, links, faces and (PLY) tetrahedra. In 2D z is 0."""
+    name = os.fspath(path)
+    kind = os.path.splitext(name)[1].lower()
+    x = np.zeros((len(shape), 3))
+    x[:, : shape.position.shape[1]] = shape.position
+    if kind == ".obj":
+        lines = [f"v {a!r} {b!r} {c!r}" for a, b, c in x.tolist()]
+        lines += [f"l {i} {j}" for i, j in (shape.links + 1).tolist()]
+        lines += [f"f {i} {j} {k}" for i, j, k in (shape.faces + 1).tolist()]
+        text = "\n".join(lines) + "\n"
+        with open(name, "w", encoding="ascii") as file:
+            file.write(text)
+    elif kind == ".ply":
+        with open(name, "wb") as file:
+            file.write(_to_ply(x, shape, binary))
+    else:
+        raise ValueError(f"save: {name} ends with {kind!r}, but .obj and .ply are what can be written.")
+
+
+def _fans(polygons: list[list[int]]) -> np.ndarray:
+    out = [(p[0], p[k], p[k + 1]) for p in polygons for k in range(1, len(p) - 1)]
+    return np.array(out, dtype=np.int64).reshape(-1, 3)
+
+
+def _obj(name: str, data: bytes):
+    points, edges, polygons = [], [], []
+    for number, line in enumerate(data.decode("utf-8", "replace").replace("\\\n", " ").splitlines(), 1):
+        words = line.partition("#")[0].split()
+        if not words or words[0] not in ("v", "l", "f"):
+            continue
+        try:
+            if words[0] == "v":
+                points.append([float(w) for w in words[1:4]])
+                if len(points[-1]) != 3:
+                    raise ValueError
+            else:
+                indices = [int(w.partition("/")[0]) for w in words[1:]]
+                indices = [i - 1 if i > 0 else len(points) + i if i < 0 else -1 for i in indices]
+                if len(indices) < (2 if words[0] == "l" else 3):
+                    raise ValueError
+                if words[0] == "l":
+                    edges += list(zip(indices, indices[1:], strict=False))
+                else:
+                    polygons.append(indices)
+        except ValueError:
+            raise ValueError(f"load: {name}, line {number}: {line.strip()!r} cannot be understood.") from None
+    none = np.zeros((0, 4), dtype=np.int64)
+    return np.array(points).reshape(-1, 3), np.array(edges, dtype=np.int64).reshape(-1, 2), _fans(polygons), none
+
+
+def _header(name: str, data: bytes):
+    """The format, the elements [(name, count, [(property, type, list count type or None)])], and where the body begins."""
+    stop = data.find(b"end_header")
+    if not data.startswith(b"ply") or stop < 0:
+        raise ValueError(f"load: {name} is not a PLY file; it has no header.")
+    begin = data.index(b"\n", stop) + 1
+    kind, elements = "", []
+    for line in data[:stop].decode("ascii", "replace").splitlines():
+        words = line.split()
+        try:
+            if words[:1] == ["format"]:
+                kind = words[1]
+            elif words[:1] == ["element"]:
+                elements.append((words[1], int(words[2]), []))
+            elif words[:2] == ["property", "list"]:
+                elements[-1][2].append((words[4], _TYPES[words[3]], _TYPES[words[2]]))
+            elif words[:1] == ["property"]:
+                elements[-1][2].append((words[2], _TYPES[words[1]], None))
+        except (IndexError, KeyError, ValueError):
+            raise ValueError(f"load: {name}: {line.strip()!r} in the header cannot be understood.") from None
+    if kind not in ("ascii", "binary_little_endian", "binary_big_endian"):
+        raise ValueError(f"load: {name}: format {kind!r} is unknown.")
+    return kind, elements, begin
+
+
+def _ply(name: str, data: bytes):
+    kind, elements, at = _header(name, data)
+    words, order, here = data[at:].split() if kind == "ascii" else [], ">" if "big" in kind else "<", 0
+    found: dict[str, dict[str, list]] = {}
+
+    def take(form: str, count: int) -> list:
+        nonlocal here, at
+        if kind == "ascii":
+            here += count
+            if here > len(words):
+                raise IndexError
+            return [float(w) if form[0] == "f" else int(w) for w in words[here - count : here]]
+        values = np.frombuffer(data, order + form, count, at)
+        at += values.nbytes
+        return values.tolist()
+
+    for element, count, properties in elements:
+        columns: dict[str, list] = {p: [] for p, _, _ in properties}
+        for k in range(count):
+            try:
+                for p, form, many in properties:
+                    columns[p].append(take(form, int(take(many, 1)[0])) if many else take(form, 1)[0])
+            except (IndexError, ValueError):
+                raise ValueError(f"load: {name}: element {element} {k} of {count} is incomplete or no number.") from None
+        found[element] = columns
+    vertex = found.get("vertex", {})
+    if not all(c in vertex for c in "xyz"):
+        raise ValueError(f"load: {name} has no vertices with x, y and z.")
+    edge, cells = found.get("edge", {}), []
+    for element in ("tetrahedron", "tetrahedra", "tetra", "tet", "cell"):
+        for k, cell in enumerate(_lists(found, element)):
+            if len(cell) != 4:
+                raise ValueError(f"load: {name}: element {element} {k} has {len(cell)} corners, but tetrahedra have 4.")
+            cells.append(cell)
+    return (
+        np.stack([np.array(vertex[c], dtype=np.float64) for c in "xyz"], axis=1),
+        np.array([edge.get("vertex1", []), edge.get("vertex2", [])], dtype=np.int64).T.reshape(-1, 2),
+        _fans(_lists(found, "face")),
+        np.array(cells, dtype=np.int64).reshape(-1, 4),
+    )
+
+
+def _lists(found: dict, element: str) -> list:
+    columns = found.get(element, {})
+    return next((columns[p] for p in ("vertex_indices", "vertex_index", "indices") if p in columns), [])
+
+
+def _to_ply(x: np.ndarray, shape: Shape, binary: bool) -> bytes:
+    head = ["ply", f"format {'binary_little_endian' if binary else 'ascii'} 1.0", f"element vertex {len(x)}"]
+    head += [f"property double {c}" for c in "xyz"]
+    parts: list[tuple[np.ndarray, str]] = [(x, "<f8")]
+    head += [f"element edge {len(shape.links)}", "property int vertex1", "property int vertex2"]
+    parts.append((shape.links, "<i4"))
+    for name, tuples in (("face", shape.faces), ("tetrahedron", shape.tetrahedra)):
+        head += [f"element {name} {len(tuples)}", "property list int int vertex_indices"]
+        parts.append((np.column_stack([np.full(len(tuples), tuples.shape[1]), tuples]), "<i4"))
+    out = ("\n".join([*head, "end_header"]) + "\n").encode("ascii")
+    if binary:
+        return out + b"".join(values.astype(form).tobytes() for values, form in parts)
+    rows = [" ".join(map(repr, row)) for values, _ in parts for row in values.tolist()]
+    return out + ("\n".join(rows) + "\n").encode("ascii")

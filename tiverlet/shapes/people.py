@@ -1,0 +1,69 @@
+"""Figures with joints."""
+
+import numpy as np
+
+from .. import checks
+from .shape import Shape, point
+
+# Heights and distances from the middle, of a height of 1, facing +x; and which point each part hangs on.
+_POINTS = {
+    "head": (0.0, 0.93, 0.0), "neck": (0.0, 0.82, 0.0), "chest": (0.0, 0.70, 0.0), "hip": (0.0, 0.53, 0.0),
+    "shoulder": (0.0, 0.80, 0.11), "elbow": (0.0, 0.62, 0.13), "hand": (0.0, 0.44, 0.14),
+    "joint": (0.0, 0.52, 0.06), "knee": (0.0, 0.28, 0.07), "foot": (0.0, 0.04, 0.07),
+}  # fmt: skip
+_NAMES = ["head", "neck", "chest", "hip"] + [
+    f"{side} {part}" for side in ("left", "right") for part in ("shoulder", "elbow", "hand", "joint", "knee", "foot")
+]
+# Joints: how far the path through three points may turn [rad]; in 2D from the first to the second limit, in 3D up to the larger.
+_TURNS = [
+    ("head", "neck", "chest", -0.6, 0.6), ("neck", "chest", "hip", -0.5, 0.5),
+    ("{} shoulder", "{} elbow", "{} hand", 0.0, 2.4), ("{} joint", "{} knee", "{} foot", -2.4, 0.0),
+    ("chest", "{} joint", "{} knee", -0.4, 2.0), ("neck", "{} shoulder", "{} elbow", -2.8, 2.8),
+]  # fmt: skip
+
+
+def ragdoll(feet, height: float = 1.8) -> Shape:
+    """A figure of 16 points that stands upright at `feet` [m], in 2D from the side, facing +x, or in 3D.
+
+    links: the bones; the trunk is braced by links of its own. limits, lower and upper: neck, back, elbows, knees, hips and
+    shoulders. radius: of head, trunk and limbs. Points are named in order by tv.shapes.people.NAMES.
+    """
+    base = point("ragdoll", "feet", feet)
+    height = checks.number("ragdoll", "height", height, above=0.0)
+    position = []
+    for name in NAMES:
+        side, _, part = name.rpartition(" ")
+        x, y, z = _POINTS[part]
+        position.append([x, y, -z if side == "left" else z])
+    x = np.array(position) * height
+    if len(base) == 2:  # from the side: the two sides are a hair apart, so that no link has length 0
+        x = x[:, :2] + 0.005 * height * np.sign(x[:, 2:])
+    number = {name: k for k, name in enumerate(NAMES)}
+
+    def pairs(*names):
+        return [(number[a], number[b]) for a, b in names]
+
+    links = pairs(("head", "neck"), ("neck", "chest"), ("chest", "hip"))
+    braces = []
+    for s in ("left", "right"):
+        arm, elbow, hand, leg, knee, foot = (f"{s} {p}" for p in ("shoulder", "elbow", "hand", "joint", "knee", "foot"))
+        links += pairs(("neck", arm), (arm, elbow), (elbow, hand), ("hip", leg), (leg, knee), (knee, foot))
+        braces += pairs(("chest", arm), ("head", arm), ("chest", leg))
+    braces += pairs(("left shoulder", "right shoulder"), ("left joint", "right joint"))
+    limits, lower, upper = [], [], []
+    for a, b, c, low, high in _TURNS:
+        for s in ("left", "right") if "{}" in a + b + c else ("",):
+            limits.append([number[n.format(s)] for n in (a, b, c)])
+            if len(base) == 3:
+                low, high = 0.0, max(abs(low), abs(high))
+            lower.append(low)
+            upper.append(high)
+    size = {"head": 0.065, "neck": 0.04, "chest": 0.07, "hip": 0.07}
+    radius = np.array([size.get(n, 0.03) for n in NAMES]) * height
+    return Shape(
+        base + x, np.array(links), np.array(braces), limits=np.array(limits), lower=np.array(lower), upper=np.array(upper),
+        radius=radius,
+    )  # fmt: skip
+
+
+NAMES = tuple(_NAMES)
