@@ -4,6 +4,7 @@ from . import runtime  # first: it sets what Taichi reads when it is imported  #
 from . import measure, shapes
 from .constraints import (
     AngleLimit,
+    Area,
     Ball,
     Bend,
     Box,
@@ -14,11 +15,15 @@ from .constraints import (
     Distance,
     HalfSpace,
     Mesh,
+    Path,
     Pin,
     Polygon,
     Rope,
     Sdf,
+    ShapeMatch,
+    Snap,
     Spacer,
+    Volume,
 )
 from .forces import Attractor, Drag, Force, Gravity, Wind
 from .particles import Particles
@@ -30,8 +35,8 @@ from .tools import approach, clamp, golden, golden_colors, golden_index, mix, sm
 from .world import World
 
 __all__ = [
-    "AngleLimit", "Attractor", "Ball", "Bend", "Box", "Capsule", "Constraint", "Contact", "Dihedral", "Distance", "Drag",
-    "Force", "Gravity", "HalfSpace", "Jacobi", "Mesh", "Particles", "Pin", "Polygon", "Recorder", "Rope", "Sdf", "Spacer",
-    "StepReport", "Wind", "World", "approach", "clamp", "golden", "golden_colors", "golden_index", "init", "measure", "mix",
-    "runtime", "shapes", "smoothstep",
+    "AngleLimit", "Area", "Attractor", "Ball", "Bend", "Box", "Capsule", "Constraint", "Contact", "Dihedral", "Distance",
+    "Drag", "Force", "Gravity", "HalfSpace", "Jacobi", "Mesh", "Particles", "Path", "Pin", "Polygon", "Recorder", "Rope",
+    "Sdf", "ShapeMatch", "Snap", "Spacer", "StepReport", "Volume", "Wind", "World", "approach", "clamp", "golden",
+    "golden_colors", "golden_index", "init", "measure", "mix", "runtime", "shapes", "smoothstep",
 ]  # fmt: skip

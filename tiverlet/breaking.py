@@ -51,13 +51,6 @@ class Breaking(Batch):
         return -scale * self.scene.memory.read(self._on_lam)[: self.count].astype(np.float64)
 
     @property
-    def residual(self) -> np.ndarray:
-        """What the last substep left of each violation, (m,), relative as in StepReport.residual; 0 where it is broken."""
-        if self.scene is None:
-            raise RuntimeError(f"{self!r}.residual: there is none before a world has been stepped with it.")
-        return self.scene.residuals(self)
-
-    @property
     def broken(self) -> np.ndarray:
         """Which constraints have broken so far, Boolean (m,)."""
         return self.stamps() > 0

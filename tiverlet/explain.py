@@ -50,8 +50,7 @@ def _present(world: "World") -> list[str]:
     out = []
     for f in world.features:
         if isinstance(f, Batch):
-            held = world._scene.inv_mass[f.indices]
-            idle = int((held == 0).all(axis=1).sum()) if f.count and not f.drives else 0
+            idle = int(f.idle(world._scene.inv_mass).sum()) if f.count and not f.drives else 0
             note = f", {idle} of them between particles that cannot move" if idle else ""
             out.append(f"{f!r}: {f.count} {'driven particles' if f.drives else 'constraints'}{note}")
         elif isinstance(f, Acceleration):

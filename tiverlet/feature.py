@@ -140,7 +140,9 @@ class Batch(Feature):
     particles of constraint c are: self.members(c, k); where their moves go: self.push(c, k, move).
     """
 
-    arity = 0
+    arity = 0  # 0: as many as each needs, see ragged.py
+    reweighs = False  # miss() needs weigh()
+    blocks = corner_count = 0  # of ragged batches: how much there is for weigh() and for spread() to do
     soft = False  # has springs, which act at a start
     breaks = False  # has constraints that a load can break
     drives = False  # puts its particles in place instead of relaxing them
@@ -152,9 +154,29 @@ class Batch(Feature):
         return len(self.indices)
 
     @property
+    def residual(self) -> np.ndarray:
+        """What the last substep left of each violation, (m,), relative as in StepReport.residual; 0 where it is broken."""
+        if self.scene is None:
+            raise RuntimeError(f"{self!r}.residual: there is none before a world has been stepped with it.")
+        return self.scene.residuals(self)
+
+    @property
     def broken(self) -> np.ndarray:
         """Which constraints have broken so far, Boolean (m,)."""
         return np.zeros(self.count, dtype=bool)
+
+    def members_of(self, c: int) -> np.ndarray:
+        """The particles of constraint c."""
+        return self.indices[c]
+
+    def idle(self, inv_mass: np.ndarray) -> np.ndarray:
+        """Whether each constraint has no particle that can move, (m,)."""
+        return (inv_mass[self.indices] == 0).all(axis=1)
+
+    def partners(self, particles: Particles) -> np.ndarray:
+        """Pairs of particles that may overlap, (k, 2), because this batch says where they are to each other."""
+        pairs = [self.indices[:, [a, b]] for a in range(self.arity) for b in range(a)]
+        return np.concatenate([*pairs, np.zeros((0, 2), dtype=np.int32)])
 
     def bind(self, scene: Scene) -> None:
         """Declare the particles and slots of each constraint."""
@@ -192,6 +214,14 @@ class Batch(Feature):
     @ti.func
     def kick(self, c, h):
         """Push what the constraint's spring, if it has one, adds to h^2 a at the present positions; for starts."""
+
+    @ti.func
+    def weigh(self, b, h, hh, first, fresh):
+        """Before relax() and kick() sum over block b of a ragged batch. first: -1 before kick()."""
+
+    @ti.func
+    def spread(self, e, h, hh, first, fresh):
+        """After relax() and kick(): push the move of corner e of a ragged batch."""
 
     @ti.func
     def miss(self, c, h, hh, when, fresh):

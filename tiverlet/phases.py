@@ -35,6 +35,7 @@ class Phases:
         self.drags = [f for f in accelerations if f.decays]
         self.decays = bool(self.drags)
         self.batches: list[Batch] = [b for b in batches if b.count]
+        self.ragged = [b for b in self.batches if b.blocks]
         self.drivers = drivers
         self.contacts = [contact] if contact else []
         self.grid, self.hashes = grid, bool(grid)
@@ -161,17 +162,33 @@ class Phases:
             self.integrate(i, h, t, tick, fresh)
         for f in ti.static(self.drivers):
             for c in range(f.count):
-                f.drive(c, when[1])
+                f.drive(c, h, when[1])
                 for k in ti.static(self.contacts):
                     k.watch(f.member(c, 0))
+
+    @ti.func
+    def weigh(self, h, hh, first, fresh, some: ti.template()):  # type: ignore[valid-type]
+        """The sums of constraints on many particles, by blocks. some: for which; those of the residual, or all."""
+        for f in ti.static([f for f in self.ragged if f.reweighs or some]):
+            for b in range(f.blocks):
+                f.weigh(b, h, hh, first, fresh)
+
+    @ti.func
+    def spread(self, h, hh, first, fresh):
+        """The moves of constraints on many particles."""
+        for f in ti.static(self.ragged):
+            for e in range(f.corner_count):
+                f.spread(e, h, hh, first, fresh)
 
     @ti.func
     def relax(self, h, when, first, last, fresh, final):
         """3 One pass: constraints into slots, particles gather them; contacts; walls."""
         hh = self.reach(h, fresh)
+        self.weigh(h, hh, first, fresh, True)
         for f in ti.static(self.batches):
             for c in range(f.count):
                 f.relax(c, h, hh, when, first, fresh)
+        self.spread(h, hh, first, fresh)
         for c in ti.static(self.contacts):
             if ti.static(len(self.batches) > 0):
                 for i in range(self.n):

@@ -9,7 +9,7 @@ import taichi as ti
 from . import checks
 from .breaking import Breaking
 from .compliance import law, stiff
-from .feature import Batch, Scene
+from .feature import Scene
 from .particles import Particles
 
 
@@ -32,6 +32,7 @@ class Scalar(Breaking):
     """
 
     side = 0  # 0: C = 0;  1: C <= 0, pulls when f > rest;  -1: C >= 0, pushes when f < rest
+    collapses = 0  # the power of a length that f is, where gradients vanish with the size of the body; else 0
     rest: Any  # a Knob in each constraint: (m,) array
     compliance: np.ndarray
     damping: np.ndarray
@@ -43,8 +44,7 @@ class Scalar(Breaking):
 
     def setup(self, indices, rest, compliance, damping, break_at=None) -> None:
         """Keep the arguments of __init__; what depends on the particles is checked in prepare()."""
-        self.indices = checks.indices(repr(self), self.index_name, indices, 2**31 - 1, arity=self.arity)
-        self._warn_duplicates()
+        self.lay(indices)
         m = self.count
         self.strengthen(break_at)
         self._rest_given = rest
@@ -53,17 +53,31 @@ class Scalar(Breaking):
         for array in (self.indices, self.compliance, self.damping):
             array.flags.writeable = False
 
+    def lay(self, indices) -> None:
+        """Keep the particles of each constraint."""
+        self.indices = checks.indices(repr(self), self.index_name, indices, 2**31 - 1, arity=self.arity)
+        self._warn_duplicates()
+
+    def fit(self, particles: Particles) -> None:
+        """Check the particles of each constraint against those that there are."""
+        checks.indices(repr(self), self.index_name, self.indices, particles.count, arity=self.arity)
+
+    @property
+    def goal(self) -> np.ndarray:
+        """What f is to be, (m,)."""
+        return self.rest
+
     def rest_of(self, position: np.ndarray) -> np.ndarray:
         """f at the given positions, (m,): the rest value when none is given."""
         raise NotImplementedError
 
     def violation(self, position: np.ndarray) -> np.ndarray:
         """C at the given positions, (m,)."""
-        return self.rest_of(position) - self.rest
+        return self.rest_of(position) - self.goal
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check indices against the number of particles and settle the rest values."""
-        checks.indices(repr(self), self.index_name, self.indices, particles.count, arity=self.arity)
+        self.fit(particles)
         if "rest" not in self.__dict__:
             if self._rest_given is None:
                 self.__dict__["rest"] = self.rest_of(particles.position)
@@ -72,15 +86,15 @@ class Scalar(Breaking):
 
     def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Warn of constraints that are violated between particles that cannot move."""
-        stuck = (inv_mass[self.indices] == 0).all(axis=1)
+        stuck = self.idle(inv_mass)
         if stuck.any():
             C = self.violation(particles.position)
             wrong = stuck & (
-                np.abs(C if self.side == 0 else np.maximum(self.side * C, 0)) > 1e-6 * np.maximum(np.abs(self.rest), 1e-6)
+                np.abs(C if self.side == 0 else np.maximum(self.side * C, 0)) > 1e-6 * np.maximum(np.abs(self.goal), 1e-6)
             )
             if wrong.any():
                 k = int(np.argmax(wrong))
-                at = tuple(int(i) for i in self.indices[k])
+                at = tuple(int(i) for i in self.members_of(k))
                 warnings.warn(
                     f"{self!r}: {self.index_name}[{k}] = {at} is off by {C[k]:g}, but its particles cannot move "
                     f"({int(wrong.sum())} such in all). They are skipped.",
@@ -97,7 +111,7 @@ class Scalar(Breaking):
             warnings.warn(
                 f"{self!r}: {len(ordered) - len(unique)} of the {self.index_name} are duplicates, the first of them {first}. "
                 "They act together: the same result where rigid, stiffer by their number where compliant.",
-                stacklevel=4,
+                stacklevel=5,
             )
 
     @property
@@ -107,14 +121,14 @@ class Scalar(Breaking):
 
     def bind(self, scene: Scene) -> None:
         """Declare rest values, multipliers, and for soft ones the memory that the averaged constraint needs."""
-        Batch.bind(self, scene)
+        super().bind(scene)
         self._on_real = scene.real
         self._on_soft = self.soft
         self._on_damped = self.soft and bool((self.damping > 0).any())
         start = self.rest_of(scene.particles.position) if self.count else np.zeros(0)
         self._on_scale = self.unit or (float(np.abs(start).mean()) if np.any(start) else scene.size)
         name, m, add = repr(self), self.count, scene.memory.field
-        self._on_rest = add(f"{name}.rest", m, values=self.rest)
+        self._on_rest = add(f"{name}.rest", m, values=self.goal)
         self._on_lam = add(f"{name}.multiplier", m, state=True)
         if self._on_soft:
             self._on_alpha = add(f"{name}.compliance", m, values=self.compliance)
@@ -128,7 +142,7 @@ class Scalar(Breaking):
     def upload(self) -> None:
         """Write new rest values."""
         if self.scene and self.count:
-            self.scene.memory.write(self._on_rest, self.rest)
+            self.scene.memory.write(self._on_rest, self.goal)
 
     @ti.func
     def measure(self, c, q):
@@ -201,16 +215,22 @@ class Scalar(Breaking):
         turned = both < 0.75 * ti.sqrt(here * there) or there == 0
         if turned:
             n, both = g, here
+        violation, A, alpha, lam, W = self.equation(c, f, f0, w, both, h, hh, first, fresh)
+        return violation, A, alpha, lam, W, n, g, turned and self.distinct(f, f0)
+
+    @ti.func
+    def equation(self, c, f, f0, w, W, h, hh, first, fresh):
+        """A C + B + alpha' lam, A, alpha', lam and W (0 where it is broken), from f at the end and at the start, and w."""
         if ti.static(self.breaks):
             if not self.holds(c):
-                both = 0
+                W = 0
         C, A = f - self._on_rest[c], ti.cast(1, self._on_real)
         B, alpha = ti.cast(0, self._on_real), ti.cast(0, self._on_real)
         lam = self._on_lam[c]
         if first != 0:
             lam = 0
         if ti.static(self._on_soft):
-            if both > 0:
+            if W > 0:
                 A, now, last = law(self._on_alpha[c], self.dashpot(c), h, w, fresh)
                 alpha = self._on_alpha[c] / hh
                 if first != 0:
@@ -220,7 +240,7 @@ class Scalar(Breaking):
                     self._on_last[c] = f0
                 else:
                     B = self._on_history[c]
-        return A * C + B + alpha * lam, A, alpha, lam, both, n, g, turned and self.distinct(f, f0)
+        return A * C + B + alpha * lam, A, alpha, lam, W
 
     @ti.func
     def solve(self, c, h, hh, first, fresh):
@@ -229,6 +249,29 @@ class Scalar(Breaking):
         Returns the multiplier before and after, the size of the violation that this removes, and the direction (arity, dim).
         """
         violation, A, alpha, lam, W, n, _, turned = self.known(c, h, hh, first, fresh)
+        new, size = self.answer(violation, A, alpha, lam, W, turned)
+        if ti.static(self.collapses > 0):
+            q, move = self.corners(c, 0), ti.cast(0, self._on_real)
+            for k in ti.static(range(self.arity)):
+                move += self._on_w[self.member(c, k)] ** 2 * n[k, :].dot(n[k, :])
+            new = self.tempered(c, lam, new, q.norm_sqr(), move)
+        return lam, new, size, n
+
+    @ti.func
+    def tempered(self, c, lam, new, extent, move):
+        """Next to where it has no direction, f is curved: no pass moves corners further than they are, or are to be, apart.
+
+        extent: squared size of the body. move: squared size of what a multiplier of 1 moves.
+        """
+        reach = ti.sqrt(extent) + ti.pow(ti.abs(self._on_rest[c]), ti.static(1 / self.collapses))
+        far = ti.abs(new - lam) * ti.sqrt(move)
+        if far > reach:
+            new = lam + (new - lam) * (reach / far)
+        return new
+
+    @ti.func
+    def answer(self, violation, A, alpha, lam, W, turned):
+        """The multiplier of a Jacobi pass, and the size of the violation that it removes."""
         new, size = lam, ti.cast(0, self._on_real)
         if W > 0:
             new = lam - self._on_slots.relaxation * violation / (A * W + alpha)
@@ -237,7 +280,7 @@ class Scalar(Breaking):
             size = ti.abs(new - lam) * (A * W + alpha) / self._on_slots.relaxation
             if turned and new != lam:
                 self._on_slots.turned[None] = 1
-        return lam, new, size, n
+        return new, size
 
     @ti.func
     def relax(self, c, h, hh, when, first, fresh):
@@ -255,32 +298,48 @@ class Scalar(Breaking):
         """
         f, g = self.measure(c, self.corners(c, 0))
         f = self.near(f, self._on_rest[c])
+        f0, w = f, ti.cast(0, self._on_real)
+        if ti.static(self._on_damped):
+            f0, _ = self.measure(c, self.corners(c, 1))
+        for k in ti.static(range(self.arity)):
+            w += self._on_w[self.member(c, k)] * g[k, :].dot(g[k, :])
+        force = self.force(c, f, self.near(f0, f), w, h)
+        for k in ti.static(range(self.arity)):
+            self.push(c, k, h * h * self._on_w[self.member(c, k)] * force * g[k, :])
+
+    @ti.func
+    def force(self, c, f, f0, w, h):
+        """F of kick(), from f now and a substep ago."""
         force = ti.cast(0, self._on_real)
         if ti.static(self._on_soft):
-            w = ti.cast(0, self._on_real)
-            for k in ti.static(range(self.arity)):
-                w += self._on_w[self.member(c, k)] * g[k, :].dot(g[k, :])
             alpha = self._on_alpha[c]
             if w > 0 and alpha > 0 and self.holds(c):
                 resolved = 1 - stiff(alpha, h, w)
                 C = self.bounded(f - self._on_rest[c])
                 force = -resolved * C / alpha
                 if ti.static(self._on_damped):
-                    f0, _ = self.measure(c, self.corners(c, 1))
                     if ti.static(self.side == 0) or C != 0:
-                        force -= resolved * self._on_damping[c] * (f - self.near(f0, f)) / h
-        for k in ti.static(range(self.arity)):
-            self.push(c, k, h * h * self._on_w[self.member(c, k)] * force * g[k, :])
+                        force -= resolved * self._on_damping[c] * (f - f0) / h
+        return force
 
     @ti.func
     def miss(self, c, h, hh, when, fresh):
         """The violation that is left, relative to the rest value (to the batch's mean f where that is 0)."""
         _, _, violation, _ = self.solve(c, h, hh, 0, fresh)
+        if ti.static(self.collapses > 0):
+            f, g = self.measure(c, self.corners(c, 0))
+            if g.norm_sqr() == 0 and self.holds(c):
+                violation = ti.abs(self.bounded(f - self._on_rest[c]))
+        return violation / self.extent(c)
+
+    @ti.func
+    def extent(self, c):
+        """What the residual of constraint c is relative to."""
         size = ti.cast(self._on_scale, self._on_real)
         if ti.static(not self.unit):
             if self._on_rest[c] != 0:
                 size = ti.abs(self._on_rest[c])
-        return violation / size
+        return size
 
     @ti.func
     def energy(self, c, back):

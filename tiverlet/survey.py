@@ -170,6 +170,8 @@ class Survey:
     @ti.kernel
     def measure(self, h64: ti.f64, t64: ti.f64, fresh: ti.i32, begin: ti.i32) -> Figures:
         """All figures; fresh: the last substep was a start; begin: d holds velocities, no step was made yet."""
+        h32 = ti.cast(h64, self.sub.real)
+        self.sub.weigh(h32, self.sub.reach(h32, fresh), 0, fresh, False)
         for thread in range(BLOCKS * self.spread):
             if thread % self.spread == 0:
                 h, t = ti.cast(h64, self.sub.real), ti.cast(t64, self.sub.real)
@@ -269,6 +271,8 @@ class Residuals:
     @ti.kernel
     def measure(self, h64: ti.f64, fresh: ti.i32, out: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
         """Of every constraint."""
+        h32 = ti.cast(h64, self.sub.real)
+        self.sub.weigh(h32, self.sub.reach(h32, fresh), 0, fresh, False)
         for c in range(self.batch.count):
             h = ti.cast(h64, self.sub.real)
             out[c] = self.batch.miss(c, h, self.sub.reach(h, fresh), self.sub.clock(0, 1), fresh)

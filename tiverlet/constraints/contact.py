@@ -89,7 +89,7 @@ class Contact(Touch):
     def join(self, scene: Scene, batches: list[Batch], parallel: bool) -> Grid:
         """Declare the fields, among them the grid's."""
         n, dim = scene.particles.count, scene.particles.dim
-        pairs = [b.indices[:, [a, c]] for b in batches for a in range(b.arity) for c in range(a)]
+        pairs = [b.partners(scene.particles) for b in batches]
         linked = np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=np.int32)
         self.scene = scene
         self._on_state = scene.state

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import checks
-from ..constraints import Box
+from ..constraints import Box, Path
 from ..feature import Batch
 from ..tools import golden_colors
 from ..wall import Wall
@@ -111,7 +111,7 @@ class Recorder:
             whole = f.indices[~f.broken] if f.breaks else f.indices
             self._stream.log(f"{SCENE}/links/{k}", self._strips.from_fields(strips=x[whole]), strict=True)
         for k, f in enumerate(world.features):
-            if isinstance(f, Wall):
+            if isinstance(f, (Wall, Path)):
                 self._wall(k, f)
         if number and world.last is not None:
             for name, value in _figures(world, number).items():

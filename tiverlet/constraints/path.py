@@ -1,0 +1,253 @@
+"""Beads on a wire."""
+
+import warnings
+
+import numpy as np
+import taichi as ti
+
+from .. import checks
+from ..curve import Curve
+from ..feature import Knob, Scene
+from ..particles import Particles
+from ..tether import Tether
+
+WALK = 64  # steps along the pieces of a path, at most, that a search takes
+
+
+class Path(Tether):
+    """Particles on a curve: free to slide without friction, or driven along it.
+
+    C(x) = x - P(s), a vector across the curve. Free, s is where the plane across the curve at the start of the substep, through
+    the predicted place, meets the curve: the force of the wire has no part along it (SHAKE). Second order, and energy is kept.
+    Where the curve turns by more than 41 degrees in a substep the nearest point takes its place, and it is flagged. At the
+    ends of an open curve particles stop.
+
+    indices: (m,) particles. points: (k, dim) [m], along the curve. closed: from the last point back to the first.
+    smooth: a cubic spline through the points, with continuous curvature; otherwise a polyline, with corners.
+    speed: number or (m,) [m/s]; driven at this speed, positive in the order of the points. Live.
+    at: number or (m,) [m]; driven to this arc length, evenly during each frame in which it changes. Live. Not with `speed`.
+    compliance: number or (m,) [m/N], of a soft wire; damping: number or (m,) [N s/m], across it. Free particles only.
+
+    `length` is that of the curve [m], `place(s)` its points, `load` the force of the wire on each particle [N].
+    """
+
+    speed = Knob(lambda f, v: checks.per_item("Path", "speed", v, f.count), "Along the curve [m/s], (m,).")
+    at = Knob(lambda f, v: checks.per_item("Path", "at", v, f.count), "Arc length at the end of the next frame [m].")
+
+    def __init__(
+        self, indices, points, *, closed=False, smooth=True, speed=None, at=None, compliance=0.0, damping=0.0
+    ):  # fmt: skip
+        self.setup(indices, compliance, damping)
+        self.points = checks.points("Path", "points", points)
+        self.points.flags.writeable = False
+        if len(self.points) < (3 if closed else 2):
+            raise ValueError(f"Path: {len(self.points)} points make no {'closed' if closed else 'open'} curve.")
+        steps = np.linalg.norm(np.diff(self.points, axis=0, append=self.points[:1]), axis=1)
+        if (steps[: None if closed else -1] == 0).any():
+            k = int(np.argmin(steps))
+            raise ValueError(f"Path: points[{k}] and the next are the same, {tuple(map(float, self.points[k]))}; leave one out.")
+        self.curve = Curve(self.points, bool(closed), bool(smooth))
+        self.driven = speed is not None or at is not None
+        if speed is not None and at is not None:
+            raise ValueError("Path: speed and at exclude each other; give one of them, or none for free particles.")
+        if self.driven and self.soft:
+            raise ValueError("Path: driven particles take no compliance; they go along whatever pulls at them.")
+        if speed is not None:
+            self.speed = speed
+        if at is not None:
+            self.at = at
+
+    @property
+    def drives(self) -> bool:
+        """Whether the particles are driven."""
+        return self.driven
+
+    @property
+    def length(self) -> float:
+        """Length of the curve [m]."""
+        return self.curve.length
+
+    def place(self, s) -> np.ndarray:
+        """Points of the curve at arc lengths s [m]."""
+        return self.curve.at(s)
+
+    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Driven particles cannot be moved by anything else."""
+        super().prepare(particles, inv_mass)
+        checks.points("Path", "points", self.points, dim=particles.dim)
+        rows = self.indices[:, 0]
+        self._start = self.curve.nearest(particles.position[rows])
+        if self.driven:
+            inv_mass[rows] = 0.0
+
+    def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Warn of particles that are not on the curve."""
+        x = particles.position[self.indices[:, 0]]
+        off = np.linalg.norm(x - self.curve.at(self._start), axis=1)
+        if not self.driven and not self.soft and (off > 1e-2 * self.length).any():
+            k = int(np.argmax(off))
+            at = tuple(round(float(v), 6) for v in self.curve.at(self._start[k]))
+            warnings.warn(
+                f"Path: particle {self.indices[k, 0]} starts {off[k]:.3g} m off the curve, which throws it. Start at {at}.",
+                stacklevel=3,
+            )
+
+    def begin(self, position: np.ndarray) -> np.ndarray:
+        """C at the start."""
+        return position[self.indices[:, 0]] - self.curve.at(self._start)
+
+    def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
+        """The curve, for pictures."""
+        return self.curve.at(np.linspace(0, self.length * (1 - 1e-12), 4 * len(self.curve.lengths) + 1))[None], 0.0
+
+    def bind(self, scene: Scene) -> None:
+        """The curve, and where each particle is on it."""
+        super().bind(scene)
+        c, dim, add, m = self.curve, scene.particles.dim, scene.memory.field, self.count
+        self._on_pieces, self._on_closed = len(c.lengths), c.closed
+        self._on_a, self._on_b, self._on_c, self._on_d = (
+            add(f"Path.{name}", self._on_pieces, width=dim, values=v)
+            for name, v in (("points", c.a), ("tangents", c.b), ("second", c.c), ("third", c.d))
+        )
+        self._on_lengths = add("Path.lengths", self._on_pieces, values=c.lengths)
+        piece, rest = c.split(self._start)
+        self._on_piece = add("Path.piece", m, kind=ti.i32, values=piece, state=True)
+        self._on_rest = add("Path.rest", m, values=rest, state=True)
+        self._on_least = scene.size * (2.0**-22 if scene.real == ti.f32 else 2.0**-44)
+        if self.driven:
+            self._on_moves = "speed" in self.__dict__
+            self._on_begin = add("Path.begin", self._on_pieces + 1, kind=ti.f64, values=c.starts)
+            self._on_from = add("Path.from", m, kind=ti.f64, values=self._start, state=True)
+            self._on_to = add("Path.to", m, kind=ti.f64, values=self.speed if self._on_moves else self._start, state=True)
+        else:
+            self._on_tangent = add("Path.tangent", m, width=dim)
+
+    def upload(self) -> None:
+        """Take the new speed, or aim at the new arc lengths."""
+        if self.scene and self.count and self.driven:
+            self.scene.memory.write(self._on_to, self.speed if self._on_moves else self.at)
+            self.moving = not self._on_moves
+
+    def settle(self) -> None:
+        """The next frame starts from where this one went."""
+        if self.scene and self.count:
+            self.scene.memory.write(self._on_from, self.at)
+
+    @ti.func
+    def point(self, k, r):
+        """P and dP/dr on piece k."""
+        b, c, d = self._on_b[k], self._on_c[k], self._on_d[k]
+        return self._on_a[k] + r * (b + r * (c + r * d)), b + r * (2 * c + 3 * r * d)
+
+    @ti.func
+    def drive(self, c, h, when):
+        """Put the particle where it is to be."""
+        s, length = self._on_from[c], self._on_begin[self._on_pieces]
+        if ti.static(self._on_moves):
+            s += self._on_to[c] * h
+            self._on_from[c] = s
+        else:
+            s = s * (1 - when) + self._on_to[c] * when
+        if ti.static(self._on_closed):
+            s -= ti.floor(s / length) * length
+        else:
+            s = ti.min(ti.max(s, 0), length)
+        low, high = 0, self._on_pieces
+        while high - low > 1:
+            middle = (low + high) // 2
+            if self._on_begin[middle] <= s:
+                low = middle
+            else:
+                high = middle
+        P, T = self.point(low, ti.cast(s - self._on_begin[low], self._on_real))
+        i = self.member(c, 0)
+        d = P - self._on_state.place(i)
+        self._on_state.d[i] = d
+        self._on_state.advance(i, d)
+
+    @ti.func
+    def search(self, x):
+        """The piece nearest to x, and how far along it, as if it were straight."""
+        best, piece, rest = ti.cast(ti.math.inf, self._on_real), 0, 0 * x[0]
+        for k in range(self._on_pieces):
+            a, end = self._on_a[k], self.point(k, self._on_lengths[k])[0]
+            along = end - a
+            u = ti.min(ti.max((x - a).dot(along) / along.dot(along), 0), 1)
+            far = (x - a - u * along).norm_sqr()
+            if far < best:
+                best, piece, rest = far, k, u * self._on_lengths[k]
+        return piece, rest
+
+    @ti.func
+    def foot(self, k, r, x, t, across):
+        """Where, from rest r on piece k on, the plane through x across t meets the curve; or else the point nearest to x.
+
+        Also says whether the curve turned away from t by more than 41 degrees, or the way was too long.
+        """
+        going, bent, came = True, False, -1
+        for _ in range(WALK):
+            if going:
+                P, T = self.point(k, r)
+                n, length = T, self._on_lengths[k]
+                if across:
+                    n = t
+                    bent = T.dot(t) < 0.75 * T.norm()
+                step = (x - P).dot(n) / T.dot(n)
+                if bent:
+                    going = False
+                elif r + step > length:
+                    ahead = k + 1 if k + 1 < self._on_pieces else 0
+                    if ahead == came or (ti.static(not self._on_closed) and ahead == 0):
+                        r, going = length, False
+                    else:
+                        came, k, r = k, ahead, 0 * r
+                elif r + step < 0:
+                    ahead = k - 1 if k > 0 else self._on_pieces - 1
+                    if ahead == came or (ti.static(not self._on_closed) and k == 0):
+                        r, going = 0 * r, False
+                    else:
+                        came, k, r = k, ahead, self._on_lengths[ahead]
+                else:
+                    r, came, going = r + step, -1, ti.abs(step) > self._on_least
+        return k, r, bent or going
+
+    @ti.func
+    def offsets(self, c, when, first, fresh):
+        """Across the curve, from where the plane across it meets it; at an end or a bend, from the nearest point."""
+        i = self.member(c, 0)
+        x, t, C0 = self._on_state.place(i), self._on_tangent[c], 0 * self._on_tangent[c]
+        k, r = self._on_piece[c], self._on_rest[c]
+        if first != 0:
+            start = x - self._on_state.d[i]
+            if fresh != 0:
+                k, r = self.search(start)
+            k, r, lost = self.foot(k, r, start, t, False)
+            self._on_piece[c], self._on_rest[c] = k, r
+            P, T = self.point(k, r)
+            t, C0 = T / T.norm(), start - P
+            self._on_tangent[c] = t
+        k, r, bent = self.foot(k, r, x, t, True)
+        if bent:
+            k, r, lost = self.foot(self._on_piece[c], self._on_rest[c], x, t, False)
+            self._on_slots.turned[None] = 1
+        P, T = self.point(k, r)
+        C = x - P
+        ends = ti.static(not self._on_closed) and ((k == 0 and r <= 0) or (k == self._on_pieces - 1 and r >= self._on_lengths[k]))
+        if not (bent or ends):
+            C -= C.dot(t) * t
+        return C, C0
+
+    @ti.func
+    def present(self, c, back):
+        """From the nearest point."""
+        i = self.member(c, 0)
+        x = self._on_state.place(i) - back * self._on_state.d[i]
+        k, r, lost = self.foot(self._on_piece[c], self._on_rest[c], x, x, False)
+        P, T = self.point(k, r)
+        return x - P
+
+    @ti.func
+    def change(self, c):
+        """What of the motion is across the curve."""
+        d, t = self._on_state.d[self.member(c, 0)], self._on_tangent[c]
+        return d - d.dot(t) * t

@@ -1,0 +1,93 @@
+"""A tidy grid."""
+
+import numpy as np
+import taichi as ti
+
+from .. import checks
+from ..feature import Scene
+from ..particles import Particles
+from ..tether import Tether
+
+
+class Snap(Tether):
+    """Particles drawn to the nearest node of a grid, as by a spring.
+
+    C(x) = x - node(x_n), the node nearest to the particle at the start of the substep; unit gradients. The energy
+    |C|^2 / (2 compliance) is continuous where the node changes, half way between two.
+
+    indices: (m,) particles. spacing: of the grid, number or (dim,) [m], above 0; inf leaves an axis free.
+    origin: one of the nodes, number or (dim,) [m].
+    compliance: number or (m,) [m/N], above 0: a rigid grid would be a Pin. damping: number or (m,) [N s/m].
+
+    `load` is the force on each particle [N].
+    """
+
+    def __init__(self, indices, spacing, origin=0.0, *, compliance, damping=0.0):
+        self.setup(indices, compliance, damping)
+        if (self.compliance == 0).any():
+            i = int(np.argmin(self.compliance))
+            raise ValueError(f"Snap: compliance[{i}] = 0, but a rigid grid leaves nothing free; use Pin, or a small compliance.")
+        self.spacing, self.origin = spacing, origin
+
+    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Settle the grid."""
+        super().prepare(particles, inv_mass)
+        dim = particles.dim
+        self._spacing = checks.per_item("Snap", "spacing", self.spacing, dim, infinite=True, above=0.0)
+        self._origin = checks.per_item("Snap", "origin", self.origin, dim)
+
+    def node(self, position: np.ndarray) -> np.ndarray:
+        """The nodes nearest to positions (m, dim)."""
+        free = np.isinf(self._spacing)
+        step = np.where(free, 1.0, self._spacing)
+        return np.where(free, position, self._origin + np.floor((position - self._origin) / step + 0.5) * step)
+
+    def begin(self, position: np.ndarray) -> np.ndarray:
+        """C at the start."""
+        x = position[self.indices[:, 0]]
+        return x - self.node(x)
+
+    def bind(self, scene: Scene) -> None:
+        """The node of each particle."""
+        super().bind(scene)
+        dim, free = scene.particles.dim, np.isinf(self._spacing)
+        add, x = scene.memory.field, scene.particles.position[self.indices[:, 0]]
+        self._on_grid = add("Snap.grid", 2, width=dim, values=[self._origin, np.where(free, 0.0, self._spacing)])
+        self._on_node = add("Snap.node", self.count, width=dim, values=self.node(x), state=True)
+        self.changed = False
+
+    @ti.func
+    def nearest(self, x):
+        """The node nearest to x; x itself along axes that are free."""
+        node = x
+        for k in ti.static(range(self._on_state.dim)):
+            step, zero = self._on_grid[1][k], self._on_grid[0][k]
+            if step > 0:
+                node[k] = zero + ti.floor((x[k] - zero) / step + 0.5) * step
+        return node
+
+    @ti.func
+    def offsets(self, c, when, first, fresh):
+        """x - node; what is remembered of the substep before is put in terms of the same node."""
+        i = self.member(c, 0)
+        x, start = self._on_state.place(i), self._on_state.place(i) - self._on_state.d[i]
+        if first != 0:
+            node = self.nearest(start)
+            self._on_last[c] += self._on_node[c] - node
+            for k in ti.static(range(self._on_state.dim)):
+                if self._on_grid[1][k] == 0:
+                    self._on_last[c][k] = 0
+            self._on_node[c] = node
+        node = self._on_node[c]
+        C = x - node
+        for k in ti.static(range(self._on_state.dim)):
+            if self._on_grid[1][k] == 0:
+                C[k] = 0
+        return C, start - node
+
+    @ti.func
+    def present(self, c, back):
+        """x - node."""
+        i = self.member(c, 0)
+        x = self._on_state.place(i) - back * self._on_state.d[i]
+        return x - self.nearest(x)

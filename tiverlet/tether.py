@@ -1,0 +1,144 @@
+"""Particles drawn to a place, each by itself: what pins, paths and grids share."""
+
+import numpy as np
+import taichi as ti
+
+from . import checks
+from .compliance import law, stiff
+from .feature import Batch, Scene
+from .particles import Particles
+
+
+class Tether(Batch):
+    """One particle each, with the vector C(x) = x - place, from soft to rigid: give offsets() and present().
+
+    The formula of Scalar for each axis alike; the gradients are unit vectors.
+    """
+
+    arity = 1
+    compliance: np.ndarray
+    damping: np.ndarray
+
+    def setup(self, indices, compliance, damping) -> None:
+        """Keep the arguments of __init__."""
+        who = repr(self)
+        rows = checks.indices(who, "indices", indices, 2**31 - 1)
+        if len(np.unique(rows)) < len(rows):
+            values, counts = np.unique(rows, return_counts=True)
+            raise ValueError(f"{who}: particle {values[counts > 1][0]} is named twice, and can have only one place.")
+        self.indices = rows[:, None]
+        self.compliance = checks.per_item(who, "compliance", compliance, len(rows), least=0.0)
+        self.damping = checks.per_item(who, "damping", damping, len(rows), least=0.0)
+        for array in (self.indices, self.compliance, self.damping):
+            array.flags.writeable = False
+
+    @property
+    def soft(self) -> bool:
+        """Whether any of them is a spring."""
+        return bool((self.compliance > 0).any())
+
+    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Check that the particles exist."""
+        checks.indices(repr(self), "indices", self.indices[:, 0], particles.count)
+
+    def begin(self, position: np.ndarray) -> np.ndarray:
+        """C at the start, (m, dim)."""
+        return np.zeros((self.count, position.shape[1]))
+
+    def bind(self, scene: Scene) -> None:
+        """For what is not driven its multiplier, and for springs their memory."""
+        super().bind(scene)
+        self._on_size, self._on_real, self._on_soft = scene.size, scene.real, self.soft
+        if not self.drives:
+            name, m, dim, add = repr(self), self.count, scene.particles.dim, scene.memory.field
+            self._on_lam = add(f"{name}.multiplier", m, width=dim, state=True)
+            if self.soft:
+                self._on_alpha = add(f"{name}.compliance", m, values=self.compliance)
+                self._on_damping = add(f"{name}.damping", m, values=self.damping)
+                self._on_last = add(f"{name}.last", m, width=dim, values=self.begin(scene.particles.position), state=True)
+                self._on_history = add(f"{name}.history", m, width=dim)
+
+    @property
+    def load(self) -> np.ndarray:
+        """The force on each particle during the last substep [N], (m, dim)."""
+        if self.scene is None:
+            raise RuntimeError(f"{self!r}.load: there is none before a world has been stepped with it.")
+        if self.drives:
+            raise RuntimeError(f"{self!r}.load: driven particles are taken along whatever it takes; give compliance to measure.")
+        scale = 1 / self.scene.hh if self.scene.hh else 0.0
+        return scale * self.scene.memory.read(self._on_lam)[: self.count].astype(np.float64)
+
+    @ti.func
+    def offsets(self, c, when, first, fresh):
+        """C at the end and at the start of the substep."""
+        zero = 0 * self._on_state.d[0]
+        return zero, zero
+
+    @ti.func
+    def present(self, c, back):
+        """C at x - back d."""
+        return 0 * self._on_state.d[0]
+
+    @ti.func
+    def change(self, c):
+        """How far C changed in the last substep, by the motion of the particle."""
+        return self._on_state.d[self.member(c, 0)]
+
+    @ti.func
+    def solve(self, c, h, hh, when, first, fresh):
+        """Multiplier before and after, and the size of the violation that this removes."""
+        w = self._on_w[self.member(c, 0)]
+        C, C0 = self.offsets(c, when, first, fresh)
+        lam, B = self._on_lam[c], 0 * C
+        if first != 0:
+            lam = 0 * lam
+        new, size = lam, 0 * w
+        if w > 0:
+            alpha, A = 0 * w, 1 + 0 * w
+            if ti.static(self._on_soft):
+                alpha = self._on_alpha[c] / hh
+                A, now, last = law(self._on_alpha[c], self._on_damping[c], h, w, fresh)
+                if first != 0:
+                    self._on_history[c] = now * C0 + last * self._on_last[c]
+                    self._on_last[c] = C0
+                B = self._on_history[c]
+            K = A * self._on_slots.split[self.member(c, 0)] + alpha
+            new = lam - self._on_slots.relaxation * (A * C + B + alpha * lam) / K
+            size = (new - lam).norm() * K / self._on_slots.relaxation
+        return lam, new, size
+
+    @ti.func
+    def relax(self, c, h, hh, when, first, fresh):
+        """Draw the particle to its place."""
+        lam, new, size = self.solve(c, h, hh, when, first, fresh)
+        self._on_lam[c] = new
+        self.push(c, 0, self._on_w[self.member(c, 0)] * (new - lam))
+
+    @ti.func
+    def kick(self, c, h):
+        """As in Scalar, for each axis."""
+        move = 0 * self._on_state.d[0]
+        if ti.static(self._on_soft):
+            w, alpha = self._on_w[self.member(c, 0)], self._on_alpha[c]
+            if w > 0 and alpha > 0:
+                C = self.present(c, 0)
+                rate = self.change(c) / h
+                move = -h * h * w * (1 - stiff(alpha, h, w)) * (C / alpha + self._on_damping[c] * rate)
+        self.push(c, 0, move)
+
+    @ti.func
+    def miss(self, c, h, hh, when, fresh):
+        """What is left, relative to the size of the scene."""
+        _, _, size = self.solve(c, h, hh, when, 0, fresh)
+        return size / self._on_size
+
+    @ti.func
+    def energy(self, c, back):
+        """|C|^2 / (2 alpha)."""
+        out = ti.cast(0, ti.f64)
+        if ti.static(self._on_soft):
+            alpha = self._on_alpha[c]
+            if alpha > 0:
+                C = self.present(c, back)
+                out = ti.cast(C.dot(C) / (2 * alpha), ti.f64)
+        return out
