@@ -135,6 +135,7 @@ def test_unused_files_change_no_bit(tmp_path):
     text = init.read_text()
     for title in ("Attractor", "Drag", "Force", "Wind", "Rope", "Spacer"):
         text = text.replace(f'"{title}", ', "").replace(f"{title}, ", "").replace(f", {title}\n", "\n")
+        text = text.replace(f"    {title},\n", "")
     init.write_text(text)
     code = """
 import sys

@@ -25,7 +25,7 @@ class Calm:
     def __init__(self, contact: Any):
         scene = contact.scene
         self.contact, self.state, self.real = contact, scene.state, scene.real
-        self.earlier = contact._on_move  # is free at the end of a substep
+        self.change = contact._on_move  # is free at the end of a substep
         self.factors = scene.memory.field("Contact.chebyshev", PASSES, values=chebyshev(PASSES, CONDITION))
 
     @ti.func
@@ -40,7 +40,7 @@ class Calm:
 
     @ti.func
     def want(self, i, k):
-        """Pass k for particle i: d' = factor (d + 2 / (1 + 1 / CONDITION) want - earlier) + earlier, put where `earlier` was."""
+        """Pass k for particle i: what changes d. change' = (factor - 1) change + factor 2 / (1 + 1 / CONDITION) want."""
         want, w = 0 * self.state.d[i], self.state.w[i]
         if self.contact._on_split[i] > 0:
             for e in range(self.contact._on_grid.first[i], self.contact._on_grid.first[i] + self.contact._on_grid.number[i]):
@@ -56,18 +56,14 @@ class Calm:
                 size = lean.dot(lean)
                 if size > 0:
                     want -= want.dot(lean) / size * lean
-            d, earlier = self.state.d[i], self.earlier[i]
-            if k == 0:
-                earlier = d
-            self.earlier[i] = self.factors[k] * (d + ti.static(2 / (1 + 1 / CONDITION)) * want - earlier) + earlier
+            factor = self.factors[k]
+            self.change[i] = (factor - 1) * self.change[i] + (factor * ti.static(2 / (1 + 1 / CONDITION))) * want
 
     @ti.func
     def move(self, i):
-        """d becomes d', `earlier` becomes d."""
+        """Change d."""
         if self.contact._on_split[i] > 0:
-            d = self.state.d[i]
-            self.state.d[i] = self.earlier[i]
-            self.earlier[i] = d
+            self.state.d[i] += self.change[i]
 
 
 def chebyshev(passes: int, condition: float) -> np.ndarray:

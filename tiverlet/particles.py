@@ -2,6 +2,7 @@
 
 import numpy as np
 import taichi as ti
+from numpy.typing import ArrayLike
 
 from . import checks
 from .runtime import Memory
@@ -23,7 +24,10 @@ class Particles:
     structure, fixed when a world is built. To move particles, assign to world.position and world.velocity.
     """
 
-    def __init__(self, position, *, velocity=0.0, mass=1.0, radius=0.0, pinned=(), group=0):
+    def __init__(
+        self, position: ArrayLike, *, velocity: ArrayLike = 0.0, mass: ArrayLike = 1.0, radius: ArrayLike = 0.0,
+        pinned: ArrayLike = (), group: ArrayLike = 0,
+    ):  # fmt: skip
         who = "Particles"
         self.position = checks.points(who, "position", position)
         self.count, self.dim = self.position.shape
