@@ -3,6 +3,8 @@
 import pathlib
 import re
 
+import pytest
+
 from .conftest import python
 
 ROOT = pathlib.Path(__file__).parent.parent
@@ -42,3 +44,8 @@ def test_other_demos_check_themselves():
     assert "formula" in python((ROOT / "demos" / "cradle.py").read_text()).stdout
     assert "carries 1.0" in python((ROOT / "demos" / "net.py").read_text()).stdout
     assert "through the neck" in python((ROOT / "demos" / "hourglass.py").read_text()).stdout
+
+
+@pytest.mark.parametrize("name", ["soft", "bead", "tidy", "cloth", "ragdoll", "machine"])
+def test_demos_of_bodies_check_themselves(name):
+    assert f"{name}.rrd" in python((ROOT / "demos" / f"{name}.py").read_text()).stdout

@@ -59,15 +59,6 @@ def outward(x):
     return x / x.norm()
 
 
-def shells(corners, rest, **options):
-    """Tetrahedra given by their faces."""
-    return tv.Volume(
-        np.concatenate([corners[:, f] for f in ([0, 1, 2], [0, 2, 3], [0, 3, 1], [3, 2, 1])], axis=1).reshape(-1, 3),
-        rest,
-        **options,
-    )
-
-
 def made(function, **more):
     """Rows of the user's own."""
     return lambda corners, rest, **options: tv.Constraint(function, corners, rest, **more, **options)
@@ -81,11 +72,9 @@ ROWS = {
     "Bend 3D": Row(tv.Bend, PATH, -0.3),
     "AngleLimit 3D": Row(limit, PATH, 0.3, bilateral=False),
     "Dihedral 3D": Row(tv.Dihedral, WINGS, 0.3),
-    "Area 2D": Row(tv.Area, PATH[:, :2], -0.02),
     "Area 3D": Row(tv.Area, PATH, 0.02),
     "Area of loops 2D": Row(tv.Area, WINGS[[0, 3, 1, 2], :2], 0.05),
     "Volume 3D": Row(tv.Volume, WINGS, 0.01, largest=1e9),
-    "Volume of surfaces 3D": Row(shells, WINGS, -0.01, largest=1e9),
     "Constraint 2D": Row(made(spread), PATH[:, :2], 0.2),
     "Constraint 3D": Row(made(radius, gradient=outward), LINK[1:], 0.1, internal=False),
 }
