@@ -32,7 +32,7 @@ def build() -> tuple[tv.World, tv.Path]:
     """Numbers 0 to 8 are the wheel and its hub, 9 the stamp, 10 to 12 the rocker, 13 to 16 the arm."""
     angle = 2 * np.pi * np.arange(8) / 8
     wheel = CRANK * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    rocker, arm = [[1.3, 0.0], [1.52, 0.449], [1.08, -0.449]], [[2.3, 0.5], [2.3, 0.1], [2.3, -0.3], [2.6, -0.3]]
+    rocker, arm = [[1.3, 0.0], [1.52, 0.449], [1.08, -0.449]], [[1.9, 0.5], [1.9, 0.1], [1.9, -0.3], [2.2, -0.3]]
     x = np.array([*wheel, [0.0, 0.0], [0.0, stamp(0.0)], *rocker, *arm])
     drive = tv.Path([0], tv.shapes.polygon((0, 0), CRANK, 64).position, closed=True, speed=2 * np.pi * CRANK * RATE)
     rail = tv.Path([9], [[0.0, -1.5], [0.0, -0.5]], smooth=False)
