@@ -58,9 +58,7 @@ def main(path: str = "machine.rrd", seconds: float = 3.0) -> None:
             force.append((-rail.load[0, 0], side(world.time - 1 / 2400)))
             recorder.log()
     load, want = np.array(force[10:]).T
-    print(
-        f"{path}: the stamp is {1e6 * off:.1f} micrometres from the formula at most, its rail bears up to {abs(load).max():.1f} N,"
-    )
+    print(f"{path}: the stamp is {1e6 * off:.1f} micrometres from the formula, its rail bears up to {abs(load).max():.1f} N,")
     print(f"{abs(load - want).max():.2f} N from the formula, flags: {', '.join(sorted(report.flags)) or 'none'}")
     if off > 1e-4 or abs(load - want).max() > 0.05 * abs(want).max():
         raise SystemExit("the machine has jammed")
