@@ -27,8 +27,7 @@ def build() -> tuple[tv.World, tv.Area, list[slice]]:
         tv.Gravity(9.81),
         tv.Distance(soft, compliance=3e-3, damping=0.02),
         area,
-        tv.ShapeMatch([np.arange(parts[5].start, parts[5].stop)], compliance=5e-5, damping=5.0),
-        tv.ShapeMatch([np.arange(parts[6].start, parts[6].stop)]),
+        tv.ShapeMatch([np.arange(p.start, p.stop) for p in parts[5:]], compliance=[5e-5, 0.0], damping=[5.0, 0.0]),
         tv.Contact(friction=0.3),
         tv.Box((-1.5, 0.0), (1.5, 4.0), friction=0.4),
     ]
