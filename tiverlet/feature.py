@@ -1,13 +1,15 @@
 """What acts on particles: the contract that every force, constraint and wall keeps, and the guide to writing one.
 
 A feature is a batch of arrays and one small kernel function. It checks its arguments in Python, declares its own
-fields, and is absent from memory, from the kernels and from the clock when it is not in the scene. There are four
+fields, and is absent from memory, from the kernels and from the clock when it is not in the scene. There are these
 kinds, told apart by what the substep asks of them:
 
     Acceleration   acceleration(i, x, v, t) of one particle, and/or a linear drag rate
     Batch          relax(c, ...) of one constraint: reads its particles, writes the moves it wants into slots
     Scalar         (scalar.py) a Batch whose constraint is one number: give measure(c, q) = f and its gradients, and
                    C = f - rest gets compliance, damping, mass splitting, residual and load from there
+    Ragged         (ragged.py) a Batch on any number of particles each, summed in blocks; Content, for a Scalar of that kind
+    Tether         (tether.py) a Batch of particles that are each drawn to a place of its own: give the vector to it
     Wall           (wall.py) confine(i, ...) of one particle, with the last word
 
 A new constraint on k particles is one file with one Scalar subclass: `arity = k`, an __init__ that checks its arrays,
