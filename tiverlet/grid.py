@@ -52,6 +52,7 @@ class Grid:
         self.number = add("grid.number", n, kind=ti.i32)
         self.stale = add("grid.stale", None, kind=ti.i32, values=1)
         self.need = add("grid.need", None, kind=ti.i32)
+        self.still = bool((scene.inv_mass == 0).any())  # whether there are pairs that cannot move
         self.linked = len(linked) > 0
         if self.linked:
             both = np.concatenate([linked, linked[:, ::-1]])
@@ -291,7 +292,10 @@ class Grid:
         """Whether a pair belongs on the list: near, not both immovable, not linked."""
         r = self.state.apart(i, j)
         far = self.radius.of(i) + self.radius.of(j) + ti.cast(self.skin, self.real)
-        yes = r.dot(r) < far * far and self.state.w[i] + self.state.w[j] > 0
+        yes = r.dot(r) < far * far
+        if ti.static(self.still):
+            if yes:
+                yes = self.state.w[i] + self.state.w[j] > 0
         if ti.static(not self.table.uniform):
             if yes:
                 yes = self.table.of(i, j)[3] > 0

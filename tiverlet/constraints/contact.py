@@ -21,15 +21,15 @@ class Contact(Touch):
 
     friction: Coulomb, a number or (static, dynamic), or a mapping from pairs of groups to these: {(0, 1): 0.5}. restitution:
     0 to 1, or such a mapping. groups: the pairs of groups that touch, None for all. skin: how far beyond touching pairs are
-    listed [m], "auto" for 0.3 of the median radius; speed only, never the result. push_out: particles that overlap at the
+    listed [m], "auto" for 0.5 of the median radius; speed only, never the result. push_out: particles that overlap at the
     start, or after positions were assigned, part at this speed [m/s] at most: they act as if they were small enough to fit, and
     grow back.
 
     A Jacobi pass: each pair wants C back along the current n, split by mass, p = C / (m_i w_i + m_j w_j), which conserves
     momentum. A particle has its mass split m times, where m bounds the eigenvalues of S, the sum of n n^T over its overlapping
-    pairs: then sum w J J^T <= diag(sum w m) for the rows J of its pairs, and no eigenvalue of a pass exceeds 1. m = tr(S^8)^(1/8)
-    is 3.3 for a disc among six neighbours (counting pairs gives 6) and 4.6 for a sphere among twelve. With friction tangents are
-    taken back too; n n^T and t t^T sum up to the count, which is taken then.
+    pairs: then sum w J J^T <= diag(sum w m) for the rows J of its pairs, and no eigenvalue of a pass exceeds 1. m = tr(S^4)^(1/4)
+    is 3.6 for a disc among six neighbours (counting pairs gives 6) and 5.3 for a sphere among twelve. With friction tangents are
+    taken back too; n n^T and t t^T sum up to the count, which is taken then, and for up to two pairs.
 
     A pair that overlapped in the last substep keeps a part of its push, p = CARRY p_last + C / (...), as far as that is not more
     than what parts the pair alone, C / (w_i + w_j). For a mode with eigenvalue L of a pass, stepping has the characteristic
@@ -68,7 +68,7 @@ class Contact(Touch):
         """Choose the skin, and refuse positions too far out for cells to be told apart."""
         radius = particles.radius
         some = radius[radius > 0]
-        auto = 0.3 * float(np.median(some)) if len(some) else 1.0
+        auto = 0.5 * float(np.median(some)) if len(some) else 1.0
         self._on_size = auto if self.skin == "auto" else float(self.skin)
         self._on_finest = float(radius.min(initial=np.inf))
         self.matters = len(some) > 0
@@ -138,7 +138,7 @@ class Contact(Touch):
                 tensor += (one * scale) * r.outer_product(r)
                 deepest = ti.min(deepest, share)
         if ti.static(not self._on_rubs):
-            if deepest > 0.25:
+            if pairs > 2 and deepest > 0.25:
                 pairs = ti.min(largest(tensor) / deepest, pairs)
         if self._on_split[i] > 0 and pairs == 0:
             if first != 0:
@@ -157,7 +157,7 @@ class Contact(Touch):
             for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
                 j = self._on_grid.near[e]
                 overlap, n = self.meet(i, j, self.far(i, j))
-                kick, push, last = 0 * overlap, 0 * overlap, self._on_push.field[e]
+                kick, push = 0 * overlap, 0 * overlap
                 if ti.static(self._on_bounces):
                     if first != 0:
                         self._on_aim.field[e] = 0 * n
@@ -170,15 +170,16 @@ class Contact(Touch):
                             if kick > 0:
                                 self._on_aim.field[e] = aim * n
                                 self._on_hit[None] = 1
-                    push = overlap / shared
-                    if first != 0 and fresh == 0:
-                        push = ti.min(push + ti.static(CARRY) * last, overlap / (w + self._on_state.w[j]))
-                    want = push * n
+                    part, last = overlap / shared, self._on_push.field[e]
+                    if first == 0:
+                        push = last
+                    elif fresh == 0:
+                        part = ti.min(part + ti.static(CARRY) * last, overlap / (w + self._on_state.w[j]))
+                    push += part
+                    want = part * n
                     if ti.static(self._on_rubs):
-                        want -= self.rub(i, j, n, push * shared + kick, self._on_slip.field[e]) / shared
+                        want -= self.rub(i, j, n, part * shared + kick, self._on_slip.field[e]) / shared
                     total += w * want
-                if first == 0 and overlap > 0:
-                    push += last
                 self._on_push.field[e] = push
         self._on_move[i] = total
         if ti.static(self._on_bounces):
@@ -254,7 +255,5 @@ class Contact(Touch):
 
 @ti.func
 def largest(tensor):
-    """At least the largest eigenvalue of a symmetric matrix S >= 0, and just that for rank 1: tr(S^8)^(1/8)."""
-    fourth = tensor @ tensor
-    fourth = fourth @ fourth
-    return ti.sqrt(ti.sqrt(fourth.norm()))
+    """At least the largest eigenvalue of a symmetric matrix S >= 0: tr(S^4)^(1/4)."""
+    return ti.sqrt((tensor @ tensor).norm())
