@@ -87,7 +87,7 @@ def gas(n: int, dim: int, fraction: float, h: float, seconds: float) -> dict[str
 def packing(n: int, dim: int, speed: float) -> dict[str, float]:
     """Frictionless discs (half of them 1.4 times as large) or equal spheres, between walls that close in at `speed` [m/s].
 
-    Ends when they bear a load: 2 dim contacts per particle on average, as an isostatic packing has, less a tenth that rattle.
+    Ends when they bear a load, at 2 dim contacts per particle on average, as an isostatic packing has.
     Returns the packing fraction in the middle, away from the walls, less what they overlap.
     """
     radius = np.where(np.arange(n) % 2 == 0, 0.5, 0.7) if dim == 2 else np.full(n, 0.5)
@@ -99,7 +99,7 @@ def packing(n: int, dim: int, speed: float) -> dict[str, float]:
     box = Box([0] * dim, [size] * dim)
     with World(Particles(x, velocity=v, radius=radius), [Drag(1.0), Contact(), box], substeps=8) as world:
         low, contacts = 0.0, 0.0
-        while contacts < 0.9 * 2 * dim:
+        while contacts < 2 * dim:
             low += speed / 120
             box.lower, box.upper = [low] * dim, [size - low] * dim
             report = world.step(1 / 60)
