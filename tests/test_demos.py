@@ -49,3 +49,13 @@ def test_other_demos_check_themselves():
 @pytest.mark.parametrize("name", ["soft", "bead", "tidy", "cloth", "ragdoll", "machine"])
 def test_demos_of_bodies_check_themselves(name):
     assert f"{name}.rrd" in python((ROOT / "demos" / f"{name}.py").read_text()).stdout
+
+
+def test_polygons_keep_their_corners_out_of_each_other():
+    code = f"""
+import sys
+sys.path.insert(0, {str(ROOT / "demos")!r})
+import polygons
+polygons.main("polygons.rrd", seconds=1.5)
+"""
+    assert "36 bodies" in python(code).stdout

@@ -193,6 +193,9 @@ class Phases:
             if ti.static(len(self.batches) > 0):
                 for i in range(self.n):
                     self.slots.gather(i, first, final)
+            if ti.static(c.measures):
+                for i in range(self.n):
+                    c.measure(i)
             for i in range(self.n):
                 c.count(i, first)
             for i in range(self.n):

@@ -15,6 +15,7 @@ from .mesh import Mesh
 from .path import Path
 from .pin import Pin
 from .polygon import Polygon
+from .polygons import Polygons
 from .rope import Rope
 from .sdf import Sdf
 from .shape_match import ShapeMatch
@@ -24,5 +25,5 @@ from .volume import Volume
 
 __all__ = [
     "AngleLimit", "Area", "Ball", "Bend", "Box", "Capsule", "Constraint", "Contact", "Dihedral", "Distance", "HalfSpace",
-    "Mesh", "Path", "Pin", "Polygon", "Rope", "Sdf", "ShapeMatch", "Snap", "Spacer", "Volume",
+    "Mesh", "Path", "Pin", "Polygon", "Polygons", "Rope", "Sdf", "ShapeMatch", "Snap", "Spacer", "Volume",
 ]  # fmt: skip

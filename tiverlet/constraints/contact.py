@@ -53,6 +53,7 @@ class Contact(Touch):
         self.push_out = checks.number("Contact", "push_out", push_out, least=0.0)
 
     matters = True
+    measures = False  # looks at all contacts once in each pass, before they are counted
 
     @property
     def rubs(self) -> bool:

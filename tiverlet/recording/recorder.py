@@ -8,6 +8,7 @@ import numpy as np
 
 from .. import checks
 from ..constraints import Box, Path
+from ..facets import Facets
 from ..feature import Batch
 from ..tools import golden_colors
 from ..wall import Wall
@@ -153,6 +154,9 @@ def _bounds(world: "World") -> tuple[np.ndarray, np.ndarray]:
     low = (x - r).min(axis=0, initial=np.inf) if len(x) else np.zeros(world.particles.dim)
     high = (x + r).max(axis=0, initial=-np.inf) if len(x) else np.ones(world.particles.dim)
     for f in world.features:
+        if isinstance(f, Facets) and f.turned_in:  # a container
+            corners = f.placed(f.corners).reshape(-1, world.particles.dim)
+            low, high = np.minimum(low, corners.min(axis=0)), np.maximum(high, corners.max(axis=0))
         if isinstance(f, Box):
             low = np.where(np.isfinite(f.lower), np.minimum(low, f.lower), low)
             high = np.where(np.isfinite(f.upper), np.maximum(high, f.upper), high)

@@ -1,0 +1,168 @@
+"""Bodies of particle loops: rest, friction, conservation, and no vertex inside of another body."""
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+
+
+def bodies(shapes):
+    """Positions, loops and links of rigid bodies from lists of corners: each corner is linked to all others of its body."""
+    loops, links, at = [], [], 0
+    for corners in shapes:
+        i, j = np.triu_indices(len(corners), 1)
+        loops.append(at + np.arange(len(corners)))
+        links.append(np.stack([i, j], axis=1) + at)
+        at += len(corners)
+    return np.concatenate(shapes), loops, np.concatenate(links)
+
+
+def regular(sides: int, radius: float, center, turn: float = 0.0):
+    """Corners of a regular polygon; turned so that it stands on an edge."""
+    a = np.arange(sides) * 2 * np.pi / sides - np.pi / 2 + np.pi / sides + turn
+    return radius * np.stack([np.cos(a), np.sin(a)], axis=1) + center
+
+
+def depths(points: np.ndarray, loop: np.ndarray) -> np.ndarray:
+    """How deep points are inside of a polygon, 0 outside; by brute force."""
+    from .test_solids import outside
+
+    return np.maximum(-outside(points, loop), 0)
+
+
+def test_boxes_stand_on_each_other_and_on_slopes(world):
+    # Three boxes of exactly the same width, corners on corners: at rest, and the lower joint, which carries more, overlaps more
+    # (a Jacobi pass gives a contact the compliance D h^2, with D of about 4 for each of the masses on top). On slopes of 20 and
+    # 30 degrees, pinned triangles, a box sticks if tan < mu and slides with g (sin - mu cos) if not (R18).
+    mu, side = 0.45, 0.2
+    shapes = [regular(4, side / np.sqrt(2), (0.0, (k + 0.5) * side)) for k in range(3)]
+    pinned = []
+    for x, degrees in ((2.0, 20.0), (6.0, 30.0)):
+        a = np.radians(degrees)
+        t, n = np.array([np.cos(a), -np.sin(a)]), np.array([np.sin(a), np.cos(a)])
+        top = np.array([x, 1.5])
+        shapes.append(np.array([top, [x, -1.0], [x + 3 * t[0], -1.0], top + 3 * t]))
+        pinned += list(range(4 * len(shapes) - 4, 4 * len(shapes)))
+        shapes.append(regular(4, side / np.sqrt(2), top + t + side / 2 * n, -a))
+    x, loops, links = bodies(shapes)
+    features = [tv.Gravity(9.81), tv.Distance(links), tv.Polygons(loops, friction=mu), tv.HalfSpace((0, 1), friction=0.5)]
+    w = world(tv.Particles(x, pinned=pinned), features, precision="f64", substeps=20)
+    w.run(0.7)
+    start = w.position
+    w.run(0.3)
+    got = w.position
+    stack = got[:12].reshape(3, 4, 2)
+    np.testing.assert_allclose(w.velocity[:12], 0, atol=1e-6)
+    # Box k rests with its lower corners in box k - 1, and that with its upper ones in it: one joint carries 2, the other 1.
+    gaps = [stack[k, :, 1].max() - stack[k + 1, :, 1].min() for k in range(2)]
+    assert 0 < gaps[1] < gaps[0] < 40 * 9.81 / 1200**2
+    np.testing.assert_allclose(stack[:, :, 0].mean(axis=1), 0, atol=1e-6)
+    np.testing.assert_allclose(got[16:20], start[16:20], atol=1e-6)
+    a = np.radians(30.0)
+    way = 9.81 * (np.sin(a) - mu * np.cos(a)) * (1.0**2 - 0.7**2) / 2
+    assert np.linalg.norm((got - start)[24:28].mean(axis=0)) == pytest.approx(way, rel=0.02)
+    assert w.last.clean
+
+
+def test_collisions_conserve_momentum_and_angular_momentum(world):
+    # A spinning hexagon, a triangle and two points meet in free space, with friction and restitution and unequal masses.
+    x, loops, links = bodies([regular(6, 0.3, (-0.6, 0.1)), regular(3, 0.4, (0.6, 0.0), 0.3)])
+    x = np.concatenate([x, [[0.0, 0.62], [0.0, -0.62]]])  # points: friction at a radius would be a torque, and nothing spins
+    v = np.concatenate([np.tile([2.0, 0.0], (6, 1)), np.tile([-2.0, 0.0], (3, 1)), [[0.0, -2.0], [0.0, 2.0]]])
+    v[:6] += 3.0 * np.stack([-(x[:6, 1] - 0.1), x[:6, 0] + 0.6], axis=1)
+    mass = np.r_[np.full(6, 1.0), np.full(3, 3.0), 0.5, 0.5]
+    start = tv.Particles(x, velocity=v, mass=mass, radius=0.0)
+    w = world(start, [tv.Distance(links), tv.Polygons(loops, friction=0.4, restitution=0.5)], precision="f64")
+
+    def moments(x, v):
+        return np.r_[(mass[:, None] * v).sum(axis=0), (mass * (x[:, 0] * v[:, 1] - x[:, 1] * v[:, 0])).sum()]
+
+    # What is conserved is the sum of m d, and of x times m d, of the displacements d = h v; the latter but for the slip in a
+    # substep, at most 4 m/s h, times the impulses, about 10 kg m/s.
+    want = moments(x, v)
+    for substeps in (20, 100):
+        w.position, w.velocity, w.substeps = start.position, start.velocity, substeps
+        turned = 0
+        for _ in range(60):
+            w.step(1 / 60)
+            turned = max(turned, np.abs(w.velocity[9:] - v[9:]).max())
+            x, d = w.position, w._scene.memory.read(w._scene.state.d) * 60 * substeps
+            np.testing.assert_allclose(moments(x, d)[:2], want[:2], atol=1e-10)
+        assert turned > 0.5
+        assert moments(x, d)[2] == pytest.approx(want[2], abs=40 / 60 / substeps)
+    assert tv.measure.kinetic_energy(w) <= 0.5 * (mass * (v**2).sum(axis=1)).sum()
+
+
+def test_a_pile_settles_without_overlap_and_alike_on_both_paths(world):
+    # Convex and concave bodies, discs, mixed sizes: after settling no vertex is deeper inside of another body than 1 % of an
+    # edge, nor a disc than 2 % of its radius, and kinetic energy is below 1e-2 m g r per particle.
+    rng = np.random.default_rng(3)
+    shapes = []
+    for k in range(16):
+        center = np.array([k % 4 * 0.5 - 0.75, k // 4 * 0.5 + 0.3])
+        if k % 5 == 4:  # an arrow
+            shapes.append(np.array([[-0.2, -0.15], [0.0, -0.05], [0.2, -0.15], [0.0, 0.2]]) + center)
+        else:
+            shapes.append(regular(3 + k % 4, rng.uniform(0.12, 0.2), center, rng.uniform(0, 6)))
+    x, loops, links = bodies(shapes)
+    n, discs = len(x), 12
+    x = np.concatenate([x, np.stack([np.arange(discs) % 6 * 0.3 - 0.75, np.arange(discs) // 6 * 0.3 + 2.4], axis=1)])
+    radius = np.r_[np.zeros(n), np.full(discs, 0.08)]
+    hashes = []
+    for path, frames in (("fused", 150), ("parallel", 40)):
+        features = [
+            tv.Gravity(9.81), tv.Distance(links), tv.Polygons(loops, friction=0.3),
+            tv.Box((-1.1, 0), (1.1, 9), friction=0.3),
+        ]  # fmt: skip
+        w = world(tv.Particles(x, radius=radius), features, path=path, substeps=24)
+        for k in range(frames):
+            w.step(1 / 60)
+            if k == 39:
+                hashes.append(w.hash())
+        if path == "fused":
+            settled = w.position
+            assert tv.measure.kinetic_energy(w) < 1e-2 * 9.81 * 0.15 * len(x)
+    assert hashes[0] == hashes[1]
+    for loop in loops:
+        edge = np.linalg.norm(settled[loop] - settled[np.roll(loop, 1)], axis=1).min()
+        others = np.setdiff1d(np.arange(n), loop)
+        assert depths(settled[others], settled[loop]).max() < 0.01 * edge
+        from .test_solids import outside
+
+        assert outside(settled[n:], settled[loop]).min() > 0.08 * 0.98
+    apart = np.linalg.norm(settled[n:, None] - settled[n:], axis=2)[np.triu_indices(discs, 1)]
+    assert apart.min() > 0.16 * 0.98
+
+
+def test_overlap_is_pushed_out_and_collapse_stays_finite(world):
+    # A corner that starts inside of a box leaves it at push_out; a loop without links is pressed flat, and nothing is lost.
+    x, loops, _ = bodies([regular(4, 0.5, (0.0, 0.0)), regular(4, 0.5, (0.6, 0.02)), regular(3, 0.3, (5.0, 1.0))])
+    _, _, links = bodies([x[:4], x[4:8]])
+    features = [tv.Distance(links), tv.Polygons(loops, push_out=0.3), tv.Gravity(0.0), tv.Box((-9, -0.6), (9, 9))]
+    w = world(tv.Particles(x), features, precision="f64")
+    for _ in range(90):
+        w.step(1 / 60)
+        assert np.abs(w.velocity).max() < 0.3 * 1.01
+    assert depths(w.position[4:8], w.position[:4]).max() < 1e-3 and depths(w.position[:4], w.position[4:8]).max() < 1e-3
+    w.position = np.concatenate([w.position[:8], [[5.0, 0.0], [5.0, 0.0], [5.0, 0.0]]])
+    features[2].g = 9.81
+    w.run(0.5)
+    assert np.isfinite(w.position).all()
+
+
+def test_bad_loops_are_named():
+    square = regular(4, 0.5, (0.0, 0.0))
+    particles = tv.Particles(np.concatenate([square, [[0.0, 0.01], [2.0, 0.0], [3.0, 0.0], [4.0, 0.0]]]))
+    deep = tv.Particles(np.concatenate([regular(8, 0.5, (0.0, 0.0)), [[0.0, 0.01]]]))
+    for make, words in (
+        (lambda: tv.Polygons([[0, 1]]), r"loops\[0\] has 2 particles"),
+        (lambda: tv.Polygons([[0, 1, 2], [2, 3, 4]]), r"particle 2 is in loops\[0\] and again in loops\[1\]"),
+        (lambda: tv.Polygons([[0, 1, 1]]), r"particle 1 is in loops\[0\] and again in loops\[0\]"),
+        (lambda: tv.World(particles, [tv.Polygons([[0, 1, 9]])]), r"loops\[0\]\[2\] = 9, but there are 8"),
+        (lambda: tv.World(particles, [tv.Polygons([[5, 6, 7]])]), r"loops\[0\] encloses an area of 0"),
+        (lambda: tv.World(deep, [tv.Polygons([range(8)])]), r"particle 8 starts 0.452 m inside of loops\[0\]"),
+        (lambda: tv.World(tv.Particles(np.zeros((3, 3))), [tv.Polygons([[0, 1, 2]])]), "for 2D worlds"),
+        (lambda: tv.World(particles, [tv.Polygons([[0, 1, 2]]), tv.Contact()]), "more than one Contact"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            make()
