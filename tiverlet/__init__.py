@@ -37,7 +37,7 @@ from .world import World
 
 __all__ = [
     "AngleLimit", "Area", "Attractor", "Ball", "Bend", "Box", "Capsule", "Constraint", "Contact", "Dihedral", "Distance",
-    "Drag", "Force", "Gravity", "HalfSpace", "Jacobi", "Mesh", "Particles", "Path", "Pin", "Polygon", "Polygons", "Recorder", "Rope",
-    "Sdf", "ShapeMatch", "Snap", "Spacer", "StepReport", "Volume", "Wind", "World", "approach", "clamp", "golden",
+    "Drag", "Force", "Gravity", "HalfSpace", "Jacobi", "Mesh", "Particles", "Path", "Pin", "Polygon", "Polygons", "Recorder",
+    "Rope", "Sdf", "ShapeMatch", "Snap", "Spacer", "StepReport", "Volume", "Wind", "World", "approach", "clamp", "golden",
     "golden_colors", "golden_index", "init", "measure", "mix", "runtime", "shapes", "smoothstep",
 ]  # fmt: skip

@@ -30,7 +30,7 @@ class Polygons(Contact):
 
     loops: for each body its particles in order around it, at least 3, either way round. Their radii round the rim off. What holds
     a body together is up to others (Distance, Area, ShapeMatch); it may bend, and stretch by a quarter. friction, restitution: as
-    in Contact, and so are all particles that are in no loop. push_out: bodies that overlap part at this speed [m/s] at most.
+    in Contact, and so are all particles that are in no loop. push_out: about the speed at which bodies that overlap part [m/s].
 
     A Jacobi pass: each contact wants C back, split by mass and by the number n_i of active contacts of each particle,
     p = -C / (n_v w_v + (1 - t)^2 n_a w_a + t^2 n_b w_b). That conserves momentum, and angular momentum but for the slip within a
@@ -132,7 +132,7 @@ class Polygons(Contact):
         reach = replace(scene, particles=cover, radius=Radii(scene.memory, self._on_cover))
         pairs = [f.partners(p) for f in batches]
         linked = np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=np.int32)
-        # For each entry the contact of which its particle is the vertex: overlap, place on the edge (-1: discs), normal; and where
+        # For each entry the contact of which its particle is the vertex: overlap, place on the edge (-1: discs), normal; where
         # in the list of the other particle those are in which it is the start, and the end, of the edge (-1: nowhere).
         self._on_met, self._on_back = Luggage("met", 4, lasting=False), Luggage("back", 2, lasting=False)
         self._on_slip, self._on_aim = Luggage("slip", 2, lasting=True), Luggage("aim", 2, lasting=False)
