@@ -135,7 +135,8 @@ def test_a_pile_settles_without_overlap_and_alike_on_both_paths(world):
 
 
 def test_overlap_is_pushed_out_and_collapse_stays_finite(world):
-    # A corner that starts inside of a box leaves it: each body at less than 1.5 push_out (measured: 1.3); a loop without links is pressed flat, and nothing is lost.
+    # A corner that starts inside of a box leaves it: each body at less than 1.5 push_out (measured: 1.3). A loop without links is
+    # pressed flat, and stays finite.
     x, loops, _ = bodies([regular(4, 0.5, (0.0, 0.0)), regular(4, 0.5, (0.6, 0.02)), regular(3, 0.3, (5.0, 1.0))])
     _, _, links = bodies([x[:4], x[4:8]])
     features = [tv.Distance(links), tv.Polygons(loops, push_out=0.3), tv.Gravity(0.0), tv.Box((-9, -0.6), (9, 9))]
