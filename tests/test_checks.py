@@ -80,7 +80,8 @@ def scene(*features, **kwargs):
         (scene(precision="f16"), ValueError, "precision = 'f16', but it must be one of 'f32'"),
         (scene(path="fast"), ValueError, "path = 'fast'"),
         (lambda: tv.World(np.zeros((3, 2))), TypeError, r"use tv.Particles\(position\)"),
-        (lambda: tv.Jacobi(relaxation=1.5), ValueError, "stable only below 4/3"),
+        (scene(tv.Distance([[0, 1], [1, 2]]), solver=tv.Jacobi(1.5)), ValueError, r"4/3 / lambda_max = 1.3\d+"),  # row 63
+        (scene(tv.Distance([[0, 1]], compliance=1.0), solver=tv.Jacobi(1.4)), ValueError, "stable only below 4/3 where"),
         (lambda: tv.Jacobi(relaxation=0), ValueError, "above 0"),
         (lambda: tv.init(arch="gpu"), ValueError, "arch = 'gpu', but it must be one of 'cpu'"),
         (lambda: tv.init(threads=0), ValueError, "threads = 0"),

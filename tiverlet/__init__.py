@@ -30,14 +30,15 @@ from .forces import Attractor, Drag, Force, Gravity, Wind
 from .particles import Particles
 from .recording import Recorder
 from .runtime import init
-from .solvers import Jacobi
+from .solvers import Chebyshev, ConjugateGradient, Direct, Jacobi
 from .survey import StepReport
 from .tools import approach, clamp, golden, golden_colors, golden_index, mix, smoothstep
 from .world import World
 
 __all__ = [
-    "AngleLimit", "Area", "Attractor", "Ball", "Bend", "Box", "Capsule", "Constraint", "Contact", "Dihedral", "Distance",
-    "Drag", "Force", "Gravity", "HalfSpace", "Jacobi", "Mesh", "Particles", "Path", "Pin", "Polygon", "Polygons", "Recorder",
-    "Rope", "Sdf", "ShapeMatch", "Snap", "Spacer", "StepReport", "Volume", "Wind", "World", "approach", "clamp", "golden",
-    "golden_colors", "golden_index", "init", "measure", "mix", "runtime", "shapes", "smoothstep",
+    "AngleLimit", "Area", "Attractor", "Ball", "Bend", "Box", "Capsule", "Chebyshev", "ConjugateGradient", "Constraint",
+    "Contact", "Dihedral", "Direct", "Distance", "Drag", "Force", "Gravity", "HalfSpace", "Jacobi", "Mesh", "Particles",
+    "Path", "Pin", "Polygon", "Polygons", "Recorder", "Rope", "Sdf", "ShapeMatch", "Snap", "Spacer", "StepReport", "Volume",
+    "Wind", "World", "approach", "clamp", "golden", "golden_colors", "golden_index", "init", "measure", "mix", "runtime",
+    "shapes", "smoothstep",
 ]  # fmt: skip

@@ -11,7 +11,9 @@ from .constraints.contact import Contact
 from .feature import Acceleration, Batch, Feature, Scene
 from .grid import Grid
 from .particles import Particles, Radii, State
-from .solvers.jacobi import Jacobi, Slots
+from .solvers.jacobi import Jacobi
+from .solvers.slots import Slots
+from .solvers.solver import Solver
 from .substep import Substep
 from .survey import Survey
 from .wall import Wall
@@ -39,7 +41,7 @@ class Assembly:
     survey: Survey
 
 
-def assemble(particles: Particles, features: tuple[Feature, ...], solver: Jacobi, precision: str, path: str) -> Assembly:
+def assemble(particles: Particles, features: tuple[Feature, ...], solver: Solver, precision: str, path: str) -> Assembly:
     """Check the features against the particles and each other, then declare and place every field, in one tree."""
     inv_mass = particles.inv_mass.copy()
     for feature in features:
@@ -64,7 +66,7 @@ def assemble(particles: Particles, features: tuple[Feature, ...], solver: Jacobi
         raise
 
 
-def _bind(scene: Scene, features: tuple[Feature, ...], solver: Jacobi, path: str) -> Assembly:
+def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver, path: str) -> Assembly:
     memory, state, particles = scene.memory, scene.state, scene.particles
 
     def of(kind: type[T]) -> list[T]:
@@ -80,7 +82,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Jacobi, path: str
     starts = any(f.rubs for f in surfaces) or any(w.sweeps for w in walls)
     state.remember(memory, starts, any(f.bounces for f in surfaces), bool(contact and walls))
     if batches:
-        scene.slots = Slots(memory, state, batches, scene.inv_mass, solver)
+        scene.slots = Slots(scene, batches, solver)
     parallel = path == "parallel"
     grid = contact.join(scene, batches, parallel) if contact else None
     for feature in [*accelerations, *drivers, *batches, *walls]:
@@ -109,6 +111,15 @@ def checked_features(features: Iterable[Feature]) -> tuple[Feature, ...]:
     if sum(isinstance(f, Contact) for f in features) > 1:
         raise ValueError("World: more than one Contact; one covers all particles.")
     return features
+
+
+def checked_solver(solver: Solver | None) -> Solver:
+    """The solver of a new world."""
+    solver = Jacobi() if solver is None else solver
+    if not isinstance(solver, Solver):
+        hint = f"; write {solver.__name__}()" if isinstance(solver, type) else ""
+        raise TypeError(f"World: solver = {solver!r} is not a solver, as tv.Jacobi() or tv.Direct() is{hint}.")
+    return solver
 
 
 def check_settings(precision: str, path: str) -> None:

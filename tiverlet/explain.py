@@ -30,6 +30,7 @@ def explain(world: "World") -> str:
         size = sum(world.fields[name] for name in names)
         lines.append(f"    {owner:10s} {size:>9d} bytes: {', '.join(n.partition('.')[2] or n for n in names)}")
     if sub.batches:
+        lines.append(f"Solved by {world._solver.explain(sub.batches, sub.slots)}")
         lines.append(f"Constraint corners that can move: {sub.slots.total} of {sum(b.indices.size for b in sub.batches)}")
     return "\n".join(lines)
 

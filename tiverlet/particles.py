@@ -106,7 +106,7 @@ class State:
     def __init__(self, memory: Memory, particles: Particles, inv_mass: np.ndarray, compensated: bool):
         n, dim = particles.count, particles.dim
         self.compensated = compensated
-        self.double = memory.real == ti.f64
+        self.real, self.double = memory.real, memory.real == ti.f64
         self.count, self.dim = n, dim
         self.starts = self.befores = self.leans = False
         self.x = memory.field("position", n, width=dim, values=particles.position, state=True)

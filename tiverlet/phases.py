@@ -5,6 +5,7 @@ from typing import Any
 import taichi as ti
 
 from .feature import Acceleration, Batch, Scene
+from .scalar import Scalar
 from .tools import golden_steps
 from .wall import Wall
 
@@ -35,6 +36,12 @@ class Phases:
         self.drags = [f for f in accelerations if f.decays]
         self.decays = bool(self.drags)
         self.batches: list[Batch] = [b for b in batches if b.count]
+        self.systems = [scene.slots.system] if scene.slots and scene.slots.system else []
+        self.steps = max([s.steps for s in self.systems], default=0) if parallel else 0
+        for system in self.systems:
+            system.spread = 512 if parallel else 1
+        self.hurries = bool(scene.slots) and scene.slots.accelerates
+        self.told = [b for b in self.batches if isinstance(b, Scalar) and b._on_told]
         self.ragged = [b for b in self.batches if b.blocks]
         self.drivers = drivers
         self.contacts = [contact] if contact else []
@@ -181,14 +188,37 @@ class Phases:
                 f.spread(e, h, hh, first, fresh)
 
     @ti.func
-    def relax(self, h, when, first, last, fresh, final):
-        """3 One pass: constraints into slots, particles gather them; contacts; walls."""
+    def tell(self, h, when, first, fresh):
+        """3a Every constraint leaves the moves that it wants in its slots, or tells its system what it is about."""
         hh = self.reach(h, fresh)
         self.weigh(h, hh, first, fresh, True)
+        if ti.static(self.hurries):
+            ti.loop_config(serialize=True)
+            for _ in range(1):
+                self.slots.hurry(first)
         for f in ti.static(self.batches):
             for c in range(f.count):
                 f.relax(c, h, hh, when, first, fresh)
         self.spread(h, hh, first, fresh)
+
+    @ti.func
+    def settle(self, first):
+        """3b Systems are solved."""
+        for system in ti.static(self.systems):
+            for b in range(system.parts):
+                system.solve(b)
+        self.take(first)
+
+    @ti.func
+    def take(self, first):
+        """What systems found goes to the multipliers."""
+        for f in ti.static(self.told):
+            for c in range(f.count):
+                f.take(c, first)
+
+    @ti.func
+    def collect(self, h, when, first, last, fresh, final):
+        """3c Particles gather their moves; contacts; walls."""
         for c in ti.static(self.contacts):
             if ti.static(len(self.batches) > 0):
                 for i in range(self.n):
@@ -269,7 +299,9 @@ class Phases:
     def pass_(self, h, when, it, iterations, fresh, s, substeps):
         """Pass `it` of substep s."""
         first, last = ti.cast(it == 0, ti.i32), ti.cast(it == iterations - 1, ti.i32)
-        self.relax(h, when, first, last, fresh, ti.cast(s == substeps - 1, ti.i32))
+        self.tell(h, when, first, fresh)
+        self.settle(first)
+        self.collect(h, when, first, last, fresh, ti.cast(s == substeps - 1, ti.i32))
 
     @ti.func
     def reach(self, h, fresh):

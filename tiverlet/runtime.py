@@ -197,10 +197,15 @@ class Memory:
             self._later.clear()
 
     def abandon(self) -> None:
-        """Give up before place(): a builder that is never finished would poison everything that Taichi does later."""
+        """Give up before place(): a builder that is never finished would poison everything that Taichi does later.
+
+        So would fields that are gone before Taichi has looked at them, which it does before the next kernel.
+        """
         if self._tree is None:
             self.field("abandoned", None)
-            self._builder.finalize().destroy()
+            tree = self._builder.finalize()
+            self._runtime.materialize()
+            tree.destroy()
 
     def check(self) -> None:
         """Raise RuntimeError when the fields are gone or belong to a runtime that is."""

@@ -12,6 +12,10 @@ from .compliance import law, stiff
 from .feature import Scene
 from .particles import Particles
 
+# Where constraints converge within a substep, SHAKE is an explicit method for what is across them, with its limits:
+TENSEST = 4.0  # (omega h)^2 of a vibration across a tension, beyond which Verlet diverges
+LOST = 0.015  # violation at the start of a substep, relative to the size, from where on its direction would bring in energy
+
 
 class Scalar(Breaking):
     """Constraints C(x) = f(x) - rest = 0, >= 0 or <= 0, soft or rigid, from `measure`. numerics: one formula for all.
@@ -67,9 +71,36 @@ class Scalar(Breaking):
         """What f is to be, (m,)."""
         return self.rest
 
+    @property
+    def joins(self) -> bool:
+        """Whether constraints of the batch can be solved together with others: few corners, and a direction everywhere."""
+        return self.arity > 0 and not self.collapses
+
     def rest_of(self, position: np.ndarray) -> np.ndarray:
         """f at the given positions, (m,): the rest value when none is given."""
         raise NotImplementedError
+
+    def slopes(self, position: np.ndarray) -> np.ndarray:
+        """grad_k f of every constraint, (m, arity, dim), by central differences: each constraint on particles of its own."""
+        twin: Any = self.copy()
+        twin.indices = np.arange(self.indices.size).reshape(self.indices.shape)
+        x = position[self.indices]
+        step = 1e-6 * (float(np.ptp(x, axis=1).max(initial=0.0)) or 1.0)
+        out = np.zeros_like(x)
+        for k in range(self.arity):
+            for a in range(x.shape[2]):
+                ends = np.stack([x, x])
+                ends[:, :, k, a] += [[step], [-step]]
+                up, down = (twin.rest_of(end.reshape(-1, x.shape[2])) for end in ends)
+                out[:, k, a] = (up - down) / (2 * step)
+        return out
+
+    def closeness(self, position: np.ndarray) -> np.ndarray:
+        """What makes C a share of the size of its constraint, (m,): 1 / length for links, 0 for what has no extent."""
+        x = position[self.indices]
+        size = np.linalg.norm(x - x[:, :1], axis=2).max(axis=1, initial=0.0)
+        size *= np.sqrt((self.slopes(position) ** 2).sum(axis=(1, 2)) / 2)
+        return np.divide(1, size, out=np.zeros(self.count), where=size > 0)
 
     def violation(self, position: np.ndarray) -> np.ndarray:
         """C at the given positions, (m,)."""
@@ -130,6 +161,16 @@ class Scalar(Breaking):
         name, m, add = repr(self), self.count, scene.memory.field
         self._on_rest = add(f"{name}.rest", m, values=self.goal)
         self._on_lam = add(f"{name}.multiplier", m, state=True)
+        rows = scene.slots.rows(self)
+        self._on_told, self._on_alone = bool((rows >= 0).any()), bool((rows < 0).any())
+        if self._on_told:
+            self._on_row = add(f"{name}.row", m, kind=ti.i32, values=rows)
+        self._on_firm = self.joins and (self._on_told or scene.slots.accelerates)
+        if self._on_firm:
+            self._on_close = add(f"{name}.close", m, values=self.closeness(scene.particles.position))
+        self._on_hurries = self._on_firm and scene.slots.accelerates and self._on_alone and self.side == 0
+        if self._on_hurries:
+            self._on_step = add(f"{name}.step", m)
         if self._on_soft:
             self._on_alpha = add(f"{name}.compliance", m, values=self.compliance)
             self._on_last = add(f"{name}.last", m, values=start, state=True)
@@ -184,6 +225,14 @@ class Scalar(Breaking):
         return out
 
     @ti.func
+    def is_rigid(self, c):
+        """Whether constraint c has no compliance."""
+        out = True
+        if ti.static(self._on_soft):
+            out = self._on_alpha[c] == 0
+        return out
+
+    @ti.func
     def bounded(self, value):
         """`value` on the side on which the constraint acts, 0 on the other."""
         if ti.static(self.side != 0):
@@ -213,7 +262,11 @@ class Scalar(Breaking):
             here += self._on_slots.split[i] * gg
             there += self._on_slots.split[i] * n[k, :].dot(n[k, :])
         turned = both < 0.75 * ti.sqrt(here * there) or there == 0
-        if turned:
+        lost = turned
+        if ti.static(self._on_firm):
+            if self.is_rigid(c):
+                lost = lost or ti.abs(self.bounded(f0 - self._on_rest[c])) * self._on_close[c] > LOST
+        if lost:
             n, both = g, here
         violation, A, alpha, lam, W = self.equation(c, f, f0, w, both, h, hh, first, fresh)
         return violation, A, alpha, lam, W, n, g, turned and self.distinct(f, f0)
@@ -243,21 +296,6 @@ class Scalar(Breaking):
         return A * C + B + alpha * lam, A, alpha, lam, W
 
     @ti.func
-    def solve(self, c, h, hh, first, fresh):
-        """One Jacobi solution of constraint c.
-
-        Returns the multiplier before and after, the size of the violation that this removes, and the direction (arity, dim).
-        """
-        violation, A, alpha, lam, W, n, _, turned = self.known(c, h, hh, first, fresh)
-        new, size = self.answer(violation, A, alpha, lam, W, turned)
-        if ti.static(self.collapses > 0):
-            q, move = self.corners(c, 0), ti.cast(0, self._on_real)
-            for k in ti.static(range(self.arity)):
-                move += self._on_w[self.member(c, k)] ** 2 * n[k, :].dot(n[k, :])
-            new = self.tempered(c, lam, new, q.norm_sqr(), move)
-        return lam, new, size, n
-
-    @ti.func
     def tempered(self, c, lam, new, extent, move):
         """Next to where it has no direction, f is curved: no pass moves corners further than they are, or are to be, apart.
 
@@ -284,11 +322,64 @@ class Scalar(Breaking):
 
     @ti.func
     def relax(self, c, h, hh, when, first, fresh):
-        """Move each corner by w_j dlam grad_j C."""
-        lam, new, _, n = self.solve(c, h, hh, first, fresh)
-        self._on_lam[c] = new
+        """Move each corner by w_j dlam grad_j C; a constraint that belongs to a system tells it what it knows."""
+        violation, A, alpha, lam, W, n, g, turned = self.known(c, h, hh, first, fresh)
+        step = ti.cast(1, self._on_real)
+        if ti.static(self._on_told):
+            row = self._on_row[c]
+            if row >= 0:
+                self._on_slots.system.tell(row, violation, A, alpha, lam, W, self.lever(c, W))
+                for k in ti.static(range(self.arity)):
+                    self._on_slots.system.lean(self._on_places[c][k], self.member(c, k), g[k, :])
+                if turned and violation != 0:
+                    self._on_slots.turned[None] = 1
+        if ti.static(self._on_alone):
+            if self.relaxed_alone(c):
+                new, _ = self.answer(violation, A, alpha, lam, W, turned)
+                if ti.static(self.collapses > 0):
+                    move = ti.cast(0, self._on_real)
+                    for k in ti.static(range(self.arity)):
+                        move += self._on_w[self.member(c, k)] ** 2 * n[k, :].dot(n[k, :])
+                    new = self.tempered(c, lam, new, self.corners(c, 0).norm_sqr(), move)
+                step = new - lam
+                if ti.static(self._on_hurries):
+                    last = self._on_step[c]
+                    if first != 0:
+                        last = 0
+                    most = TENSEST / self.lever(c, W / 2)  # split by two in a chain
+                    step = ti.max(-most, ti.min(most, lam + self._on_slots.hurried(last, step))) - lam
+                    self._on_step[c] = step
+                    if ti.abs(lam + step) == most:
+                        ti.atomic_max(self._on_slots.tension[None], ti.cast(TENSEST, ti.f64))
+                    new = lam + step
+                self._on_lam[c] = new
         for k in ti.static(range(self.arity)):
-            self.push(c, k, self._on_w[self.member(c, k)] * (new - lam) * n[k, :])
+            self.push(c, k, self._on_w[self.member(c, k)] * step * n[k, :])
+
+    @ti.func
+    def lever(self, c, W):
+        """(omega h)^2 of the fastest vibration across a tension, for a multiplier of 1: of a chain 4 w / l, where W = 2 w."""
+        return 2 * W * self._on_close[c]
+
+    @ti.func
+    def relaxed_alone(self, c):
+        """Whether constraint c belongs to no system."""
+        out = True
+        if ti.static(self._on_told):
+            out = self._on_row[c] < 0
+        return out
+
+    @ti.func
+    def take(self, c, first):
+        """Add what the system has found to the multiplier."""
+        if ti.static(self._on_told):
+            row = self._on_row[c]
+            if row >= 0:
+                step = ti.cast(self._on_slots.system.step[row], self._on_real)
+                if first != 0:
+                    self._on_lam[c] = step
+                else:
+                    self._on_lam[c] += step
 
     @ti.func
     def kick(self, c, h):
@@ -325,12 +416,13 @@ class Scalar(Breaking):
     @ti.func
     def miss(self, c, h, hh, when, fresh):
         """The violation that is left, relative to the rest value (to the batch's mean f where that is 0)."""
-        _, _, violation, _ = self.solve(c, h, hh, 0, fresh)
+        violation, A, alpha, lam, W, _, _, _ = self.known(c, h, hh, 0, fresh)
+        _, left = self.answer(violation, A, alpha, lam, W, False)
         if ti.static(self.collapses > 0):
             f, g = self.measure(c, self.corners(c, 0))
             if g.norm_sqr() == 0 and self.holds(c):
-                violation = ti.abs(self.bounded(f - self._on_rest[c]))
-        return violation / self.extent(c)
+                left = ti.abs(self.bounded(f - self._on_rest[c]))
+        return left / self.extent(c)
 
     @ti.func
     def extent(self, c):

@@ -65,6 +65,30 @@ class Substep(Phases):
         return self.is_stale() + 2 * self.struck()
 
     @ti.kernel
+    def opened(self, h64: ti.f64, s: ti.i32, substeps: ti.i32, it: ti.i32, fresh: ti.i32):
+        """The start of a pass in which a system iterates."""
+        self.tell(ti.cast(h64, self.real), self.clock(s, substeps), ti.cast(it == 0, ti.i32), fresh)
+        for system in ti.static(self.systems):
+            system.open()
+
+    @ti.kernel
+    def iterated(self):
+        """One step of such a system."""
+        for system in ti.static(self.systems):
+            system.go()
+
+    @ti.kernel
+    def collected(
+        self, h64: ti.f64, s: ti.i32, substeps: ti.i32, it: ti.i32, iterations: ti.i32, fresh: ti.i32
+    ) -> ti.i32:  # fmt: skip
+        """The end of the pass; returns what relaxed() does."""
+        h, when = ti.cast(h64, self.real), self.clock(s, substeps)
+        first, last, final = ti.cast(it == 0, ti.i32), ti.cast(it == iterations - 1, ti.i32), ti.cast(s == substeps - 1, ti.i32)
+        self.take(first)
+        self.collect(h, when, first, last, fresh, final)
+        return self.is_stale() + 2 * self.struck()
+
+    @ti.kernel
     def rebounded(self):
         """One pass of phase 4."""
         self.rebound()

@@ -9,13 +9,14 @@ import taichi as ti
 
 from .grid import FARTHEST
 from .particles import LARGEST
+from .scalar import TENSEST
 from .substep import Substep
 
 BLOCKS = 64  # partial sums: their number is fixed, so the total has the same bits on any number of threads
 STIFF = 4.0  # (omega h)^2 beyond which Verlet diverges
 
 
-Figures = ti.types.vector(14, ti.f64)
+Figures = ti.types.vector(15, ti.f64)
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,7 @@ class StepReport:
         "out-of-range"      a coordinate is too large for the precision, or for the cells of the contact grid
         "tunnelling-risk"   a particle moved by more than its own size in one substep, so it may have passed another
         "stiff-force"       a force changes too fast for the substep (omega h > 2) and makes energy grow
+        "softened"          a system was made to give way, because its tension is too large for the substep
         "turned"            a constraint turned by more than 41 degrees in a substep and lost its second order there
     """
 
@@ -61,7 +63,8 @@ class StepReport:
             last.time, max(first.substeps, last.substeps), max(first.iterations, last.iterations),
             max(first.residual, last.residual), max(first.overlap, last.overlap), max(first.contacts, last.contacts),
             last.energy, first.energy_change + last.energy_change, first.flags | last.flags,
-            tuple(dict.fromkeys(first.notes + last.notes)), last.bad if first.bad is None else first.bad,
+            tuple({n.partition(":")[0]: n for n in first.notes + last.notes}.values()),
+            last.bad if first.bad is None else first.bad,
             first.broken + last.broken, max(first.seconds, last.seconds),
         )  # fmt: skip
 
@@ -177,7 +180,7 @@ class Survey:
                 h, t = ti.cast(h64, self.sub.real), ti.cast(t64, self.sub.real)
                 b = thread // self.spread
                 self.parts[b], self.low[b], self.high[b] = self.block(b, h, t, self.sub.clock(0, 1), fresh, begin)
-        out = ti.Vector.zero(ti.f64, 14)
+        out = ti.Vector.zero(ti.f64, 15)
         ti.loop_config(serialize=True)
         for _ in range(1):
             for b in range(1, BLOCKS):
@@ -197,6 +200,9 @@ class Survey:
             if ti.static(len(self.batches) > 0):
                 flags += 2 * self.sub.slots.turned[None]
                 self.sub.slots.turned[None] = 0
+                if ti.static(self.sub.slots.converges):
+                    out[14] = self.sub.slots.tension[None]
+                    self.sub.slots.tension[None] = 0
             self.flags[None] = flags
         for k in ti.static(range(6)):
             out[k] = self.parts[0][k]
@@ -231,13 +237,21 @@ class Survey:
             )
         reach = float(np.abs([low, high]).max()) if (high >= low).all() else 0.0
         if reach >= self.farthest:
-            notes["out-of-range"] = f"A coordinate reached {reach:g} m, beyond {self.farthest:g} m, where the precision fails."
+            notes["out-of-range"] = (
+                f"A coordinate is out of range: it reached {reach:g} m, and beyond {self.farthest:g} m the precision fails."
+            )
         if int(flags) & 1:
             notes["tunnelling-risk"] = (
                 "A particle moved by more than its own size in one substep and may have passed another; use more substeps."
             )
         if int(flags) & 2:
             notes["turned"] = "A constraint turned by more than 41 degrees in one substep and is damped there; use more substeps."
+        if out[14] >= TENSEST:
+            need = int(np.ceil(substeps * np.sqrt(out[14] / STIFF)))
+            notes["softened"] = (
+                f"A tension makes particles vibrate too fast for the substep: omega h >= {np.sqrt(out[14]):.3g}, stable below 2. "
+                f"Its constraints give way instead. Use about {need} substeps."
+            )
         if stiff > STIFF:
             need = int(np.ceil(substeps * np.sqrt(stiff / STIFF))) + 1
             notes["stiff-force"] = (

@@ -10,14 +10,14 @@ import numpy as np
 from rich.progress import track
 
 from . import checks, runtime, snapshot
-from .assembly import assemble, check_settings, checked_features
+from .assembly import assemble, check_settings, checked_features, checked_solver
 from .breaking import BREAKS
 from .calm import EVERY, PASSES
 from .explain import explain
 from .feature import Acceleration, Feature
 from .particles import Particles, in_range
 from .queries import Contacts, Search, near_by_all, nearest
-from .solvers.jacobi import Jacobi
+from .solvers.solver import Solver
 from .substep import REBOUNDS, decay
 from .survey import StepReport
 
@@ -37,14 +37,14 @@ class World:
 
     def __init__(
         self, particles: Particles, features: Iterable[Feature] = (), *, substeps: int = 20, iterations: int = 1,
-        solver: Jacobi | None = None, precision: str = "f32", path: str = "auto",
+        solver: Solver | None = None, precision: str = "f32", path: str = "auto",
     ):  # fmt: skip
         if not isinstance(particles, Particles):
             raise TypeError(f"World: particles = {particles!r} is a {type(particles).__name__}; use tv.Particles(position).")
         check_settings(precision, path)
         self._particles, self._features = particles, checked_features(features)
+        self._solver, self._precision = checked_solver(solver), precision
         self.substeps, self.iterations = substeps, iterations
-        self._solver, self._precision = solver or Jacobi(), precision
         parts = assemble(particles, self._features, self._solver, precision, path)
         self._memory, self._scene, self._batches = parts.memory, parts.scene, parts.batches
         self._grid, self._sub, self._survey, self._path = parts.grid, parts.substep, parts.survey, parts.path
@@ -115,6 +115,8 @@ class World:
         if drag and drag != self._drag:
             self._sub.decay[None] = drag
         self._h, self._drag = h, drag
+        if self._sub.hurries:
+            self._sub.slots.kappa[None] = self._solver.condition(self.iterations)
         for feature in self._features:
             if feature.moving:
                 feature.moving = False
@@ -152,7 +154,13 @@ class World:
             for it in range(self.iterations if relaxes else 0):
                 if stale:
                     self._list()
-                state = self._sub.relaxed(h, s, n, it, self.iterations, fresh)
+                if self._sub.steps:
+                    self._sub.opened(h, s, n, it, fresh)
+                    for _ in range(self._sub.steps):
+                        self._sub.iterated()
+                    state = self._sub.collected(h, s, n, it, self.iterations, fresh)
+                else:
+                    state = self._sub.relaxed(h, s, n, it, self.iterations, fresh)
                 stale, struck = state & 1, state & 2
             if self._sub.concludes:
                 for _ in range(REBOUNDS if struck else 0):
@@ -368,7 +376,9 @@ class World:
 
     @iterations.setter
     def iterations(self, value: int) -> None:
-        self._iterations = checks.integer("World", "iterations", value, least=1)
+        value = checks.integer("World", "iterations", value, least=1)
+        self._solver.check(value)
+        self._iterations = value
 
     @property
     def fields(self) -> dict[str, int]:

@@ -94,12 +94,14 @@ class Constraint(Scalar):
             high = self.origin.astype(np.float32).astype(np.float64)  # two words: in f32 too, the origin is where it was put
             self._on_origin = [high.tolist(), (self.origin - high).tolist()]
         self.size = Scene(None, None, particles, inv_mass).size  # type: ignore[arg-type]
-        self._on_known: tuple[Any, Any] = (None, None)
+        self._on_known: tuple[Any, Any, Any] = (None, None, None)
         self._on_fixed = int(self.origin is None)
         self._on_slopes = Slopes(self.function, self.gradient, self.arity, particles.dim, self._on_fixed, self.size)
         Scalar.prepare(self, particles, inv_mass)
-        values = self.rest_of(particles.position)
-        self._on_known = (particles.position, values)
+        values, slopes = np.zeros(0), np.zeros((0, self.arity, particles.dim))
+        if self.count:
+            values, slopes, _ = self._on_slopes(self._corners(particles.position))
+        self._on_known = (particles.position, values, slopes)
         if not np.isfinite(values).all():
             i = int(np.argmin(np.isfinite(values)))
             raise ValueError(f"{self!r}: the function is {values[i]} for {self.index_name}[{i}] at its initial position.")
@@ -132,10 +134,14 @@ class Constraint(Scalar):
 
     def rest_of(self, position: np.ndarray) -> np.ndarray:
         """The values of function."""
-        known, values = self._on_known
+        known, values, _ = self._on_known
         if position is known:  # while the world's fields are being declared, Taichi cannot launch kernels
             return values
         return self._on_slopes(self._corners(position))[0] if self.count else np.zeros(0)
+
+    def slopes(self, position: np.ndarray) -> np.ndarray:
+        """The gradients at the positions that a world starts with."""
+        return self._on_known[2]
 
     @ti.func
     def corners(self, c, back):

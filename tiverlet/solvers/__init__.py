@@ -1,5 +1,8 @@
-"""Ways to relax constraints."""
+"""Ways to solve constraints."""
 
+from .chebyshev import Chebyshev
+from .conjugate import ConjugateGradient
+from .direct import Direct
 from .jacobi import Jacobi
 
-__all__ = ["Jacobi"]
+__all__ = ["Chebyshev", "ConjugateGradient", "Direct", "Jacobi"]

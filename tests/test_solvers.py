@@ -1,0 +1,134 @@
+"""Relaxation up to the law of its stability, and solvers that converge faster than it."""
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+from tiverlet.solvers.spectrum import largest
+
+
+def cloth(n, shear=False):
+    """Positions and links of a square cloth of n x n particles in the plane y = 0, side 1."""
+    k = np.arange(n * n).reshape(n, n)
+    pairs = [np.stack([k[:, :-1].ravel(), k[:, 1:].ravel()], axis=1), np.stack([k[:-1].ravel(), k[1:].ravel()], axis=1)]
+    if shear:
+        pairs.append(np.stack([k[:-1, :-1].ravel(), k[1:, 1:].ravel()], axis=1))
+        pairs.append(np.stack([k[1:, :-1].ravel(), k[:-1, 1:].ravel()], axis=1))
+    row, column = np.divmod(np.arange(n * n), n)
+    return np.stack([column, 0 * row, row], axis=1) / (n - 1), np.vstack(pairs)
+
+
+@pytest.mark.parametrize("shear, figure", [(False, 0.66), (True, 0.53)])
+def test_largest_eigenvalue_of_a_net(world, shear, figure):
+    # Numerics 4.3: 0.66 for a square net, 0.53 for cloth with shear; and the dense matrix says the same.
+    x, pairs = cloth(12, shear)
+    w = world(tv.Particles(x, pinned=np.arange(12)), [tv.Gravity(9.81), tv.Distance(pairs)], solver=tv.Jacobi("auto"))
+    r = x[pairs[:, 0]] - x[pairs[:, 1]]
+    r /= np.linalg.norm(r, axis=1)[:, None]
+    inv = np.where(np.arange(len(x)) < 12, 0.0, 1.0)
+    split = np.bincount(pairs.ravel(), minlength=len(x)) * inv
+    G = np.zeros((len(pairs), *x.shape))
+    G[np.arange(len(pairs)), pairs[:, 0]], G[np.arange(len(pairs)), pairs[:, 1]] = r, -r
+    D = split[pairs].sum(axis=1)
+    alive = D > 0
+    A = np.einsum("jia,i,kia->jk", G, inv, G)[np.ix_(alive, alive)] / np.sqrt(np.outer(D[alive], D[alive]))
+    value = float(np.linalg.eigvalsh(A).max())
+    assert largest(w._scene, [w.features[1]], split) == pytest.approx(value, rel=1e-3)
+    assert value == pytest.approx(figure, rel=0.03)
+    assert w._scene.slots.relaxation == pytest.approx(1.2 / value, rel=1e-3)
+    assert f"relaxation {1.2 / value:.3g}" in w.explain()
+
+
+def test_the_largest_safe_relaxation_is_stable_and_better(world):
+    x, pairs = cloth(12, shear=True)
+    left = []
+    for solver in (tv.Jacobi(), tv.Jacobi("auto")):
+        w = world(tv.Particles(x, mass=1e-3, pinned=[0, 11]), [tv.Gravity(9.81), tv.Distance(pairs)], solver=solver)
+        report = w.run(1.0)
+        assert report.energy <= 1e-6 and report.clean
+        left.append(report.residual)
+    assert left[1] < 0.6 * left[0]
+
+
+def test_auto_is_one_where_springs_would_change(world):
+    w = world(tv.Particles(np.eye(2)), [tv.Distance([[0, 1]], compliance=1e-3)], solver=tv.Jacobi("auto"))
+    assert w._scene.slots.relaxation == 1.0
+
+
+def hung(world, solver, n=10, **settings):
+    """A cloth that falls and swings on one of its edges."""
+    x, pairs = cloth(n)
+    start = tv.Particles(x, mass=1 / n**2, pinned=np.arange(n))
+    return world(start, [tv.Gravity(9.81), tv.Distance(pairs)], solver=solver, **{"precision": "f64", **settings})
+
+
+def test_conjugate_gradients_reach_the_direct_solution(world):
+    # A Newton step of the same linear system: after enough steps the same, and before them nearer with each.
+    direct, many = (hung(world, s, substeps=10) for s in (tv.Direct(width=100), tv.ConjugateGradient(60)))
+    few = hung(world, tv.ConjugateGradient(8), substeps=10)
+    for w in (direct, many, few):
+        w.run(0.5)
+    assert direct.last.residual < 1e-5 and many.last.clean
+    np.testing.assert_allclose(many.position, direct.position, atol=1e-7)
+    assert 1e-5 < np.abs(few.position - direct.position).max() < 1e-2 and few.last.residual < 1e-2
+    assert abs(many.last.energy) < 2e-3  # of m g L = 9.81: SHAKE neither gains nor loses
+
+
+def test_converged_cloth_from_soft_to_rigid(world):
+    # Springs on the same footing: static stretch by alpha F in one iteration, with the rest of the system rigid.
+    n = 6
+    x, pairs = cloth(n)
+    alpha = np.where(np.arange(len(pairs)) % 2, 1e-3, 0.0)
+    made = []
+    for solver in (tv.Direct(width=100), tv.ConjugateGradient(60)):
+        link = tv.Distance(pairs, compliance=alpha, damping=1.0)
+        w = world(
+            tv.Particles(x, mass=0.1, pinned=np.arange(n)), [tv.Gravity(9.81), link, tv.Drag(5.0)], precision="f64",
+            solver=solver, substeps=10,
+        )  # fmt: skip
+        w.run(0.3)
+        made.append((w.position, link.load))
+    np.testing.assert_allclose(made[0][0], made[1][0], atol=1e-8)
+    np.testing.assert_allclose(made[0][1], made[1][1], atol=1e-5 * np.abs(made[0][1]).max())
+
+
+def test_chebyshev_converges_as_the_square_root(world):
+    # k passes of Jacobi leave (1 - 1/kappa)^k of the slowest mode, those of Chebyshev 2 (1 - 2/sqrt(kappa))^k.
+    left = {}
+    for solver in (tv.Jacobi(), tv.Chebyshev()):
+        w = hung(world, solver)
+        for k in (8, 24):
+            w.position, w.velocity, w.iterations = w.particles.position, w.particles.velocity, k
+            left[type(solver), k] = np.median([w.step(1 / 60).residual for _ in range(30)])
+            assert abs(w.last.energy) < 0.1 and w.last.energy < 1e-3
+    assert left[tv.Chebyshev, 8] < left[tv.Jacobi, 8] / 4 and left[tv.Chebyshev, 24] < left[tv.Jacobi, 24] / 10
+
+
+def test_64_chebyshev_refuses_what_is_unstable(world):
+    x, pairs = cloth(3)
+    with pytest.raises(
+        ValueError, match=r"kappa = 50 with iterations = 1, .* kappa <= 1.29 iterations\^2 = 1.29. Use iterations=7"
+    ):
+        tv.World(tv.Particles(x), [tv.Distance(pairs)], solver=tv.Chebyshev(kappa=50))
+    w = world(tv.Particles(x), [tv.Distance(pairs)], solver=tv.Chebyshev(kappa=50), iterations=7)
+    with pytest.raises(ValueError, match="kappa = 50 with iterations = 6"):
+        w.iterations = 6
+    assert w.iterations == 7
+    for wrong in (lambda: tv.Chebyshev(1.0), lambda: tv.ConjugateGradient(0), lambda: tv.Jacobi("fast")):
+        with pytest.raises((ValueError, TypeError)):
+            wrong()
+    with pytest.raises(TypeError, match=r"solver = <class .*Direct'> is not a solver.*write Direct\(\)"):
+        tv.World(tv.Particles(x), solver=tv.Direct)
+
+
+@pytest.mark.parametrize("make", [tv.Chebyshev, tv.ConjugateGradient])
+def test_both_paths_have_the_same_bits(world, make):
+    hashes = []
+    for path in ("fused", "parallel"):
+        x, pairs = cloth(8)
+        features = [tv.Gravity(9.81), tv.Distance(pairs), tv.Rope([[0, 9], [63, 54]])]
+        w = world(tv.Particles(x, pinned=np.arange(8)), features, solver=make(), path=path, iterations=4, substeps=3)
+        w.run(0.2)
+        assert w.last.residual < 0.2 and "non-finite" not in w.last.flags
+        hashes.append(w.hash())
+    assert hashes[0] == hashes[1]

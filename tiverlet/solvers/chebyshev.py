@@ -1,0 +1,45 @@
+"""Chebyshev acceleration of mass-split Jacobi: many passes that converge as the square root, without a global sum."""
+
+import numpy as np
+
+from .. import checks
+from .solver import Solver
+
+LIMIT = 1.29  # kappa <= LIMIT k^2: T_k > 3, so that the residual polynomial stays above -1/3
+
+
+class Chebyshev(Solver):
+    """The passes of a substep are steps of the Chebyshev semi-iteration (Golub and Varga 1961; Wang 2015 for cloth).
+
+    With corrections z of Jacobi, eigenvalues between 1 / kappa and 1, and k passes,
+
+        d_0 = z_0 / theta,   d_j = rho_j rho_(j-1) d_(j-1) + (2 rho_j / delta) z_j,   rho_j = T_j(sigma) / T_(j+1)(sigma)
+
+    with theta = (1 + 1 / kappa) / 2, delta = (1 - 1 / kappa) / 2, sigma = theta / delta. Each multiplier needs one number of
+    memory and no sum over all, so the bits are those of any number of threads, and a pass costs what one of Jacobi does.
+
+    kappa: the condition number that the passes are made for. Stepping is stable when kappa <= 1.29 k^2 for k iterations; more is
+    refused. None takes half of that, which leaves room for what is not linear. Use 4 iterations or more; with one this is Jacobi.
+    Ropes, spacers and what is not one number are relaxed as by Jacobi beside it.
+    """
+
+    accelerates = converges = True
+
+    def __init__(self, kappa: float | None = None):
+        self.kappa = None if kappa is None else checks.number("Chebyshev", "kappa", kappa, above=1.0)
+
+    def check(self, iterations: int) -> None:
+        """Refuse what would be unstable with so many passes."""
+        if self.kappa is not None and self.kappa > LIMIT * iterations**2:
+            need = int(np.ceil(np.sqrt(self.kappa / LIMIT)))
+            raise ValueError(
+                f"Chebyshev: kappa = {self.kappa:g} with iterations = {iterations}, but stepping is stable only for kappa <= "
+                f"1.29 iterations^2 = {LIMIT * iterations**2:.4g}. Use iterations={need} or more, or kappa=None."
+            )
+
+    def condition(self, iterations: int) -> float:
+        """The condition number that so many passes are made for."""
+        return self.kappa or max(LIMIT / 2 * iterations**2, 1.1)
+
+    def __repr__(self) -> str:
+        return "Chebyshev()" if self.kappa is None else f"Chebyshev(kappa={self.kappa:g})"

@@ -1,0 +1,181 @@
+"""Preconditioned conjugate gradients on the constraints of a scene: cloth and nets that converge."""
+
+import numpy as np
+import taichi as ti
+
+from .. import checks
+from ..feature import Batch, Scene
+from ..scalar import TENSEST, Scalar
+from .slots import Slots
+from .solver import Solver
+from .system import System
+
+BLOCKS = 64  # partial sums: their number is fixed, so the total has the same bits on any number of threads
+
+
+class ConjugateGradient(Solver):
+    """All constraints that are one number and act both ways are solved as one linear system in each iteration of a substep:
+
+        A_j sum_k (grad C_j(x) . w . grad C_k(x_n)) dlam_k + alpha'_j dlam_j = -(A_j C_j + B_j + alpha'_j lam_j)
+
+    by `steps` steps of conjugate gradients, preconditioned by the diagonal (Hestenes and Stiefel 1952); the matrix is symmetric
+    but for what the constraints turn in a substep. The error falls as ((sqrt(kappa) - 1) / (sqrt(kappa) + 1))^steps: some forty
+    steps for a cloth of 30 x 30. Sums are over a fixed number of blocks, in f64: the bits are those of any number of threads.
+
+    Made for constraints that can all be met. Where they contradict each other (a row of links drawn straight between two pins),
+    it stops at the tension that the substep can stand ("softened") and may bring in energy; Jacobi and Chebyshev do not.
+
+    steps: of conjugate gradients in an iteration. Ropes, spacers and what is not one number are relaxed as by Jacobi beside it.
+    """
+
+    converges = True
+
+    def __init__(self, steps: int = 20):
+        self.steps = checks.integer("ConjugateGradient", "steps", steps, least=1)
+
+    def system(self, scene: Scene, batches: list[Batch], slots: Slots) -> "Krylov | None":
+        """The system of a scene on the device; None where there is none."""
+        scalars = [b for b in batches if isinstance(b, Scalar) and b.joins and b.side == 0]
+        return Krylov(scene, batches, slots, scalars, self.steps) if scalars else None
+
+    def explain(self, batches: list[Batch], slots: Slots) -> str:
+        """What is solved how."""
+        told = slots.system.rows if slots.system else 0
+        alone = slots.system.left_out(batches) if told else sum(b.count for b in batches)
+        return f"{self!r}: {told} constraints together" + (f"; {alone} relaxed as by Jacobi" if alone else "")
+
+    def __repr__(self) -> str:
+        return f"ConjugateGradient(steps={self.steps})"
+
+
+class Krylov(System):
+    """The system of one world on the device. Row r is a constraint in its batch's order."""
+
+    def __init__(self, scene: Scene, batches: list[Batch], slots: Slots, scalars: list[Scalar], steps: int):
+        places = [slots.places(b) for b in scalars]
+        rows = np.flatnonzero(np.concatenate([(p >= 0).any(axis=1) for p in places]))
+        super().__init__(scene, batches, slots, scalars, rows)
+        self.steps, self.n, self.begin, self.w = steps, scene.particles.count, slots.begin, scene.state.w
+        self.spread = 1  # launches for each block; Taichi gives each CPU thread at least 512 of them, see Phases
+        row = np.concatenate([np.repeat(self.row(b), b.arity) for b in scalars])
+        slot, who = (np.concatenate([a.ravel() for a in arrays]) for arrays in (places, [b.indices for b in scalars]))
+        free = slot >= 0
+        order = np.argsort(row[free], kind="stable")
+        ends = np.concatenate([[0], np.cumsum(np.bincount(row[free], minlength=self.rows))])
+        self.corner_begin = self.ints("corner_begin", ends)
+        self.corner = self.ints("corner", np.stack([slot[free], who[free]], axis=1)[order], 2)
+        self.ahead, self.rest, self.applied = self.vector("ahead"), self.vector("rest"), self.vector("applied")
+        self.scaled, self.soft = self.vector("preconditioner"), self.vector("softness")
+        self.gradient = scene.memory.field("system.gradient", slots.total, width=self.dim)
+        self.pull = scene.memory.field("system.pull", self.n, width=self.dim)
+        self.part, self.worst = self.reals("part", BLOCKS), self.reals("worst", BLOCKS)
+        self.sums = scene.memory.field("system.sums", None, width=3, kind=ti.f64)  # r.z, the coming weight, what is taken back
+
+    def vector(self, name: str):
+        """A real number for each row."""
+        return self.memory.field(f"system.{name}", self.rows)
+
+    @ti.func
+    def tell(self, r, violation, A, alpha, lam, W, lever):
+        """The right side, the preconditioner, and the first direction."""
+        System.tell(self, r, violation, A, alpha, lam, W, lever)
+        zero = 0 * violation
+        self.step[r] = 0
+        self.rest[r] = ti.select(W > 0, -violation / A, zero)
+        self.soft[r] = ti.select(W > 0, alpha / A, zero)
+        self.scaled[r] = ti.select(W > 0, 1 / (W + self.soft[r]), zero)
+        self.ahead[r] = self.scaled[r] * self.rest[r]
+
+    @ti.func
+    def lean(self, place, i, gradient):
+        """The gradient at one corner, whose slot is `place` and particle i."""
+        if place >= 0:
+            self.gradient[place] = gradient
+
+    @ti.func
+    def begin_of(self, b):
+        """The first row of block b."""
+        return b * ((self.rows + BLOCKS - 1) // BLOCKS)
+
+    @ti.func
+    def summed(self):
+        """The sum of the parts, in order."""
+        out = ti.cast(0, ti.f64)
+        for b in range(BLOCKS):
+            out += self.part[b]
+        return out
+
+    @ti.func
+    def open(self):
+        """r . z of the first residual."""
+        for k in range(BLOCKS * self.spread):
+            if k % self.spread == 0:
+                b, total = k // self.spread, ti.cast(0, ti.f64)
+                for r in range(self.begin_of(b), ti.min(self.begin_of(b + 1), self.rows)):
+                    total += ti.cast(self.rest[r], ti.f64) * self.ahead[r]
+                self.part[b] = total
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            self.sums[None][0] = self.summed()
+
+    @ti.func
+    def go(self):
+        """One step of conjugate gradients. One that needs a tension too large for the substep is taken back, and is the last."""
+        for i in range(self.n):
+            if self.w[i] > 0:
+                total = 0 * self.pull[i]
+                for s in range(self.begin[i], self.begin[i + 1]):
+                    r = self.row_of[s]
+                    if r >= 0:
+                        total += self.ahead[r] * self.move[s]
+                if ti.static(self.shares):
+                    total *= self.share[i]
+                self.pull[i] = total
+        for k in range(BLOCKS * self.spread):
+            if k % self.spread == 0:
+                b, total = k // self.spread, ti.cast(0, ti.f64)
+                for r in range(self.begin_of(b), ti.min(self.begin_of(b + 1), self.rows)):
+                    value = self.soft[r] * self.ahead[r]
+                    for c in range(self.corner_begin[r], self.corner_begin[r + 1]):
+                        at = self.corner[c]
+                        value += self.gradient[at[0]].dot(self.pull[at[1]])
+                    self.applied[r] = value
+                    total += ti.cast(value, ti.f64) * self.ahead[r]
+                self.part[b] = total
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            curve = self.summed()
+            self.sums[None][1] = ti.select(curve > 0, self.sums[None][0] / curve, ti.cast(0, ti.f64))
+        for k in range(BLOCKS * self.spread):
+            if k % self.spread == 0:
+                b, total, worst = k // self.spread, ti.cast(0, ti.f64), ti.cast(0, ti.f64)
+                far = self.sums[None][1]
+                for r in range(self.begin_of(b), ti.min(self.begin_of(b + 1), self.rows)):
+                    self.step[r] += far * self.ahead[r]
+                    rest = self.rest[r] - ti.cast(far, self.real) * self.applied[r]
+                    self.rest[r] = rest
+                    total += ti.cast(self.scaled[r] * rest, ti.f64) * rest
+                    worst = ti.max(worst, self.lever[r] * ti.abs(self.lam[r] + self.step[r]))
+                self.part[b], self.worst[b] = total, worst
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            now, before, worst = self.summed(), self.sums[None][0], self.worst[0]
+            for b in range(1, BLOCKS):
+                worst = ti.max(worst, self.worst[b])
+            ti.atomic_max(self.tension[None], worst)
+            back = ti.select(worst > TENSEST, self.sums[None][1], 0 * now)
+            if worst > TENSEST:
+                now = 0
+            self.sums[None] = ti.Vector([now, ti.select(before > 0, now / before, 0 * now), back], ti.f64)
+        for r in range(self.rows):
+            if self.sums[None][2] != 0:
+                self.step[r] -= self.sums[None][2] * self.ahead[r]
+                self.rest[r] = 0
+            self.ahead[r] = self.scaled[r] * self.rest[r] + ti.cast(self.sums[None][1], self.real) * self.ahead[r]
+
+    @ti.func
+    def solve(self, b):
+        """All steps, one after the other."""
+        self.open()
+        for _ in range(self.steps):
+            self.go()

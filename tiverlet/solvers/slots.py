@@ -1,0 +1,108 @@
+"""Where constraints leave the moves that they want, and where particles collect them."""
+
+from typing import Any
+
+import numpy as np
+import taichi as ti
+
+from ..feature import Batch, Scene
+
+
+class Slots:
+    """One slot for each corner of a constraint, in the order of the batches and of the constraints in them.
+
+    The slots of one particle stand side by side, so that a particle adds them in an order that depends on nothing else. Corners
+    that cannot move have no slot.
+
+    split: the mass-split weight n w of each particle, for the n blocks of constraints that it belongs to: a system that is solved
+    as a whole is one, and each constraint that is relaxed by itself.
+    """
+
+    def __init__(self, scene: Scene, batches: list[Batch], solver):
+        memory, state, inv_mass = scene.memory, scene.state, scene.inv_mass
+        n = len(inv_mass)
+        members = np.concatenate([b.indices.ravel() for b in batches])
+        movable = inv_mass[members] > 0
+        self.total = int(movable.sum())
+        degree = np.bincount(members[movable], minlength=n)
+        order = np.argsort(np.where(movable, members, n), kind="stable")
+        place = np.empty(len(members), dtype=np.int64)
+        place[order] = np.arange(len(members))
+        place[~movable] = -1
+        ends = np.cumsum([b.indices.size for b in batches])
+        parts = np.split(place, ends[:-1])
+        self._places = {id(b): p.reshape(b.indices.shape) for b, p in zip(batches, parts, strict=True)}
+        self.state = state
+        self.move = memory.field("slots.move", self.total, width=state.dim)
+        self.begin = memory.field("slots.begin", n + 1, kind=ti.i32, values=np.concatenate([[0], np.cumsum(degree)]))
+        self.pull = memory.field("slots.pull", n, width=state.dim, state=True)
+        self.accelerates = solver.accelerates
+        if self.accelerates:
+            self.pace = memory.field("slots.pace", None, width=3, kind=ti.f64)
+            self.kappa = memory.field("slots.kappa", None, kind=ti.f64)
+        self.converges = solver.converges
+        if self.converges:
+            self.tension = memory.field("slots.tension", None, kind=ti.f64)
+        self.turned = memory.field("slots.turned", None, kind=ti.i32)
+        if any(b.breaks for b in batches):
+            self.broken = memory.field("slots.broken", None, kind=ti.i32)
+        self.system: Any = solver.system(scene, batches, self)
+        self.whole = bool(self.system)
+        blocks = self.system.blocks if self.system else degree
+        self.split = memory.field("slots.split_mass", n, values=blocks * inv_mass)
+        self.relaxation = solver.relaxed_by(scene, batches, blocks * inv_mass)
+
+    def places(self, batch: Batch) -> np.ndarray:
+        """The slot of each corner of a batch, -1 where it cannot move."""
+        return self._places[id(batch)]
+
+    def rows(self, batch: Batch) -> np.ndarray:
+        """The row of each constraint of a batch in a system, -1 where it is relaxed by itself."""
+        return self.system.row(batch) if self.system else np.full(batch.count, -1)
+
+    @ti.func
+    def hurry(self, first):
+        """The Chebyshev weights of the coming pass: of the step before, of the correction; and rho. See Chebyshev."""
+        delta = (1 - 1 / self.kappa[None]) / 2
+        sigma = (1 - delta) / delta
+        rho = self.pace[None][2]
+        if first != 0:
+            self.pace[None] = ti.Vector([0, 1 / (1 - delta), 1 / sigma], ti.f64)
+        else:
+            now = 1 / (2 * sigma - rho)
+            self.pace[None] = ti.Vector([now * rho, 2 * now / delta, now], ti.f64)
+
+    @ti.func
+    def hurried(self, step, correction):
+        """The step of a multiplier, from its last one and the correction."""
+        return ti.cast(self.pace[None][0], self.state.real) * step + ti.cast(self.pace[None][1], self.state.real) * correction
+
+    @ti.func
+    def total_of(self, i):
+        """The sum of the moves in the slots of particle i, in order."""
+        total = 0 * self.state.x[i]
+        for s in range(self.begin[i], self.begin[i + 1]):
+            total += self.move[s]
+        return total
+
+    @ti.func
+    def wanted(self, i):
+        """What the constraints want of particle i: the sum of the moves, in f64 where large ones of a system cancel."""
+        total = 0 * self.state.x[i]
+        if ti.static(self.whole):
+            total = self.system.total_of(i, self.begin[i], self.begin[i + 1])
+        else:
+            total = self.total_of(i)
+        return total
+
+    @ti.func
+    def gather(self, i, first, final):
+        """Move particle i by what the constraints want. `pull` keeps the sum of a frame's last substep."""
+        if self.begin[i + 1] > self.begin[i]:
+            total = self.wanted(i)
+            self.state.shift(i, total)
+            if final != 0:
+                if first != 0:
+                    self.pull[i] = total
+                else:
+                    self.pull[i] += total

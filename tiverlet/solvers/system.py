@@ -1,0 +1,91 @@
+"""Constraints that are solved together: what they tell, and what particles make of the answer."""
+
+import numpy as np
+import taichi as ti
+
+from ..feature import Batch, Scene
+from ..scalar import Scalar
+from .slots import Slots
+
+
+class System:
+    """Rows of constraints, each with its violation, its weights and the step of its multiplier that a solver finds.
+
+    scalars: the batches that take part, their constraints numbered through; rows: those numbers, in the order of the solver.
+    """
+
+    parts = 1  # systems that have nothing to do with each other
+    steps = 0  # of an iteration in launches of their own; 0 for a solution by solve()
+
+    def __init__(self, scene: Scene, batches: list[Batch], slots: Slots, scalars: list[Scalar], rows: np.ndarray):
+        self.real, self.dim, self.move, self.tension = scene.real, scene.state.dim, slots.move, slots.tension
+        self.memory, self.inv_mass, self.rows = scene.memory, scene.inv_mass, len(rows)
+        counts = [b.count for b in scalars]
+        row = np.full(sum(counts), -1)
+        row[rows] = np.arange(len(rows))
+        self._rows = dict(zip(map(id, scalars), np.split(row, np.cumsum(counts)[:-1]), strict=True))
+        self.blocks, self.shares = self._blocks(batches, scene.inv_mass)
+        of_slot = np.full(sum(b.indices.size for b in batches), -1)
+        for b in scalars:
+            slot = slots.places(b)
+            of_slot[slot[slot >= 0]] = np.broadcast_to(self.row(b)[:, None], slot.shape)[slot >= 0]
+        self.row_of = self.ints("row_of_slot", of_slot)
+        self.step, self.violation, self.scale = self.reals("step"), self.reals("violation"), self.reals("scale")
+        self.alpha, self.lam, self.lever = self.reals("alpha"), self.reals("multiplier"), self.reals("lever")
+        if self.shares:
+            self.share = self.ints("share", self.blocks)
+
+    def ints(self, name: str, values: np.ndarray, width: int = 0):
+        """A field of integers."""
+        return self.memory.field(f"system.{name}", len(values), width=width, kind=ti.i32, values=values)
+
+    def reals(self, name: str, length: int | None = None):
+        """A field of f64, one for each row."""
+        return self.memory.field(f"system.{name}", self.rows if length is None else length, kind=ti.f64)
+
+    def _blocks(self, batches: list[Batch], inv_mass: np.ndarray) -> tuple[np.ndarray, bool]:
+        """The number of blocks that each particle belongs to, one system at most; and whether any is in a system and others."""
+        n = len(inv_mass)
+        inside, alone = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64)
+        for b in batches:
+            row = self.row(b)
+            if (row >= 0).any():
+                inside[b.indices[row >= 0]] = True
+                alone += np.bincount(b.indices[row < 0].ravel(), minlength=n)
+            else:
+                alone += np.bincount(b.indices.ravel(), minlength=n)
+        free = inv_mass > 0
+        return np.where(free, inside + alone, 0), bool((inside & (alone > 0) & free).any())
+
+    def row(self, batch: Batch) -> np.ndarray:
+        """The row of each constraint of a batch, -1 where it is relaxed by itself."""
+        return self._rows.get(id(batch), np.full(batch.count, -1))
+
+    def left_out(self, batches: list[Batch]) -> int:
+        """The number of constraints that are relaxed by themselves, of those with a particle that can move."""
+        return sum(int((~b.idle(self.inv_mass) & (self.row(b) < 0)).sum()) for b in batches)
+
+    @ti.func
+    def tell(self, r, violation, A, alpha, lam, W, lever):
+        """What constraint r is about in this pass, but for what its corners tell. lever: see Scalar."""
+        self.violation[r], self.alpha[r], self.lam[r], self.lever[r] = violation, alpha, lam, lever
+        self.scale[r] = ti.select(W > 0, A, 0 * A)
+
+    @ti.func
+    def lean(self, place, i, gradient):
+        """The gradient at one corner, whose slot is `place` and particle i."""
+
+    @ti.func
+    def solve(self, b):
+        """Part b: the step of every multiplier in it."""
+
+    @ti.func
+    def total_of(self, i, begin, end):
+        """The sum of the moves of particle i: those of a large tension at both sides of it cancel, in f64."""
+        total = ti.Vector.zero(ti.f64, self.dim)
+        for s in range(begin, end):
+            r, factor = self.row_of[s], ti.cast(1, ti.f64)
+            if r >= 0:
+                factor = self.step[r]
+            total += factor * ti.cast(self.move[s], ti.f64)
+        return ti.cast(total, self.real)
