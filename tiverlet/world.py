@@ -27,7 +27,8 @@ class World:
 
     particles: Particles. features: what acts, in any order; at most one Contact. What is not in the list costs nothing.
     substeps: substeps of a frame. iterations: passes over the constraints in it. Both may change at any time, at no compile cost.
-    solver: how constraints are solved: Jacobi (None), Direct for chains, trees and loops, Chebyshev or ConjugateGradient for cloth.
+    solver: how constraints are solved: Jacobi (None), Direct for chains, trees and loops, Chebyshev or ConjugateGradient for
+    cloth.
     precision: "f32" (position and displacement), "f32-compensated" (the position carries a low word, for coordinates far from the
     origin), "f64".
     path: "auto", "fused" (one launch per frame, one thread) or "parallel"; the bits are the same.
