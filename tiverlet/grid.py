@@ -196,7 +196,8 @@ class Grid:
         """The list is stale once a particle has moved by half the skin."""
         r = self.state.x[i] - self.origin[i]
         if not (r.dot(r) <= ti.cast((0.49 * self.skin) ** 2, self.real)):  # "not <=" also catches NaN
-            self.stale[None] = 1
+            if self.stale[None] == 0:  # threads that all write to the same place wait for each other
+                self.stale[None] = 1
 
     @ti.func
     def build(self):

@@ -48,6 +48,7 @@ class Phases:
         self.grid, self.hashes = grid, bool(grid)
         self.breakers: list[Any] = [b for b in self.batches if b.breaks]
         self.concludes = any(c.rubs or c.bounces for c in self.contacts) or bool(self.breakers)
+        self.calms = any(c.calms for c in self.contacts)
         self.walls: list[Wall] = walls
         self.posed = [w for w in walls if w.poses]
         self.radius = scene.radius

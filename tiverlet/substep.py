@@ -46,7 +46,7 @@ class Substep(Phases):
                             for _ in range(REBOUNDS):
                                 self.rebound()
                         self.remember(h, tick + s)
-                if ti.static(self.hashes):
+                if ti.static(self.calms):
                     if self.halted() == 0 and (since + s) % EVERY == EVERY - 1:
                         for k in range(PASSES):
                             self.calm(k)

@@ -167,7 +167,7 @@ class World:
                 for _ in range(REBOUNDS if struck else 0):
                     self._sub.rebounded()
                 self._sub.remembered(h, self._tick + s)
-            if self._grid and (self._since + s) % EVERY == EVERY - 1:
+            if self._sub.calms and (self._since + s) % EVERY == EVERY - 1:
                 for k in range(PASSES):
                     self._sub.calmed(k)
 

@@ -54,6 +54,7 @@ class Contact(Touch):
 
     matters = True
     measures = False  # looks at all contacts once in each pass, before they are counted
+    calms = True  # knows which of them bear a load, see calm.py
 
     @property
     def rubs(self) -> bool:
@@ -120,7 +121,8 @@ class Contact(Touch):
         d = self._on_state.d[i]
         limit = self._on_radius.stride(i)
         if not (d.dot(d) <= limit * limit):
-            self._on_fast[None] = 1
+            if self._on_fast[None] == 0:
+                self._on_fast[None] = 1
 
     @ti.func
     def count(self, i, first):
@@ -170,7 +172,8 @@ class Contact(Touch):
                             lifts += w / shared * lift * n
                             if kick > 0:
                                 self._on_aim.field[e] = aim * n
-                                self._on_hit[None] = 1
+                                if self._on_hit[None] == 0:
+                                    self._on_hit[None] = 1
                     part, last = overlap / shared, self._on_push.field[e]
                     if first == 0:
                         push = last

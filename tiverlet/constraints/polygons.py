@@ -43,7 +43,7 @@ class Polygons(Contact):
     of a wall passes between two of them.
     """
 
-    measures = True
+    measures, calms = True, False
     _on_store: Any = None
 
     def __init__(self, loops: Iterable, friction=0.0, restitution=0.0, *, skin="auto", push_out=1.0):
@@ -144,7 +144,6 @@ class Polygons(Contact):
         ]
         apart: Any = _Apart(self)
         self._on_grid = Grid(reach, self._on_size, linked, apart, luggage, parallel)
-        self._on_calm: Any = _Loud()
         return self._on_grid
 
     def ease(self) -> None:
@@ -491,18 +490,6 @@ class Polygons(Contact):
                 worst = ti.max(worst, met[0] / size)
                 touching += 1
         return touching, worst
-
-
-class _Loud:
-    """In place of Calm: contacts of vertices and edges keep their sound."""
-
-    @ti.func
-    def want(self, i, k):
-        """Nothing."""
-
-    @ti.func
-    def move(self, i):
-        """Nothing."""
 
 
 class _Apart:
