@@ -34,7 +34,7 @@ def build(bodies: int = 45) -> tv.World:
     turn = np.arange(6) * np.pi / 3
     drum = tv.Polygon(RADIUS * np.stack([np.cos(turn), np.sin(turn)], axis=1), inside=True, friction=0.5)
     features = [tv.Gravity(9.81), tv.Distance(np.concatenate(links)), tv.Polygons(loops, friction=0.4), drum]
-    return tv.World(tv.Particles(np.concatenate(position), mass=0.1), features)
+    return tv.World(tv.Particles(np.concatenate(position), mass=0.1), features, substeps=40)
 
 
 def deepest(world: tv.World) -> float:

@@ -90,8 +90,8 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver, path: str
     substep = Substep(scene, accelerations, batches, drivers, contact, grid, walls, parallel)
     survey = Survey(substep)
     memory.place()
-    if grid:
-        grid.allocate(len(particles) * ROOM[scene.radius.uniform][particles.dim - 2] + 64)
+    if grid and contact:
+        grid.allocate(len(particles) * max(ROOM[scene.radius.uniform][particles.dim - 2], contact.room) + 64)
     return Assembly(path, memory, scene, batches, grid, substep, survey)
 
 

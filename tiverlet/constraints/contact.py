@@ -53,6 +53,7 @@ class Contact(Touch):
         self.push_out = checks.number("Contact", "push_out", push_out, least=0.0)
 
     matters = True
+    room = 0  # entries of the list for each particle, at first, if that is more than discs have
     measures = False  # looks at all contacts once in each pass, before they are counted
     calms = True  # knows which of them bear a load, see calm.py
 

@@ -44,6 +44,7 @@ class Polygons(Contact):
     """
 
     measures, calms = True, False
+    room = 64  # the particles of near bodies
     _on_store: Any = None
 
     def __init__(self, loops: Iterable, friction=0.0, restitution=0.0, *, skin="auto", push_out=1.0):
