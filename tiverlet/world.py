@@ -305,13 +305,13 @@ class World:
 
     @property
     def contacts(self) -> Contacts:
-        """The pairs that overlap now, as arrays. Empty without a Contact."""
+        """The pairs of discs or spheres that overlap now, as arrays. Empty without a Contact; Polygons keep no impulses (NaN)."""
         x, r = self.position, self._particles.radius
         pairs, push = np.zeros((0, 2), dtype=np.int64), np.zeros(0)
         if self._grid:
             self._list()
             pairs, at = self._grid.pairs()
-            push = self._grid.read(self._sub.contacts[0]._on_push, at)
+            push = self._grid.read(self._sub.contacts[0]._on_push, at) if self._sub.calms else np.full(len(pairs), np.nan)
         d = x[pairs[:, 0]] - x[pairs[:, 1]]
         length = np.linalg.norm(d, axis=1)
         overlap = r[pairs].sum(axis=1) - length
