@@ -14,15 +14,12 @@ from ..grid import Grid, Luggage
 from ..material import Table
 from ..particles import Particles, Radii
 from .contact import Contact
+from .rim import VERTEX, Rim, area_of, depth_of
 
-SLACK = 1 / 512  # of an edge: as much further it goes at its ends, so that bodies of the same width stand on each other
-CLOSE = 1e-4  # edges whose distances differ by less are equally near: the first of them counts
-TINY = 1e-30
 STRETCH = 1.25  # of an edge, beyond which a contact in its middle might not be listed
-VERTEX, START, END = range(3)  # what a particle is in a contact with one that it is listed with
 
 
-class Polygons(Contact):
+class Polygons(Rim):
     """Bodies made of particle loops do not overlap each other, nor other particles: vertex against edge, disc against disc (2D).
 
     C(x) = (x_v - (1 - t) x_a - t x_b) . n - (r_v + (1 - t) r_a + t r_b) >= 0 for a vertex v and the edge from a to b of another
@@ -69,7 +66,7 @@ class Polygons(Contact):
         length = np.zeros(n)  # of the longer edge
         for k, loop in enumerate(self.loops):
             checks.indices("Polygons", f"loops[{k}]", loop, n)
-            area = _area(x[loop])
+            area = area_of(x[loop])
             extent = float(np.ptp(x[loop], axis=0).max())
             if abs(area) <= 1e-9 * extent**2:
                 raise ValueError(f"Polygons: loops[{k}] encloses an area of {area:g} m^2; its particles are on a line.")
@@ -103,7 +100,7 @@ class Polygons(Contact):
             a = x[loop]
             some = ((x >= a.min(axis=0)) & (x <= a.max(axis=0))).all(axis=1) & (self._on_body != k)
             for i in np.flatnonzero(some):
-                depth, edge = _depth(x[i], a)
+                depth, edge = depth_of(x[i], a)
                 if depth > edge / 2:
                     raise ValueError(
                         f"Polygons: particle {i} starts {depth:.3g} m inside of loops[{k}], deeper than half of the nearest edge "
@@ -180,183 +177,6 @@ class Polygons(Contact):
             limit = ti.min(limit, self._on_radius.stride(i) if ti.static(self._on_radius.least > 0) else limit)
         if not (d.dot(d) <= limit * limit):
             self._on_fast[None] = 1
-
-    @ti.func
-    def after(self, i):
-        """The next particle around the body of particle i; -1 if it has none."""
-        return self._on_loop[i][0]
-
-    @ti.func
-    def before(self, i):
-        """The one before."""
-        return self._on_loop[i][1]
-
-    @ti.func
-    def corner(self, v, a):
-        """1 if v is in front of the corner a, beside none of its edges; -1 if it is behind an inner one; 0 if beside an edge.
-
-        A particle without edges is a corner all around.
-        """
-        out = 1
-        if self.after(a) >= 0:
-            r, u, w = self._on_state.apart(v, a), self._on_state.apart(self.after(a), a), self._on_state.apart(self.before(a), a)
-            if r.dot(u) > 0 or r.dot(w) > 0:
-                out = 0
-            elif u.cross(w) < 0:
-                out = -1
-        return out
-
-    @ti.func
-    def edge(self, v, a, front, eased: ti.template()):  # type: ignore[valid-type]
-        """How far v overlaps the edge from a to the next, negative where it does not, the normal, and where on the edge.
-
-        What was in front at the start of the substep came in over this edge if it crossed it between its ends. What was behind
-        already goes out over the nearest one that faces its own body, at push_out.
-        """
-        b = self.after(a)
-        r, u = self._on_state.apart(v, a), self._on_state.apart(b, a)
-        uu, t = u.dot(u), 0 * r[0]
-        overlap, n = t - 1, 0 * r
-        if uu > 0:
-            length = ti.sqrt(uu)
-            t, n = r.dot(u) / uu, ti.Vector([u[1], -u[0]]) / length
-            height, cross, came, shared = r.dot(n), t, True, a
-            if height < 0:
-                d = self._on_state.d[a]
-                r0, u0 = r - (self._on_state.d[v] - d), u - (self._on_state.d[b] - d)
-                height0, t0 = r0.dot(ti.Vector([u0[1], -u0[0]])) / length, r0.dot(u0) / ti.max(u0.dot(u0), uu * SLACK)
-                came = height0 >= -SLACK * length
-                if height0 > 0:
-                    cross = t0 + height0 / (height0 - height) * (t - t0)
-            beside = -SLACK <= cross <= 1 + SLACK
-            if not came and t < 0:
-                beside = front < 0
-                if beside:  # the nearest way out is over an inner corner
-                    height, shared = -r.norm(), self.before(a)
-                    n = r / ti.min(height, -uu * TINY)
-            t = ti.min(ti.max(t, 0), 1)
-            far = self._on_radius.of(v) + (1 - t) * self._on_radius.of(a) + t * self._on_radius.of(b)
-            if beside and height < far and height >= -length / 2:
-                out = far - height
-                if not came:
-                    back = self.inward(v)
-                    came = back.dot(n) >= 0 and self.nearest(v, a, shared, height, back)
-                    if ti.static(eased):
-                        out = ti.min(out, self.push_out * self._on_h[None] - self.relative(v, a, b, t).dot(n))
-                if came:
-                    overlap = out
-        return overlap, n, t
-
-    @ti.func
-    def inward(self, v):
-        """The way from an outer corner v into its own body; 0 where there is none."""
-        out = 0 * self._on_state.x[v]
-        if self.after(v) >= 0:
-            u, w = self._on_state.apart(self.after(v), v), self._on_state.apart(self.before(v), v)
-            if u.cross(w) > 0:
-                out = u * w.norm() + w * u.norm()
-        return out
-
-    @ti.func
-    def nearest(self, v, a, shared, height, back):
-        """Whether no edge of the body of a but those from a and `shared` is nearer to v, which is at `height` below 0 over them.
-
-        Edges that face away from the body of v, which lies in the direction `back`, are no way out for it.
-        """
-        out = True
-        for e in range(self._on_grid.first[v], self._on_grid.first[v] + self._on_grid.number[v]):
-            j = self._on_grid.near[e]
-            if j != a and j != shared and self._on_loop[j][2] == self._on_loop[a][2]:
-                r, u = self._on_state.apart(v, j), self._on_state.apart(self.after(j), j)
-                uu, faces = u.dot(u), u[1] * back[0] - u[0] * back[1] >= 0
-                if uu > 0:
-                    r -= ti.min(ti.max(r.dot(u) / uu, 0), 1) * u
-                rest = -height - r.norm()
-                if faces and (rest > -CLOSE * height or (rest >= CLOSE * height and j < a)):
-                    out = False
-        return out
-
-    @ti.func
-    def measure(self, i):
-        """Find the contacts that particle i is the vertex of, or the first of two discs: at most one with each near particle."""
-        self.look(i, True)
-
-    @ti.func
-    def look(self, i, eased: ti.template()):  # type: ignore[valid-type]
-        """As measure(), with or without the overlap that is allowed."""
-        for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
-            j = self._on_grid.near[e]
-            overlap, n, t = 0 * self._on_w[i] - 1, 0 * self._on_state.x[i], 0 * self._on_w[i]
-            front = self.corner(i, j)
-            if self.after(j) >= 0:
-                overlap, n, t = self.edge(i, j, front, eased)
-            if overlap <= 0 and i < j and front > 0:
-                overlap, n = self.touch(i, j, self._on_radius.of(i) + self._on_radius.of(j))
-                if overlap > 0:
-                    t = 0 * t - 1
-                    if self.corner(j, i) <= 0:
-                        overlap = -overlap
-            if ti.static(eased):
-                overlap -= self._on_less[i]
-            self._on_met.field[e] = ti.Vector([overlap, t, n[0], n[1]])
-            back = ti.Vector([self.find(j, i), -1])
-            if self.before(i) >= 0:
-                back[1] = self.find(j, self.before(i))
-            self._on_back.field[e] = ti.cast(back, self.scene.real)
-
-    @ti.func
-    def find(self, v, a):
-        """Where a is in the list of v, counted from its begin; -1 if it is not."""
-        low, end = self._on_grid.first[v], self._on_grid.first[v] + self._on_grid.number[v]
-        high = end
-        while low < high:
-            middle = (low + high) // 2
-            if self._on_grid.near[middle] < a:
-                low = middle + 1
-            else:
-                high = middle
-        out = -1
-        if low < end:
-            if self._on_grid.near[low] == a:
-                out = low - self._on_grid.first[v]
-        return out
-
-    @ti.func
-    def meeting(self, i, e, role):
-        """The contact in which particle i, with the one at entry e of its list, is in a role.
-
-        Returns the entry that keeps it (-1: there is none), its particles v, a, b, where on the edge, and the part of its move
-        that is that of i: 1, -(1 - t) or -t. Two discs are an edge of which only the start is touched.
-        """
-        j = self._on_grid.near[e]
-        at, v, a = e, i, j
-        if role != VERTEX:
-            back = self._on_back.field[e]
-            v, a, at = j, i, ti.cast(back[0], ti.i32)
-            if role == END:
-                a, at = self.before(i), ti.cast(back[1], ti.i32)
-            if at >= 0:
-                at += self._on_grid.first[j]
-        b, t, part = a, 0 * self._on_w[i], 0 * self._on_w[i] + 1
-        if at >= 0:
-            t = self._on_met.field[at][1]
-            if t >= 0:
-                b = self.after(a)
-            elif role == END:
-                at = -1
-            t = ti.max(t, 0)
-            if b < 0:
-                at = -1
-            if role == START:
-                part = t - 1
-            elif role == END:
-                part = -t
-        return at, v, a, b, t, part
-
-    @ti.func
-    def relative(self, v, a, b, t):
-        """The displacement of v relative to the point t of the edge from a to b."""
-        return self._on_state.d[v] - (1 - t) * self._on_state.d[a] - t * self._on_state.d[b]
 
     @ti.func
     def split(self, count: ti.template(), v, a, b, t):  # type: ignore[valid-type]
@@ -509,24 +329,3 @@ class _Apart:
         if self.loop[i][2] >= 0 and self.loop[i][2] == self.loop[j][2]:
             row[3] = 0
         return row
-
-
-def _area(loop: np.ndarray) -> float:
-    after = np.roll(loop, -1, axis=0)
-    v = loop - loop.mean(axis=0)
-    w = after - loop.mean(axis=0)
-    return float((v[:, 0] * w[:, 1] - v[:, 1] * w[:, 0]).sum()) / 2
-
-
-def _depth(point: np.ndarray, loop: np.ndarray) -> tuple[float, float]:
-    """How deep a point is inside of a loop, 0 outside, and the length of the nearest edge."""
-    a, b = loop, np.roll(loop, -1, axis=0)
-    u, r = b - a, point - a
-    length = np.linalg.norm(u, axis=1)
-    t = np.clip((r * u).sum(axis=1) / length**2, 0, 1)
-    distance = np.linalg.norm(r - t[:, None] * u, axis=1)
-    k = int(np.argmin(distance))
-    above = (a[:, 1] > point[1]) != (b[:, 1] > point[1])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        right = a[:, 0] + r[:, 1] / u[:, 1] * u[:, 0] > point[0]
-    return (float(distance[k]) if (above & right).sum() % 2 else 0.0), float(length[k])
