@@ -11,7 +11,7 @@ from ..material import Table
 from ..particles import Particles
 from ..touch import Touch
 
-CARRY = 0.4
+CARRY = 0.4  # of its last push that a pair keeps; below 1/2
 
 
 class Contact(Touch):
