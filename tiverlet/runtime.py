@@ -56,10 +56,7 @@ def init(arch: str = "cpu", threads: int | None = None, debug: bool = False, see
     if arch != "cpu" and not _available(arch):
         offer = ", ".join(repr(a) for a in ARCHITECTURES if a == "cpu" or _available(a))
         raise RuntimeError(f'init: arch "{arch}" is not available on this machine. Available: {offer}.')
-    # Taichi's own passes take half of the time that compiling takes, and LLVM does what they do: the same bits, as fast.
-    options: dict[str, Any] = {"advanced_optimization": False}
-    if threads is not None:
-        options["cpu_max_num_threads"] = threads
+    options: dict[str, Any] = {} if threads is None else {"cpu_max_num_threads": threads}
     with contextlib.redirect_stdout(io.StringIO()):  # ti.init prints its banner whatever the log level
         ti.init(
             arch=getattr(ti, arch), default_fp=ti.f32, fast_math=False, debug=debug, random_seed=seed,
