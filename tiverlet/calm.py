@@ -24,7 +24,7 @@ class Calm:
 
     def __init__(self, contact: Any):
         scene = contact.scene
-        self.contact, self.state, self.real = contact, scene.state, scene.real
+        self.contact, self.state = contact, scene.state
         self.change = contact._on_move  # is free at the end of a substep
         self.factors = scene.memory.field("Contact.chebyshev", PASSES, values=chebyshev(PASSES, CONDITION))
 

@@ -217,15 +217,9 @@ class Content(Scalar, Ragged):
         return left / self.extent(c)
 
     @ti.func
-    def energy(self, c, back):
-        """C^2 / (2 alpha) at x - back d."""
-        out = ti.cast(0, ti.f64)
-        if ti.static(self._on_soft):
-            alpha = self._on_alpha[c]
-            if alpha > 0 and self.holds(c):
-                f, i0 = ti.cast(0, self._on_real), self.hub(c)
-                for e in range(self._on_starts[c], self._on_starts[c + 1]):
-                    f += self.arm(e, i0, back).dot(self.slope(e, back))
-                C = f / self._on_dim - self._on_rest[c]
-                out = C * C / (2 * alpha)
-        return out
+    def value(self, c, back):
+        """f at x - back d, by Euler's theorem."""
+        f, i0 = ti.cast(0, self._on_real), self.hub(c)
+        for e in range(self._on_starts[c], self._on_starts[c + 1]):
+            f += self.arm(e, i0, back).dot(self.slope(e, back))
+        return f / self._on_dim

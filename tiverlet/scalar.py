@@ -440,7 +440,12 @@ class Scalar(Breaking):
         if ti.static(self._on_soft):
             alpha = self._on_alpha[c]
             if alpha > 0 and self.holds(c):
-                f, _ = self.measure(c, self.corners(c, back))
-                C = self.bounded(self.near(f, self._on_rest[c]) - self._on_rest[c])
+                C = self.bounded(self.near(self.value(c, back), self._on_rest[c]) - self._on_rest[c])
                 out = C * C / (2 * alpha)
         return out
+
+    @ti.func
+    def value(self, c, back):
+        """f at x - back d."""
+        f, _ = self.measure(c, self.corners(c, back))
+        return f

@@ -202,6 +202,7 @@ class Rim(Contact):
 
 
 def area_of(loop: np.ndarray) -> float:
+    """The area that a loop (k, 2) encloses, positive where it goes around counterclockwise [m^2]."""
     after = np.roll(loop, -1, axis=0)
     v = loop - loop.mean(axis=0)
     w = after - loop.mean(axis=0)
