@@ -17,7 +17,8 @@ def explain(world: "World") -> str:
     lines = [
         f"{len(p)} particles in {p.dim}D, {int((p.inv_mass == 0).sum())} static; {world.precision} on "
         f"{runtime.architecture()}, {runtime.threads()} threads",
-        f"{world.substeps} substeps x {world.iterations} iterations, path {world.path}: {_launches(world)}",
+        f"{'auto, now ' * world._guard.auto}{world.substeps} substeps x {world.iterations} iterations, path {world.path}: "
+        f"{_launches(world)}",
         "In the kernels:",
         *(f"    {line}" for line in _present(world)),
         "Left out, at no cost:",

@@ -26,6 +26,8 @@ import taichi as ti
 from .particles import Particles, State
 from .runtime import Memory
 
+BENT, FAR = 1, 2  # how far a constraint turned in a substep: by more than 26 degrees, by more than 41
+
 
 @dataclass
 class Scene:

@@ -7,7 +7,7 @@ import numpy as np
 import taichi as ti
 
 from . import checks
-from .feature import Batch, Scene
+from .feature import FAR, Batch, Scene
 from .particles import Particles
 from .scalar import Scalar
 
@@ -170,24 +170,24 @@ class Content(Scalar, Ragged):
 
     @ti.func
     def total(self, c):
-        """f, f0, the sum of w |grad|^2, the mass-split weight, whether the current direction has to do, and the last two sums."""
+        """f, f0, the sum of w |grad|^2, the mass-split weight, how far it turned, and the last two sums."""
         sums = ti.Vector.zero(self._on_real, 8)
         for b in range(self._on_blocks[c], self._on_blocks[c + 1]):
             sums += self._on_sums[b]
-        turned = sums[3] < 0.75 * ti.sqrt(sums[4] * sums[5]) or sums[5] == 0
+        turn = self._on_slots.turn(sums[3], ti.sqrt(sums[4] * sums[5]))
         W = sums[3]
-        if turned:
+        if turn == FAR:
             W = sums[4]
-        return sums[0] / self._on_dim, sums[1] / self._on_dim, sums[2], W, turned, sums[6], sums[7]
+        return sums[0] / self._on_dim, sums[1] / self._on_dim, sums[2], W, turn, sums[6], sums[7]
 
     @ti.func
     def relax(self, c, h, hh, when, first, fresh):
         """Find dlam."""
-        f, f0, w, W, turned, extent, move = self.total(c)
+        f, f0, w, W, turn, extent, move = self.total(c)
         violation, A, alpha, lam, W = self.equation(c, f, f0, w, W, h, hh, first, fresh)
-        new, left = self.answer(violation, A, alpha, lam, W, turned)
+        new, left = self.answer(violation, A, alpha, lam, W, turn)
         new = self.tempered(c, lam, new, extent, move)
-        self._on_lam[c], self._on_change[c], self._on_astray[c] = new, new - lam, turned
+        self._on_lam[c], self._on_change[c], self._on_astray[c] = new, new - lam, turn == FAR
 
     @ti.func
     def spread(self, e, h, hh, first, fresh):
@@ -201,15 +201,15 @@ class Content(Scalar, Ragged):
     @ti.func
     def kick(self, c, h):
         """As in Scalar."""
-        f, f0, w, W, turned, extent, move = self.total(c)
+        f, f0, w, W, turn, extent, move = self.total(c)
         self._on_change[c], self._on_astray[c] = h * h * self.force(c, f, f0, w, h), 1
 
     @ti.func
     def miss(self, c, h, hh, when, fresh):
         """The violation that is left, relative to the rest value."""
-        f, f0, w, W, turned, extent, move = self.total(c)
+        f, f0, w, W, turn, extent, move = self.total(c)
         violation, A, alpha, lam, W = self.equation(c, f, f0, w, W, h, hh, 0, fresh)
-        new, left = self.answer(violation, A, alpha, lam, W, turned)
+        new, left = self.answer(violation, A, alpha, lam, W, turn)
         if w == 0:  # collapsed, or static
             for e in range(self._on_starts[c], self._on_starts[c + 1]):
                 if self._on_w[self._on_members[e]] > 0 and self.holds(c):

@@ -245,11 +245,11 @@ class Memory:
         return dict(zip((e.name for e in chosen), self._dump(chosen), strict=True))
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Write back what state() returned, bit for bit."""
+        """Write back what state() returned, bit for bit; 0 to fields that were not there then."""
         self.check()
         chosen = [e for e in self.entries if e.state]
         if chosen:
-            self._load(chosen, [state[e.name] for e in chosen])
+            self._load(chosen, [state.get(e.name, np.zeros(1)) for e in chosen])
 
     def _find(self, field) -> Entry:
         return next(e for e in self.entries if e.field is field)

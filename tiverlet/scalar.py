@@ -9,7 +9,7 @@ import taichi as ti
 from . import checks
 from .breaking import Breaking
 from .compliance import law, stiff
-from .feature import Scene
+from .feature import FAR, Scene
 from .particles import Particles
 
 # Where constraints converge within a substep, SHAKE is an explicit method for what is across them, with its limits:
@@ -244,7 +244,7 @@ class Scalar(Breaking):
         """What every solver knows of constraint c in a pass; of the state it writes nothing but the memory of soft constraints.
 
         Returns the violation A C + B + alpha' lam, A, alpha', lam, the mass-split weight W (0: no corner can move), directions n
-        and gradients g, both (arity, dim), and whether n had to be g because the constraint turned too far.
+        and gradients g, both (arity, dim), and how far it turned, see Slots.note; n is g where it turned too far.
         """
         if first != 0:
             self.begin(c, fresh)
@@ -261,15 +261,15 @@ class Scalar(Breaking):
             both += self._on_slots.split[i] * g[k, :].dot(n[k, :])
             here += self._on_slots.split[i] * gg
             there += self._on_slots.split[i] * n[k, :].dot(n[k, :])
-        turned = both < 0.75 * ti.sqrt(here * there) or there == 0
-        lost = turned
+        turn = self._on_slots.turn(both, ti.sqrt(here * there))
+        lost = turn == FAR
         if ti.static(self._on_firm):
             if self.is_rigid(c):
                 lost = lost or ti.abs(self.bounded(f0 - self._on_rest[c])) * self._on_close[c] > LOST
         if lost:
             n, both = g, here
         violation, A, alpha, lam, W = self.equation(c, f, f0, w, both, h, hh, first, fresh)
-        return violation, A, alpha, lam, W, n, g, turned and self.distinct(f, f0)
+        return violation, A, alpha, lam, W, n, g, turn * ti.cast(self.distinct(f, f0), ti.i32)
 
     @ti.func
     def equation(self, c, f, f0, w, W, h, hh, first, fresh):
@@ -308,7 +308,7 @@ class Scalar(Breaking):
         return new
 
     @ti.func
-    def answer(self, violation, A, alpha, lam, W, turned):
+    def answer(self, violation, A, alpha, lam, W, turn):
         """The multiplier of a Jacobi pass, and the size of the violation that it removes."""
         new, size = lam, ti.cast(0, self._on_real)
         if W > 0:
@@ -316,14 +316,14 @@ class Scalar(Breaking):
             if ti.static(self.side != 0):
                 new = -self.bounded(-new)
             size = ti.abs(new - lam) * (A * W + alpha) / self._on_slots.relaxation
-            if turned and new != lam:
-                self._on_slots.turned[None] = 1
+            if new != lam:
+                self._on_slots.note(turn)
         return new, size
 
     @ti.func
     def relax(self, c, h, hh, when, first, fresh):
         """Move each corner by w_j dlam grad_j C; a constraint that belongs to a system tells it what it knows."""
-        violation, A, alpha, lam, W, n, g, turned = self.known(c, h, hh, first, fresh)
+        violation, A, alpha, lam, W, n, g, turn = self.known(c, h, hh, first, fresh)
         step = ti.cast(1, self._on_real)
         if ti.static(self._on_told):
             row = self._on_row[c]
@@ -331,11 +331,11 @@ class Scalar(Breaking):
                 self._on_slots.system.tell(row, violation, A, alpha, lam, W, self.lever(c, W))
                 for k in ti.static(range(self.arity)):
                     self._on_slots.system.lean(self._on_places[c][k], self.member(c, k), g[k, :])
-                if turned and violation != 0:
-                    self._on_slots.turned[None] = 1
+                if violation != 0:
+                    self._on_slots.note(turn)
         if ti.static(self._on_alone):
             if self.relaxed_alone(c):
-                new, _ = self.answer(violation, A, alpha, lam, W, turned)
+                new, _ = self.answer(violation, A, alpha, lam, W, turn)
                 if ti.static(self.collapses > 0):
                     move = ti.cast(0, self._on_real)
                     for k in ti.static(range(self.arity)):
@@ -417,7 +417,7 @@ class Scalar(Breaking):
     def miss(self, c, h, hh, when, fresh):
         """The violation that is left, relative to the rest value (to the batch's mean f where that is 0)."""
         violation, A, alpha, lam, W, _, _, _ = self.known(c, h, hh, 0, fresh)
-        _, left = self.answer(violation, A, alpha, lam, W, False)
+        _, left = self.answer(violation, A, alpha, lam, W, 0)
         if ti.static(self.collapses > 0):
             f, g = self.measure(c, self.corners(c, 0))
             if g.norm_sqr() == 0 and self.holds(c):

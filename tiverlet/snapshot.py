@@ -1,12 +1,24 @@
-"""The exact state of a world: what its future depends on, its hash, and how another world takes it over."""
+"""The exact state of a world: what its future depends on, its hash, and how this or another world returns to it."""
 
 import hashlib
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 if TYPE_CHECKING:
     from .world import World
+
+CLOCK = ("_time", "_tick", "_since", "_frame", "_h", "_drag", "_fresh", "_started", "_placed", "_energy")
+
+
+@dataclass(frozen=True)
+class Kept:
+    """The state at one time: of every field that the future depends on, and of the clock."""
+
+    values: dict[str, np.ndarray]
+    clock: dict[str, Any]
+    guard: tuple
 
 
 def state(world: "World") -> dict[str, np.ndarray]:
@@ -19,33 +31,54 @@ def state(world: "World") -> dict[str, np.ndarray]:
 
 
 def digest(world: "World") -> str:
-    """SHA-256 of the exact state and the clock."""
-    out = hashlib.sha256(repr((world._time, world._tick, world._since, world._h, world._fresh)).encode())
+    """SHA-256 of the exact state, the clock, and what the guard remembers."""
+    clock = (world._time, world._tick, world._since, world._h, world._fresh, *world._guard.memory)
+    out = hashlib.sha256(repr(clock).encode())
     for name, values in state(world).items():
         out.update(name.encode())
         out.update(values.tobytes())
     return out.hexdigest()
 
 
+def keep(world: "World") -> Kept:
+    """A copy of the exact state."""
+    return Kept(state(world), {name: getattr(world, name) for name in CLOCK}, world._guard.memory)
+
+
+def put_back(world: "World", kept: Kept) -> None:
+    """Return to an earlier state, bit for bit."""
+    world._set(kept.clock["_h"], kept.clock["_drag"])
+    grid, stores = world._grid, list(map(id, world._memories))
+    if "Contact.shrunk" in kept.values:
+        world._sub.contacts[0].ease()
+    for memory in world._memories:
+        memory.restore(kept.values)
+    if grid:
+        pieces = {piece.name: kept.values[f"Contact.{piece.name}"] for piece in grid.lasting}
+        grid.restore(kept.values["Contact.pairs"], pieces)
+    if list(map(id, world._memories)) != stores:
+        world._renew()  # there are new fields
+    for name, value in kept.clock.items():
+        setattr(world, name, value)
+    world._guard.memory = kept.guard
+
+
+def install(world: "World", kept: Kept) -> None:
+    """Give a world that was just built the state of another one of the same scene and precision, bit for bit."""
+    world._upload()
+    put_back(world, kept)
+
+
 def transfer(old: "World", new: "World") -> None:
     """Take over the state, bit for bit where both have the same precision."""
-    new._time, new._tick, new._since, new._frame = old._time, old._tick, old._since, old._frame
-    if new._precision != old._precision:
-        new.position, new.velocity = old.position, old.velocity
-        for ours, theirs in zip(old._sub.breakers, new._sub.breakers, strict=True):
-            new._memory.write(theirs._on_broken, ours.stamps())
+    kept = keep(old)
+    if new._precision == old._precision:
+        install(new, kept)
+        for ours, theirs in zip(old.features, new.features, strict=True):
+            theirs.changed, theirs.moving = ours.changed, ours.moving
         return
-    new._upload(old._h, old._drag)
-    if any(c._on_eases for c in old._sub.contacts):
-        new._sub.contacts[0].ease()
-        new._renew()
-    values = state(old)
-    for memory in new._memories:
-        memory.restore(values)
-    if new._grid:
-        new._grid.restore(values["Contact.pairs"], {piece.name: values[f"Contact.{piece.name}"] for piece in new._grid.lasting})
-        new._renew()
-    for ours, theirs in zip(old.features, new.features, strict=True):
-        theirs.changed, theirs.moving = ours.changed, ours.moving
-    new._fresh, new._started = old._fresh, old._started
-    new._placed, new._energy = old._placed, old._energy
+    new._time, new._tick, new._since, new._frame = old._time, old._tick, old._since, old._frame
+    new._guard.memory = kept.guard
+    new.position, new.velocity = old.position, old.velocity
+    for ours, theirs in zip(old._sub.breakers, new._sub.breakers, strict=True):
+        new._memory.write(theirs._on_broken, ours.stamps())

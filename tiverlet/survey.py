@@ -7,16 +7,18 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
+from .feature import FAR
 from .grid import FARTHEST
 from .particles import LARGEST
 from .scalar import TENSEST
 from .substep import Substep
 
 BLOCKS = 64  # partial sums: their number is fixed, so the total has the same bits on any number of threads
+TURNS = (0, 26, 41)  # degrees, for nothing, BENT and FAR
 STIFF = 4.0  # (omega h)^2 beyond which Verlet diverges
 
 
-Figures = ti.types.vector(15, ti.f64)
+Figures = ti.types.vector(16, ti.f64)
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,9 @@ class StepReport:
     residual: worst violation of a constraint, relative to its rest value. overlap: of the worst contact, in radii of the
     smaller particle. contacts: number of overlapping pairs. energy: kinetic and potential energy [J], of what has a potential,
     half a substep ago; energy_change: since the frame before [J]. bad: index of the first particle whose state is not finite,
-    or None. broken: number of constraints that broke; world.broken has them. seconds: what the frame took.
+    or None. broken: number of constraints that broke; world.broken has them. turn: 26 or 41 where a constraint turned by more
+    than so many degrees in a substep, else 0. tension: (omega h)^2 of the fastest vibration across a tension that a solver
+    converged to; 4 is the limit of stability. tries: how often the frame was made, see Guard. seconds: what the frame took.
 
     flags: words for what the user should know; notes: one sentence for each, with the cause and a remedy.
         "non-finite"        a position or displacement is NaN or infinite
@@ -35,6 +39,8 @@ class StepReport:
         "stiff-force"       a force changes too fast for the substep (omega h > 2) and makes energy grow
         "softened"          a system was made to give way, because its tension is too large for the substep
         "turned"            a constraint turned by more than 41 degrees in a substep and lost its second order there
+        "substeps-capped"   the guard would have taken more substeps, but they are at most 4096, or the budget was spent
+        "stuck"             neither more substeps nor more iterations bring the residual or the overlap to the tolerance
     """
 
     time: float
@@ -49,6 +55,9 @@ class StepReport:
     notes: tuple[str, ...] = field(default=(), repr=False)
     bad: int | None = None
     broken: int = 0
+    turn: int = 0
+    tension: float = 0.0
+    tries: int = 1
     seconds: float = field(default=0.0, compare=False, repr=False)
 
     @property
@@ -65,7 +74,8 @@ class StepReport:
             last.energy, first.energy_change + last.energy_change, first.flags | last.flags,
             tuple({n.partition(":")[0]: n for n in first.notes + last.notes}.values()),
             last.bad if first.bad is None else first.bad,
-            first.broken + last.broken, max(first.seconds, last.seconds),
+            first.broken + last.broken, max(first.turn, last.turn), max(first.tension, last.tension),
+            max(first.tries, last.tries), max(first.seconds, last.seconds),
         )  # fmt: skip
 
 
@@ -180,7 +190,7 @@ class Survey:
                 h, t = ti.cast(h64, self.sub.real), ti.cast(t64, self.sub.real)
                 b = thread // self.spread
                 self.parts[b], self.low[b], self.high[b] = self.block(b, h, t, self.sub.clock(0, 1), fresh, begin)
-        out = ti.Vector.zero(ti.f64, 15)
+        out = ti.Vector.zero(ti.f64, 16)
         ti.loop_config(serialize=True)
         for _ in range(1):
             for b in range(1, BLOCKS):
@@ -198,7 +208,7 @@ class Survey:
                 flags += c._on_fast[None]
                 c._on_fast[None] = 0
             if ti.static(len(self.batches) > 0):
-                flags += 2 * self.sub.slots.turned[None]
+                out[15] = self.sub.slots.turned[None]
                 self.sub.slots.turned[None] = 0
                 if ti.static(self.sub.slots.converges):
                     out[14] = self.sub.slots.tension[None]
@@ -240,11 +250,11 @@ class Survey:
             notes["out-of-range"] = (
                 f"A coordinate is out of range: it reached {reach:g} m, and beyond {self.farthest:g} m the precision fails."
             )
-        if int(flags) & 1:
+        if flags > 0:
             notes["tunnelling-risk"] = (
                 "A particle moved by more than its own size in one substep and may have passed another; use more substeps."
             )
-        if int(flags) & 2:
+        if out[15] == FAR:
             notes["turned"] = "A constraint turned by more than 41 degrees in one substep and is damped there; use more substeps."
         if out[14] >= TENSEST:
             need = int(np.ceil(substeps * np.sqrt(out[14] / STIFF)))
@@ -271,6 +281,8 @@ class Survey:
             tuple(notes.values()),
             first,
             int(out[13]),
+            TURNS[int(out[15])],
+            float(out[14]),
         )
         return done, np.where(high >= low, high - low, 0.0)
 

@@ -10,23 +10,25 @@ import numpy as np
 from rich.progress import track
 
 from . import checks, runtime, snapshot
+from .access import Access
 from .assembly import assemble, check_settings, checked_features, checked_solver
-from .breaking import BREAKS
 from .calm import EVERY, PASSES
 from .explain import explain
 from .feature import Acceleration, Feature
-from .particles import Particles, in_range
-from .queries import Contacts, Search, near_by_all, nearest
+from .guard import Guard
+from .particles import Particles
+from .queries import Search
 from .solvers.solver import Solver
 from .substep import REBOUNDS, decay
 from .survey import StepReport
 
 
-class World:
+class World(Access):
     """Particles and what acts on them.
 
     particles: Particles. features: what acts, in any order; at most one Contact. What is not in the list costs nothing.
-    substeps: substeps of a frame. iterations: passes over the constraints in it. Both may change at any time, at no compile cost.
+    substeps: substeps of a frame, or "auto" for as many as it needs (see Guard). iterations: passes over the constraints in each.
+    Both may change at any time, at no compile cost.
     solver: how constraints are solved: Jacobi (None), Direct for chains, trees and loops, Chebyshev or ConjugateGradient for
     cloth.
     precision: "f32" (position and displacement), "f32-compensated" (the position carries a low word, for coordinates far from the
@@ -37,7 +39,7 @@ class World:
     """
 
     def __init__(
-        self, particles: Particles, features: Iterable[Feature] = (), *, substeps: int = 20, iterations: int = 1,
+        self, particles: Particles, features: Iterable[Feature] = (), *, substeps: int | str = 20, iterations: int = 1,
         solver: Solver | None = None, precision: str = "f32", path: str = "auto",
     ):  # fmt: skip
         if not isinstance(particles, Particles):
@@ -45,6 +47,7 @@ class World:
         check_settings(precision, path)
         self._particles, self._features = particles, checked_features(features)
         self._solver, self._precision = checked_solver(solver), precision
+        self._guard = Guard()
         self.substeps, self.iterations = substeps, iterations
         parts = assemble(particles, self._features, self._solver, precision, path)
         self._memory, self._scene, self._batches = parts.memory, parts.scene, parts.batches
@@ -62,30 +65,46 @@ class World:
 
     # The step.
 
-    def step(self, dt: float) -> StepReport:
-        """Advance by dt [s], in `substeps` substeps, and say how it went.
+    def step(self, dt: float, tolerance: float | None = None, budget: float | None = None) -> StepReport:
+        """Advance by dt [s], and say how it went.
 
-        Raises ValueError for dt that is not finite and above 0. With another substep length than before, displacements are turned
-        into velocities first and back after (time-corrected Verlet), so the step stays second order.
+        Without tolerance and budget the frame has `substeps` substeps; with substeps="auto", as many as it needs to be stable.
+        tolerance: of the residual and the overlap, both relative; the frame is made again with more substeps until they are met.
+        budget: seconds of computing that the frame may take; alone, it is spent for as many substeps as fit. The report says how
+        many substeps there were, and has a flag when the aim was missed. Results of a budget depend on the speed of the machine.
+
+        Raises ValueError for dt, tolerance or budget that is not finite and above 0. With another substep length than before,
+        displacements are turned into velocities first and back after (time-corrected Verlet), so the step stays second order.
         """
         self._memory.check()
         dt = checks.number("World.step", "dt", dt, above=0.0)
         clock = perf_counter()
-        with runtime.literals(self._scene.real):
+        self._heed()
+        if self._guard.auto or tolerance is not None or budget is not None:
+            report = self._guard.advance(self, dt, tolerance, budget)
+        else:
             self._begin(dt / self.substeps)
+            report = self._advance(dt, self.substeps, self.iterations)
+        self._last = report = replace(report, seconds=perf_counter() - clock)
+        return report
+
+    def _advance(self, dt: float, substeps: int, iterations: int) -> StepReport:
+        """One frame from where _begin() left off."""
+        with runtime.literals(self._scene.real):
+            if self._sub.hurries:
+                self._sub.slots.kappa[None] = self._solver.condition(iterations)
             if len(self._particles):
-                (self._fused if self._path == "fused" else self._parallel)()
-            self._tick = (self._tick + self.substeps) % 2**31
-            self._since = (self._since + self.substeps) % 2**31
+                (self._fused if self._path == "fused" else self._parallel)(substeps, iterations)
+            self._tick = (self._tick + substeps) % 2**31
+            self._since = (self._since + substeps) % 2**31
             self._pass(dt)
-            self._started, self._fresh = self._fresh and self.substeps == 1, False
+            self._started, self._fresh = self._fresh and substeps == 1, False
             _, phi1, phi2, *_ = self._drag or decay(0.0, self._h)
             self._scene.hh = self._h**2 * (phi2 if self._started else phi1)
-            report = self._look()
+            report = self._look(substeps, iterations)
         change = report.energy - self._energy  # type: ignore[operator]
         self._energy = report.energy
-        self._last = replace(report, energy_change=change, seconds=perf_counter() - clock)
-        return self._last
+        return replace(report, energy_change=change)
 
     def _pass(self, dt: float) -> None:
         """Advance the clock: frames of the same length are counted, not summed, so that they add no rounding errors."""
@@ -95,29 +114,15 @@ class World:
         self._frame = (since, dt, count + 1)
         self._time = since + (count + 1) * dt
 
-    def _begin(self, h: float) -> None:
-        """Bring h and the knobs to the device; where they change what displacements mean, start anew from velocities."""
-        drag = decay(sum(f.rate for f in self._sub.drags), h) if self._sub.decays else None
-        turned = any(f.changed and isinstance(f, Acceleration) for f in self._features)
-        if h != self._h or drag != self._drag or turned:
-            self._restart()
-        if self._fresh:
-            self._since = 0
-        self._upload(h, drag)
-        if self._energy is None:
-            report = self._look(begin=True)
-            self._energy = report.energy
-            if report.overlap > 0 and self._placed:
-                self._ease()
-        self._placed = False
+    def _heed(self) -> None:
+        """Bring the knobs to the device; where a force has changed, start anew while the device still has what it was."""
+        with runtime.literals(self._scene.real):
+            if any(f.changed and isinstance(f, Acceleration) for f in self._features):
+                self._restart()
+            self._upload()
 
-    def _upload(self, h: float, drag: list[float] | None) -> None:
+    def _upload(self) -> None:
         """Write what was changed in Python since the last frame."""
-        if drag and drag != self._drag:
-            self._sub.decay[None] = drag
-        self._h, self._drag = h, drag
-        if self._sub.hurries:
-            self._sub.slots.kappa[None] = self._solver.condition(self.iterations)
         for feature in self._features:
             if feature.moving:
                 feature.moving = False
@@ -126,42 +131,63 @@ class World:
                 feature.changed = False
                 feature.upload()
 
+    def _begin(self, h: float) -> None:
+        """Take h for the substep; with another one than before, displacements mean something else: start anew from velocities."""
+        with runtime.literals(self._scene.real):
+            drag = decay(sum(f.rate for f in self._sub.drags), h) if self._sub.decays else None
+            if h != self._h or drag != self._drag:
+                self._restart()
+            if self._fresh:
+                self._since = 0
+            self._set(h, drag)
+            if self._energy is None:
+                report = self._look(1, 1, begin=True)
+                self._energy = report.energy
+                if report.overlap > 0 and self._placed:
+                    self._ease()
+            self._placed = False
+
+    def _set(self, h: float, drag: list[float] | None) -> None:
+        if drag and drag != self._drag:
+            self._sub.decay[None] = drag
+        self._h, self._drag = h, drag
+
     def _restart(self) -> None:
         """Turn displacements into velocities, so that the next substep starts from the state at this time."""
         if not self._fresh:
             self._sub.to_velocity(self._h, self._time)
             self._fresh = True
 
-    def _fused(self) -> None:
+    def _fused(self, substeps: int, iterations: int) -> None:
         """All substeps in one launch, resumed where the neighbour list had to grow."""
         begin = it0 = skip = 0
         while True:
             fresh = int(self._fresh)
             clock = self._time, self._tick, self._since
-            self._sub.fused(self._h, *clock, fresh, self.substeps, self.iterations, begin, it0, skip)
+            self._sub.fused(self._h, *clock, fresh, substeps, iterations, begin, it0, skip)
             if not self._grid or not self._sub.halt[None][0]:
                 return
             (_, begin, it0), skip = (int(v) for v in self._sub.halt[None]), 1
             self._sub.halt[None] = [0, 0, 0]
             self._grow()
 
-    def _parallel(self) -> None:
+    def _parallel(self, n: int, iterations: int) -> None:
         """A few launches per substep."""
-        h, n, relaxes = self._h, self.substeps, self._batches or self._grid or self._sub.walls
+        h, relaxes = self._h, self._batches or self._grid or self._sub.walls
         for s in range(n):
             fresh = int(self._fresh and s == 0)
             struck = 0
             stale = self._sub.predicted(h, self._time, self._tick, fresh, s, n)
-            for it in range(self.iterations if relaxes else 0):
+            for it in range(iterations if relaxes else 0):
                 if stale:
                     self._list()
                 if self._sub.steps:
                     self._sub.opened(h, s, n, it, fresh)
                     for _ in range(self._sub.steps):
                         self._sub.iterated()
-                    state = self._sub.collected(h, s, n, it, self.iterations, fresh)
+                    state = self._sub.collected(h, s, n, it, iterations, fresh)
                 else:
-                    state = self._sub.relaxed(h, s, n, it, self.iterations, fresh)
+                    state = self._sub.relaxed(h, s, n, it, iterations, fresh)
                 stale, struck = state & 1, state & 2
             if self._sub.concludes:
                 for _ in range(REBOUNDS if struck else 0):
@@ -197,12 +223,12 @@ class World:
         self._sub = copy.copy(self._sub)
         self._survey = self._survey.of(self._sub)
 
-    def _look(self, begin: bool = False) -> StepReport:
+    def _look(self, substeps: int, iterations: int, begin: bool = False) -> StepReport:
         """Survey the state."""
         if self._grid and self._grid.stale[None]:
             self._list()
         with runtime.literals(self._scene.real):
-            report, extent = self._survey.report(self._time, self._h, self.substeps, self.iterations, self._started, begin)
+            report, extent = self._survey.report(self._time, self._h, substeps, iterations, self._started, begin)
         if self._grid:
             self._grid.fit(extent)
         return report
@@ -215,10 +241,13 @@ class World:
         with runtime.literals(self._scene.real):
             return self._survey.residuals(batch, self._h, self._started)
 
-    def run(self, seconds: float, dt: float = 1 / 60, recorder=None, progress: bool = False) -> StepReport:
+    def run(
+        self, seconds: float, dt: float = 1 / 60, recorder=None, progress: bool = False, *, tolerance: float | None = None,
+        budget: float | None = None,
+    ) -> StepReport:  # fmt: skip
         """Step for `seconds` [s] in frames of dt [s]; returns the worst figures of all frames.
 
-        recorder: a Recorder that logs each frame. progress: show a bar.
+        tolerance, budget: of each frame, see step(). recorder: a Recorder that logs each frame. progress: show a bar.
         """
         seconds = checks.number("World.run", "seconds", seconds, above=0.0)
         dt = checks.number("World.run", "dt", dt, above=0.0)
@@ -227,174 +256,18 @@ class World:
             frames = track(frames, description=f"{len(self._particles)} particles")
         worst = None
         for _ in frames:
-            report = self.step(dt)
+            report = self.step(dt, tolerance, budget)
             worst = report if worst is None else worst.worse(report)
             if recorder is not None:
                 recorder.log()
         assert worst
         return worst
 
-    # What the user reads and sets.
-
-    @property
-    def position(self) -> np.ndarray:
-        """Positions [m], (n, dim), a read-only copy in f64. Assign an array to move particles; velocities are kept."""
-        return self._export(self._sub.positions)
-
-    @position.setter
-    def position(self, value) -> None:
-        value = checks.points("World", "position", value, dim=self._particles.dim, count=len(self._particles))
-        in_range("World", "position", value)
-        if self._sub.contacts:
-            self._sub.contacts[0].check_range(value)
-        self._memory.check()
-        with runtime.literals(self._scene.real):
-            self._restart()
-            self._scene.state.put(self._memory, value)
-        self._energy, self._placed = None, True
-        if self._grid:
-            self._grid.stale[None] = 1
-
-    @property
-    def velocity(self) -> np.ndarray:
-        """Velocities [m/s], (n, dim), a read-only copy in f64; second order in h. Assign an array to set them."""
-        return self._export(self._sub.velocities, self._h, self._time, int(self._fresh))
-
-    @velocity.setter
-    def velocity(self, value) -> None:
-        value = checks.points("World", "velocity", value, dim=self._particles.dim, count=len(self._particles))
-        self._memory.check()
-        self._memory.write(self._scene.state.d, value)
-        self._fresh, self._energy = True, None
-
-    def _export(self, kernel, *args) -> np.ndarray:
-        self._memory.check()
-        out = np.zeros((max(1, len(self._particles)), self._particles.dim))
-        with runtime.literals(self._scene.real):
-            kernel(*args, out)
-        out = out[: len(self._particles)]
-        out.flags.writeable = False
-        return out
-
-    def near(self, points, radius) -> np.ndarray:
-        """The particles whose centers are within `radius` [m] of points: (m, 2), rows of `points` and particles, in order.
-
-        points: (k, dim) [m]. radius: number or (k,), at least 0. With a Contact in the world its grid is used; without, all are
-        compared.
-        """
-        points = checks.points("World.near", "points", points, dim=self._particles.dim)
-        radius = checks.per_item("World.near", "radius", radius, len(points), least=0.0)
-        self._memory.check()
-        if not len(points) or not len(self._particles):
-            return np.zeros((0, 2), dtype=np.int64)
-        if not self._grid:
-            return near_by_all(self.position, points, radius)
-        self._list()
-        with runtime.literals(self._scene.real):
-            self._search = self._search or Search(self._grid)
-            return self._search.near(points, radius)
-
-    def nearest(self, points) -> tuple[np.ndarray, np.ndarray]:
-        """Index of, and distance [m] to, the particle whose center is nearest to each point; of equally near ones the first."""
-        points = checks.points("World.nearest", "points", points, dim=self._particles.dim)
-        if not len(self._particles):
-            raise ValueError("World.nearest: there are no particles.")
-        position = self.position
-        start = self._grid.finest if self._grid else 2 * float(np.abs(position).max() + np.abs(points).max(initial=1.0))
-        return nearest(self.near, position, points, start)
-
-    @property
-    def contacts(self) -> Contacts:
-        """The pairs of discs or spheres that overlap now, as arrays. Empty without a Contact; Polygons keep no impulses (NaN)."""
-        x, r = self.position, self._particles.radius
-        pairs, push = np.zeros((0, 2), dtype=np.int64), np.zeros(0)
-        if self._grid:
-            self._list()
-            pairs, at = self._grid.pairs()
-            push = self._grid.read(self._sub.contacts[0]._on_push, at) if self._sub.calms else np.full(len(pairs), np.nan)
-        d = x[pairs[:, 0]] - x[pairs[:, 1]]
-        length = np.linalg.norm(d, axis=1)
-        overlap = r[pairs].sum(axis=1) - length
-        some = overlap > 0
-        normal = d[some] / np.where(length > 0, length, 1.0)[some, None]
-        return Contacts(pairs[some], overlap[some], normal, push[some] / (self._h or 1.0))
-
-    @property
-    def broken(self) -> list[tuple[Feature, np.ndarray]]:
-        """What broke in the last frame: features, and the indices of their constraints. Those of all frames: feature.broken."""
-        out = []
-        if self._last and self._last.broken:
-            for f in self._sub.breakers:
-                stamps = f.stamps()
-                recent = (stamps > 0) & ((self._tick - stamps) % BREAKS < self._last.substeps)
-                if recent.any():
-                    out.append((f, np.flatnonzero(recent)))
-        return out
-
-    @property
-    def time(self) -> float:
-        """Simulated time [s]."""
-        return self._time
-
-    @property
-    def last(self) -> StepReport | None:
-        """The report of the last step; None before the first."""
-        return self._last
-
-    @property
-    def particles(self) -> Particles:
-        """What the world was built from: initial state and structure."""
-        return self._particles
-
-    @property
-    def features(self) -> tuple[Feature, ...]:
-        """What acts on the particles."""
-        return self._features
-
-    @property
-    def precision(self) -> str:
-        """ "f32", "f32-compensated" or "f64"."""
-        return self._precision
-
-    @property
-    def path(self) -> str:
-        """ "fused" or "parallel"."""
-        return self._path
-
-    @property
-    def substeps(self) -> int:
-        """Substeps of a frame."""
-        return self._substeps
-
-    @substeps.setter
-    def substeps(self, value: int) -> None:
-        self._substeps = checks.integer("World", "substeps", value, least=1)
-
-    @property
-    def iterations(self) -> int:
-        """Passes over the constraints in a substep."""
-        return self._iterations
-
-    @iterations.setter
-    def iterations(self, value: int) -> None:
-        value = checks.integer("World", "iterations", value, least=1)
-        self._solver.check(value)
-        self._iterations = value
-
-    @property
-    def fields(self) -> dict[str, int]:
-        """Every field on the device, by name, and its size [bytes]."""
-        return {e.name: e.bytes for memory in self._memories for e in memory.entries}
+    # Other worlds.
 
     def hash(self) -> str:
         """SHA-256 of the exact state: equal if and only if two worlds of the same scene will go on alike, bit for bit."""
         return snapshot.digest(self)
-
-    @property
-    def _memories(self) -> list[runtime.Memory]:
-        """The trees of fields: one from the start, others where a list or a need has grown."""
-        grown = [self._grid.store if self._grid else None, *(c._on_store for c in self._sub.contacts)]
-        return [self._memory, *(m for m in grown if m)]
 
     def explain(self) -> str:
         """What was compiled and what was left out, with fields, bytes and launches."""
@@ -402,7 +275,11 @@ class World:
 
     def clone(self, **changes) -> "World":
         """The same scene in the same state, with other substeps, iterations, solver, precision or path."""
-        settings = {"substeps": self.substeps, "iterations": self.iterations, "solver": self._solver}
+        settings: dict[str, Any] = {
+            "substeps": "auto" if self._guard.auto else self.substeps,
+            "iterations": self.iterations,
+            "solver": self._solver,
+        }
         settings |= {"precision": self._precision, "path": self._path}
         if unknown := set(changes) - set(settings):
             raise TypeError(f"World.clone: {sorted(unknown)[0]} cannot be changed; one of {', '.join(settings)} can.")

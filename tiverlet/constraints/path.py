@@ -7,7 +7,7 @@ import taichi as ti
 
 from .. import checks
 from ..curve import Curve
-from ..feature import Knob, Scene
+from ..feature import FAR, Knob, Scene
 from ..particles import Particles
 from ..tether import Tether
 
@@ -229,7 +229,7 @@ class Path(Tether):
         k, r, bent = self.foot(k, r, x, t, True)
         if bent:
             k, r, lost = self.foot(self._on_piece[c], self._on_rest[c], x, t, False)
-            self._on_slots.turned[None] = 1
+            self._on_slots.note(FAR)
         P, T = self.point(k, r)
         C = x - P
         ends = ti.static(not self._on_closed) and ((k == 0 and r <= 0) or (k == self._on_pieces - 1 and r >= self._on_lengths[k]))

@@ -204,8 +204,7 @@ class ShapeMatch(Ragged):
             pose = rotation.matrix(end)
             self._on_turn[c], self._on_place[c] = end, p - pose @ q
             self.keep(self._on_pose, c, pose)
-            if cosine < 0.75:
-                self._on_slots.turned[None] = 1
+            self._on_slots.note(self._on_slots.turn(cosine, 1.0))
             if ti.static(self._on_soft):
                 R = rotation.matrix(start)
                 if first > 0:  # in the frame of the body

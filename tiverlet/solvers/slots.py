@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from ..feature import Batch, Scene
+from ..feature import BENT, FAR, Batch, Scene
 
 
 class Slots:
@@ -43,7 +43,7 @@ class Slots:
         self.converges = solver.converges
         if self.converges:
             self.tension = memory.field("slots.tension", None, kind=ti.f64)
-        self.turned = memory.field("slots.turned", None, kind=ti.i32)
+        self.turned = memory.field("slots.turned", None, kind=ti.i32)  # the worst turn since the last survey
         if any(b.breaks for b in batches):
             self.broken = memory.field("slots.broken", None, kind=ti.i32)
         self.system: Any = solver.system(scene, batches, self)
@@ -76,6 +76,22 @@ class Slots:
     def hurried(self, step, correction):
         """The step of a multiplier, from its last one and the correction."""
         return ti.cast(self.pace[None][0], self.state.real) * step + ti.cast(self.pace[None][1], self.state.real) * correction
+
+    @ti.func
+    def turn(self, along, sizes):
+        """How far a direction turned, from the product of what it was and is, and that of their sizes."""
+        out = 0
+        if along < 0.9 * sizes:
+            out = BENT
+        if along < 0.75 * sizes or sizes == 0:
+            out = FAR
+        return out
+
+    @ti.func
+    def note(self, turn):
+        """Keep the worst turn. Threads that all write to the same place wait for each other, so they look first."""
+        if turn > self.turned[None]:
+            ti.atomic_max(self.turned[None], turn)
 
     @ti.func
     def total_of(self, i):

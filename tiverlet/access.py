@@ -1,0 +1,197 @@
+"""What the user of a world reads and sets: state, clock, settings, and who is near or in contact."""
+
+from typing import Any
+
+import numpy as np
+
+from . import checks, runtime
+from .breaking import BREAKS
+from .feature import Feature
+from .particles import Particles, in_range
+from .queries import Contacts, Search, near_by_all, nearest
+from .survey import StepReport
+
+
+class Access:
+    """The half of a World that does not step it."""
+
+    _particles: Particles
+    _features: tuple[Feature, ...]
+    _memory: runtime.Memory
+    _solver: Any
+    _scene: Any
+    _sub: Any
+    _guard: Any
+    _grid: Any
+    _h: float
+    _time: float
+    _tick: int
+    _fresh: bool
+    _placed: bool
+    _energy: float | None
+    _last: StepReport | None
+    _search: Search | None
+    _precision: str
+    _path: str
+    _restart: Any
+    _list: Any
+
+    @property
+    def position(self) -> np.ndarray:
+        """Positions [m], (n, dim), a read-only copy in f64. Assign an array to move particles; velocities are kept."""
+        return self._export(self._sub.positions)
+
+    @position.setter
+    def position(self, value) -> None:
+        value = checks.points("World", "position", value, dim=self._particles.dim, count=len(self._particles))
+        in_range("World", "position", value)
+        if self._sub.contacts:
+            self._sub.contacts[0].check_range(value)
+        self._memory.check()
+        with runtime.literals(self._scene.real):
+            self._restart()
+            self._scene.state.put(self._memory, value)
+        self._energy, self._placed = None, True
+        if self._grid:
+            self._grid.stale[None] = 1
+
+    @property
+    def velocity(self) -> np.ndarray:
+        """Velocities [m/s], (n, dim), a read-only copy in f64; second order in h. Assign an array to set them."""
+        return self._export(self._sub.velocities, self._h, self._time, int(self._fresh))
+
+    @velocity.setter
+    def velocity(self, value) -> None:
+        value = checks.points("World", "velocity", value, dim=self._particles.dim, count=len(self._particles))
+        self._memory.check()
+        self._memory.write(self._scene.state.d, value)
+        self._fresh, self._energy = True, None
+
+    def _export(self, kernel, *args) -> np.ndarray:
+        self._memory.check()
+        out = np.zeros((max(1, len(self._particles)), self._particles.dim))
+        with runtime.literals(self._scene.real):
+            kernel(*args, out)
+        out = out[: len(self._particles)]
+        out.flags.writeable = False
+        return out
+
+    def near(self, points, radius) -> np.ndarray:
+        """The particles whose centers are within `radius` [m] of points: (m, 2), rows of `points` and particles, in order.
+
+        points: (k, dim) [m]. radius: number or (k,), at least 0. With a Contact in the world its grid is used; without, all are
+        compared.
+        """
+        points = checks.points("World.near", "points", points, dim=self._particles.dim)
+        radius = checks.per_item("World.near", "radius", radius, len(points), least=0.0)
+        self._memory.check()
+        if not len(points) or not len(self._particles):
+            return np.zeros((0, 2), dtype=np.int64)
+        if not self._grid:
+            return near_by_all(self.position, points, radius)
+        self._list()
+        with runtime.literals(self._scene.real):
+            self._search = self._search or Search(self._grid)
+            return self._search.near(points, radius)
+
+    def nearest(self, points) -> tuple[np.ndarray, np.ndarray]:
+        """Index of, and distance [m] to, the particle whose center is nearest to each point; of equally near ones the first."""
+        points = checks.points("World.nearest", "points", points, dim=self._particles.dim)
+        if not len(self._particles):
+            raise ValueError("World.nearest: there are no particles.")
+        position = self.position
+        start = self._grid.finest if self._grid else 2 * float(np.abs(position).max() + np.abs(points).max(initial=1.0))
+        return nearest(self.near, position, points, start)
+
+    @property
+    def contacts(self) -> Contacts:
+        """The pairs of discs or spheres that overlap now, as arrays. Empty without a Contact; Polygons keep no impulses (NaN)."""
+        x, r = self.position, self._particles.radius
+        pairs, push = np.zeros((0, 2), dtype=np.int64), np.zeros(0)
+        if self._grid:
+            self._list()
+            pairs, at = self._grid.pairs()
+            push = self._grid.read(self._sub.contacts[0]._on_push, at) if self._sub.calms else np.full(len(pairs), np.nan)
+        d = x[pairs[:, 0]] - x[pairs[:, 1]]
+        length = np.linalg.norm(d, axis=1)
+        overlap = r[pairs].sum(axis=1) - length
+        some = overlap > 0
+        normal = d[some] / np.where(length > 0, length, 1.0)[some, None]
+        return Contacts(pairs[some], overlap[some], normal, push[some] / (self._h or 1.0))
+
+    @property
+    def broken(self) -> list[tuple[Feature, np.ndarray]]:
+        """What broke in the last frame: features, and the indices of their constraints. Those of all frames: feature.broken."""
+        out = []
+        if self._last and self._last.broken:
+            for f in self._sub.breakers:
+                stamps = f.stamps()
+                recent = (stamps > 0) & ((self._tick - stamps) % BREAKS < self._last.substeps)
+                if recent.any():
+                    out.append((f, np.flatnonzero(recent)))
+        return out
+
+    @property
+    def time(self) -> float:
+        """Simulated time [s]."""
+        return self._time
+
+    @property
+    def last(self) -> StepReport | None:
+        """The report of the last step; None before the first."""
+        return self._last
+
+    @property
+    def particles(self) -> Particles:
+        """What the world was built from: initial state and structure."""
+        return self._particles
+
+    @property
+    def features(self) -> tuple[Feature, ...]:
+        """What acts on the particles."""
+        return self._features
+
+    @property
+    def precision(self) -> str:
+        """ "f32", "f32-compensated" or "f64"."""
+        return self._precision
+
+    @property
+    def path(self) -> str:
+        """ "fused" or "parallel"."""
+        return self._path
+
+    @property
+    def substeps(self) -> int:
+        """Substeps of a frame; of the next one where they are chosen. Assign a number, or "auto"."""
+        return self._guard.substeps if self._guard.auto else self._substeps
+
+    @substeps.setter
+    def substeps(self, value: int | str) -> None:
+        if isinstance(value, str) and value != "auto":
+            raise ValueError(f'World: substeps = {value!r}, but it must be an integer of at least 1, or "auto".')
+        self._guard.auto = value == "auto"
+        if not self._guard.auto:
+            self._substeps = checks.integer("World", "substeps", value, least=1)
+
+    @property
+    def iterations(self) -> int:
+        """Passes over the constraints in a substep."""
+        return self._iterations
+
+    @iterations.setter
+    def iterations(self, value: int) -> None:
+        value = checks.integer("World", "iterations", value, least=1)
+        self._solver.check(value)
+        self._iterations = value
+
+    @property
+    def fields(self) -> dict[str, int]:
+        """Every field on the device, by name, and its size [bytes]."""
+        return {e.name: e.bytes for memory in self._memories for e in memory.entries}
+
+    @property
+    def _memories(self) -> list[runtime.Memory]:
+        """The trees of fields: one from the start, others where a list or a need has grown."""
+        grown = [self._grid.store if self._grid else None, *(c._on_store for c in self._sub.contacts)]
+        return [self._memory, *(m for m in grown if m)]

@@ -1,0 +1,152 @@
+"""Frames that are made again with more substeps until they are good: substeps="auto", tolerance and budget."""
+
+from dataclasses import replace
+from time import perf_counter
+from typing import TYPE_CHECKING
+
+from . import checks, snapshot
+from .survey import StepReport
+
+if TYPE_CHECKING:
+    from .world import World
+
+START = 8  # substeps of the first frame
+MOST = 4096  # substeps of a frame
+PASSES = 64  # iterations of a substep
+RESIDUAL, OVERLAP = 1e-2, 0.1  # what is good where the user asks for nothing else
+TENSION = 2.0  # (omega h)^2: half the limit of stability
+RISKS = {"tunnelling-risk", "stiff-force", "softened", "non-finite"}
+GAIN = 1.4  # by which twice the effort has to lower the figures; of second order they fall by 4, of first order by 2
+IDLE = {"substeps": 2, "iterations": 1}  # doublings without a gain that are enough
+ROOM = 6.0  # by which the figures have to be better than asked before less is tried
+PATIENCE = 64  # frames, at most, until it is tried again
+
+
+class Guard:
+    """Chooses the substeps of a frame.
+
+    A frame is undone, and made again with twice the substeps, when in one of them a constraint turned by more than 26 degrees
+    (cos < 0.9, where SHAKE's direction is no longer good), a residual above 1e-2 or an overlap above a tenth of a radius was
+    left, a tension made particles vibrate with (omega h)^2 > 2, or when it has a flag that shorter substeps remove. Where twice
+    the substeps bring no gain, twice the iterations are tried; where they bring none either, the flag is "stuck".
+    When all figures, which are of the order of h^2, leave room for it, the next frame is tried with half the effort. Each time
+    that fails, twice as many frames pass before the next try, up to 64.
+
+    Making a frame again needs the state at its begin, which is read back to the CPU before each frame: that is the price.
+    """
+
+    def __init__(self):
+        self.auto = False
+        self.substeps, self.iterations = START, 1  # of the next frame
+        self.dt = 0.0  # of the last one
+        self.wait, self.patience = 0, 1  # frames until less is tried, and after the next failure
+        self.stuck = 1.0  # the figure that no effort improved
+        self.cost = 0.0  # measured seconds of an iteration
+
+    @property
+    def memory(self) -> tuple:
+        """What the next frames depend on."""
+        return self.substeps, self.iterations, self.dt, self.wait, self.patience, self.stuck
+
+    @memory.setter
+    def memory(self, value: tuple) -> None:
+        self.substeps, self.iterations, self.dt, self.wait, self.patience, self.stuck = value
+
+    def advance(self, world: "World", dt: float, tolerance: float | None, budget: float | None) -> StepReport:
+        """One frame, made again until it is good, nothing helps, or there can be no more."""
+        tolerance = None if tolerance is None else checks.number("World.step", "tolerance", tolerance, above=0.0)
+        budget = None if budget is None else checks.number("World.step", "budget", budget, above=0.0)
+        end = float("inf") if budget is None else perf_counter() + budget
+        self.prepare(world.iterations, dt, tolerance, budget)
+        n, k = self.substeps, self.iterations
+        kept, tries, best, idle, kind = snapshot.keep(world), 0, float("inf"), 0, "substeps"
+        world._begin(dt / n)
+        while True:
+            tries, begun = tries + 1, perf_counter()
+            report = world._advance(dt, n, k)
+            took = perf_counter() - begun
+            self.learn(took / (n * k))
+            figure, risks = judge(report, tolerance)
+            if risks:
+                best, idle, kind = float("inf"), 0, "substeps"
+            elif figure <= self.stuck:
+                verdict = "good" if figure <= 1 else "stuck"
+                break
+            else:
+                idle = 0 if figure * GAIN <= best else idle + 1
+                best = min(best, figure)
+                if idle >= IDLE[kind]:
+                    if kind == "iterations" or k >= PASSES:
+                        verdict = "stuck"
+                        break
+                    kind, idle = "iterations", 0
+            if n >= MOST or perf_counter() + 2 * took > end:
+                verdict = "substeps-capped"
+                break
+            n, k = (min(2 * n, MOST), k) if kind == "substeps" else (n, 2 * k)
+            snapshot.put_back(world, kept)
+            world._begin(dt / n)
+        if verdict == "stuck":
+            self.stuck = max(self.stuck, GAIN * figure)  # and the next frames do not try in vain
+        else:
+            self.substeps, self.iterations = n, k
+        self.look_ahead(world.iterations, report, figure, verdict, tries)
+        return told(report, figure, risks, verdict, tries)
+
+    def prepare(self, iterations: int, dt: float, tolerance: float | None, budget: float | None) -> None:
+        """The effort to begin with."""
+        self.iterations = max(self.iterations, iterations)
+        if self.dt and dt != self.dt:
+            self.substeps = max(1, min(round(self.substeps * dt / self.dt), MOST))
+        self.dt = dt
+        if budget is not None and self.cost:
+            fits = max(1, min(int(0.8 * budget / (self.cost * self.iterations)), MOST))
+            if fits < self.substeps or (tolerance is None and fits > 1.25 * self.substeps):
+                self.substeps = fits
+        elif self.wait:
+            self.wait -= 1
+            if not self.wait:
+                self.stuck = 1.0
+
+    def learn(self, cost: float) -> None:
+        """Keep the cost of an iteration: lower ones at once, for the first frame compiles; higher ones by and by."""
+        self.cost = min(cost, self.cost + 0.3 * (cost - self.cost)) if self.cost else cost
+
+    def look_ahead(self, iterations: int, report: StepReport, figure: float, verdict: str, tries: int) -> None:
+        """Less for the next frame, if this one leaves room for it; and patience where that has just failed."""
+        if verdict != "good" or tries > 1:
+            self.patience = min(2 * self.patience, PATIENCE) if tries > 1 else self.patience
+            self.wait = self.patience
+        elif not self.wait and figure * ROOM <= 1:
+            if self.iterations > iterations:
+                self.iterations //= 2
+            elif self.substeps > 1:
+                self.substeps = (self.substeps + 1) // 2
+        elif not self.wait:
+            self.patience = 1
+
+
+def judge(report: StepReport, tolerance: float | None) -> tuple[float, set[str]]:
+    """How the worst figure compares with what is asked (1: just met), and what shorter substeps have to remove."""
+    risks = set(report.flags & RISKS)
+    if report.turn:
+        risks.add("turned")
+    ratios = (
+        report.residual / (tolerance or RESIDUAL),
+        report.overlap / (tolerance or OVERLAP),
+        report.tension / TENSION,
+    )
+    return max(r if r == r else float("inf") for r in ratios), risks  # NaN is the worst of all
+
+
+def told(report: StepReport, figure: float, risks: set[str], verdict: str, tries: int) -> StepReport:
+    """The report with what the guard has to say."""
+    if verdict == "good":
+        return replace(report, tries=tries)
+    wrong = sorted(risks) or [f"a figure is {figure:.3g} times what is asked"]
+    why = {
+        "stuck": "Nothing helps: constraints contradict each other, or particles still part that began in one place.",
+        "substeps-capped": f"More than {report.substeps} substeps are needed, but the budget is spent or there can be no more.",
+    }[verdict]
+    note = f"The frame is not as good as asked: {', '.join(wrong)}. {why}"
+    return replace(report, flags=report.flags | {verdict}, notes=(*report.notes, note), tries=tries)
