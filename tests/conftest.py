@@ -7,16 +7,32 @@ import sys
 
 import numpy as np
 import pytest
+import taichi as ti
+from taichi.lang import ops
 
 import tiverlet as tv
 
 HERE = pathlib.Path(__file__).parent
+SOURCES = str(pathlib.Path(tv.__file__).parent)
 CASES = {c["id"]: c for c in json.loads((HERE / "reference" / "cases.json").read_text())["cases"]}
 
 
 @pytest.fixture(scope="session", autouse=True)
 def taichi():
     tv.init()
+    assign = ops.assign
+
+    def checked(to, value):
+        """Refuse, in our own kernels, what compiles only with Taichi's analysis; without it LLVM ends the process."""
+        whole = not to.ptr.is_tensor() and value.ptr.is_tensor()
+        truth = to.ptr.get_rvalue_type() == ti.u1 and value.ptr.get_rvalue_type() != ti.u1
+        if (whole or truth) and SOURCES in ops.stack_info():
+            raise TypeError(f"a {'vector' if whole else 'number'} is assigned to a variable that is not one:\n{ops.stack_info()}")
+        return assign(to, value)
+
+    ops.assign = checked
+    yield
+    ops.assign = assign
 
 
 @pytest.fixture

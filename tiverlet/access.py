@@ -48,7 +48,7 @@ class Access:
         if self._sub.contacts:
             self._sub.contacts[0].check_range(value)
         self._memory.check()
-        with runtime.literals(self._scene.real):
+        with self._memory.compiler():
             self._restart()
             self._scene.state.put(self._memory, value)
         self._energy, self._placed = None, True
@@ -70,7 +70,7 @@ class Access:
     def _export(self, kernel, *args) -> np.ndarray:
         self._memory.check()
         out = np.zeros((max(1, len(self._particles)), self._particles.dim))
-        with runtime.literals(self._scene.real):
+        with self._memory.compiler():
             kernel(*args, out)
         out = out[: len(self._particles)]
         out.flags.writeable = False
@@ -90,7 +90,7 @@ class Access:
         if not self._grid:
             return near_by_all(self.position, points, radius)
         self._list()
-        with runtime.literals(self._scene.real):
+        with self._memory.compiler():
             self._search = self._search or Search(self._grid)
             return self._search.near(points, radius)
 

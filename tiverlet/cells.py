@@ -36,7 +36,7 @@ class Cells:
         self.bits = np.maximum(2 * dim, np.ceil(np.log2(np.maximum(2 * counts, 1)))).astype(int)
         offsets = np.concatenate([[0], np.cumsum(1 << self.bits)])
         self.buckets = int(offsets[-1])
-        self._shapes = self.shapes(np.ones(dim))
+        self._shapes = self.shapes(np.ptp(scene.particles.position, axis=0))
         self.edge = add("grid.edge", self.buckets + 2, kind=ti.i32)
         self.sorted = add("grid.sorted", n, kind=ti.i32)
         self.shape = add("grid.shape", self.levels, width=dim, kind=ti.i32, values=self._shapes)

@@ -20,6 +20,7 @@ class Slopes:
     """
 
     def __init__(self, function: tuple, gradient: tuple | None, arity: int, dim: int, fixed: int, size: float):
+        self.compiler = runtime.Compiler(ti.f64)
         self.function, self.counts = function
         self.given: Any = gradient[0] if gradient else None
         self.gradient_counts = bool(gradient and gradient[1])
@@ -33,7 +34,7 @@ class Slopes:
         runtime.ensure_started()
         m = len(q)
         f, g, d = np.zeros(m), np.zeros((m, self.arity, self.dim)), np.zeros((m, self.arity, self.dim))
-        with runtime.literals(ti.f64):
+        with self.compiler():
             self.evaluate(np.ascontiguousarray(q), f, g, d)
         return f, g if self.analytic else d, d
 

@@ -9,7 +9,6 @@ import contextlib
 import io
 import os
 import threading
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +20,8 @@ os.environ.setdefault("TI_LOG_LEVEL", "error")
 import numpy as np
 import taichi as ti
 from taichi.lang import impl
+
+from .compiling import Compiler
 
 ARCHITECTURES = ("cpu", "cuda", "metal", "vulkan")
 GROUP = 16  # fields that one transfer kernel serves; Taichi unrolls the loop over them
@@ -118,22 +119,6 @@ def _adopt(wanted: dict | None = None) -> None:
     _started.update(runtime=impl.get_runtime(), pid=os.getpid(), thread=threading.get_ident(), wanted=wanted)
 
 
-@contextlib.contextmanager
-def literals(real) -> Iterator[None]:
-    """Compile kernels with `real` as the type of their literals.
-
-    Taichi rounds the literal 0.1 to its default type even next to f64 operands; a world of precision "f64" (and the
-    user's own functions in it) must not lose half of the digits that way. Kernels compile at their first launch.
-    """
-    runtime = impl.get_runtime()
-    before = runtime.default_fp
-    runtime.set_default_fp(real)
-    try:
-        yield
-    finally:
-        runtime.set_default_fp(before)
-
-
 @dataclass(frozen=True)
 class Entry:
     """One field: its place in memory, and what explain() says of it."""
@@ -164,6 +149,7 @@ class Memory:
                 "world.close(), or `with tv.World(...) as world:`."
             )
         self.real = real
+        self.compiler = Compiler(real)
         self.entries: list[Entry] = []
         self._later: list[tuple[Entry, np.ndarray]] = []
         self._builder = ti.FieldsBuilder()
@@ -259,7 +245,8 @@ class Memory:
         for k in range(0, len(entries), GROUP):
             some = entries[k : k + GROUP]
             parts = [np.broadcast_to(a, _shape(e)).ravel() for e, a in zip(some, arrays[k : k + GROUP], strict=True)]
-            self._transfer(some).load(np.concatenate(parts).astype(np.float64))
+            with self.compiler():
+                self._transfer(some).load(np.concatenate(parts).astype(np.float64))
 
     def _dump(self, entries: list[Entry]) -> list[np.ndarray]:
         out = []
@@ -267,7 +254,8 @@ class Memory:
             some = entries[k : k + GROUP]
             sizes = [e.bytes // e.kind.itemsize for e in some]
             flat = np.empty(sum(sizes), dtype=np.float64)
-            self._transfer(some).dump(flat)
+            with self.compiler():
+                self._transfer(some).dump(flat)
             parts = np.split(flat, np.cumsum(sizes)[:-1])
             out += [p.astype(e.kind).reshape(_shape(e)) for p, e in zip(parts, some, strict=True)]
         return out

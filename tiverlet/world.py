@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from rich.progress import track
 
-from . import checks, runtime, snapshot
+from . import checks, snapshot
 from .access import Access
 from .assembly import assemble, check_settings, checked_features, checked_solver
 from .calm import EVERY, PASSES
@@ -90,7 +90,7 @@ class World(Access):
 
     def _advance(self, dt: float, substeps: int, iterations: int) -> StepReport:
         """One frame from where _begin() left off."""
-        with runtime.literals(self._scene.real):
+        with self._memory.compiler():
             if self._sub.hurries:
                 self._sub.slots.kappa[None] = self._solver.condition(iterations)
             if len(self._particles):
@@ -116,7 +116,7 @@ class World(Access):
 
     def _heed(self) -> None:
         """Bring the knobs to the device; where a force has changed, start anew while the device still has what it was."""
-        with runtime.literals(self._scene.real):
+        with self._memory.compiler():
             if any(f.changed and isinstance(f, Acceleration) for f in self._features):
                 self._restart()
             self._upload()
@@ -133,7 +133,7 @@ class World(Access):
 
     def _begin(self, h: float) -> None:
         """Take h for the substep; with another one than before, displacements mean something else: start anew from velocities."""
-        with runtime.literals(self._scene.real):
+        with self._memory.compiler():
             drag = decay(sum(f.rate for f in self._sub.drags), h) if self._sub.decays else None
             if h != self._h or drag != self._drag:
                 self._restart()
@@ -149,7 +149,7 @@ class World(Access):
 
     def _set(self, h: float, drag: list[float] | None) -> None:
         if drag and drag != self._drag:
-            self._sub.decay[None] = drag
+            self._memory.write(self._sub.decay, drag)
         self._h, self._drag = h, drag
 
     def _restart(self) -> None:
@@ -200,7 +200,7 @@ class World(Access):
     def _list(self) -> None:
         """Build the neighbour list, growing it until everything fits."""
         assert self._grid
-        with runtime.literals(self._scene.real):
+        with self._memory.compiler():
             while self._sub.listed() > self._grid.capacity:
                 self._grow()
 
@@ -227,7 +227,7 @@ class World(Access):
         """Survey the state."""
         if self._grid and self._grid.stale[None]:
             self._list()
-        with runtime.literals(self._scene.real):
+        with self._memory.compiler():
             report, extent = self._survey.report(self._time, self._h, substeps, iterations, self._started, begin)
         if self._grid:
             self._grid.fit(extent)
@@ -238,7 +238,7 @@ class World(Access):
         self._memory.check()
         if not self._h:
             raise RuntimeError(f"{batch!r}.residual: there is none before the world has been stepped.")
-        with runtime.literals(self._scene.real):
+        with self._memory.compiler():
             return self._survey.residuals(batch, self._h, self._started)
 
     def run(

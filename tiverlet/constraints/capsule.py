@@ -86,17 +86,17 @@ class Capsule(Wall):
         moved = self._on_a.step(when) * (1 - t) + self._on_b.step(when) * t
         d = self._on_state.d[i] - moved
         way = d.norm()
-        _, gap, _ = self.nearest(x - d, a, b)
+        _t, gap, _n = self.nearest(x - d, a, b)  # not twice the same name: Taichi would assign a vector to a number
         gap -= far
         # It was outside, or touched, and may have come in: walk along the path, never further than the surface is away.
         if gap > -TOUCH * far and gap < way:
             s = ti.max(gap, 0) / way
             for k in range(MARCH):
                 if s < 1:
-                    _, gap, _ = self.nearest(x - (1 - s) * d, a, b)
+                    _t, gap, _n = self.nearest(x - (1 - s) * d, a, b)
                     s += ti.max(gap - far, 0) / way
             depth = 0 * depth
             if s < 1:
-                _, _, n = self.nearest(x - (1 - s) * d, a, b)
+                _t, _gap, n = self.nearest(x - (1 - s) * d, a, b)
                 depth = (s - 1) * d.dot(n)
         self.press(i, depth, n, moved, h, last)

@@ -193,13 +193,14 @@ class _Probe:
     """The function at many places, in Python and f64."""
 
     def __init__(self, wall: Sdf):
+        self.compiler = runtime.Compiler(ti.f64)
         self.wall: Any = wall
         self.dim = wall.dim
 
     def value(self, points: np.ndarray) -> np.ndarray:
         """The function at points (n, dim) of the wall's frame, (n,)."""
         out = np.zeros(len(points))
-        with runtime.literals(ti.f64):
+        with self.compiler():
             self._value(np.ascontiguousarray(points, dtype=np.float64), out)
         return out
 
@@ -212,7 +213,7 @@ class _Probe:
     def gradient(self, points: np.ndarray) -> np.ndarray:
         """The user's gradient, (n, dim)."""
         out = np.zeros(points.shape)
-        with runtime.literals(ti.f64):
+        with self.compiler():
             self._gradient(np.ascontiguousarray(points, dtype=np.float64), out)
         return out
 

@@ -32,8 +32,9 @@ class Attractor(Acceleration):
     def bind(self, scene: Scene) -> None:
         """Center and strength on the device."""
         self.scene = scene
-        self._on_center = scene.memory.field("Attractor.center", None, width=self.dim)
-        self._on_strength = scene.memory.field("Attractor.strength", None)
+        self._on_center = scene.memory.field("Attractor.center", None, width=self.dim, values=self.center)
+        self._on_strength = scene.memory.field("Attractor.strength", None, values=self.strength)
+        self.changed = False
 
     def upload(self) -> None:
         """Write both."""

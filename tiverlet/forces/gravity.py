@@ -36,12 +36,17 @@ class Gravity(Acceleration):
     def bind(self, scene: Scene) -> None:
         """One vector on the device."""
         self.scene = scene
-        self._on_g = scene.memory.field("Gravity.g", None, width=scene.particles.dim)
+        self._on_g = scene.memory.field("Gravity.g", None, width=scene.particles.dim, values=self._vector())
+        self.changed = False
+
+    def _vector(self) -> list[float]:
+        """g as a vector."""
+        down = [0.0, -1.0, 0.0][: self.dim]
+        return [self.g * c for c in down] if np.ndim(self.g) == 0 else list(np.asarray(self.g))
 
     def upload(self) -> None:
         """Write g."""
-        down = [0.0, -1.0, 0.0][: self.dim]
-        self._on_g[None] = [self.g * c for c in down] if np.ndim(self.g) == 0 else list(np.asarray(self.g))
+        self._on_g[None] = self._vector()
 
     @ti.func
     def acceleration(self, i, x, v, t):

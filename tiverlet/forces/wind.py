@@ -32,7 +32,8 @@ class Wind(Acceleration):
     def bind(self, scene: Scene) -> None:
         """One vector on the device: rate * velocity, the acceleration that is left when the drag is taken apart."""
         self.scene = scene
-        self._on_push = scene.memory.field("Wind.push", None, width=self.dim)
+        self._on_push = scene.memory.field("Wind.push", None, width=self.dim, values=self.rate * self.velocity)
+        self.changed = False
 
     def upload(self) -> None:
         """Write rate * velocity."""
