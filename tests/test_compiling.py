@@ -64,7 +64,7 @@ ours = tv.World(tv.Particles([[1.0, 0.0]]), [tv.Gravity()], substeps=10)
 bad = tv.World(tv.Particles([[1.0, 0.0]]), [tv.Force(wrong)])
 for w in (ours, mine, ours, mine):
     w.step(0.01)
-    assert ti.cfg.cfg_optimization and ti.cfg.default_fp == ti.f32
+    assert ti.cfg.cfg_optimization and ti.cfg.cache_loop_invariant_global_vars and ti.cfg.default_fp == ti.f32
 assert mine._memory.compiler.thorough and not ours._memory.compiler.thorough
 assert abs(mine.position[0, 0] - 0.980067) < 1e-4  # cos(omega t), omega = 10 / s
 for _ in range(2):

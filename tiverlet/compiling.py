@@ -1,11 +1,11 @@
-"""How kernels are compiled: in half of the time that Taichi takes by itself, to the same bits.
+"""How kernels are compiled: in a third of the time that Taichi takes by itself, to the same bits.
 
-Three quarters of that time go into Taichi's analysis of control flow, which LLVM does again, and into pictures of source lines
-for errors that do not happen. Both are left out while a kernel of ours compiles, and only then: what the user compiles in the
-same process is compiled as ever. A kernel with the user's functions in it keeps the analysis. What it leaves out can hide what
-LLVM ends the process for: a vector assigned to a variable that is a number, where nobody reads it.
+Most of that time goes into Taichi's analysis of control flow, which LLVM does again, and into pictures of source lines for
+errors that do not happen. Both are left out while a kernel of ours compiles, and only then: what the user compiles in the same
+process is compiled as ever. A kernel with the user's functions in it keeps the analysis, because it can hide what LLVM ends the
+process for: a vector assigned to a variable that is a number, where nobody reads it (`_, gap, _ = nearest(x)`).
 
-Everything here knows the inside of Taichi 1.7.4; where another Taichi looks different, it is compiled as Taichi does.
+Everything here knows the inside of Taichi 1.7.4; with another one, kernels are compiled as Taichi does.
 """
 
 import contextlib
@@ -22,10 +22,11 @@ import taichi as ti
 from taichi.lang import impl, kernel_impl
 from taichi.lang.ast import ASTTransformerContext
 
-HOME = tuple(
-    str(pathlib.Path(str(module)).parent) for module in (__file__, ti.__file__)
-)  # of functions that are known to be safe
-HOSTS = ("Arch.x64", "Arch.arm64")  # where leaving the analysis out was measured to cost nothing
+HOME = (str(pathlib.Path(__file__).parent), str(pathlib.Path(ti.__file__).parent))  # of functions that are known to be safe
+HOSTS = ("Arch.x64", "Arch.arm64")  # where leaving it out was measured to cost nothing
+# No analysis of control flow, and, since that one would find that two addresses are the same, no variables for what loops read
+# and write at one address: it would become two variables.
+LEAN = {"cfg_optimization": False, "cache_loop_invariant_global_vars": False}
 _lock = threading.RLock()  # the type of literals is one for all threads
 _active: list["Compiler"] = []  # whose kernels are being compiled or launched, the innermost last
 _lines: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()  # of functions, as inspect finds them
@@ -43,30 +44,36 @@ class Compiler:
     def __init__(self, real):
         self.real = real
         self.thorough = not _patched  # once and for all, since what Taichi fails to compile may be tried again
-        self._analysis = True  # what Taichi was started with
+        self._settings: dict[str, Any] = {}  # that Taichi was started with
 
     @contextlib.contextmanager
     def __call__(self) -> Iterator[None]:
-        runtime = impl.get_runtime()
+        runtime: Any = impl.get_runtime()
         with _lock:
-            config = runtime.prog.config()
-            before = runtime.default_fp, config.cfg_optimization
-            self._analysis = _active[0]._analysis if _active else config.cfg_optimization
+            config, literals = runtime.prog.config(), runtime.default_fp
+            before = {name: getattr(config, name) for name in LEAN}
+            self._settings = _active[0]._settings if _active else before
             runtime.set_default_fp(self.real)
             if str(config.arch) in HOSTS and not self.thorough:
-                config.cfg_optimization = False
+                _set(config, LEAN)
             _active.append(self)
             try:
                 yield
             finally:
                 _active.pop()
-                runtime.set_default_fp(before[0])
-                config.cfg_optimization = before[1]
+                runtime.set_default_fp(literals)
+                _set(config, before)
 
     def beware(self) -> None:
         """Be thorough from here on: a function that is not ours is being compiled."""
+        runtime: Any = impl.get_runtime()
         self.thorough = True
-        impl.get_runtime().prog.config().cfg_optimization = self._analysis
+        _set(runtime.prog.config(), self._settings)
+
+
+def _set(config, settings: dict[str, Any]) -> None:
+    for name, value in settings.items():
+        setattr(config, name, value)
 
 
 def _lines_of(function) -> tuple[list[str], int]:
@@ -87,18 +94,23 @@ def _file_of(function) -> str:
     return _files[function]
 
 
-def _place_of(context, node) -> str:
+def _place_of(self: Any, node: Any) -> str:
     """Where a node is, without the picture of it that Taichi draws for every node; errors still get it."""
-    if not _active or context.raised:
-        return _draw(context, node)
-    line, name = context.src[node.lineno - 1], context.func.func.__name__
-    return f'File "{context.file}", line {node.lineno + context.lineno_offset}, in {name}:\n{line}\n'
+    if not _active or self.raised:
+        return _draw(self, node)
+    line, name = self.src[node.lineno - 1], self.func.func.__name__
+    return f'File "{self.file}", line {node.lineno + self.lineno_offset}, in {name}:\n{line}\n'
 
 
 def _patch() -> bool:
     """Put these in the place of what Taichi calls; whether it is the Taichi that they are made for."""
     names = ("getsourcelines", "getsourcefile", "textwrap")
-    if ti.__version__ != (1, 7, 4) or not all(hasattr(kernel_impl, name) for name in names):
+    config = impl.default_cfg()
+    if (
+        ti.__version__ != (1, 7, 4)
+        or not all(hasattr(kernel_impl, name) for name in names)
+        or not all(hasattr(config, name) for name in LEAN)
+    ):
         return False
     kernel_impl.getsourcelines, kernel_impl.getsourcefile = _lines_of, _file_of
     # Every line of a function is expanded at every call of it.
@@ -107,7 +119,7 @@ def _patch() -> bool:
     return True
 
 
-_find_lines: Any = kernel_impl.getsourcelines
-_find_file: Any = kernel_impl.getsourcefile
-_draw: Any = ASTTransformerContext.get_pos_info
+_find_lines: Any = getattr(kernel_impl, "getsourcelines", None)
+_find_file: Any = getattr(kernel_impl, "getsourcefile", None)
+_draw: Any = getattr(ASTTransformerContext, "get_pos_info", None)
 _patched = _patch()
