@@ -9,6 +9,7 @@ Everything here knows the inside of Taichi 1.7.4; with another one, kernels are 
 """
 
 import contextlib
+import os
 import pathlib
 import textwrap
 import threading
@@ -22,8 +23,10 @@ import taichi as ti
 from taichi.lang import impl, kernel_impl
 from taichi.lang.ast import ASTTransformerContext
 
-HOME = (str(pathlib.Path(__file__).parent), str(pathlib.Path(ti.__file__).parent))  # of functions that are known to be safe
-HOSTS = ("Arch.x64", "Arch.arm64")  # where leaving it out was measured to cost nothing
+HOME = tuple(
+    str(pathlib.Path(file).parent) + os.sep for file in (__file__, ti.__file__)
+)  # of functions that are known to be safe
+HOSTS = ("Arch.x64", "Arch.arm64")  # whose kernels LLVM makes as fast without it; measured on x64
 # No analysis of control flow, and, since that one would find that two addresses are the same, no variables for what loops read
 # and write at one address: it would become two variables.
 LEAN = {"cfg_optimization": False, "cache_loop_invariant_global_vars": False}

@@ -25,6 +25,7 @@ from .compiling import Compiler
 
 ARCHITECTURES = ("cpu", "cuda", "metal", "vulkan")
 GROUP = 16  # fields that one transfer kernel serves; Taichi unrolls the loop over them
+SMALL = 300_000  # numbers that one thread copies in a millisecond
 MAX_TREES = 400  # Taichi holds at most 511 trees of fields and does not check; the rest is left to the user's own fields.
 
 _started: dict = {}  # what init() was asked for, and by which process and thread
@@ -283,10 +284,31 @@ class _Transfer:
         for e in entries:
             self.plan.append((e.field, e.field.dtype, max(1, e.length), e.width, bool(e.length), offset))
             offset += e.bytes // e.kind.itemsize
+        self.serial = offset < SMALL and architecture() == "cpu"  # in one piece, which compiles in half the time
 
     @ti.kernel
     def load(self, flat: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
         """From the array to the fields."""
+        if ti.static(self.serial):
+            ti.loop_config(serialize=True)
+            for _ in range(1):
+                self.put(flat)
+        else:
+            self.put(flat)
+
+    @ti.kernel
+    def dump(self, flat: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
+        """From the fields to the array."""
+        if ti.static(self.serial):
+            ti.loop_config(serialize=True)
+            for _ in range(1):
+                self.get(flat)
+        else:
+            self.get(flat)
+
+    @ti.func
+    def put(self, flat: ti.template()):  # type: ignore[valid-type]
+        """All fields, one after the other."""
         for field, kind, length, width, many, offset in ti.static(self.plan):
             for i in range(length):
                 if ti.static(width == 0):
@@ -301,9 +323,9 @@ class _Transfer:
                         else:
                             field[None][k] = ti.cast(flat[offset + k], kind)
 
-    @ti.kernel
-    def dump(self, flat: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
-        """From the fields to the array."""
+    @ti.func
+    def get(self, flat: ti.template()):  # type: ignore[valid-type]
+        """All fields, one after the other."""
         for field, kind, length, width, many, offset in ti.static(self.plan):
             for i in range(length):
                 if ti.static(width == 0):

@@ -106,7 +106,12 @@ class Substep(Phases):
     @ti.kernel
     def listed(self) -> ti.i32:
         """Build the neighbour list; returns the largest number of entries that a block needs."""
-        self.grid.build()
+        if ti.static(self.parallel):
+            self.grid.build()
+        else:
+            ti.loop_config(serialize=True)
+            for _ in range(1):
+                self.grid.build()
         return self.grid.need[None]
 
     @ti.kernel

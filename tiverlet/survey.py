@@ -185,6 +185,7 @@ class Survey:
         """All figures; fresh: the last substep was a start; begin: d holds velocities, no step was made yet."""
         h32 = ti.cast(h64, self.sub.real)
         self.sub.weigh(h32, self.sub.reach(h32, fresh), 0, fresh, False)
+        ti.loop_config(serialize=not self.sub.parallel)
         for thread in range(BLOCKS * self.spread):
             if thread % self.spread == 0:
                 h, t = ti.cast(h64, self.sub.real), ti.cast(t64, self.sub.real)
