@@ -14,7 +14,8 @@ def hang(world, name, **settings):
     """The chain of a D case, hung up at its anchor."""
     x, mass, pairs = pendulums(name)
     start = tv.Particles(x, mass=mass, pinned=[0])
-    return world(start, [tv.Gravity(case(name)["params"]["g"]), tv.Distance(pairs)], **{"precision": "f64", **settings})
+    settings = {"precision": "f64", "solver": tv.Jacobi(), **settings}
+    return world(start, [tv.Gravity(case(name)["params"]["g"]), tv.Distance(pairs)], **settings)
 
 
 def test_pendulum_state(world):

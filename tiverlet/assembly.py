@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TypeVar
 
+import numpy as np
 import taichi as ti
 
 from . import runtime
@@ -11,6 +12,9 @@ from .constraints.contact import Contact
 from .feature import Acceleration, Batch, Feature, Scene
 from .grid import Grid
 from .particles import Particles, Radii, State
+from .scalar import LOST, Scalar
+from .solvers.direct import Direct
+from .solvers.elimination import plan
 from .solvers.jacobi import Jacobi
 from .solvers.slots import Slots
 from .solvers.solver import Solver
@@ -27,6 +31,7 @@ ROOM = {True: (7, 14), False: (12, 32)}
 # Particles and constraints from which waking threads pays. A falling pile of discs took, fused and on 2 threads, 4.1 and 8.1 ms a
 # frame with 10 000 of them, 8.9 and 11.5 with 30 000, 25.8 and 24.2 with 100 000.
 CROSSOVER = 100_000
+WIDTH = 4  # of the systems that are solved directly where the user names no solver: chains, loops, joints of up to 5 rods
 
 
 @dataclass
@@ -34,6 +39,7 @@ class Assembly:
     """The parts of a world on the device."""
 
     path: str
+    solver: Solver
     memory: runtime.Memory
     scene: Scene
     batches: list[Batch]
@@ -42,8 +48,11 @@ class Assembly:
     survey: Survey
 
 
-def assemble(particles: Particles, features: tuple[Feature, ...], solver: Solver, precision: str, path: str) -> Assembly:
-    """Check the features against the particles and each other, then declare and place every field, in one tree."""
+def assemble(particles: Particles, features: tuple[Feature, ...], solver: Solver | None, precision: str, path: str) -> Assembly:
+    """Check the features against the particles and each other, then declare and place every field, in one tree.
+
+    solver: None for the one that suits the structure.
+    """
     inv_mass = particles.inv_mass.copy()
     for feature in features:
         feature.prepare(particles, inv_mass)
@@ -67,7 +76,7 @@ def assemble(particles: Particles, features: tuple[Feature, ...], solver: Solver
         raise
 
 
-def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver, path: str) -> Assembly:
+def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, path: str) -> Assembly:
     memory, state, particles = scene.memory, scene.state, scene.particles
 
     def of(kind: type[T]) -> list[T]:
@@ -82,6 +91,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver, path: str
     surfaces = [*walls, *([contact] if contact else [])]
     starts = any(f.rubs for f in surfaces) or any(w.sweeps for w in walls)
     state.remember(memory, starts, any(f.bounces for f in surfaces), bool(contact and walls))
+    solver = solver or by_structure(batches, particles.position, scene.inv_mass)
     if batches:
         scene.slots = Slots(scene, batches, solver)
     parallel = path == "parallel"
@@ -93,7 +103,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver, path: str
     memory.place()
     if grid and contact:
         grid.allocate(len(particles) * max(ROOM[scene.radius.uniform][particles.dim - 2], contact.room) + 64)
-    return Assembly(path, memory, scene, batches, grid, substep, survey)
+    return Assembly(path, solver, memory, scene, batches, grid, substep, survey)
 
 
 def checked_features(features: Iterable[Feature]) -> tuple[Feature, ...]:
@@ -114,10 +124,32 @@ def checked_features(features: Iterable[Feature]) -> tuple[Feature, ...]:
     return features
 
 
-def checked_solver(solver: Solver | None) -> Solver:
-    """The solver of a new world."""
-    solver = Jacobi() if solver is None else solver
-    if not isinstance(solver, Solver):
+def by_structure(batches: list[Batch], position: np.ndarray, inv_mass: np.ndarray) -> Solver:
+    """The solver of a world whose user names none.
+
+    Direct where constraints hang together like chains, trees or loops: for the cost of one relaxation it leaves some 1e-4 of the
+    length of a link where Jacobi leaves a tenth. Jacobi for what is denser, such as cloth; for bodies with limits of angles,
+    which contacts can lock in a shape that Newton's method does not leave; and for scenes that start with violated constraints,
+    which may contradict each other: relaxed, they settle on a compromise.
+    """
+    links = [b for b in batches if isinstance(b, Scalar) and b.joins]
+    if not links or any(b.side and b.arity > 2 for b in links):
+        return Jacobi()
+    for b in links:
+        C = b.violation(position)
+        if (np.where(b.side, np.maximum(b.side * C, 0), np.abs(C)) * b.closeness(position) > LOST).any():
+            return Jacobi()
+    arity = np.repeat([b.arity for b in links], [b.count for b in links])
+    item = np.concatenate([b.indices.ravel() for b in links])
+    owner = np.repeat(np.arange(len(arity)), arity)
+    free = inv_mass[item] > 0
+    found = plan(len(arity), owner[free], item[free], WIDTH)
+    return Direct(WIDTH) if len(found.column) else Jacobi()
+
+
+def checked_solver(solver: Solver | None) -> Solver | None:
+    """The solver of a new world; None to have it chosen."""
+    if solver is not None and not isinstance(solver, Solver):
         hint = f"; write {solver.__name__}()" if isinstance(solver, type) else ""
         raise TypeError(f"World: solver = {solver!r} is not a solver, as tv.Jacobi() or tv.Direct() is{hint}.")
     return solver

@@ -29,8 +29,8 @@ class World(Access):
     particles: Particles. features: what acts, in any order; at most one Contact. What is not in the list costs nothing.
     substeps: substeps of a frame, or "auto" for as many as it needs (see Guard). iterations: passes over the constraints in each.
     Both may change at any time, at no compile cost.
-    solver: how constraints are solved: Jacobi (None), Direct for chains, trees and loops, Chebyshev or ConjugateGradient for
-    cloth.
+    solver: how constraints are solved: Direct for chains, trees and loops, Jacobi, Chebyshev or ConjugateGradient for cloth. None
+    takes Direct for what hangs together like chains and Jacobi for the rest; explain() says what was chosen.
     precision: "f32" (position and displacement), "f32-compensated" (the position carries a low word, for coordinates far from the
     origin), "f64".
     path: "auto", "fused" (one launch per frame, one thread) or "parallel"; the bits are the same.
@@ -46,12 +46,14 @@ class World(Access):
             raise TypeError(f"World: particles = {particles!r} is a {type(particles).__name__}; use tv.Particles(position).")
         check_settings(precision, path)
         self._particles, self._features = particles, checked_features(features)
-        self._solver, self._precision = checked_solver(solver), precision
+        given = checked_solver(solver)
+        self._solver, self._precision = given or Solver(), precision
         self._guard = Guard()
         self.substeps, self.iterations = substeps, iterations
-        parts = assemble(particles, self._features, self._solver, precision, path)
+        parts = assemble(particles, self._features, given, precision, path)
         self._memory, self._scene, self._batches = parts.memory, parts.scene, parts.batches
         self._grid, self._sub, self._survey, self._path = parts.grid, parts.substep, parts.survey, parts.path
+        self._solver = parts.solver
         parts.scene.residuals = self._residuals
         self._time, self._tick, self._h = 0.0, 0, 0.0
         self._since = 0  # substeps since the last start
