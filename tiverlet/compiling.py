@@ -23,9 +23,8 @@ import taichi as ti
 from taichi.lang import impl, kernel_impl
 from taichi.lang.ast import ASTTransformerContext
 
-HOME = tuple(
-    str(pathlib.Path(file).parent) + os.sep for file in (__file__, ti.__file__)
-)  # of functions that are known to be safe
+# Where functions come from that are known to be safe.
+HOME = tuple(str(pathlib.Path(file).parent) + os.sep for file in (__file__, ti.__file__))
 HOSTS = ("Arch.x64", "Arch.arm64")  # whose kernels LLVM makes as fast without it; measured on x64
 # No analysis of control flow, and, since that one would find that two addresses are the same, no variables for what loops read
 # and write at one address: it would become two variables.
