@@ -388,3 +388,28 @@ def test_direct_has_the_same_bits_on_both_paths(world):
 def test_direct_checks_its_arguments():
     with pytest.raises(ValueError, match="Direct: width = -1"):
         tv.Direct(-1)
+
+
+def test_the_default_suits_the_structure(world):
+    # Links like chains, trees and loops are solved directly; cloth, braced bodies, limits of angles, single links and what starts
+    # violated are relaxed. explain() says what was chosen, and a solver that the user names is taken as it is.
+    flat = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1], [2, 1]])
+    x, chain = flat[[0, 1, 2, 4]], links(3)
+    braced = [(i, j) for i in range(4) for j in range(i)]
+    for position, features, solver in (
+        (x, [tv.Distance(chain)], "Direct"),
+        (x, [tv.Rope(chain), tv.Contact(), tv.Gravity()], "Direct"),
+        (flat[:4], [tv.Distance(loop(4))], "Direct"),
+        (flat, [tv.Distance([(0, 1), (1, 2), (1, 3)])], "Direct"),
+        (flat, [tv.Distance([(0, 1), (2, 3)])], "Jacobi"),
+        (flat[:4], [tv.Distance(braced)], "Jacobi"),
+        (x, [tv.Distance(chain), tv.Bend([(0, 1, 2)])], "Jacobi"),
+        (x, [tv.Distance(chain, [1.0, 1.0, 3.0])], "Jacobi"),
+        (x, [tv.Rope(chain, 5.0)], "Direct"),
+        (x, [], "Jacobi"),
+    ):
+        w = world(tv.Particles(position), features)
+        assert type(w._solver).__name__ == solver, features
+        assert f"Solved by {solver}" in w.explain() or not features
+    w = world(tv.Particles(x), [tv.Distance(chain)], solver=tv.Jacobi())
+    assert "Solved by Jacobi" in w.explain()

@@ -31,7 +31,7 @@ ROOM = {True: (7, 14), False: (12, 32)}
 # Particles and constraints from which waking threads pays. A falling pile of discs took, fused and on 2 threads, 4.1 and 8.1 ms a
 # frame with 10 000 of them, 8.9 and 11.5 with 30 000, 25.8 and 24.2 with 100 000.
 CROSSOVER = 100_000
-WIDTH = 4  # of the systems that are solved directly where the user names no solver: chains, loops, joints of up to 5 rods
+WIDTH = 2  # of the systems that are solved directly where the user names no solver: chains, loops, joints of up to 3 rods
 
 
 @dataclass
@@ -127,13 +127,13 @@ def checked_features(features: Iterable[Feature]) -> tuple[Feature, ...]:
 def by_structure(batches: list[Batch], position: np.ndarray, inv_mass: np.ndarray) -> Solver:
     """The solver of a world whose user names none.
 
-    Direct where constraints hang together like chains, trees or loops: for the cost of one relaxation it leaves some 1e-4 of the
-    length of a link where Jacobi leaves a tenth. Jacobi for what is denser, such as cloth; for bodies with limits of angles,
-    which contacts can lock in a shape that Newton's method does not leave; and for scenes that start with violated constraints,
-    which may contradict each other: relaxed, they settle on a compromise.
+    Direct where links hang together like chains, trees or loops: for the cost of one relaxation it leaves some 1e-4 of the length
+    of a link where Jacobi leaves a tenth. Jacobi for what is denser, such as cloth and braced bodies; where there are constraints
+    on more than two particles, which contacts can lock in a shape that Newton's method does not leave; and for scenes that start
+    with violated constraints, which may contradict each other: relaxed, they settle on a compromise.
     """
     links = [b for b in batches if isinstance(b, Scalar) and b.joins]
-    if not links or any(b.side and b.arity > 2 for b in links):
+    if not links or any(b.arity > 2 for b in links):
         return Jacobi()
     for b in links:
         C = b.violation(position)

@@ -143,7 +143,7 @@ class World(Access):
                 self._since = 0
             self._set(h, drag)
             if self._energy is None:
-                report = self._look(1, 1, begin=True)
+                report = self._look(begin=True)
                 self._energy = report.energy
                 if report.overlap > 0 and self._placed:
                     self._ease()
@@ -225,7 +225,7 @@ class World(Access):
         self._sub = copy.copy(self._sub)
         self._survey = self._survey.of(self._sub)
 
-    def _look(self, substeps: int, iterations: int, begin: bool = False) -> StepReport:
+    def _look(self, substeps: int = 1, iterations: int = 1, begin: bool = False) -> StepReport:
         """Survey the state."""
         if self._grid and self._grid.stale[None]:
             self._list()
