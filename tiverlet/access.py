@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from . import checks, runtime
+from . import checks, composition, runtime
 from .breaking import BREAKS
 from .feature import Feature
 from .particles import Particles, in_range
@@ -33,6 +33,7 @@ class Access:
     _search: Search | None
     _precision: str
     _path: str
+    _order: int
     _restart: Any
     _list: Any
 
@@ -57,8 +58,14 @@ class Access:
 
     @property
     def velocity(self) -> np.ndarray:
-        """Velocities [m/s], (n, dim), a read-only copy in f64; second order in h. Assign an array to set them."""
-        return self._export(self._sub.velocities, self._h, self._time, int(self._fresh))
+        """Velocities [m/s], (n, dim), a read-only copy in f64; of the order of the world. Assign an array to set them."""
+        if self._order == 2 or self._fresh:
+            return self._export(self._sub.velocities, self._h, self._time, int(self._fresh))
+        self._memory.check()
+        with self._memory.compiler():
+            out = composition.velocity(self)[: len(self._particles)]
+        out.flags.writeable = False
+        return out
 
     @velocity.setter
     def velocity(self, value) -> None:
@@ -155,6 +162,11 @@ class Access:
     def precision(self) -> str:
         """ "f32", "f32-compensated" or "f64"."""
         return self._precision
+
+    @property
+    def order(self) -> int:
+        """Of the error in the substep."""
+        return self._order
 
     @property
     def path(self) -> str:

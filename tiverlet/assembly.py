@@ -7,7 +7,7 @@ from typing import TypeVar
 import numpy as np
 import taichi as ti
 
-from . import runtime
+from . import composition, runtime
 from .constraints.contact import Contact
 from .feature import Acceleration, Batch, Feature, Scene
 from .grid import Grid
@@ -48,7 +48,9 @@ class Assembly:
     survey: Survey
 
 
-def assemble(particles: Particles, features: tuple[Feature, ...], solver: Solver | None, precision: str, path: str) -> Assembly:
+def assemble(
+    particles: Particles, features: tuple[Feature, ...], solver: Solver | None, precision: str, path: str, order: int
+) -> Assembly:  # fmt: skip
     """Check the features against the particles and each other, then declare and place every field, in one tree.
 
     solver: None for the one that suits the structure.
@@ -64,11 +66,11 @@ def assemble(particles: Particles, features: tuple[Feature, ...], solver: Solver
             'World: precision = "f32-compensated" needs exact rounding, but Taichi was started with fast_math=True. '
             "Use tv.init(), or ti.init(fast_math=False)."
         )
-    path = _chosen(path, particles, features)
+    path = _chosen(path, particles, features) if order == 2 else "fused"
     memory = runtime.Memory(PRECISIONS[precision])
     try:
         state = State(memory, particles, inv_mass, precision == "f32-compensated")
-        return _bind(Scene(memory, state, particles, inv_mass), features, solver, path)
+        return _bind(Scene(memory, state, particles, inv_mass, order=order), features, solver, path)
     except BaseException:
         memory.abandon()
         for feature in features:
@@ -91,14 +93,17 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     surfaces = [*walls, *([contact] if contact else [])]
     starts = any(f.rubs for f in surfaces) or any(w.sweeps for w in walls)
     state.remember(memory, starts, any(f.bounces for f in surfaces), bool(contact and walls))
-    solver = solver or by_structure(batches, particles.position, scene.inv_mass)
+    solver = solver or (by_structure(batches, particles.position, scene.inv_mass) if scene.order == 2 else Direct())
     if batches:
         scene.slots = Slots(scene, batches, solver)
+        if scene.order > 2:
+            composition.check_solved(batches, scene, solver)
     parallel = path == "parallel"
     grid = contact.join(scene, batches, parallel) if contact else None
     for feature in [*accelerations, *drivers, *batches, *walls]:
         feature.bind(scene)
-    substep = Substep(scene, accelerations, batches, drivers, contact, grid, walls, parallel)
+    kind = Substep if scene.order == 2 else composition.Composition
+    substep = kind(scene, accelerations, batches, drivers, contact, grid, walls, parallel)
     survey = Survey(substep)
     memory.place()
     if grid and contact:
@@ -155,12 +160,16 @@ def checked_solver(solver: Solver | None) -> Solver | None:
     return solver
 
 
-def check_settings(precision: str, path: str) -> None:
-    """Refuse names that do not exist."""
+def check_settings(precision: str, path: str, order: int, features: tuple[Feature, ...]) -> None:
+    """Refuse what does not exist, and an order that the features do not have."""
     if precision not in PRECISIONS:
         raise ValueError(f"World: precision = {precision!r}, but it must be one of {', '.join(map(repr, PRECISIONS))}.")
     if path not in PATHS:
         raise ValueError(f"World: path = {path!r}, but it must be one of {', '.join(map(repr, PATHS))}.")
+    if order not in composition.ORDERS:
+        raise ValueError(f"World: order = {order!r}, but it must be one of {', '.join(map(str, composition.ORDERS))}.")
+    if order > 2:
+        composition.refuse(order, features, precision, path)
 
 
 def _chosen(path: str, particles: Particles, features: tuple[Feature, ...]) -> str:

@@ -18,7 +18,7 @@ def explain(world: "World") -> str:
         f"{len(p)} particles in {p.dim}D, {int((p.inv_mass == 0).sum())} static; {world.precision} on "
         f"{runtime.architecture()}, {runtime.threads()} threads",
         f"{'auto, now ' * world._guard.auto}{world.substeps} substeps x {world.iterations} iterations, path {world.path}: "
-        f"{_launches(world)}",
+        f"{_launches(world)}" + (f"; order {world.order}, {world._sub.count} stages in a substep" if world.order > 2 else ""),
         "In the kernels:",
         *(f"    {line}" for line in _present(world)),
         "Left out, at no cost:",

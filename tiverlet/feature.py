@@ -40,6 +40,7 @@ class Scene:
     radius: Any = None  # where something asks for radii
     slots: Any = None  # where constraints leave their moves
     residuals: Any = None  # batch -> what the last substep left of each of its violations
+    order: int = 2  # of the substep in h
     hh: float = 0.0  # [s^2] what an acceleration added to the displacement in the last substep, see Batch.relax
 
     @property

@@ -60,7 +60,7 @@ class Guard:
         self.prepare(world.iterations, dt, tolerance, budget)
         n, k = self.substeps, self.iterations
         kept, tries, best, idle, kind = snapshot.keep(world), 0, float("inf"), 0, "substeps"
-        world._begin(dt / n)
+        world._begin(dt / n * world._sub.first)
         while True:
             tries, begun = tries + 1, perf_counter()
             report = world._advance(dt, n, k)
@@ -85,7 +85,7 @@ class Guard:
                 break
             n, k = (min(2 * n, MOST), k) if kind == "substeps" else (n, 2 * k)
             snapshot.put_back(world, kept)
-            world._begin(dt / n)
+            world._begin(dt / n * world._sub.first)
         if verdict == "stuck":
             self.stuck = max(self.stuck, GAIN * figure)  # and the next frames do not try in vain
         else:

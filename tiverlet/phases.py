@@ -29,6 +29,8 @@ class Phases:
         parallel: bool,
     ):
         self.parallel = parallel
+        # For substeps made of stages: the share of the first, what accelerates in the last per h^2, omega^2 of springs.
+        self.first, self.reaches, self.fastest = 1.0, 1.0, 0.0
         self.scene, self.state, self.slots = scene, scene.state, scene.slots
         self.n, self.dim, self.real = scene.particles.count, scene.particles.dim, scene.real
         self.accelerations = [f for f in accelerations if f.accelerates]

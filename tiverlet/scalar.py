@@ -150,11 +150,16 @@ class Scalar(Breaking):
         """Whether any constraint of the batch has compliance."""
         return bool((self.compliance > 0).any())
 
+    def sprung(self, scene: Scene) -> np.ndarray:
+        """Which constraints act as forces, (m,): soft ones in substeps of an order above 2. See composition.py."""
+        return (self.compliance > 0) & (scene.order > 2)
+
     def bind(self, scene: Scene) -> None:
         """Declare rest values, multipliers, and for soft ones the memory that the averaged constraint needs."""
         super().bind(scene)
         self._on_real = scene.real
         self._on_soft = self.soft
+        self._on_sprung = bool(self.sprung(scene).any())
         self._on_damped = self.soft and bool((self.damping > 0).any())
         start = self.rest_of(scene.particles.position) if self.count else np.zeros(0)
         self._on_scale = self.unit or (float(np.abs(start).mean()) if np.any(start) else scene.size)
@@ -276,6 +281,9 @@ class Scalar(Breaking):
         """A C + B + alpha' lam, A, alpha', lam and W (0 where it is broken), from f at the end and at the start, and w."""
         if ti.static(self.breaks):
             if not self.holds(c):
+                W = 0
+        if ti.static(self._on_sprung):
+            if not self.is_rigid(c):
                 W = 0
         C, A = f - self._on_rest[c], ti.cast(1, self._on_real)
         B, alpha = ti.cast(0, self._on_real), ti.cast(0, self._on_real)
@@ -405,7 +413,9 @@ class Scalar(Breaking):
         if ti.static(self._on_soft):
             alpha = self._on_alpha[c]
             if w > 0 and alpha > 0 and self.holds(c):
-                resolved = 1 - stiff(alpha, h, w)
+                resolved = ti.cast(1, self._on_real)
+                if ti.static(not self._on_sprung):
+                    resolved -= stiff(alpha, h, w)
                 C = self.bounded(f - self._on_rest[c])
                 force = -resolved * C / alpha
                 if ti.static(self._on_damped):

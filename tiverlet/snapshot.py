@@ -72,7 +72,7 @@ def install(world: "World", kept: Kept) -> None:
 def transfer(old: "World", new: "World") -> None:
     """Take over the state, bit for bit where both have the same precision."""
     kept = keep(old)
-    if new._precision == old._precision:
+    if new._precision == old._precision and new._order == old._order:
         install(new, kept)
         for ours, theirs in zip(old.features, new.features, strict=True):
             theirs.changed, theirs.moving = ours.changed, ours.moving

@@ -239,6 +239,7 @@ class Survey:
         """The report of a frame (without energy_change), and the size of the bounding box [m]."""
         out = np.array(self.measure(h, time, int(fresh), int(begin)))
         energy, residual, overlap, stiff, contacts, bad, flags = (float(v) for v in out[:7])
+        stiff = max(stiff, self.sub.fastest * h * h)
         low, high = out[7 : 7 + self.dim], out[10 : 10 + self.dim]
         notes = {}
         first = int(bad) if bad < self.n else None

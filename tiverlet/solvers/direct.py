@@ -49,7 +49,7 @@ class Direct(Solver):
         item = np.concatenate([b.indices.ravel() for b in scalars])
         arity = np.repeat([b.arity for b in scalars], [b.count for b in scalars])
         owner = np.repeat(np.arange(len(arity)), arity)
-        free = slot >= 0
+        free = (slot >= 0) & ~np.concatenate([b.sprung(scene) for b in scalars])[owner]
         found = plan(len(arity), owner[free], item[free], self.width)
         return Elimination(scene, batches, slots, scalars, found, slot[free]) if found.parts else None
 

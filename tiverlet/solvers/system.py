@@ -24,7 +24,7 @@ class System:
         row = np.full(sum(counts), -1)
         row[rows] = np.arange(len(rows))
         self._rows = dict(zip(map(id, scalars), np.split(row, np.cumsum(counts)[:-1]), strict=True))
-        self.blocks, self.shares = self._blocks(batches, scene.inv_mass)
+        self.blocks, self.shares = self._blocks(batches, scene)
         of_slot = np.full(sum(b.indices.size for b in batches), -1)
         for b in scalars:
             slot = slots.places(b)
@@ -43,18 +43,20 @@ class System:
         """A field of f64, one for each row."""
         return self.memory.field(f"system.{name}", self.rows if length is None else length, kind=ti.f64)
 
-    def _blocks(self, batches: list[Batch], inv_mass: np.ndarray) -> tuple[np.ndarray, bool]:
+    def _blocks(self, batches: list[Batch], scene: Scene) -> tuple[np.ndarray, bool]:
         """The number of blocks that each particle belongs to, one system at most; and whether any is in a system and others."""
-        n = len(inv_mass)
+        n = len(scene.inv_mass)
         inside, alone = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64)
         for b in batches:
             row = self.row(b)
+            if isinstance(b, Scalar) and b.sprung(scene).any():
+                row = np.where(b.sprung(scene), 0, row)  # forces take no share of the mass
             if (row >= 0).any():
                 inside[b.indices[row >= 0]] = True
                 alone += np.bincount(b.indices[row < 0].ravel(), minlength=n)
             else:
                 alone += np.bincount(b.indices.ravel(), minlength=n)
-        free = inv_mass > 0
+        free = scene.inv_mass > 0
         return np.where(free, inside + alone, 0), bool((inside & (alone > 0) & free).any())
 
     def row(self, batch: Batch) -> np.ndarray:

@@ -1,0 +1,173 @@
+"""Substeps of order 4, 6 and 8."""
+
+import re
+
+import numpy as np
+import pytest
+import taichi as ti
+
+import tiverlet as tv
+
+from .conftest import case, order, pendulums, rerun, rms
+
+HIGH = (4, 6, 8)
+
+
+def chain(world, name, **settings):
+    x, mass, pairs = pendulums(name)
+    features = [tv.Gravity(case(name)["params"]["g"]), tv.Distance(pairs)]
+    return world(tv.Particles(x, mass=mass, pinned=[0]), features, **{"precision": "f64", **settings})
+
+
+def reference(name, t):
+    values = case(name)["values"][f"t{t}"]
+    xy = np.array(values["xy"])
+    return np.array(values.get("nodes_1based", np.arange(len(xy)) + 1)), xy
+
+
+@pytest.mark.parametrize("high", HIGH)
+def test_orders_and_the_error_of_a_good_peer(world, high):
+    # MuJoCo 4.0 with RK4 in joint coordinates, RMS position: D01 at t = 2, 60 and 240 steps/s: 2.2e-6, 2.5e-8 m; D05 at t = 0.5,
+    # 60, 240 and 1200 steps/s: 1.4e-3, 2.9e-6, 6.2e-8. Here with rods as constraints, and at most the same number of substeps.
+    for name, t, rates, peer in (
+        ("D01_double_pendulum", 2.0, (30, 60, 120, 240), {60: 2.2e-6, 240: 2.5e-8}),
+        ("D05_chain10", 0.5, (120, 240, 480, 1200), {240: 2.9e-6, 1200: 6.2e-8}),
+    ):
+        w, (at, want) = chain(world, name, order=high), reference(name, t)
+        errors = np.array([rms(rerun(w, t, dt=t, substeps=round(n * t)).position[at], want) for n in rates])
+        assert all(errors[rates.index(n)] < limit for n, limit in peer.items()), errors
+        clear = errors[errors > 1e-11][:3]  # of what is not rounding yet
+        assert len(clear) < 2 or order(clear) > high - 0.5, errors
+        assert w.last.clean and w.last.residual < 1e-12
+        w.close()
+
+
+def test_velocities_have_the_order_too(world):
+    # A Kepler ellipse, e = 0.5, from its pericentre: back there after T = 2 pi with the velocity (0, sqrt(3)). And a conical
+    # pendulum, whose rod has to take out what is along it: v is at right angles to it, and as fast as at the start.
+    tilt, g = 0.7, 9.81
+    spin = np.sqrt(g / np.cos(tilt))
+    x = [(0.5, 0, 0), (5, 0, 5), (5 + np.sin(tilt), -np.cos(tilt), 5)]
+    v = [(0, np.sqrt(3.0), 0), (0, 0, 0), (0, 0, spin * np.sin(tilt))]
+    for high in HIGH:
+
+        @ti.func
+        def pull(x):
+            out = -x / x.norm() ** 3
+            if x[2] > 1:
+                out = ti.Vector([0, -9.81, 0])
+            return out
+
+        features = [tv.Force(pull), tv.Distance([(1, 2)])]
+        w = world(tv.Particles(x, velocity=v, pinned=[1]), features, precision="f64", order=high)
+        errors, across = [], []
+        for n in (100, 200, 400):
+            w.position, w.velocity, w.substeps = x, v, n
+            w.run(2 * np.pi, dt=2 * np.pi)
+            errors.append(np.abs(w.velocity[0] - v[0]).max())
+            rod = w.position[2] - w.position[1]
+            across.append(abs(w.velocity[2] @ rod))
+        assert order(errors[: 2 if high == 8 else 3]) > high - 0.5, errors
+        assert max(across) < 1e-9 and np.linalg.norm(w.velocity[2]) == pytest.approx(spin * np.sin(tilt), rel=1e-7)
+        w.close()
+
+
+def test_springs_are_forces(world):
+    # A chain of soft and rigid links converges, with order 6, to what order 2 converges to. A mass below its spring, of length l:
+    # l = 1 + g / k + (1 - g / k) cos(omega t), with omega^2 = k = 400.
+    k = np.arange(6)
+    x = np.concatenate([np.stack([0.3 * np.arange(7), 0.0 * np.arange(7)], axis=1), [(0, 5), (0, 3)]])
+    pairs = np.vstack([np.stack([k, k + 1], axis=1), [(7, 8)]])
+    compliance = np.array([1e-3, 2e-3, 0, 0, 5e-3, 1e-3, 1 / 400])
+    rest = np.array([0.3] * 6 + [1.0])
+
+    def build(**settings):
+        links = tv.Distance(pairs, rest, compliance=compliance)
+        return world(tv.Particles(x, pinned=[0, 7]), [tv.Gravity(9.81), links], precision="f64", solver=tv.Direct(), **settings)
+
+    best = rerun(build(order=8), 1.0, dt=1.0, substeps=600).position
+    sag = 9.81 / 400
+    assert 5 - best[8, 1] == pytest.approx(1 + sag + (1 - sag) * np.cos(20.0), abs=1e-11)
+    w = build(order=6)
+    assert order([rms(rerun(w, 1.0, dt=1.0, substeps=n).position, best) for n in (80, 160, 320)]) > 5.5
+    errors = [rms(rerun(build(), 1.0, dt=1.0, substeps=n).position, best) for n in (1000, 2000)]
+    assert 3.5 < errors[0] / errors[1] < 4.5 and errors[1] < 1e-3
+    assert "stiff-force" in rerun(w, 1.0, dt=1.0, substeps=8).last.flags
+
+
+def test_motion_can_be_turned_round(world):
+    # A composition of reversible stages is reversible: back at the start, to rounding, whatever the error was in between.
+    w = chain(world, "D05_chain10", order=4)
+    start = w.particles.position
+    w.substeps = 50
+    w.run(0.5, dt=0.1)
+    w.velocity = -w.velocity
+    w.run(0.5, dt=0.1)
+    np.testing.assert_allclose(w.position, start, atol=1e-9)
+
+
+def test_energy_neither_grows_nor_falls(world):
+    # Symplectic: over 200 s the error of the energy stays that of the first second.
+    w = chain(world, "D02_double_pendulum_low", order=4, substeps=5)
+    p = case("D02_double_pendulum_low")["params"]
+
+    def energy():
+        mass = w.particles.mass
+        return (0.5 * mass[:, None] * w.velocity**2).sum() + p["g"] * (mass[1:] * w.position[1:, 1]).sum()
+
+    start, seen = energy(), []
+    for _ in range(200):
+        w.run(1.0, dt=1 / 10)
+        seen.append(abs(energy() - start))
+    assert max(seen) < 4 * max(seen[:10]) + 1e-10 and max(seen) < 1e-5
+
+
+def test_another_length_of_substep_keeps_the_order(world):
+    name, t = "D01_double_pendulum", 2.0
+    w, (at, want) = chain(world, name, order=4), reference(name, t)
+    errors = []
+    for n in (1, 2, 4):
+        rerun(w, 0.5, dt=0.5, substeps=20 * n)
+        w.substeps = 7 * n
+        w.run(1.5, dt=0.25)
+        errors.append(rms(w.position[at], want))
+    assert order(errors) > 3.5, errors
+    w.substeps = "auto"
+    w.run(0.1)
+    copy = w.clone()
+    assert copy.order == 4 and copy.hash() == w.hash() and "order 4, 5 stages" in copy.explain()
+    copy.close()
+
+
+@pytest.mark.parametrize(
+    "feature, why",
+    [
+        (tv.Drag(1.0), "depends on velocities"),
+        (tv.Wind((1, 0), 1.0), "depends on velocities"),
+        (tv.Contact(), "one-sided"),
+        (tv.HalfSpace((0, 1), 0.0), "one-sided"),
+        (tv.Rope([(0, 1)]), "one-sided"),
+        (tv.Distance([(0, 1)], compliance=1e-3, damping=1.0), "damping"),
+        (tv.Distance([(0, 1)], break_at=1.0), "can break"),
+        (tv.ShapeMatch([[0, 1, 2]]), "not one number"),
+        (tv.Area([[0, 1, 2, 3]]), "any number of corners"),
+    ],
+)
+def test_what_has_no_such_order_is_refused(feature, why):
+    particles = tv.Particles([(0, 0), (1, 0), (0, 1), (1, 1)], radius=0.1)
+    with pytest.raises(ValueError, match=re.escape(f"order = 4, but {feature!r} ") + f".*{why}"):
+        tv.World(particles, [feature], precision="f64", order=4)
+
+
+def test_settings_without_such_an_order_are_refused():
+    particles = tv.Particles(np.random.default_rng(0).normal(size=(30, 3)))
+    with pytest.raises(ValueError, match="order = 3, but it must be one of 2, 4, 6, 8"):
+        tv.World(particles, order=3)
+    with pytest.raises(ValueError, match='precision="f64"'):
+        tv.World(particles, order=4)
+    with pytest.raises(ValueError, match="one thread only"):
+        tv.World(particles, precision="f64", path="parallel", order=4)
+    i, j = np.triu_indices(30, 1)
+    for solver in (None, tv.Jacobi()):  # all linked with all
+        with pytest.raises(ValueError, match="relaxes Distance .435 of them"):
+            tv.World(particles, [tv.Distance(np.stack([i, j], 1))], precision="f64", solver=solver, order=4)
