@@ -131,7 +131,7 @@ class Path(Tether):
     def settle(self) -> None:
         """The next frame starts from where this one went."""
         if self.scene and self.count:
-            self.scene.memory.write(self._on_from, self.at)
+            self.scene.memory.write(self._on_from, self.scene.memory.read(self._on_to)[: self.count])
 
     @ti.func
     def point(self, k, r):

@@ -74,7 +74,7 @@ class Pin(Tether):
     def settle(self) -> None:
         """The next frame starts from the target."""
         if self.scene and self.count:
-            self.scene.memory.write(self._on_from, self.target)
+            self.scene.memory.write(self._on_from, self.scene.memory.read(self._on_to)[: self.count])
 
     @ti.func
     def aim(self, c, when):
