@@ -28,7 +28,7 @@ from .constraints import (
 )
 from .forces import Attractor, Drag, Force, Gravity, Wind
 from .particles import Particles
-from .recording import Recorder
+from .recording import Recorder, replay
 from .runtime import init
 from .solvers import Chebyshev, ConjugateGradient, Direct, Jacobi
 from .survey import StepReport
@@ -39,6 +39,6 @@ __all__ = [
     "AngleLimit", "Area", "Attractor", "Ball", "Bend", "Box", "Capsule", "Chebyshev", "ConjugateGradient", "Constraint",
     "Contact", "Dihedral", "Direct", "Distance", "Drag", "Force", "Gravity", "HalfSpace", "Jacobi", "Mesh", "Particles",
     "Path", "Pin", "Polygon", "Polygons", "Recorder", "Rope", "Sdf", "ShapeMatch", "Snap", "Spacer", "StepReport", "Volume",
-    "Wind", "World", "approach", "clamp", "golden", "golden_colors", "golden_index", "init", "measure", "mix", "runtime",
-    "shapes", "smoothstep",
+    "Wind", "World", "approach", "clamp", "golden", "golden_colors", "golden_index", "init", "measure", "mix", "replay",
+    "runtime", "shapes", "smoothstep",
 ]  # fmt: skip

@@ -34,6 +34,7 @@ class Access:
     _precision: str
     _path: str
     _order: int
+    _watchers: list[Any]
     _restart: Any
     _list: Any
 
@@ -49,6 +50,8 @@ class Access:
         if self._sub.contacts:
             self._sub.contacts[0].check_range(value)
         self._memory.check()
+        for watcher in self._watchers:
+            watcher.assigned("position", value)
         with self._memory.compiler():
             self._restart()
             self._scene.state.put(self._memory, value)
@@ -71,6 +74,8 @@ class Access:
     def velocity(self, value) -> None:
         value = checks.points("World", "velocity", value, dim=self._particles.dim, count=len(self._particles))
         self._memory.check()
+        for watcher in self._watchers:
+            watcher.assigned("velocity", value)
         self._memory.write(self._scene.state.d, value)
         self._fresh, self._energy = True, None
 

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
+from .arguments import Noted
 from .particles import Particles, State
 from .runtime import Memory
 
@@ -77,8 +78,9 @@ class Knob:
         feature.changed = True
 
 
-class Feature:
-    """Base of all. `changed` says that a knob waits to be uploaded, `moving` that a target is under way."""
+class Feature(Noted):
+    """Base of all. `arguments` are those that it was made with; `changed` says that a knob waits to be uploaded, `moving`
+    that a target is under way."""
 
     changed = True
     moving = False

@@ -87,6 +87,11 @@ def fast_math() -> bool:
     return bool(_config().fast_math)
 
 
+def wanted() -> dict[str, Any]:
+    """What init() was asked for; nothing when the user started Taichi."""
+    return _started.get("wanted") or {}
+
+
 def ensure_started() -> None:
     """Start Taichi with the defaults if it does not run, and refuse where building fields would crash."""
     if ti.cfg is None:

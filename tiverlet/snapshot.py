@@ -9,7 +9,8 @@ import numpy as np
 if TYPE_CHECKING:
     from .world import World
 
-CLOCK = ("_time", "_tick", "_since", "_frame", "_h", "_drag", "_fresh", "_started", "_placed", "_energy")
+HASHED = ("_time", "_tick", "_since", "_h", "_fresh")  # of the clock; the rest follows from the same past
+CLOCK = (*HASHED, "_frame", "_drag", "_started", "_placed", "_energy")
 
 
 @dataclass(frozen=True)
@@ -20,29 +21,42 @@ class Kept:
     clock: dict[str, Any]
     guard: tuple
 
+    def digest(self) -> str:
+        """SHA-256 of the exact state, the clock, and what the guard remembers."""
+        out = hashlib.sha256(repr((*(self.clock[name] for name in HASHED), *self.guard)).encode())
+        for name, values in self.values.items():
+            out.update(name.encode())
+            out.update(values.tobytes())
+        return out.hexdigest()
 
-def state(world: "World") -> dict[str, np.ndarray]:
-    """Every field that the future depends on: not what the neighbour list looks like, but what its pairs carry."""
+    def position(self, count: int) -> np.ndarray:
+        """Positions [m] of `count` particles, in f64 where there is more than one word of f32."""
+        x = self.values["position"][:count]
+        if "position_low" in self.values:
+            x = x + self.values["position_low"][:count].astype(np.float64)
+        return x
+
+
+def state(world: "World", pairs: bool = True) -> dict[str, np.ndarray]:
+    """Every field that the future depends on: not what the neighbour list looks like, but what its pairs carry.
+
+    Without `pairs` that is left out, which takes a fraction of the time; it shows in the next frame.
+    """
     out = {name: values for memory in world._memories for name, values in memory.state().items()}
-    if world._grid:
+    if world._grid and pairs:
         out["Contact.pairs"], carried = world._grid.carried()
         out.update((f"Contact.{name}", values) for name, values in carried.items())
     return out
 
 
-def digest(world: "World") -> str:
-    """SHA-256 of the exact state, the clock, and what the guard remembers."""
-    clock = (world._time, world._tick, world._since, world._h, world._fresh, *world._guard.memory)
-    out = hashlib.sha256(repr(clock).encode())
-    for name, values in state(world).items():
-        out.update(name.encode())
-        out.update(values.tobytes())
-    return out.hexdigest()
-
-
-def keep(world: "World") -> Kept:
+def keep(world: "World", pairs: bool = True) -> Kept:
     """A copy of the exact state."""
-    return Kept(state(world), {name: getattr(world, name) for name in CLOCK}, world._guard.memory)
+    return Kept(state(world, pairs), {name: getattr(world, name) for name in CLOCK}, world._guard.memory)
+
+
+def flags(world: "World") -> list[list[bool]]:
+    """Of each feature, whether knobs wait to be uploaded, and whether a target is under way."""
+    return [[f.changed, f.moving] for f in world.features]
 
 
 def put_back(world: "World", kept: Kept) -> None:
@@ -63,19 +77,19 @@ def put_back(world: "World", kept: Kept) -> None:
     world._guard.memory = kept.guard
 
 
-def install(world: "World", kept: Kept) -> None:
-    """Give a world that was just built the state of another one of the same scene and precision, bit for bit."""
+def install(world: "World", kept: Kept, flagged: list[list[bool]]) -> None:
+    """Give a world that was just built the state of another one of the same scene, knobs and precision, bit for bit."""
     world._upload()
     put_back(world, kept)
+    for feature, (changed, moving) in zip(world.features, flagged, strict=True):
+        feature.changed, feature.moving = changed, moving
 
 
 def transfer(old: "World", new: "World") -> None:
     """Take over the state, bit for bit where both have the same precision."""
     kept = keep(old)
     if new._precision == old._precision and new._order == old._order:
-        install(new, kept)
-        for ours, theirs in zip(old.features, new.features, strict=True):
-            theirs.changed, theirs.moving = ours.changed, ours.moving
+        install(new, kept, flags(old))
         return
     new._time, new._tick, new._since, new._frame = old._time, old._tick, old._since, old._frame
     new._guard.memory = kept.guard

@@ -66,6 +66,7 @@ class World(Access):
         self._energy: float | None = None
         self._last: StepReport | None = None
         self._search: Search | None = None  # compiled when it is first asked
+        self._watchers: list[Any] = []  # recorders: told of what the user assigns, and before and after every step
 
     # The step.
 
@@ -82,6 +83,8 @@ class World(Access):
         """
         self._memory.check()
         dt = checks.number("World.step", "dt", dt, above=0.0)
+        for watcher in self._watchers:
+            watcher.before()
         clock = perf_counter()
         self._heed()
         if self._guard.auto or tolerance is not None or budget is not None:
@@ -90,6 +93,8 @@ class World(Access):
             self._begin(dt / self.substeps * self._sub.first)
             report = self._advance(dt, self.substeps, self.iterations)
         self._last = report = replace(report, seconds=perf_counter() - clock)
+        for watcher in self._watchers:
+            watcher.after(dt, report)
         return report
 
     def _advance(self, dt: float, substeps: int, iterations: int) -> StepReport:
@@ -274,20 +279,21 @@ class World(Access):
 
     def hash(self) -> str:
         """SHA-256 of the exact state: equal if and only if two worlds of the same scene will go on alike, bit for bit."""
-        return snapshot.digest(self)
+        return snapshot.keep(self).digest()
 
     def explain(self) -> str:
         """What was compiled and what was left out, with fields, bytes and launches."""
         return explain(self)
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        """How it is computed: substeps, iterations, solver, precision, path and order, as __init__ takes them."""
+        out: dict[str, Any] = {"substeps": "auto" if self._guard.auto else self.substeps, "iterations": self.iterations}
+        return out | {"solver": self._solver, "precision": self._precision, "path": self._path, "order": self._order}
+
     def clone(self, **changes) -> "World":
         """The same scene in the same state, with other substeps, iterations, solver, precision, path or order."""
-        settings: dict[str, Any] = {
-            "substeps": "auto" if self._guard.auto else self.substeps,
-            "iterations": self.iterations,
-            "solver": self._solver,
-        }
-        settings |= {"precision": self._precision, "path": self._path, "order": self._order}
+        settings = self.settings
         if unknown := set(changes) - set(settings):
             raise TypeError(f"World.clone: {sorted(unknown)[0]} cannot be changed; one of {', '.join(settings)} can.")
         self._memory.check()

@@ -1,5 +1,6 @@
-"""Recordings for the rerun viewer. The only part of tiverlet that imports rerun, and only when it is used."""
+"""Recordings for the rerun viewer, and their replay. The only part of tiverlet that imports rerun, and only when it is used."""
 
 from .recorder import Recorder
+from .replay import Replay, Verdict, replay
 
-__all__ = ["Recorder"]
+__all__ = ["Recorder", "Replay", "Verdict", "replay"]

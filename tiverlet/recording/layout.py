@@ -4,18 +4,24 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+SCENE = "world/scene"  # the view looks at "world", so that a mirror at "world/scene" shows
+LEGEND = "legend/strain"
+
 # The viewer's 2D views have y pointing down, with no option. A mirror above the data, and below the
 # origin of the view, turns it up without touching the data.
 MIRROR = rr.Transform3D(scale=[1.0, -1.0, 1.0])
+# Views of curves, by title: for each curve the end of its path, its label and its colour.
 CURVES = {
-    "residual": ("worst constraint violation", [230, 120, 60]),
-    "overlap": ("worst overlap [radii]", [90, 160, 230]),
-    "energy": ("energy [J]", [120, 200, 120]),
-    "milliseconds": ("time per frame [ms]", [190, 140, 220]),
-}
+    "Worst violation": {"residual": ("of constraints", [230, 120, 60]), "overlap": ("overlap [radii]", [90, 160, 230])},
+    "Energy [J]": {"energy": ("energy", [120, 200, 120])},
+    "Momentum [kg m/s]": {
+        "momentum/x": ("x", [235, 110, 100]), "momentum/y": ("y", [130, 200, 110]), "momentum/z": ("z", [110, 150, 240]),
+    },
+    "Effort": {"substeps": ("substeps", [150, 160, 175]), "milliseconds": ("ms per frame", [190, 140, 220])},
+}  # fmt: skip
 
 
-def blueprint(low: np.ndarray, high: np.ndarray) -> rrb.Blueprint:
+def blueprint(low: np.ndarray, high: np.ndarray, links: bool) -> rrb.Blueprint:
     """The scene on the left, curves and text on the right, for a scene within the corners low and high [m]."""
     size = np.maximum(high - low, 1e-9)
     if len(low) == 2:
@@ -29,10 +35,19 @@ def blueprint(low: np.ndarray, high: np.ndarray) -> rrb.Blueprint:
         middle, far = (low + high) / 2, 1.4 * float(np.linalg.norm(size))
         eye = rrb.EyeControls3D(position=middle + far * np.array([0.45, 0.35, 0.82]), look_target=middle, eye_up=(0.0, 1.0, 0.0))
         view = rrb.Spatial3DView(origin="world", name="Scene", eye_controls=eye, background=[18, 20, 26])
-    curves = [rrb.TimeSeriesView(origin=f"figures/{name}", name=title) for name, (title, _) in CURVES.items()]
-    side = rrb.Vertical(*curves, rrb.TextDocumentView(origin="about", name="About"), row_shares=[1, 1, 1, 1, 1.4])
+    curves = [
+        rrb.TimeSeriesView(origin="figures", contents=[f"figures/{name}" for name in names], name=title)
+        for title, names in CURVES.items()
+    ]
+    pages = [rrb.TextDocumentView(origin="about", name="About"), rrb.TextLogView(origin="events", name="Events")]
+    scale = rrb.Spatial2DView(
+        origin="legend", name="Strain of links", background=[18, 20, 26],
+        visual_bounds=rrb.VisualBounds2D(x_range=[-0.7, 6.7], y_range=[-0.7, 0.9]),
+    )  # fmt: skip
+    side = rrb.Vertical(*curves, rrb.Tabs(*pages), row_shares=[1, 1, 1, 1, 1.6])
+    left = rrb.Vertical(view, scale, row_shares=[11, 1]) if links else view
     return rrb.Blueprint(
-        rrb.Horizontal(view, side, column_shares=[7, 3]),
+        rrb.Horizontal(left, side, column_shares=[7, 3]),
         rrb.TimePanel(state="collapsed", timeline="frame"),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),

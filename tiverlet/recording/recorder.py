@@ -1,52 +1,61 @@
-"""Writing a simulation to a file for the rerun viewer."""
+"""Writing a simulation to a file that is picture, checkpoint and proof."""
 
+import contextlib
 import os
-import uuid
+import warnings
+import weakref
+import zlib
+from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .. import checks
-from ..constraints import Box, Path
-from ..facets import Facets
-from ..feature import Batch
-from ..tools import golden_colors
-from ..wall import Wall
+from .. import checks, snapshot
+from .journal import JOURNAL, Journal
+from .sink import Sink
 
 if TYPE_CHECKING:
     from ..world import World
 
-SCENE = "world/scene"  # the view looks at "world", so that a mirror at "world/scene" shows
-PARTICLES = f"{SCENE}/particles"
-POINT = -2.5  # a particle without radius is drawn as a dot of so many pixels (negative: screen units)
+FLUSH = 1.0  # [s] after which what was logged is brought to the file
+SHARE = 10  # an exact state is written when the pictures since the last one weigh so many times as much
+SPARSE = 300  # frames after which one is written in any case
+RESERVE = 40_000  # bytes of a budget for the layout and the summary
 
 
 class Recorder:
-    """Writes frames of a world to an .rrd file: positions, links, walls, and curves of the figures of each frame.
+    """Writes frames of a world to an .rrd file, and all that it takes to compute them again, bit for bit.
 
         with tv.Recorder("rope.rrd", world) as recorder:
             world.step(1 / 60)
             recorder.log()
 
-    path: the file; its folder must exist. world: what to record. every: log only each so many frames.
+    path: the file; its folder must exist. world: what to record. every: log only each so many frames. budget: bytes that the file
+    may have; when they run short, fewer frames are drawn, and a warning at the end says which.
 
-    Radii, colours and the layout are written once. Positions are stored as f32. The file is complete when the block ends; of a
-    process that is killed, all but about the last fifth of a second is there. Open it with `rerun rope.rrd`.
+    Drawn are positions (f32), links coloured by their strain, walls, contacts of up to 1500 particles, what breaks, and curves.
+    Beside that the file holds the scene with all arguments, exact states to continue from, the hash of every frame drawn, every
+    step, and what the user turned or assigned in between, also between frames that are not drawn: see tv.replay.
+
+    The file is complete when the block ends. Of a process that is killed, all but the last second is there, and can be replayed.
+    Open it with `rerun rope.rrd`. Raises ValueError and OSError where the file cannot be made, and OSError when it cannot be
+    written any further; what has been written then can be read.
     """
 
-    def __init__(self, path, world: "World", every: int = 1):
+    def __init__(self, path, world: "World", every: int = 1, budget: int | None = None):
         import rerun as rr
 
         self._rr: Any = rr
         self._world = world
         self.every = checks.integer("Recorder", "every", every, least=1)
+        self.budget = None if budget is None else checks.integer("Recorder", "budget", budget, least=1)
         self.path = os.fspath(path)
         folder = os.path.dirname(os.path.abspath(self.path))
         if not os.path.isdir(folder):
             raise ValueError(f"Recorder: the folder {folder} does not exist. Make it first: os.makedirs({folder!r}).")
         self.frames = self._calls = 0
-        self._worst = None
-        self._stream: Any = rr.RecordingStream(f"tiverlet_{world.particles.dim}d", recording_id=uuid.uuid4())
+        self._thinned: list[tuple[int, int]] = []  # from which frame on each so many are drawn
+        self._seen: set[str] = set()  # flags
         self._open()
 
     def __enter__(self) -> "Recorder":
@@ -56,114 +65,148 @@ class Recorder:
         self.close()
 
     def _open(self) -> None:
-        from .layout import CURVES, MIRROR, blueprint
+        from .curves import Curves
+        from .drawing import Drawing, bounds, links
+        from .layout import MIRROR, SCENE, blueprint
 
         rr, world = self._rr, self._world
-        low, high = _bounds(world)
-        self._stream.save(self.path, default_blueprint=blueprint(low, high))
-        self._stream.send_recording_name(os.path.splitext(os.path.basename(self.path))[0])
-        if world.particles.dim == 2:
-            self._static(SCENE, MIRROR)
-        else:
-            self._static(SCENE, rr.ViewCoordinates.RIGHT_HAND_Y_UP)
-        p = world.particles
-        colors = golden_colors(len(p))
-        colors[p.inv_mass == 0] = (140, 140, 150)
-        radii = np.where(p.radius > 0, p.radius, POINT)
-        self._static(PARTICLES, self._points.from_fields(radii=radii, colors=colors))
-        self._links = [(k, f) for k, f in enumerate(world.features) if isinstance(f, Batch) and f.arity == 2 and f.count]
-        for k, _ in self._links:
-            self._static(f"{SCENE}/links/{k}", self._strips.from_fields(colors=[[205, 205, 215]], radii=[-0.75]))
-        for name, (title, color) in CURVES.items():
-            self._static(f"figures/{name}", rr.SeriesLines(names=[title], colors=[color]))
-        self._static("about", rr.TextDocument(_about(world), media_type="text/markdown"))
-        self._walls: dict[int, bytes] = {}
+        extent = bounds(world)
+        layout = blueprint(*extent, bool(links(world)))
+        title = os.path.splitext(os.path.basename(self.path))[0]
+        self._sink = Sink(self.path, f"tiverlet_{world.particles.dim}d", layout, title)
+        self._closing = weakref.finalize(self, self._sink.close)  # also when the process ends
+        self._stream = self._sink.stream
+        self._drawing = Drawing(world, self._stream, extent)
+        flat = world.particles.dim == 2
+        self._drawing.static(SCENE, MIRROR if flat else rr.ViewCoordinates.RIGHT_HAND_Y_UP)
+        self._drawing.begin()
+        self._curves = Curves(world, self._stream)
+        self._drawing.static("about", rr.TextDocument(about(world), media_type="text/markdown"))
+        self._flushed = perf_counter()
+        self._stamp(0)
+        self._journal = Journal(world, self._write)
+        self._journal.stirred.update(range(len(world.features)))  # all are to be drawn
+        self._state()
         self._frame(0)
+        self._least = self.bytes + RESERVE
+        if self.budget is not None and self.budget < 2 * self._least:
+            self._journal.close()
+            self._closing()
+            os.unlink(self.path)
+            raise ValueError(
+                f"Recorder: budget = {self.budget} bytes, but the scene and its first frame take {self._least}. "
+                f"Give at least {2 * self._least}."
+            )
+
+    def _stamp(self, number: int) -> None:
+        self._stream.set_time("frame", sequence=number)
+        self._stream.set_time("time", duration=self._world.time)
+
+    def _write(self, text: str, blob: np.ndarray, checksum: str) -> None:
+        self._stream.log(JOURNAL, self._rr.AnyValues(text=text, blob=blob, checksum=checksum), strict=True)
 
     @property
-    def _points(self):
-        return self._rr.Points2D if self._world.particles.dim == 2 else self._rr.Points3D
-
-    @property
-    def _strips(self):
-        return self._rr.LineStrips2D if self._world.particles.dim == 2 else self._rr.LineStrips3D
-
-    def _static(self, entity: str, what) -> None:
-        self._stream.log(entity, what, static=True, strict=True)
+    def bytes(self) -> int:
+        """About what the file will have when it is closed [bytes]."""
+        return max(self._sink.bytes, self._drawing.bytes + self._journal.bytes + 1500 * self.frames)
 
     def log(self) -> None:
         """Write the present frame, if it is one of `every`."""
-        if self._stream is None:
+        if self._sink.stream is None:
             raise RuntimeError("Recorder: this recording is closed; make a new Recorder for another file.")
         self._calls += 1
-        report = self._world.last
-        if report is not None:
-            self._worst = report if self._worst is None else self._worst.worse(report)
-        if self._calls % self.every == 0:
+        if self._calls % self._stride() == 0:
             self._frame(self._calls)
+        if perf_counter() - self._flushed > FLUSH:
+            self.flush()
+        if self._sink.error:
+            self._fail()
+
+    def flush(self) -> None:
+        """Wait until what was logged is in the file, so that it is there whatever happens to the process."""
+        self._curves.send()
+        self._sink.flush()
+        self._flushed = perf_counter()
+
+    def _fail(self) -> None:
+        error = self._sink.error
+        assert error
+        self._journal.close()
+        self._closing()
+        why = f"Recorder: writing failed at frame {self._calls} ({error.strerror}). What the file holds can be replayed"
+        raise OSError(error.errno, why, self.path) from None
+
+    def _stride(self) -> int:
+        """One of how many frames is drawn: each time half of what is left of the budget is used, half as many."""
+        if self.budget is None:
+            return self.every
+        room, left, halvings = self.budget - self._least, self.budget - self.bytes - RESERVE, 0
+        each = (self.bytes - self._least) / max(1, self.frames - 1) if self.frames > 1 else 0
+        while left < room / 2 and halvings < 40:
+            room, halvings = room / 2, halvings + 1
+        if left < 2 * each:
+            halvings = 40
+        stride = self.every * 2**halvings
+        if halvings and (not self._thinned or self._thinned[-1][1] < stride):
+            self._thinned.append((self._calls, stride))
+        return max([self.every, *(s for _, s in self._thinned)])
+
+    def _state(self) -> None:
+        """Write an exact state to continue from."""
+        self._due = SHARE * self._journal.state()
+        self._drawn, self._last_state = self._drawing.bytes, self._calls
 
     def _frame(self, number: int) -> None:
-        rr, world = self._rr, self._world
-        self._stream.set_time("frame", sequence=number)
-        self._stream.set_time("time", duration=world.time)
-        x = world.position.astype(np.float32)
-        self._stream.log(PARTICLES, self._points.from_fields(positions=x), strict=True)
-        for k, f in self._links:
-            whole = f.indices[~f.broken] if f.breaks else f.indices
-            self._stream.log(f"{SCENE}/links/{k}", self._strips.from_fields(strips=x[whole]), strict=True)
-        for k, f in enumerate(world.features):
-            if isinstance(f, (Wall, Path)):
-                self._wall(k, f)
-        if number and world.last is not None:
-            for name, value in _figures(world, number).items():
-                self._stream.log(f"figures/{name}", rr.Scalars(value), strict=True)
+        world, journal = self._world, self._journal
+        journal.frame = number
+        self._stamp(number)
+        if number and (self._drawing.bytes - self._drawn > self._due or number - self._last_state >= SPARSE):
+            self._state()
+        now = snapshot.keep(world, pairs=False)
+        n = len(world.particles)
+        x = now.position(n)
+        x32 = x.astype(np.float32)
+        report, journal.recent = journal.recent, None
+        journal.put("frame", {"time": world.time, "hash": now.digest(), "crc": zlib.crc32(x32.tobytes())})
+        self._drawing.frame(x, x32, journal.stirred, bool(report and report.broken))
+        journal.stirred.clear()
+        if report:
+            self._curves.add(number, report, now)
+            for note in report.notes:
+                if note not in self._seen:
+                    self._seen.add(note)
+                    self._drawing.event(note, "WARN")
         self.frames += 1
-
-    def _wall(self, k: int, wall) -> None:
-        """Walls are drawn when they have changed."""
-        strips, thickness = wall.outline(*_bounds(self._world))
-        key = strips.tobytes()
-        if len(strips) and self._walls.get(k) != key:
-            self._walls[k] = key
-            radius = thickness if thickness else -1.5  # half the width in the scene, or pixels
-            drawn = self._strips(strips, colors=[[120, 125, 140]], radii=[radius])
-            self._stream.log(f"{SCENE}/walls/{k}", drawn, strict=True)
 
     def close(self) -> None:
         """Write the summary and finish the file. Calling it twice does nothing."""
-        if self._stream is None:
+        if self._sink.stream is None:
             return
-        text = _about(self._world, self._worst, self.frames)
-        self._static("about", self._rr.TextDocument(text, media_type="text/markdown"))
-        self._stream.disconnect()
-        self._stream = None
+        journal, world = self._journal, self._world
+        journal.close()
+        self._curves.send()
+        with contextlib.suppress(RuntimeError):  # a world that was closed has no state
+            journal.put("end", {"frames": self.frames, "time": world.time, "hash": world.hash()})
+        thinned = [f"from frame {frame} on one of {stride}" for frame, stride in self._thinned if stride < 2**40]
+        if self._thinned and self._thinned[-1][1] >= 2**40:
+            thinned.append(f"from frame {self._thinned[-1][0]} on none")
+        note = ""
+        if thinned:
+            note = (
+                f"Recorder: to stay within budget = {self.budget} bytes, {self.frames} of {self._calls + 1} frames are drawn: "
+                f"{', '.join(thinned)}. All steps are in the file; for more frames give a larger budget, for even ones every=."
+            )
+        text = about(world, journal.worst, self.frames, note)
+        self._drawing.static("about", self._rr.TextDocument(text, media_type="text/markdown"))
+        self._closing()
+        if self._sink.error:
+            self._fail()
+        if note:
+            warnings.warn(note, stacklevel=2)
 
 
-def _figures(world: "World", number: int) -> dict[str, float]:
-    r = world.last
-    assert r
-    out = {"residual": r.residual, "overlap": r.overlap, "energy": r.energy}
-    if number > 1:  # the first frame compiles the kernels, and would dwarf all others
-        out["milliseconds"] = r.seconds * 1e3
-    return out
-
-
-def _bounds(world: "World") -> tuple[np.ndarray, np.ndarray]:
-    """A box around what will be seen: the walls where there is a finite Box, the particles where not."""
-    x, r = world.position, world.particles.radius[:, None]
-    low = (x - r).min(axis=0, initial=np.inf) if len(x) else np.zeros(world.particles.dim)
-    high = (x + r).max(axis=0, initial=-np.inf) if len(x) else np.ones(world.particles.dim)
-    for f in world.features:
-        if isinstance(f, Facets) and f.turned_in:  # a container
-            corners = f.placed(f.corners).reshape(-1, world.particles.dim)
-            low, high = np.minimum(low, corners.min(axis=0)), np.maximum(high, corners.max(axis=0))
-        if isinstance(f, Box):
-            low = np.where(np.isfinite(f.lower), np.minimum(low, f.lower), low)
-            high = np.where(np.isfinite(f.upper), np.maximum(high, f.upper), high)
-    return low, high
-
-
-def _about(world: "World", worst=None, frames: int = 0) -> str:
+def about(world: "World", worst=None, frames: int = 0, note: str = "") -> str:
+    """A page about the scene, and about all frames once there are some."""
     rows = [
         f"# {len(world.particles)} particles in {world.particles.dim}D",
         "",
@@ -173,9 +216,9 @@ def _about(world: "World", worst=None, frames: int = 0) -> str:
     ]
     if worst is not None:
         rows[1:1] = [
-            "", f"{frames} frames, {world.time:.4g} s simulated.", "",
+            "", f"{frames} frames, {world.time:.4g} s simulated.", "", *([note, ""] if note else []),
             "| worst of all frames | |", "|---|---|", f"| constraint violation | {worst.residual:.2e} |",
-            f"| overlap | {worst.overlap:.2e} radii |", f"| contacts | {worst.contacts} |",
+            f"| overlap | {worst.overlap:.2e} radii |", f"| contacts | {worst.contacts} |", f"| broken | {worst.broken} |",
             f"| flags | {', '.join(sorted(worst.flags)) or 'none'} |", *(f"\n{note}" for note in worst.notes),
         ]  # fmt: skip
     return "\n".join(rows)

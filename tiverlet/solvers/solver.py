@@ -4,10 +4,11 @@ from typing import Any
 
 import numpy as np
 
+from ..arguments import Noted
 from ..feature import Batch, Scene
 
 
-class Solver:
+class Solver(Noted):
     """How the constraints of a world are solved.
 
     A solver may take constraints out of the relaxation and solve them together: system() then returns an object of the kind of

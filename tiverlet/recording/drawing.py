@@ -1,0 +1,164 @@
+"""What of a world is drawn, and how: particles, links by their strain, walls, contacts, breaks."""
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..constraints import Box, Path
+from ..constraints.distance import Link
+from ..facets import Facets
+from ..feature import Batch
+from ..tools import golden_colors
+from ..wall import Wall
+from .journal import PARTICLES
+from .layout import LEGEND, SCENE
+from .strain import colors, legend
+
+if TYPE_CHECKING:
+    from ..world import World
+
+POINT = -2.5  # a particle without radius is drawn as a dot of so many pixels (negative: screen units)
+MANY = 5000  # links of a kind that are drawn; of more, an even selection, since lines take most of the file
+FEW = 1500  # particles up to which contacts are drawn; finding them would take too much of the frame beyond
+
+
+class Drawing:
+    """The picture of a world in a rerun stream. `bytes` is about what was logged."""
+
+    def __init__(self, world: "World", stream: Any, extent: tuple[np.ndarray, np.ndarray]):
+        import pyarrow
+        import rerun as rr
+
+        self._rr, self._pa, self._world, self._stream = rr, pyarrow, world, stream
+        flat = world.particles.dim == 2
+        self._points: Any = rr.Points2D if flat else rr.Points3D
+        self._strips: Any = rr.LineStrips2D if flat else rr.LineStrips3D
+        point = pyarrow.list_(pyarrow.field("item", pyarrow.float32(), nullable=False), world.particles.dim)
+        self._strip = pyarrow.list_(pyarrow.field("item", point, nullable=False))  # of rerun's lines
+        self.bytes = 0
+        self._extent = extent
+        self._contacts = len(world.particles) <= FEW and bool(world._sub.contacts)
+        self._touched = self._torn = False
+        self._links = [(k, f, slice(None, None, -(-f.count // MANY))) for k, f in links(world)]
+        self._broken = {k: f.broken for k, f in enumerate(world.features) if isinstance(f, Batch) and f.breaks}
+
+    def static(self, entity: str, what: Any) -> None:
+        """Log what holds for all frames."""
+        self._stream.log(entity, what, static=True, strict=True)
+
+    def _log(self, entity: str, what: Any) -> None:
+        self._stream.log(entity, what, strict=True)
+
+    def begin(self) -> None:
+        """What does not change."""
+        p = self._world.particles
+        hues = golden_colors(len(p))
+        hues[p.inv_mass == 0] = (140, 140, 150)
+        self.static(PARTICLES, self._points.from_fields(radii=np.where(p.radius > 0, p.radius, POINT), colors=hues))
+        for k, _, _ in self._links:
+            self.static(f"{SCENE}/links/{k}", self._strips.from_fields(radii=[-1.2]))
+        if self._links:
+            hues, labels = legend()
+            at = np.stack([np.arange(len(hues)), np.zeros(len(hues))], axis=1)
+            ends = np.stack([at - [0.45, 0], at + [0.45, 0]], axis=1)
+            self.static(LEGEND, self._rr.LineStrips2D(ends, colors=hues, labels=labels, radii=[-5.0], show_labels=True))
+
+    def frame(self, x: np.ndarray, x32: np.ndarray, turned: Iterable[int], torn: bool) -> None:
+        """Draw a frame. x: (n, dim), and rounded to f32. turned: features that are not as they were in the last one. torn: if
+        something broke since then.
+        """
+        self._log(PARTICLES, self._points.from_fields(positions=x32))
+        self.bytes += x32.nbytes
+        for link in self._links:
+            self._link(*link, x)
+        for k in turned:
+            self._wall(k)
+        if self._contacts:
+            self._contact(x32)
+        if torn or self._torn:
+            self._breaks(x)
+            self._torn = torn
+
+    def _link(self, k: int, f: Any, some: slice, x: np.ndarray) -> None:
+        """Links as line strips; the strips go to rerun in its own layout, which is ten times as fast."""
+        rows, rest = f.indices[some], f.rest[some] if isinstance(f, Link) else np.full(len(f.indices[some]), np.nan)
+        if k in self._broken:
+            whole = ~self._broken[k][some]
+            rows, rest = rows[whole], rest[whole]
+        ends = x[rows]
+        pa = self._pa
+        points = pa.FixedSizeListArray.from_arrays(pa.array(ends.astype(np.float32).ravel()), type=self._strip.value_type)
+        strips = pa.ListArray.from_arrays(pa.array(np.arange(0, 2 * len(rows) + 1, 2, dtype=np.int32)), points, type=self._strip)
+        r = ends[:, 0] - ends[:, 1]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            shades = colors(np.sqrt(np.einsum("ij,ij->i", r, r)) / rest - 1)
+        self._log(f"{SCENE}/links/{k}", self._strips.from_fields(strips=strips, colors=shades))
+        self.bytes += shades.nbytes + 4 * ends.size
+
+    def _wall(self, k: int) -> None:
+        """A wall or a path, where it is now."""
+        wall = self._world.features[k]
+        if isinstance(wall, (Wall, Path)):
+            strips, thickness = wall.outline(*self._extent)
+            radius = thickness if thickness else -1.5  # half the width in the scene, or pixels
+            self._log(f"{SCENE}/walls/{k}", self._strips(strips, colors=[[120, 125, 140]], radii=[radius]))
+            self.bytes += strips.nbytes
+
+    def _contact(self, x: np.ndarray) -> None:
+        """Where particles touch: between the two, as a short line across."""
+        world = self._world
+        found = world.contacts if world.last is not None else None
+        pairs = np.zeros((0, 2), dtype=int) if found is None else found.pairs
+        if not len(pairs) and not self._touched:
+            return
+        self._touched = bool(len(pairs))
+        r = world.particles.radius
+        if found is not None:
+            middle = x[pairs[:, 1]] + found.normal * (r[pairs[:, 1]] - found.overlap / 2)[:, None]
+        else:
+            middle = np.zeros((0, world.particles.dim))
+        self._log(f"{SCENE}/contacts", self._points(middle.astype(np.float32), radii=[-1.5], colors=[[255, 220, 120]]))
+        self.bytes += middle.nbytes // 2
+
+    def _breaks(self, x: np.ndarray) -> None:
+        """A mark where something broke since the last frame, and a line in the list of events."""
+        marks = [np.zeros((0, x.shape[1]))]
+        for k, before in self._broken.items():
+            f = self._world.features[k]
+            now = f.broken  # type: ignore[attr-defined]
+            new = np.flatnonzero(now & ~before)
+            self._broken[k] = now
+            for c in new.tolist():
+                members = f.members_of(c)  # type: ignore[attr-defined]
+                marks.append(x[members].mean(axis=0, keepdims=True))
+            if len(new):
+                named = ", ".join(map(str, new[:20].tolist())) + (" ..." if len(new) > 20 else "")
+                self.event(f"{f!r} (feature {k}): {len(new)} broke: {named}", "WARN")
+        at = np.concatenate(marks).astype(np.float32)
+        self._log(f"{SCENE}/breaks", self._points(at, radii=[-7.0], colors=[[255, 60, 60, 180]]))
+
+    def event(self, text: str, level: str = "INFO") -> None:
+        """A line in the list of events."""
+        self._log("events", self._rr.TextLog(text, level=level))
+        self.bytes += len(text)
+
+
+def links(world: "World") -> list[tuple[int, Batch]]:
+    """The features that are drawn as lines between two particles, with their numbers."""
+    return [(k, f) for k, f in enumerate(world.features) if isinstance(f, Batch) and f.arity == 2 and f.count]
+
+
+def bounds(world: "World") -> tuple[np.ndarray, np.ndarray]:
+    """A box around what will be seen: the walls where there is a finite Box, the particles where not."""
+    x, r = world.position, world.particles.radius[:, None]
+    low = (x - r).min(axis=0, initial=np.inf) if len(x) else np.zeros(world.particles.dim)
+    high = (x + r).max(axis=0, initial=-np.inf) if len(x) else np.ones(world.particles.dim)
+    for f in world.features:
+        if isinstance(f, Facets) and f.turned_in:  # a container
+            corners = f.placed(f.corners).reshape(-1, world.particles.dim)
+            low, high = np.minimum(low, corners.min(axis=0)), np.maximum(high, corners.max(axis=0))
+        if isinstance(f, Box):
+            low = np.where(np.isfinite(f.lower), np.minimum(low, f.lower), low)
+            high = np.where(np.isfinite(f.upper), np.maximum(high, f.upper), high)
+    return low, high

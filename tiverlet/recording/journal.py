@@ -1,0 +1,144 @@
+"""The journal of a recording: what happened to a world, entry by entry, so that it can happen again.
+
+    scene     particles, features, settings, versions; another one where the scene changes
+    state     an exact state, to continue from
+    turned    knobs that the user turned, before the next step
+    assigned  positions or velocities that the user assigned
+    frame     a frame of the picture, and the hash of the state then
+    end       the recording was closed
+
+Each entry also says which steps were made since the one before, and carries a checksum of itself and of all before it.
+"""
+
+import copy
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .. import snapshot
+from ..survey import StepReport
+from . import scene
+
+if TYPE_CHECKING:
+    from ..world import World
+
+FORMAT = 1
+JOURNAL = "tiverlet/journal"
+PARTICLES = "world/scene/particles"  # the entity that has the positions of each frame
+Write = Callable[[str, np.ndarray, str], None]
+
+
+@dataclass
+class Entry:
+    """What happened, after `steps`: rows of dt [s], substeps, iterations, and how many such steps.
+
+    data["now"]: substeps, iterations and the memory of the guard after it, where they are not those of the entry before.
+    """
+
+    kind: str
+    frame: int
+    data: dict[str, Any] = field(default_factory=dict)
+    arrays: dict[str, np.ndarray] = field(default_factory=dict)
+    steps: list[list] = field(default_factory=list)
+
+    def pack(self, serial: int) -> tuple[str, bytes]:
+        """The entry as text and bytes."""
+        arrays = {name: np.asarray(a, dtype=a.dtype.newbyteorder("<")) for name, a in self.arrays.items()}
+        table = [[name, a.dtype.str, list(a.shape)] for name, a in arrays.items()]
+        parts = {"serial": serial, "kind": self.kind, "frame": self.frame, "steps": self.steps, "data": self.data}
+        return json.dumps({**parts, "arrays": table}), b"".join(a.tobytes() for a in arrays.values())
+
+    @staticmethod
+    def unpack(text: str, blob: bytes) -> "Entry":
+        """The entry that pack() was given."""
+        parts, arrays, at = json.loads(text), {}, 0
+        for name, kind, shape in parts["arrays"]:
+            dtype = np.dtype(kind)
+            if dtype.kind not in "biuf":
+                raise ValueError(f"array {name!r} has the type {kind}")
+            count = int(np.prod(shape, dtype=np.int64))
+            arrays[name] = np.frombuffer(blob, dtype, count, at).reshape(shape).astype(dtype.newbyteorder("="))
+            at += arrays[name].nbytes
+        return Entry(parts["kind"], parts["frame"], parts["data"], arrays, parts["steps"])
+
+
+def checksum(before: str, text: str, blob: bytes) -> str:
+    """Of an entry and all before it."""
+    return hashlib.sha256(b"\n".join([before.encode(), text.encode(), blob])).hexdigest()
+
+
+class Journal:
+    """Watches a world and writes entries."""
+
+    def __init__(self, world: "World", write: Write):
+        self.world, self.frame, self.bytes = world, 0, 0
+        self.worst: StepReport | None = None  # of the whole recording
+        self.recent: StepReport | None = None  # since the last frame
+        self.stirred: set[int] = set()  # features that were turned since then
+        self._write, self._serial, self._sum = write, 0, ""
+        self._steps: list[list] = []
+        self._last: list | None = None
+        data, arrays = scene.describe(world)
+        self._known = [copy.deepcopy(scene.knobs(f)) for f in world.features]
+        self.put("scene", {"format": FORMAT, **data}, arrays)
+        world._watchers.append(self)
+
+    def put(self, kind: str, data: dict[str, Any], arrays: dict[str, np.ndarray] | None = None) -> int:
+        """Write an entry; returns its size [bytes]."""
+        now = self._now()
+        if now != self._last:
+            data["now"], self._last = now, now
+        text, blob = Entry(kind, self.frame, data, arrays or {}, self._steps).pack(self._serial)
+        self._sum = checksum(self._sum, text, blob)
+        self._write(text, np.frombuffer(blob, dtype=np.uint8), self._sum)
+        self._serial, self._steps = self._serial + 1, []
+        self.bytes += len(text) + len(blob)
+        return len(text) + len(blob)
+
+    def _now(self) -> list:
+        """What the user has set for the next step, and what the guard remembers."""
+        settings = self.world.settings
+        return [settings["substeps"], settings["iterations"], list(self.world._guard.memory)]
+
+    def state(self) -> int:
+        """Write the exact state; returns the size of the entry."""
+        kept, world = snapshot.keep(self.world), self.world
+        more = {"flags": snapshot.flags(world), "reach": world._scene.hh}
+        return self.put("state", {"clock": kept.clock, **more}, kept.values)
+
+    def before(self) -> None:
+        """A step begins: write down what was turned since the last one."""
+        arrays: dict[str, np.ndarray] = {}
+        turned = {}
+        for k, feature in enumerate(self.world.features):
+            if feature.changed:
+                now, known = scene.knobs(feature), self._known[k]
+                new = {name: v for name, v in now.items() if name not in known or not np.array_equal(v, known[name])}
+                turned[k] = {name: scene.encode(v, f"{k}.{name}", arrays, scene.Needs()) for name, v in new.items()}
+                known.update(copy.deepcopy(new))
+        if turned:
+            self.stirred.update(turned)
+            self.put("turned", {"features": turned}, arrays)
+
+    def after(self, dt: float, report: StepReport) -> None:
+        """A step was made."""
+        step = [dt, report.substeps, report.iterations]
+        if self._steps and self._steps[-1][:3] == step:
+            self._steps[-1][3] += 1
+        else:
+            self._steps.append([*step, 1])
+        self.worst = report if self.worst is None else self.worst.worse(report)
+        self.recent = report if self.recent is None else self.recent.worse(report)
+
+    def assigned(self, name: str, value: np.ndarray) -> None:
+        """The user assigned positions or velocities."""
+        self.put("assigned", {"name": name}, {"value": value})
+
+    def close(self) -> None:
+        """Look away."""
+        if self in self.world._watchers:
+            self.world._watchers.remove(self)

@@ -1,0 +1,302 @@
+"""Reading a recording back: its picture, a world that goes on from any frame, and the proof that both are true."""
+
+import json
+import os
+import zlib
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .. import snapshot
+from . import rrd, scene
+from .journal import FORMAT, JOURNAL, PARTICLES, Entry, checksum
+
+if TYPE_CHECKING:
+    from ..world import World
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What verify() found; true if every frame came out as recorded.
+
+    frames: how many were compared. frame: the first that differs. particle: the first particle that does, where it shows; it may
+    show only later. text: a sentence that says so.
+    """
+
+    frames: int
+    frame: int | None = None
+    particle: int | None = None
+    text: str = field(default="", repr=False)
+
+    def __bool__(self) -> bool:
+        return self.frame is None
+
+    def __str__(self) -> str:
+        return self.text
+
+
+class Replay:
+    """A recording that was read. See replay()."""
+
+    def __init__(self, path: str, given: Mapping[str, Any]):
+        self.path, self._given = path, given
+        with rrd.chunks(path) as (chunks, whole):
+            self._entries, trouble = _journal(path, chunks, whole)
+            dim = self._entries[0].arrays["position"].shape[1]
+            drawn = _by_frame(chunks, PARTICLES, f"Points{dim}D:positions")
+            self.curves = _curves(chunks)
+        self._drawn = {k: x.reshape(-1, dim) for k, x in drawn.items()}
+        first = self._entries[0]
+        self.scene: dict[str, Any] = first.data
+        shown = [e for e in self._entries if e.kind == "frame" and e.frame in self._drawn]
+        self._frames = {e.frame: e for e in shown}
+        self.frames = np.array([e.frame for e in shown], dtype=np.int64)
+        self.times = np.array([e.data["time"] for e in shown])
+        self.complete = whole and self._entries[-1].kind == "end"
+        self.text = self._say(trouble)
+
+    def _say(self, trouble: str) -> str:
+        s = self.scene["environment"]
+        out = f"{self.path}: {len(self.frames)} frames"
+        if len(self.frames):
+            out += f" (0 ... {self.frames[-1]}), {self.times[-1]:.6g} s"
+        out += f", recorded with tiverlet {s['tiverlet']} and Taichi {s['taichi']} on {s['arch']} ({s['machine']}, {s['system']})"
+        if not self.complete:
+            last = f"it ends with frame {self.frames[-1]}" if len(self.frames) else "it has no frame"
+            out += f". The recording was not closed: {last}"
+        return f"{out}.{trouble}"
+
+    def __repr__(self) -> str:
+        return f"Replay({self.path!r}, {len(self.frames)} frames{'' if self.complete else ', not complete'})"
+
+    def _entry(self, frame: int) -> Entry:
+        if frame not in self._frames:
+            near = self.frames[np.argmin(np.abs(self.frames - frame))] if len(self.frames) else None
+            raise ValueError(f"replay: {self.path} has no frame {frame}; the nearest is {near}. All are in .frames.")
+        return self._frames[frame]
+
+    def position(self, frame: int) -> np.ndarray:
+        """Positions [m] as they are drawn, (n, dim), in f32. world(frame).position has all digits."""
+        entry, x = self._entry(frame), self._drawn[frame]
+        if zlib.crc32(x.tobytes()) != entry.data["crc"]:
+            raise ValueError(f"replay: the picture of frame {frame} in {self.path} is not what was recorded. See .verify().")
+        return x
+
+    def world(self, frame: int) -> "World":
+        """A world in the exact state of a frame, to go on with: computed from the nearest state before, and compared.
+
+        Raises RuntimeError when the computation does not lead to the recorded state, as it may on another machine.
+        """
+        goal = self._entries.index(self._entry(frame))
+        start = max(k for k, e in enumerate(self._entries[: goal + 1]) if e.kind == "state")
+        world = None
+        try:
+            for world, entry in self._run(start, goal):
+                if entry.kind == "frame" and snapshot.keep(world, pairs=False).digest() != entry.data["hash"]:
+                    raise RuntimeError(f"replay: frame {entry.frame} of {self.path} does not come out as recorded. {self._why()}")
+            assert world
+            return world
+        except BaseException:
+            if world:
+                world.close()
+            raise
+
+    def verify(self) -> Verdict:
+        """Compute everything again from the first frame on, and compare hashes, states and pictures.
+
+        In a world with contacts, what pairs carry along is part of the hash of states and of the end, but not of that of frames,
+        where it shows in the next one.
+        """
+        count, wrong, world = 0, None, None
+        try:
+            for world, entry in self._run(1, len(self._entries) - 1):
+                off = None
+                if entry.kind == "frame":
+                    count += 1
+                    now = snapshot.keep(world, pairs=False)
+                    same = now.digest() == entry.data["hash"]
+                    off = _differing(now.position(len(world.particles)).astype(np.float32), self._drawn.get(entry.frame))
+                    if same and off is not None:
+                        return Verdict(count, entry.frame, off, self._judge(entry.frame, entry.frame, off, picture=True))
+                elif entry.kind == "state":
+                    now, then = snapshot.keep(world), _kept(entry, world)
+                    same = now.digest() == then.digest()
+                    changed = (k for k, v in now.values.items() if k in then.values and len(v) == len(world.particles))
+                    found = (_differing(now.values[k], then.values[k]) for k in changed)
+                    off = next((i for i in found if i is not None), None)
+                else:
+                    same = entry.kind != "end" or world.hash() == entry.data["hash"]
+                if not same and wrong is None:
+                    wrong = entry.frame
+                if off is not None:
+                    break
+        finally:
+            if world:
+                world.close()
+        if wrong is None:
+            return Verdict(count, text=f"{self.path}: all {count} frames come out as recorded, bit for bit.")
+        return Verdict(count, wrong, off, self._judge(wrong, entry.frame, off))
+
+    def _judge(self, frame: int, seen: int, particle: int | None, picture: bool = False) -> str:
+        if picture:
+            return (
+                f"{self.path}: the picture of frame {frame} shows particle {particle} where it was not; the state is as recorded."
+            )
+        where = "" if particle is None else f", first particle {particle}" + (f" (seen in frame {seen})" if seen != frame else "")
+        return f"{self.path}: frame {frame} does not come out as recorded{where}. {self._why()}"
+
+    def _why(self) -> str:
+        then, now = self.scene["environment"], scene.environment()
+        other = [f"{name} {then[name]} then, {now[name]} now" for name in now if name in then and then[name] != now[name]]
+        if other:
+            return f"What is not as it was: {', '.join(other)}."
+        return "Versions and machine are those of the recording, so the file was changed, or a function of the scene was."
+
+    def _run(self, start: int, end: int) -> Iterator[tuple["World", Entry]]:
+        """Do what the entries from `start` (a state) to `end` say; the world after each. The caller closes it."""
+        base = max(k for k in range(start) if self._entries[k].kind == "scene")
+        source = self._entries[base]
+        before = [turned for e in self._entries[base:start] if e.kind == "turned" for turned in self._turned(e)]
+        world = scene.rebuild(source.data, source.arrays, self._given, before)
+        state = self._entries[start]
+        _settle(world, [e.data["now"] for e in self._entries[: start + 1] if "now" in e.data][-1])
+        snapshot.install(world, _kept(state, world), state.data["flags"])
+        world._scene.hh = state.data["reach"]
+        yield world, state
+        for entry in self._entries[start + 1 : end + 1]:
+            self._apply(world, entry)
+            yield world, entry
+
+    def _apply(self, world: "World", entry: Entry) -> None:
+        """Make the steps of an entry, and then what it says."""
+        settings = world.settings
+        for dt, substeps, iterations, count in entry.steps:
+            world.substeps, world.iterations = substeps, iterations
+            for _ in range(count):
+                world.step(dt)
+        world.substeps, world.iterations = settings["substeps"], settings["iterations"]
+        if entry.kind == "turned":
+            for k, values in self._turned(entry):
+                scene.turn(world.features[k], values)
+        elif entry.kind == "assigned":
+            setattr(world, entry.data["name"], entry.arrays["value"])
+        if "now" in entry.data:
+            _settle(world, entry.data["now"])
+
+    def _turned(self, entry: Entry) -> list[scene.Turned]:
+        return [
+            (int(k), {name: scene.decode(v, entry.arrays, self._given) for name, v in values.items()})
+            for k, values in entry.data["features"].items()
+        ]
+
+    def export(self, path: str) -> None:
+        """Write positions, times, masses, radii and curves to an .npz file, or positions to a .csv table."""
+        x = np.stack([self.position(int(k)) for k in self.frames]) if len(self.frames) else np.zeros((0, 0, 2), np.float32)
+        kind = os.path.splitext(path)[1]
+        if kind == ".npz":
+            p = self._entries[0].arrays
+            more: dict[str, Any] = {name: p[name] for name in ("mass", "radius")}
+            for name, (frames, values) in self.curves.items():
+                more |= {f"{name} frame": frames, f"{name} value": values}
+            np.savez_compressed(path, position=x, frame=self.frames, time=self.times, **more)
+        elif kind == ".csv":
+            n, dim = x.shape[1:]
+            with open(path, "w") as out:
+                out.write(f"frame,time,particle,{','.join('xyz'[:dim])}\n")
+                for frame, time, rows in zip(self.frames.tolist(), self.times.tolist(), x, strict=True):
+                    for i, row in enumerate(rows.tolist()):
+                        out.write(f"{frame},{time!r},{i},{','.join(f'{v:.9g}' for v in row)}\n")
+        else:
+            raise ValueError(f"replay: {path} ends in {kind!r}, but .npz or .csv can be written.")
+
+
+def replay(path, given: Iterable[Any] | Mapping[str, Any] = ()) -> Replay:
+    """Read a recording that a Recorder has written.
+
+        recording = tv.replay("rope.rrd")
+        recording.position(60)                 # as drawn
+        world = recording.world(60)            # goes on from there, bit for bit
+        print(recording.verify())              # computes all again and compares
+
+    given: the user's own functions and classes that are in the scene, or a mapping from their names. Their source is in the file
+    to be read, in scene["needs"]; loading a file runs nothing that it contains. Only world() and verify() need them.
+
+    .frames: the numbers of the frames in the file. .times [s]. .curves: (frames, values) of each figure by name. .complete:
+    whether the recording was closed; one that was cut short by a crash has all that was flushed. .text: what the file is, and
+    where it ends.
+
+    Raises FileNotFoundError, and ValueError for what is no recording of tiverlet, was written in another format, or was changed
+    after it was written, naming the place.
+    """
+    names = given if isinstance(given, Mapping) else {thing.__name__: thing for thing in given}
+    return Replay(os.fspath(path), dict(names))
+
+
+def _settle(world: "World", settings: list) -> None:
+    """Set what the user had set, and what the guard remembered."""
+    world.substeps, world.iterations, world._guard.memory = *settings[:2], tuple(settings[2])
+
+
+def _kept(entry: Entry, world: "World") -> snapshot.Kept:
+    return snapshot.Kept(entry.arrays, entry.data["clock"], world._guard.memory)
+
+
+def _differing(now: np.ndarray, then: np.ndarray | None) -> int | None:
+    """The first row whose bits differ."""
+    if then is None or not len(now):
+        return None
+    if now.shape != then.shape or now.dtype != then.dtype:
+        return 0
+    bits = [np.ascontiguousarray(a).view(np.uint8).reshape(len(a), -1) for a in (now, then)]
+    rows = (bits[0] != bits[1]).any(axis=1)
+    return int(np.argmax(rows)) if rows.any() else None
+
+
+def _journal(path: str, chunks: list[Any], whole: bool) -> tuple[list[Entry], str]:
+    """The entries in order, checked, and what is to be said about them."""
+    packed = []
+    for chunk in chunks:
+        if chunk.entity_path == f"/{JOURNAL}":
+            packed += zip(*(rrd.rows(chunk, name) for name in ("text", "blob", "checksum")), strict=True)
+    read = sorted(((json.loads(text)["serial"], text, blob, mark) for text, blob, mark in packed), key=lambda row: row[0])
+    if not read:
+        why = "is not a recording of tiverlet; `rerun` shows it" if whole else "was cut short before anything was flushed"
+        raise ValueError(f"replay: {path} {why}.")
+    first = json.loads(read[0][1])
+    if first["kind"] == "scene" and first["data"]["format"] != FORMAT:
+        theirs, version = first["data"]["format"], first["data"]["environment"]["tiverlet"]
+        raise ValueError(
+            f"replay: {path} is in format {theirs}, of tiverlet {version}, but this version reads format {FORMAT}. "
+            "The picture opens with `rerun`; for the rest use that version."
+        )
+    entries, mark = [], ""
+    for k, (serial, text, blob, wanted) in enumerate(read):
+        if serial != k:
+            return entries, f" Entry {k} of the journal is missing, so it is read up to there."
+        mark = checksum(mark, text, blob.tobytes())
+        entry = Entry.unpack(text, blob.tobytes())
+        if mark != wanted:
+            raise ValueError(
+                f"replay: {path} was changed after it was recorded: entry {k}, {entry.kind!r} of frame {entry.frame}."
+            )
+        entries.append(entry)
+    return entries, ""
+
+
+def _by_frame(chunks: list[Any], entity: str, column: str) -> dict[int, np.ndarray]:
+    out = {}
+    for chunk in chunks:
+        if chunk.entity_path == f"/{entity}" and not chunk.is_static and column in chunk.to_record_batch().schema.names:
+            out.update(zip(rrd.numbers(chunk, "frame").tolist(), rrd.rows(chunk, column), strict=True))
+    return dict(sorted(out.items()))
+
+
+def _curves(chunks: list[Any]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Frames and values of each figure."""
+    names = {chunk.entity_path for chunk in chunks if chunk.entity_path.startswith("/figures/")}
+    found = {name: _by_frame(chunks, name[1:], "Scalars:scalars") for name in sorted(names)}
+    return {
+        name[len("/figures/") :]: (np.array(list(by)), np.concatenate(list(by.values()))) for name, by in found.items() if by
+    }  # fmt: skip

@@ -1,0 +1,195 @@
+"""A scene as plain data, and back: particles, features and settings by their arguments, never by code."""
+
+import functools
+import inspect
+import platform
+import textwrap
+import warnings
+from collections.abc import Iterable, Mapping
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .. import constraints, forces, runtime, solvers
+from ..arguments import Noted
+from ..feature import Feature, Knob
+from ..particles import Particles
+
+if TYPE_CHECKING:
+    from ..world import World
+
+PARTICLES = ("position", "velocity", "mass", "radius", "pinned", "group")
+PUBLIC = {
+    name: kind for module in (constraints, forces, solvers) for name, kind in vars(module).items()
+    if isinstance(kind, type) and issubclass(kind, Noted)
+}  # fmt: skip
+Turned = tuple[int, dict[str, Any]]  # the number of a feature, and its knobs
+LONG = 8  # numbers in a list from which it is kept as an array
+
+
+class Needs:
+    """The user's own functions and classes in a scene: their code is kept to be read, and never run."""
+
+    def __init__(self) -> None:
+        self.sources: dict[str, str] = {}
+        self._known: dict[str, Any] = {}
+
+    def name(self, thing: Any) -> str:
+        """What it goes by in the file."""
+        plain = getattr(thing, "__name__", type(thing).__name__)
+        same = [name for name, known in self._known.items() if known is thing]
+        if same:
+            return same[0]
+        count = sum(name == plain or name.startswith(f"{plain} #") for name in self._known)
+        name = f"{plain} #{count + 1}" if count else plain
+        self._known[name], self.sources[name] = thing, source(thing)
+        return name
+
+
+def source(thing: Any) -> str:
+    """The text of a function or class, a ti.func among them; "" where there is none."""
+    plain = thing.func.func if getattr(thing, "_is_taichi_function", False) else thing
+    try:
+        return textwrap.dedent(inspect.getsource(plain))
+    except (OSError, TypeError):
+        return ""
+
+
+def encode(value: Any, name: str, arrays: dict[str, np.ndarray], needs: Needs) -> Any:
+    """A value as JSON; arrays are put aside under names that begin with `name`."""
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
+        arrays[name] = value
+        return {"array": name}
+    if isinstance(value, Mapping):
+        items = [[encode(part, f"{name}.{k}", arrays, needs) for part in item] for k, item in enumerate(value.items())]
+        return {"map": items}
+    if isinstance(value, Iterable):
+        parts = list(value)
+        if len(parts) >= LONG and (array := _array(parts)) is not None:
+            return encode(array, name, arrays, needs)
+        return [encode(part, f"{name}.{k}", arrays, needs) for k, part in enumerate(parts)]
+    return {"given": needs.name(value)}
+
+
+def _array(parts: list) -> np.ndarray | None:
+    try:
+        array = np.asarray(parts)
+    except ValueError:
+        return None
+    return array if array.dtype.kind in "iuf" else None
+
+
+def decode(data: Any, arrays: Mapping[str, np.ndarray], given: Mapping[str, Any]) -> Any:
+    """The value that encode() was given."""
+    if isinstance(data, list):
+        return [decode(part, arrays, given) for part in data]
+    if not isinstance(data, dict):
+        return data
+    ((kind, inner),) = data.items()
+    if kind == "array":
+        return arrays[inner]
+    if kind == "map":
+        return {_key(decode(k, arrays, given)): decode(v, arrays, given) for k, v in inner}
+    return given[inner]
+
+
+def _key(value: Any) -> Any:
+    return tuple(value) if isinstance(value, (list, np.ndarray)) else value
+
+
+@functools.cache
+def _knobs(kind: type) -> tuple[str, ...]:
+    return tuple(name for name in dir(kind) if isinstance(getattr(kind, name, None), Knob))
+
+
+def knobs(feature: Feature) -> dict[str, Any]:
+    """The live settings of a feature, as they are."""
+    return {name: vars(feature)[name] for name in _knobs(type(feature)) if name in vars(feature)}
+
+
+def turn(feature: Feature, values: Mapping[str, Any]) -> None:
+    """Set knobs together: some are checked against each other, so the order would matter."""
+    if wrong := set(values) - set(_knobs(type(feature))):
+        raise ValueError(f"replay: {feature!r} has no knob {sorted(wrong)[0]!r}.")
+    vars(feature).update(values)
+    for name, value in values.items():
+        setattr(feature, name, value)
+    feature.changed = True
+
+
+def describe(world: "World") -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """The scene of a world as JSON and arrays."""
+    arrays: dict[str, np.ndarray] = {}
+    needs = Needs()
+
+    def made(thing: Any, name: str) -> dict[str, Any]:
+        kinds = type(thing).__mro__
+        if kinds[0].__module__.partition(".")[0] == __name__.partition(".")[0]:
+            kind = next(k.__name__ for k in kinds if PUBLIC.get(k.__name__) is k)
+        else:
+            kind = {"given": needs.name(kinds[0])}
+        return {"class": kind, "arguments": {k: encode(v, f"{name}.{k}", arrays, needs) for k, v in thing.arguments.items()}}
+
+    features = []
+    for k, feature in enumerate(world.features):
+        values = {name: encode(v, f"{k}.{name} now", arrays, needs) for name, v in knobs(feature).items()}
+        features.append({**made(feature, str(k)), "knobs": values})
+    settings = dict(world.settings)
+    settings["solver"] = made(settings["solver"], "solver")
+    p = world.particles
+    scene = {
+        "particles": {name: encode(getattr(p, name), name, arrays, needs) for name in PARTICLES},
+        "features": features, "settings": settings, "environment": environment(), "needs": needs.sources,
+    }  # fmt: skip
+    return scene, arrays
+
+
+def environment() -> dict[str, Any]:
+    """What the bits may depend on besides the scene, and who started Taichi how."""
+    import taichi as ti
+
+    wanted = runtime.wanted()
+    return {
+        "tiverlet": version("tiverlet"), "taichi": ".".join(map(str, ti.__version__)), "numpy": np.__version__,
+        "python": platform.python_version(), "machine": platform.machine(), "system": platform.system(),
+        "arch": runtime.architecture(), "threads": runtime.threads(), "fast_math": runtime.fast_math(),
+        "seed": wanted.get("seed"), "debug": wanted.get("debug"),
+    }  # fmt: skip
+
+
+def rebuild(scene: dict[str, Any], arrays: Mapping[str, np.ndarray], given: Mapping[str, Any], turned: list[Turned]) -> "World":
+    """A world of the scene, with what was turned since."""
+    from ..world import World
+
+    missing = sorted(set(scene["needs"]) - set(given))
+    if missing:
+        raise ValueError(
+            f"replay: the scene uses {', '.join(missing)}, which the recording keeps only to be read. Give "
+            f"{'it' if len(missing) == 1 else 'them'} again: tv.replay(path, given=[{', '.join(missing)}]). As recorded:\n\n"
+            + "\n".join(scene["needs"][name] for name in missing)
+        )
+    for name, text in scene["needs"].items():
+        if text and source(given[name]) not in ("", text):
+            warnings.warn(f"replay: {name} reads otherwise than when it was recorded; the bits may differ.", stacklevel=4)
+
+    def make(thing: dict[str, Any]) -> Any:
+        kind = thing["class"]
+        kind = given[kind["given"]] if isinstance(kind, dict) else PUBLIC[kind]
+        return kind(**{name: decode(value, arrays, given) for name, value in thing["arguments"].items()})
+
+    p = {name: decode(value, arrays, given) for name, value in scene["particles"].items()}
+    features = []
+    for data in scene["features"]:
+        feature = make(data)
+        turn(feature, {name: decode(value, arrays, given) for name, value in data["knobs"].items()})
+        features.append(feature)
+    for k, values in turned:
+        turn(features[k], values)
+    settings = dict(scene["settings"])
+    settings["solver"] = make(settings["solver"])
+    return World(Particles(p.pop("position"), **p), features, **settings)

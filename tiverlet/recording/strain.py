@@ -1,0 +1,36 @@
+"""Colours for how far links are from their rest lengths."""
+
+import numpy as np
+
+# Decades of |strain|: links that keep their length to LEAST look neutral, and the colour is full at MOST.
+LEAST, MOST = 1e-4, 1e-1
+LEVELS = 32  # colours on each side
+NEUTRAL, LONGER, SHORTER = (np.array(c, dtype=np.float64) for c in ([170, 172, 182], [255, 92, 48], [64, 140, 255]))
+
+
+def _scale() -> np.ndarray:
+    """RGBA as u32, from the shortest to the longest."""
+    side = np.linspace(0.0, 1.0, LEVELS + 1)[:, None]
+    shorter, longer = (NEUTRAL + side * (end - NEUTRAL) for end in (SHORTER, LONGER))
+    rgb = np.concatenate([shorter[:0:-1], longer]).round().astype(np.uint32)
+    return rgb[:, 0] << 24 | rgb[:, 1] << 16 | rgb[:, 2] << 8 | np.uint32(255)
+
+
+SCALE = _scale()
+
+
+def colors(strain: np.ndarray) -> np.ndarray:
+    """RGBA of each strain (m,) as u32: grey as it should be, to red where it is longer and to blue where it is shorter.
+
+    Grey, too, where there is none (NaN).
+    """
+    strain = np.nan_to_num(strain.astype(np.float32), nan=0.0)
+    share = np.log2(np.clip(np.abs(strain), LEAST, MOST) / LEAST) / np.log2(MOST / LEAST)
+    return SCALE[LEVELS + np.rint(np.copysign(LEVELS * share, strain)).astype(np.int32)]
+
+
+def legend() -> tuple[np.ndarray, list[str]]:
+    """Colours and labels of the scale, from the shortest to the longest."""
+    decades = np.array([1e-1, 1e-2, 1e-3])
+    strain = np.concatenate([-decades, [0.0], decades[::-1]])
+    return colors(strain), [f"{100 * s:+g} %" if s else "at rest" for s in strain]
