@@ -17,7 +17,8 @@ from .sink import Sink
 if TYPE_CHECKING:
     from ..world import World
 
-FLUSH = 1.0  # [s] after which what was logged is brought to the file
+SEND = 1.0  # [s] after which the points of curves are sent on
+BACKLOG = 32 << 20  # bytes that may wait to be written
 SHARE = 10  # an exact state is written when the pictures since the last one weigh so many times as much
 SPARSE = 300  # frames after which one is written in any case
 RESERVE = 40_000  # bytes of a budget for the layout and the summary
@@ -37,7 +38,8 @@ class Recorder:
     Beside that the file holds the scene with all arguments, exact states to continue from, the hash of every frame drawn, every
     step, and what the user turned or assigned in between, also between frames that are not drawn: see tv.replay.
 
-    The file is complete when the block ends. Of a process that is killed, all but the last second is there, and can be replayed.
+    The file is complete when the block ends. Of a process that is killed, all but about the last fifth of a second is there (of
+    curves, the last second), and can be replayed; what flush() has brought to the file is there in any case.
     Open it with `rerun rope.rrd`. Raises ValueError and OSError where the file cannot be made, and OSError when it cannot be
     written any further; what has been written then can be read.
     """
@@ -82,7 +84,7 @@ class Recorder:
         self._drawing.begin()
         self._curves = Curves(world, self._stream)
         self._drawing.static("about", rr.TextDocument(about(world), media_type="text/markdown"))
-        self._flushed = perf_counter()
+        self._sent, self._flushed = perf_counter(), 0
         self._stamp(0)
         self._journal = Journal(world, self._write)
         self._journal.stirred.update(range(len(world.features)))  # all are to be drawn
@@ -106,9 +108,13 @@ class Recorder:
         self._stream.log(JOURNAL, self._rr.AnyValues(text=text, blob=blob, checksum=checksum), strict=True)
 
     @property
+    def _logged(self) -> int:
+        return self._drawing.bytes + self._journal.bytes + 1500 * self.frames
+
+    @property
     def bytes(self) -> int:
         """About what the file will have when it is closed [bytes]."""
-        return max(self._sink.bytes, self._drawing.bytes + self._journal.bytes + 1500 * self.frames)
+        return max(self._sink.bytes, self._logged)
 
     def log(self) -> None:
         """Write the present frame, if it is one of `every`."""
@@ -117,7 +123,10 @@ class Recorder:
         self._calls += 1
         if self._calls % self._stride() == 0:
             self._frame(self._calls)
-        if perf_counter() - self._flushed > FLUSH:
+        if perf_counter() - self._sent > SEND:
+            self._curves.send()
+            self._sent = perf_counter()
+        if self._logged - self._flushed > BACKLOG:
             self.flush()
         if self._sink.error:
             self._fail()
@@ -126,7 +135,7 @@ class Recorder:
         """Wait until what was logged is in the file, so that it is there whatever happens to the process."""
         self._curves.send()
         self._sink.flush()
-        self._flushed = perf_counter()
+        self._flushed = self._logged
 
     def _fail(self) -> None:
         error = self._sink.error
