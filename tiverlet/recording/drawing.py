@@ -12,7 +12,7 @@ from ..feature import Batch
 from ..tools import golden_colors
 from ..wall import Wall
 from .journal import PARTICLES
-from .layout import LEGEND, SCENE
+from .layout import LEGEND, SCENE, WIDE
 from .strain import colors, legend
 
 if TYPE_CHECKING:
@@ -60,9 +60,12 @@ class Drawing:
             self.static(f"{SCENE}/links/{k}", self._strips.from_fields(radii=[-1.2]))
         if self._links:
             hues, labels = legend()
-            at = np.stack([np.arange(len(hues)), np.zeros(len(hues))], axis=1)
-            ends = np.stack([at - [0.45, 0], at + [0.45, 0]], axis=1)
-            self.static(LEGEND, self._rr.LineStrips2D(ends, colors=hues, labels=labels, radii=[-5.0], show_labels=True))
+            at = np.stack([WIDE * np.arange(len(hues)), np.zeros(len(hues))], axis=1)
+            ends = np.stack([at - [0.45 * WIDE, 0.2], at + [0.45 * WIDE, -0.2]], axis=1)
+            self.static(f"{LEGEND}/scale", self._rr.LineStrips2D(ends, colors=hues, radii=[-5.0]))
+            self.static(
+                f"{LEGEND}/labels", self._rr.Points2D(at + [0, 0.5], colors=hues, labels=labels, radii=[0], show_labels=True)
+            )
 
     def frame(self, x: np.ndarray, x32: np.ndarray, turned: Iterable[int], torn: bool) -> None:
         """Draw a frame. x: (n, dim), and rounded to f32. turned: features that are not as they were in the last one. torn: if

@@ -1,11 +1,15 @@
 """How a recording opens in the viewer."""
 
+import uuid
+
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+SCENE_VIEW = uuid.uuid5(uuid.NAMESPACE_DNS, "scene.tiverlet")  # the view of the scene, to be found in any recording
 SCENE = "world/scene"  # the view looks at "world", so that a mirror at "world/scene" shows
 LEGEND = "legend/strain"
+WIDE = 3.0  # steps of the legend are so far apart, with a height of 1
 
 # The viewer's 2D views have y pointing down, with no option. A mirror above the data, and below the
 # origin of the view, turns it up without touching the data.
@@ -17,7 +21,8 @@ CURVES = {
     "Momentum [kg m/s]": {
         "momentum/x": ("x", [235, 110, 100]), "momentum/y": ("y", [130, 200, 110]), "momentum/z": ("z", [110, 150, 240]),
     },
-    "Effort": {"substeps": ("substeps", [150, 160, 175]), "milliseconds": ("ms per frame", [190, 140, 220])},
+    "Substeps": {"substeps": ("substeps", [150, 160, 175])},
+    "Time per frame [ms]": {"milliseconds": ("ms", [190, 140, 220])},
 }  # fmt: skip
 
 
@@ -32,19 +37,25 @@ def blueprint(low: np.ndarray, high: np.ndarray, links: bool) -> rrb.Blueprint:
         )
         view = rrb.Spatial2DView(origin="world", name="Scene", visual_bounds=bounds, background=[18, 20, 26])
     else:
-        middle, far = (low + high) / 2, 1.4 * float(np.linalg.norm(size))
+        middle, far = (low + high) / 2, 1.05 * float(np.linalg.norm(size))
         eye = rrb.EyeControls3D(position=middle + far * np.array([0.45, 0.35, 0.82]), look_target=middle, eye_up=(0.0, 1.0, 0.0))
         view = rrb.Spatial3DView(origin="world", name="Scene", eye_controls=eye, background=[18, 20, 26])
     curves = [
-        rrb.TimeSeriesView(origin="figures", contents=[f"figures/{name}" for name in names], name=title)
+        rrb.TimeSeriesView(
+            origin="figures",
+            contents=[f"figures/{name}" for name in names],
+            name=title,
+            plot_legend=rrb.PlotLegend(corner="RightTop", visible=len(names) > 1),
+        )
         for title, names in CURVES.items()
     ]
     pages = [rrb.TextDocumentView(origin="about", name="About"), rrb.TextLogView(origin="events", name="Events")]
     scale = rrb.Spatial2DView(
         origin="legend", name="Strain of links", background=[18, 20, 26],
-        visual_bounds=rrb.VisualBounds2D(x_range=[-0.7, 6.7], y_range=[-0.7, 0.9]),
+        visual_bounds=rrb.VisualBounds2D(x_range=[-0.6 * WIDE, 6.6 * WIDE], y_range=[-0.6, 1.0]),
     )  # fmt: skip
-    side = rrb.Vertical(*curves, rrb.Tabs(*pages), row_shares=[1, 1, 1, 1, 1.6])
+    side = rrb.Vertical(*curves[:-2], rrb.Horizontal(*curves[-2:]), rrb.Tabs(*pages), row_shares=[1, 1, 1, 1, 1.6])
+    view.id = SCENE_VIEW
     left = rrb.Vertical(view, scale, row_shares=[11, 1]) if links else view
     return rrb.Blueprint(
         rrb.Horizontal(left, side, column_shares=[7, 3]),

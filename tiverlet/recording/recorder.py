@@ -48,7 +48,7 @@ class Recorder:
         import rerun as rr
 
         self._rr: Any = rr
-        self._world = world
+        self.world = world
         self.every = checks.integer("Recorder", "every", every, least=1)
         self.budget = None if budget is None else checks.integer("Recorder", "budget", budget, least=1)
         self.path = os.fspath(path)
@@ -71,7 +71,7 @@ class Recorder:
         from .drawing import Drawing, bounds, links
         from .layout import MIRROR, SCENE, blueprint
 
-        rr, world = self._rr, self._world
+        rr, world = self._rr, self.world
         extent = bounds(world)
         layout = blueprint(*extent, bool(links(world)))
         title = os.path.splitext(os.path.basename(self.path))[0]
@@ -102,7 +102,7 @@ class Recorder:
 
     def _stamp(self, number: int) -> None:
         self._stream.set_time("frame", sequence=number)
-        self._stream.set_time("time", duration=self._world.time)
+        self._stream.set_time("time", duration=self.world.time)
 
     def _write(self, text: str, blob: np.ndarray, checksum: str) -> None:
         self._stream.log(JOURNAL, self._rr.AnyValues(text=text, blob=blob, checksum=checksum), strict=True)
@@ -166,7 +166,7 @@ class Recorder:
         self._drawn, self._last_state = self._drawing.bytes, self._calls
 
     def _frame(self, number: int) -> None:
-        world, journal = self._world, self._journal
+        world, journal = self.world, self._journal
         journal.frame = number
         self._stamp(number)
         if number and (self._drawing.bytes - self._drawn > self._due or number - self._last_state >= SPARSE):
@@ -191,7 +191,7 @@ class Recorder:
         """Write the summary and finish the file. Calling it twice does nothing."""
         if self._sink.stream is None:
             return
-        journal, world = self._journal, self._world
+        journal, world = self._journal, self.world
         journal.close()
         self._curves.send()
         with contextlib.suppress(RuntimeError):  # a world that was closed has no state

@@ -1,0 +1,1 @@
+"""The commands of `python -m tiverlet`: one module each, with ABOUT, add(parser) and main(args) -> exit status."""

@@ -1,0 +1,59 @@
+"""A recording: open it in the viewer, compute it again and compare, take a picture, or write its numbers to a file."""
+
+import argparse
+import os
+import runpy
+from typing import Any
+
+ABOUT = "view, verify, picture or export a recording"
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """The file, and what to do with it."""
+    parser.add_argument("file", help="an .rrd file that a Recorder has written")
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--verify", action="store_true", help="compute all frames again, and compare; exit status 1 if one differs")
+    what.add_argument("--web", action="store_true", help="serve the viewer to browsers, on 127.0.0.1 only")
+    what.add_argument("--png", metavar="OUT.png", help="save a picture, without a window; needs a Vulkan driver, in software too")
+    what.add_argument("--export", choices=("npz", "csv"), help="write positions (npz: and curves) beside the file")
+    parser.add_argument("--frame", type=int, action="append", help="of --png; several with a %%d in the name; default the last")
+    parser.add_argument("--scene", action="store_true", help="of --png: the scene alone, without curves and text")
+    parser.add_argument("--port", type=int, default=9090, help="of --web; default 9090")
+    parser.add_argument("--given", metavar="SCRIPT.py", help="of --verify: where the user's own functions in the scene are")
+
+
+def main(args: argparse.Namespace) -> int:
+    """Do it."""
+    from ..recording import replay
+
+    recording = replay(args.file)
+    print(recording.text)
+    if args.verify:
+        if args.given:
+            recording = replay(args.file, functions(args.given, recording.scene["needs"]))
+        verdict = recording.verify()
+        print(verdict)
+        return 0 if verdict else 1
+    if args.export:
+        out = f"{os.path.splitext(args.file)[0]}.{args.export}"
+        recording.export(out)
+        print(f"{out}: {os.path.getsize(out)} bytes")
+        return 0
+    from ..recording import viewer
+
+    if args.png:
+        for out in viewer.picture(args.file, args.png, args.frame, args.scene):
+            print(out)
+        return 0
+    if args.web:
+        return viewer.serve(args.file, args.port)
+    status = viewer.show(args.file)
+    if status:
+        print("The viewer needs a display and a graphics driver; --web and --png do without a display.")
+    return status
+
+
+def functions(script: str, names: dict[str, str]) -> dict[str, Any]:
+    """What of these names a script defines. The script is run, up to its `if __name__ == "__main__":`."""
+    found = runpy.run_path(script, run_name="given")
+    return {name: found[name.partition(" #")[0]] for name in names if name.partition(" #")[0] in found}

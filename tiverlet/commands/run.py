@@ -1,0 +1,86 @@
+"""Run a demo or a script of your own, and record it: what its Recorder writes, or, where it has none, its first world."""
+
+import argparse
+import contextlib
+import os
+import pathlib
+import runpy
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+ABOUT = "run a demo or script, and record it"
+DEMOS = pathlib.Path(__file__).parents[2] / "demos"
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """The script, and where to record it."""
+    parser.add_argument("script", help="a .py file, or the name of a demo")
+    parser.add_argument("--out", metavar="FILE.rrd", help="default: the name of the script, here")
+    parser.add_argument("arguments", nargs="*", help="passed on to the script")
+
+
+def main(args: argparse.Namespace) -> int:
+    """Run it."""
+    from ..recording import replay
+
+    path = find(args.script)
+    out = args.out or f"{path.stem}.rrd"
+    with recording(out) as made:
+        before = sys.argv, list(sys.path)
+        sys.argv, sys.path[0] = [str(path), *(args.arguments or [])], str(path.parent)
+        try:
+            runpy.run_path(str(path), run_name="__main__")
+            status = 0
+        except SystemExit as end:
+            status = end.code if isinstance(end.code, int) else int(end.code is not None)
+            if isinstance(end.code, str):
+                print(end.code, file=sys.stderr)
+        finally:
+            sys.argv, sys.path[:] = before
+    if made:
+        print(f"{replay(out).text} {os.path.getsize(out)} bytes.")
+    else:
+        print(f"{path.name} made no step, so nothing was recorded.", file=sys.stderr)
+    return status
+
+
+def find(name: str) -> pathlib.Path:
+    """The script of that name, or the demo."""
+    for path in (pathlib.Path(name), DEMOS / f"{name}.py"):
+        if path.is_file():
+            return path.resolve()
+    demos = ", ".join(sorted(p.stem for p in DEMOS.glob("*.py"))) or "none are installed"
+    raise ValueError(f"run: there is no file {name}, and no demo of that name ({demos}).")
+
+
+@contextlib.contextmanager
+def recording(out: str) -> Iterator[list[Any]]:
+    """While this lasts, every Recorder writes to `out`, and a world that is stepped before there is one gets its own."""
+    import tiverlet
+
+    from ..world import World
+
+    made: list[Any] = []
+    step, recorder = World.step, tiverlet.Recorder
+
+    class Redirected(recorder):
+        def __init__(self, path, *args, **kwargs):
+            super().__init__(out, *args, **kwargs)
+            made.append(self)
+
+    def stepped(world: World, *args, **kwargs):
+        if not made:
+            made.append(recorder(out, world))
+        report = step(world, *args, **kwargs)
+        if made and type(made[0]) is recorder and made[0].world is world:
+            made[0].log()
+        return report
+
+    tiverlet.Recorder, World.step = Redirected, stepped  # type: ignore[misc]
+    try:
+        yield made
+    finally:
+        tiverlet.Recorder, World.step = recorder, step  # type: ignore[misc]
+        for one in made:
+            one.close()
