@@ -1,6 +1,7 @@
 """Replay: a recording leads to the same bits again, wherever it goes on from, and says so where it does not."""
 
 import json
+import pathlib
 import re
 import resource
 import struct
@@ -10,7 +11,8 @@ import pytest
 import taichi as ti
 
 import tiverlet as tv
-from tiverlet.recording import journal, rrd, scene
+from tiverlet.__main__ import main
+from tiverlet.recording import journal, rrd, scene, viewer
 
 from .conftest import python
 
@@ -374,6 +376,51 @@ def test_a_budget_is_kept_and_said(world, tmp_path):
     recording = tv.replay(tmp_path / "b.rrd")
     assert 60 < len(recording.frames) < 300 and recording.frames[-1] > 150
     assert recording.verify()
+
+
+def test_command_line(falling, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "a.rrd"
+    path.write_bytes(falling.read_bytes())
+    assert main(["replay", str(path), "--verify"]) == 0 and "all 11 frames come out" in capsys.readouterr().out
+    wrong = rewrite(falling, tmp_path / "b.rrd", lambda text: text.replace('"g": 5.0', '"g": 5.5'))
+    assert main(["replay", str(wrong), "--verify"]) == 1 and "first particle 0" in capsys.readouterr().out
+    assert main(["replay", str(path), "--export", "csv"]) == 0 and (tmp_path / "a.csv").exists()
+    assert main(["replay", "none.rrd"]) == 2 and "none.rrd" in capsys.readouterr().err
+
+    # A script that records nothing itself, and whose function has to be given to verify().
+    (tmp_path / "mine.py").write_text("""
+import sys
+import taichi as ti
+import tiverlet as tv
+
+@ti.func
+def swing(x):
+    return -10.0 * x
+
+if __name__ == "__main__":
+    assert sys.argv[1:] == ["5"]
+    with tv.World(tv.Particles([[0.0, 1.0]]), [tv.Force(swing)], substeps=2) as world:
+        for _ in range(int(sys.argv[1])):
+            world.step(1 / 60)
+    raise SystemExit(3)
+""")
+    assert main(["run", "mine.py", "5", "--out", "mine.rrd"]) == 3
+    assert "6 frames (0 ... 5)" in capsys.readouterr().out and not hasattr(tv.World.step, "__wrapped__")
+    assert main(["replay", "mine.rrd", "--verify"]) == 2 and "given=[swing]" in capsys.readouterr().err
+    assert main(["replay", "mine.rrd", "--verify", "--given", "mine.py"]) == 0
+    assert main(["run", "nobody"]) == 2 and "no demo of that name" in capsys.readouterr().err
+
+
+def test_a_picture_without_a_window(falling, tmp_path):
+    places = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d", "/usr/local/share/vulkan/icd.d")
+    if not any(pathlib.Path(place).glob("*.json") for place in places):
+        pytest.skip("no Vulkan driver here; apt-get install mesa-vulkan-drivers")
+    one, other = viewer.picture(str(falling), str(tmp_path / "%d.png"), [0, 20], scene=True)
+    first, last = (viewer.pixels_of(png).astype(int) for png in (one, other))
+    assert first.shape == last.shape and first.shape[0] > 300
+    assert (np.abs(first - last).max(axis=2) > 60).sum() > 50  # particles have moved, on a background that has not
+    assert (np.abs(first - last).max(axis=2) < 20).mean() > 0.5
 
 
 def test_moving_targets_move_evenly(world):

@@ -27,22 +27,27 @@ def main(args: argparse.Namespace) -> int:
     path = find(args.script)
     out = args.out or f"{path.stem}.rrd"
     with recording(out) as made:
-        before = sys.argv, list(sys.path)
-        sys.argv, sys.path[0] = [str(path), *(args.arguments or [])], str(path.parent)
-        try:
-            runpy.run_path(str(path), run_name="__main__")
-            status = 0
-        except SystemExit as end:
-            status = end.code if isinstance(end.code, int) else int(end.code is not None)
-            if isinstance(end.code, str):
-                print(end.code, file=sys.stderr)
-        finally:
-            sys.argv, sys.path[:] = before
+        status = execute(path, args.arguments)
     if made:
         print(f"{replay(out).text} {os.path.getsize(out)} bytes.")
     else:
         print(f"{path.name} made no step, so nothing was recorded.", file=sys.stderr)
     return status
+
+
+def execute(path: pathlib.Path, arguments: list[str]) -> int:
+    """Run a script as Python would; returns its exit status."""
+    before = sys.argv, list(sys.path)
+    sys.argv, sys.path[0] = [str(path), *arguments], str(path.parent)
+    try:
+        runpy.run_path(str(path), run_name="__main__")
+    except SystemExit as end:
+        if isinstance(end.code, str):
+            print(end.code, file=sys.stderr)
+        return end.code if isinstance(end.code, int) else int(end.code is not None)
+    finally:
+        sys.argv, sys.path[:] = before
+    return 0
 
 
 def find(name: str) -> pathlib.Path:
@@ -51,7 +56,7 @@ def find(name: str) -> pathlib.Path:
         if path.is_file():
             return path.resolve()
     demos = ", ".join(sorted(p.stem for p in DEMOS.glob("*.py"))) or "none are installed"
-    raise ValueError(f"run: there is no file {name}, and no demo of that name ({demos}).")
+    raise ValueError(f"There is no file {name}, and no demo of that name ({demos}).")
 
 
 @contextlib.contextmanager

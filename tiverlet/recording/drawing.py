@@ -61,7 +61,7 @@ class Drawing:
         if self._links:
             hues, labels = legend()
             at = np.stack([WIDE * np.arange(len(hues)), np.zeros(len(hues))], axis=1)
-            ends = np.stack([at - [0.45 * WIDE, 0.2], at + [0.45 * WIDE, -0.2]], axis=1)
+            ends = np.stack([at - [0.45 * WIDE, 0.4], at + [0.45 * WIDE, -0.4]], axis=1)
             self.static(f"{LEGEND}/scale", self._rr.LineStrips2D(ends, colors=hues, radii=[-5.0]))
             self.static(
                 f"{LEGEND}/labels", self._rr.Points2D(at + [0, 0.5], colors=hues, labels=labels, radii=[0], show_labels=True)

@@ -9,7 +9,7 @@ import rerun.blueprint as rrb
 SCENE_VIEW = uuid.uuid5(uuid.NAMESPACE_DNS, "scene.tiverlet")  # the view of the scene, to be found in any recording
 SCENE = "world/scene"  # the view looks at "world", so that a mirror at "world/scene" shows
 LEGEND = "legend/strain"
-WIDE = 3.0  # steps of the legend are so far apart, with a height of 1
+WIDE = 5.0  # steps of the legend are so far apart, with a height of 1
 
 # The viewer's 2D views have y pointing down, with no option. A mirror above the data, and below the
 # origin of the view, turns it up without touching the data.
@@ -52,11 +52,11 @@ def blueprint(low: np.ndarray, high: np.ndarray, links: bool) -> rrb.Blueprint:
     pages = [rrb.TextDocumentView(origin="about", name="About"), rrb.TextLogView(origin="events", name="Events")]
     scale = rrb.Spatial2DView(
         origin="legend", name="Strain of links", background=[18, 20, 26],
-        visual_bounds=rrb.VisualBounds2D(x_range=[-0.6 * WIDE, 6.6 * WIDE], y_range=[-0.6, 1.0]),
+        visual_bounds=rrb.VisualBounds2D(x_range=[-0.6 * WIDE, 6.6 * WIDE], y_range=[-1.3, 1.5]),
     )  # fmt: skip
     side = rrb.Vertical(*curves[:-2], rrb.Horizontal(*curves[-2:]), rrb.Tabs(*pages), row_shares=[1, 1, 1, 1, 1.6])
     view.id = SCENE_VIEW
-    left = rrb.Vertical(view, scale, row_shares=[11, 1]) if links else view
+    left = rrb.Vertical(view, scale, row_shares=[10, 1.2]) if links else view
     return rrb.Blueprint(
         rrb.Horizontal(left, side, column_shares=[7, 3]),
         rrb.TimePanel(state="collapsed", timeline="frame"),

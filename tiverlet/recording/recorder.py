@@ -194,8 +194,10 @@ class Recorder:
         journal, world = self._journal, self.world
         journal.close()
         self._curves.send()
+        end = {"frames": self.frames, "time": world.time}
         with contextlib.suppress(RuntimeError):  # a world that was closed has no state
-            journal.put("end", {"frames": self.frames, "time": world.time, "hash": world.hash()})
+            end["hash"] = world.hash()
+        journal.put("end", end)
         thinned = [f"from frame {frame} on one of {stride}" for frame, stride in self._thinned if stride < 2**40]
         if self._thinned and self._thinned[-1][1] >= 2**40:
             thinned.append(f"from frame {self._thinned[-1][0]} on none")

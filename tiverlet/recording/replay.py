@@ -127,7 +127,7 @@ class Replay:
                     found = (_differing(now.values[k], then.values[k]) for k in changed)
                     off = next((i for i in found if i is not None), None)
                 else:
-                    same = entry.kind != "end" or world.hash() == entry.data["hash"]
+                    same = "hash" not in entry.data or world.hash() == entry.data["hash"]
                 if not same and wrong is None:
                     wrong = entry.frame
                 if off is not None:

@@ -64,9 +64,9 @@ def picture(path: str, png: str, frames: list[int] | None = None, scene: bool = 
     frames = frames or [int(replay(path).frames[-1])]
     out = [os.path.abspath(png % k if "%" in png else png) for k in frames]
     if len(set(out)) < len(out):
-        raise ValueError(f"replay: {len(frames)} frames need a name with %d in it, such as frame_%d.png.")
+        raise ValueError(f"{len(frames)} frames need a name with %d in it, such as frame_%d.png.")
     if missing := [name for name in out if not os.path.isdir(os.path.dirname(name))]:
-        raise ValueError(f"replay: the folder of {missing[0]} does not exist.")
+        raise ValueError(f"The folder of {missing[0]} does not exist.")
     port = _free_port()
     with tempfile.TemporaryFile() as said:
         words = ("--headless", "--hide-welcome-screen", "--port", str(port), os.path.abspath(path))
@@ -78,7 +78,7 @@ def picture(path: str, png: str, frames: list[int] | None = None, scene: bool = 
             said.seek(0)
             reasons = [line for line in said.read().decode(errors="replace").splitlines() if "adapter" in line]
             raise RuntimeError(
-                f"replay: rerun's viewer made no picture: {[*reasons, str(e)][0]}. It needs a Vulkan driver; one in software is "
+                f"rerun's viewer made no picture: {[*reasons, str(e)][0]}. It needs a Vulkan driver; one in software is "
                 "enough (Debian, Ubuntu: apt-get install mesa-vulkan-drivers)."
             ) from None
         finally:
