@@ -172,6 +172,15 @@ def test_round_trip(build, precision, tmp_path):
     assert go_on(recording, 6) == end
 
 
+def test_an_empty_world_is_replayed(tmp_path):
+    with tv.World(tv.Particles(np.zeros((0, 3))), [tv.Gravity()]) as world, tv.Recorder(tmp_path / "e.rrd", world) as recorder:
+        for _ in range(3):
+            world.step(1 / 60)
+            recorder.log()
+    recording = tv.replay(tmp_path / "e.rrd")
+    assert list(recording.frames) == [0, 1, 2, 3] and recording.position(3).shape == (0, 3) and recording.verify()
+
+
 def test_user_functions_must_be_given_again(tmp_path):
     path = tmp_path / "f.rrd"
     with tv.World(tv.Particles([[1.0, 0.0]]), [tv.Force(swirl)]) as world, tv.Recorder(path, world):

@@ -44,11 +44,13 @@ class Replay:
         self.path, self._given = path, given
         with rrd.chunks(path) as (chunks, whole):
             self._entries, trouble = _journal(path, chunks, whole)
-            dim = self._entries[0].arrays["position"].shape[1]
+            first = self._entries[0]
+            dim = first.arrays["position"].shape[1]
             drawn = _by_frame(chunks, PARTICLES, f"Points{dim}D:positions")
             self.curves = _curves(chunks)
+        if not len(first.arrays["position"]):
+            drawn = {e.frame: np.zeros(0, dtype=np.float32) for e in self._entries if e.kind == "frame"}
         self._drawn = {k: x.reshape(-1, dim) for k, x in drawn.items()}
-        first = self._entries[0]
         self.scene: dict[str, Any] = first.data
         shown = [e for e in self._entries if e.kind == "frame" and e.frame in self._drawn]
         self._frames = {e.frame: e for e in shown}
@@ -231,7 +233,10 @@ def replay(path, given: Iterable[Any] | Mapping[str, Any] = ()) -> Replay:
     after it was written, naming the place.
     """
     names = given if isinstance(given, Mapping) else {thing.__name__: thing for thing in given}
-    return Replay(os.fspath(path), dict(names))
+    try:
+        return Replay(os.fspath(path), dict(names))
+    except (KeyError, IndexError, TypeError) as e:
+        raise ValueError(f"replay: {path} is damaged, or was not written by a Recorder: {e!r}.") from e
 
 
 def _settle(world: "World", settings: list) -> None:

@@ -62,10 +62,13 @@ def _read(readable: str, path: str, whole: bool) -> list[Any]:
 
 
 def rows(chunk: Any, column: str) -> list:
-    """What a column of a chunk has, row by row; NumPy arrays where it has numbers."""
+    """What a column of a chunk has, row by row; NumPy arrays where it has numbers. Where all are empty, rerun leaves it out."""
     import pyarrow as pa
 
-    values = chunk.to_record_batch().column(column)
+    batch = chunk.to_record_batch()
+    if column not in batch.schema.names:
+        return [np.zeros(0, dtype=np.uint8)] * chunk.num_rows
+    values = batch.column(column)
     inner, width = values.values, 1
     while pa.types.is_fixed_size_list(inner.type) or pa.types.is_list(inner.type):
         width *= inner.type.list_size
