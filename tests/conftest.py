@@ -1,6 +1,5 @@
 """One Taichi for the whole run; worlds are closed after each test."""
 
-import json
 import pathlib
 import subprocess
 import sys
@@ -11,10 +10,10 @@ import taichi as ti
 from taichi.lang import ops
 
 import tiverlet as tv
+from tiverlet.report.cases import entries, known
 
-HERE = pathlib.Path(__file__).parent
 SOURCES = str(pathlib.Path(tv.__file__).parent)
-CASES = {c["id"]: c for c in json.loads((HERE / "reference" / "cases.json").read_text())["cases"]}
+CASES = {name: known(name) for name in entries()}
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -50,7 +49,7 @@ def world():
 
 
 def case(name: str) -> dict:
-    """An entry of reference/cases.json."""
+    """An entry of cases.json, the file of known answers in tiverlet/report/cases."""
     return CASES[name]
 
 

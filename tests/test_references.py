@@ -1,4 +1,4 @@
-"""Ropes, nets and beams against statics and modes from reference/cases.json.
+"""Ropes, nets and beams against statics and modes from cases.json.
 
 Where one Jacobi pass cannot hold a long rigid rope, its law is tested: a pass is a spring of compliance W h^2.
 """

@@ -1,5 +1,7 @@
 """tiverlet: a particle engine on Taichi. Position Verlet, a spatial hash, and Jacobi constraints from soft to rigid."""
 
+from typing import Any
+
 from . import runtime  # first: it sets what Taichi reads when it is imported  # isort: skip
 from . import measure, shapes
 from .constraints import (
@@ -42,3 +44,12 @@ __all__ = [
     "Wind", "World", "approach", "clamp", "golden", "golden_colors", "golden_index", "init", "measure", "mix", "replay",
     "runtime", "shapes", "smoothstep",
 ]  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    """tv.report is imported when it is first asked for: scenes need none of it."""
+    if name == "report":
+        import importlib
+
+        return importlib.import_module(".report", __name__)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,12 +1,12 @@
-"""The command line: python -m tiverlet run | replay."""
+"""The command line: python -m tiverlet run | replay | report | stress | info."""
 
 import argparse
 import sys
 
-from .commands import replay, run
+from .commands import info, replay, report, run, stress
 
 # Each has ABOUT (a line), add(parser) for its arguments, and main(args) -> exit status.
-COMMANDS = {"run": run, "replay": replay}
+COMMANDS = {"run": run, "replay": replay, "report": report, "stress": stress, "info": info}
 
 
 def main(words: list[str] | None = None) -> int:

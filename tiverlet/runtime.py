@@ -56,7 +56,7 @@ def init(arch: str = "cpu", threads: int | None = None, debug: bool = False, see
             "world's fields. Call tv.init before the first World and before any ti.init, or leave it out."
         )
     if arch != "cpu" and not _available(arch):
-        offer = ", ".join(repr(a) for a in ARCHITECTURES if a == "cpu" or _available(a))
+        offer = ", ".join(map(repr, available()))
         raise RuntimeError(f'init: arch "{arch}" is not available on this machine. Available: {offer}.')
     options: dict[str, Any] = {} if threads is None else {"cpu_max_num_threads": threads}
     with contextlib.redirect_stdout(io.StringIO()):  # ti.init prints its banner whatever the log level
@@ -75,6 +75,11 @@ def architecture() -> str:
     """The architecture that Taichi runs on, by the names of init()."""
     name = str(_config().arch).rsplit(".", 1)[-1]
     return "cpu" if name in ("x64", "arm64") else name
+
+
+def available() -> list[str]:
+    """The architectures that this machine and this Taichi have."""
+    return [a for a in ARCHITECTURES if a == "cpu" or _available(a)]
 
 
 def threads() -> int:

@@ -1,1 +1,4 @@
-"""The commands of `python -m tiverlet`: one module each, with ABOUT, add(parser) and main(args) -> exit status."""
+"""Commands of `python -m tiverlet`, one in each file: ABOUT, add(parser) and main(args) -> exit status.
+
+They import what they need when they run, so that --help is quick.
+"""

@@ -1,0 +1,30 @@
+"""What tiverlet runs on: versions, architectures and cores; for bug reports."""
+
+import argparse
+
+ABOUT = "versions, architectures and cores"
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """No arguments."""
+
+
+def main(args: argparse.Namespace) -> int:
+    """Print them."""
+    import platform
+    from importlib import metadata
+
+    from .. import runtime
+    from ..report.sweep import machine
+
+    print(f"machine        {machine()}")
+    for package in ("tiverlet", "taichi", "numpy", "rerun-sdk", "rich", "matplotlib"):
+        try:
+            print(f"{package:14} {metadata.version(package)}")
+        except metadata.PackageNotFoundError:
+            print(f"{package:14} not installed")
+    print(f"system         {platform.platform()}")
+    print(f"architectures  {', '.join(runtime.available())}")
+    runtime.ensure_started()
+    print(f"Taichi runs on {runtime.architecture()}, {runtime.threads()} threads")
+    return 0

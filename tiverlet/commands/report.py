@@ -1,0 +1,44 @@
+"""Error against run time on scenes with known answers, beside the article's scheme and textbook XPBD."""
+
+import argparse
+
+from .pool import add_workers, workers
+
+ABOUT = "error against run time on scenes with known answers"
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """The arguments."""
+    parser.add_argument("cases", nargs="*", help="names or beginnings of names, such as D01 or S; all without any")
+    parser.add_argument("--list", action="store_true", help="list the cases")
+    parser.add_argument("--quick", action="store_true", help="a few substeps and one timed run of each")
+    parser.add_argument("--json", metavar="FILE", help="write all points, for machines")
+    parser.add_argument("--markdown", metavar="FILE", help="write the table, and one of all points for each case")
+    parser.add_argument("--plot", metavar="FOLDER", help="write a log-log plot of each case (needs matplotlib)")
+    parser.add_argument("--record", metavar="FILE", help="write the curves for the rerun viewer")
+    add_workers(parser)
+
+
+def main(args: argparse.Namespace) -> int:
+    """Measure, print, write; the status is 1 when a case is not what it must be."""
+    from rich.console import Console
+
+    from ..report import CASES, error_vs_time
+
+    console = Console()
+    if args.list:
+        for name, case in CASES.items():
+            console.print(f"{name:36} {case.title}", highlight=False)
+        return 0
+    with workers(args.workers) as executor:
+        report = error_vs_time(args.cases or None, quick=args.quick, executor=executor, progress=console.is_terminal)
+    console.print(report)
+    for path, text in ((args.json, report.json), (args.markdown, lambda: report.markdown(every=True))):
+        if path:
+            with open(path, "w", encoding="utf-8") as file:
+                file.write(text())
+    if args.plot:
+        report.plot(args.plot)
+    if args.record:
+        report.record(args.record)
+    return 1 if report.failures else 0

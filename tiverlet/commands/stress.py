@@ -1,0 +1,30 @@
+"""The certificate of stiff and extreme cases: each is run, measured, and passes or fails by its own criterion."""
+
+import argparse
+
+from .pool import add_workers, workers
+
+ABOUT = "stiff and extreme cases, with a verdict on each"
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """The arguments."""
+    parser.add_argument("rows", nargs="*", type=int, help="numbers of rows; all without any")
+    parser.add_argument("--json", metavar="FILE", help="write the certificate, for machines")
+    add_workers(parser)
+
+
+def main(args: argparse.Namespace) -> int:
+    """Run, print, write; the status is 1 when a row fails."""
+    from rich.console import Console
+
+    from ..report import stress
+
+    console = Console()
+    with workers(args.workers) as executor:
+        certificate = stress(rows=args.rows or None, executor=executor, progress=console.is_terminal)
+    console.print(certificate)
+    if args.json:
+        with open(args.json, "w", encoding="utf-8") as file:
+            file.write(certificate.json())
+    return 0 if certificate.passed else 1

@@ -1,0 +1,136 @@
+"""Error against run time: sweep substeps, solvers and precisions of the cases, with the baselines on the same axes."""
+
+import platform
+from collections.abc import Iterable, Sequence
+from concurrent.futures import Executor, as_completed
+from dataclasses import dataclass
+from typing import Any
+
+from rich.progress import Progress
+
+from .baselines import BASELINES
+from .cases import CASES, LEFT_OUT, METHODS, Case, chosen
+from .errors import ErrorReport, Missing
+from .points import Point, Task, curve
+
+FARTHER = (4, 16)  # baselines get the substeps of the case, and its most times these: they need more for as much time
+QUICK = 3  # efforts of a quick sweep
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a sweep measures, and what it leaves out."""
+
+    tasks: list[Task]
+    omissions: list[str]
+
+
+def plan(
+    cases: Sequence[Case], methods: Iterable[str] | None, precisions: Sequence[str], efforts: Sequence[int] | None,
+    baselines: bool, runs: int, quick: bool,
+) -> Plan:  # fmt: skip
+    """The curves of a sweep: every method of a case in f64, its first one in the other precisions, and the baselines."""
+    tasks, refused = [], {}
+    for case in cases:
+        steps = tuple(efforts or case.efforts)
+        steps = few(case, steps) if quick else steps
+        for k, method in enumerate(methods or case.methods):
+            for precision in precisions if k == 0 or methods else precisions[:1]:
+                tasks.append(Task(case.name, method, precision, steps, runs))
+        for name, kind in BASELINES.items() if baselines else ():
+            if why := kind.refuses(case.build()[1]):
+                refused.setdefault((name, why), []).append(case.name)
+            else:
+                tasks.append(Task(case.name, name, "f64", (*steps, *(steps[-1] * k for k in FARTHER)), runs))
+    omissions = [f"{name} on {', '.join(names)}: {why}" for (name, why), names in refused.items()]
+    if not baselines:
+        omissions.append("the baselines: not asked for")
+    return Plan(tasks, omissions)
+
+
+def few(case: Case, steps: tuple[int, ...]) -> tuple[int, ...]:
+    """Those of a quick sweep: where the order shows, and where the limit is checked."""
+    fit = [s for s in case.fit or steps if s in steps]
+    middle = fit if case.fit else [s for s in fit if s >= case.at] or fit
+    return tuple(sorted({*middle[:QUICK], *(s for s in steps if s == case.at)}))
+
+
+def error_vs_time(
+    cases: Sequence[str] | str | None = None, *, methods: Sequence[str] | None = None,
+    precisions: Sequence[str] = ("f64", "f32"), efforts: Sequence[int] | None = None, baselines: bool = True, runs: int = 5,
+    executor: Executor | Any = None, progress: bool = False, quick: bool = False,
+) -> ErrorReport:  # fmt: skip
+    """Measure error against run time on scenes with known answers.
+
+    cases: names or beginnings of names in tv.report.CASES ("D01", "S"); None for all. methods: names in tv.report.METHODS for
+    every case; None for those that each case names. precisions: the first for every method, the others for the first method.
+    efforts: substeps of a frame; None for those of each case. baselines: the article's scheme and textbook XPBD beside them.
+    runs: timed runs of a point, after the one that is looked at; the median counts (fewer where one takes long).
+    executor: with submit(), as in concurrent.futures; curves are measured in its workers, which must not be forked from a process
+    that has started Taichi (use the start method "spawn"). What a worker that dies leaves behind is named in .missing.
+    quick: fewer substeps and one timed run. progress: show a bar.
+
+    Protocol: Rackauckas and Nie, SciMLBenchmarks (work-precision diagrams with omissions).
+    """
+    for name in methods or ():
+        if name not in METHODS:
+            raise ValueError(f"error_vs_time: methods has {name!r}, but there are {', '.join(METHODS)}.")
+    some = chosen(cases)
+    todo = plan(some, methods, precisions, efforts, baselines, 1 if quick else runs, quick)
+    points, missing = [], []
+    with Progress(disable=not progress) as bar:
+        row = bar.add_task("error against run time", total=len(todo.tasks))
+        for task, made, why in run(todo.tasks, executor):
+            points += made
+            missing += [Missing(str(task), why)] if why else []
+            bar.update(row, advance=1, description=str(task))
+    order = {name: k for k, name in enumerate(CASES)}
+    points.sort(key=lambda p: (order[p.case], p.method in BASELINES))
+    left = [f"{name}: {why}" for name, why in LEFT_OUT.items()] if cases is None else []
+    return ErrorReport([c.name for c in some], points, missing, todo.omissions + left, machine())
+
+
+def run(tasks: Sequence[Task], executor: Any = None) -> Iterable[tuple[Task, list[Point], str]]:
+    """Each task with its points, or with why it has none, as they are done."""
+    if executor is None:
+        for task in tasks:
+            yield attempt(task)
+        return
+    waiting = {}
+    for task in tasks:
+        try:
+            waiting[executor.submit(curve, task)] = task
+        except Exception as error:  # a pool that has lost a worker takes no more
+            yield task, [], said(error)
+    for future in as_completed(waiting):
+        try:
+            yield waiting[future], future.result(), ""
+        except Exception as error:
+            yield waiting[future], [], said(error)
+
+
+def attempt(task: Task) -> tuple[Task, list[Point], str]:
+    """A task here and now."""
+    try:
+        return task, curve(task), ""
+    except Exception as error:
+        return task, [], said(error)
+
+
+def said(error: BaseException) -> str:
+    """An error in a line."""
+    text = " ".join(f"{type(error).__name__}: {error}".split())
+    return text if len(text) <= 200 else text[:197] + "..."
+
+
+def machine() -> str:
+    """What the times were measured on."""
+    import os
+
+    name = platform.processor() or platform.machine()
+    try:
+        with open("/proc/cpuinfo") as file:
+            name = next(line.split(":", 1)[1].strip() for line in file if line.startswith("model name"))
+    except (OSError, StopIteration):
+        pass
+    return f"{name}, {os.cpu_count()} cores, {platform.system()}, Python {platform.python_version()}"
