@@ -301,6 +301,17 @@ class World(Access):
         snapshot.transfer(self, new)
         return new
 
+    def report(self, seconds: float, tolerance: float | None = None, **options):
+        """Error against run time of this scene, from its present state: a SceneReport with the cheapest settings, ready to paste.
+
+        seconds [s]: how far ahead. tolerance: error at the end [m], by default a thousandth of the motion. options: dt [s] of a
+        frame; substeps: those to try; progress: show a bar. Clones run; this world is not touched. Knobs keep their present
+        values. There is no known answer: the reference is the finest run, and how far that is off is estimated and said.
+        """
+        from .report.scene import scene_report
+
+        return scene_report(self, seconds, tolerance, **options)
+
     def close(self) -> None:
         """Free the memory on the device. Using the world afterwards raises RuntimeError."""
         for memory in self._memories:

@@ -10,7 +10,7 @@ from ...particles import Particles
 from .case import Case, Run, ends_at, known, links
 
 RATE = 4.0  # [1/s] of the drag that brings them to rest; after 10 s exp(-20) of a swing is left
-SETTLED = {"conserves": False, "trusted": 3e-9, "efforts": (5, 10, 20, 40, 80, 160)}
+SETTLED = {"conserves": False, "trusted": 3e-9, "efforts": (5, 10, 20, 40, 80)}
 
 
 def rope(n: int, length: float, span: float, alpha: float) -> tuple[Particles, list[Feature]]:
