@@ -26,6 +26,7 @@ class Baseline:
 
     name = ""
     soft = False  # knows compliance
+    frame: Any  # the kernel: (h, exp(-rate h), substeps, iterations, fresh)
 
     def __init__(self, particles: Particles, features: Sequence[Feature]):
         runtime.ensure_started()

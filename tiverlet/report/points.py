@@ -37,8 +37,9 @@ class Task:
 class Point:
     """One run: what it was, how wrong it ended and what it cost.
 
-    error in the unit of its case. seconds: median of `runs` runs of the first second after it was looked at, per simulated second, without compilation;
-    compile [s]: until the first frame was done. visits: constraints evaluated per simulated second; an elimination counts 2.5.
+    error in the unit of its case. seconds: per simulated second, the median of `runs` runs of its first frames, after one that is
+    looked at; without compilation. compile [s]: until the first frame was done. visits: constraints evaluated per simulated
+    second; an elimination counts 2.5.
     residual: the worst relative violation at the ends of frames. energy, momentum: the largest drift during the run, as a share
     of the largest kinetic energy and of the largest momentum; NaN where nothing is conserved. diverged: not finite, or further
     off than the whole motion.
@@ -86,15 +87,16 @@ def curve(task: Task) -> list[Point]:
         for substeps in task.efforts or case.efforts:
             world.substeps = substeps
             run, energy, momentum = observe(case, world)
-            times = timed(lambda: repeat(case, world), task.runs)
             with np.errstate(all="ignore"):
                 error = float(case.error(run)) if np.isfinite(world.position).all() else np.inf
+            left = residual_of(world)
+            times = timed(lambda: repeat(case, world), task.runs)
             flags: set[str] = set().union(*(r.flags for r in run.reports))
             visits = substeps * iterations * charge * count / case.frame
             point = Point(
                 case.name, task.method, task.precision, substeps, iterations, error,
                 float(np.median(times)), len(times), compiled, visits,
-                max((r.residual for r in run.reports), default=residual_of(world)), energy, momentum,
+                max((r.residual for r in run.reports), default=left), energy, momentum,
                 tuple(sorted(flags)), not error <= case.size,
             )  # fmt: skip
             out.append(point)

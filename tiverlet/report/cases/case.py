@@ -1,7 +1,7 @@
 """What a case is: a scene with a known answer, and how far from it a run ends."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
@@ -31,7 +31,7 @@ METHODS = {
 
 @cache
 def _file() -> dict[str, dict]:
-    text = resources.files(__package__).joinpath("cases.json").read_text()
+    text = resources.files("tiverlet.report.cases").joinpath("cases.json").read_text()
     return {c["id"]: c for c in json.loads(text)["cases"]}
 
 
@@ -73,7 +73,7 @@ class Case:
 
     name: str
     title: str
-    build: Callable[[], tuple[Particles, list[Feature]]]
+    build: Callable[[], tuple[Particles, Sequence[Feature]]]
     seconds: float
     error: Callable[[Run], float]
     limit: float

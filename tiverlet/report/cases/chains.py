@@ -11,7 +11,7 @@ from .case import Case, Run, ends_at, known, links, spin, upright
 CHAIN = ("Direct", "Jacobi")
 
 
-def hung(name: str) -> tuple[Particles, list[Feature]]:
+def hung(name: str) -> tuple[Particles, tuple[Gravity, Distance]]:
     """The planar chain of an entry, with its first particle as the anchor."""
     p = known(name)["params"]
     if name.startswith("D06"):  # "100 x 0.01", "all 90"
@@ -23,7 +23,7 @@ def hung(name: str) -> tuple[Particles, list[Feature]]:
     steps = np.stack([np.sin(angle), -np.cos(angle)], axis=1) * np.array(p["lengths"])[:, None]
     x = np.vstack([[0, 0], np.cumsum(steps, axis=0)])
     start = Particles(x, mass=np.r_[1.0, p["masses"]], pinned=[0])
-    return start, [Gravity(p["g"]), Distance(links(len(angle)))]
+    return start, (Gravity(p["g"]), Distance(links(len(angle))))
 
 
 def swings(name: str, t: float, limit: float, **more) -> Case:

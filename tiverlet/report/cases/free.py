@@ -1,5 +1,7 @@
 """Particles that are free, or on springs: falls, orbits, oscillators and the modes of chains."""
 
+from typing import Any
+
 import numpy as np
 import taichi as ti
 
@@ -157,7 +159,8 @@ def cast() -> tuple[Particles, list[Feature]]:
     pairs = [np.stack([k[:-1].ravel(), k[1:].ravel()], axis=1), np.stack([k[:, :-1].ravel(), k[:, 1:].ravel()], axis=1)]
     x = np.stack(np.divmod(np.arange(36.0), 6), axis=1) + rng.uniform(-0.1, 0.1, (36, 2))
     v, mass = rng.normal(size=(36, 2)) + [2.0, 5.0], np.exp(rng.uniform(0, np.log(100), 36))
-    net = Distance(np.concatenate(pairs), 1.0, compliance=np.where(np.arange(60) % 3 == 0, 1e-3, 0.0))
+    alpha: Any = np.where(np.arange(60) % 3 == 0, 1e-3, 0.0)
+    net = Distance(np.concatenate(pairs), 1.0, compliance=alpha)
     return Particles(x, velocity=v, mass=mass), [Gravity(9.81), net]
 
 

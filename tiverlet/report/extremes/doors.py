@@ -1,5 +1,7 @@
 """Rows about what is refused at the door: values that make no sense, with the name and the index of the first."""
 
+from typing import Any
+
 import numpy as np
 
 from ... import solvers
@@ -153,9 +155,10 @@ def _kappa() -> Finding:
 
 @row(65, "warm starting with one pass", "refused: it diverges always, so there is no such setting")
 def _warm() -> Finding:
+    no_such: Any = {"warm_start": 0.9}
     return refused(
-        *((lambda kind=kind: kind(warm_start=0.9), "warm_start") for kind in (solvers.Jacobi, solvers.Direct, solvers.Chebyshev)),
-        (scene(warm_start=0.9), "warm_start"),
+        *((lambda kind=kind: kind(**no_such), "warm_start") for kind in (solvers.Jacobi, solvers.Direct, solvers.Chebyshev)),
+        (scene(**no_such), "warm_start"),
     )
 
 

@@ -159,7 +159,7 @@ def _gravity() -> Finding:
             pull.g = g
             rerun(w, 0.5, 0.1)
             holds[f"g = {g:g}"] = bool(np.isclose(w.position[0, 1], -g * 0.125, rtol=1e-13, atol=0))
-        w.position, w.velocity = [[0.0, 0.0]], [[0.0, 0.0]]
+        w.position, w.velocity = np.zeros((1, 2)), np.zeros((1, 2))
         x, v = 0.0, 0.0
         for g in np.random.default_rng(0).uniform(-1e3, 1e3, 20):
             pull.g = g

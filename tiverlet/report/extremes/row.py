@@ -5,6 +5,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -54,7 +55,7 @@ def row(number: int, what: str, criterion: str) -> Callable:
 
 
 @contextmanager
-def world(particles: Particles, features: Sequence[Feature] = (), **settings) -> Iterator[World]:
+def world(particles: Particles, features: Sequence[Feature] = (), **settings) -> Iterator[Any]:
     """A world in f64 that is closed at the end; warnings about its structure are not shown."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -1,0 +1,288 @@
+"""The reports: what they measure, what they say of it, and that a defect in the engine does not get past them."""
+
+import json
+import multiprocessing
+import os
+import pathlib
+import re
+import shutil
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+from tiverlet.__main__ import main
+from tiverlet.report import CASES, baselines, errors, points
+from tiverlet.report.cases import LEFT_OUT, chosen, entries
+from tiverlet.report.certificate import certify
+from tiverlet.report.extremes import ROWS, Finding, Row
+
+from .conftest import figures, python, rms
+
+ROOT = pathlib.Path(tv.__file__).parent
+
+
+def test_every_known_answer_is_a_case_or_said_to_be_left_out():
+    named = {name.partition(":")[0] for name in CASES} | set(LEFT_OUT)
+    assert set(entries()) <= named
+    assert len(CASES) >= 25 and sorted(ROWS) == list(range(1, 71))
+    assert [c.name for c in chosen("D07_massratio_1000")] == [n for n in CASES if n.startswith("D07_massratio_1000")]
+    with pytest.raises(ValueError, match="'D99' fits no case. Near it: D0"):
+        chosen(["D99"])
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_cases_are_whole_frames_and_know_their_baselines(name):
+    case = CASES[name]
+    particles, features = case.build()
+    assert len(particles) and all(m in tv.report.METHODS for m in case.methods) and case.at in case.efforts
+    assert case.frames * case.frame == pytest.approx(case.seconds, rel=1e-9) and set(case.fit) <= set(case.efforts)
+    # A second scene of the same case is another one: features cannot act in two worlds.
+    assert not set(map(id, features)) & set(map(id, case.build()[1]))
+
+
+def test_baselines_are_the_textbook_ones():
+    # The prototypes' errors in cases.json, of XPBD with Gauss-Seidel: to the two digits that a different order of sums leaves.
+    for name, t, limit in (("D01_double_pendulum", 2.0, 0.02), ("D05_chain10", 0.5, 0.02)):
+        case = CASES[name]
+        with baselines.Xpbd(*case.build()) as w:
+            errors_ = []
+            for w.substeps in (20, 40):
+                w.restart()
+                for _ in range(case.frames):
+                    w.step(case.frame)
+                errors_.append(case.error(points.Run(w)))
+            assert errors_[0] == pytest.approx(figures(name, t, 20)["XPBD-GS"], rel=limit)
+            assert errors_[0] / errors_[1] == pytest.approx(2, abs=0.2)  # first order
+    # The article's start is late by a t dt / 2: 49 mm after 1 s at dt = 0.01.
+    with baselines.Article(tv.Particles([[0.0, 0.0]]), [tv.Gravity(9.81)]) as w:
+        w.substeps = 1
+        for _ in range(100):
+            w.step(0.01)
+        assert w.position[0, 1] + 9.81 / 2 == pytest.approx(-9.81 * 0.01 / 2, rel=1e-9)
+    refuses = baselines.Article.refuses
+    assert refuses([tv.Contact()]) and refuses([tv.Distance([[0, 1]], compliance=1.0)]) and not refuses([tv.Gravity()])
+
+
+@pytest.fixture(scope="module")
+def report():
+    """A small sweep: two links, and an elastic one."""
+    return tv.report.error_vs_time(["D01", "S04"], efforts=(10, 20, 40, 80), runs=1)
+
+
+def test_a_sweep_finds_second_order_and_first(report):
+    assert not report.failures and not report.missing
+    for case in report.cases:
+        assert report.order(case, CASES[case].methods[0]) == pytest.approx(2, abs=0.05)
+        assert report.order(case, "XPBD") is None or report.order(case, "XPBD") == pytest.approx(1, abs=0.1)
+    ours, theirs = report.curve("D01_double_pendulum", "Direct"), report.curve("D01_double_pendulum", "XPBD")
+    assert [p.substeps for p in theirs] == [10, 20, 40, 80, 320, 1280] and ours[1].error * 1000 < theirs[1].error
+    # Operations: 2 links, 20 substeps in 1/60 s; an elimination counts 2.5.
+    assert theirs[1].visits == 2 * 20 * 60 and ours[1].visits == 2.5 * 2 * 20 * 60
+    assert all(p.seconds > 0 and p.compile > 0 for p in report.points)
+    assert ours[-1].energy < 1e-5 < 1e-2 < theirs[1].energy
+    assert any("article on S04" in line for line in report.omissions)
+
+
+def test_a_report_can_be_read_by_people_and_machines(report, tmp_path):
+    data = json.loads(report.json())
+    assert len(data["points"]) == len(report.points) and not data["failures"] and data["machine"]
+    table, text = report.markdown(), str(report)
+    assert table.count("\n| ") == 2 and "D01" in text and "article on S04" in text
+    assert len(report.markdown(every=True).split("\n")) > len(report.points)
+    report.record(tmp_path / "curves.rrd")
+    assert (tmp_path / "curves.rrd").stat().st_size > 1000
+    pytest.importorskip("matplotlib")
+    assert [os.path.getsize(p) > 1000 for p in report.plot(tmp_path / "plots")] == [True, True]
+
+
+def test_what_is_wrong_is_said(report):
+    # The same points, made worse: the order of 1 instead of 2, an error above the limit, one that has diverged, a loss in f32.
+    case, method = "D01_double_pendulum", "Direct"
+
+    def altered(change, precision="f64"):
+        some = [change(p) if (p.case, p.method, p.precision) == (case, method, precision) else p for p in report.points]
+        return errors.ErrorReport([case], some, [], [], "")
+
+    assert re.search("order 1.0", str(altered(lambda p: replace(p, error=1e-6 * 20 / p.substeps)).failures))
+    assert re.search("limit 1e-05", str(altered(lambda p: replace(p, error=10 * p.error)).failures))
+    lost = altered(lambda p: replace(p, error=np.inf, diverged=True))
+    assert "diverged at 20" in str(lost.failures) and any("20 substeps: diverged" in line for line in lost.omissions)
+    assert json.loads(lost.json())["points"][0]["error"] is None
+    assert "f32: error" in str(altered(lambda p: replace(p, error=0.1), "f32").failures)
+    # Equal run time: a hundred times the error at the same cost is a factor of a hundred.
+    plain = [
+        replace(report.points[0], case=case, method="Direct", precision="f64", substeps=n, seconds=n, error=1 / n)
+        for n in (1, 2, 4)
+    ]
+    worse = [replace(p, method="XPBD", error=100 * p.error) for p in plain]
+    found = errors.ErrorReport([case], plain + worse, [], [], "").advantage(case, "Direct")
+    assert found == pytest.approx((100, 100))
+
+
+def die(task):
+    """What a worker that is killed does."""
+    os._exit(3)
+
+
+class Deadly:
+    """An executor whose worker dies of one task."""
+
+    def __init__(self, pool):
+        self.pool = pool
+
+    def submit(self, function, task):
+        return self.pool.submit(die if task.method == "XPBD" else function, task)
+
+
+def test_sweeps_run_in_processes_and_survive_one_that_dies():
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        found = tv.report.error_vs_time(
+            "D01", methods=["Direct"], precisions=("f64",), efforts=(20, 40), runs=1, executor=Deadly(pool)
+        )
+    assert [p.substeps for p in found.curve("D01_double_pendulum", "Direct")] == [20, 40]
+    assert any(m.task == "D01_double_pendulum, XPBD, f64" for m in found.missing) and "missing" in str(found)
+    assert any("BrokenProcessPool" in why for why in found.failures["D01_double_pendulum, XPBD, f64"])
+
+
+def test_sweeps_run_on_dask():
+    distributed = pytest.importorskip("distributed")
+    with distributed.Client(n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None) as client:
+        found = tv.report.error_vs_time(
+            "D01", methods=["Direct"], precisions=("f64",), efforts=(20,), baselines=False, executor=client.get_executor()
+        )
+    assert len(found.points) == 1 and not found.missing
+
+
+def test_the_certificate_tells_what_holds_and_what_does_not(monkeypatch, tmp_path, capsys):
+    def wrong():
+        raise RuntimeError("no such luck")
+
+    monkeypatch.setitem(ROWS, 71, Row(71, "a row", "holds", lambda: Finding("1 m", {"short": False, "long": True})))
+    monkeypatch.setitem(ROWS, 72, Row(72, "another", "works", wrong))
+    monkeypatch.setitem(ROWS, 73, Row(73, "an empty one", "says something", lambda: Finding("nothing")))
+    assert [certify(n).verdict for n in (71, 72, 73)] == ["FAILED"] * 3
+    assert certify(71).failing == ("short",) and "no such luck" in certify(72).failing[0]
+    path = str(tmp_path / "certificate.json")
+    assert main(["stress", "3", "5", "49", "64", "--workers", "1", "--json", path]) == 0
+    assert json.loads(pathlib.Path(path).read_text())["passed"] is True
+    assert main(["stress", "71", "3", "--workers", "1"]) == 1
+    assert "1 of 2 passed, 1 failed" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="rows has 99"):
+        tv.report.stress(rows=[99])
+
+
+@pytest.mark.parametrize("number", [10, 13, 19, 20, 28, 38, 59, 60, 63, 65, 66])
+def test_rows_about_doors_pass(number):
+    result = certify(number)
+    assert result.verdict == "passed", result
+
+
+def test_commands(capsys):
+    assert main(["info"]) == 0 and "taichi" in capsys.readouterr().out
+    assert main(["report", "--list"]) == 0 and "S05_tennis_racket" in capsys.readouterr().out
+    assert main(["report", "nonsense", "--workers", "1"]) == 2 and "fits no case" in capsys.readouterr().err
+    assert main(["stress", "--workers", "0"]) == 2
+
+
+def rope(world, **settings):
+    shape = tv.shapes.rope((0, 2), (1, 2), points=5)
+    return world(tv.Particles(shape.position, pinned=[0]), [tv.Gravity(9.81), tv.Distance(shape.links)], **settings)
+
+
+def test_a_world_reports_on_itself(world):
+    w = rope(world, solver=tv.Direct())
+    w.run(0.1)
+    before = w.hash()
+    found = w.report(0.3, tolerance=1e-3, substeps=(5, 10, 20, 40))
+    assert w.hash() == before and found.converges and found.order == pytest.approx(2, abs=0.1)
+    best = found.recommended
+    assert best and best.error + found.reference_error <= 1e-3
+    assert found.paste == f"world = tv.World(particles, features, {best.paste})" and "substeps=" in best.paste
+    # What it says of an error is so: against a reference that is a hundred times finer.
+    fine = w.clone(precision="f64", solver=tv.Direct(), substeps=1000)
+    fine.run(0.3)
+    for s in found.settings:
+        if (s.solver, s.precision) == ("Direct()", "f64"):
+            clone = w.clone(precision="f64", solver=tv.Direct(), substeps=s.substeps)
+            clone.run(0.3)
+            assert rms(clone.position, fine.position) == pytest.approx(s.error, abs=found.reference_error + 1e-2 * s.error)
+            clone.close()
+    fine.close()
+    single = [s for s in found.settings if s.precision == "f32"]
+    assert all(s.rounding > 0 and 0 <= s.share <= 1 for s in single)
+    data = json.loads(found.json())
+    assert len(data["settings"]) == len(found.settings) == 16 and "| Direct() |" in found.markdown() and "Pareto" in str(found)
+    nothing = w.report(0.3, tolerance=1e-12, substeps=(5, 10))
+    assert nothing.recommended is None and "No setting tried is within 1e-12 m" in nothing.paste
+    with pytest.raises(ValueError, match="from 2 on"):
+        w.report(0.3, substeps=[5])
+
+
+def test_a_world_says_what_breaks_it(world):
+    found = tv.report.stress(rope(world), seconds=0.3)
+    seen = {o.parameter: o for o in found.outcomes}
+    assert seen["as it is"].verdict == "stands it" and seen["NaN in one input"].verdict == "refused by name"
+    assert seen["all masses x 1e6"].verdict == "stands it" and seen["stiffnesses x 1e9"].verdict == "not tried"
+    # A pendulum in f32, a thousand kilometres from the origin, where an ulp is 6 cm.
+    assert "f32-compensated" in found.breaks["shifted by 1e+06 m"] and seen["shifted by 1e+06 m"].particle is not None
+    # One pass cannot hold a mass of 1e6 kg on links of 1 kg; it says which link gives most.
+    assert "Distance" in found.breaks["mass of one particle x 1e6"]
+    assert not found.passed and "BREAKS" in str(found) and json.loads(found.json())["passed"] is False
+
+
+PLANTS = {
+    "the gradient at the predicted position": (
+        "error_vs_time('D01', methods=['Jacobi'], precisions=('f64',), efforts=(20, 40, 80), baselines=False, runs=1)",
+        [("scalar.py", "f0, n = self.measure(c, self.corners(c, 1))", "f0, n = self.measure(c, self.corners(c, 0))")],
+    ),
+    "averaging by the count of constraints": (
+        "error_vs_time('M01', precisions=('f64',), efforts=(20,), baselines=False, runs=1)",
+        [
+            ("solvers/slots.py", "n, values=blocks * inv_mass)", "n, values=inv_mass)"),
+            (
+                "solvers/slots.py",
+                "        return total\n",
+                "        return total / ti.max(self.begin[i + 1] - self.begin[i], 1)\n",
+            ),
+        ],
+    ),
+    "one contact in a hundred dropped": (
+        "stress(rows=[30])",
+        [("grid.py", "ti.max(ti.min(used, room) - begin, 0)", "ti.max(ti.min(used, room) - begin - (i % 100 == 7), 0)")],
+    ),
+    "gravity lost in f32": (
+        "stress(rows=[11])",
+        [
+            (
+                "phases.py",
+                "self.state.advance(i, self.dithered(self.state.x[i], d, tick, DITHER[1]))",
+                "before = self.state.x[i]; self.state.x[i] += d; self.state.d[i] = self.state.x[i] - before",
+            )
+        ],
+    ),
+}
+
+
+@pytest.mark.parametrize("defect", PLANTS)
+def test_a_planted_defect_is_caught(defect, tmp_path):
+    # A copy of the package with the defect; without it the same reports pass, see above and `python -m tiverlet stress`.
+    call, edits = PLANTS[defect]
+    shutil.copytree(ROOT, tmp_path / "tiverlet", ignore=shutil.ignore_patterns("__pycache__"))
+    for file, sound, broken in edits:
+        path = tmp_path / "tiverlet" / file
+        text = path.read_text()
+        assert sound in text, f"{file} has changed; plant the defect anew"
+        path.write_text(text.replace(sound, broken))
+    code = f"""
+import tiverlet as tv
+assert tv.__file__.startswith({str(tmp_path)!r})
+found = tv.report.{call}
+print(found)
+good = found.passed if hasattr(found, "passed") else not found.failures
+raise SystemExit(0 if good else 7)
+"""
+    done = python(code, check=False, PYTHONPATH=str(tmp_path))
+    assert done.returncode == 7, done.stdout + done.stderr
