@@ -72,7 +72,7 @@ class SceneReport:
     @property
     def converges(self) -> bool:
         """Whether the reference is one: closer to the truth than a tenth of the motion."""
-        return self.reference_error < ITSELF * self.motion
+        return bool(self.reference_error < ITSELF * self.motion)
 
     @property
     def recommended(self) -> Setting | None:
