@@ -74,7 +74,7 @@ class Baseline:
     def step(self, dt: float) -> None:
         """A frame of dt [s]."""
         h = dt / self.substeps
-        with runtime.literals(ti.f64):
+        with self.memory.compiler():
             self.frame(h, np.exp(-self.rate * h), self.substeps, self.iterations, int(self.fresh))
         self.fresh = False
 
