@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import taichi as ti
 
 import tiverlet as tv
 from tiverlet.__main__ import main
@@ -231,6 +232,37 @@ def test_a_world_says_what_breaks_it(world):
     # One pass cannot hold a mass of 1e6 kg on links of 1 kg; it says which link gives most.
     assert "Distance" in found.breaks["mass of one particle x 1e6"]
     assert not found.passed and "BREAKS" in str(found) and json.loads(found.json())["passed"] is False
+
+
+@ti.func
+def spoilt(x, v, t, i):
+    """Not a number for particle 3, after 0.14 s."""
+    f = 0.0 * x
+    if t > 0.139 and i == 3:
+        f[0] = ti.sqrt(-1.0 - x[0] * x[0])
+    return f
+
+
+def test_an_autopsy_names_what_went_wrong_first(world, tmp_path):
+    # Frames of 0.05 s with 5 substeps: t = 0.14 is at the end of substep 3 of frame 2; the force acts in the next one.
+    chain = tv.Distance([[0, 1], [1, 2], [2, 3], [3, 4]])
+    start = tv.Particles(np.arange(10.0).reshape(5, 2), pinned=[0])
+    w = world(start, [tv.Gravity(), chain, tv.Force(spoilt)], substeps=5, precision="f64")
+    before = w.hash()
+    found = tv.report.autopsy(w, 1.0, dt=0.05)
+    assert w.hash() == before and found.found and "non-finite" in found.report.flags and found.particle == 3
+    assert (found.frame, found.substep) == (2, 4) and found.times[-1] == pytest.approx(0.15)
+    assert {s.members for s in found.suspects} == {(2, 3), (3, 4)} and "Particle 3 shows it" in str(found)
+    assert np.isfinite(found.positions[:-1]).all() and np.isnan(found.positions[-1, 3]).any()
+    # The states are those of the run itself, bit for bit.
+    w.run(0.1, dt=0.05)
+    np.testing.assert_array_equal(found.positions[0], w.position)
+    found.record(tmp_path / "wrong.rrd")
+    assert (tmp_path / "wrong.rrd").stat().st_size > 1000
+    good = tv.report.autopsy(w, 0.02, dt=0.02)
+    assert not good.found and str(good) == "Nothing went wrong."
+    with pytest.raises(RuntimeError, match="nothing went wrong"):
+        good.record(tmp_path / "nothing.rrd")
 
 
 PLANTS = {

@@ -29,7 +29,7 @@ class Summary:
     """One case: its first method in f64 at the substeps that its limit is for, and what that is compared with.
 
     advantage, over_article: how many times smaller the error is than that of XPBD and the article's scheme at the same run time,
-    see ErrorReport.advantage. single: the error in f32. failures: what is wrong with it.
+    see ErrorReport.advantage. order: by the solver shown_by. single: the error in f32. failures: what is wrong with it.
     """
 
     case: str
@@ -38,6 +38,7 @@ class Summary:
     error: float
     unit: str
     order: float | None
+    shown_by: str
     seconds: float
     energy: float
     momentum: float
@@ -98,9 +99,10 @@ class ErrorReport:
         points = self.curve(name, method)
         best = next((p for p in points if p.substeps == case.at), points[-1])
         single = next((p.error for p in self.curve(name, method, "f32") if p.substeps == best.substeps), None)
-        slope = next((o for m in case.methods if (o := self.order(name, m)) is not None), None) if case.order else None
+        shown = [(o, m) for m in case.methods if (o := self.order(name, m)) is not None] if case.order else []
+        slope, by = (shown or [(None, "")])[0]
         return Summary(
-            name, method, best.substeps, best.error, case.unit, slope, best.seconds, best.energy, best.momentum, single,
+            name, method, best.substeps, best.error, case.unit, slope, by, best.seconds, best.energy, best.momentum, single,
             self.advantage(name, method, "XPBD"), self.advantage(name, method, "article"),
             tuple(self.faults(case, method, best)),
         )  # fmt: skip
@@ -235,7 +237,7 @@ def front(points: list[Point]) -> np.ndarray:
 def cells(s: Summary) -> tuple[str, ...]:
     """A line of the table."""
     return (
-        s.case, s.method, str(s.substeps), f"{s.error:.1e} {s.unit}", "" if s.order is None else f"{s.order:.2f}",
+        s.case, s.method, str(s.substeps), f"{s.error:.1e} {s.unit}", ordered(s),
         f"{1e3 * s.seconds:.1f}", times(s.advantage), times(s.over_article), "" if s.single is None else f"{s.single:.1e}",
         drift(s.energy), drift(s.momentum), "; ".join(s.failures) or "ok",
     )  # fmt: skip
@@ -248,6 +250,13 @@ def entry(p: Point) -> tuple[str, ...]:
         p.method, p.precision, f"{p.substeps} x {p.iterations}", error, f"{p.seconds:.2e}", f"{p.visits:.1e}",
         f"{p.residual:.1e}", drift(p.energy), f"{p.compile:.1f}", " ".join(p.flags),
     )  # fmt: skip
+
+
+def ordered(s: Summary) -> str:
+    """The order, and the solver that shows it where the first one has no error of the step left."""
+    if s.order is None:
+        return ""
+    return f"{s.order:.2f}" if s.shown_by == s.method else f"{s.order:.2f} ({s.shown_by})"
 
 
 def times(ratios: tuple[float, float] | None) -> str:

@@ -51,7 +51,7 @@ class Setting:
         """The arguments of a World with these settings."""
         words = [f"substeps={self.substeps}"]
         words += [f"iterations={self.iterations}"] if self.iterations != 1 else []
-        words += [f"solver=tv.{self.solver}"] if not self.solver.startswith("Jacobi(relaxation=1)") else []
+        words += [f"solver=tv.{self.solver}"]
         words += [f'precision="{self.precision}"'] if self.precision != "f32" else []
         return ", ".join(words)
 

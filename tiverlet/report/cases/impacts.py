@@ -143,5 +143,5 @@ CASES = [
     Case("R19_sphere_departure", "Sliding off a smooth disc", round_hill, 1.4, leaves, 0.3, 30.0, "degrees", order=None,
          conserves=False),
     Case("R21_stack_N", "Column of ten discs: forces at rest", column, 6.0, carried, 1e-3, 1.0, "relative",
-         efforts=(5, 10, 20, 40), order=None, conserves=False),
+         efforts=(5, 10, 20, 40), order=None, single=0.15, conserves=False),  # the top pair overlaps by 14 ulps
 ]  # fmt: skip
