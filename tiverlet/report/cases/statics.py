@@ -91,8 +91,8 @@ def hollows(n: int, alpha: float, limit: float) -> Case:
         return abs(float(run.world.position[(n + 1) ** 2 // 2, 1]) / want - 1)
 
     return Case(
-        f"S08_net_sag:{key}", f"Net of {n} x {n} cells, {alpha:g} m/N", lambda: net(n, alpha), 12.0, error, limit, 1.0, "relative",
-        methods=("CG x 20", "Jacobi"), **SETTLED,
+        f"S08_net_sag:{key}", f"Net of {n} x {n} cells, {alpha:g} m/N", lambda: net(n, alpha), 12.0, error, limit, 1.0,
+        "relative", methods=("CG x 20", "Jacobi"), **SETTLED,
     )  # fmt: skip
 
 
