@@ -11,7 +11,7 @@ rope = tv.shapes.rope((0, 2), (1, 2), points=40)
 world = tv.World(
     tv.Particles(rope.position, mass=0.01, radius=0.01, pinned=[0]),
     [tv.Gravity(9.81), tv.Distance(rope.links), tv.Box((-2, 0), (2, 3)), tv.Contact()],
-    substeps=20,
+    substeps="auto",
 )
 with tv.Recorder("rope.rrd", world) as recorder:
     report = world.run(5.0, recorder=recorder)
