@@ -16,29 +16,31 @@ from tiverlet.commands import run
 from tiverlet.recording import viewer
 
 HERE = pathlib.Path(__file__).parent
-# Each picture: its width, and the demos in it with the frame to show, in rows.
+# Each picture: its width, and in rows the demos in it, with the frame to show and from where to where of the scene's height.
 PICTURES = {
-    "article": (1200, [[("article", 290)]]),
-    "hourglass": (900, [[("hourglass", 200)]]),
-    "net": (1020, [[("net", 26)]]),
-    "polygons": (800, [[("polygons", 400)]]),
-    "bodies": (1200, [[("soft", 60), ("cloth", 150)], [("ragdoll", 150), ("machine", 200)]]),
+    "article": (1200, [[("article", 290, 0.0, 1.0)]]),
+    "hourglass": (900, [[("hourglass", 90, 0.22, 0.9)]]),
+    "net": (1020, [[("net", 26, 0.0, 1.0)]]),
+    "polygons": (800, [[("polygons", 400, 0.0, 1.0)]]),
+    "bodies": (
+        1200,
+        [[("soft", 60, 0.4, 1.0), ("cloth", 150, 0.0, 1.0)], [("ragdoll", 150, 0.3, 1.0), ("machine", 200, 0.0, 1.0)]],
+    ),
 }
 MARGIN = 12  # pixels of background that are left around a scene
 
 
-def scene(demo: str, frame: int, folder: str) -> Image.Image:
-    """One frame of one demo, without the empty background around it."""
+def scene(folder: str, demo: str, frame: int, begin: float, end: float) -> Image.Image:
+    """One frame of one demo, without the empty background around it, from one part of its height to another."""
     out, png = f"{folder}/{demo}.rrd", f"{folder}/{demo}.png"
     with run.recording(out):
         run.execute(run.find(demo), [])
     viewer.picture(out, png, [frame], scene=True)
     pixels = viewer.pixels_of(png)
     drawn = (np.abs(pixels.astype(int) - pixels[-1, -1]) > 40).any(axis=2)
-    drawn[: len(drawn) // 20] = False  # the title of the view
-    (top, bottom), (left, right) = ((int(v.min()), int(v.max())) for v in np.nonzero(drawn))
-    box = (left - MARGIN, max(top - MARGIN, len(drawn) // 20), right + MARGIN, bottom + MARGIN)
-    return Image.fromarray(pixels).crop(box)
+    (top, bottom), (left, right) = ((max(int(v.min()) - MARGIN, 0), int(v.max()) + MARGIN) for v in np.nonzero(drawn))
+    image = Image.fromarray(pixels).crop((left, top, right, bottom))
+    return image.crop((0, round(begin * image.height), image.width, round(end * image.height)))
 
 
 def compose(rows: list[list[Image.Image]], width: int) -> Image.Image:
@@ -64,7 +66,7 @@ def main(names: list[str]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         for name in names or PICTURES:
             width, rows = PICTURES[name]
-            out = compose([[scene(demo, frame, folder) for demo, frame in row] for row in rows], width)
+            out = compose([[scene(folder, *what) for what in row] for row in rows], width)
             out.quantize(128).save(HERE / f"{name}.png", optimize=True)
             print(HERE / f"{name}.png", out.size)
 
