@@ -121,7 +121,7 @@ class Drawing:
             middle = x[pairs[:, 1]] + found.normal * (r[pairs[:, 1]] - found.overlap / 2)[:, None]
         else:
             middle = np.zeros((0, world.particles.dim))
-        self._log(f"{SCENE}/contacts", self._points(middle.astype(np.float32), radii=[-1.5], colors=[[255, 220, 120]]))
+        self._log(f"{SCENE}/contacts", self._points(middle.astype(np.float32), radii=[-1.2], colors=[[20, 22, 28]]))
         self.bytes += middle.nbytes // 2
 
     def _breaks(self, x: np.ndarray) -> None:

@@ -21,7 +21,7 @@ import numpy as np
 
 from .. import snapshot
 from ..survey import StepReport
-from . import scene
+from . import rrd, scene
 
 if TYPE_CHECKING:
     from ..world import World
@@ -142,3 +142,34 @@ class Journal:
         """Look away."""
         if self in self.world._watchers:
             self.world._watchers.remove(self)
+
+
+def read(path: str, chunks: list[Any], whole: bool) -> tuple[list[Entry], str]:
+    """The entries in order, checked, and what is to be said about them."""
+    packed = []
+    for chunk in chunks:
+        if chunk.entity_path == f"/{JOURNAL}":
+            packed += zip(*(rrd.rows(chunk, name) for name in ("text", "blob", "checksum")), strict=True)
+    rows = sorted(((json.loads(text)["serial"], text, blob, mark) for text, blob, mark in packed), key=lambda row: row[0])
+    if not rows:
+        why = "is not a recording of tiverlet; `rerun` shows it" if whole else "was cut short before anything was flushed"
+        raise ValueError(f"replay: {path} {why}.")
+    first = json.loads(rows[0][1])
+    if first["kind"] == "scene" and first["data"]["format"] != FORMAT:
+        theirs, version = first["data"]["format"], first["data"]["environment"]["tiverlet"]
+        raise ValueError(
+            f"replay: {path} is in format {theirs}, of tiverlet {version}, but this version reads format {FORMAT}. "
+            "The picture opens with `rerun`; for the rest use that version."
+        )
+    entries, mark = [], ""
+    for k, (serial, text, blob, wanted) in enumerate(rows):
+        if serial != k:
+            return entries, f" Entry {k} of the journal is missing, so it is read up to there."
+        mark = checksum(mark, text, blob.tobytes())
+        entry = Entry.unpack(text, blob.tobytes())
+        if mark != wanted:
+            raise ValueError(
+                f"replay: {path} was changed after it was recorded: entry {k}, {entry.kind!r} of frame {entry.frame}."
+            )
+        entries.append(entry)
+    return entries, ""

@@ -181,10 +181,9 @@ class Recorder:
         journal.stirred.clear()
         if report:
             self._curves.add(number, report, now)
-            for note in report.notes:
-                if note not in self._seen:
-                    self._seen.add(note)
-                    self._drawing.event(note, "WARN")
+            if report.flags - self._seen:
+                self._seen |= report.flags
+                self._drawing.event(" ".join(report.notes), "WARN")
         self.frames += 1
 
     def close(self) -> None:

@@ -1,6 +1,5 @@
 """Reading a recording back: its picture, a world that goes on from any frame, and the proof that both are true."""
 
-import json
 import os
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
@@ -10,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import snapshot
-from . import rrd, scene
-from .journal import FORMAT, JOURNAL, PARTICLES, Entry, checksum
+from . import journal, rrd, scene
+from .journal import Entry
 
 if TYPE_CHECKING:
     from ..world import World
@@ -43,11 +42,11 @@ class Replay:
     def __init__(self, path: str, given: Mapping[str, Any]):
         self.path, self._given = path, given
         with rrd.chunks(path) as (chunks, whole):
-            self._entries, trouble = _journal(path, chunks, whole)
+            self._entries, trouble = journal.read(path, chunks, whole)
             first = self._entries[0]
             dim = first.arrays["position"].shape[1]
-            drawn = _by_frame(chunks, PARTICLES, f"Points{dim}D:positions")
-            self.curves = _curves(chunks)
+            drawn = rrd.by_frame(chunks, journal.PARTICLES, f"Points{dim}D:positions")
+            self.curves = rrd.curves(chunks)
         if not len(first.arrays["position"]):
             drawn = {e.frame: np.zeros(0, dtype=np.float32) for e in self._entries if e.kind == "frame"}
         self._drawn = {k: x.reshape(-1, dim) for k, x in drawn.items()}
@@ -257,51 +256,3 @@ def _differing(now: np.ndarray, then: np.ndarray | None) -> int | None:
     bits = [np.ascontiguousarray(a).view(np.uint8).reshape(len(a), -1) for a in (now, then)]
     rows = (bits[0] != bits[1]).any(axis=1)
     return int(np.argmax(rows)) if rows.any() else None
-
-
-def _journal(path: str, chunks: list[Any], whole: bool) -> tuple[list[Entry], str]:
-    """The entries in order, checked, and what is to be said about them."""
-    packed = []
-    for chunk in chunks:
-        if chunk.entity_path == f"/{JOURNAL}":
-            packed += zip(*(rrd.rows(chunk, name) for name in ("text", "blob", "checksum")), strict=True)
-    read = sorted(((json.loads(text)["serial"], text, blob, mark) for text, blob, mark in packed), key=lambda row: row[0])
-    if not read:
-        why = "is not a recording of tiverlet; `rerun` shows it" if whole else "was cut short before anything was flushed"
-        raise ValueError(f"replay: {path} {why}.")
-    first = json.loads(read[0][1])
-    if first["kind"] == "scene" and first["data"]["format"] != FORMAT:
-        theirs, version = first["data"]["format"], first["data"]["environment"]["tiverlet"]
-        raise ValueError(
-            f"replay: {path} is in format {theirs}, of tiverlet {version}, but this version reads format {FORMAT}. "
-            "The picture opens with `rerun`; for the rest use that version."
-        )
-    entries, mark = [], ""
-    for k, (serial, text, blob, wanted) in enumerate(read):
-        if serial != k:
-            return entries, f" Entry {k} of the journal is missing, so it is read up to there."
-        mark = checksum(mark, text, blob.tobytes())
-        entry = Entry.unpack(text, blob.tobytes())
-        if mark != wanted:
-            raise ValueError(
-                f"replay: {path} was changed after it was recorded: entry {k}, {entry.kind!r} of frame {entry.frame}."
-            )
-        entries.append(entry)
-    return entries, ""
-
-
-def _by_frame(chunks: list[Any], entity: str, column: str) -> dict[int, np.ndarray]:
-    out = {}
-    for chunk in chunks:
-        if chunk.entity_path == f"/{entity}" and not chunk.is_static and column in chunk.to_record_batch().schema.names:
-            out.update(zip(rrd.numbers(chunk, "frame").tolist(), rrd.rows(chunk, column), strict=True))
-    return dict(sorted(out.items()))
-
-
-def _curves(chunks: list[Any]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Frames and values of each figure."""
-    names = {chunk.entity_path for chunk in chunks if chunk.entity_path.startswith("/figures/")}
-    found = {name: _by_frame(chunks, name[1:], "Scalars:scalars") for name in sorted(names)}
-    return {
-        name[len("/figures/") :]: (np.array(list(by)), np.concatenate(list(by.values()))) for name, by in found.items() if by
-    }  # fmt: skip

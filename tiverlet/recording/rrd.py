@@ -82,3 +82,21 @@ def rows(chunk: Any, column: str) -> list:
 def numbers(chunk: Any, timeline: str) -> np.ndarray:
     """The times of the rows of a chunk."""
     return chunk.to_record_batch().column(timeline).to_numpy(zero_copy_only=False)
+
+
+def by_frame(chunks: list[Any], entity: str, column: str) -> dict[int, np.ndarray]:
+    """What a column of an entity has, by frame."""
+    out = {}
+    for chunk in chunks:
+        if chunk.entity_path == f"/{entity}" and not chunk.is_static and column in chunk.to_record_batch().schema.names:
+            out.update(zip(numbers(chunk, "frame").tolist(), rows(chunk, column), strict=True))
+    return dict(sorted(out.items()))
+
+
+def curves(chunks: list[Any]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Frames and values of each figure."""
+    names = {chunk.entity_path for chunk in chunks if chunk.entity_path.startswith("/figures/")}
+    found = {name: by_frame(chunks, name[1:], "Scalars:scalars") for name in sorted(names)}
+    return {
+        name[len("/figures/") :]: (np.array(list(by)), np.concatenate(list(by.values()))) for name, by in found.items() if by
+    }  # fmt: skip
