@@ -181,6 +181,13 @@ def test_rows_about_doors_pass(number):
     assert result.verdict == "passed", result
 
 
+@pytest.mark.parametrize("number", [2, 22, 45, 55, 62])
+def test_some_rows_about_scenes_pass(number):
+    # All 70 take a minute: python -m tiverlet stress.
+    result = certify(number)
+    assert result.verdict == "passed", result
+
+
 def test_commands(capsys):
     assert main(["info"]) == 0 and "taichi" in capsys.readouterr().out
     assert main(["report", "--list"]) == 0 and "S05_tennis_racket" in capsys.readouterr().out
