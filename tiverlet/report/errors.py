@@ -28,8 +28,9 @@ class Missing:
 class Summary:
     """One case: its first method in f64 at the substeps that its limit is for, and what that is compared with.
 
-    advantage, over_article: how many times smaller the error is than that of XPBD and the article's scheme at the same run time,
-    see ErrorReport.advantage. order: by the solver shown_by. single: the error in f32. failures: what is wrong with it.
+    in_time, in_work, over_article: how many times larger the error of XPBD is at the same run time and at the same number of
+    constraint visits, and that of the article's scheme at the same run time, see ErrorReport.advantage. order: by the solver
+    shown_by. single: the error in f32. failures: what is wrong with it.
     """
 
     case: str
@@ -43,7 +44,8 @@ class Summary:
     energy: float
     momentum: float
     single: float | None
-    advantage: tuple[float, float] | None
+    in_time: tuple[float, float] | None
+    in_work: tuple[float, float] | None
     over_article: tuple[float, float] | None
     failures: tuple[str, ...]
 
@@ -74,13 +76,14 @@ class ErrorReport:
         """The order of convergence by least squares over the points that show one; None where fewer than three do."""
         return fitted(CASES[case], self.curve(case, method, precision))
 
-    def advantage(self, case: str, method: str, against: str = "XPBD") -> tuple[float, float] | None:
-        """How many times larger the error of a baseline is at equal run time: the median, and the least.
+    def advantage(self, case: str, method: str, against: str = "XPBD", cost: str = "seconds") -> tuple[float, float] | None:
+        """How many times larger the error of a baseline is at equal cost: the median, and the least.
 
-        Between their points, over the run times that both curves cover (None where they have none in common). A frame costs a
-        fixed time, most of which is Python's in small scenes, and so much for each substep: both are fitted to measured times.
+        cost: "seconds" or "visits" (of constraints). Between their points, over what both curves cover (None where that is
+        nothing). A frame costs a fixed time, most of which is Python's in small scenes, and so much for each substep: both are
+        fitted to the measured times. Visits are the same on every machine.
         """
-        ours, theirs = (front(self.curve(case, name)) for name in (method, against))
+        ours, theirs = (front(self.curve(case, name), cost) for name in (method, against))
         if not len(ours) or not len(theirs):
             return None
         low, high = max(ours[0, 0], theirs[0, 0]), min(ours[-1, 0], theirs[-1, 0])
@@ -103,7 +106,7 @@ class ErrorReport:
         slope, by = (shown or [(None, "")])[0]
         return Summary(
             name, method, best.substeps, best.error, case.unit, slope, by, best.seconds, best.energy, best.momentum, single,
-            self.advantage(name, method, "XPBD"), self.advantage(name, method, "article"),
+            self.advantage(name, method), self.advantage(name, method, cost="visits"), self.advantage(name, method, "article"),
             tuple(self.faults(case, method, best)),
         )  # fmt: skip
 
@@ -195,7 +198,7 @@ class ErrorReport:
         record(self, path)
 
 
-HEADS = ("case", "solver", "substeps", "error", "order", "ms per s", "XPBD / ours", "article / ours", "f32 error", "energy drift",
+HEADS = ("case", "solver", "substeps", "error", "order", "ms per s", "XPBD / ours", "at equal work", "article / ours", "f32 error", "energy drift",
          "momentum drift", "verdict")  # fmt: skip
 COLUMNS = (
     "solver",
@@ -223,14 +226,15 @@ def fitted(case: Case, points: list[Point]) -> float | None:
     return -float(np.polyfit(np.log([p.substeps for p in some]), np.log([p.error for p in some]), 1)[0])
 
 
-def front(points: list[Point]) -> np.ndarray:
-    """The logarithms of run time, by a fixed cost and one for each substep, and of the best error within it, (k, 2)."""
-    good = [p for p in points if np.isfinite(p.error) and p.error > 0]
+def front(points: list[Point], cost: str) -> np.ndarray:
+    """The logarithms of a cost, and of the best error within it, (k, 2)."""
+    good = [p for p in points if np.isfinite(p.error) and p.error > 0 and getattr(p, cost) > 0]
     if len(good) < 3:
         return np.zeros((0, 2))
-    n, t = np.array([p.substeps for p in good], dtype=float), np.array([p.seconds for p in good])
-    slope, fixed = np.polyfit(n, t, 1, w=1 / t)
-    t = np.maximum(fixed, 0.1 * t.min()) + max(slope, 1e-12) * n
+    n, t = np.array([p.substeps for p in good], dtype=float), np.array([getattr(p, cost) for p in good])
+    if cost == "seconds":
+        slope, fixed = np.polyfit(n, t, 1, w=1 / t)
+        t = np.maximum(fixed, 0.1 * t.min()) + max(slope, 1e-12) * n
     return np.log(np.stack([t, np.minimum.accumulate([p.error for p in good])], axis=1))
 
 
@@ -238,7 +242,7 @@ def cells(s: Summary) -> tuple[str, ...]:
     """A line of the table."""
     return (
         s.case, s.method, str(s.substeps), f"{s.error:.1e} {s.unit}", ordered(s),
-        f"{1e3 * s.seconds:.1f}", times(s.advantage), times(s.over_article), "" if s.single is None else f"{s.single:.1e}",
+        f"{1e3 * s.seconds:.1f}", times(s.in_time), times(s.in_work), times(s.over_article), "" if s.single is None else f"{s.single:.1e}",
         drift(s.energy), drift(s.momentum), "; ".join(s.failures) or "ok",
     )  # fmt: skip
 
