@@ -1,14 +1,16 @@
 """What the user of a world reads and sets: state, clock, settings, and who is near or in contact."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
-from . import checks, composition, runtime
+from . import checks, composition, regroup, runtime
 from .breaking import BREAKS
 from .feature import Feature
 from .particles import Particles, in_range
 from .queries import Contacts, Search, near_by_all, nearest
+from .regroup import Handle
 from .survey import StepReport
 
 
@@ -27,7 +29,8 @@ class Access:
     _time: float
     _tick: int
     _fresh: bool
-    _placed: bool
+    _placed: int | None
+    _handles: Any
     _energy: float | None
     _last: StepReport | None
     _search: Search | None
@@ -55,7 +58,7 @@ class Access:
         with self._memory.compiler():
             self._restart()
             self._scene.state.put(self._memory, value)
-        self._energy, self._placed = None, True
+        self._energy, self._placed = None, 0
         if self._grid:
             self._grid.stale[None] = 1
 
@@ -206,6 +209,39 @@ class Access:
     def fields(self) -> dict[str, int]:
         """Every field on the device, by name, and its size [bytes]."""
         return {e.name: e.bytes for memory in self._memories for e in memory.entries}
+
+    def add(self, particles: Particles | None = None, features: Iterable[Feature] = ()) -> Handle:
+        """Add particles and features, between frames. Returns a handle to the particles, see Handle.
+
+        The new particles come after the last; features name all of them by their numbers, so a rope that is added on top of n
+        particles has the links shapes.rope(...).links + n. Rest values that are not given are taken from the present positions.
+        Particles that overlap others part gently, as at the start.
+
+        What was there goes on to the bit: time, positions, velocities, multipliers, the history of springs, what pairs in contact
+        remember. Where a force or a spring is added, displacements are first turned into velocities, as when a force changes.
+        It costs what building a world costs, some seconds of compiling for a large scene: add many things at once.
+
+        Raises as World() does, and RuntimeError while it is recorded; the world is then as before.
+        """
+        return regroup.add(self, particles, features)
+
+    def remove(self, particles: Any = (), features: Iterable[Feature] = ()) -> None:
+        """Remove particles and features, between frames.
+
+        particles: a handle, indices or a Boolean mask. The others close up, in order. A constraint goes with any of its
+        particles, and so do a loop, a surface, a cluster or a body of Polygons, whole; what it was part of stays, with what is
+        left, in the same Python object, and costs nothing once it is empty. features: of world.features; they become free.
+
+        What stays goes on to the bit, see add(). A force that goes with a particle is gone from the next substep on, as when a
+        constraint breaks. Functions of the user's own that take the number of a particle or constraint get the new one.
+
+        Raises ValueError or TypeError for what there is not, and RuntimeError while it is recorded; the world is then as before.
+        """
+        regroup.remove(self, particles, features)
+
+    def handle(self, particles: Any) -> Handle:
+        """A handle to some particles, by indices or a Boolean mask; it knows their numbers when others are removed."""
+        return regroup.handle(self, regroup.chosen(self, "World.handle", particles))
 
     @property
     def _memories(self) -> list[runtime.Memory]:

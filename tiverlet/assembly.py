@@ -1,6 +1,6 @@
 """Building a world: what of its scene exists on the device, and in which order it comes to be."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -49,17 +49,23 @@ class Assembly:
 
 
 def assemble(
-    particles: Particles, features: tuple[Feature, ...], solver: Solver | None, precision: str, path: str, order: int
+    particles: Particles, features: tuple[Feature, ...], starts: Sequence[Particles | None], first: int,
+    solver: Solver | None, precision: str, path: str, order: int,
 ) -> Assembly:  # fmt: skip
     """Check the features against the particles and each other, then declare and place every field, in one tree.
 
-    solver: None for the one that suits the structure.
+    particles: as they are now. starts: for each feature how they were when it came; None if it comes now. first: from this
+    number on particles come now. solver: None for the one that suits the structure.
     """
     inv_mass = particles.inv_mass.copy()
-    for feature in features:
-        feature.prepare(particles, inv_mass)
-    for feature in features:
-        feature.review(particles, inv_mass)
+    for feature, start in zip(features, starts, strict=True):
+        feature.start = particles if start is None else start
+        feature.prepare(feature.start, inv_mass)
+    for feature, start in zip(features, starts, strict=True):
+        if start is None:
+            feature.review(particles, inv_mass)
+        else:
+            feature.admit(particles, first)
     runtime.ensure_started()
     if precision == "f32-compensated" and runtime.fast_math():
         raise ValueError(
@@ -93,7 +99,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     surfaces = [*walls, *([contact] if contact else [])]
     starts = any(f.rubs for f in surfaces) or any(w.sweeps for w in walls)
     state.remember(memory, starts, any(f.bounces for f in surfaces), bool(contact and walls))
-    solver = solver or (by_structure(batches, particles.position, scene.inv_mass) if scene.order == 2 else Direct())
+    solver = solver or (by_structure(batches, scene.inv_mass) if scene.order == 2 else Direct())
     if batches:
         scene.slots = Slots(scene, batches, solver)
         if scene.order > 2:
@@ -129,7 +135,7 @@ def checked_features(features: Iterable[Feature]) -> tuple[Feature, ...]:
     return features
 
 
-def by_structure(batches: list[Batch], position: np.ndarray, inv_mass: np.ndarray) -> Solver:
+def by_structure(batches: list[Batch], inv_mass: np.ndarray) -> Solver:
     """The solver of a world whose user names none.
 
     Direct where links hang together like chains, trees or loops: for the cost of one relaxation it leaves some 1e-4 of the length
@@ -141,8 +147,8 @@ def by_structure(batches: list[Batch], position: np.ndarray, inv_mass: np.ndarra
     if not links or any(b.arity > 2 for b in links):
         return Jacobi()
     for b in links:
-        C = b.violation(position)
-        if (np.where(b.side, np.maximum(b.side * C, 0), np.abs(C)) * b.closeness(position) > LOST).any():
+        C = b.violation(b.start.position)
+        if (np.where(b.side, np.maximum(b.side * C, 0), np.abs(C)) * b.closeness(b.start.position) > LOST).any():
             return Jacobi()
     arity = np.repeat([b.arity for b in links], [b.count for b in links])
     item = np.concatenate([b.indices.ravel() for b in links])

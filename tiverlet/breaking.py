@@ -45,6 +45,8 @@ class Breaking(Batch):
         More exactly the force along grad f: newtons where f is a length, N m where it is an angle. In f32, rounding of positions
         is felt as about m ulp(x) / h^2, 1 N for 1 kg some 10 m from the origin at 1200 substeps/s; use f64 where that matters.
         """
+        if not self.count:
+            return np.zeros(0)
         if self.scene is None:
             raise RuntimeError(f"{self!r}.load: there is none before a world has been stepped with it.")
         scale = 1 / self.scene.hh if self.scene.hh else 0.0

@@ -171,7 +171,7 @@ def fastest(batches: list[Any], scene: Scene) -> float:
     for b in batches:
         soft = b.compliance > 0
         w = (degree * scene.inv_mass)[b.indices][:, :, None]
-        squares = (w * b.slopes(scene.particles.position) ** 2).sum(axis=(1, 2))
+        squares = (w * b.slopes(b.start.position) ** 2).sum(axis=(1, 2))
         worst = max(worst, float((squares[soft] / b.compliance[soft]).max(initial=0.0)))
     return worst
 

@@ -49,13 +49,6 @@ class Scene:
         """The Taichi type of the world's real numbers."""
         return self.memory.real
 
-    @property
-    def size(self) -> float:
-        """A length that is typical of the scene [m], for relative residuals of things that have none of their own."""
-        x = self.particles.position
-        extent = float(np.ptp(x, axis=0).max()) if len(x) else 0.0
-        return extent or float(self.particles.radius.max(initial=0.0)) or 1.0
-
 
 class Knob:
     """A live setting of a feature: checked when assigned, written to the device before the next frame.
@@ -85,6 +78,7 @@ class Feature(Noted):
     changed = True
     moving = False
     scene: Any = None  # Scene, from bind() on
+    start: Any = None  # Particles, as they were when it came: what it takes from them is what it took then, when bound again too
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the arguments against the particles; set inv_mass to 0 for those that this feature holds."""
@@ -92,8 +86,11 @@ class Feature(Noted):
     def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Warn of what makes no sense, once it is settled which particles can move."""
 
+    def admit(self, particles: Particles, first: int) -> None:
+        """Check particles that come later, from number `first` on."""
+
     def bind(self, scene: Scene) -> None:
-        """Declare fields with scene.memory.field(...). Called once, when the world is built."""
+        """Declare fields with scene.memory.field(...). Called when the world is built, and again when it is built anew."""
 
     def upload(self) -> None:
         """Write changed knobs to the device. Called before a frame when `changed`."""
@@ -104,9 +101,21 @@ class Feature(Noted):
     def copy(self) -> "Feature":
         """The same feature, unbound: same arrays and knobs, ready for another world."""
         new = object.__new__(type(self))
-        device = ("scene", "changed", "moving") + tuple(k for k in vars(self) if k.startswith("_on_"))
-        new.__dict__.update((k, v) for k, v in vars(self).items() if k not in device)
+        new.__dict__.update(vars(self))
+        new.release()
         return new
+
+    def release(self) -> None:
+        """Forget the world that it acted in."""
+        for name in ["scene", "start", "changed", "moving", *(k for k in vars(self) if k.startswith("_on_"))]:
+            self.__dict__.pop(name, None)
+
+    def spared(self, number: np.ndarray) -> tuple[np.ndarray, ...]:
+        """When particles get new numbers, -1 for those that go: masks of what stays, for its fields of as many rows."""
+        return ()
+
+    def renumber(self, number: np.ndarray, count: int) -> None:
+        """Take the new numbers of its particles, of which there are `count` now, and leave out what had one that goes."""
 
     def __repr__(self) -> str:
         return type(self).__name__
@@ -154,6 +163,8 @@ class Batch(Feature):
     breaks = False  # has constraints that a load can break
     drives = False  # puts its particles in place instead of relaxing them
     indices: np.ndarray  # (m, arity)
+    each: tuple[str, ...] = ()  # its arrays with one row for each constraint, beside the indices
+    index_name = "indices"  # the argument of __init__ that they are, as `listing` gives them
 
     @property
     def count(self) -> int:
@@ -163,6 +174,8 @@ class Batch(Feature):
     @property
     def residual(self) -> np.ndarray:
         """What the last substep left of each violation, (m,), relative as in StepReport.residual; 0 where it is broken."""
+        if not self.count:
+            return np.zeros(0)
         if self.scene is None:
             raise RuntimeError(f"{self!r}.residual: there is none before a world has been stepped with it.")
         return self.scene.residuals(self)
@@ -179,6 +192,29 @@ class Batch(Feature):
     def idle(self, inv_mass: np.ndarray) -> np.ndarray:
         """Whether each constraint has no particle that can move, (m,)."""
         return (inv_mass[self.indices] == 0).all(axis=1)
+
+    def spared(self, number: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Constraints stay as long as all of their particles do."""
+        return (np.all(number[self.indices] >= 0, axis=1),)
+
+    def renumber(self, number: np.ndarray, count: int) -> None:
+        """Keep the rows of what stays."""
+        some = self.spared(number)[0]
+        self.select(some, number)
+        for name in self.each:
+            if isinstance(self.__dict__.get(name), np.ndarray):
+                self.__dict__[name] = self.__dict__[name][some]
+        now = {self.index_name: self.listing} | {name: self.__dict__[name] for name in self.each if name in self.__dict__}
+        self.arguments = {k: v if v is None or np.isscalar(v) else now.get(k, v) for k, v in self.arguments.items()}
+
+    @property
+    def listing(self) -> Any:
+        """The particles of each constraint, as the user gives them."""
+        return self.indices
+
+    def select(self, some: np.ndarray, number: np.ndarray) -> None:
+        """Keep the particles of these constraints, by their new numbers."""
+        self.indices = number[self.indices[some]].astype(np.int32)
 
     def partners(self, particles: Particles) -> np.ndarray:
         """Pairs of particles that may overlap, (k, 2), because this batch says where they are to each other."""

@@ -46,6 +46,22 @@ class Particles:
                 array.flags.writeable = False
         self._fixed = True
 
+    @property
+    def size(self) -> float:
+        """A length that is typical of them [m], for relative residuals of things that have none of their own."""
+        extent = float(np.ptp(self.position, axis=0).max()) if self.count else 0.0
+        return extent or float(self.radius.max(initial=0.0)) or 1.0
+
+    def regrouped(self, some: np.ndarray, added: "Particles | None" = None, position: np.ndarray | None = None) -> "Particles":
+        """Those in the mask `some` and then `added` ones; position: where those are, if not where they were."""
+        here = self.position[some] if position is None else position
+        both: dict[str, np.ndarray] = {"position": here} | {
+            name: getattr(self, name)[some] for name in ("velocity", "mass", "radius", "pinned", "group")
+        }
+        if added is not None:
+            both = {name: np.concatenate([values, getattr(added, name)]) for name, values in both.items()}
+        return Particles(**both)
+
     def __setattr__(self, name: str, value) -> None:
         if getattr(self, "_fixed", False):
             raise AttributeError(

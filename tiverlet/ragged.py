@@ -62,6 +62,11 @@ class Ragged(Batch):
         """The constraint of each corner, (total,)."""
         return np.repeat(np.arange(self.count), np.diff(self.starts))
 
+    @property
+    def listing(self) -> list[np.ndarray]:
+        """The particles of each."""
+        return [self.members_of(k) for k in range(self.count)]
+
     def members_of(self, c: int) -> np.ndarray:
         """The particles of constraint c."""
         return self.indices[self.starts[c] : self.starts[c + 1]]
@@ -69,6 +74,15 @@ class Ragged(Batch):
     def idle(self, inv_mass: np.ndarray) -> np.ndarray:
         """Whether each constraint has no particle that can move, (m,)."""
         return np.bincount(self.owner, weights=inv_mass[self.indices] > 0, minlength=self.count) == 0
+
+    def spared(self, number: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Constraints stay as long as all of their particles do, and their corners with them."""
+        some = np.bincount(self.owner, weights=number[self.indices] < 0, minlength=self.count) == 0
+        return some, some[self.owner]
+
+    def select(self, some: np.ndarray, number: np.ndarray) -> None:
+        """Keep the particles of these constraints, by their new numbers."""
+        self.layout([number[self.members_of(k)] for k, stays in enumerate(some) if stays])
 
     def known_particles(self, particles: Particles, name: str) -> None:
         """Refuse corners that do not exist."""

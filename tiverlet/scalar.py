@@ -41,6 +41,7 @@ class Scalar(Breaking):
     compliance: np.ndarray
     damping: np.ndarray
 
+    each = ("rest", "compliance", "damping", "break_at")
     index_name = "pairs"
     rest_name = "rest"
     exchangeable: tuple[tuple[int, ...], ...] | None = None  # groups of corners that may swap; None: all of them
@@ -161,8 +162,8 @@ class Scalar(Breaking):
         self._on_soft = self.soft
         self._on_sprung = bool(self.sprung(scene).any())
         self._on_damped = self.soft and bool((self.damping > 0).any())
-        start = self.rest_of(scene.particles.position) if self.count else np.zeros(0)
-        self._on_scale = self.unit or (float(np.abs(start).mean()) if np.any(start) else scene.size)
+        start = self.rest_of(self.start.position) if self.count else np.zeros(0)
+        self._on_scale = self.unit or (float(np.abs(start).mean()) if np.any(start) else self.start.size)
         name, m, add = repr(self), self.count, scene.memory.field
         self._on_rest = add(f"{name}.rest", m, values=self.goal)
         self._on_lam = add(f"{name}.multiplier", m, state=True)
@@ -172,7 +173,7 @@ class Scalar(Breaking):
             self._on_row = add(f"{name}.row", m, kind=ti.i32, values=rows)
         self._on_firm = self.joins and (self._on_told or scene.slots.accelerates)
         if self._on_firm:
-            self._on_close = add(f"{name}.close", m, values=self.closeness(scene.particles.position))
+            self._on_close = add(f"{name}.close", m, values=self.closeness(self.start.position))
         self._on_hurries = self._on_firm and scene.slots.accelerates and self._on_alone and self.side == 0
         if self._on_hurries:
             self._on_step = add(f"{name}.step", m)

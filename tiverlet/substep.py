@@ -115,11 +115,11 @@ class Substep(Phases):
         return self.grid.need[None]
 
     @ti.kernel
-    def shrunk(self):
-        """Make overlapping particles small enough to fit, from where they grow back."""
+    def shrunk(self, first: ti.i32):
+        """Make particles that overlap with those from number `first` on small enough to fit, from where they grow back."""
         for c in ti.static(self.contacts):
             for i in range(self.n):
-                c.shrink(i)
+                c.shrink(i, first)
 
     @ti.kernel
     def to_velocity(self, h64: ti.f64, t: ti.f64):

@@ -16,6 +16,7 @@ class Tether(Batch):
     """
 
     arity = 1
+    each = ("compliance", "damping")
     compliance: np.ndarray
     damping: np.ndarray
 
@@ -33,6 +34,11 @@ class Tether(Batch):
             array.flags.writeable = False
 
     @property
+    def listing(self) -> np.ndarray:
+        """One particle each."""
+        return self.indices[:, 0]
+
+    @property
     def soft(self) -> bool:
         """Whether any of them is a spring."""
         return bool((self.compliance > 0).any())
@@ -48,19 +54,21 @@ class Tether(Batch):
     def bind(self, scene: Scene) -> None:
         """For what is not driven its multiplier, and for springs their memory."""
         super().bind(scene)
-        self._on_size, self._on_real, self._on_soft = scene.size, scene.real, self.soft
+        self._on_size, self._on_real, self._on_soft = self.start.size, scene.real, self.soft
         if not self.drives:
             name, m, dim, add = repr(self), self.count, scene.particles.dim, scene.memory.field
             self._on_lam = add(f"{name}.multiplier", m, width=dim, state=True)
             if self.soft:
                 self._on_alpha = add(f"{name}.compliance", m, values=self.compliance)
                 self._on_damping = add(f"{name}.damping", m, values=self.damping)
-                self._on_last = add(f"{name}.last", m, width=dim, values=self.begin(scene.particles.position), state=True)
+                self._on_last = add(f"{name}.last", m, width=dim, values=self.begin(self.start.position), state=True)
                 self._on_history = add(f"{name}.history", m, width=dim)
 
     @property
     def load(self) -> np.ndarray:
         """The force on each particle during the last substep [N], (m, dim)."""
+        if not self.count:
+            return np.zeros((0, 0 if self.start is None else self.start.dim))
         if self.scene is None:
             raise RuntimeError(f"{self!r}.load: there is none before a world has been stepped with it.")
         if self.drives:

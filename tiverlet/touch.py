@@ -87,14 +87,16 @@ class Touch(Feature):
             self._on_eases = True
 
     @ti.func
-    def shrink(self, i):
-        """Make particle i small enough: each pair gives up its overlap in proportion to the radii."""
-        less = ti.cast(0, self.scene.real)
+    def shrink(self, i, first):
+        """Make particle i small enough: each pair with a particle from number `first` on gives up its overlap in proportion to
+        the radii."""
+        less = ti.select(first > 0, self._on_less[i], ti.cast(0, self.scene.real))
         for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
             j = self._on_grid.near[e]
-            far = self._on_radius.of(i) + self._on_radius.of(j)
-            overlap, _ = self.touch(i, j, far)
-            less = ti.max(less, overlap * self._on_radius.of(i) / far)
+            if ti.max(i, j) >= first:
+                far = self._on_radius.of(i) + self._on_radius.of(j)
+                overlap, _ = self.touch(i, j, far)
+                less = ti.max(less, overlap * self._on_radius.of(i) / far)
         self._on_less[i] = less
 
     @ti.func

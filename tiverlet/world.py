@@ -1,7 +1,8 @@
 """The world: a scene, and its step."""
 
 import copy
-from collections.abc import Iterable
+import weakref
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from time import perf_counter
 from typing import Any
@@ -11,13 +12,13 @@ from rich.progress import track
 
 from . import checks, composition, snapshot
 from .access import Access
-from .assembly import assemble, check_settings, checked_features, checked_solver
+from .assembly import Assembly, assemble, check_settings, checked_features, checked_solver
 from .calm import EVERY, PASSES
 from .explain import explain
 from .feature import Acceleration, Feature
 from .guard import Guard
 from .particles import Particles
-from .queries import Search
+from .regroup import Handle
 from .solvers.solver import Solver
 from .substep import REBOUNDS, decay
 from .survey import StepReport
@@ -46,27 +47,50 @@ class World(Access):
     ):  # fmt: skip
         if not isinstance(particles, Particles):
             raise TypeError(f"World: particles = {particles!r} is a {type(particles).__name__}; use tv.Particles(position).")
-        self._particles, self._features, self._order = particles, checked_features(features), order
-        check_settings(precision, path, order, self._features)
-        given = checked_solver(solver)
-        self._solver, self._precision = given or Solver(), precision
+        features = checked_features(features)
+        starts = [None] * len(features)
+        self._build(particles, features, starts, substeps, iterations, solver, precision, path, order)
+
+    @staticmethod
+    def _of(particles: Particles, features: tuple[Feature, ...], starts: Sequence[Particles | None], **settings) -> "World":
+        """A world of features that came at different times, see _build()."""
+        new = object.__new__(World)
+        new._build(particles, features, starts, **settings)
+        return new
+
+    def _build(self, particles, features, starts, substeps, iterations, solver, precision, path, order) -> None:
+        """starts: for each feature the particles as they were when it came; None if it comes now."""
+        check_settings(precision, path, order, features)
+        self._wanted, self._order = (checked_solver(solver), path), order
+        self._solver, self._precision, self._batches = self._wanted[0] or Solver(), precision, []
         self._guard = Guard()
         self.substeps, self.iterations = substeps, iterations
-        parts = assemble(particles, self._features, given, precision, path, order)
-        self._memory, self._scene, self._batches = parts.memory, parts.scene, parts.batches
-        self._grid, self._sub, self._survey, self._path = parts.grid, parts.substep, parts.survey, parts.path
-        self._solver = parts.solver
-        parts.scene.residuals = self._residuals
+        self._install(particles, features, assemble(particles, features, starts, len(particles), *self._asked))
+        self._handles: weakref.WeakSet[Handle] = weakref.WeakSet()
         self._time, self._tick, self._h = 0.0, 0, 0.0
         self._since = 0  # substeps since the last start
         self._frame = (0.0, 0.0, 0)  # when frames of the present length began, their length, their number
         self._fresh, self._started = True, False  # d holds velocities; the last substep was the first after a start
-        self._placed = True  # by the user, and not looked at yet
+        self._placed: int | None = 0  # the first of the particles that the user placed and that were not looked at yet
         self._drag: list[float] | None = None
         self._energy: float | None = None
         self._last: StepReport | None = None
-        self._search: Search | None = None  # compiled when it is first asked
         self._watchers: list[Any] = []  # recorders: told of what the user assigns, and before and after every step
+
+    @property
+    def _asked(self) -> tuple[Solver | None, str, str, int]:
+        """What assemble() takes. A solver that was chosen for constraints that there are stays."""
+        solver = self._wanted[0] or (self._solver if self._batches else None)
+        return solver, self._precision, self._wanted[1], self._order
+
+    def _install(self, particles: Particles, features: tuple[Feature, ...], parts: Assembly) -> None:
+        """Take these for the parts of the world."""
+        self._particles, self._features = particles, features
+        self._memory, self._scene, self._batches = parts.memory, parts.scene, parts.batches
+        self._grid, self._sub, self._survey, self._path = parts.grid, parts.substep, parts.survey, parts.path
+        self._solver = parts.solver
+        self._search = None  # compiled when it is first asked
+        parts.scene.residuals = self._residuals
 
     # The step.
 
@@ -150,11 +174,11 @@ class World(Access):
                 self._since = 0
             self._set(h, drag)
             if self._energy is None:
-                report = self._look(begin=True)
+                report = self._look(begin=self._fresh)
                 self._energy = report.energy
-                if report.overlap > 0 and self._placed:
-                    self._ease()
-            self._placed = False
+                if report.overlap > 0 and self._placed is not None:
+                    self._ease(self._placed)
+            self._placed = None
 
     def _set(self, h: float, drag: list[float] | None) -> None:
         if drag and drag != self._drag:
@@ -222,13 +246,13 @@ class World(Access):
         self._grid.grow()
         self._renew()
 
-    def _ease(self) -> None:
-        """Let particles that the user put into each other part gently."""
+    def _ease(self, first: int) -> None:
+        """Let particles part gently that the user put into each other, from number `first` on."""
         contact = self._sub.contacts[0]
         if not contact._on_eases:
             contact.ease()
             self._sub = copy.copy(self._sub)  # kernels that know of the new field; the survey has no use for it
-        self._sub.shrunk()
+        self._sub.shrunk(first)
 
     def _renew(self) -> None:
         """Kernels that know of a new field; Taichi compiles them for each Substep anew."""
@@ -292,12 +316,16 @@ class World(Access):
         return out | {"solver": self._solver, "precision": self._precision, "path": self._path, "order": self._order}
 
     def clone(self, **changes) -> "World":
-        """The same scene in the same state, with other substeps, iterations, solver, precision, path or order."""
+        """The same scene in the same state, with other substeps, iterations, solver, precision, path or order.
+
+        Handles stay with the world that gave them.
+        """
         settings = self.settings
         if unknown := set(changes) - set(settings):
             raise TypeError(f"World.clone: {sorted(unknown)[0]} cannot be changed; one of {', '.join(settings)} can.")
         self._memory.check()
-        new = World(self._particles, [f.copy() for f in self._features], **{**settings, **changes})
+        copies = tuple(f.copy() for f in self._features)
+        new = World._of(self._particles, copies, [f.start for f in self._features], **{**settings, **changes})
         snapshot.transfer(self, new)
         return new
 

@@ -24,6 +24,7 @@ class AngleLimit(Turning):
     `load` is the moment at either stop [N m].
     """
 
+    each = ("lower", "upper", "compliance", "damping", "break_at")
     side = 1
     lower = Knob(lambda f, v: f._bound("lower", v), "The smaller limit [rad].")
     upper = Knob(lambda f, v: f._bound("upper", v), "The larger limit [rad].")

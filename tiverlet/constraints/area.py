@@ -29,6 +29,7 @@ class Area(Scalar):
     """
 
     index_name = "loops"
+    each = (*Scalar.each, "pressure")
     collapses = 2
     rest = Knob(lambda f, v: checks.per_item("Area", "rest", v, f.count, least=0.0), "Area at pressure 1 [m^2].")
     pressure = Knob(lambda f, v: checks.per_item("Area", "pressure", v, f.count, least=0.0), "Factor on the rest area.")

@@ -8,7 +8,7 @@ import taichi as ti
 
 from .. import checks
 from ..differences import Slopes
-from ..feature import Knob, Scene
+from ..feature import Knob
 from ..particles import Particles
 from ..scalar import Scalar
 from ..tools import golden
@@ -93,7 +93,7 @@ class Constraint(Scalar):
             self.origin = checks.vector(repr(self), "origin", origin, particles.dim)
             high = self.origin.astype(np.float32).astype(np.float64)  # two words: in f32 too, the origin is where it was put
             self._on_origin = [high.tolist(), (self.origin - high).tolist()]
-        self.size = Scene(None, None, particles, inv_mass).size  # type: ignore[arg-type]
+        self.size = particles.size
         self._on_known: tuple[Any, Any, Any] = (None, None, None)
         self._on_fixed = int(self.origin is None)
         self._on_slopes = Slopes(self.function, self.gradient, self.arity, particles.dim, self._on_fixed, self.size)

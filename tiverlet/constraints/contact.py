@@ -1,5 +1,7 @@
 """Particles that do not overlap."""
 
+import copy
+
 import numpy as np
 import taichi as ti
 
@@ -75,8 +77,18 @@ class Contact(Touch):
         self._on_size = auto if self.skin == "auto" else float(self.skin)
         self._on_finest = float(radius.min(initial=np.inf))
         self.matters = len(some) > 0
+        self.table = copy.copy(self.table)  # which is bound to one world
         if self.matters:
             self.check_range(particles.position)
+
+    def admit(self, particles: Particles, first: int) -> None:
+        """Refuse positions too far out."""
+        if self.matters:
+            self.check_range(particles.position)
+
+    def spared(self, number: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Its fields are those of the particles."""
+        return (number >= 0,)
 
     def check_range(self, position: np.ndarray) -> None:
         """Raise where coordinates are too large for the cells."""
@@ -92,7 +104,7 @@ class Contact(Touch):
     def join(self, scene: Scene, batches: list[Batch], parallel: bool) -> Grid:
         """Declare the fields, among them the grid's."""
         n, dim = scene.particles.count, scene.particles.dim
-        pairs = [b.partners(scene.particles) for b in batches]
+        pairs = [b.partners(b.start) for b in batches]
         linked = np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=np.int32)
         self.scene = scene
         self._on_state = scene.state

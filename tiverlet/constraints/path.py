@@ -31,6 +31,7 @@ class Path(Tether):
     `length` is that of the curve [m], `place(s)` its points, `load` the force of the wire on each particle [N].
     """
 
+    each = ("compliance", "damping", "speed", "at")
     speed = Knob(lambda f, v: checks.per_item("Path", "speed", v, f.count), "Along the curve [m/s], (m,).")
     at = Knob(lambda f, v: checks.per_item("Path", "at", v, f.count), "Arc length at the end of the next frame [m].")
 
@@ -113,7 +114,7 @@ class Path(Tether):
         piece, rest = c.split(self._start)
         self._on_piece = add("Path.piece", m, kind=ti.i32, values=piece, state=True)
         self._on_rest = add("Path.rest", m, values=rest, state=True)
-        self._on_least = scene.size * (2.0**-22 if scene.real == ti.f32 else 2.0**-44)
+        self._on_least = self.start.size * (2.0**-22 if scene.real == ti.f32 else 2.0**-44)
         if self.driven:
             self._on_moves = "speed" in self.__dict__
             self._on_begin = add("Path.begin", self._on_pieces + 1, kind=ti.f64, values=c.starts)

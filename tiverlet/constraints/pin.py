@@ -31,6 +31,7 @@ class Pin(Tether):
     `load` is the force of each spring on its particle [N].
     """
 
+    each = ("compliance", "damping", "target")
     dim = 0
     target = Knob(_targets, "Where the particles are held, (m, dim) [m].")
 
@@ -60,7 +61,7 @@ class Pin(Tether):
         """Targets at the start and the end of a frame."""
         super().bind(scene)
         # A driven particle sets out from where it is; a spring is anchored at the target from the start.
-        here = scene.particles.position[self.indices[:, 0]] if self.drives else self.target
+        here = self.start.position[self.indices[:, 0]] if self.drives else self.target
         self.changed = self.drives
         self._on_from = scene.memory.field("Pin.from", self.count, width=self.dim, values=here, state=True)
         self._on_to = scene.memory.field("Pin.to", self.count, width=self.dim, values=here, state=True)

@@ -1,5 +1,6 @@
 """Bodies made of loops of particles that do not overlap (2D)."""
 
+import copy
 from collections.abc import Iterable
 from dataclasses import replace
 from types import SimpleNamespace
@@ -79,7 +80,7 @@ class Polygons(Rim):
             self._on_ends[loop, 0], self._on_ends[after, 1], self._on_body[loop] = after, loop, k
             length[loop] = np.maximum(length[loop], edge)
             length[after] = np.maximum(length[after], edge)
-        self._check_start(particles)
+        self._check_start(particles, 0)
         # Two particles are listed when their reaches add up: a vertex with both ends of an edge that it is beside.
         self._on_length = length
         far = 1.5 * STRETCH * length
@@ -89,17 +90,29 @@ class Polygons(Rim):
         self._on_reach = float(length[loops].min(initial=np.inf)) / 4
         self._on_size = 0.15 * float(np.median(self._on_cover)) if self.skin == "auto" else float(self.skin)
         self._on_finest = float(self._on_cover.min(initial=np.inf))
+        self.table = copy.copy(self.table)  # which is bound to one world
         self.matters = n > 0 and bool(self.loops or (particles.radius > 0).any())
         if self.matters:
             self.check_range(x)
 
-    def _check_start(self, particles: Particles) -> None:
-        """Refuse particles that start deeper inside of a body than half of the edge that is nearest."""
+    def admit(self, particles: Particles, first: int) -> None:
+        """Refuse positions too far out, or inside of bodies."""
+        super().admit(particles, first)
+        self._check_start(particles, first)
+
+    def renumber(self, number: np.ndarray, count: int) -> None:
+        """Bodies stay as long as all of their particles do."""
+        whole = [loop for loop in self.loops if (number[loop] >= 0).all()]
+        self.loops = [number[loop].astype(np.int32) for loop in whole]
+        self.arguments = {**self.arguments, "loops": self.loops}
+
+    def _check_start(self, particles: Particles, first: int) -> None:
+        """Refuse particles, from number `first` on, that start deeper inside of a body than half of the edge that is nearest."""
         x = particles.position
         for k, loop in enumerate(self.loops):
             a = x[loop]
             some = ((x >= a.min(axis=0)) & (x <= a.max(axis=0))).all(axis=1) & (self._on_body != k)
-            for i in np.flatnonzero(some):
+            for i in np.flatnonzero(some[first:]) + first:
                 depth, edge = depth_of(x[i], a)
                 if depth > edge / 2:
                     raise ValueError(
@@ -128,7 +141,7 @@ class Polygons(Rim):
         self.table.bind(scene)
         cover: Any = SimpleNamespace(count=n, dim=2, position=p.position, radius=self._on_cover, group=p.group)
         reach = replace(scene, particles=cover, radius=Radii(scene.memory, self._on_cover))
-        pairs = [f.partners(p) for f in batches]
+        pairs = [f.partners(f.start) for f in batches]
         linked = np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=np.int32)
         # For each entry the contact of which its particle is the vertex: overlap, place on the edge (-1: discs), normal; where
         # in the list of the other particle those are in which it is the start, and the end, of the edge (-1: nowhere).
@@ -148,12 +161,13 @@ class Polygons(Rim):
         """The field is there from the start."""
 
     @ti.func
-    def shrink(self, i):
-        """Allow particle i the overlap that it has as a vertex."""
+    def shrink(self, i, first):
+        """Allow particle i the overlap that it has as a vertex, as far as particles from number `first` on have to do with it."""
         self.look(i, False)
-        less = 0 * self._on_w[i]
+        less = ti.select(first > 0, self._on_less[i], 0 * self._on_w[i])
         for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
-            less = ti.max(less, self._on_met.field[e][0])
+            if ti.max(i, self._on_grid.near[e]) >= first:
+                less = ti.max(less, self._on_met.field[e][0])
         self._on_less[i] = less
 
     @ti.func

@@ -91,7 +91,7 @@ class Sdf(Solid):
     def bind(self, scene: Scene) -> None:
         """No field of its own."""
         Solid.bind(self, scene)
-        single, size = scene.real == ti.f32, scene.size
+        single, size = scene.real == ti.f32, self.start.size
         grain = float(scene.particles.radius.max(initial=0.0)) + self.radius or size / 100
         self._on_close = size * (2.0**-21 if single else 2.0**-50)
         self._on_slight = 2.0**-20 if single else 2.0**-48

@@ -52,6 +52,8 @@ class ShapeMatch(Ragged):
                 f"ShapeMatch: creep[{k}] = {self.creep[k]:g}, but a rigid cluster does not flow; give it compliance."
             )
 
+    each = ("compliance", "damping", "creep", "yield_strain")
+    index_name = "clusters"
     compliance: np.ndarray
     damping: np.ndarray
     creep: np.ndarray
@@ -76,6 +78,15 @@ class ShapeMatch(Ragged):
         square = np.bincount(self.owner, weights=m * (self._shape**2).sum(axis=1), minlength=self.count)
         self._radius = np.sqrt(square / total)
 
+    def renumber(self, number: np.ndarray, count: int) -> None:
+        """Particles that come later have a place in the shape of all, which no cluster uses."""
+        super().renumber(number, count)
+        if self._rest is not None:
+            rest = np.zeros((count, self._rest.shape[1]))
+            rest[number[number >= 0]] = self._rest[number >= 0]
+            self._rest = rest
+            self.arguments = {**self.arguments, "rest": rest}
+
     def partners(self, particles: Particles) -> np.ndarray:
         """Particles of a cluster that are near each other may overlap; the rest cannot meet unless it is soft."""
         near = [_near(self.members_of(c), particles) for c in range(self.count)]
@@ -89,7 +100,7 @@ class ShapeMatch(Ragged):
         w = scene.inv_mass[self.indices]
         mass = np.bincount(self.owner, weights=np.divide(1, w, where=w > 0, out=np.zeros_like(w)), minlength=m)
         self._on_mass = add("ShapeMatch.mass", m, values=mass)
-        self._on_size = add("ShapeMatch.radius", m, values=np.maximum(self._radius, 1e-6 * scene.size))
+        self._on_size = add("ShapeMatch.radius", m, values=np.maximum(self._radius, 1e-6 * self.start.size))
         self._on_shape = add("ShapeMatch.shape", self.corner_count, width=dim, values=self._shape, state=self._on_plastic)
         turn = rotation.identity(dim)
         self._on_turn = add("ShapeMatch.turn", m, width=len(turn), kind=ti.f64, values=[turn] * m, state=True)

@@ -51,7 +51,7 @@ class Snap(Tether):
         """The node of each particle."""
         super().bind(scene)
         dim, free = scene.particles.dim, np.isinf(self._spacing)
-        add, x = scene.memory.field, scene.particles.position[self.indices[:, 0]]
+        add, x = scene.memory.field, self.start.position[self.indices[:, 0]]
         self._on_grid = add("Snap.grid", 2, width=dim, values=[self._origin, np.where(free, 0.0, self._spacing)])
         self._on_node = add("Snap.node", self.count, width=dim, values=self.node(x), state=True)
         self.changed = False

@@ -31,6 +31,7 @@ class Volume(Scalar):
     """
 
     index_name = "cells"
+    each = (*Scalar.each, "pressure")
     collapses = 3
     rest = Knob(lambda f, v: checks.per_item("Volume", "rest", v, f.count, least=0.0), "Volume at pressure 1 [m^3].")
     pressure = Knob(lambda f, v: checks.per_item("Volume", "pressure", v, f.count, least=0.0), "Factor on the rest volume.")
@@ -103,6 +104,17 @@ class Surfaces(Volume, Content):
         faces = checks.indices("Volume", "cells", members, 2**31 - 1, arity=3)
         self.faces, self._surface = _oriented(faces)
         self.layout([np.unique(self.faces[self._surface == k]) for k in range(int(self._surface.max(initial=-1)) + 1)])
+
+    @property
+    def listing(self) -> np.ndarray:
+        """The faces."""
+        return self.faces
+
+    def select(self, some: np.ndarray, number: np.ndarray) -> None:
+        """Keep the faces of these surfaces too."""
+        Content.select(self, some, number)
+        self.faces = number[self.faces[some[self._surface]]].astype(np.int32)
+        self._surface = (np.cumsum(some) - 1)[self._surface[some[self._surface]]]
 
     def reverse(self, which: np.ndarray) -> None:
         """Turn the faces of these around."""

@@ -139,6 +139,8 @@ def describe(world: "World") -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     for k, feature in enumerate(world.features):
         values = {name: encode(v, f"{k}.{name} now", arrays, needs) for name, v in knobs(feature).items()}
         features.append({**made(feature, str(k)), "knobs": values})
+        if not np.array_equal(feature.start.position, world.particles.position):  # it was added later
+            features[-1]["start"] = encode(feature.start.position, f"{k} start", arrays, needs)
     settings = dict(world.settings)
     settings["solver"] = made(settings["solver"], "solver")
     p = world.particles
@@ -183,8 +185,12 @@ def rebuild(scene: dict[str, Any], arrays: Mapping[str, np.ndarray], given: Mapp
         return kind(**{name: decode(value, arrays, given) for name, value in thing["arguments"].items()})
 
     p = {name: decode(value, arrays, given) for name, value in scene["particles"].items()}
-    features = []
+    particles = Particles(p.pop("position"), **p)
+    everyone = np.ones(len(particles), dtype=bool)
+    features, starts = [], []
     for data in scene["features"]:
+        start = decode(data["start"], arrays, given) if "start" in data else None
+        starts.append(None if start is None else particles.regrouped(everyone, position=start))
         feature = make(data)
         turn(feature, {name: decode(value, arrays, given) for name, value in data["knobs"].items()})
         features.append(feature)
@@ -192,4 +198,4 @@ def rebuild(scene: dict[str, Any], arrays: Mapping[str, np.ndarray], given: Mapp
         turn(features[k], values)
     settings = dict(scene["settings"])
     settings["solver"] = make(settings["solver"])
-    return World(Particles(p.pop("position"), **p), features, **settings)
+    return World._of(particles, tuple(features), starts, **settings)

@@ -12,7 +12,7 @@ ROUNDS = 300  # of power iteration; it converges from below, and the margin of 1
 def largest(scene: Scene, scalars: list[Scalar], split: np.ndarray) -> float:
     """lambda_max of D^-1 A for the scene as it starts, A = G w G^T and D its diagonal in mass-split weights."""
     w, n, dim = scene.inv_mass, len(scene.inv_mass), scene.particles.dim
-    slopes = [b.slopes(scene.particles.position) for b in scalars]
+    slopes = [b.slopes(b.start.position) for b in scalars]
     who = np.concatenate([b.indices.ravel() for b in scalars])
     row = np.repeat(np.arange(sum(b.count for b in scalars)), np.repeat([b.arity for b in scalars], [b.count for b in scalars]))
     G = np.concatenate([g.reshape(-1, dim) for g in slopes])
