@@ -212,3 +212,22 @@ def test_after_an_error_the_world_is_as_before(world):
     assert w.hash() == before and w.features[1] is link and (link.rest == rest).all() and len(w.particles) == 3
     w.run(0.1)
     assert w.add() is not None and w.time == pytest.approx(0.2)
+
+
+def test_a_recording_begins_after_what_came_and_went(world, tmp_path):
+    # The scene of a world that was built anew is recorded as it is now, with features that came when nothing was where it began.
+    x = np.array([[0.0, 0], [1, 0], [2, 0], [3, 0], [4, 0], [5, 0]])
+    links = tv.Rope([[0, 1], [1, 2], [3, 4], [4, 5]], [1.0, 1.01, 1.02, 1.03])
+    w = world(tv.Particles(x, pinned=[0, 3]), [tv.Gravity(), links, tv.Pin([5], compliance=[1e-2])], precision="f64")
+    w.run(0.3)
+    w.remove([1])
+    w.add(tv.Particles([[9.0, 0.0]]), [tv.Distance([[4, 5]], compliance=1e-3), tv.Area([[1, 3, 5]])])
+    assert links.indices.tolist() == [[2, 3], [3, 4]] and links.rest.tolist() == [1.02, 1.03]
+    w.run(0.1)
+    with tv.Recorder(tmp_path / "later.rrd", w) as recorder:
+        with pytest.raises(RuntimeError, match=r"World.add: the world is being recorded"):
+            w.add(tv.Particles([[9.0, 9.0]]))
+        for _ in range(3):
+            w.step(1 / 60)
+            recorder.log()
+    assert tv.replay(tmp_path / "later.rrd").verify()
