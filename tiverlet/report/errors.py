@@ -198,8 +198,10 @@ class ErrorReport:
         record(self, path)
 
 
-HEADS = ("case", "solver", "substeps", "error", "order", "ms per s", "XPBD / ours", "at equal work", "article / ours", "f32 error", "energy drift",
-         "momentum drift", "verdict")  # fmt: skip
+HEADS = (
+    "case", "solver", "substeps", "error", "order", "ms per s", "XPBD / ours", "at equal work", "article / ours", "f32 error",
+    "energy drift", "momentum drift", "verdict",
+)  # fmt: skip
 COLUMNS = (
     "solver",
     "precision",
@@ -242,8 +244,8 @@ def cells(s: Summary) -> tuple[str, ...]:
     """A line of the table."""
     return (
         s.case, s.method, str(s.substeps), f"{s.error:.1e} {s.unit}", ordered(s),
-        f"{1e3 * s.seconds:.1f}", times(s.in_time), times(s.in_work), times(s.over_article), "" if s.single is None else f"{s.single:.1e}",
-        drift(s.energy), drift(s.momentum), "; ".join(s.failures) or "ok",
+        f"{1e3 * s.seconds:.1f}", times(s.in_time), times(s.in_work), times(s.over_article),
+        "" if s.single is None else f"{s.single:.1e}", drift(s.energy), drift(s.momentum), "; ".join(s.failures) or "ok",
     )  # fmt: skip
 
 
