@@ -20,25 +20,25 @@ class Sink:
     def __init__(self, path: str, application: str, blueprint: Any, name: str):
         import rerun as rr
 
-        self.path, self.bytes = path, 0
+        self.bytes = 0
         self.error: OSError | None = None
+        self.stream: Any = rr.RecordingStream(application, recording_id=uuid.uuid4())
+        if not self.stream.is_enabled():
+            raise RuntimeError("Recorder: rerun is switched off by RERUN in the environment; unset it to record.")
         try:
             self._file = open(path, "wb", buffering=0)
         except OSError as e:
             raise type(e)(e.errno, f"Recorder: {path} cannot be written ({e.strerror}); choose another place") from None
-        self.stream: Any = rr.RecordingStream(application, recording_id=uuid.uuid4())
-        if not self.stream.is_enabled():
-            raise RuntimeError("Recorder: rerun is switched off by RERUN=off in the environment; unset it to record.")
         self._copy: threading.Thread | None = None
-        target = path
         if os.path.isdir("/dev/fd"):
             out, into = os.pipe()
             self._copy = threading.Thread(target=self._pump, args=(out,), daemon=True)
             self._copy.start()
-            target = f"/dev/fd/{into}"
-        self.stream.save(target, default_blueprint=blueprint)
-        if self._copy:
+            self.stream.save(f"/dev/fd/{into}", default_blueprint=blueprint)
             os.close(into)
+        else:
+            self._file.close()
+            self.stream.save(path, default_blueprint=blueprint)
         self.stream.send_recording_name(name)
 
     def _pump(self, out: int) -> None:
