@@ -189,7 +189,7 @@ def test_explain_names_what_is_in_and_what_is_out(world):
     for part in (
         "3 particles in 2D, 2 static; f32 on cpu", "20 substeps x 3 iterations, path fused: 2 launches per frame",
         "Distance: 2 constraints, 1 of them between particles that cannot move", "grid, neighbour list, contacts: no Contact",
-        "every constraint is rigid", "Constraint corners that can move: 1 of 4",
+        "every constraint is rigid", "breaks counted: no constraint has break_at", "Constraint corners that can move: 1 of 4",
     ):  # fmt: skip
         assert part in text
     stated = int(text.split(" fields, ")[1].split(" bytes")[0])

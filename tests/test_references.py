@@ -19,8 +19,15 @@ def line(n: int) -> np.ndarray:
     return np.stack([np.arange(n), np.arange(n) + 1], axis=1)
 
 
+def discrete(n: int, values: dict) -> np.ndarray:
+    """The steps of a catenary of n links of 10 m in all, (n, 2): link i has the slope (i - (n + 1) / 2) / H."""
+    slope = (np.arange(1, n + 1) - (n + 1) / 2) / values["H_over_mg"]
+    return 10.0 / n * np.stack([np.ones(n), slope], axis=1) / np.sqrt(1 + slope**2)[:, None]
+
+
 def test_ropes_hang_as_catenaries(world):
     # R10b, rigid: 1e-4 with 16 passes. S07, elastic: 1e-4 with 4 passes and any effort beyond. All five ropes in one world.
+    # Then the rigid ones and one of a hundred links as they are solved by default, directly: 1e-8 with one pass.
     rigid = [(n, 10.0, 6.0, 0.0, case(f"R10b_discrete_catenary_N{n}")["values"]) for n in (10, 20)]
     keys = {"N10_alpha1e-3": (10, 1e-3), "N20_alpha1e-4": (20, 1e-4), "N50_alpha1e-3": (50, 1e-3)}
     soft = [(n, 1.0, 0.8, a, case("S07_elastic_catenary")["values"][key]) for key, (n, a) in keys.items()]
@@ -34,7 +41,7 @@ def test_ropes_hang_as_catenaries(world):
         first += n + 1
     link = tv.Distance(np.concatenate(pairs), rest, compliance=alpha)
     start = tv.Particles(np.concatenate(x), mass=0.1, pinned=ends)
-    w = world(start, [tv.Gravity(9.81), link, tv.Drag(4.0)], precision="f64")
+    w = world(start, [tv.Gravity(9.81), link, tv.Drag(4.0)], precision="f64", solver=tv.Jacobi())
     for substeps, iterations in ((20, 16), (24, 20)):
         rerun(w, 8.0, substeps=substeps, iterations=iterations)
         at, k = ends[::2], 0
@@ -43,11 +50,22 @@ def test_ropes_hang_as_catenaries(world):
             top = v["end_tension"] if "end_tension" in v else v["end_link_tension_over_mg"] * 0.1 * 9.81
             assert link.load[k] == pytest.approx(top, rel=1e-4)
             k += n
-        # R10b again: the shape is that of links whose slopes are (i - (N + 1) / 2) / H.
         for i, (n, *_, v) in zip(at[:2], rigid, strict=True):
-            slope = (np.arange(1, n + 1) - (n + 1) / 2) / v["H_over_mg"]
-            steps = 10.0 / n * np.stack([np.ones(n), slope], axis=1) / np.sqrt(1 + slope**2)[:, None]
-            np.testing.assert_allclose(np.diff(w.position[i : i + n + 1], axis=0), steps, atol=5e-4 / n)
+            np.testing.assert_allclose(np.diff(w.position[i : i + n + 1], axis=0), discrete(n, v), atol=5e-4 / n)
+    at, x, k = {10: 0, 20: 11, 100: 32}, [], 0
+    for n in at:
+        t = np.linspace(0, 1, n + 1)
+        x.append(np.stack([6 * t, -4 * (1 - np.abs(2 * t - 1))], axis=1))
+    link = tv.Distance(np.concatenate([line(n) + i for n, i in at.items()]), np.concatenate([np.full(n, 10 / n) for n in at]))
+    start = tv.Particles(np.concatenate(x), mass=0.1, pinned=[end for n, i in at.items() for end in (i, i + n)])
+    w = world(start, [tv.Gravity(9.81), link, tv.Drag(4.0)], precision="f64")
+    w.run(12.0)
+    for n, i in at.items():
+        v = case(f"R10b_discrete_catenary_N{n}")["values"]
+        assert -w.position[i : i + n + 1, 1].min() == pytest.approx(v["sag"], rel=1e-8)
+        assert link.load[k] == pytest.approx(v["end_link_tension_over_mg"] * 0.1 * 9.81, rel=1e-8)
+        np.testing.assert_allclose(np.diff(w.position[i : i + n + 1], axis=0), discrete(n, v), atol=1e-8 / n)
+        k += n
 
 
 def test_one_pass_sags_by_the_law(world):

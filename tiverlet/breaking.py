@@ -75,5 +75,10 @@ class Breaking(Batch):
     def tear(self, c, hh, tick):
         """Break constraint c if its load in this substep was too large; it acts no more from the next one on."""
         if self._on_broken[c] == 0 and ti.abs(self._on_lam[c]) > self._on_strength[c] * hh:
-            self._on_broken[c] = tick % ti.static(BREAKS) + 1
-            self._on_slots.broken[None] += 1
+            self.part(c, tick)
+
+    @ti.func
+    def part(self, c, tick):
+        """Note that constraint c breaks in this substep."""
+        self._on_broken[c] = tick % ti.static(BREAKS) + 1
+        self._on_slots.broken[None] += 1

@@ -81,6 +81,7 @@ def _absent(world: "World") -> list[str]:
             not any(getattr(b, "soft", False) for b in sub.batches),
             "compliance and its history: every constraint is rigid",
         ),
+        (not sub.breakers, "loads compared and breaks counted: no constraint has break_at"),
         (sub.radius is None or sub.radius.uniform, "field of radii: all are equal or none is needed"),
         (world.precision != "f32-compensated", "low words of positions: precision is not f32-compensated"),
     ]
