@@ -128,11 +128,7 @@ class Composition(Substep):
     def stage(self, h, last, t, when, starts, iterations, final):
         """A stage of h after one of `last`."""
         if ti.static(self.springs):
-            self.weigh(h, h * h, -1, 0, True)
-            for f in ti.static(self.batches):
-                for c in range(f.count):
-                    f.kick(c, h)
-            self.spread(h, h * h, -1, 0)
+            self.kick(h)
         for i in range(self.n):
             self.propel(i, h, last, t, starts)
         for f in ti.static(self.drivers):

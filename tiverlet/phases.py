@@ -191,6 +191,15 @@ class Phases:
                 f.spread(e, h, hh, first, fresh)
 
     @ti.func
+    def kick(self, h):
+        """h^2 times what springs, at the present positions, accelerate: to the slots."""
+        self.weigh(h, h * h, -1, 0, True)
+        for f in ti.static(self.batches):
+            for c in range(f.count):
+                f.kick(c, h)
+        self.spread(h, h * h, -1, 0)
+
+    @ti.func
     def tell(self, h, when, first, fresh):
         """3a Every constraint leaves the moves that it wants in its slots, or tells its system what it is about."""
         hh = self.reach(h, fresh)

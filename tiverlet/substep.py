@@ -130,11 +130,7 @@ class Substep(Phases):
         """
         h = ti.cast(h64, self.real)
         if ti.static(self.springs):
-            self.weigh(h, h * h, -1, 0, True)
-            for f in ti.static(self.batches):
-                for c in range(f.count):
-                    f.kick(c, h)
-            self.spread(h, h * h, -1, 0)
+            self.kick(h)
         for i in range(self.n):
             bond = 0 * self.state.d[i]
             if ti.static(self.springs):
