@@ -181,6 +181,29 @@ def test_an_empty_world_is_replayed(tmp_path):
     assert list(recording.frames) == [0, 1, 2, 3] and recording.position(3).shape == (0, 3) and recording.verify()
 
 
+def test_what_comes_and_goes_is_replayed(world, tmp_path):
+    w = world(tv.Particles(np.eye(3), velocity=(0, 1, 0)), [tv.Gravity()], substeps=2)
+    w.run(0.1)
+    with tv.Recorder(tmp_path / "c.rrd", w) as recorder:
+        for frame in range(6):
+            if frame == 2:
+                w.add(tv.Particles([[9.0, 9.0, 9.0]], mass=2.0), [tv.Drag(0.1)])
+            if frame == 4:
+                w.remove([0])
+            w.step(1 / 60)
+            recorder.log()
+    recording = tv.replay(tmp_path / "c.rrd")
+    assert [len(recording.position(frame)) for frame in range(7)] == [3, 3, 3, 4, 4, 3, 3]
+    assert recording.verify()
+    with recording.world(4) as again:
+        assert [repr(f) for f in again.features] == ["Gravity", "Drag"] and again.time == recording.times[4]
+        assert again.particles.mass.tolist() == [1, 1, 1, 2]
+    with recording.world(6) as again:
+        assert again.hash() == w.hash()
+    with pytest.raises(ValueError, match="not the same in all frames"):
+        recording.export("c.npz")
+
+
 def test_user_functions_must_be_given_again(tmp_path):
     path = tmp_path / "f.rrd"
     with tv.World(tv.Particles([[1.0, 0.0]]), [tv.Force(swirl)]) as world, tv.Recorder(path, world):

@@ -221,7 +221,7 @@ class Access:
         remember. Where a force or a spring is added, displacements are first turned into velocities, as when a force changes.
         It costs what building a world costs, some seconds of compiling for a large scene: add many things at once.
 
-        Raises as World() does, and RuntimeError while it is recorded; the world is then as before.
+        Raises as World() does; the world is then as before.
         """
         return regroup.add(self, particles, features)
 
@@ -235,7 +235,7 @@ class Access:
         What stays goes on to the bit, see add(). A force that goes with a particle is gone from the next substep on, as when a
         constraint breaks. Functions of the user's own that take the number of a particle or constraint get the new one.
 
-        Raises ValueError or TypeError for what there is not, and RuntimeError while it is recorded; the world is then as before.
+        Raises ValueError or TypeError for what there is not; the world is then as before.
         """
         regroup.remove(self, particles, features)
 

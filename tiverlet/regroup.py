@@ -46,7 +46,7 @@ class Handle:
 
 def add(world: Any, particles: Particles | None, features: Iterable[Feature]) -> Handle:
     """See World.add."""
-    late = listed(world, "add", features)
+    late = listed("add", features)
     if particles is not None:
         if not isinstance(particles, Particles):
             raise TypeError(f"World.add: particles = {particles!r} is a {type(particles).__name__}; use tv.Particles(position).")
@@ -63,7 +63,7 @@ def add(world: Any, particles: Particles | None, features: Iterable[Feature]) ->
 
 def remove(world: Any, particles: Any, features: Iterable[Feature]) -> None:
     """See World.remove."""
-    gone = listed(world, "remove", features)
+    gone = listed("remove", features)
     for k, feature in enumerate(gone):
         if not any(feature is f for f in world.features):
             raise ValueError(f"World.remove: features[{k}] = {feature!r} does not act in this world.")
@@ -90,10 +90,8 @@ def chosen(world: Any, who: str, particles: Any) -> np.ndarray:
     return checks.indices(who, "particles", array, n)
 
 
-def listed(world: Any, what: str, features: Any) -> tuple[Feature, ...]:
+def listed(what: str, features: Any) -> tuple[Feature, ...]:
     """Features as a tuple."""
-    if world._watchers:
-        raise RuntimeError(f"World.{what}: the world is being recorded; close the Recorder first, and make a new one after.")
     if isinstance(features, Feature) or not isinstance(features, Iterable):
         raise TypeError(f"World.{what}: features = {features!r} is a {type(features).__name__}; write a list, [...].")
     return tuple(features)
@@ -158,6 +156,8 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
         world._placed = n
     if m and not world._fresh:
         _launch(world, n)
+    for watcher in world._watchers:
+        watcher.regrouped()
 
 
 def _drives(feature: Feature, number: np.ndarray) -> bool:

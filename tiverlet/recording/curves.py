@@ -19,13 +19,17 @@ class Curves:
         import rerun as rr
 
         self._rr, self._stream = rr, stream
-        p = world.particles
-        self._mass = np.where(p.inv_mass > 0, p.mass, 0.0)
+        self.weigh(world)
         self._rows: dict[str, list[tuple[int, float, float]]] = {}
         self._begun = False
         for curves in CURVES.values():
             for name, (title, color) in curves.items():
                 stream.log(f"figures/{name}", rr.SeriesLines(names=[title], colors=[color]), static=True, strict=True)
+
+    def weigh(self, world: "World") -> None:
+        """Look at the masses; there may be others when particles were added or removed."""
+        p = world.particles
+        self._mass = np.where(p.inv_mass > 0, p.mass, 0.0)
 
     def add(self, frame: int, report: StepReport, now: Kept) -> None:
         """The figures of a frame. The momentum is that of the displacements, half a substep ago, as the energy is."""

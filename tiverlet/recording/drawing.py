@@ -38,10 +38,8 @@ class Drawing:
         self._strip = pyarrow.list_(pyarrow.field("item", point, nullable=False))  # of rerun's lines
         self.bytes = 0
         self._extent = extent
-        self._contacts = len(world.particles) <= FEW and bool(world._sub.contacts)
+        self.scenes = 0  # that were begun
         self._touched = self._torn = False
-        self._links = [(k, f, slice(None, None, -(-f.count // MANY))) for k, f in links(world)]
-        self._broken = {k: f.broken for k, f in enumerate(world.features) if isinstance(f, Batch) and f.breaks}
 
     def static(self, entity: str, what: Any) -> None:
         """Log what holds for all frames."""
@@ -51,13 +49,22 @@ class Drawing:
         self._stream.log(entity, what, strict=True)
 
     def begin(self) -> None:
-        """What does not change."""
-        p = self._world.particles
+        """What does not change until particles or features come or go; then all is drawn anew, under another name."""
+        world, p = self._world, self._world.particles
+        self._root = f"{SCENE}/scene{self.scenes}" if self.scenes else SCENE
+        if self.scenes:
+            self._log(SCENE, self._rr.Clear(recursive=True))
+        self.scenes += 1
+        self._contacts = len(p) <= FEW and bool(world._sub.contacts)
+        self._links = [(k, f, slice(None, None, -(-f.count // MANY))) for k, f in links(world)]
+        self._broken = {k: f.broken for k, f in enumerate(world.features) if isinstance(f, Batch) and f.breaks}
         hues = golden_colors(len(p))
         hues[p.inv_mass == 0] = (140, 140, 150)
-        self.static(PARTICLES, self._points.from_fields(radii=np.where(p.radius > 0, p.radius, POINT), colors=hues))
+        self.static(
+            f"{self._root}/{PARTICLES}", self._points.from_fields(radii=np.where(p.radius > 0, p.radius, POINT), colors=hues)
+        )
         for k, _, _ in self._links:
-            self.static(f"{SCENE}/links/{k}", self._strips.from_fields(radii=[-1.2]))
+            self.static(f"{self._root}/links/{k}", self._strips.from_fields(radii=[-1.2]))
         if self._links:
             hues, labels = legend()
             at = np.stack([WIDE * np.arange(len(hues)), np.zeros(len(hues))], axis=1)
@@ -71,7 +78,7 @@ class Drawing:
         """Draw a frame. x: (n, dim), and rounded to f32. turned: features that are not as they were in the last one. torn: if
         something broke since then.
         """
-        self._log(PARTICLES, self._points.from_fields(positions=x32))
+        self._log(f"{self._root}/{PARTICLES}", self._points.from_fields(positions=x32))
         self.bytes += x32.nbytes
         for link in self._links:
             self._link(*link, x)
@@ -96,7 +103,7 @@ class Drawing:
         r = ends[:, 0] - ends[:, 1]
         with np.errstate(divide="ignore", invalid="ignore"):
             shades = colors(np.sqrt(np.einsum("ij,ij->i", r, r)) / rest - 1)
-        self._log(f"{SCENE}/links/{k}", self._strips.from_fields(strips=strips, colors=shades))
+        self._log(f"{self._root}/links/{k}", self._strips.from_fields(strips=strips, colors=shades))
         self.bytes += shades.nbytes + 4 * ends.size
 
     def _wall(self, k: int) -> None:
@@ -105,7 +112,7 @@ class Drawing:
         if isinstance(wall, (Wall, Path)):
             strips, thickness = wall.outline(*self._extent)
             radius = thickness if thickness else -1.5  # half the width in the scene, or pixels
-            self._log(f"{SCENE}/walls/{k}", self._strips(strips, colors=[[120, 125, 140]], radii=[radius]))
+            self._log(f"{self._root}/walls/{k}", self._strips(strips, colors=[[120, 125, 140]], radii=[radius]))
             self.bytes += strips.nbytes
 
     def _contact(self, x: np.ndarray) -> None:
@@ -121,7 +128,7 @@ class Drawing:
             middle = x[pairs[:, 1]] + found.normal * (r[pairs[:, 1]] - found.overlap / 2)[:, None]
         else:
             middle = np.zeros((0, world.particles.dim))
-        self._log(f"{SCENE}/contacts", self._points(middle.astype(np.float32), radii=[-1.2], colors=[[20, 22, 28]]))
+        self._log(f"{self._root}/contacts", self._points(middle.astype(np.float32), radii=[-1.2], colors=[[20, 22, 28]]))
         self.bytes += middle.nbytes // 2
 
     def _breaks(self, x: np.ndarray) -> None:
@@ -139,7 +146,7 @@ class Drawing:
                 named = ", ".join(map(str, new[:20].tolist())) + (" ..." if len(new) > 20 else "")
                 self.event(f"{f!r} (feature {k}): {len(new)} broke: {named}", "WARN")
         at = np.concatenate(marks).astype(np.float32)
-        self._log(f"{SCENE}/breaks", self._points(at, radii=[-7.0], colors=[[255, 60, 60, 180]]))
+        self._log(f"{self._root}/breaks", self._points(at, radii=[-7.0], colors=[[255, 60, 60, 180]]))
 
     def event(self, text: str, level: str = "INFO") -> None:
         """A line in the list of events."""

@@ -1,6 +1,6 @@
 """The journal of a recording: what happened to a world, entry by entry, so that it can happen again.
 
-    scene     particles, features, settings, versions; another one where the scene changes
+    scene     particles, features, settings, versions; another one where particles or features came or went. A state follows.
     state     an exact state, to continue from
     turned    knobs that the user turned, before the next step
     assigned  positions or velocities that the user assigned
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 FORMAT = 1
 JOURNAL = "tiverlet/journal"
-PARTICLES = "world/scene/particles"  # the entity that has the positions of each frame
+PARTICLES = "particles"  # the end of the entities that have the positions of frames
 Write = Callable[[str, np.ndarray, str], None]
 
 
@@ -78,14 +78,22 @@ class Journal:
         self.world, self.frame, self.bytes = world, 0, 0
         self.worst: StepReport | None = None  # of the whole recording
         self.recent: StepReport | None = None  # since the last frame
-        self.stirred: set[int] = set()  # features that were turned since then
+        self.stirred: set[int]  # features that were turned since then
         self._write, self._serial, self._sum = write, 0, ""
         self._steps: list[list] = []
+        self.scenes = self.size = 0  # how many there were, and the size of the last state [bytes]
         self._last: list | None = None
-        data, arrays = scene.describe(world)
-        self._known = [copy.deepcopy(scene.knobs(f)) for f in world.features]
-        self.put("scene", {"format": FORMAT, **data}, arrays)
+        self.regrouped()
         world._watchers.append(self)
+
+    def regrouped(self) -> None:
+        """Write the scene and its state: at the begin, and when the user has added or removed something."""
+        data, arrays = scene.describe(self.world)
+        self._known = [copy.deepcopy(scene.knobs(f)) for f in self.world.features]
+        self.put("scene", {"format": FORMAT, **data}, arrays)
+        self.size = self.state()
+        self.scenes += 1
+        self.stirred = set(range(len(self.world.features)))  # all are to be drawn
 
     def put(self, kind: str, data: dict[str, Any], arrays: dict[str, np.ndarray] | None = None) -> int:
         """Write an entry; returns its size [bytes]."""
@@ -105,7 +113,7 @@ class Journal:
         return [settings["substeps"], settings["iterations"], list(self.world._guard.memory)]
 
     def state(self) -> int:
-        """Write the exact state; returns the size of the entry."""
+        """Write the exact state; returns the size of the entry [bytes]."""
         kept, world = snapshot.keep(self.world), self.world
         more = {"flags": snapshot.flags(world), "reach": world._scene.hh}
         return self.put("state", {"clock": kept.clock, **more}, kept.values)
@@ -172,4 +180,8 @@ def read(path: str, chunks: list[Any], whole: bool) -> tuple[list[Entry], str]:
                 f"replay: {path} was changed after it was recorded: entry {k}, {entry.kind!r} of frame {entry.frame}."
             )
         entries.append(entry)
+    if entries[-1].kind == "scene":  # its state was not flushed
+        entries.pop()
+    if not entries:
+        raise ValueError(f"replay: {path} was cut short before anything was flushed.")
     return entries, ""

@@ -81,14 +81,12 @@ class Recorder:
         self._drawing = Drawing(world, self._stream, extent)
         flat = world.particles.dim == 2
         self._drawing.static(SCENE, MIRROR if flat else rr.ViewCoordinates.RIGHT_HAND_Y_UP)
-        self._drawing.begin()
         self._curves = Curves(world, self._stream)
         self._drawing.static("about", rr.TextDocument(about(world), media_type="text/markdown"))
         self._sent, self._flushed = perf_counter(), 0
         self._stamp(0)
         self._journal = Journal(world, self._write)
-        self._journal.stirred.update(range(len(world.features)))  # all are to be drawn
-        self._state()
+        self._note_state(self._journal.size)
         self._frame(0)
         self._least = self.bytes + RESERVE
         if self.budget is not None and self.budget < 2 * self._least:
@@ -160,9 +158,9 @@ class Recorder:
             self._thinned.append((self._calls, stride))
         return max([self.every, *(s for _, s in self._thinned)])
 
-    def _state(self) -> None:
-        """Write an exact state to continue from."""
-        self._due = SHARE * self._journal.state()
+    def _note_state(self, size: int) -> None:
+        """An exact state of that size was written, to continue from: when the next one is due."""
+        self._due = SHARE * size
         self._drawn, self._last_state = self._drawing.bytes, self._calls
 
     def _frame(self, number: int) -> None:
@@ -170,7 +168,10 @@ class Recorder:
         journal.frame = number
         self._stamp(number)
         if number and (self._drawing.bytes - self._drawn > self._due or number - self._last_state >= SPARSE):
-            self._state()
+            self._note_state(journal.state())
+        if journal.scenes > self._drawing.scenes:
+            self._curves.weigh(world)
+            self._drawing.begin()
         now = snapshot.keep(world, pairs=False)
         n = len(world.particles)
         x = now.position(n)

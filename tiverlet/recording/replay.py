@@ -43,12 +43,14 @@ class Replay:
         self.path, self._given = path, given
         with rrd.chunks(path) as (chunks, whole):
             self._entries, trouble = journal.read(path, chunks, whole)
-            first = self._entries[0]
+            first, empty = self._entries[0], False
             dim = first.arrays["position"].shape[1]
             drawn = rrd.by_frame(chunks, journal.PARTICLES, f"Points{dim}D:positions")
             self.curves = rrd.curves(chunks)
-        if not len(first.arrays["position"]):
-            drawn = {e.frame: np.zeros(0, dtype=np.float32) for e in self._entries if e.kind == "frame"}
+        for e in self._entries:
+            empty = not len(e.arrays["position"]) if e.kind == "scene" else empty  # rerun leaves out what is empty everywhere
+            if e.kind == "frame" and empty:
+                drawn[e.frame] = np.zeros(0, dtype=np.float32)
         self._drawn = {k: x.reshape(-1, dim) for k, x in drawn.items()}
         self.scene: dict[str, Any] = first.data
         shown = [e for e in self._entries if e.kind == "frame" and e.frame in self._drawn]
@@ -155,20 +157,30 @@ class Replay:
             return f"What is not as it was: {', '.join(other)}."
         return "Versions and machine are those of the recording, so the file was changed, or a function of the scene was."
 
-    def _run(self, start: int, end: int) -> Iterator[tuple["World", Entry]]:
-        """Do what the entries from `start` (a state) to `end` say; the world after each. The caller closes it."""
-        base = max(k for k in range(start) if self._entries[k].kind == "scene")
+    def _begin(self, start: int) -> "World":
+        """A world in the state of entry `start`."""
+        state, base = self._entries[start], max(k for k in range(start) if self._entries[k].kind == "scene")
         source = self._entries[base]
         before = [turned for e in self._entries[base:start] if e.kind == "turned" for turned in self._turned(e)]
         world = scene.rebuild(source.data, source.arrays, self._given, before)
-        state = self._entries[start]
         _settle(world, [e.data["now"] for e in self._entries[: start + 1] if "now" in e.data][-1])
         snapshot.install(world, _kept(state, world), state.data["flags"])
         world._scene.hh = state.data["reach"]
-        yield world, state
-        for entry in self._entries[start + 1 : end + 1]:
-            self._apply(world, entry)
-            yield world, entry
+        return world
+
+    def _run(self, start: int, end: int) -> Iterator[tuple["World", Entry]]:
+        """Do what the entries from `start` (a state) to `end` say; the world after each. The caller closes the last one.
+
+        Where particles or features came or went there is a new scene, and its state is taken as it was recorded.
+        """
+        world = self._begin(start)
+        yield world, self._entries[start]
+        for k in range(start + 1, end + 1):
+            self._apply(world, self._entries[k])
+            if self._entries[k].kind == "scene":
+                world.close()
+                world = self._begin(k + 1)
+            yield world, self._entries[k]
 
     def _apply(self, world: "World", entry: Entry) -> None:
         """Make the steps of an entry, and then what it says."""
@@ -194,16 +206,17 @@ class Replay:
 
     def export(self, path: str) -> None:
         """Write positions, times, masses, radii and curves to an .npz file, or positions to a .csv table."""
-        x = np.stack([self.position(int(k)) for k in self.frames]) if len(self.frames) else np.zeros((0, 0, 2), np.float32)
-        kind = os.path.splitext(path)[1]
+        x = [self.position(int(k)) for k in self.frames]
+        kind, p = os.path.splitext(path)[1], self._entries[0].arrays
         if kind == ".npz":
-            p = self._entries[0].arrays
+            if sum(e.kind == "scene" for e in self._entries) > 1:
+                raise ValueError("replay: the particles are not the same in all frames, so they are no array; export to .csv.")
             more: dict[str, Any] = {name: p[name] for name in ("mass", "radius")}
             for name, (frames, values) in self.curves.items():
                 more |= {f"{name} frame": frames, f"{name} value": values}
-            np.savez_compressed(path, position=x, frame=self.frames, time=self.times, **more)
+            np.savez_compressed(path, position=np.array(x), frame=self.frames, time=self.times, **more)
         elif kind == ".csv":
-            n, dim = x.shape[1:]
+            dim = p["position"].shape[1]
             with open(path, "w") as out:
                 out.write(f"frame,time,particle,{','.join('xyz'[:dim])}\n")
                 for frame, time, rows in zip(self.frames.tolist(), self.times.tolist(), x, strict=True):

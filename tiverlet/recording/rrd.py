@@ -85,10 +85,10 @@ def numbers(chunk: Any, timeline: str) -> np.ndarray:
 
 
 def by_frame(chunks: list[Any], entity: str, column: str) -> dict[int, np.ndarray]:
-    """What a column of an entity has, by frame."""
+    """What a column of an entity has, or of all whose paths end like this, by frame."""
     out = {}
     for chunk in chunks:
-        if chunk.entity_path == f"/{entity}" and not chunk.is_static and column in chunk.to_record_batch().schema.names:
+        if chunk.entity_path.endswith(f"/{entity}") and not chunk.is_static and column in chunk.to_record_batch().schema.names:
             out.update(zip(numbers(chunk, "frame").tolist(), rows(chunk, column), strict=True))
     return dict(sorted(out.items()))
 
