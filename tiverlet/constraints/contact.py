@@ -146,9 +146,10 @@ class Contact(Touch):
         for e in range(begin, end):
             j = self._on_grid.near[e]
             r, far = self._on_state.apart(i, j), self.far(i, j)
-            scale = 1 / (far * far)
-            share = r.dot(r) * scale
-            one = ti.select(share < 1, zero + 1, zero)  # no branch: it would be taken at random
+            rr, ff = r.dot(r), far * far
+            one = ti.select(rr < ff, zero + 1, zero)  # as in touch(), to the last digit; no branch: it would be taken at random
+            scale = 1 / ff
+            share = rr * scale
             pairs += one
             if ti.static(not self._on_rubs):
                 tensor += (one * scale) * r.outer_product(r)
