@@ -26,6 +26,7 @@ PICTURES = {
         1200,
         [[("soft", 60, 0.4, 1.0), ("cloth", 150, 0.0, 1.0)], [("ragdoll", 150, 0.3, 1.0), ("machine", 200, 0.0, 1.0)]],
     ),
+    "rails": (1200, [[("bead", 45, 0.0, 1.0), ("tidy", 300, 0.42, 1.0)]]),
 }
 MARGIN = 12  # pixels of background that are left around a scene
 
