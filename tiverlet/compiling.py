@@ -29,6 +29,7 @@ HOSTS = ("Arch.x64", "Arch.arm64")  # whose kernels LLVM makes as fast without i
 # No analysis of control flow, and, since that one would find that two addresses are the same, no variables for what loops read
 # and write at one address: it would become two variables.
 LEAN = {"cfg_optimization": False, "cache_loop_invariant_global_vars": False}
+_INSIDE = contextlib.nullcontext()
 _lock = threading.RLock()  # the type of literals is one for all threads
 _active: list["Compiler"] = []  # whose kernels are being compiled or launched, the innermost last
 _lines: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()  # of functions, as inspect finds them
@@ -47,9 +48,16 @@ class Compiler:
         self.real = real
         self.thorough = not _patched  # once and for all, since what Taichi fails to compile may be tried again
         self._settings: dict[str, Any] = {}  # that Taichi was started with
+        self._thread = 0
+
+    def __call__(self) -> contextlib.AbstractContextManager[None]:
+        """The context; inside itself it has nothing to do."""
+        if _active and _active[-1] is self and self._thread == threading.get_ident():
+            return _INSIDE
+        return self._entered()
 
     @contextlib.contextmanager
-    def __call__(self) -> Iterator[None]:
+    def _entered(self) -> Iterator[None]:
         runtime: Any = impl.get_runtime()
         with _lock:
             config, literals = runtime.prog.config(), runtime.default_fp
@@ -59,6 +67,7 @@ class Compiler:
             if str(config.arch) in HOSTS and not self.thorough:
                 _set(config, LEAN)
             _active.append(self)
+            self._thread = threading.get_ident()
             try:
                 yield
             finally:

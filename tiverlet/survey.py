@@ -18,7 +18,7 @@ TURNS = (0, 26, 41)  # degrees, for nothing, BENT and FAR
 STIFF = 4.0  # (omega h)^2 beyond which Verlet diverges
 
 
-Figures = ti.types.vector(16, ti.f64)
+FIGURES = 16
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,14 @@ class Survey:
         return figures, low, high
 
     @ti.kernel
-    def measure(self, h64: ti.f64, t64: ti.f64, fresh: ti.i32, begin: ti.i32) -> Figures:
+    def measure(
+        self,
+        h64: ti.f64,
+        t64: ti.f64,
+        fresh: ti.i32,
+        begin: ti.i32,
+        out: ti.types.ndarray(ti.f64, 1),  # type: ignore[valid-type]
+    ):
         """All figures; fresh: the last substep was a start; begin: d holds velocities, no step was made yet."""
         h32 = ti.cast(h64, self.sub.real)
         self.sub.weigh(h32, self.sub.reach(h32, fresh), 0, fresh, False)
@@ -191,7 +198,6 @@ class Survey:
                 h, t = ti.cast(h64, self.sub.real), ti.cast(t64, self.sub.real)
                 b = thread // self.spread
                 self.parts[b], self.low[b], self.high[b] = self.block(b, h, t, self.sub.clock(0, 1), fresh, begin)
-        out = ti.Vector.zero(ti.f64, 16)
         ti.loop_config(serialize=True)
         for _ in range(1):
             for b in range(1, BLOCKS):
@@ -223,7 +229,6 @@ class Survey:
             self.sub.slots.broken[None] = 0
         for k in ti.static(range(self.dim)):
             out[7 + k], out[10 + k] = self.low[0][k], self.high[0][k]
-        return out
 
     def residuals(self, batch, h: float, fresh: bool) -> np.ndarray:
         """What the last substep left of each violation in a batch, (m,)."""
@@ -237,7 +242,8 @@ class Survey:
         self, time: float, h: float, substeps: int, iterations: int, fresh: bool, begin: bool
     ) -> tuple[StepReport, np.ndarray]:
         """The report of a frame (without energy_change), and the size of the bounding box [m]."""
-        out = np.array(self.measure(h, time, int(fresh), int(begin)))
+        out = np.zeros(FIGURES)
+        self.measure(h, time, int(fresh), int(begin), out)
         energy, residual, overlap, stiff, contacts, bad, flags = (float(v) for v in out[:7])
         stiff = max(stiff, self.sub.fastest * h * h)
         low, high = out[7 : 7 + self.dim], out[10 : 10 + self.dim]

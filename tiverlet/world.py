@@ -110,12 +110,13 @@ class World(Access):
         for watcher in self._watchers:
             watcher.before()
         clock = perf_counter()
-        self._heed()
-        if self._guard.auto or tolerance is not None or budget is not None:
-            report = self._guard.advance(self, dt, tolerance, budget)
-        else:
-            self._begin(dt / self.substeps * self._sub.first)
-            report = self._advance(dt, self.substeps, self.iterations)
+        with self._memory.compiler():
+            self._heed()
+            if self._guard.auto or tolerance is not None or budget is not None:
+                report = self._guard.advance(self, dt, tolerance, budget)
+            else:
+                self._begin(dt / self.substeps * self._sub.first)
+                report = self._advance(dt, self.substeps, self.iterations)
         self._last = report = replace(report, seconds=perf_counter() - clock)
         for watcher in self._watchers:
             watcher.after(dt, report)
