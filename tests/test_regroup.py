@@ -198,6 +198,8 @@ def test_after_an_error_the_world_is_as_before(world):
         w.add(features=[link])
     with pytest.raises(ValueError, match=r"Rope: pairs\[0\] = \(3, 4\), but there are 4 particles"):
         w.add(more, [tv.Gravity(1.0), tv.Rope([[3, 4]])])
+    with pytest.raises(ValueError, match=r"order = 4, but Contact is one-sided"):
+        world(tv.Particles(x, radius=0.1), precision="f64", order=4).add(features=[tv.Contact()])
     with pytest.raises(ValueError, match="too large for f32"):  # found late, when the force has already asked for a new start
         w.add(more, [tv.Gravity(1.0), tv.Volume([[0, 1, 2, 3]], rest=1e30)])
     with pytest.raises(ValueError, match=r"World.remove: features\[0\] = Gravity does not act in this world"):

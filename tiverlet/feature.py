@@ -13,7 +13,9 @@ kinds, told apart by what the substep asks of them:
     Wall           (wall.py) confine(i, ...) of one particle, with the last word
 
 A new constraint on k particles is one file with one Scalar subclass: `arity = k`, an __init__ that checks its arrays,
-`rest_of(position)` for a default rest value, and `measure`. See constraints/distance.py.
+`rest_of(position)` for a default rest value, and `measure`. See constraints/distance.py. Arrays of its own with a row for each
+constraint are named in `each`, and what depends on where particles were is taken from `self.start`, so that worlds can be added to
+(regroup.py).
 """
 
 from collections.abc import Callable

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from . import checks, runtime, snapshot
-from .assembly import assemble, checked_features
+from .assembly import assemble, check_settings, checked_features
 from .constraints.contact import Contact
 from .feature import Acceleration, Batch, Feature
 from .particles import Particles
@@ -55,6 +55,7 @@ def add(world: Any, particles: Particles | None, features: Iterable[Feature]) ->
     checked_features(late)
     if sum(isinstance(f, Contact) for f in (*world.features, *late)) > 1:
         raise ValueError("World.add: more than one Contact; one covers all particles.")
+    check_settings(world._precision, world._wanted[1], world._order, (*world.features, *late))
     n, count = len(world.particles), 0 if particles is None else len(particles)
     if late or count:
         rebuild(world, np.ones(n, dtype=bool), particles, (*world.features, *late))
