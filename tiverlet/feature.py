@@ -14,8 +14,8 @@ kinds, told apart by what the substep asks of them:
 
 A new constraint on k particles is one file with one Scalar subclass: `arity = k`, an __init__ that checks its arrays,
 `rest_of(position)` for a default rest value, and `measure`. See constraints/distance.py. Arrays of its own with a row for each
-constraint are named in `each`, and what depends on where particles were is taken from `self.start`, so that worlds can be added to
-(regroup.py).
+constraint are named in `each`, and what depends on where particles were is taken from `self.start`, so that a world can be built
+anew around it (regroup.py).
 """
 
 from collections.abc import Callable
