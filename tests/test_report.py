@@ -9,6 +9,8 @@ import shutil
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 
+import dask
+import distributed
 import numpy as np
 import pytest
 import taichi as ti
@@ -151,13 +153,16 @@ def test_sweeps_run_in_processes_and_survive_one_that_dies():
     assert any("BrokenProcessPool" in why for why in found.failures["D01_double_pendulum, XPBD, f64"])
 
 
-def test_sweeps_run_on_dask():
-    distributed = pytest.importorskip("distributed")
-    with distributed.Client(n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None) as client:
+def test_sweeps_run_on_dask_and_survive_a_worker_that_dies():
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
+        distributed.Client(n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None) as client,
+    ):
         found = tv.report.error_vs_time(
-            "D01", methods=["Direct"], precisions=("f64",), efforts=(20,), baselines=False, executor=client.get_executor()
+            "D01", methods=["Direct"], precisions=("f64",), efforts=(20,), runs=1, executor=Deadly(client.get_executor())
         )
-    assert len(found.points) == 1 and not found.missing
+    assert [p.substeps for p in found.curve("D01_double_pendulum", "Direct")] == [20]
+    assert any(m.task == "D01_double_pendulum, XPBD, f64" for m in found.missing)
 
 
 def test_the_certificate_tells_what_holds_and_what_does_not(monkeypatch, tmp_path, capsys):
