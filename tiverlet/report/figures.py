@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def plot(report: "ErrorReport", folder) -> list[str]:
     """One PNG for each case; diverged points are crosses on the top edge."""
     try:
-        from matplotlib.figure import Figure
+        from matplotlib.figure import Figure  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise RuntimeError('plot: matplotlib is not there. Install it with the extra: pip install "tiverlet[plots]".') from error
     os.makedirs(folder, exist_ok=True)
