@@ -173,7 +173,7 @@ def _carried(
 ) -> dict[str, np.ndarray]:
     """The state of a world that was built anew: the rows of what stayed are as they were."""
     new = memory.state()
-    names = [{id(e.field): e.name for mem in (one,) for e in mem.entries if e.state} for one in (world._memory, memory)]
+    names = [{id(e.field): e.name for e in one.entries if e.state} for one in (world._memory, memory)]
     owned: list[set[str]] = [set(), set()]
     moves: list[tuple[str, str, tuple[np.ndarray, ...]]] = []
     for feature, before in attributes.items():

@@ -6,6 +6,7 @@ import taichi as ti
 from .. import checks
 from ..feature import Knob, Scene
 from ..particles import Particles
+from ..scalar import Scalar
 from .bend import TURN, Turning
 
 
@@ -80,15 +81,7 @@ class AngleLimit(Turning):
             self.scene.memory.write(self._on_rest, self.rest)
             self.scene.memory.write(self._on_middle, self.middle)
 
-    @ti.func
-    def near(self, f, other):
-        """A distance from the middle: it has no other value."""
-        return f
-
-    @ti.func
-    def distinct(self, f, f0):
-        """A limit at straight acts on neither side of it."""
-        return True
+    near, distinct = Scalar.near, Scalar.distinct  # a distance from the middle has one value, and acts on one side of straight
 
     @ti.func
     def measure(self, c, q):

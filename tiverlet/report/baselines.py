@@ -64,6 +64,18 @@ class Baseline:
                 return "knows no dashpots"
         return ""
 
+    @ti.func
+    def relax(self, c, part, give):
+        """Take back `part` of what link c lacks, as far as it does not give way."""
+        i, j = self.pair[c][0], self.pair[c][1]
+        r = self.x[i] - self.x[j]
+        length = r.norm()
+        sum = self.w[i] + self.w[j]
+        if length > 0 and sum > 0:
+            step = part * (self.length[c] - length) / (sum + give) * r / length
+            self.x[i] += self.w[i] * step
+            self.x[j] -= self.w[j] * step
+
     def restart(self) -> None:
         """Go back to the start."""
         moves = (self.particles.inv_mass > 0)[:, None]
@@ -135,14 +147,7 @@ class Article(Baseline):
                     self.x[i] += d
             for it in range(iterations):
                 for c in range(self.m):
-                    i, j = self.pair[c][0], self.pair[c][1]
-                    r = self.x[i] - self.x[j]
-                    length = r.norm()
-                    sum = self.w[i] + self.w[j]
-                    if length > 0 and sum > 0:
-                        step = STIFFNESS * (self.length[c] - length) / sum * r / length
-                        self.x[i] += self.w[i] * step
-                        self.x[j] -= self.w[j] * step
+                    self.relax(c, STIFFNESS, 0.0)
         for i in range(self.n):
             self.v[i] = (self.x[i] - self.before[i]) / h
 
@@ -165,14 +170,7 @@ class Xpbd(Baseline):
                     self.x[i] += h * self.v[i]
             for it in range(iterations):
                 for c in range(self.m):
-                    i, j = self.pair[c][0], self.pair[c][1]
-                    r = self.x[i] - self.x[j]
-                    length = r.norm()
-                    sum = self.w[i] + self.w[j]
-                    if length > 0 and sum > 0:
-                        step = (self.length[c] - length) / (sum + self.give[c] / (h * h)) * r / length
-                        self.x[i] += self.w[i] * step
-                        self.x[j] -= self.w[j] * step
+                    self.relax(c, 1.0, self.give[c] / (h * h))
             for i in range(self.n):
                 self.v[i] = (self.x[i] - self.before[i]) / h
 
