@@ -17,7 +17,7 @@ import taichi as ti
 
 import tiverlet as tv
 from tiverlet.__main__ import main
-from tiverlet.report import CASES, baselines, errors, points
+from tiverlet.report import CASES, baselines, errors, perturbed, points
 from tiverlet.report.cases import LEFT_OUT, chosen, entries
 from tiverlet.report.certificate import certify
 from tiverlet.report.extremes import ROWS, Finding, Row
@@ -238,6 +238,24 @@ def test_a_world_reports_on_itself(world):
     assert nothing.recommended is None and "No setting tried is within 1e-12 m" in nothing.paste
     with pytest.raises(ValueError, match="from 2 on"):
         w.report(0.3, substeps=[5])
+
+
+def test_reports_keep_the_order_of_a_world(world):
+    # Order 4 is for f64 and links that are solved: the report finds it, recommends it, and what is perturbed still has it.
+    links = [(0, 1), (1, 2)]
+    w = world(
+        tv.Particles([(0, 0), (1, 0), (2, 0)], pinned=[0]),
+        [tv.Gravity(9.81), tv.Distance(links)],
+        precision="f64",
+        order=4,
+        substeps=5,
+    )
+    w.run(0.1)
+    found = w.report(0.2, substeps=(2, 5, 10))
+    assert found.order == pytest.approx(4, abs=0.1) and {s.precision for s in found.settings} == {"f64"}
+    assert found.paste.endswith('precision="f64", order=4)')
+    with perturbed.scene_of(w, 1 / 60).build(w) as copy:
+        assert copy.order == 4
 
 
 def test_a_world_says_what_breaks_it(world):

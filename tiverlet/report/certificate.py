@@ -12,6 +12,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.progress import Progress
 from rich.table import Table
 
+from . import output
 from .extremes import ROWS, NotAvailable
 from .sweep import said
 
@@ -62,15 +63,12 @@ class Certificate:
         yield self.summary
 
     def __str__(self) -> str:
-        console = Console(width=160)
-        with console.capture() as text:
-            console.print(self)
-        return text.get()
+        return output.text(self, 160)
 
     def markdown(self) -> str:
         """The table as Markdown."""
-        lines = ["| # | case | criterion | figure | verdict |", "|---|---|---|---|---|"]
-        lines += [f"| {r.number} | {r.what} | {r.criterion} | {r.figure} | {verdict(r)} |" for r in self.results]
+        rows = [(str(r.number), r.what, r.criterion, r.figure, verdict(r)) for r in self.results]
+        lines = output.table(("#", "case", "criterion", "figure", "verdict"), rows)
         return "\n".join([*lines, "", self.summary]) + "\n"
 
     def json(self) -> str:

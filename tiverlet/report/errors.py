@@ -8,6 +8,7 @@ import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 
+from . import output
 from .cases import CASES, Case
 from .points import Point
 
@@ -152,19 +153,14 @@ class ErrorReport:
             yield f"left out: {line}"
 
     def __str__(self) -> str:
-        console = Console(width=160, record=True, file=None, quiet=True)
-        with console.capture() as text:
-            console.quiet = False
-            console.print(self)
-        return text.get()
+        return output.text(self, 160)
 
     def markdown(self, every: bool = False) -> str:
         """The table as Markdown; every: also one table of all points for each case."""
-        lines = [" | ".join(["", *HEADS, ""]).strip(), "|" + "---|" * len(HEADS)]
-        lines += [" | ".join(["", *cells(s), ""]).strip() for s in self.summaries]
+        lines = output.table(HEADS, map(cells, self.summaries))
         for case in self.cases if every else ():
-            lines += ["", f"**{case}**: {CASES[case].title}", "", "| " + " | ".join(COLUMNS) + " |", "|" + "---|" * len(COLUMNS)]
-            lines += ["| " + " | ".join(entry(p)) + " |" for points in self.curves(case) for p in points]
+            rows = [entry(p) for points in self.curves(case) for p in points]
+            lines += ["", f"**{case}**: {CASES[case].title}", "", *output.table(COLUMNS, rows)]
         lines += ["", *(f"- missing: {m.task}: {m.why}" for m in self.missing)]
         lines += [f"- left out: {line}" for line in self.omissions] if every else []
         return "\n".join(lines).strip() + "\n"
@@ -176,7 +172,7 @@ class ErrorReport:
             {
                 "machine": self.machine,
                 "cases": cases,
-                "points": [p.row() for p in self.points],
+                "points": [output.plain(asdict(p)) for p in self.points],
                 "orders": {f"{c}, {m}": o for c in self.cases for m in CASES[c].methods if (o := self.order(c, m))},
                 "failures": {k: list(v) for k, v in self.failures.items()},
                 "missing": [asdict(m) for m in self.missing],

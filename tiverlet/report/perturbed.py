@@ -18,6 +18,7 @@ from ..measure import kinetic_energy
 from ..particles import Particles
 from ..solid import Solid
 from ..world import World
+from . import output
 from .sweep import said
 
 if TYPE_CHECKING:
@@ -64,10 +65,7 @@ class Endurance:
         yield table
 
     def __str__(self) -> str:
-        console = Console(width=140)
-        with console.capture() as text:
-            console.print(self)
-        return text.get()
+        return output.text(self, 140)
 
     def json(self) -> str:
         """Everything, for machines."""
@@ -86,13 +84,11 @@ class Scene:
 
     def build(self, world: World) -> World:
         """With the settings and the structure of a world."""
-        p, settings = world.particles, {"substeps": world.substeps, "iterations": world.iterations}
+        p = world.particles
         start = Particles(self.position, velocity=self.velocity, mass=self.mass, radius=p.radius, pinned=p.pinned, group=p.group)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            return World(
-                start, self.features, solver=world._solver, precision=world.precision, path=world.path, **settings
-            )  # fmt: skip
+            return World(start, self.features, **world.settings)
 
 
 def perturbed(world: World, *, seconds: float = 1.0, dt: float = 1 / 60, shift: float = 1e6) -> Endurance:

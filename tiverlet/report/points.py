@@ -1,7 +1,7 @@
 """The measuring of one curve: a case, one way to solve it, one precision, and as many substeps as are asked for."""
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
 
@@ -60,10 +60,6 @@ class Point:
     momentum: float
     flags: tuple[str, ...]
     diverged: bool
-
-    def row(self) -> dict:
-        """As plain numbers, with None for what is not finite, as JSON wants it."""
-        return {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in asdict(self).items()}
 
 
 def curve(task: Task) -> list[Point]:

@@ -16,6 +16,7 @@ from ..feature import Batch
 from ..scalar import Scalar
 from ..solvers import Direct, Jacobi
 from ..world import World
+from . import output
 from .cases.case import rms
 
 EFFORTS = (2, 5, 10, 20, 40, 80, 160)
@@ -45,6 +46,7 @@ class Setting:
     residual: float
     energy_change: float
     flags: tuple[str, ...]
+    order: int = 2
 
     @property
     def paste(self) -> str:
@@ -53,6 +55,7 @@ class Setting:
         words += [f"iterations={self.iterations}"] if self.iterations != 1 else []
         words += [f"solver=tv.{self.solver}"]
         words += [f'precision="{self.precision}"'] if self.precision != "f32" else []
+        words += [f"order={self.order}"] if self.order != 2 else []
         return ", ".join(words)
 
 
@@ -117,30 +120,21 @@ class SceneReport:
         )  # fmt: skip
 
     def __str__(self) -> str:
-        console = Console(width=150)
-        with console.capture() as text:
-            console.print(self)
-        return text.get()
+        return output.text(self, 150)
 
     def markdown(self) -> str:
         """The table as Markdown."""
-        lines = ["| " + " | ".join(HEADS) + " |", "|" + "---|" * len(HEADS)]
-        lines += ["| " + " | ".join(self.cells(s)) + " |" for s in self.settings]
+        lines = output.table(HEADS, map(self.cells, self.settings))
         return "\n".join([*lines, "", "```python", self.paste, "```"]) + "\n"
 
     def json(self) -> str:
         """Everything, for machines."""
         names = ("reference", "reference_error", "order", "tolerance", "motion", "converges", "paste")
-        about = plain({k: getattr(self, k) for k in names})
-        return json.dumps({**about, "settings": [plain(asdict(s)) for s in self.settings]}, indent=1, allow_nan=False)
+        about = output.plain({k: getattr(self, k) for k in names})
+        return json.dumps({**about, "settings": [output.plain(asdict(s)) for s in self.settings]}, indent=1, allow_nan=False)
 
 
 HEADS = ("solver", "substeps", "precision", "error [m]", "f32's share", "ms per s", "residual", "energy [J]", "Pareto", "flags")
-
-
-def plain(row: dict) -> dict:
-    """With None for numbers that JSON does not have."""
-    return {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in row.items()}
 
 
 def scene_report(
@@ -162,12 +156,13 @@ def scene_report(
     # The reference goes twice as far, so that the finest of the sweep is measured against something finer.
     finer = [*efforts, 2 * efforts[-1]]
     rows: dict[tuple[str, str], list[Result]] = {}
-    solvers = solvers_of(world)
+    solvers, precisions = solvers_of(world), ("f64", "f32") if world.order == 2 else ("f64",)
     with Progress(disable=not progress) as bar:
-        shown = bar.add_task("report", total=len(solvers) * (len(finer) + len(efforts)))
+        shown = bar.add_task("report", total=len(solvers) * (1 + len(precisions) * len(efforts)))
         for solver in solvers:
-            for precision, list_ in (("f64", finer), ("f32", efforts)):
-                rows[repr(solver), precision] = runner.run(solver, precision, list_, lambda: bar.advance(shown))
+            for precision in precisions:
+                some = finer if precision == "f64" else efforts
+                rows[repr(solver), precision] = runner.run(solver, precision, some, lambda: bar.advance(shown))
     best, truth, error, order = reference(rows)
     motion = rms(truth, runner.start[0]) if np.isfinite(truth).all() else np.inf
     made = []
@@ -197,6 +192,7 @@ def scene_report(
                 r.residual,
                 r.energy,
                 r.flags,
+                world.order,
             )  # fmt: skip
         )
     settings.sort(key=lambda s: s.seconds)
@@ -261,8 +257,10 @@ class Runner:
 
 
 def solvers_of(world: World) -> list[Any]:
-    """The solvers that make sense for a scene: its own, and Direct next to Jacobi where links hang together."""
+    """The solvers that make sense for a scene: its own, and Direct next to Jacobi where links hang together, at order 2."""
     own = world._solver
+    if world.order > 2:
+        return [own]
     scalars = [f for f in world.features if isinstance(f, Scalar) and f.joins and f.count]
     other = Direct() if isinstance(own, Jacobi) else Jacobi()
     return [own, other] if scalars and type(other) is not type(own) else [own]

@@ -1,0 +1,26 @@
+"""What all reports print with: text, Markdown, and numbers that JSON has."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+
+def text(shown: Any, width: int) -> str:
+    """What print() of rich shows of something, in lines of `width`."""
+    console = Console(width=width)
+    with console.capture() as out:
+        console.print(shown)
+    return out.get()
+
+
+def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """The lines of a Markdown table."""
+    lines = ["| " + " | ".join(row) + " |" for row in (heads, *rows)]
+    return [lines[0], "|" + "---|" * len(heads), *lines[1:]]
+
+
+def plain(row: dict) -> dict:
+    """With None for numbers that JSON does not have."""
+    return {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in row.items()}
