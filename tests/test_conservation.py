@@ -10,22 +10,26 @@ from .test_links import net
 
 @pytest.mark.parametrize("precision, limit", [("f64", 1e-12), ("f32", 1e-6)])
 def test_momentum_is_conserved_for_ten_thousand_steps(world, precision, limit):
-    # Masses 1 ... 100, links from rigid to soft, contacts: all internal forces are equal and opposite.
-    x, v, mass, pairs, rest, alpha, damping = net(2, seed=4)
+    # Masses 1 ... 100, links from rigid to soft, contacts: all internal forces are equal and opposite. What is left is rounding, of
+    # m d in each substep: in f32 n N = 12 x 1e4 times 2^-24 of a particle's share, which walks to sqrt(n N) 2^-24 / sqrt(12) times
+    # a twelfth of the whole, 5e-7.
+    x, v, _, pairs, rest, alpha, damping = net(2, seed=4)
+    mass = 100.0 ** (np.random.default_rng(0).permutation(12) / 11)
     features = [tv.Distance(pairs, rest, compliance=alpha, damping=damping), tv.Contact()]
     w = world(tv.Particles(x, velocity=v, mass=mass, radius=0.3), features, substeps=100, precision=precision)
-    touched = 0
+    touched, worst = 0, 0.0
 
     def moving():
         d = w._memory.state()["displacement"].astype(np.float64)
-        return mass @ d / w._h, np.abs(mass @ np.abs(d)).sum() / w._h
+        return mass @ d / w._h, (mass @ np.abs(d)).sum() / w._h
 
     w.step(1 / 60)
     start, size = moving()
     for _ in range(100):  # 1e4 substeps
         touched += w.step(1 / 60).contacts
+        worst = max(worst, np.abs(moving()[0] - start).max())
     assert touched > 0 and np.isfinite(w.position).all()
-    assert np.abs(moving()[0] - start).max() <= limit * max(size, moving()[1])
+    assert worst <= limit * size and mass.max() / mass.min() == pytest.approx(100, rel=1e-12)
 
 
 def test_momentum_is_not_conserved_by_averaging_here(world):

@@ -65,31 +65,44 @@ def test_static_elongation_is_alpha_times_load(world, name, efforts):
 
 
 def test_compliance_from_1e_minus_12_to_1e12(world):
-    # Rows 8 and 9: a link under its load of 9.81 N is longer by alpha F, and the softest fall freely. One pendulum each.
+    # Rows 8 and 9: a link under its load of 9.81 N is longer by s = alpha F; let go at its rest length it gets there by
+    # s'' = g - s / alpha - c s', and the softest fall freely. One pendulum each.
     alpha = np.array([0.0, *10.0 ** np.arange(-12, 13)])
-    m = len(alpha)
+    m, g, c, t = len(alpha), 9.81, 20.0, 2.0
     x = np.zeros((2 * m, 2))
     x[:, 0] = np.tile(np.arange(m), 2)
     x[m:, 1] = -1.0
     link = tv.Distance(np.stack([np.arange(m), m + np.arange(m)], axis=1), rest=1.0, compliance=alpha)
     start = tv.Particles(x, pinned=np.arange(m))
+    soft = (alpha > 1e-2) & (alpha < 1e5)  # 1e-2 is damped critically; from 1e5 on the spring adds less than 5e-7
+    root = np.sqrt(c * c / 4 - 1 / alpha[soft])
+    fast, slow = -c / 2 - root, -c / 2 + root
+    want = g * alpha
+    want[soft] *= 1 + (fast * np.exp(slow * t) - slow * np.exp(fast * t)) / (slow - fast)
+    want[alpha >= 1e5] = g / c * (t + np.expm1(-c * t) / c)
     for precision in ("f64", "f32"):
         w = world(
             start,
-            [tv.Gravity(9.81), link.copy(), tv.Drag(20.0)],
+            [tv.Gravity(g), link.copy(), tv.Drag(c)],
             substeps=20,
             iterations=4,
             precision=precision,
         )
-        w.run(2.0)
+        w.run(t)
         stretch = -w.position[m:, 1] - 1.0
         assert np.isfinite(w.position).all() and not w.last.flags and (np.diff(stretch) >= -2e-7).all()
-        sure = alpha <= 1e-3
         # In f32 a position near 1 m stops following once d < ulp / 2 = 6e-8: speeds below 7e-5 m/s, drag below 1.4e-3 N.
-        rtol, atol = (1e-6, 1e-12) if precision == "f64" else (1.5e-3 / 9.81, 4e-7)
-        np.testing.assert_allclose(stretch[sure], 9.81 * alpha[sure], rtol=rtol, atol=atol)
-        free = 9.81 / 20 * (2 - (1 - np.exp(-40)) / 20)
-        np.testing.assert_allclose(stretch[-6:], free, rtol=1e-5)
+        rtol, atol = (1e-6, 1e-12) if precision == "f64" else (1.5e-3 / g, 4e-7)
+        np.testing.assert_allclose(stretch, want, rtol=rtol, atol=atol)
+        if precision == "f64":  # what is in balance stays, whatever the effort, to the last digit of a coordinate of 1 m
+            hung = x.copy()
+            hung[m:, 1] -= g * alpha
+            for substeps, iterations in ((20, 4), (20, 1), (7, 1), (50, 2)):
+                w.position, w.velocity = hung, 0 * x
+                w.substeps, w.iterations = substeps, iterations
+                w.run(t)
+                np.testing.assert_allclose(-w.position[m:, 1] - 1.0, g * alpha, rtol=1e-6, atol=2.3e-16)
+                np.testing.assert_allclose(w.features[1].load, g, rtol=1e-9)
 
 
 @pytest.mark.parametrize("precision", ["f32", "f64"])
@@ -228,47 +241,76 @@ def test_soft_pins_are_springs(world):
     np.testing.assert_allclose(w.position[0], [0, -9.81 / k], atol=1e-7)
 
 
-def test_redundant_and_contradictory_links(world):
-    # Row 22: doubled rigid links change nothing once they converge. Row 21: a triangle 1, 1, 3 cannot close.
-    x = np.array([[0, 0], [1.0, 0], [2.0, 0], [3.0, 0]])
-    pairs = np.array([[0, 1], [1, 2], [2, 3]])
-    made = []
+def test_redundant_links(world):
+    # Row 22: a rope of ten links and one of which each link is there twice, relaxed: alike all the way, since splitting counts both,
+    # and at rest the catenary R10b, with half of the tension in each of two links.
+    n, v = 10, case("R10b_discrete_catenary_N10")["values"]
+    t, k = np.linspace(0, 1, n + 1), np.arange(n)
+    rope = np.stack([6 * t, -4 * (1 - np.abs(2 * t - 1))], axis=1)
+    pairs = np.stack([k, k + 1], axis=1)
     with pytest.warns(UserWarning, match="duplicates"):
-        doubled = tv.Distance(np.concatenate([pairs, pairs]))
-    for f in (tv.Distance(pairs), doubled):
-        w = world(tv.Particles(x, pinned=[0]), [tv.Gravity(9.81), f], iterations=200, precision="f64")
-        w.run(0.5)
-        made.append(w.position)
-    np.testing.assert_allclose(made[0], made[1], atol=1e-6)
+        links = tv.Distance(np.concatenate([pairs, pairs + n + 1, pairs + n + 1]), 10 / n)
+    start = tv.Particles(np.concatenate([rope, rope]), mass=0.1, pinned=[0, n, n + 1, 2 * n + 1])
+    w = world(start, [tv.Gravity(9.81), links, tv.Drag(4.0)], iterations=16, precision="f64", solver=tv.Jacobi())
+    for seconds in (0.5, 7.5):
+        w.run(seconds)
+        np.testing.assert_allclose(w.position[: n + 1], w.position[n + 1 :], atol=1e-10)
+        single, first, second = links.load.reshape(3, n)
+        np.testing.assert_allclose(first, single / 2, rtol=1e-6)
+        np.testing.assert_array_equal(first, second)
+    assert -w.position[:, 1].min() == pytest.approx(v["sag"], rel=1e-5)
+    assert single[0] == pytest.approx(v["end_link_tension_over_mg"] * 0.1 * 9.81, rel=1e-5)
+
+
+def test_contradictory_links(world):
+    # Row 21: a triangle 1, 1, 3 cannot close. Relaxed, it settles on the compromise, and what it swings by on the way goes.
     links = tv.Distance([[0, 1], [1, 2], [0, 2]], [1.0, 1.0, 3.0])
     w = world(tv.Particles([[0.0, 0], [1, 0.1], [2.2, 0]]), [links], substeps=50, precision="f64")
-    energies = []
+    energies, size = [], 0.0
     for _ in range(2000):  # 1e5 substeps
         report = w.step(1 / 60)
         energies.append(report.energy)
-    assert np.isfinite(w.position).all() and energies[-1] <= energies[0] + 1e-6
+        size = max(size, np.ptp(w.position))
+    largest = np.reshape(energies, (10, 200)).max(axis=1)
+    assert (np.diff(largest) < 0).all() and largest[-1] < 0.02 * largest[0] and size < 3.0
     # Least squares with equal weights: all three lie on a line, lengths 4/3, 4/3, 8/3, off by 1/3 each.
-    assert report.residual == pytest.approx(1 / 3, abs=0.02)
-    assert sorted(np.abs(tv.measure.strain(w, [[0, 1], [1, 2], [0, 2]], [1, 1, 3]))) == pytest.approx(
-        [1 / 9, 1 / 3, 1 / 3], abs=0.02
-    )
+    assert report.residual == pytest.approx(1 / 3, abs=1e-4)
+    assert tv.measure.strain(w, links.indices, [1, 1, 3]) == pytest.approx([1 / 3, 1 / 3, -1 / 9], abs=1e-4)
 
 
-def test_over_constrained_and_hub(world):
-    # Row 23: ten particles, all 45 distances; angular momentum stays. Row 24: a thousand links on one particle.
-    rng = np.random.default_rng(3)
-    x = rng.normal(size=(10, 3))
-    x -= x.mean(axis=0)
-    v = np.cross([0.0, 0.0, 1.0], x)
-    pairs = np.array([(i, j) for i in range(10) for j in range(i)])
-    w = world(tv.Particles(x, velocity=v), [tv.Distance(pairs)], iterations=20, precision="f64")
-    start = tv.measure.angular_momentum(w)
-    w.run(2.0)
-    np.testing.assert_allclose(tv.measure.angular_momentum(w), start, rtol=1e-3)
-    assert w.last.residual < 1e-4
+def test_over_constrained_bodies(world):
+    # Row 23: S05 held by all 15 distances of its six masses, and ten particles by all 45. The discrete angular momentum
+    # sum m x_(n-1) x x_n stays to rounding, for any number of passes; the racket tumbles with order 2.
+    c = case("S05_tennis_racket")
+    racket = np.repeat(np.diag(c["params"]["half_axes"]), 2, axis=0) * np.array([1, -1] * 3)[:, None]
+    ten = np.random.default_rng(3).normal(size=(10, 3))
+    ten -= ten.mean(axis=0)
+    bodies = (slice(0, 6), slice(6, 16))
+    i, j = (np.concatenate([np.triu_indices(6, 1)[k], np.triu_indices(10, 1)[k] + 6]) for k in range(2))
+    v = np.concatenate([np.cross(c["params"]["omega0_body"], racket), np.cross([0.0, 0.0, 1.0], ten)])
+    start = tv.Particles(np.concatenate([racket, ten]), velocity=v)
+    w = world(start, [tv.Distance(np.stack([i, j], axis=1))], precision="f64", solver=tv.Jacobi())
+    want = [c["values"]["t2.0"][f"particle{k}_xyz"] for k in (1, 3)]
+    for iterations in (1, 20):
+        errors = [rms(rerun(w, 2.0, substeps=n, iterations=iterations).position[[0, 2]], want) for n in (10, 20, 40)]
+        assert 1.9 <= order(errors) <= 2.1 and errors[1] <= (1e-4 if iterations > 1 else 3e-4)
+        rerun(w, 1 / 60, substeps=20)
+        spins = []
+        for _ in range(120):
+            report = w.step(1 / 60)
+            s = w._memory.state()
+            turn = np.cross(s["position"], s["displacement"]) * 1200
+            spins.append([turn[body].sum(axis=0) for body in bodies])
+        assert np.ptp(spins, axis=0).max() <= 1e-13 * np.linalg.norm(spins[0])
+        assert report.clean and report.residual <= (1e-7 if iterations > 1 else 1e-4)
+
+
+def test_a_thousand_links_on_one_particle(world):
+    # Row 24: the hub of a star, relaxed.
     a = 2 * np.pi * tv.golden(np.arange(1000))
     star = np.concatenate([[[0.0, 0.0]], np.stack([np.cos(a), np.sin(a)], axis=1)])
     spokes = np.stack([np.zeros(1000, dtype=int), np.arange(1, 1001)], axis=1)
-    w = world(tv.Particles(star, velocity=rng.normal(size=(1001, 2))), [tv.Distance(spokes)], precision="f64")
+    v = np.random.default_rng(3).normal(size=(1001, 2))
+    w = world(tv.Particles(star, velocity=v), [tv.Distance(spokes)], precision="f64", solver=tv.Jacobi())
     report = w.run(5.0)
-    assert np.isfinite(w.position).all() and report.energy <= 1001 * 1.1 and w.last.residual < 0.1
+    assert np.isfinite(w.position).all() and report.energy <= 0.5 * (v**2).sum() * 1.01 and w.last.residual < 0.1
