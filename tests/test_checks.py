@@ -77,6 +77,7 @@ def scene(*features, **kwargs):
         (scene(substeps=2.5), TypeError, "substeps = 2.5 is a float"),
         (scene(substeps=True), TypeError, "substeps = True"),
         (scene(iterations=-1), ValueError, "iterations = -1"),
+        (scene(iterations=0), ValueError, "iterations = 0, but it must be at least 1"),
         (scene(precision="f16"), ValueError, "precision = 'f16', but it must be one of 'f32'"),
         (scene(path="fast"), ValueError, "path = 'fast'"),
         (lambda: tv.World(np.zeros((3, 2))), TypeError, r"use tv.Particles\(position\)"),
@@ -121,7 +122,7 @@ def test_structure_is_fixed_and_says_so(world):
     with pytest.raises(ValueError, match="listed twice"):
         g = tv.Gravity()
         tv.World(p, [g, g])
-    for value in ([[0.0, NAN], [0, 0]], [[0.0, 0.0]], np.zeros((2, 3))):  # row 38: stale shapes are rejected
+    for value in ([[0.0, NAN], [0, 0]], [[0.0, INF], [0, 0]], [[0.0, 0.0]], np.zeros((2, 3))):  # rows 38, 53
         with pytest.raises(ValueError, match="World: position"):
             w.position = value
         with pytest.raises(ValueError, match="World: velocity"):

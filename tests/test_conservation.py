@@ -10,9 +10,9 @@ from .test_links import net
 
 @pytest.mark.parametrize("precision, limit", [("f64", 1e-12), ("f32", 1e-6)])
 def test_momentum_is_conserved_for_ten_thousand_steps(world, precision, limit):
-    # Masses 1 ... 100, links from rigid to soft, contacts: all internal forces are equal and opposite. What is left is rounding, of
-    # m d in each substep: in f32 n N = 12 x 1e4 times 2^-24 of a particle's share, which walks to sqrt(n N) 2^-24 / sqrt(12) times
-    # a twelfth of the whole, 5e-7.
+    # Masses 1 ... 100, links from rigid to soft, contacts: internal forces are equal and opposite. What is left is the rounding
+    # of m d: n N = 12 x 1e4 times, in f32, 2^-24 / sqrt(12) of a particle's share, a twelfth of the whole. It walks to
+    # sqrt(n N) 2^-24 / sqrt(12) / 12 = 5e-7 of it.
     x, v, _, pairs, rest, alpha, damping = net(2, seed=4)
     mass = 100.0 ** (np.random.default_rng(0).permutation(12) / 11)
     features = [tv.Distance(pairs, rest, compliance=alpha, damping=damping), tv.Contact()]

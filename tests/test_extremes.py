@@ -64,7 +64,7 @@ class Chains:
 
 @pytest.mark.parametrize("solver", [None, tv.Jacobi()])
 def test_12_one_substep_of_a_tenth_of_a_second(world, solver):
-    # Bounded: finite, and no more energy than there was, give or take the resolution, a part of m g L of the whole chain. One pass
+    # Bounded: finite, and no more energy than there was, give or take the resolution, half of m g L of the whole chain. One pass
     # of 0.1 s holds a heavy end about as well as a rubber band would, which is what the residual says.
     chains = Chains(world, substeps=1, solver=solver)
     w, x = chains.world, chains.world.particles.position
@@ -79,8 +79,8 @@ def test_12_one_substep_of_a_tenth_of_a_second(world, solver):
             for (now, most), begin, name in zip(chains.energies(), start, chains.names, strict=True):
                 assert now <= begin + 0.5 * most, (name, iterations)
     if solver:
-        # Rows 1 and 2: one Jacobi pass cannot hold a heavy end. It is as far off as the prototype's to six digits, and the residual,
-        # which is what a ruler measures, says so.
+        # Rows 1 and 2: one Jacobi pass cannot hold a heavy end. It is as far off as that of the prototype, to six digits, and the
+        # residual, which is what a ruler measures, says so.
         w.iterations = 1
         for iterations in (1, 50):
             rerun(w, 0.5, substeps=20, iterations=iterations)

@@ -242,8 +242,8 @@ def test_soft_pins_are_springs(world):
 
 
 def test_redundant_links(world):
-    # Row 22: a rope of ten links and one of which each link is there twice, relaxed: alike all the way, since splitting counts both,
-    # and at rest the catenary R10b, with half of the tension in each of two links.
+    # Row 22: a rope of ten links beside one of which each link is there twice, relaxed: alike all the way, since splitting counts
+    # both, and at rest the catenary R10b, with half of the tension in each of two links.
     n, v = 10, case("R10b_discrete_catenary_N10")["values"]
     t, k = np.linspace(0, 1, n + 1), np.arange(n)
     rope = np.stack([6 * t, -4 * (1 - np.abs(2 * t - 1))], axis=1)

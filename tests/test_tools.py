@@ -59,10 +59,10 @@ def test_colors_differ():
 
 
 def test_tools_work_inside_kernels():
-    out = ti.field(ti.f64, 8)
+    out, back = ti.field(ti.f64, 10), ti.field(ti.u32, (3, 4))
 
     @ti.kernel
-    def run(third: ti.f64):
+    def run(third: ti.f64, some: ti.types.ndarray(ti.u32, 1)):
         out[0] = tv.mix(third, ti.f64(2.0), ti.f64(0.25))
         out[1] = tv.clamp(third, 0, 1)
         out[2] = tv.smoothstep(ti.f64(0.0), ti.f64(1.0), third)
@@ -72,11 +72,18 @@ def test_tools_work_inside_kernels():
         out[5], out[6] = uv[0], uv[1]
         v = tv.mix(ti.Vector([third, third]), ti.Vector([third, 2 * third]), ti.f64(0.5))
         out[7] = v[1]
+        out[8], out[9] = tv.mix(third, ti.f64(1e17), 0), tv.mix(ti.f64(1e17), third, 1)
+        for k in range(4):
+            back[0, k] = tv.golden_index(tv.golden(some[k]))
+            back[1, k] = tv.golden_index(tv.golden(some[k], 2), 2)
+            back[2, k] = tv.golden_index(tv.golden(some[k], 3), 3)
 
-    third = 1 / 3
-    run(third)
+    third, some = 1 / 3, np.array([0, 7, 2**31, 2**32 - 1], dtype=np.uint32)
+    run(third, some)
     want = [
         tv.mix(third, 2.0, 0.25), third, tv.smoothstep(0.0, 1.0, third), tv.approach(third, 2.0, 3.0, 0.5), tv.golden(12345),
-        *tv.golden(12345, dim=2), 1.5 * third,
+        *tv.golden(12345, dim=2), 1.5 * third, third, third,
     ]  # fmt: skip
     np.testing.assert_allclose(out.to_numpy(), want, rtol=1e-15)
+    np.testing.assert_array_equal(out.to_numpy()[-2:], third)  # exact at both ends
+    np.testing.assert_array_equal(back.to_numpy(), [some] * 3)

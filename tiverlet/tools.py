@@ -103,8 +103,29 @@ def golden(i, dim: int = 1):
     return float(out) if out.ndim == 0 else out
 
 
+@functools.cache
+def _golden_inverse(dim: int) -> int:
+    """What the first step of the golden sequence times it is 1 mod 2**32."""
+    return pow(golden_steps(dim)[0], -1, _BITS)
+
+
+@ti.func
+def _golden_index_axis(value, inverse: ti.template()):  # type: ignore[valid-type]
+    turned = ti.floor(ti.cast(value, ti.f64) * 4294967296.0 + 0.5)
+    return ti.cast(turned, ti.u32) * ti.u32(inverse)
+
+
+@ti.func
+def _golden_index_kernel(value, dim: ti.template() = 1):  # type: ignore[valid-type]
+    if ti.static(dim == 1):
+        return _golden_index_axis(value, ti.static(_golden_inverse(1)))
+    else:
+        return _golden_index_axis(value[0], ti.static(_golden_inverse(dim)))
+
+
+@_both(_golden_index_kernel)
 def golden_index(value, dim: int = 1):
-    """The inverse of golden: the i whose point is `value` (dim 1) or has `value` as its first coordinate.
+    """The inverse of golden: the i whose point is `value` (dim 1) or has `value` as its first coordinate; in kernels a u32.
 
     Exact for every value that golden returns; for others, the index of the nearest multiple of 2**-32.
     """
@@ -113,8 +134,7 @@ def golden_index(value, dim: int = 1):
         array = array[..., 0]
     if not ((array >= 0) & (array < 1)).all():
         raise ValueError("golden_index: values must be at least 0 and below 1.")
-    inverse = np.uint64(pow(golden_steps(dim)[0], -1, _BITS))
-    index = (np.rint(array * _BITS).astype(np.uint64) * inverse) & np.uint64(_BITS - 1)
+    index = (np.rint(array * _BITS).astype(np.uint64) * np.uint64(_golden_inverse(dim))) & np.uint64(_BITS - 1)
     return int(index) if index.ndim == 0 else index.astype(np.int64)
 
 
