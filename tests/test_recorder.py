@@ -2,14 +2,13 @@
 
 import numpy as np
 import pytest
+import rerun as rr
 
 import tiverlet as tv
 
 
 def read(path, entity: str, column: str):
     """All rows of a column of an entity, by frame (None for static data)."""
-    import rerun as rr
-
     out = {}
     for chunk in rr.chunk.RrdReader(str(path)).stream():
         if chunk.entity_path != entity:
@@ -34,10 +33,10 @@ def test_every_frame_reads_back(world, tmp_path, dim):
     w = world(tv.Particles(x, radius=np.r_[0.0, np.full(29, 0.02)], pinned=[0]), features)
     path = tmp_path / "a.rrd"
     seen = [w.position]
-    energy = []
+    reports = []
     with tv.Recorder(path, w) as recorder:
         for _ in range(12):
-            energy.append(w.step(1 / 60).energy)
+            reports.append(w.step(1 / 60))
             recorder.log()
             seen.append(w.position)
     kind = f"{dim}D"
@@ -46,11 +45,24 @@ def test_every_frame_reads_back(world, tmp_path, dim):
     for k, position in enumerate(seen):
         np.testing.assert_array_equal(np.array(frames[k], dtype=np.float32), position.astype(np.float32))
     strips = read(path, "/world/scene/links/1", f"LineStrips{kind}:strips")
-    np.testing.assert_array_equal(np.array(strips[12], np.float32), seen[12].astype(np.float32)[links])
+    for k, position in enumerate(seen):
+        np.testing.assert_array_equal(np.array(strips[k], np.float32), position.astype(np.float32)[links])
     radii = read(path, "/world/scene/particles", f"Points{kind}:radii")
     assert list(radii) == [None] and radii[None][0] < 0 and radii[None][1] == np.float32(0.02)
-    curve = read(path, "/figures/energy", "Scalars:scalars")
-    assert [curve[k + 1][0] for k in range(12)] == energy
+    hues = np.array(read(path, "/world/scene/particles", f"Points{kind}:colors")[None], dtype=np.uint32) >> 8  # RGBA
+    red, green, blue = tv.golden_colors(30).astype(np.uint32).T
+    np.testing.assert_array_equal(hues[1:], (red << 16 | green << 8 | blue)[1:])
+    for name in ("energy", "residual", "overlap", "substeps"):
+        curve = read(path, f"/figures/{name}", "Scalars:scalars")
+        assert [curve[k + 1][0] for k in range(12)] == [getattr(report, name) for report in reports]
+    curve = read(path, "/figures/milliseconds", "Scalars:scalars")  # of the first frame: compiling
+    assert [curve[k + 1][0] for k in range(1, 12)] == [report.seconds * 1e3 for report in reports[1:]]
+    # y is up: the views of rerun in 2D have it down, and a mirror above the data turns it; in 3D it is said.
+    if dim == 2:
+        assert read(path, "/world/scene", "Transform3D:scale")[None] == [[1, -1, 1]]
+    else:
+        assert read(path, "/world/scene", "ViewCoordinates:xyz")[None] == [[3, 1, 6]]  # right, up, back
+    assert len(rr.chunk.RrdReader(str(path)).blueprints()) == 1
     about = read(path, "/about", "TextDocument:text")[None][0]
     assert "13 frames, 0.2 s simulated" in about and "constraint violation" in about
     assert set(read(path, "/world/scene/walls/3", f"LineStrips{kind}:strips")) == {0}  # a wall that stands is written once
