@@ -51,6 +51,7 @@ def scene(*features, **kwargs):
         (lambda: tv.Distance([[0, 1]], compliance=NAN), ValueError, r"compliance\[0\] = nan"),
         (lambda: tv.Distance([[0, 1]], damping=[-1.0]), ValueError, r"damping\[0\] = -1"),
         (scene(tv.Distance([[0, 1], [1, 2]], rest=[1, -2])), ValueError, r"rest\[1\] = -2"),
+        (scene(tv.Distance([[0, 1]], rest=NAN)), ValueError, r"Distance: rest\[0\] = nan"),
         (scene(tv.Rope([[0, 1]], length=NAN)), ValueError, r"Rope: length\[0\] = nan"),
         (scene(tv.Spacer([[0, 1]], [1, 2])), ValueError, r"length has shape \(2,\)"),
         (lambda: tv.Pin([0, 0]), ValueError, "named twice"),
