@@ -43,11 +43,11 @@ def check(world: tv.World) -> None:
         raise SystemExit("the grains are stuck in the neck")
 
 
-def main(path: str = "hourglass.rrd") -> None:
+def main(path: str = "hourglass.rrd", seconds: float = 6.0) -> None:
     """Run, record, and say how it went."""
     world = build()
     with tv.Recorder(path, world, every=2) as recorder:
-        report = world.run(6.0, recorder=recorder, progress=True)
+        report = world.run(seconds, recorder=recorder, progress=True)
     check(world)
     fallen = float((world.position[:, 1] < 0).mean())
     print(f"{path}: {len(world.particles)} grains, {fallen:.0%} through the neck, worst overlap {report.overlap:.2f} radii,")
