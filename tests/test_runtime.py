@@ -1,6 +1,10 @@
 """What would end the process without an exception ends with a message instead. Each case in a process of its own."""
 
+import numpy as np
 import pytest
+import taichi as ti
+
+from tiverlet.runtime import Memory
 
 from .conftest import python
 
@@ -17,6 +21,33 @@ def expect(error, words, run):
     else:
         raise SystemExit("no error")
 """
+
+
+def test_the_host_sees_the_fields_as_kernels_do():
+    # Of every kind and shape, one beside the other: what the host writes a kernel reads, and the other way round, to the bit.
+    memory, rng = Memory(ti.f32), np.random.default_rng(0)
+    kinds = ((ti.f32, np.float32), (ti.f64, np.float64), (ti.i32, np.int32))
+    want = {}
+    for k in range(40):
+        kind, exact = kinds[rng.integers(3)]
+        length, width = [None, 1, 2, 7, 1000][rng.integers(5)], rng.integers(5)
+        memory.field(f"f{k}", length, width=int(width), kind=kind)
+        shape = (length or 1,) + ((width,) if width else ())
+        want[f"f{k}"] = (rng.normal(size=shape) * 1e6).astype(exact)
+    memory.place()
+    views, entries = memory._views, memory.entries
+    assert len(views) == len(entries)
+    for first, then in ((views, {}), ({}, views)):
+        for sign in (-1, 1):
+            memory._views = first
+            memory._load(entries, [sign * want[e.name].astype(np.float64) for e in entries])
+            memory._views = then
+            for e, got in zip(entries, memory._dump(entries), strict=True):
+                assert got.dtype == e.kind
+                np.testing.assert_array_equal(got, sign * want[e.name])
+    memory.destroy()
+    with pytest.raises(RuntimeError, match="closed"):
+        memory.state()
 
 
 def test_import_is_quiet_and_starts_nothing():

@@ -44,7 +44,9 @@ class Access:
     @property
     def position(self) -> np.ndarray:
         """Positions [m], (n, dim), a read-only copy in f64. Assign an array to move particles; velocities are kept."""
-        return self._export(self._sub.positions)
+        out = self._scene.state.get(self._memory)
+        out.flags.writeable = False
+        return out
 
     @position.setter
     def position(self, value) -> None:

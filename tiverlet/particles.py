@@ -133,6 +133,11 @@ class State:
             low = particles.position - high
             self.low = memory.field("position_low", n, width=dim, values=low, state=True)
 
+    def get(self, memory: Memory) -> np.ndarray:
+        """A copy of the positions, low words added in f64."""
+        out = memory.read(self.x).astype(np.float64)
+        return (out + memory.read(self.low) if self.compensated else out)[: self.count]
+
     def put(self, memory: Memory, position: np.ndarray) -> None:
         """Overwrite the positions."""
         memory.write(self.x, position)

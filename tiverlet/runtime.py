@@ -6,6 +6,7 @@ these into an error that says what to do, so that no other module has to know.
 """
 
 import contextlib
+import ctypes
 import io
 import os
 import threading
@@ -167,6 +168,7 @@ class Memory:
         self._tree = None
         self._runtime = impl.get_runtime()
         self._transfers: dict[tuple, _Transfer] = {}  # compiled once, since that costs more than running them
+        self._views: dict[int, np.ndarray] = {}  # arrays that are the fields, by the id of the entry, where the host can see them
 
     def field(self, name: str, length: int | None, *, width: int = 0, kind=None, values=None, state: bool = False) -> Any:
         """Declare a field of `length` elements (None: a single one, of 0 dimensions) and give it its first values."""
@@ -189,9 +191,27 @@ class Memory:
         global _trees
         self._tree = self._builder.finalize()
         _trees += 1
+        if architecture() == "cpu":
+            self._see()
         if self._later:
             self._load([entry for entry, _ in self._later], [values for _, values in self._later])
             self._later.clear()
+
+    def _see(self) -> None:
+        """Arrays that are the fields: reading and writing them by kernels takes longer to compile than all else takes to run."""
+        first = self.entries[0].field
+        with self.compiler():
+            address = _Place(first, bool(self.entries[0].length)).address()
+        (start, *_), tree = _chain(first)
+        memory = (ctypes.c_char * tree.cell_size_bytes).from_address(address - start)
+        for e in self.entries:
+            offsets, _ = _chain(e.field)
+            cell = e.field.parent().ptr.cell_size_bytes
+            steps = (cell, offsets[1] - offsets[0] if e.width > 1 else e.kind.itemsize)
+            if any(b - a != steps[1] for a, b in zip(offsets, offsets[1:], strict=False)):
+                self._views.clear()  # laid out as never seen yet: by kernels, then
+                return
+            self._views[id(e)] = np.ndarray(_shape(e), e.kind, memory, offsets[0], steps[: 1 + bool(e.width)])
 
     def abandon(self) -> None:
         """Give up before place(): a builder that is never finished would poison everything that Taichi does later.
@@ -222,6 +242,7 @@ class Memory:
             self._tree.destroy()
             _trees -= 1
         self._tree = None
+        self._views.clear()
 
     def write(self, field, values) -> None:
         """Overwrite a whole field."""
@@ -252,6 +273,10 @@ class Memory:
         return next(e for e in self.entries if e.field is field)
 
     def _load(self, entries: list[Entry], arrays: list[np.ndarray]) -> None:
+        if self._views:
+            for e, a in zip(entries, arrays, strict=True):
+                self._views[id(e)][...] = np.broadcast_to(a, _shape(e))
+            return
         # Every number that we hold (f32, f64, i32) is exact in f64, so one kernel and one flat array serve all.
         for k in range(0, len(entries), GROUP):
             some = entries[k : k + GROUP]
@@ -260,6 +285,8 @@ class Memory:
                 self._transfer(some).load(np.concatenate(parts).astype(np.float64))
 
     def _dump(self, entries: list[Entry]) -> list[np.ndarray]:
+        if self._views:
+            return [self._views[id(e)].copy() for e in entries]
         out = []
         for k in range(0, len(entries), GROUP):
             some = entries[k : k + GROUP]
@@ -283,6 +310,30 @@ _NUMPY = {ti.f32: np.float32, ti.f64: np.float64, ti.i32: np.int32}
 
 def _shape(entry: Entry) -> tuple[int, ...]:
     return (max(1, entry.length),) + ((entry.width,) if entry.width else ())
+
+
+def _chain(field) -> tuple[list[int], Any]:
+    """How many bytes from the begin of its tree each component of the first element is, and the root of the tree."""
+    offsets, node = [], None
+    for component in field._get_field_members():
+        node, offset = component.ptr.snode(), 0
+        while node.parent is not None:
+            offset, node = offset + node.offset_bytes_in_parent_cell, node.parent
+        offsets.append(offset)
+    return offsets, node
+
+
+@ti.data_oriented
+class _Place:
+    """Where a field is."""
+
+    def __init__(self, field, many: bool):
+        self.field, self.at = field, [0] if many else []
+
+    @ti.kernel
+    def address(self) -> ti.u64:  # type: ignore[valid-type]
+        """Of its first element."""
+        return ti.get_addr(self.field, ti.static(self.at))
 
 
 @ti.data_oriented
