@@ -181,10 +181,11 @@ def test_coincident_particles_part_gently(world, count, dim):
     made = []
     for _ in range(2):
         w.position, w.velocity = np.zeros((count, dim)), np.zeros((count, dim))
-        w.run(1.0)
+        w.run(0.25)
         made.append(w.position)
-        assert np.abs(w.velocity.sum(axis=0)).max() <= 1e-12 * count
     np.testing.assert_array_equal(*made)
+    w.run(0.75)
+    assert np.abs(w.velocity.sum(axis=0)).max() <= 1e-12 * count
     across = np.linalg.norm(w.position[:, None] - w.position[None], axis=-1) if count <= 100 else None
     if across is not None:
         assert across[np.triu_indices(count, 1)].min() >= 0.02 * 0.99

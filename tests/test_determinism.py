@@ -38,8 +38,8 @@ for threads, path in {runs}:
 
 
 def test_every_solver_has_the_same_bits_on_2_and_8_threads():
-    # Sums over all constraints, as conjugate gradients take them, and systems that several threads solve, beside contacts: of 4900
-    # particles, since a loop is shared out in parts of 512 at least.
+    # Sums over all constraints, as conjugate gradients take them, and systems that several threads solve, beside contacts: of
+    # 4900 particles, since a loop is shared out in parts of 512 at least.
     code = """
 import numpy as np
 import tiverlet as tv
