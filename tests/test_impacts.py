@@ -39,17 +39,21 @@ def test_head_on_collisions(world, dim, precision, limit):
         np.testing.assert_allclose(momentum, m1 * u1 + m2 * u2, rtol=limit)
 
 
-@pytest.mark.parametrize("e, key", [(1.0, "e1"), (0.5, "e0.5"), (0.0, "e0")])
-def test_oblique_discs(world, e, key):
-    # R15: v1 = u - (1 + e)/2 (u . n) n, direction to 1e-3 rad at v h / r = 0.01.
-    p, want = case("R15_oblique_discs")["params"], case("R15_oblique_discs")["values"][key]
-    start = tv.Particles([[-0.4, p["b"]], [0.0, 0.0]], velocity=[[p["u"], 0], [0, 0]], radius=p["r"])
-    w = world(start, [tv.Contact(restitution=e)], precision="f64", substeps=33)
+def test_oblique_discs(world):
+    # R15: v1 = u - (1 + e)/2 (u . n) n, direction to 1e-3 rad at v h / r = 0.01. One pair for each e, a group each.
+    p, values = case("R15_oblique_discs")["params"], case("R15_oblique_discs")["values"]
+    rows = [(1.0, "e1"), (0.5, "e0.5"), (0.0, "e0")]
+    aside = 10.0 * np.repeat(np.arange(3), 2)[:, None] * [0, 1]
+    x, v = np.tile([[-0.4, p["b"]], [0.0, 0.0]], (3, 1)) + aside, np.tile([[p["u"], 0], [0.0, 0]], (3, 1))
+    contact = tv.Contact(restitution={(k, k): e for k, (e, _) in enumerate(rows)})
+    start = tv.Particles(x, velocity=v, radius=p["r"], group=np.repeat(np.arange(3), 2))
+    w = world(start, [contact], precision="f64", substeps=33)
     w.run(0.6)
-    for got, ref in zip(w.velocity, (want["v1"], want["v2"]), strict=True):
-        ref = np.array(ref) * [1, 1 if np.sign(ref[1]) == np.sign(got[1]) else -1]  # the case counts b downwards
-        assert abs(np.arctan2(got[1], got[0]) - np.arctan2(ref[1], ref[0])) < 1e-3
-        np.testing.assert_allclose(got, ref, atol=2e-3)
+    for (_, key), pair in zip(rows, w.velocity.reshape(3, 2, 2), strict=True):
+        for got, ref in zip(pair, (values[key]["v1"], values[key]["v2"]), strict=True):
+            ref = np.array(ref) * [1, 1 if np.sign(ref[1]) == np.sign(got[1]) else -1]  # the case counts b downwards
+            assert abs(np.arctan2(got[1], got[0]) - np.arctan2(ref[1], ref[0])) < 1e-3
+            np.testing.assert_allclose(got, ref, atol=2e-3)
 
 
 @pytest.mark.parametrize("e", [0.5, 0.8, 0.9])
@@ -73,30 +77,40 @@ def test_bouncing_ball(world, e, dim):
 
 
 def test_newtons_cradle(world):
-    # R17: pair by pair, with a gap and touching; the last ball carries on with all of it.
-    for gap, e in ((0.001, 1.0), (0.001, 0.9), (0.0, 1.0)):
-        p, want = case("R17_newton_cradle")["params"], case("R17_newton_cradle")["values"]
-        x = np.zeros((p["n"], 2))
-        x[:, 0] = np.arange(p["n"]) * (2 * p["r"] + gap)
-        x[0, 0] -= 0.1
-        start = tv.Particles(x, velocity=[[1.0, 0]] + [[0, 0]] * 4, radius=p["r"])
-        w = world(start, [tv.Contact(restitution=e)], precision="f64")
-        w.run(0.13)
-        np.testing.assert_allclose(w.velocity[:, 0], want["v_final"] if e == 1 else want["e0p9_v_final"], atol=1e-9)
-        assert tv.measure.momentum(w)[0] == pytest.approx(1.0, rel=1e-12)
+    # R17: pair by pair, with a gap and touching; the last ball carries on with all of it. Three rows, a group for each e.
+    p, want = case("R17_newton_cradle")["params"], case("R17_newton_cradle")["values"]
+    n, rows = p["n"], ((0.001, 0), (0.001, 1), (0.0, 0))
+    x, v = np.zeros((3, n, 2)), np.zeros((3, n, 2))
+    for k, (gap, _) in enumerate(rows):
+        x[k, :, 0], x[k, :, 1] = np.arange(n) * (2 * p["r"] + gap), k
+    x[:, 0, 0] -= 0.1
+    v[:, 0, 0] = 1.0
+    contact = tv.Contact(restitution={(0, 0): 1.0, (1, 1): 0.9})
+    group = np.repeat([e for _, e in rows], n)
+    w = world(tv.Particles(x.reshape(-1, 2), velocity=v.reshape(-1, 2), radius=p["r"], group=group), [contact], precision="f64")
+    w.run(0.13)
+    for (_, e), got in zip(rows, w.velocity.reshape(3, n, 2), strict=True):
+        np.testing.assert_allclose(got[:, 0], want["e0p9_v_final" if e else "v_final"], atol=1e-9)
+        assert got[:, 0].sum() == pytest.approx(1.0, rel=1e-12)
 
 
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("precision", ["f32", "f64"])
 def test_incline(world, dim, precision):
-    # R18: a = g (sin - mu cos); it stops after v^2 / (2 g (mu cos - sin)) and stays to the bit if tan < mu. h = 1/600.
+    # R18: a = g (sin - mu cos); it stops after v^2 / (2 g (mu cos - sin)) and stays to the bit if tan < mu. h = 1/600. One plane
+    # at 20 degrees for each mu; gravity is turned for the other angles.
+    n, t = np.zeros(dim), np.zeros(dim)
+    a = np.radians(20.0)
+    n[:2], t[:2] = (np.sin(a), np.cos(a)), (np.cos(a), -np.sin(a))
+    planes = {}
     for key, v in case("R18_incline_friction")["values"].items():
         degrees, mu, speed = (float(part.lstrip("degmuv")) for part in key.replace("deg", "").split("_"))
-        a = np.radians(degrees)
-        n, t = np.zeros(dim), np.zeros(dim)
-        n[:2], t[:2] = (np.sin(a), np.cos(a)), (np.cos(a), -np.sin(a))
-        start = tv.Particles([0.1 * n], velocity=speed * t, radius=0.1)
-        w = world(start, [tv.Gravity(9.81), tv.HalfSpace(n, friction=mu)], precision=precision, substeps=10)
+        if mu not in planes:
+            features = [tv.Gravity(9.81), tv.HalfSpace(n, friction=mu)]
+            planes[mu] = world(tv.Particles([0.1 * n], radius=0.1), features, precision=precision)
+        w = planes[mu]
+        w.position, w.velocity, w.substeps = [0.1 * n], [speed * t], 10
+        w.features[0].g = 9.81 * (np.sin(np.radians(degrees)) * t - np.cos(np.radians(degrees)) * n)
         if v["state"] == "slides":
             w.run(1.0)
             assert (w.position[0] - 0.1 * n) @ t == pytest.approx(v["distance_1s"], rel=1e-2 if precision == "f32" else 1e-9)
@@ -126,12 +140,13 @@ def test_friction_between_particles(world):
     # Row 59: a disc on a fixed disc, on the slope of its tangent. Below the threshold it stays; mu = 0 slides, mu = 1e6 sticks.
     a = np.radians(20.0)
     top = np.array([np.sin(a), np.cos(a)])
-    for mu, stays in ((0.0, False), (np.tan(a) * 0.95, False), (np.tan(a) * 1.05, True), (1e6, True)):
-        start = tv.Particles([[0.0, 0.0], top], radius=0.5, pinned=[0])
-        w = world(start, [tv.Gravity(9.81), tv.Contact(friction=mu)], precision="f64")
-        w.run(0.5)
-        moved = np.hypot(*(w.position[1] - top))
-        assert (moved < 1e-9) == stays
+    rows = ((0.0, False), (np.tan(a) * 0.95, False), (np.tan(a) * 1.05, True), (1e6, True))
+    x = np.array([[[10.0 * k, 0.0], top + [10.0 * k, 0]] for k in range(4)]).reshape(-1, 2)
+    start = tv.Particles(x, radius=0.5, pinned=[0, 2, 4, 6], group=np.repeat(np.arange(4), 2))
+    w = world(start, [tv.Gravity(9.81), tv.Contact(friction={(k, k): mu for k, (mu, _) in enumerate(rows)})], precision="f64")
+    w.run(0.5)
+    for k, (mu, stays) in enumerate(rows):
+        assert (np.hypot(*(w.position - x)[2 * k + 1]) < 1e-9) == stays, mu
     for friction, error in ((-0.1, "at least 0"), (float("nan"), "finite"), ((0.2, 0.5), "must not exceed")):
         with pytest.raises(ValueError, match=error):
             tv.Contact(friction=friction)
