@@ -102,13 +102,12 @@ def test_a_hundred_thousand_particles(world):
     np.testing.assert_array_equal(got, near_pairs(position, radius, 0.05))
 
 
-@pytest.mark.parametrize("path", ["fused", "parallel"])
-def test_a_list_that_is_too_small_grows_and_nothing_is_lost(world, path):
-    # Row 35: hash with room for one entry equals hash with room for all, and every contact is there.
+def test_a_list_that_is_too_small_grows_and_nothing_is_lost(world):
+    # Row 35: hash with room for one entry equals hash with room for all, on both paths, and every contact is there.
     rng = np.random.default_rng(9)
     position = rng.uniform(-1, 1, (200, 2))
     hashes = []
-    for capacity in (1, 100_000):
+    for path, capacity in (("fused", 100_000), ("fused", 1), ("parallel", 1)):
         w = world(
             tv.Particles(position, radius=0.1),
             [tv.Gravity(9.81), tv.Contact(), tv.Box((-1.2, -1.2), (1.2, 3))],
@@ -118,8 +117,8 @@ def test_a_list_that_is_too_small_grows_and_nothing_is_lost(world, path):
         w._renew()
         w.run(0.2)
         hashes.append(w.hash())
-    assert hashes[0] == hashes[1]
-    assert w._grid.capacity * w._grid.blocks >= 2 * len(w._grid.pairs()[0])
+        assert w._grid.capacity * w._grid.blocks >= 2 * len(w._grid.pairs()[0]) > 0
+    assert len(set(hashes)) == 1
 
 
 def test_the_skin_changes_no_bit(world):
@@ -168,31 +167,30 @@ def test_momentum_in_collisions(world):
 
 
 @pytest.mark.filterwarnings("ignore:.*near pairs per particle")
-@pytest.mark.parametrize("count, dim", [(2, 2), (2, 3), (100, 2), (1000, 2), (1000, 3)])
-def test_coincident_particles_part_gently(world, count, dim):
-    # Row 16: a direction made from the indices, equal and opposite. Row 48: at push_out, whatever the depth.
-    speed = 0.25
-    w = world(
-        tv.Particles(np.zeros((count, dim)), radius=0.01),
-        [tv.Contact(push_out=speed)],
-        precision="f64",
-        substeps=5,
-    )
+@pytest.mark.parametrize("dim", [2, 3])
+def test_coincident_particles_part_gently(world, dim):
+    # Row 16: a direction made from the indices, equal and opposite. Row 48: at push_out, whatever the depth. Clusters of 2, 100
+    # and 1000, far from each other.
+    speed, counts = 0.25, (2, 100, 1000)
+    x = np.repeat(np.arange(3), counts)[:, None] * (50 * np.eye(dim)[0])
+    w = world(tv.Particles(x, radius=0.01), [tv.Contact(push_out=speed)], precision="f64", substeps=5)
     made = []
     for _ in range(2):
-        w.position, w.velocity = np.zeros((count, dim)), np.zeros((count, dim))
+        w.position, w.velocity = x, 0 * x
         w.run(0.25)
         made.append(w.position)
     np.testing.assert_array_equal(*made)
     w.run(0.75)
-    assert np.abs(w.velocity.sum(axis=0)).max() <= 1e-12 * count
-    across = np.linalg.norm(w.position[:, None] - w.position[None], axis=-1) if count <= 100 else None
-    if across is not None:
-        assert across[np.triu_indices(count, 1)].min() >= 0.02 * 0.99
     assert w.last.overlap < 0.05
-    # Neighbours part at `speed`; across a cluster of N particles speeds add up to that times its width in particles.
-    width = 2 * np.ceil(count ** (1 / dim)) if count > 2 else 1
-    assert np.linalg.norm(w.velocity, axis=1).max() <= speed * width
+    for count, end in zip(counts, np.cumsum(counts), strict=True):
+        at, v = w.position[end - count : end], w.velocity[end - count : end]
+        assert np.abs(v.sum(axis=0)).max() <= 1e-12 * count
+        if count <= 100:
+            across = np.linalg.norm(at[:, None] - at[None], axis=-1)
+            assert across[np.triu_indices(count, 1)].min() >= 0.02 * 0.99
+        # Neighbours part at `speed`; across a cluster of N particles speeds add up to that times its width in particles.
+        width = 2 * np.ceil(count ** (1 / dim)) if count > 2 else 1
+        assert np.linalg.norm(v, axis=1).max() <= speed * width
 
 
 def test_deep_overlap_leaves_at_no_more_than_push_out(world):
