@@ -35,7 +35,7 @@ def test_the_host_sees_the_fields_as_kernels_do():
         shape = (length or 1,) + ((width,) if width else ())
         want[f"f{k}"] = (rng.normal(size=shape) * 1e6).astype(exact)
     memory.place()
-    views, entries = memory._views, memory.entries
+    views, entries = memory._seen(), memory.entries
     assert len(views) == len(entries)
     for first, then in ((views, {}), ({}, views)):
         for sign in (-1, 1):

@@ -168,7 +168,7 @@ class Memory:
         self._tree = None
         self._runtime = impl.get_runtime()
         self._transfers: dict[tuple, _Transfer] = {}  # compiled once, since that costs more than running them
-        self._views: dict[int, np.ndarray] = {}  # arrays that are the fields, by the id of the entry, where the host can see them
+        self._views: dict[int, np.ndarray] | None = None  # see _seen()
 
     def field(self, name: str, length: int | None, *, width: int = 0, kind=None, values=None, state: bool = False) -> Any:
         """Declare a field of `length` elements (None: a single one, of 0 dimensions) and give it its first values."""
@@ -191,27 +191,33 @@ class Memory:
         global _trees
         self._tree = self._builder.finalize()
         _trees += 1
-        if architecture() == "cpu":
-            self._see()
         if self._later:
             self._load([entry for entry, _ in self._later], [values for _, values in self._later])
             self._later.clear()
 
-    def _see(self) -> None:
-        """Arrays that are the fields: reading and writing them by kernels takes longer to compile than all else takes to run."""
-        first = self.entries[0].field
+    def _seen(self) -> dict[int, np.ndarray]:
+        """Arrays that are the fields, by the id of the entry; none where the host cannot see them.
+
+        Reading and writing fields by kernels takes longer to compile than all else takes to run.
+        """
+        if self._views is None:
+            self._views = self._look() if architecture() == "cpu" else {}
+        return self._views
+
+    def _look(self) -> dict[int, np.ndarray]:
+        first, out = self.entries[0], {}
         with self.compiler():
-            address = _Place(first, bool(self.entries[0].length)).address()
-        (start, *_), tree = _chain(first)
+            address = _Place(first.field, bool(first.length)).address()
+        (start, *_), tree = _chain(first.field)
         memory = (ctypes.c_char * tree.cell_size_bytes).from_address(address - start)
         for e in self.entries:
             offsets, _ = _chain(e.field)
             cell = e.field.parent().ptr.cell_size_bytes
             steps = (cell, offsets[1] - offsets[0] if e.width > 1 else e.kind.itemsize)
             if any(b - a != steps[1] for a, b in zip(offsets, offsets[1:], strict=False)):
-                self._views.clear()  # laid out as never seen yet: by kernels, then
-                return
-            self._views[id(e)] = np.ndarray(_shape(e), e.kind, memory, offsets[0], steps[: 1 + bool(e.width)])
+                return {}  # laid out as never seen yet: by kernels, then
+            out[id(e)] = np.ndarray(_shape(e), e.kind, memory, offsets[0], steps[: 1 + bool(e.width)])
+        return out
 
     def abandon(self) -> None:
         """Give up before place(): a builder that is never finished would poison everything that Taichi does later.
@@ -242,7 +248,7 @@ class Memory:
             self._tree.destroy()
             _trees -= 1
         self._tree = None
-        self._views.clear()
+        self._views = None
 
     def write(self, field, values) -> None:
         """Overwrite a whole field."""
@@ -273,9 +279,10 @@ class Memory:
         return next(e for e in self.entries if e.field is field)
 
     def _load(self, entries: list[Entry], arrays: list[np.ndarray]) -> None:
-        if self._views:
+        views = self._seen()
+        if views:
             for e, a in zip(entries, arrays, strict=True):
-                self._views[id(e)][...] = np.broadcast_to(a, _shape(e))
+                views[id(e)][...] = np.broadcast_to(a, _shape(e))
             return
         # Every number that we hold (f32, f64, i32) is exact in f64, so one kernel and one flat array serve all.
         for k in range(0, len(entries), GROUP):
@@ -285,8 +292,9 @@ class Memory:
                 self._transfer(some).load(np.concatenate(parts).astype(np.float64))
 
     def _dump(self, entries: list[Entry]) -> list[np.ndarray]:
-        if self._views:
-            return [self._views[id(e)].copy() for e in entries]
+        views = self._seen()
+        if views:
+            return [views[id(e)].copy() for e in entries]
         out = []
         for k in range(0, len(entries), GROUP):
             some = entries[k : k + GROUP]
