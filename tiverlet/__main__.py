@@ -1,12 +1,12 @@
-"""The command line: python -m tiverlet run | replay | report | stress | info."""
+"""The command line: python -m tiverlet run | replay | report | report speed | stress | info."""
 
 import argparse
 import sys
 
-from .commands import info, replay, report, run, stress
+from .commands import info, replay, report, run, speed, stress
 
-# Each has ABOUT (a line), add(parser) for its arguments, and main(args) -> exit status.
-COMMANDS = {"run": run, "replay": replay, "report": report, "stress": stress, "info": info}
+# Each has ABOUT (a line), add(parser) for its arguments, and main(args) -> exit status. A name may be of two words.
+COMMANDS = {"run": run, "replay": replay, "report": report, "report speed": speed, "stress": stress, "info": info}
 
 
 def main(words: list[str] | None = None) -> int:
@@ -15,7 +15,9 @@ def main(words: list[str] | None = None) -> int:
     commands = parser.add_subparsers(dest="command", required=True, metavar="command")
     for name, command in COMMANDS.items():
         command.add(commands.add_parser(name, help=command.ABOUT, description=command.__doc__))
-    args = parser.parse_args(words)
+    words = sys.argv[1:] if words is None else words
+    two = " ".join(words[:2])
+    args = parser.parse_args([two, *words[2:]] if two in COMMANDS else words)
     try:
         return COMMANDS[args.command].main(args)
     except (ValueError, TypeError, RuntimeError, OSError) as error:

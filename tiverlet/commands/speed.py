@@ -1,0 +1,46 @@
+"""How fast scenes of 10 to a million particles run, next to what the machine can do and to other engines, and what starts cost."""
+
+import argparse
+
+ABOUT = "speed, memory and starts; beside a pile in C, and other engines"
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """The arguments."""
+    parser.add_argument("scenes", nargs="*", help="pile, spheres, cloth, ropes, rope, mixed; all without any")
+    parser.add_argument("--sizes", type=int, nargs="+", metavar="N", help="numbers of particles; default: each scene's own ladder")
+    parser.add_argument("--threads", type=int, nargs="+", metavar="T", help="numbers of CPU threads; default 1, 2, 4, ... all cores")
+    parser.add_argument("--list", action="store_true", help="list the scenes and their sizes")
+    parser.add_argument("--quick", action="store_true", help="two small sizes of each, and few runs")
+    for name, what in (("yardstick", "pile.c"), ("peers", "other engines"), ("absent", "the package without unused files")):
+        parser.add_argument(f"--no-{name}", dest=name, action="store_false", help=f"without {what}")
+    parser.add_argument("--json", metavar="FILE", help="write everything, for machines")
+    parser.add_argument("--markdown", metavar="FILE", help="write the tables")
+    parser.add_argument("--plot", metavar="FOLDER", help="write plots (needs matplotlib)")
+
+
+def main(args: argparse.Namespace) -> int:
+    """Measure, print, write; the status is 1 when something could not be measured."""
+    from rich.console import Console
+
+    from ..report import speed
+    from ..report.speed import SCENES
+
+    console = Console()
+    if args.list:
+        for name, scene in SCENES.items():
+            sizes = ", ".join(f"{n:,}" for n in scene.sizes)
+            console.print(f"{name:8} {scene.title}, {scene.substeps} substeps; {sizes} particles", highlight=False)
+        return 0
+    report = speed(
+        args.scenes or None, sizes=args.sizes, threads=args.threads, quick=args.quick, yardstick=args.yardstick,
+        peers=args.peers, absent=args.absent, progress=console.is_terminal,
+    )  # fmt: skip
+    console.print(report)
+    for path, text in ((args.json, report.json), (args.markdown, report.markdown)):
+        if path:
+            with open(path, "w", encoding="utf-8") as file:
+                file.write(text())
+    if args.plot:
+        report.plot(args.plot)
+    return 1 if report.missing else 0

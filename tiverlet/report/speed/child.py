@@ -1,0 +1,80 @@
+"""The process in which a scene is timed: it says what the start cost, then obeys commands, one a line, each answered in JSON.
+
+    run K: K frames; the seconds that they took
+    restart: back to the start, and one frame that is not timed
+    look: launches of a frame, counted; path, memory, flags
+    quality: the mean overlap of the pairs that overlap [diameters], and the worst relative violation of a constraint
+    traffic: bytes that a frame moves, by kernel, see counting.py
+
+It runs in copies of the package that lack most of it, see absent.py.
+"""
+
+import json
+import sys
+from time import perf_counter
+from typing import Any
+
+# Run by `python -c`, so that the import can be timed; importing this module imports much else.
+START = """
+from time import perf_counter
+clock = perf_counter()
+import tiverlet
+seconds = perf_counter() - clock
+import json, sys
+from tiverlet.report.speed.child import main
+main(json.loads(sys.argv[1]), seconds)
+"""
+COUNTED = 6  # frames over which launches and bytes are averaged
+
+
+def main(job: dict[str, Any], imported: float) -> None:
+    """job: scene, n, threads, and whether only the start is asked for. imported: seconds."""
+    import tiverlet as tv
+
+    from .counting import DT, launches, traffic
+    from .scenes import SCENES
+
+    scene = SCENES[job["scene"]]
+    clock = perf_counter()
+    particles, features = scene.build(job["n"])
+    shaped = perf_counter() - clock
+    clock = perf_counter()
+    tv.init(threads=job["threads"])
+    started = perf_counter() - clock
+    clock = perf_counter()
+    world = tv.World(particles, features, substeps=scene.substeps)
+    report = world.step(DT)
+    first = perf_counter() - clock
+    say({"import": imported, "start": started, "shape": shaped, "first": first, "particles": len(particles)})
+    flags = set(report.flags)
+    for line in sys.stdin:
+        word, *number = line.split()
+        if word == "run":
+            clock = perf_counter()
+            for _ in range(int(number[0])):
+                report = world.step(DT)
+                flags |= report.flags
+            say(perf_counter() - clock)
+        elif word == "restart":
+            world.position, world.velocity = particles.position, particles.velocity
+            world.step(DT)
+            say(0.0)
+        elif word == "look":
+            with launches() as count:
+                for _ in range(COUNTED):
+                    world.step(DT)
+            say({
+                "launches": count.total() / COUNTED, "path": world.path, "memory": sum(world.fields.values()),
+                "fields": len(world.fields), "flags": sorted(flags),
+            })  # fmt: skip
+        elif word == "quality":
+            overlap = float(world.contacts.overlap.mean()) if report.contacts else 0.0
+            say({"overlap": overlap / (2 * float(particles.radius[0]) or 1.0), "residual": report.residual})
+        else:
+            say(traffic(world, COUNTED))
+    world.close()
+
+
+def say(what: Any) -> None:
+    """Answer."""
+    print(json.dumps(what), flush=True)

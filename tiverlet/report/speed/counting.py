@@ -1,0 +1,155 @@
+"""What a frame does, counted at Taichi's door: kernels launched, and bytes that their loops read and write."""
+
+import contextlib
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any
+
+import taichi as ti
+from taichi.lang import common_ops, impl, kernel_impl, ops
+from taichi.lang.ast.ast_transformer import ASTTransformer
+
+DT = 1 / 60  # [s] of a frame
+
+
+@contextlib.contextmanager
+def replaced(*places: tuple[Any, str, Any]) -> Iterator[None]:
+    """While this lasts, attributes have other values."""
+    before = [(owner, name, owner.__dict__[name]) for owner, name, _ in places]
+    for owner, name, value in places:
+        setattr(owner, name, value)
+    try:
+        yield
+    finally:
+        for owner, name, value in before:
+            setattr(owner, name, value)
+
+
+@contextlib.contextmanager
+def launches() -> Iterator[Counter[str]]:
+    """The kernels that are launched while this lasts, by name."""
+    count: Counter[str] = Counter()
+    launch = kernel_impl.Kernel.launch_kernel
+
+    def counted(self, *args):
+        count[self.func.__name__] += 1
+        return launch(self, *args)
+
+    with replaced((kernel_impl.Kernel, "launch_kernel", counted)):
+        yield count
+
+
+class Sweep:
+    """One outermost loop of a kernel: how often it runs (None: known only when it runs), and what it reads and writes."""
+
+    def __init__(self):
+        self.trips: int | None = None
+        self.sites: list[list] = []  # [field, read, written, whether in a loop inside the loop]
+
+    def bytes(self, lengths: dict[int, tuple[int, int]]) -> int:
+        """What it moves, if each element of a field that it names is read once and written once. lengths: see traffic()."""
+        total, fields = 0, {id(site[0]) for site in self.sites}
+        for key in fields & lengths.keys():
+            sites = [s for s in self.sites if id(s[0]) == key]
+            length, size = lengths[key]
+            if self.trips is not None and not any(deep for *_, deep in sites):
+                length = min(length, self.trips * len(sites))
+            total += length * size * (any(s[1] for s in sites) + any(s[2] for s in sites))
+        return total
+
+
+class Tracer:
+    """Watches Taichi translate kernels: .sweeps has the loops of each, by its name."""
+
+    def __init__(self):
+        self.sweeps: dict[str, list[Sweep]] = {}
+        self._open: list[Sweep] = []
+        self._depth = 0
+        self._known: dict[int, tuple[Any, list]] = {}  # expressions that are elements of fields; kept, so that ids stay theirs
+
+    @contextlib.contextmanager
+    def watching(self) -> Iterator[None]:
+        """While this lasts."""
+        materialize, loop, subscript = kernel_impl.Kernel.materialize, ASTTransformer.build_range_for, impl.subscript
+        common: Any = common_ops.TaichiOperations
+        assign, augment = common._assign, common._augassign
+
+        def translated(kernel, *args, **kwargs):
+            self._open, self._known = [], {}
+            out = materialize(kernel, *args, **kwargs)
+            if self._known:  # it was not there already
+                self.sweeps[kernel.func.__name__] = self._open
+            return out
+
+        def looped(ctx, node):
+            self._depth += 1
+            if self._depth == 1:
+                self._open.append(Sweep())
+            try:
+                out = loop(ctx, node)
+            finally:
+                self._depth -= 1
+            if self._depth == 0:
+                ends = [0, *(arg.ptr for arg in node.iter.args)][-2:]
+                self._open[-1].trips = ends[1] - ends[0] if all(isinstance(e, int) for e in ends) else None
+            return out
+
+        def subscripted(builder, value, *args, **kwargs):
+            out = subscript(builder, value, *args, **kwargs)
+            if isinstance(value, ti.Field) and self._open and self._depth:
+                site = [value, True, False, self._depth > 1]
+                self._open[-1].sites.append(site)
+                self._known[id(out)] = (out, site)
+            elif id(value) in self._known and isinstance(out, type(value)):  # a component
+                self._known[id(out)] = (out, self._known[id(value)][1])
+            return out
+
+        def assigned(to, value):
+            if id(to) in self._known:
+                site = self._known[id(to)][1]
+                site[1], site[2] = False, True
+            return assign(to, value)
+
+        def changed(to, value, op):
+            if id(to) in self._known:
+                self._known[id(to)][1][2] = True
+            return augment(to, value, op)
+
+        def atomic(function):
+            def both(to, value):
+                if id(to) in self._known:
+                    self._known[id(to)][1][2] = True
+                return function(to, value)
+
+            return both
+
+        with replaced(
+            (kernel_impl.Kernel, "materialize", translated), (ASTTransformer, "build_range_for", staticmethod(looped)),
+            (impl, "subscript", subscripted), (common, "_assign", assigned), (common, "_augassign", changed),
+            *((module, name, atomic(getattr(module, name))) for module in (ti, ops) for name in ("atomic_add", "atomic_sub")),
+        ):  # fmt: skip
+            yield
+
+
+def traffic(world, frames: int) -> dict[str, float]:
+    """Bytes that a frame moves, by kernel, on the parallel path, on average of so many frames from the present state.
+
+    A model, not a measurement: every launch of a kernel is counted, and every loop in it reads each element of each field that it
+    names once, and writes it once if it assigns it; of the lists of neighbours, the entries that are in use. So it is what would
+    cross the bus if nothing stayed in the caches from one loop to the next, and if what particles read of each other (gathers)
+    were fetched once. The fields are those that the kernels name as they are translated; nothing here knows them by name.
+    """
+    tracer = Tracer()
+    with tracer.watching(), world.clone(path="parallel") as clone:
+        clone.step(DT)
+        with launches() as count:
+            for _ in range(frames):
+                clone.step(DT)
+        main, *stores = clone._memories
+        lengths = {id(e.field): (max(1, e.length), e.bytes // max(1, e.length)) for e in main.entries}
+        if stores:
+            listed = int(clone._grid.number.to_numpy().sum())
+            lengths |= {id(e.field): (min(e.length, listed), e.bytes // e.length) for m in stores for e in m.entries}
+        return {
+            name: k / frames * sum(sweep.bytes(lengths) for sweep in tracer.sweeps.get(name, ())) for name, k in count.items()
+        }

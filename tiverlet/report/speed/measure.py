@@ -1,0 +1,217 @@
+"""The measuring: sizes, threads, processes."""
+
+import os
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from statistics import median
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from rich.progress import Progress
+
+from ... import checks
+from ..sweep import machine, said
+from . import peers as others
+from . import processes, stripped, yardstick
+from .result import Absent, Peer, Run, SpeedReport
+from .scenes import SCENES
+
+BLOCK = 1 << 28  # bytes of each of the arrays that are copied: many times the caches
+FRAMES = (12, 60)  # timed in a round, at least and at most
+WORK = 5e7  # particle-substeps of a round, at most, if that is more than the least frames
+ROUNDS, SECONDS = 25, 2.0  # rounds at most; seconds of ours after which none is begun
+QUICK = (3, 0.2)  # the same, of a quick report
+
+
+def speed(
+    scenes: Sequence[str] | str | None = None, *, sizes: Iterable[int] | None = None, threads: Iterable[int] | None = None,
+    quick: bool = False, yardstick: bool = True, peers: bool = True, absent: bool = True, progress: bool = False,
+) -> SpeedReport:  # fmt: skip
+    """Measure how fast scenes are computed, beside a pile written by hand in C and other engines, and what a start costs.
+
+    scenes: names in SCENES; None for all. sizes: numbers of particles; None for those of each scene. threads: numbers of CPU
+    threads; None for 1, 2, 4, ... up to all cores. quick: two small sizes, and few rounds. yardstick: run pile.c too, where there
+    is a C compiler. peers: run pymunk and newton too, where they are installed. absent: compare with a package that lacks what
+    the scene does not use. progress: show a bar.
+
+    A scene is run over its first frames again and again, in turns with the yardstick; medians are reported, and the ratio of
+    medians. ValueError for scenes, sizes or threads that there are not; what fails while it runs is named in .notes.
+    """
+    names = chosen(scenes)
+    cores = numbers("threads", threads) or powers(os.cpu_count() or 1)
+    wanted = numbers("sizes", sizes)
+    ladder = {name: wanted or (SCENES[name].quick if quick else SCENES[name].sizes) for name in names}
+    session = Session(cores, quick)
+    with tempfile.TemporaryDirectory() as folder, Progress(disable=not progress) as bar:
+        row = bar.add_task("speed", total=sum(map(len, ladder.values())))
+        session.folder = folder
+        if yardstick and "pile" in names:
+            session.compile()
+        for name, sizes_ in ladder.items():
+            for n in sizes_:
+                bar.update(row, description=f"{name}, {n}")
+                with session.noting(f"{name}, {n} particles"):
+                    session.runs += session.point(name, n)
+                bar.advance(row)
+        for name in names if peers else ():
+            session.beside(name, min(ladder[name], key=lambda n: abs(n - others.SIZES.get(name, n))))
+        for name in names if absent else ():
+            if SCENES[name].needs is not None:
+                with session.noting(f"{name} without the rest of the package"):
+                    session.absent.append(session.without(name, min(ladder[name], key=lambda n: abs(n - 1000))))
+    copy = {t: bandwidth(t) for t in cores}
+    s = session
+    return SpeedReport(machine(), copy, tuple(s.runs), tuple(s.peers), tuple(s.absent), tuple(s.notes))
+
+
+class Session:
+    """What is measured one after the other, and what has been found so far."""
+
+    def __init__(self, cores: Sequence[int], quick: bool):
+        self.cores, self.quick, self.folder = cores, quick, ""
+        self.rounds, self.seconds = QUICK if quick else (ROUNDS, SECONDS)
+        self.program: str | None = None
+        self.runs: list[Run] = []
+        self.peers: list[Peer] = []
+        self.absent: list[Absent] = []
+        self.notes: list[str] = []
+        self._caches = 0
+
+    def compile(self) -> None:
+        """Compile the yardstick, or say why not."""
+        self.program, how = yardstick.build(self.folder)
+        self.notes.append(f"pile.c: {how}." if self.program else f"Left out: the yardstick pile.c, since {how}.")
+
+    @contextmanager
+    def noting(self, what: str) -> Iterator[None]:
+        """Errors inside become notes."""
+        try:
+            yield
+        except (RuntimeError, OSError) as error:
+            self.notes.append(f"Missing: {what}: {said(error)}")
+
+    def cache(self) -> str:
+        """An empty folder for compiled kernels."""
+        self._caches += 1
+        return os.path.join(self.folder, f"cache{self._caches}")
+
+    def frames(self, n: int, substeps: int) -> int:
+        """Frames of a round."""
+        return int(np.clip(WORK // (n * substeps), *FRAMES))
+
+    def point(self, name: str, n: int) -> list[Run]:
+        """A scene of one size, on all numbers of threads. Bits, and so work and quality, do not depend on these."""
+        out: list[Run] = []
+        scene, same = SCENES[name], {}
+        frames = self.frames(n, scene.substeps)
+        for threads in sorted(self.cores, reverse=True):
+            job, cache = {"scene": name, "n": n, "threads": threads}, self.cache()
+            with processes.world(job, cache) as once:
+                cold = once.ask()
+            with ExitStack() as stack:
+                ours = stack.enter_context(processes.world(job, cache))
+                warm = ours.ask()
+                both = [ours]
+                if self.program and name == "pile":
+                    both.append(stack.enter_context(yardstick.Yardstick(self.program, n, scene.substeps, threads)))
+                times = processes.side_by_side(both, frames, self.rounds, self.seconds)
+                if not same:
+                    qualities = [processes.quality(talker, frames) for talker in both]
+                    work = warm["particles"] * scene.substeps
+                    same = {**qualities[0], "bytes": sum(ours.ask("traffic").values()) / work}
+                    same["yardstick_overlap"] = qualities[1]["overlap"] if len(both) > 1 else None
+                look = ours.ask("look")
+            out.append(Run(
+                name, warm["particles"], threads, look["path"], scene.substeps, median(times[0]), len(times[0]), look["launches"],
+                memory=look["memory"] / warm["particles"], imported=median([cold["import"], warm["import"]]), cold=first(cold),
+                warm=first(warm), flags=tuple(look["flags"]), yardstick=median(times[1]) if len(both) > 1 else None, **same,
+            ))  # fmt: skip
+        return out[::-1]
+
+    def beside(self, name: str, n: int) -> None:
+        """The peers that there are for a scene, each with all threads that it can use."""
+        for peer in others.PEERS.values():
+            if name in others.SIZES:
+                if why := peer.missing():
+                    self.notes.append(f"Left out: {peer.name} on {name}, since {why}.")
+                    continue
+                with self.noting(f"{peer.name} on {name}, {n} particles"):
+                    self.peers.append(self.compare(peer, name, n))
+
+    def compare(self, peer: "others.Peer", name: str, n: int) -> Peer:
+        """The cheapest of a peer's settings that is as good as ours, or, if there is none, its best; then both in turns."""
+        scene, threads = SCENES[name], min(self.cores[-1], peer.threads)
+        frames, measure = self.frames(n, scene.substeps), others.MEASURE[name]
+        with processes.world({"scene": name, "n": n, "threads": threads}, self.cache()) as ours:
+            ours.ask()
+            target = processes.quality(ours, frames)[measure]
+            tried: list[tuple[float, tuple[int, int]]] = []
+            for setting in peer.settings:
+                with peer.process(name, n, threads, setting) as theirs:
+                    theirs.ask()
+                    tried.append((processes.quality(theirs, frames)[measure], setting))
+                if tried[-1][0] <= target:
+                    break
+            quality, setting = tried[-1] if tried[-1][0] <= target else min(tried)
+            with peer.process(name, n, threads, setting) as theirs:
+                count = theirs.ask()["particles"]
+                times = processes.side_by_side([ours, theirs], frames, self.rounds, self.seconds)
+        words = {"overlap": "mean overlap / diameter", "residual": "worst strain"}[measure]
+        return Peer(
+            f"{peer.name} {peer.version()}", name, count, threads, "{} steps x {} iterations".format(*setting), median(times[1]), median(times[0]), words, quality,
+            target, quality <= target,
+        )  # fmt: skip
+
+    def without(self, name: str, n: int) -> Absent:
+        """A scene by this package, and by one that has only what the scene uses."""
+        scene = SCENES[name]
+        assert scene.needs is not None
+        bare = stripped.copy(os.path.join(self.folder, f"bare_{name}"), scene.needs)
+        job = {"scene": name, "n": n, "threads": 1}
+        with processes.world(job, self.cache()) as whole, processes.world(job, self.cache(), bare) as part:
+            count = whole.ask()["particles"]
+            part.ask()
+            times = processes.side_by_side([whole, part], self.frames(n, scene.substeps), self.rounds, self.seconds)
+            a, b = whole.ask("look"), part.ask("look")
+        pairs: list[Any] = [(a[key], b[key]) for key in ("fields", "memory", "launches")]
+        return Absent(name, count, *pairs, (median(times[0]), median(times[1])))
+
+
+def first(start: dict[str, float]) -> float:
+    """Seconds from tv.init to the end of the first step, without building the arrays of the scene."""
+    return start["start"] + start["first"]
+
+
+def chosen(scenes: Sequence[str] | str | None) -> list[str]:
+    """Names of scenes."""
+    names = list(SCENES) if scenes is None else [scenes] if isinstance(scenes, str) else list(scenes)
+    for name in names:
+        if name not in SCENES:
+            raise ValueError(f"speed: there is no scene {name!r}, but {', '.join(SCENES)}.")
+    return list(dict.fromkeys(names))
+
+
+def numbers(what: str, given: Iterable[int] | None) -> tuple[int, ...]:
+    """Sizes or threads, in order."""
+    return tuple(sorted({checks.integer("speed", what, n, least=2 if what == "sizes" else 1) for n in given or ()}))
+
+
+def powers(cores: int) -> tuple[int, ...]:
+    """1, 2, 4, ... and all cores."""
+    return tuple(sorted({*(1 << k for k in range(cores.bit_length())), cores}))
+
+
+def bandwidth(threads: int) -> float:
+    """Bytes per second that are read and written in a copy of a large array, a part of it by each thread; the best of five."""
+    source, target = np.ones(BLOCK // 8), np.zeros(BLOCK // 8)
+    parts = list(zip(np.array_split(target, threads), np.array_split(source, threads), strict=True))
+    best = np.inf
+    with ThreadPoolExecutor(threads) as pool:
+        for _ in range(5):
+            clock = perf_counter()
+            list(pool.map(lambda pair: np.copyto(*pair), parts))
+            best = min(best, perf_counter() - clock)
+    return 2 * BLOCK / best

@@ -1,0 +1,194 @@
+"""Other engines on the same scenes, where they are installed: each in a process that obeys the commands of child.py.
+
+They are made to do what the scene says and no more: no friction, no restitution, no damping, no sleeping, no spin.
+"""
+
+import importlib.metadata
+import importlib.util
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from ...constraints import Box, Distance
+from .child import say
+from .counting import DT
+from .processes import Talker, paths
+from .scenes import SCENES
+
+SIZES = {"pile": 1000, "rope": 41}  # at which they are compared, or as near to it as is measured
+MEASURE = {"pile": "overlap", "rope": "residual"}
+START = "import json, sys; from tiverlet.report.speed.peers import main; main(json.loads(sys.argv[1]))"
+
+
+@dataclass(frozen=True)
+class Peer:
+    """settings: pairs of steps in a frame and iterations of each, the cheapest first. threads: as many as it can use."""
+
+    name: str
+    settings: Sequence[tuple[int, int]]
+    threads: int
+
+    def missing(self) -> str:
+        """Why it cannot be run; nothing if it can."""
+        return "" if importlib.util.find_spec(self.name) else "it is not installed"
+
+    def version(self) -> str:
+        """Of what is installed."""
+        return importlib.metadata.version(self.name)
+
+    def process(self, scene: str, n: int, threads: int, setting: tuple[int, int]) -> Talker:
+        """It, at work on a scene."""
+        job = {"peer": self.name, "scene": scene, "n": n, "threads": threads, "setting": setting}
+        return Talker([sys.executable, "-P", "-c", START, json.dumps(job)], {"PYTHONPATH": paths()})
+
+
+LADDER = [(steps, iterations) for steps, iterations in (
+    (1, 1), (1, 5), (1, 10), (2, 10), (4, 10), (8, 10), (8, 20), (16, 20), (20, 40), (40, 40), (40, 100), (80, 100),
+)]  # fmt: skip
+PEERS = {p.name: p for p in (Peer("pymunk", LADDER, 2), Peer("newton", LADDER, 1 << 10))}
+
+
+class Pymunk:
+    """Discs are circles that cannot turn, links pin joints, the box four segments. Impulses are iterated and kept (Chipmunk)."""
+
+    def __init__(self, particles, features, threads: int, setting: tuple[int, int]):
+        import pymunk  # pyright: ignore[reportMissingImports]
+
+        self.steps, iterations = setting
+        self.space = space = pymunk.Space(threaded=threads > 1)
+        space.threads, space.iterations, space.gravity = threads, iterations, (0, -9.81)
+        space.collision_slop = 0.0  # else a tenth of a metre of overlap is left on purpose
+        self.bodies = []
+        for x, mass, free in zip(particles.position.tolist(), particles.mass.tolist(), particles.inv_mass > 0, strict=True):
+            body = pymunk.Body(mass, float("inf")) if free else pymunk.Body(body_type=pymunk.Body.STATIC)
+            body.position = tuple(x)
+            self.bodies.append(body)
+        circles = [pymunk.Circle(b, r) for b, r in zip(self.bodies, particles.radius.tolist(), strict=True) if r > 0]
+        space.add(*self.bodies, *circles)
+        for feature in features:
+            if isinstance(feature, Distance):
+                space.add(*(pymunk.PinJoint(self.bodies[i], self.bodies[j]) for i, j in feature.indices.tolist()))
+            elif isinstance(feature, Box):
+                (a, b), (c, d) = np.asarray(feature.lower).tolist(), np.asarray(feature.upper).tolist()
+                corners = [(a, b), (c, b), (c, d), (a, d)]
+                ends = zip(corners, corners[1:] + corners[:1], strict=True)
+                # Thick, and outside: nothing falls through.
+                out = [(0, -5), (5, 0), (0, 5), (-5, 0)]
+                space.add(*(
+                    pymunk.Segment(space.static_body, (p[0] + o[0], p[1] + o[1]), (q[0] + o[0], q[1] + o[1]), 5.0)
+                    for (p, q), o in zip(ends, out, strict=True)
+                ))  # fmt: skip
+
+    def frame(self) -> None:
+        """Advance."""
+        for _ in range(self.steps):
+            self.space.step(DT / self.steps)
+
+    def position(self) -> np.ndarray:
+        """Of all particles [m]."""
+        return np.array([tuple(b.position) for b in self.bodies])
+
+
+class Newton:
+    """Newton's XPBD on Warp, on the CPU: particles in a plane of space, links springs of 1e6 N/m, the box four planes."""
+
+    STIFF = 1e6
+
+    def __init__(self, particles, features, threads: int, setting: tuple[int, int]):
+        import newton  # pyright: ignore[reportMissingImports]
+        import warp as wp  # pyright: ignore[reportMissingImports]
+
+        wp.config.quiet = True
+        self.steps, iterations = setting
+        self.dim, n = particles.dim, len(particles)
+        builder = newton.ModelBuilder(up_axis=newton.Axis.Y, gravity=-9.81)
+        x = np.zeros((n, 3))
+        x[:, : self.dim] = particles.position
+        mass = np.where(particles.inv_mass > 0, particles.mass, 0.0)
+        builder.add_particles(list(map(tuple, x)), [(0.0, 0.0, 0.0)] * n, mass.tolist(), particles.radius.tolist())
+        for feature in features:
+            if isinstance(feature, Distance):
+                for i, j in feature.indices.tolist():
+                    builder.add_spring(i, j, self.STIFF, 0.0, 0.0)
+            elif isinstance(feature, Box):
+                low, high = np.asarray(feature.lower).tolist(), np.asarray(feature.upper).tolist()
+                for axis in range(self.dim):
+                    for sign, at in ((1.0, low[axis]), (-1.0, high[axis])):
+                        normal = [sign * (k == axis) for k in range(3)]
+                        builder.add_shape_plane(plane=(*normal, -sign * at), width=0.0, length=0.0)
+        with wp.ScopedDevice("cpu"):
+            self.model = model = builder.finalize(device="cpu")
+            model.particle_mu = model.soft_contact_mu = 0.0
+            if not particles.radius.any():
+                model.particle_grid = None
+            self.boxed = any(isinstance(f, Box) for f in features)
+            self.solver = newton.solvers.SolverXPBD(model, iterations=iterations)
+            self.now, self.then, self.control = model.state(), model.state(), model.control()
+            self.contacts = model.contacts() if self.boxed else None
+
+    def frame(self) -> None:
+        """Advance."""
+        for _ in range(self.steps):
+            self.now.clear_forces()
+            if self.boxed:
+                self.model.collide(self.now, self.contacts)
+            self.solver.step(self.now, self.then, self.control, self.contacts, DT / self.steps)
+            self.now, self.then = self.then, self.now
+
+    def position(self) -> np.ndarray:
+        """Of all particles [m]."""
+        return self.now.particle_q.numpy()[:, : self.dim].astype(np.float64)
+
+
+ENGINES: dict[str, Any] = {"pymunk": Pymunk, "newton": Newton}
+
+
+def main(job: dict[str, Any]) -> None:
+    """The process of a peer."""
+    particles, features = SCENES[job["scene"]].build(job["n"])
+
+    def made():
+        return ENGINES[job["peer"]](particles, features, job["threads"], job["setting"])
+
+    engine = made()
+    say({"particles": len(particles)})
+    links = [f for f in features if isinstance(f, Distance)]
+    for line in sys.stdin:
+        word, *number = line.split()
+        if word == "run":
+            clock = perf_counter()
+            for _ in range(int(number[0])):
+                engine.frame()
+            say(perf_counter() - clock)
+        elif word == "restart":
+            engine = made()
+            engine.frame()
+            say(0.0)
+        else:
+            x = engine.position()
+            say({"overlap": overlap(x, particles.radius), "residual": max((strain(x, f, particles) for f in links), default=0.0)})
+
+
+def overlap(x: np.ndarray, radius: np.ndarray, block: int = 256) -> float:
+    """The mean overlap of pairs that overlap, in diameters of the first; every pair is looked at."""
+    found = []
+    for i in range(0, len(x), block):
+        far = np.linalg.norm(x[i : i + block, None] - x[None], axis=2)
+        depth = radius[i : i + block, None] + radius - far
+        found.append(depth[np.triu(depth > 0, k=i + 1)])
+    deep = np.concatenate(found)
+    return float(deep.mean() / (2 * radius[0])) if len(deep) else 0.0
+
+
+def strain(x: np.ndarray, links, particles) -> float:
+    """The worst relative change of length; infinite where a position is none."""
+    i, j = links.indices.T
+    rest = np.linalg.norm(particles.position[i] - particles.position[j], axis=1)
+    with np.errstate(all="ignore"):
+        worst = float(np.abs(np.linalg.norm(x[i] - x[j], axis=1) / rest - 1).max())
+    return worst if np.isfinite(worst) else float(1e300)

@@ -1,0 +1,97 @@
+"""Processes that are timed side by side: each is asked for so many frames, in turn, and answers with seconds."""
+
+import json
+import os
+import pathlib
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from statistics import mean
+from typing import Any
+
+ROOT = str(pathlib.Path(__file__).parents[3])
+PATIENCE = 600.0  # [s] that ending a process may take
+
+
+class Talker:
+    """A process that answers lines with lines of JSON. RuntimeError, with the end of what it said, when it dies."""
+
+    def __init__(self, command: Sequence[str], environment: Mapping[str, str]):
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            env={**os.environ, **environment},
+        )  # fmt: skip
+
+    def ask(self, line: str = "") -> Any:
+        """Say something, and wait for the answer; nothing: only wait."""
+        process = self._process
+        assert process.stdin and process.stdout and process.stderr
+        answer = ""
+        try:
+            if line:
+                process.stdin.write(line + "\n")
+                process.stdin.flush()
+            answer = process.stdout.readline()
+        except BrokenPipeError:
+            pass
+        if not answer:
+            process.stdin.close()
+            said = process.stderr.read().strip()
+            raise RuntimeError(f"exit status {process.wait()}: {' '.join(said.split())[-300:]}")
+        return json.loads(answer)
+
+    def __enter__(self) -> "Talker":
+        return self
+
+    def __exit__(self, *exc) -> None:
+        self._process.stdin.close()  # type: ignore[union-attr]
+        try:
+            self._process.wait(PATIENCE)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+        for pipe in (self._process.stdout, self._process.stderr):
+            pipe.close()  # type: ignore[union-attr]
+
+
+def world(job: Mapping[str, Any], cache: str, root: str = ROOT) -> Talker:
+    """The process of a scene, by the package in `root`. cache: the folder where Taichi keeps what it has compiled."""
+    from .child import START
+
+    environment = {"PYTHONPATH": paths(root), "TI_OFFLINE_CACHE_FILE_PATH": cache, "TI_OFFLINE_CACHE": "1"}
+    return Talker([sys.executable, "-P", "-c", START, json.dumps(job)], environment)
+
+
+def paths(root: str = ROOT) -> str:
+    """Where a process imports from: `root` first."""
+    return os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
+
+
+def side_by_side(talkers: Sequence[Talker], frames: int, rounds: int, seconds: float, group: int = 6) -> list[list[float]]:
+    """Seconds of a frame of each, in each round: a restart, then `frames` frames, in groups that take turns.
+
+    At least 3 rounds (or `rounds`, if that is less), at most `rounds`, and none is begun after `seconds` [s] of the first one's.
+    """
+    out: list[list[float]] = [[] for _ in talkers]
+    spent = 0.0
+    while len(out[0]) < min(3, rounds) or len(out[0]) < rounds and spent < seconds:
+        for talker in talkers:
+            talker.ask("restart")
+        total = [0.0] * len(talkers)
+        for begin in range(0, frames, group):
+            for k, talker in enumerate(talkers):
+                total[k] += talker.ask(f"run {min(group, frames - begin)}")
+        spent += total[0]
+        for times, t in zip(out, total, strict=True):
+            times.append(t / frames)
+    return out
+
+
+def quality(talker: Talker, frames: int, looks: int = 6) -> dict[str, float]:
+    """The mean overlap [diameters] and the worst relative violation during so many frames from the start, looked at now and then."""
+    talker.ask("restart")
+    seen = []
+    for _ in range(looks):
+        talker.ask(f"run {max(1, frames // looks)}")
+        seen.append(talker.ask("quality"))
+    touching = [s["overlap"] for s in seen if s["overlap"] > 0]
+    return {"overlap": mean(touching) if touching else 0.0, "residual": max(s["residual"] for s in seen)}

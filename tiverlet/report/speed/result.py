@@ -1,0 +1,262 @@
+"""What was measured, as a report: tables, Markdown, JSON, plots."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.table import Table
+
+from .. import output
+
+
+@dataclass(frozen=True)
+class Run:
+    """A scene of one size on so many threads.
+
+    seconds: of a frame, the median of `rounds` runs over its first frames, the very first apart. launches: kernels of a frame,
+    counted, on average. bytes: moved for each particle and substep, by the count of counting.py. memory: of all fields [bytes per
+    particle]. imported: of the package; cold, warm: from tv.init to the end of the first step, with nothing compiled and with
+    Taichi's cache of a process before it [s]. overlap: the mean of pairs that overlap [diameters]. residual: the worst relative
+    violation. yardstick, yardstick_overlap: of pile.c; None where it was not run.
+    """
+
+    scene: str
+    particles: int
+    threads: int
+    path: str
+    substeps: int
+    seconds: float
+    rounds: int
+    launches: float
+    bytes: float
+    memory: float
+    imported: float
+    cold: float
+    warm: float
+    overlap: float
+    residual: float
+    flags: tuple[str, ...]
+    yardstick: float | None = None
+    yardstick_overlap: float | None = None
+
+    @property
+    def rate(self) -> float:
+        """Particle-substeps per second."""
+        return self.particles * self.substeps / self.seconds
+
+    @property
+    def ratio(self) -> float | None:
+        """Its rate over the yardstick's; the medians of runs that took turns."""
+        return None if self.yardstick is None else self.yardstick / self.seconds
+
+
+@dataclass(frozen=True)
+class Peer:
+    """Another engine on the same scene: the cheapest of its settings that is no worse than ours.
+
+    setting: in words. seconds, ours: of a frame, medians of runs that took turns. quality, our_quality: the mean overlap
+    [diameters] or the worst strain, during the same frames. met: whether any setting was as good as ours; if none, it is the best.
+    """
+
+    peer: str
+    scene: str
+    particles: int
+    threads: int
+    setting: str
+    seconds: float
+    ours: float
+    measure: str
+    quality: float
+    our_quality: float
+    met: bool
+
+
+@dataclass(frozen=True)
+class Absent:
+    """A scene run by the package, and by one without the files of all features that the scene does not use.
+
+    fields, bytes, launches of a frame, and the seconds of a frame (medians of runs that took turns): here, and without.
+    """
+
+    scene: str
+    particles: int
+    fields: tuple[int, int]
+    bytes: tuple[int, int]
+    launches: tuple[float, float]
+    seconds: tuple[float, float]
+
+    @property
+    def ratio(self) -> float:
+        """What the other features cost: 1 for nothing."""
+        return self.seconds[0] / self.seconds[1]
+
+
+@dataclass(frozen=True)
+class SpeedReport:
+    """Speed, memory and starts. print() shows it; see .run(), .growth(), .scaling(), .json(), .markdown(), .plot().
+
+    copy: bytes per second that a copy of a large array moves (read and written), by threads. notes: what was left out, and how
+    the yardstick was compiled.
+    """
+
+    machine: str
+    copy: dict[int, float]
+    runs: tuple[Run, ...]
+    peers: tuple[Peer, ...]
+    absent: tuple[Absent, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def missing(self) -> list[str]:
+        """Notes on what failed."""
+        return [note for note in self.notes if note.startswith("Missing")]
+
+    def run(self, scene: str, particles: int, threads: int) -> Run:
+        """One run; KeyError where there is none."""
+        for r in self.runs:
+            if (r.scene, r.particles, r.threads) == (scene, particles, threads):
+                return r
+        raise KeyError((scene, particles, threads))
+
+    def curves(self) -> Iterator[tuple[str, int, list[Run]]]:
+        """Scene, threads, and its runs by size."""
+        for scene, threads in dict.fromkeys((r.scene, r.threads) for r in self.runs):
+            some = [r for r in self.runs if (r.scene, r.threads) == (scene, threads)]
+            yield scene, threads, sorted(some, key=lambda r: r.particles)
+
+    def share(self, r: Run) -> float:
+        """Of the bandwidth of a copy, what the counted bytes take up."""
+        return r.rate * r.bytes / self.copy[r.threads]
+
+    def growth(self, scene: str, threads: int, since: int = 10_000) -> float | None:
+        """The longest time of a particle-substep over the shortest, from `since` particles on; None for less than two sizes."""
+        rates = [r.rate for r in self.runs if (r.scene, r.threads) == (scene, threads) and r.particles >= 0.9 * since]
+        return max(rates) / min(rates) if len(rates) > 1 else None
+
+    def scaling(self, r: Run) -> float | None:
+        """How many times as fast it is as on the fewest threads; None where those are its own."""
+        others = [o for o in self.runs if (o.scene, o.particles) == (r.scene, r.particles)]
+        least = min(others, key=lambda o: o.threads)
+        return None if least.threads == r.threads else least.seconds / r.seconds
+
+    def tables(self) -> Iterator[tuple[str, tuple[str, ...], list[tuple[str, ...]]]]:
+        """Title, heads and rows of each."""
+        if self.runs:
+            yield "Speed", HEADS, [self._cells(r) for r in self.runs]
+            yield "Starts, memory, quality", STARTS, [started(r) for r in self.runs]
+        if self.peers:
+            yield "Peers, at the same measured quality or better", PEERS, [beside(p) for p in self.peers]
+        if self.absent:
+            yield "Features that exist but are not in the scene", ABSENT, [without(a) for a in self.absent]
+
+    def lines(self) -> Iterator[str]:
+        """What else there is to say."""
+        yield f"Machine: {self.machine}."
+        for threads, speed in self.copy.items():
+            yield f"A copy of a large array moves {speed / 1e9:.1f} GB/s on {threads} thread{'s' * (threads > 1)}."
+        for scene, threads, _ in self.curves():
+            growth = self.growth(scene, threads)
+            if growth is not None:
+                yield f"{scene}, {threads} threads: time per particle-substep within a factor {growth:.2f} from 10 000 on."
+        if self.runs:
+            yield MODEL
+        yield from self.notes
+
+    def _cells(self, r: Run) -> tuple[str, ...]:
+        scaling = self.scaling(r)
+        return (
+            r.scene, f"{r.particles:,}", str(r.threads), r.path, f"{1e3 * r.seconds:.3g}", f"{r.rate / 1e6:.3g}",
+            "" if r.ratio is None else f"{r.ratio:.2f}", "" if scaling is None else f"{scaling:.2f}", f"{r.launches:.3g}",
+            f"{r.bytes:.0f}", f"{100 * self.share(r):.0f} %",
+        )  # fmt: skip
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        for title, heads, rows in self.tables():
+            table = Table(title=title)
+            for k, head in enumerate(heads):
+                table.add_column(head, justify="left" if k == 0 or head in TEXT else "right")
+            for row in rows:
+                table.add_row(*row)
+            yield table
+        yield from self.lines()
+
+    def __str__(self) -> str:
+        return output.text(self, 150)
+
+    def markdown(self) -> str:
+        """Everything as Markdown."""
+        out: list[str] = []
+        for title, heads, rows in self.tables():
+            out += [f"**{title}**", "", *output.table(heads, rows), ""]
+        return "\n".join([*out, *(f"- {line}" for line in self.lines())]) + "\n"
+
+    def json(self) -> str:
+        """Everything, for machines; see of_json()."""
+        return json.dumps(asdict(self), indent=1, allow_nan=False)
+
+    @classmethod
+    def of_json(cls, text: str) -> "SpeedReport":
+        """The report that json() wrote."""
+        data = json.loads(text)
+        copy = {int(k): v for k, v in data["copy"].items()}
+        made = {"runs": Run, "peers": Peer, "absent": Absent}
+        lists = {k: tuple(restored(kind, row) for row in data[k]) for k, kind in made.items()}
+        return cls(machine=data["machine"], copy=copy, notes=tuple(data["notes"]), **lists)
+
+    def plot(self, folder) -> list[str]:
+        """Rates by size, starts, and scaling as PNG in `folder`; returns their paths. Needs matplotlib (the extra "plots")."""
+        from .figures import plot
+
+        return plot(self, folder)
+
+
+HEADS = (
+    "scene", "particles", "threads", "path", "ms per frame", "M particle-substeps/s", "of pile.c", "of 1 thread",
+    "launches per frame", "bytes per particle-substep", "of a copy",
+)  # fmt: skip
+STARTS = (
+    "scene", "particles", "threads", "import [s]", "first step, cold [s]", "warm [s]", "bytes per particle", "mean overlap",
+    "pile.c's", "worst violation", "flags",
+)  # fmt: skip
+PEERS = ("peer", "scene", "particles", "threads", "setting", "ms per frame", "ours", "times ours", "measure", "its", "ours ", "met")
+ABSENT = ("scene", "particles", "fields", "bytes", "launches per frame", "ms per frame", "ratio")
+TEXT = ("path", "flags", "setting", "measure")
+MODEL = (
+    "Bytes are a count, not a measurement: every loop of every kernel launched on the parallel path reads and writes each element of "
+    "the fields that it names once, as if nothing stayed in the caches between loops; more than 100 % of a copy is what caches gave."
+)
+
+
+def restored(kind: type, row: dict[str, Any]) -> Any:
+    """A row of JSON, with tuples where it has lists."""
+    return kind(**{f.name: tuple(v) if isinstance(v := row[f.name], list) else v for f in fields(kind)})
+
+
+def percent(share: float | None) -> str:
+    """Of a diameter; nothing for nothing."""
+    return f"{100 * share:.2f} %" if share else ""
+
+
+def started(r: Run) -> tuple[str, ...]:
+    """A line about a start."""
+    return (
+        r.scene, f"{r.particles:,}", str(r.threads), f"{r.imported:.2f}", f"{r.cold:.2f}", f"{r.warm:.2f}", f"{r.memory:.0f}",
+        percent(r.overlap), percent(r.yardstick_overlap), f"{r.residual:.1e}" if r.residual else "", " ".join(r.flags),
+    )  # fmt: skip
+
+
+def beside(p: Peer) -> tuple[str, ...]:
+    """A line about a peer."""
+    return (
+        p.peer, p.scene, f"{p.particles:,}", str(p.threads), p.setting, f"{1e3 * p.seconds:.3g}", f"{1e3 * p.ours:.3g}",
+        f"{p.seconds / p.ours:.3g}", p.measure, f"{p.quality:.2e}", f"{p.our_quality:.2e}", "yes" if p.met else "no",
+    )  # fmt: skip
+
+
+def without(a: Absent) -> tuple[str, ...]:
+    """A line about what is absent."""
+    pairs = (f"{x:g} / {y:g}" for x, y in (a.fields, a.bytes, a.launches))
+    times = f"{1e3 * a.seconds[0]:.4g} / {1e3 * a.seconds[1]:.4g}"
+    return (a.scene, f"{a.particles:,}", *pairs, times, f"{a.ratio:.3f}")

@@ -1,0 +1,59 @@
+"""A copy of the package without the files of the features that a scene does not use, without reports and recording."""
+
+import ast
+import os
+import pathlib
+import re
+import shutil
+
+PACKAGE = pathlib.Path(__file__).parents[2]
+FOLDERS = ("constraints", "forces")
+HERE = ("child.py", "counting.py", "scenes.py")  # what the process of a scene runs
+IGNORED = shutil.ignore_patterns("__pycache__", "recording", "report", "commands")
+
+
+def copy(folder: str, needs: frozenset[str]) -> str:
+    """Make one in `folder`; returns the path to import it from. needs: the files of features that stay, by name."""
+    bare = pathlib.Path(folder) / "tiverlet"
+    shutil.copytree(PACKAGE, bare, ignore=IGNORED)
+    kept = needed(bare, needs)
+    names: dict[str, list[str]] = {}
+    for part in FOLDERS:
+        for file in (bare / part).glob("*.py"):
+            if file.stem not in kept and file.stem != "__init__":
+                file.unlink()
+        init = bare / part / "__init__.py"
+        lines = exports(init)
+        names[part] = [name for module, name in lines if module in kept]
+        init.write_text("".join(f"from .{module} import {name}\n" for module, name in lines if module in kept))
+    imports = [f"from .{part} import {', '.join(some)}\n" for part, some in names.items() if some]
+    imports += ["from .particles import Particles\n", "from .runtime import init\n", "from .world import World\n"]
+    (bare / "__init__.py").write_text("from . import runtime  # first\nfrom . import shapes\n" + "".join(imports))
+    speed = bare / "report" / "speed"
+    os.makedirs(speed)
+    for init in (bare / "report" / "__init__.py", speed / "__init__.py"):
+        init.write_text("")
+    for name in HERE:
+        shutil.copy(pathlib.Path(__file__).with_name(name), speed)
+    return folder
+
+
+def needed(bare: pathlib.Path, needs: frozenset[str]) -> set[str]:
+    """Those, and what they and the rest of the package import of the same folders."""
+    kept, before = set(needs), set()
+    rest = [f for f in bare.rglob("*.py") if f.parent.name not in FOLDERS and f.parent != bare or f.parent == bare and f.stem != "__init__"]
+    for file in rest:
+        kept |= set(re.findall(rf"^from \.+(?:{'|'.join(FOLDERS)})\.(\w+) import", file.read_text(), re.M))
+    while kept != before:
+        before = set(kept)
+        for part in FOLDERS:
+            for name in before:
+                if (file := bare / part / f"{name}.py").is_file():
+                    kept |= set(re.findall(r"^from \.(\w+) import", file.read_text(), re.M))
+    return kept
+
+
+def exports(init: pathlib.Path) -> list[tuple[str, str]]:
+    """Module and name of everything that the __init__ of a folder imports from it."""
+    nodes = [n for n in ast.parse(init.read_text()).body if isinstance(n, ast.ImportFrom) and n.level == 1 and n.module]
+    return [(str(n.module), alias.name) for n in nodes for alias in n.names]

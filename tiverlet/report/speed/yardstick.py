@@ -1,0 +1,32 @@
+"""The pile written by hand in C, compiled here and now."""
+
+import os
+import pathlib
+import shutil
+import subprocess
+
+from .processes import Talker
+
+SOURCE = pathlib.Path(__file__).with_name("pile.c")
+FLAGS = ("-O3", "-march=native", "-ffast-math", "-fopenmp")
+
+
+def build(folder) -> tuple[str | None, str]:
+    """The program, and how it was compiled; or None, and why there is none."""
+    names = [name for name in (os.environ.get("CC"), "gcc", "cc", "clang") if name]
+    compiler = next((found for name in names if (found := shutil.which(name))), None)
+    if compiler is None:
+        return None, f"no C compiler is on the path ({', '.join(names)})"
+    program = os.path.join(folder, "pile")
+    command = [compiler, *FLAGS, str(SOURCE), "-lm", "-o", program]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        return None, f"{' '.join([pathlib.Path(compiler).name, *FLAGS])} fails: {' '.join(done.stderr.split())[:200]}"
+    return program, " ".join([pathlib.Path(compiler).name, *FLAGS])
+
+
+class Yardstick(Talker):
+    """The program at work on n discs; see pile.c for what it obeys."""
+
+    def __init__(self, program: str, n: int, substeps: int, threads: int):
+        super().__init__([program, str(n), str(substeps)], {"OMP_NUM_THREADS": str(threads)})
