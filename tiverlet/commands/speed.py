@@ -1,4 +1,4 @@
-"""How fast scenes of 10 to a million particles run, next to what the machine can do and to other engines, and what starts cost."""
+"""How fast scenes of 10 to a million particles run, next to what the machine and other engines can do, and what starts cost."""
 
 import argparse
 
@@ -8,8 +8,9 @@ ABOUT = "speed, memory and starts; beside a pile in C, and other engines"
 def add(parser: argparse.ArgumentParser) -> None:
     """The arguments."""
     parser.add_argument("scenes", nargs="*", help="pile, spheres, cloth, ropes, rope, mixed; all without any")
-    parser.add_argument("--sizes", type=int, nargs="+", metavar="N", help="numbers of particles; default: each scene's own ladder")
-    parser.add_argument("--threads", type=int, nargs="+", metavar="T", help="numbers of CPU threads; default 1, 2, 4, ... all cores")
+    parser.add_argument("--sizes", type=int, nargs="+", metavar="N", help="numbers of particles; default: a ladder of each scene")
+    parser.add_argument("--threads", type=int, nargs="+", metavar="T", help="numbers of CPU threads; default 1, 2, 4, ... all")
+    parser.add_argument("--arch", default="cpu", help="cpu, cuda, metal or vulkan (default cpu)")
     parser.add_argument("--list", action="store_true", help="list the scenes and their sizes")
     parser.add_argument("--quick", action="store_true", help="two small sizes of each, and few runs")
     for name, what in (("yardstick", "pile.c"), ("peers", "other engines"), ("absent", "the package without unused files")):
@@ -33,7 +34,7 @@ def main(args: argparse.Namespace) -> int:
             console.print(f"{name:8} {scene.title}, {scene.substeps} substeps; {sizes} particles", highlight=False)
         return 0
     report = speed(
-        args.scenes or None, sizes=args.sizes, threads=args.threads, quick=args.quick, yardstick=args.yardstick,
+        args.scenes or None, sizes=args.sizes, threads=args.threads, arch=args.arch, quick=args.quick, yardstick=args.yardstick,
         peers=args.peers, absent=args.absent, progress=console.is_terminal,
     )  # fmt: skip
     console.print(report)

@@ -4,6 +4,7 @@
     restart: back to the start, and one frame that is not timed
     look: launches of a frame, counted; path, memory, flags
     quality: the mean overlap of the pairs that overlap [diameters], and the worst relative violation of a constraint
+    copy: bytes per second that a copy of a large field moves
     traffic: bytes that a frame moves, by kernel, see counting.py
 
 It runs in copies of the package that lack most of it, see absent.py.
@@ -28,7 +29,7 @@ COUNTED = 6  # frames over which launches and bytes are averaged
 
 
 def main(job: dict[str, Any], imported: float) -> None:
-    """job: scene, n, threads, and whether only the start is asked for. imported: seconds."""
+    """job: scene, n, arch, threads. imported: seconds."""
     import tiverlet as tv
 
     from .counting import DT, launches, traffic
@@ -39,13 +40,22 @@ def main(job: dict[str, Any], imported: float) -> None:
     particles, features = scene.build(job["n"])
     shaped = perf_counter() - clock
     clock = perf_counter()
-    tv.init(threads=job["threads"])
+    tv.init(job["arch"], threads=job["threads"])
     started = perf_counter() - clock
     clock = perf_counter()
     world = tv.World(particles, features, substeps=scene.substeps)
     report = world.step(DT)
     first = perf_counter() - clock
-    say({"import": imported, "start": started, "shape": shaped, "first": first, "particles": len(particles)})
+    say(
+        {
+            "import": imported,
+            "start": started,
+            "shape": shaped,
+            "first": first,
+            "particles": len(particles),
+            "package": tv.__file__,
+        }
+    )
     flags = set(report.flags)
     for line in sys.stdin:
         word, *number = line.split()
@@ -70,9 +80,24 @@ def main(job: dict[str, Any], imported: float) -> None:
         elif word == "quality":
             overlap = float(world.contacts.overlap.mean()) if report.contacts else 0.0
             say({"overlap": overlap / (2 * float(particles.radius[0]) or 1.0), "residual": report.residual})
+        elif word == "copy":
+            say(copied())
         else:
             say(traffic(world, COUNTED))
     world.close()
+
+
+def copied(size: int = 1 << 28) -> float:
+    """Bytes per second that are read and written in a copy of a field of so many bytes; the best of five."""
+    import taichi as ti
+
+    source, target, best = ti.field(ti.f32, size // 4), ti.field(ti.f32, size // 4), float("inf")
+    for _ in range(6):  # the first one compiles
+        clock = perf_counter()
+        target.copy_from(source)
+        ti.sync()
+        best = min(best, perf_counter() - clock)
+    return 2 * size / best
 
 
 def say(what: Any) -> None:

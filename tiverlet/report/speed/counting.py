@@ -6,10 +6,11 @@ from collections.abc import Iterator
 from typing import Any
 
 import taichi as ti
-from taichi.lang import common_ops, impl, kernel_impl, ops
+from taichi.lang import common_ops, impl, kernel_impl
 from taichi.lang.ast.ast_transformer import ASTTransformer
 
 DT = 1 / 60  # [s] of a frame
+ATOMIC = (ti.atomic_add, ti.atomic_sub, ti.atomic_max, ti.atomic_min)
 
 
 @contextlib.contextmanager
@@ -70,7 +71,8 @@ class Tracer:
     @contextlib.contextmanager
     def watching(self) -> Iterator[None]:
         """While this lasts."""
-        materialize, loop, subscript = kernel_impl.Kernel.materialize, ASTTransformer.build_range_for, impl.subscript
+        materialize, subscript = kernel_impl.Kernel.materialize, impl.subscript
+        loop, call = ASTTransformer.build_range_for, ASTTransformer.build_Call
         common: Any = common_ops.TaichiOperations
         assign, augment = common._assign, common._augassign
 
@@ -115,18 +117,16 @@ class Tracer:
                 self._known[id(to)][1][2] = True
             return augment(to, value, op)
 
-        def atomic(function):
-            def both(to, value):
-                if id(to) in self._known:
-                    self._known[id(to)][1][2] = True
-                return function(to, value)
-
-            return both
+        def called(ctx, node):
+            out = call(ctx, node)
+            if any(node.func.ptr is function for function in ATOMIC) and id(node.args[0].ptr) in self._known:
+                self._known[id(node.args[0].ptr)][1][2] = True
+            return out
 
         with replaced(
             (kernel_impl.Kernel, "materialize", translated), (ASTTransformer, "build_range_for", staticmethod(looped)),
             (impl, "subscript", subscripted), (common, "_assign", assigned), (common, "_augassign", changed),
-            *((module, name, atomic(getattr(module, name))) for module in (ti, ops) for name in ("atomic_add", "atomic_sub")),
+            (ASTTransformer, "build_Call", staticmethod(called)),
         ):  # fmt: skip
             yield
 
@@ -136,8 +136,8 @@ def traffic(world, frames: int) -> dict[str, float]:
 
     A model, not a measurement: every launch of a kernel is counted, and every loop in it reads each element of each field that it
     names once, and writes it once if it assigns it; of the lists of neighbours, the entries that are in use. So it is what would
-    cross the bus if nothing stayed in the caches from one loop to the next, and if what particles read of each other (gathers)
-    were fetched once. The fields are those that the kernels name as they are translated; nothing here knows them by name.
+    cross the bus if nothing stayed in the caches from one loop to the next, if what particles read of each other (gathers) were
+    fetched once, and if every branch were taken. The fields are those that the kernels name while they are translated.
     """
     tracer = Tracer()
     with tracer.watching(), world.clone(path="parallel") as clone:

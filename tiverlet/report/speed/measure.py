@@ -24,27 +24,30 @@ FRAMES = (12, 60)  # timed in a round, at least and at most
 WORK = 5e7  # particle-substeps of a round, at most, if that is more than the least frames
 ROUNDS, SECONDS = 25, 2.0  # rounds at most; seconds of ours after which none is begun
 QUICK = (3, 0.2)  # the same, of a quick report
+PAIRS = 5  # of processes with and without the rest of the package: where a process has its memory matters by some percent
 
 
 def speed(
     scenes: Sequence[str] | str | None = None, *, sizes: Iterable[int] | None = None, threads: Iterable[int] | None = None,
-    quick: bool = False, yardstick: bool = True, peers: bool = True, absent: bool = True, progress: bool = False,
+    arch: str = "cpu", quick: bool = False, yardstick: bool = True, peers: bool = True, absent: bool = True,
+    progress: bool = False,
 ) -> SpeedReport:  # fmt: skip
     """Measure how fast scenes are computed, beside a pile written by hand in C and other engines, and what a start costs.
 
     scenes: names in SCENES; None for all. sizes: numbers of particles; None for those of each scene. threads: numbers of CPU
-    threads; None for 1, 2, 4, ... up to all cores. quick: two small sizes, and few rounds. yardstick: run pile.c too, where there
-    is a C compiler. peers: run pymunk and newton too, where they are installed. absent: compare with a package that lacks what
-    the scene does not use. progress: show a bar.
+    threads; None for 1, 2, 4, ... up to all cores. arch: of tv.init; on a GPU all cores serve the yardstick. quick: two small
+    sizes, and few rounds. yardstick: run pile.c too, where there is a C compiler. peers: run pymunk and newton too, where they are
+    installed. absent: compare with a package that lacks what the scene does not use. progress: show a bar.
 
     A scene is run over its first frames again and again, in turns with the yardstick; medians are reported, and the ratio of
     medians. ValueError for scenes, sizes or threads that there are not; what fails while it runs is named in .notes.
     """
     names = chosen(scenes)
-    cores = numbers("threads", threads) or powers(os.cpu_count() or 1)
+    number = os.cpu_count() or 1
+    cores = numbers("threads", threads) or (powers(number) if arch == "cpu" else (number,))
     wanted = numbers("sizes", sizes)
     ladder = {name: wanted or (SCENES[name].quick if quick else SCENES[name].sizes) for name in names}
-    session = Session(cores, quick)
+    session = Session(arch, cores, quick)
     with tempfile.TemporaryDirectory() as folder, Progress(disable=not progress) as bar:
         row = bar.add_task("speed", total=sum(map(len, ladder.values())))
         session.folder = folder
@@ -62,16 +65,16 @@ def speed(
             if SCENES[name].needs is not None:
                 with session.noting(f"{name} without the rest of the package"):
                     session.absent.append(session.without(name, min(ladder[name], key=lambda n: abs(n - 1000))))
-    copy = {t: bandwidth(t) for t in cores}
+        copy = {t: bandwidth(t) if arch == "cpu" else session.copy() for t in cores}
     s = session
-    return SpeedReport(machine(), copy, tuple(s.runs), tuple(s.peers), tuple(s.absent), tuple(s.notes))
+    return SpeedReport(machine(), arch, copy, tuple(s.runs), tuple(s.peers), tuple(s.absent), tuple(s.notes))
 
 
 class Session:
     """What is measured one after the other, and what has been found so far."""
 
-    def __init__(self, cores: Sequence[int], quick: bool):
-        self.cores, self.quick, self.folder = cores, quick, ""
+    def __init__(self, arch: str, cores: Sequence[int], quick: bool):
+        self.arch, self.cores, self.folder = arch, cores, ""
         self.rounds, self.seconds = QUICK if quick else (ROUNDS, SECONDS)
         self.program: str | None = None
         self.runs: list[Run] = []
@@ -98,6 +101,16 @@ class Session:
         self._caches += 1
         return os.path.join(self.folder, f"cache{self._caches}")
 
+    def job(self, name: str, n: int, threads: int) -> dict[str, Any]:
+        """What the process of a scene is told."""
+        return {"scene": name, "n": n, "threads": threads, "arch": self.arch}
+
+    def copy(self) -> float:
+        """The bandwidth of a copy on the device."""
+        with processes.world(self.job("rope", 2, 1), self.cache()) as one:
+            one.ask()
+            return one.ask("copy")
+
     def frames(self, n: int, substeps: int) -> int:
         """Frames of a round."""
         return int(np.clip(WORK // (n * substeps), *FRAMES))
@@ -108,7 +121,7 @@ class Session:
         scene, same = SCENES[name], {}
         frames = self.frames(n, scene.substeps)
         for threads in sorted(self.cores, reverse=True):
-            job, cache = {"scene": name, "n": n, "threads": threads}, self.cache()
+            job, cache = self.job(name, n, threads), self.cache()
             with processes.world(job, cache) as once:
                 cold = once.ask()
             with ExitStack() as stack:
@@ -134,7 +147,7 @@ class Session:
     def beside(self, name: str, n: int) -> None:
         """The peers that there are for a scene, each with all threads that it can use."""
         for peer in others.PEERS.values():
-            if name in others.SIZES:
+            if name in peer.scenes:
                 if why := peer.missing():
                     self.notes.append(f"Left out: {peer.name} on {name}, since {why}.")
                     continue
@@ -145,24 +158,25 @@ class Session:
         """The cheapest of a peer's settings that is as good as ours, or, if there is none, its best; then both in turns."""
         scene, threads = SCENES[name], min(self.cores[-1], peer.threads)
         frames, measure = self.frames(n, scene.substeps), others.MEASURE[name]
-        with processes.world({"scene": name, "n": n, "threads": threads}, self.cache()) as ours:
+        with processes.world(self.job(name, n, threads), self.cache()) as ours:
             ours.ask()
             target = processes.quality(ours, frames)[measure]
             tried: list[tuple[float, tuple[int, int]]] = []
+            fast = ours.ask("run 12")
             for setting in peer.settings:
                 with peer.process(name, n, threads, setting) as theirs:
                     theirs.ask()
                     tried.append((processes.quality(theirs, frames)[measure], setting))
-                if tried[-1][0] <= target:
+                    slow = theirs.ask("run 12") > others.SLOWER * fast
+                if slow or tried[-1][0] <= target:
                     break
             quality, setting = tried[-1] if tried[-1][0] <= target else min(tried)
             with peer.process(name, n, threads, setting) as theirs:
                 count = theirs.ask()["particles"]
                 times = processes.side_by_side([ours, theirs], frames, self.rounds, self.seconds)
-        words = {"overlap": "mean overlap / diameter", "residual": "worst strain"}[measure]
         return Peer(
-            f"{peer.name} {peer.version()}", name, count, threads, "{} steps x {} iterations".format(*setting), median(times[1]), median(times[0]), words, quality,
-            target, quality <= target,
+            f"{peer.name} {peer.version()}", name, count, threads, f"{setting[0]} steps x {setting[1]} iterations",
+            median(times[1]), median(times[0]), others.WORDS[measure], quality, target, quality <= target,
         )  # fmt: skip
 
     def without(self, name: str, n: int) -> Absent:
@@ -170,14 +184,21 @@ class Session:
         scene = SCENES[name]
         assert scene.needs is not None
         bare = stripped.copy(os.path.join(self.folder, f"bare_{name}"), scene.needs)
-        job = {"scene": name, "n": n, "threads": 1}
-        with processes.world(job, self.cache()) as whole, processes.world(job, self.cache(), bare) as part:
-            count = whole.ask()["particles"]
-            part.ask()
-            times = processes.side_by_side([whole, part], self.frames(n, scene.substeps), self.rounds, self.seconds)
-            a, b = whole.ask("look"), part.ask("look")
-        pairs: list[Any] = [(a[key], b[key]) for key in ("fields", "memory", "launches")]
-        return Absent(name, count, *pairs, (median(times[0]), median(times[1])))
+        job, caches = self.job(name, n, 1), (self.cache(), self.cache())
+        times: tuple[list[float], list[float]] = [], []
+        for _ in range(1 if self.rounds == QUICK[0] else PAIRS):
+            with processes.world(job, caches[0]) as whole, processes.world(job, caches[1], bare) as part:
+                count = whole.ask()["particles"]
+                if not (package := part.ask()["package"]).startswith(bare):
+                    raise RuntimeError(f"{package} was imported instead of the copy")
+                both = processes.side_by_side([whole, part], self.frames(n, scene.substeps), self.rounds, self.seconds)
+                a, b = whole.ask("look"), part.ask("look")
+            for some, more in zip(times, both, strict=True):
+                some += more
+        return Absent(
+            name, count, fields=(a["fields"], b["fields"]), bytes=(a["memory"], b["memory"]),
+            launches=(a["launches"], b["launches"]), seconds=(median(times[0]), median(times[1])),
+        )  # fmt: skip
 
 
 def first(start: dict[str, float]) -> float:

@@ -87,7 +87,7 @@ def side_by_side(talkers: Sequence[Talker], frames: int, rounds: int, seconds: f
 
 
 def quality(talker: Talker, frames: int, looks: int = 6) -> dict[str, float]:
-    """The mean overlap [diameters] and the worst relative violation during so many frames from the start, looked at now and then."""
+    """The mean overlap [diameters] and the worst relative violation in so many frames from the start, looked at now and then."""
     talker.ask("restart")
     seen = []
     for _ in range(looks):

@@ -7,6 +7,7 @@ from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
+from rich.text import Text
 
 from .. import output
 
@@ -57,7 +58,7 @@ class Peer:
     """Another engine on the same scene: the cheapest of its settings that is no worse than ours.
 
     setting: in words. seconds, ours: of a frame, medians of runs that took turns. quality, our_quality: the mean overlap
-    [diameters] or the worst strain, during the same frames. met: whether any setting was as good as ours; if none, it is the best.
+    [diameters] or the worst strain, in the same frames. met: whether a setting was as good as ours; if none, this is its best.
     """
 
     peer: str
@@ -97,11 +98,12 @@ class Absent:
 class SpeedReport:
     """Speed, memory and starts. print() shows it; see .run(), .growth(), .scaling(), .json(), .markdown(), .plot().
 
-    copy: bytes per second that a copy of a large array moves (read and written), by threads. notes: what was left out, and how
-    the yardstick was compiled.
+    arch: of tv.init. copy: bytes per second that a copy of a large array moves (read and written), by threads; on a GPU, there.
+    notes: what was left out, and how the yardstick was compiled.
     """
 
     machine: str
+    arch: str
     copy: dict[int, float]
     runs: tuple[Run, ...]
     peers: tuple[Peer, ...]
@@ -153,7 +155,7 @@ class SpeedReport:
 
     def lines(self) -> Iterator[str]:
         """What else there is to say."""
-        yield f"Machine: {self.machine}."
+        yield f"Machine: {self.machine}; Taichi on {self.arch}."
         for threads, speed in self.copy.items():
             yield f"A copy of a large array moves {speed / 1e9:.1f} GB/s on {threads} thread{'s' * (threads > 1)}."
         for scene, threads, _ in self.curves():
@@ -161,7 +163,7 @@ class SpeedReport:
             if growth is not None:
                 yield f"{scene}, {threads} threads: time per particle-substep within a factor {growth:.2f} from 10 000 on."
         if self.runs:
-            yield MODEL
+            yield from LEGEND
         yield from self.notes
 
     def _cells(self, r: Run) -> tuple[str, ...]:
@@ -178,9 +180,9 @@ class SpeedReport:
             for k, head in enumerate(heads):
                 table.add_column(head, justify="left" if k == 0 or head in TEXT else "right")
             for row in rows:
-                table.add_row(*row)
+                table.add_row(*map(Text, row))
             yield table
-        yield from self.lines()
+        yield from map(Text, self.lines())
 
     def __str__(self) -> str:
         return output.text(self, 150)
@@ -203,7 +205,7 @@ class SpeedReport:
         copy = {int(k): v for k, v in data["copy"].items()}
         made = {"runs": Run, "peers": Peer, "absent": Absent}
         lists = {k: tuple(restored(kind, row) for row in data[k]) for k, kind in made.items()}
-        return cls(machine=data["machine"], copy=copy, notes=tuple(data["notes"]), **lists)
+        return cls(machine=data["machine"], arch=data["arch"], copy=copy, notes=tuple(data["notes"]), **lists)
 
     def plot(self, folder) -> list[str]:
         """Rates by size, starts, and scaling as PNG in `folder`; returns their paths. Needs matplotlib (the extra "plots")."""
@@ -213,19 +215,22 @@ class SpeedReport:
 
 
 HEADS = (
-    "scene", "particles", "threads", "path", "ms per frame", "M particle-substeps/s", "of pile.c", "of 1 thread",
-    "launches per frame", "bytes per particle-substep", "of a copy",
+    "scene", "particles", "threads", "path", "ms", "Mps/s", "of pile.c", "of 1 thread", "launches", "bytes", "of a copy",
 )  # fmt: skip
 STARTS = (
-    "scene", "particles", "threads", "import [s]", "first step, cold [s]", "warm [s]", "bytes per particle", "mean overlap",
-    "pile.c's", "worst violation", "flags",
+    "scene", "particles", "threads", "import", "cold", "warm", "memory", "overlap", "pile.c's", "violation", "flags",
 )  # fmt: skip
-PEERS = ("peer", "scene", "particles", "threads", "setting", "ms per frame", "ours", "times ours", "measure", "its", "ours ", "met")
-ABSENT = ("scene", "particles", "fields", "bytes", "launches per frame", "ms per frame", "ratio")
+PEERS = ("peer", "scene", "particles", "threads", "setting", "ms", "ours", "ratio", "measure", "its", "ours", "as good")
+ABSENT = ("scene", "particles", "fields", "bytes", "launches", "ms", "ratio")
 TEXT = ("path", "flags", "setting", "measure")
-MODEL = (
-    "Bytes are a count, not a measurement: every loop of every kernel launched on the parallel path reads and writes each element of "
-    "the fields that it names once, as if nothing stayed in the caches between loops; more than 100 % of a copy is what caches gave."
+LEGEND = (
+    "ms: of a frame of 1/60 s, median. Mps/s: millions of particle-substeps per second. launches: kernels of a frame, counted.",
+    "bytes: moved for each particle and substep, a count and not a measurement: every loop of every kernel that the parallel "
+    "path launches reads and writes each element of the fields it names once, as if nothing stayed in the caches between loops. "
+    "More than 100 % of a copy is what the caches gave.",
+    "import, cold, warm [s]: of the package, and from tv.init to the end of the first step, without and with kernels that "
+    "another process has compiled. memory: bytes of all fields per particle. overlap: the mean of pairs that overlap, of a "
+    "diameter. violation: the worst of a constraint, relative.",
 )
 
 

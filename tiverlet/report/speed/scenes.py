@@ -38,7 +38,7 @@ def scattered(k: np.ndarray) -> np.ndarray:
 
 
 def pile(n: int, dim: int = 2):
-    """Discs or spheres that fall from a loose lattice onto the floor of a box 1.3 times as wide and twice as high; as in pile.c."""
+    """Discs or spheres that fall from a loose lattice into a box 1.3 times as wide and twice as high, as in pile.c."""
     side = ceil(round(n ** (1 / dim), 9))
     i = np.arange(n)
     at = [i % side, i // side] if dim == 2 else [i % side, i // side**2, i // side % side]

@@ -41,7 +41,8 @@ def copy(folder: str, needs: frozenset[str]) -> str:
 def needed(bare: pathlib.Path, needs: frozenset[str]) -> set[str]:
     """Those, and what they and the rest of the package import of the same folders."""
     kept, before = set(needs), set()
-    rest = [f for f in bare.rglob("*.py") if f.parent.name not in FOLDERS and f.parent != bare or f.parent == bare and f.stem != "__init__"]
+    inits = [bare / folder / "__init__.py" for folder in ("", *FOLDERS)]
+    rest = [file for file in bare.rglob("*.py") if file.parent.name not in FOLDERS and file not in inits]
     for file in rest:
         kept |= set(re.findall(rf"^from \.+(?:{'|'.join(FOLDERS)})\.(\w+) import", file.read_text(), re.M))
     while kept != before:
