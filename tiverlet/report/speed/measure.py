@@ -36,8 +36,8 @@ def speed(
 
     scenes: names in SCENES; None for all. sizes: numbers of particles; None for those of each scene. threads: numbers of CPU
     threads; None for 1, 2, 4, ... up to all cores. arch: of tv.init; on a GPU all cores serve the yardstick. quick: two small
-    sizes, and few rounds. yardstick: run pile.c too, where there is a C compiler. peers: run pymunk and newton too, where they are
-    installed. absent: compare with a package that lacks what the scene does not use. progress: show a bar.
+    sizes, and few rounds. yardstick: run pile.c too, where there is a C compiler. peers: run pymunk and newton too, where they
+    are installed. absent: compare with a package that lacks what the scene does not use. progress: show a bar.
 
     A scene is run over its first frames again and again, in turns with the yardstick; medians are reported, and the ratio of
     medians. ValueError for scenes, sizes or threads that there are not; what fails while it runs is named in .notes.

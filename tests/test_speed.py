@@ -1,0 +1,170 @@
+"""The report on speed: its figures belong together. Nothing here is about how fast anything is."""
+
+import json
+import pathlib
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+from tiverlet.__main__ import main
+from tiverlet.report import speed
+from tiverlet.report.speed import SCENES, SpeedReport, counting, measure, peers, scenes, stripped, yardstick
+
+
+@pytest.fixture(scope="module")
+def report():
+    """Two scenes of one size each, quickly."""
+    return speed(["pile", "rope"], sizes=[41], threads=[1], quick=True, peers=False, absent=False)
+
+
+def test_figures_are_positive_and_belong_together(report):
+    assert [(r.scene, r.particles, r.threads) for r in report.runs] == [("pile", 41, 1), ("rope", 41, 1)]
+    for r in report.runs:
+        assert r.substeps == SCENES[r.scene].substeps and r.path == "fused" and not r.flags
+        assert r.launches == 2  # all substeps, then the survey
+        assert r.rate * r.seconds == pytest.approx(41 * r.substeps, rel=1e-12)
+        assert min(r.seconds, r.rounds, r.bytes, r.memory, r.imported, r.cold, r.warm) > 0
+        assert report.share(r) == pytest.approx(r.rate * r.bytes / report.copy[1])
+        assert report.scaling(r) is None and report.growth(r.scene, 1) is None
+    pile, rope = report.runs
+    assert 0 < pile.overlap < 0.05 and pile.residual == 0
+    assert 0 < rope.residual < 1e-4 and rope.overlap == 0 and rope.yardstick is None
+    assert not report.missing
+
+
+def test_pile_in_c_does_the_same(report):
+    # Two schemes for one scene: the mean overlap is a matter of the scheme, but not of another size.
+    pile = report.run("pile", 41, 1)
+    if pile.yardstick is None:
+        assert any(note.startswith("Left out: the yardstick") for note in report.notes)
+        pytest.skip("no C compiler")
+    assert pile.ratio == pytest.approx(pile.yardstick / pile.seconds) and pile.ratio > 0
+    assert 0.2 < pile.yardstick_overlap / pile.overlap < 5
+
+
+def test_yardstick_starts_where_the_scene_does(tmp_path):
+    # pile.c has the lattice, the jitter and the box of the scene: nothing overlaps at first, and the text has the same numbers.
+    x = scenes.pile(1000)[0].position
+    assert x.min() >= 0.5 and np.ptp(x, axis=0).max() < 1.1 * 31 + 0.05
+    jitter = x - 0.5 - 1.1 * np.stack([np.arange(1000) % 32, np.arange(1000) // 32], axis=1)
+    assert jitter.min() >= 0 and jitter.max() < 0.05 + 1e-12 and abs(jitter.mean() - 0.025) < 1e-3
+    program, how = yardstick.build(tmp_path)
+    if program is None:
+        pytest.skip(how)
+    with yardstick.Yardstick(program, 1000, 8, 1) as talker:
+        assert talker.ask("quality")["overlap"] == 0
+        assert talker.ask("run 2") > 0
+
+
+def test_yardstick_is_left_out_without_a_compiler(monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("CC", raising=False)
+    program, why = yardstick.build(tmp_path)
+    assert program is None and "no C compiler" in why
+    session = measure.Session("cpu", [1], True)
+    session.folder = str(tmp_path)
+    session.compile()
+    assert session.program is None and session.notes == [f"Left out: the yardstick pile.c, since {why}."]
+
+
+def test_round_trip_and_tables(report, tmp_path):
+    again = SpeedReport.of_json(report.json())
+    assert again == report and again.markdown() == report.markdown()
+    assert json.loads(report.json())["runs"][0]["scene"] == "pile"
+    text, table = str(report), report.markdown()
+    for part in ("pile", "rope", "Mps/s", "warm [s]", "a count and not a measurement"):
+        assert part in text and part in table
+    with pytest.raises(KeyError):
+        report.run("pile", 42, 1)
+
+
+def test_plots(report, tmp_path):
+    pytest.importorskip("matplotlib")
+    names = [pathlib.Path(path).name for path in report.plot(tmp_path)]
+    assert names == ["speed.png", "start.png", "memory.png"] and all((tmp_path / name).stat().st_size > 5000 for name in names)
+
+
+def test_bytes_are_those_of_the_fields(world):
+    # Free fall in f32 and 2D, in each substep: x and d (8 bytes each) are read and written, the inverse mass (4) and, once for
+    # all, g (8) are read.
+    w = world(tv.Particles(np.zeros((300, 2))), [tv.Gravity(9.81)], substeps=5)
+    w.step(counting.DT)
+    assert counting.traffic(w, 2)["predicted"] == 5 * (300 * (4 * 8 + 4) + 8)
+
+
+def test_launches_are_counted(world):
+    w = world(tv.Particles([[0.0, 0], [1, 0]]), [tv.Gravity(1.0), tv.Distance([[0, 1]])], path="parallel", substeps=5)
+    w.step(0.01)
+    with counting.launches() as count:
+        w.step(0.01)
+    assert count == {"predicted": 5, "relaxed": 5, "measure": 1}
+    w.step(0.01)
+    assert count.total() == 11  # no more than in the block
+
+
+def test_scenes_are_sound():
+    for name, scene in SCENES.items():
+        for n in scene.quick:
+            particles, features = scene.build(n)
+            assert 0.5 * n <= len(particles) <= 2 * n + 60, name
+            assert sum(isinstance(f, tv.Contact) for f in features) == (particles.radius.any() > 0)
+            if particles.radius.any():  # nothing overlaps, links apart
+                x, r = particles.position, particles.radius[0]
+                far = np.linalg.norm(x[:, None] - x[None], axis=2) + 10 * np.eye(len(x))
+                assert far.min() > 2 * r
+                box = next(f for f in features if isinstance(f, tv.Box))
+                assert (x >= np.array(box.lower) + r - 1e-9).all() and (x <= np.array(box.upper) - r + 1e-9).all()
+
+
+def test_what_is_stripped_runs_and_has_the_same_fields():
+    # The copy has three features and what the package itself needs.
+    report = speed("pile", sizes=[20], threads=[1], quick=True, peers=False, yardstick=False)
+    (absent,) = report.absent
+    assert absent.fields[0] == absent.fields[1] and absent.bytes[0] == absent.bytes[1] and absent.launches == (2, 2)
+    assert absent.ratio > 0 and SpeedReport.of_json(report.json()) == report
+
+
+def test_a_copy_lacks_what_is_not_needed(tmp_path):
+    bare = pathlib.Path(stripped.copy(str(tmp_path), frozenset({"gravity", "distance"}))) / "tiverlet"
+    there = {f.stem for part in stripped.FOLDERS for f in (bare / part).glob("*.py")} - {"__init__"}
+    assert {"gravity", "distance", "contact"} <= there and not there & {"drag", "wind", "sdf", "mesh", "shape_match", "bend"}
+
+
+def test_quality_of_peers():
+    x = np.array([[0.0, 0], [0.9, 0], [2.5, 0]])
+    assert peers.overlap(x, np.full(3, 0.5)) == pytest.approx(0.1)
+    assert peers.overlap(x * 2, np.full(3, 0.5)) == 0
+    particles, (_, links) = scenes.rope(3)
+    assert peers.strain(particles.position * 1.25, links, particles) == pytest.approx(0.25)
+    assert peers.strain(particles.position * np.nan, links, particles) == 1e300
+
+
+def test_a_peer_runs_or_is_left_out():
+    session = measure.Session("cpu", [1], True)
+    absent = peers.Peer("no_such_engine", ("rope",), peers.LADDER, 1)
+    assert absent.missing() == "it is not installed"
+    here = [p for p in peers.PEERS.values() if not p.missing()]
+    session.beside("cloth", 100)
+    assert not session.notes and not session.peers  # no peer runs it
+    if not here:
+        session.beside("rope", 11)
+        assert len(session.notes) == len(peers.PEERS)
+
+
+def test_misuse():
+    with pytest.raises(ValueError, match="no scene 'pule'"):
+        speed("pule")
+    with pytest.raises(ValueError, match="sizes"):
+        speed("pile", sizes=[1])
+    with pytest.raises(ValueError, match="threads"):
+        speed("pile", threads=[0])
+
+
+def test_command(capsys):
+    assert main(["report", "speed", "--list"]) == 0
+    assert "a million" not in (out := capsys.readouterr().out) and all(name in out for name in SCENES)
+    assert main(["report", "speed", "pule"]) == 2
+    assert "no scene 'pule'" in capsys.readouterr().err
+    assert main(["report", "--list"]) == 0  # with no word more, the report on errors
+    assert "D01_double_pendulum" in capsys.readouterr().out
