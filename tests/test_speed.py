@@ -142,7 +142,7 @@ def test_quality_of_peers():
 
 def test_a_peer_runs_or_is_left_out():
     session = measure.Session("cpu", [1], True)
-    absent = peers.Peer("no_such_engine", ("rope",), peers.LADDER, 1)
+    absent = peers.Engine("no_such_engine", ("rope",), peers.LADDER, 1)
     assert absent.missing() == "it is not installed"
     here = [p for p in peers.PEERS.values() if not p.missing()]
     session.beside("cloth", 100)

@@ -22,6 +22,7 @@ from .scenes import SCENES
 BLOCK = 1 << 28  # bytes of each of the arrays that are copied: many times the caches
 FRAMES = (12, 60)  # timed in a round, at least and at most
 WORK = 5e7  # particle-substeps of a round, at most, if that is more than the least frames
+TURN = 1e6  # particle-substeps of a turn, if those are more than 6 frames and less than the round
 ROUNDS, SECONDS = 25, 2.0  # rounds at most; seconds of ours after which none is begun
 QUICK = (3, 0.2)  # the same, of a quick report
 PAIRS = 5  # of processes with and without the rest of the package: where a process has its memory matters by some percent
@@ -115,6 +116,12 @@ class Session:
         """Frames of a round."""
         return int(np.clip(WORK // (n * substeps), *FRAMES))
 
+    def turns(self, talkers: Sequence[processes.Talker], n: int, substeps: int) -> list[list[float]]:
+        """Seconds of a frame of each, see side_by_side()."""
+        frames = self.frames(n, substeps)
+        group = int(np.clip(TURN // (n * substeps), 6, frames))
+        return processes.side_by_side(talkers, frames, group, self.rounds, self.seconds)
+
     def point(self, name: str, n: int) -> list[Run]:
         """A scene of one size, on all numbers of threads. Bits, and so work and quality, do not depend on these."""
         out: list[Run] = []
@@ -130,11 +137,11 @@ class Session:
                 both = [ours]
                 if self.program and name == "pile":
                     both.append(stack.enter_context(yardstick.Yardstick(self.program, n, scene.substeps, threads)))
-                times = processes.side_by_side(both, frames, self.rounds, self.seconds)
+                times = self.turns(both, n, scene.substeps)
                 if not same:
                     qualities = [processes.quality(talker, frames) for talker in both]
                     work = warm["particles"] * scene.substeps
-                    same = {**qualities[0], "bytes": sum(ours.ask("traffic").values()) / work}
+                    same = {**qualities[0], "traffic": {k: v / work for k, v in ours.ask("traffic").items()}}
                     same["yardstick_overlap"] = qualities[1]["overlap"] if len(both) > 1 else None
                 look = ours.ask("look")
             out.append(Run(
@@ -154,7 +161,7 @@ class Session:
                 with self.noting(f"{peer.name} on {name}, {n} particles"):
                     self.peers.append(self.compare(peer, name, n))
 
-    def compare(self, peer: "others.Peer", name: str, n: int) -> Peer:
+    def compare(self, peer: "others.Engine", name: str, n: int) -> Peer:
         """The cheapest of a peer's settings that is as good as ours, or, if there is none, its best; then both in turns."""
         scene, threads = SCENES[name], min(self.cores[-1], peer.threads)
         frames, measure = self.frames(n, scene.substeps), others.MEASURE[name]
@@ -173,9 +180,9 @@ class Session:
             quality, setting = tried[-1] if tried[-1][0] <= target else min(tried)
             with peer.process(name, n, threads, setting) as theirs:
                 count = theirs.ask()["particles"]
-                times = processes.side_by_side([ours, theirs], frames, self.rounds, self.seconds)
+                times = self.turns([ours, theirs], n, scene.substeps)
         return Peer(
-            f"{peer.name} {peer.version()}", name, count, threads, f"{setting[0]} steps x {setting[1]} iterations",
+            f"{peer.name} {peer.version()}", name, count, threads, setting,
             median(times[1]), median(times[0]), others.WORDS[measure], quality, target, quality <= target,
         )  # fmt: skip
 
@@ -191,7 +198,7 @@ class Session:
                 count = whole.ask()["particles"]
                 if not (package := part.ask()["package"]).startswith(bare):
                     raise RuntimeError(f"{package} was imported instead of the copy")
-                both = processes.side_by_side([whole, part], self.frames(n, scene.substeps), self.rounds, self.seconds)
+                both = self.turns([whole, part], n, scene.substeps)
                 a, b = whole.ask("look"), part.ask("look")
             for some, more in zip(times, both, strict=True):
                 some += more

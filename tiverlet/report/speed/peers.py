@@ -1,6 +1,7 @@
 """Other engines on the same scenes, where they are installed: each in a process that obeys the commands of child.py.
 
-They are made to do what the scene says and no more: no friction, no restitution, no damping, no sleeping, no spin.
+Warp is measured as Newton, which runs on it. They are made to do what the scene says and no more: no friction, no restitution, no
+damping, no sleeping, no spin.
 """
 
 import importlib.metadata
@@ -22,12 +23,12 @@ from .scenes import SCENES
 
 SIZES = {"pile": 1000, "spheres": 1000, "rope": 41}  # at which they are compared, or as near to it as is measured
 MEASURE = {"pile": "overlap", "spheres": "overlap", "rope": "residual"}
-WORDS = {"overlap": "mean overlap [diameters]", "residual": "worst strain"}
+WORDS = {"overlap": "mean overlap", "residual": "worst strain"}
 START = "import json, sys; from tiverlet.report.speed.peers import main; main(json.loads(sys.argv[1]))"
 
 
 @dataclass(frozen=True)
-class Peer:
+class Engine:
     """scenes: that it can run. settings: pairs of steps in a frame and iterations of each, the cheapest first. threads: as many
     as it can use."""
 
@@ -55,7 +56,7 @@ LADDER = (
 )  # fmt: skip
 SLOWER = 30.0  # times ours, beyond which no further setting is tried
 # Discs leave their plane in space, so Newton gets spheres. Warp runs on one thread of a CPU.
-PEERS = {p.name: p for p in (Peer("pymunk", ("pile", "rope"), LADDER, 2), Peer("newton", ("spheres", "rope"), LADDER, 1))}
+PEERS = {p.name: p for p in (Engine("pymunk", ("pile", "rope"), LADDER, 2), Engine("newton", ("spheres", "rope"), LADDER, 1))}
 
 
 class Pymunk:
@@ -153,7 +154,7 @@ class Newton:
         return self.now.particle_q.numpy()[:, : self.dim].astype(np.float64)
 
 
-ENGINES: dict[str, Any] = {"pymunk": Pymunk, "newton": Newton}
+MODELS: dict[str, Any] = {"pymunk": Pymunk, "newton": Newton}
 
 
 def main(job: dict[str, Any]) -> None:
@@ -167,7 +168,7 @@ def main(job: dict[str, Any]) -> None:
     particles, features = SCENES[job["scene"]].build(job["n"])
 
     def made():
-        return ENGINES[job["peer"]](particles, features, job["threads"], job["setting"])
+        return MODELS[job["peer"]](particles, features, job["threads"], job["setting"])
 
     engine = made()
     say({"particles": len(particles)})

@@ -66,8 +66,8 @@ def paths(root: str = ROOT) -> str:
     return os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
 
 
-def side_by_side(talkers: Sequence[Talker], frames: int, rounds: int, seconds: float, group: int = 6) -> list[list[float]]:
-    """Seconds of a frame of each, in each round: a restart, then `frames` frames, in groups that take turns.
+def side_by_side(talkers: Sequence[Talker], frames: int, group: int, rounds: int, seconds: float) -> list[list[float]]:
+    """Seconds of a frame of each, in each round: a restart, then `frames` frames, in groups of `group` that take turns.
 
     At least 3 rounds (or `rounds`, if that is less), at most `rounds`, and none is begun after `seconds` [s] of the first one's.
     """

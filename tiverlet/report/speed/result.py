@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
+import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
@@ -17,10 +18,10 @@ class Run:
     """A scene of one size on so many threads.
 
     seconds: of a frame, the median of `rounds` runs over its first frames, the very first apart. launches: kernels of a frame,
-    counted, on average. bytes: moved for each particle and substep, by the count of counting.py. memory: of all fields [bytes per
-    particle]. imported: of the package; cold, warm: from tv.init to the end of the first step, with nothing compiled and with
-    Taichi's cache of a process before it [s]. overlap: the mean of pairs that overlap [diameters]. residual: the worst relative
-    violation. yardstick, yardstick_overlap: of pile.c; None where it was not run.
+    counted, on average. traffic: bytes moved for each particle and substep, by kernel, as counting.py counts them. memory: of all
+    fields [bytes per particle]. imported: of the package; cold, warm: from tv.init to the end of the first step, with nothing
+    compiled and with Taichi's cache of a process before it [s]. overlap: the mean of pairs that overlap [diameters]. residual:
+    the worst relative violation. yardstick, yardstick_overlap: of pile.c; None where it was not run.
     """
 
     scene: str
@@ -31,7 +32,7 @@ class Run:
     seconds: float
     rounds: int
     launches: float
-    bytes: float
+    traffic: dict[str, float]
     memory: float
     imported: float
     cold: float
@@ -48,6 +49,11 @@ class Run:
         return self.particles * self.substeps / self.seconds
 
     @property
+    def bytes(self) -> float:
+        """Moved for each particle and substep, by all kernels."""
+        return sum(self.traffic.values())
+
+    @property
     def ratio(self) -> float | None:
         """Its rate over the yardstick's; the medians of runs that took turns."""
         return None if self.yardstick is None else self.yardstick / self.seconds
@@ -57,15 +63,16 @@ class Run:
 class Peer:
     """Another engine on the same scene: the cheapest of its settings that is no worse than ours.
 
-    setting: in words. seconds, ours: of a frame, medians of runs that took turns. quality, our_quality: the mean overlap
-    [diameters] or the worst strain, in the same frames. met: whether a setting was as good as ours; if none, this is its best.
+    setting: steps of a frame and iterations of each. seconds, ours: of a frame, medians of runs that took turns. quality,
+    our_quality: the mean overlap [diameters] or the worst strain, in the same frames. met: whether a setting was as good as ours;
+    if none, this is its best.
     """
 
     peer: str
     scene: str
     particles: int
     threads: int
-    setting: str
+    setting: tuple[int, int]
     seconds: float
     ours: float
     measure: str
@@ -162,8 +169,14 @@ class SpeedReport:
             growth = self.growth(scene, threads)
             if growth is not None:
                 yield f"{scene}, {threads} threads: time per particle-substep within a factor {growth:.2f} from 10 000 on."
+        for name in dict.fromkeys(r.scene for r in self.runs):
+            r = max((r for r in self.runs if r.scene == name), key=lambda r: r.particles)
+            parts = sorted(r.traffic.items(), key=lambda part: -part[1])
+            yield f"{name}, {r.particles:,} particles, bytes by kernel: {', '.join(f'{k} {v:.0f}' for k, v in parts)}."
         if self.runs:
             yield from LEGEND
+        if self.peers:
+            yield PEERED
         yield from self.notes
 
     def _cells(self, r: Run) -> tuple[str, ...]:
@@ -196,15 +209,15 @@ class SpeedReport:
 
     def json(self) -> str:
         """Everything, for machines; see of_json()."""
-        return json.dumps(asdict(self), indent=1, allow_nan=False)
+        lists = {k: [output.plain(row) for row in v] for k, v in asdict(self).items() if k in ROWS}
+        return json.dumps({**asdict(self), **lists}, indent=1, allow_nan=False)
 
     @classmethod
     def of_json(cls, text: str) -> "SpeedReport":
         """The report that json() wrote."""
         data = json.loads(text)
         copy = {int(k): v for k, v in data["copy"].items()}
-        made = {"runs": Run, "peers": Peer, "absent": Absent}
-        lists = {k: tuple(restored(kind, row) for row in data[k]) for k, kind in made.items()}
+        lists = {k: tuple(restored(kind, row) for row in data[k]) for k, kind in ROWS.items()}
         return cls(machine=data["machine"], arch=data["arch"], copy=copy, notes=tuple(data["notes"]), **lists)
 
     def plot(self, folder) -> list[str]:
@@ -214,6 +227,7 @@ class SpeedReport:
         return plot(self, folder)
 
 
+ROWS = {"runs": Run, "peers": Peer, "absent": Absent}
 HEADS = (
     "scene", "particles", "threads", "path", "ms", "Mps/s", "of pile.c", "of 1 thread", "launches", "bytes", "of a copy",
 )  # fmt: skip
@@ -232,11 +246,16 @@ LEGEND = (
     "another process has compiled. memory: bytes of all fields per particle. overlap: the mean of pairs that overlap, of a "
     "diameter. violation: the worst of a constraint, relative.",
 )
+PEERED = (
+    "Peers: setting is steps of a frame x iterations, the cheapest that is as good as ours by the one measure named (nothing "
+    "else is made equal), or, if none is, the best of those tried; ratio: its time over ours."
+)
 
 
 def restored(kind: type, row: dict[str, Any]) -> Any:
-    """A row of JSON, with tuples where it has lists."""
-    return kind(**{f.name: tuple(v) if isinstance(v := row[f.name], list) else v for f in fields(kind)})
+    """A row of JSON, with tuples where it has lists, and infinity where a number was none."""
+    values = {f.name: np.inf if row[f.name] is None and f.type is float else row[f.name] for f in fields(kind)}
+    return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
 
 
 def percent(share: float | None) -> str:
@@ -254,9 +273,11 @@ def started(r: Run) -> tuple[str, ...]:
 
 def beside(p: Peer) -> tuple[str, ...]:
     """A line about a peer."""
+    steps, iterations = p.setting
     return (
-        p.peer, p.scene, f"{p.particles:,}", str(p.threads), p.setting, f"{1e3 * p.seconds:.3g}", f"{1e3 * p.ours:.3g}",
-        f"{p.seconds / p.ours:.3g}", p.measure, f"{p.quality:.2e}", f"{p.our_quality:.2e}", "yes" if p.met else "no",
+        p.peer, p.scene, f"{p.particles:,}", str(p.threads), f"{steps} x {iterations}", f"{1e3 * p.seconds:.3g}",
+        f"{1e3 * p.ours:.3g}", f"{p.seconds / p.ours:.3g}", p.measure, f"{p.quality:.2e}", f"{p.our_quality:.2e}",
+        "yes" if p.met else "no",
     )  # fmt: skip
 
 
