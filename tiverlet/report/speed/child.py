@@ -5,7 +5,7 @@
     look: launches of a frame, counted; path, memory, flags
     quality: the mean overlap of the pairs that overlap [diameters], and the worst relative violation of a constraint
     copy: bytes per second that a copy of a large field moves
-    traffic: bytes that a frame moves, by kernel, see counting.py
+    traffic: bytes that each kernel moves in a frame, and seconds that it takes, see counting.py
 
 It runs in copies of the package that lack most of it, see absent.py.
 """

@@ -1,8 +1,9 @@
-"""What a frame does, counted at Taichi's door: kernels launched, and bytes that their loops read and write."""
+"""What a frame does, seen at Taichi's door: kernels launched, the time they take, and bytes that their loops read and write."""
 
 import contextlib
 from collections import Counter
 from collections.abc import Iterator
+from time import perf_counter
 from typing import Any
 
 import taichi as ti
@@ -26,15 +27,28 @@ def replaced(*places: tuple[Any, str, Any]) -> Iterator[None]:
             setattr(owner, name, value)
 
 
+class Launches(Counter[str]):
+    """How often kernels were launched, by name; seconds: in all, if they were timed."""
+
+    def __init__(self):
+        super().__init__()
+        self.seconds: dict[str, float] = {}
+
+
 @contextlib.contextmanager
-def launches() -> Iterator[Counter[str]]:
-    """The kernels that are launched while this lasts, by name."""
-    count: Counter[str] = Counter()
+def launches(timed: bool = False) -> Iterator[Launches]:
+    """The kernels that are launched while this lasts. timed: wait for the end of each."""
+    count = Launches()
     launch = kernel_impl.Kernel.launch_kernel
 
     def counted(self, *args):
-        count[self.func.__name__] += 1
-        return launch(self, *args)
+        name, clock = self.func.__name__, perf_counter()
+        out = launch(self, *args)
+        count[name] += 1
+        if timed:
+            ti.sync()
+            count.seconds[name] = count.seconds.get(name, 0.0) + perf_counter() - clock
+        return out
 
     with replaced((kernel_impl.Kernel, "launch_kernel", counted)):
         yield count
@@ -131,25 +145,25 @@ class Tracer:
             yield
 
 
-def traffic(world, frames: int) -> dict[str, float]:
-    """Bytes that a frame moves, by kernel, on the parallel path, on average of so many frames from the present state.
+def traffic(world, frames: int) -> dict[str, tuple[float, float]]:
+    """Bytes that each kernel moves in a frame on the parallel path, and seconds that it takes, on average of so many frames.
 
-    A model, not a measurement: every launch of a kernel is counted, and every loop in it reads each element of each field that it
+    Bytes are a model, not measured: every launch of a kernel is counted, and every loop in it reads each element of each field it
     names once, and writes it once if it assigns it; of the lists of neighbours, the entries that are in use. So it is what would
     cross the bus if nothing stayed in the caches from one loop to the next, if what particles read of each other (gathers) were
     fetched once, and if every branch were taken. The fields are those that the kernels name while they are translated.
     """
-    tracer = Tracer()
+    tracer, known, count = Tracer(), -1, Launches()
     with tracer.watching(), world.clone(path="parallel") as clone:
-        clone.step(DT)
-        with launches() as count:
-            for _ in range(frames):
-                clone.step(DT)
+        while known < len(tracer.sweeps):  # until no kernel was compiled on the way
+            known = len(tracer.sweeps)
+            with launches(timed=True) as count:
+                for _ in range(frames):
+                    clone.step(DT)
         main, *stores = clone._memories
         lengths = {id(e.field): (max(1, e.length), e.bytes // max(1, e.length)) for e in main.entries}
         if stores:
             listed = int(clone._grid.number.to_numpy().sum())
             lengths |= {id(e.field): (min(e.length, listed), e.bytes // e.length) for m in stores for e in m.entries}
-        return {
-            name: k / frames * sum(sweep.bytes(lengths) for sweep in tracer.sweeps.get(name, ())) for name, k in count.items()
-        }
+        moved = {name: k * sum(s.bytes(lengths) for s in tracer.sweeps.get(name, ())) for name, k in count.items()}
+        return {name: (moved[name] / frames, count.seconds[name] / frames) for name in count}

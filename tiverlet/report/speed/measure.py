@@ -141,7 +141,9 @@ class Session:
                 if not same:
                     qualities = [processes.quality(talker, frames) for talker in both]
                     work = warm["particles"] * scene.substeps
-                    same = {**qualities[0], "traffic": {k: v / work for k, v in ours.ask("traffic").items()}}
+                    same = {**qualities[0], "traffic": {}, "times": {}}
+                    for kernel, (moved, seconds) in ours.ask("traffic").items():
+                        same["traffic"][kernel], same["times"][kernel] = moved / work, seconds / work
                     same["yardstick_overlap"] = qualities[1]["overlap"] if len(both) > 1 else None
                 look = ours.ask("look")
             out.append(Run(

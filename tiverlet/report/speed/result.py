@@ -18,10 +18,11 @@ class Run:
     """A scene of one size on so many threads.
 
     seconds: of a frame, the median of `rounds` runs over its first frames, the very first apart. launches: kernels of a frame,
-    counted, on average. traffic: bytes moved for each particle and substep, by kernel, as counting.py counts them. memory: of all
-    fields [bytes per particle]. imported: of the package; cold, warm: from tv.init to the end of the first step, with nothing
-    compiled and with Taichi's cache of a process before it [s]. overlap: the mean of pairs that overlap [diameters]. residual:
-    the worst relative violation. yardstick, yardstick_overlap: of pile.c; None where it was not run.
+    counted, on average. traffic: bytes moved for each particle and substep, by kernel, as counting.py counts them; times: seconds
+    of these kernels for each, on the parallel path and the most threads. memory: of all fields [bytes per particle]. imported: of
+    the package; cold, warm: from tv.init to the end of the first step, with nothing compiled and with Taichi's cache of a process
+    before it [s]. overlap: the mean of pairs that overlap [diameters]. residual: the worst relative violation. yardstick,
+    yardstick_overlap: of pile.c; None where it was not run.
     """
 
     scene: str
@@ -33,6 +34,7 @@ class Run:
     rounds: int
     launches: float
     traffic: dict[str, float]
+    times: dict[str, float]
     memory: float
     imported: float
     cold: float
@@ -171,8 +173,8 @@ class SpeedReport:
                 yield f"{scene}, {threads} threads: time per particle-substep within a factor {growth:.2f} from 10 000 on."
         for name in dict.fromkeys(r.scene for r in self.runs):
             r = max((r for r in self.runs if r.scene == name), key=lambda r: r.particles)
-            parts = sorted(r.traffic.items(), key=lambda part: -part[1])
-            yield f"{name}, {r.particles:,} particles, bytes by kernel: {', '.join(f'{k} {v:.0f}' for k, v in parts)}."
+            parts = (f"{k} {t * 1e9:.2g} ns, {r.traffic[k]:.0f} bytes" for k, t in sorted(r.times.items(), key=lambda p: -p[1]))
+            yield f"{name}, {r.particles:,} particles, by kernel: {'; '.join(parts)}."
         if self.runs:
             yield from LEGEND
         if self.peers:
@@ -241,7 +243,7 @@ LEGEND = (
     "ms: of a frame of 1/60 s, median. Mps/s: millions of particle-substeps per second. launches: kernels of a frame, counted.",
     "bytes: moved for each particle and substep, a count and not a measurement: every loop of every kernel that the parallel "
     "path launches reads and writes each element of the fields it names once, as if nothing stayed in the caches between loops. "
-    "More than 100 % of a copy is what the caches gave.",
+    "More than 100 % of a copy is what the caches gave. By kernel: for each particle and substep too, on the most threads.",
     "import, cold, warm [s]: of the package, and from tv.init to the end of the first step, without and with kernels that "
     "another process has compiled. memory: bytes of all fields per particle. overlap: the mean of pairs that overlap, of a "
     "diameter. violation: the worst of a constraint, relative.",
