@@ -69,11 +69,11 @@ def paths(root: str = ROOT) -> str:
 def side_by_side(talkers: Sequence[Talker], frames: int, group: int, rounds: int, seconds: float) -> list[list[float]]:
     """Seconds of a frame of each, in each round: a restart, then `frames` frames, in groups of `group` that take turns.
 
-    At least 3 rounds (or `rounds`, if that is less), at most `rounds`, and none is begun after `seconds` [s] of the first one's.
+    At most `rounds`, and none is begun after `seconds` [s] of the first one's, or five times that for the first three.
     """
     out: list[list[float]] = [[] for _ in talkers]
     spent = 0.0
-    while len(out[0]) < min(3, rounds) or len(out[0]) < rounds and spent < seconds:
+    while len(out[0]) < rounds and spent < seconds * (1 if len(out[0]) >= 3 else 5):
         for talker in talkers:
             talker.ask("restart")
         total = [0.0] * len(talkers)

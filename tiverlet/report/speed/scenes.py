@@ -109,7 +109,7 @@ TEN = tuple(10**k for k in range(1, 7))
 SCENES = {
     "pile": SpeedScene("discs that fall into a box", pile, 8, TEN, (100, 1000), frozenset({"gravity", "box", "contact"})),
     "spheres": SpeedScene("spheres that fall into a box", lambda n: pile(n, 3), 8, TEN, (100, 1000)),
-    "cloth": SpeedScene("a cloth that is held here and there", cloth, 20, TEN[1:], (100, 400)),
+    "cloth": SpeedScene("a cloth that is held here and there", cloth, 20, TEN[1:5], (100, 400)),
     "ropes": SpeedScene("ropes of 40 links", ropes, 20, (10 * LINE, 100 * LINE, 1000 * LINE, 10_000 * LINE), (LINE, 10 * LINE)),
     "rope": SpeedScene("one rope", rope, 20, (11, LINE, 101, 401), (11, LINE), frozenset({"gravity", "distance"})),
     "mixed": SpeedScene("discs, ropes and soft balls with friction", mixed, 8, TEN[1:5], (100, 400)),
