@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
+from rich.box import SIMPLE
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
@@ -153,14 +154,16 @@ class SpeedReport:
         return None if least.threads == r.threads else least.seconds / r.seconds
 
     def tables(self) -> Iterator[tuple[str, tuple[str, ...], list[tuple[str, ...]]]]:
-        """Title, heads and rows of each."""
-        if self.runs:
-            yield "Speed", HEADS, [self._cells(r) for r in self.runs]
-            yield "Starts, memory, quality", STARTS, [started(r) for r in self.runs]
-        if self.peers:
-            yield "Peers, at the same measured quality or better", PEERS, [beside(p) for p in self.peers]
-        if self.absent:
-            yield "Features that exist but are not in the scene", ABSENT, [without(a) for a in self.absent]
+        """Title, heads and rows of each, without columns that are empty."""
+        for title, heads, rows in (
+            ("Speed", HEADS, [self._cells(r) for r in self.runs]),
+            ("Starts, memory, quality", STARTS, [started(r) for r in self.runs]),
+            ("Peers, at the same measured quality or better", PEERS, [beside(p) for p in self.peers]),
+            ("Features that exist but are not in the scene", ABSENT, [without(a) for a in self.absent]),
+        ):
+            full = [k for k in range(len(heads)) if any(row[k] for row in rows)]
+            if full:
+                yield title, tuple(heads[k] for k in full), [tuple(row[k] for k in full) for row in rows]
 
     def lines(self) -> Iterator[str]:
         """What else there is to say."""
@@ -184,14 +187,14 @@ class SpeedReport:
     def _cells(self, r: Run) -> tuple[str, ...]:
         scaling = self.scaling(r)
         return (
-            r.scene, f"{r.particles:,}", str(r.threads), r.path, f"{1e3 * r.seconds:.3g}", f"{r.rate / 1e6:.3g}",
+            r.scene, f"{r.particles:,}", str(r.threads), f"{1e3 * r.seconds:.3g}", f"{r.rate / 1e6:.3g}",
             "" if r.ratio is None else f"{r.ratio:.2f}", "" if scaling is None else f"{scaling:.2f}", f"{r.launches:.3g}",
-            f"{r.bytes:.0f}", f"{100 * self.share(r):.0f} %",
+            f"{r.bytes:.0f}", f"{100 * self.share(r):.0f}%",
         )  # fmt: skip
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         for title, heads, rows in self.tables():
-            table = Table(title=title)
+            table = Table(title=title, box=SIMPLE, padding=(0, 1, 0, 0), pad_edge=False)
             for k, head in enumerate(heads):
                 table.add_column(head, justify="left" if k == 0 or head in TEXT else "right")
             for row in rows:
@@ -231,10 +234,10 @@ class SpeedReport:
 
 ROWS = {"runs": Run, "peers": Peer, "absent": Absent}
 HEADS = (
-    "scene", "particles", "threads", "path", "ms", "Mps/s", "of pile.c", "of 1 thread", "launches", "bytes", "of a copy",
+    "scene", "particles", "threads", "ms", "Mps/s", "of pile.c", "of 1 thread", "launches", "bytes", "of a copy",
 )  # fmt: skip
 STARTS = (
-    "scene", "particles", "threads", "import", "cold", "warm", "memory", "overlap", "pile.c's", "violation", "flags",
+    "scene", "particles", "threads", "path", "import", "cold", "warm", "memory", "overlap", "pile.c's", "violation", "flags",
 )  # fmt: skip
 PEERS = ("peer", "scene", "particles", "threads", "setting", "ms", "ours", "ratio", "measure", "its", "ours", "as good")
 ABSENT = ("scene", "particles", "fields", "bytes", "launches", "ms", "ratio")
@@ -262,14 +265,15 @@ def restored(kind: type, row: dict[str, Any]) -> Any:
 
 def percent(share: float | None) -> str:
     """Of a diameter; nothing for nothing."""
-    return f"{100 * share:.2f} %" if share else ""
+    return f"{100 * share:.2f}%" if share else ""
 
 
 def started(r: Run) -> tuple[str, ...]:
     """A line about a start."""
     return (
-        r.scene, f"{r.particles:,}", str(r.threads), f"{r.imported:.2f}", f"{r.cold:.2f}", f"{r.warm:.2f}", f"{r.memory:.0f}",
-        percent(r.overlap), percent(r.yardstick_overlap), f"{r.residual:.1e}" if r.residual else "", " ".join(r.flags),
+        r.scene, f"{r.particles:,}", str(r.threads), r.path, f"{r.imported:.2f}", f"{r.cold:.2f}", f"{r.warm:.2f}",
+        f"{r.memory:.0f}", percent(r.overlap), percent(r.yardstick_overlap), f"{r.residual:.1e}" if r.residual else "",
+        " ".join(r.flags),
     )  # fmt: skip
 
 
