@@ -63,7 +63,8 @@ def ropes(n: int):
     count, points = max(1, n // LINE), min(n, LINE)
     one = tv.shapes.rope((0, 0), (1, 0), points=points)
     k = np.arange(count)
-    position = (one.position + 2.0 * np.stack([k, 0 * k], axis=1)[:, None]).reshape(-1, 2)
+    wide = ceil(count**0.5)  # in rows, so that f32 resolves all of them
+    position = (one.position + 2.0 * np.stack([k % wide, k // wide], axis=1)[:, None]).reshape(-1, 2)
     links = (one.links + points * k[:, None, None]).reshape(-1, 2)
     return tv.Particles(position, mass=0.01, pinned=points * k), [tv.Gravity(9.81), tv.Distance(links)]
 
