@@ -41,11 +41,15 @@ def taichi():
 
 @pytest.fixture
 def world():
-    """tv.World, for worlds that are closed when the test ends."""
+    """tv.World, for worlds that are closed when the test ends. path="launched": parallel as on a GPU, in many launches."""
     made = []
 
     def build(*args, **kwargs):
-        made.append(tv.World(*args, **kwargs))
+        with pytest.MonkeyPatch.context() as patch:
+            if kwargs.get("path") == "launched":
+                kwargs["path"] = "parallel"
+                patch.setattr(tv.runtime, "cores", lambda: 1)  # nobody to make a team with
+            made.append(tv.World(*args, **kwargs))
         return made[-1]
 
     yield build

@@ -62,7 +62,7 @@ def clouds():
 
 @pytest.mark.filterwarnings("ignore:.*near pairs per particle")
 @pytest.mark.parametrize("name, radius, several", list(clouds()))
-@pytest.mark.parametrize("path", ["fused", "parallel"])
+@pytest.mark.parametrize("path", ["fused", "parallel", "launched"])
 def test_pairs_equal_brute_force(world, name, radius, several, path):
     w = world(tv.Particles(several[0][0], radius=radius), [tv.Contact(skin=SKIN)], precision="f64", path=path)
     for position, filled in several:
@@ -107,7 +107,7 @@ def test_a_list_that_is_too_small_grows_and_nothing_is_lost(world):
     rng = np.random.default_rng(9)
     position = rng.uniform(-1, 1, (200, 2))
     hashes = []
-    for path, capacity in (("fused", 100_000), ("fused", 1), ("parallel", 1)):
+    for path, capacity in (("fused", 100_000), ("fused", 1), ("parallel", 1), ("launched", 1)):
         w = world(
             tv.Particles(position, radius=0.1),
             [tv.Gravity(9.81), tv.Contact(), tv.Box((-1.2, -1.2), (1.2, 3))],

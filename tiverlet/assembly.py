@@ -20,6 +20,7 @@ from .solvers.slots import Slots
 from .solvers.solver import Solver
 from .substep import Substep
 from .survey import Survey
+from .team import Team
 from .wall import Wall
 
 T = TypeVar("T", bound=Feature)
@@ -105,11 +106,12 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
         if scene.order > 2:
             composition.check_solved(batches, scene, solver)
     parallel = path == "parallel"
-    grid = contact.join(scene, batches, parallel) if contact else None
+    team = Team(memory, runtime.cores() if parallel else 1, len(particles))
+    grid = contact.join(scene, batches, team, parallel) if contact else None
     for feature in [*accelerations, *drivers, *batches, *walls]:
         feature.bind(scene)
     kind = Substep if scene.order == 2 else composition.Composition
-    substep = kind(scene, accelerations, batches, drivers, contact, grid, walls, parallel)
+    substep = kind(scene, accelerations, batches, drivers, contact, grid, walls, team, parallel)
     survey = Survey(substep)
     memory.place()
     if grid and contact:

@@ -5,6 +5,8 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
+from .grid import WORD, lowest
+
 EVERY = 32  # substeps from one projection to the next
 PASSES = 32
 CONDITION = 400.0  # modes with an eigenvalue of at least 1 / CONDITION keep 1 / T(PASSES) = 8 % of their velocity
@@ -43,14 +45,18 @@ class Calm:
         """Pass k for particle i: what changes d. change' = (factor - 1) change + factor 2 / (1 + 1 / CONDITION) want."""
         want, w = 0 * self.state.d[i], self.state.w[i]
         if self.contact._on_split[i] > 0:
-            for e in range(self.contact._on_grid.first[i], self.contact._on_grid.first[i] + self.contact._on_grid.number[i]):
-                if self.bears(i, e):
-                    j = self.contact._on_grid.near[e]
-                    r = self.state.apart(i, j)
-                    rr = r.dot(r)
-                    if rr > 0:
-                        rate = (self.state.d[i] - self.state.d[j]).dot(r) / rr
-                        want -= w * rate / (self.contact._on_split[i] + self.contact._on_split[j]) * r
+            for word in range(self.contact._on_grid.words(i)):
+                bits = self.contact.touching(i, word)
+                while bits != 0:
+                    e = self.contact._on_grid.first[i] + word * WORD + lowest(bits)
+                    bits &= bits - ti.u32(1)
+                    if self.bears(i, e):
+                        j = self.contact._on_grid.near[e]
+                        r = self.state.apart(i, j)
+                        rr = r.dot(r)
+                        if rr > 0:
+                            shared = self.contact._on_split[i] + self.contact._on_split[j]
+                            want -= w * (self.state.d[i] - self.state.d[j]).dot(r) / (rr * shared) * r
             if ti.static(self.state.leans):
                 lean = self.state.lean[i]
                 size = lean.dot(lean)
@@ -63,7 +69,7 @@ class Calm:
     def move(self, i):
         """Change d."""
         if self.contact._on_split[i] > 0:
-            self.state.d[i] += self.change[i]
+            self.state.d[i] = self.state.d[i] + self.change[i]
 
 
 def chebyshev(passes: int, condition: float) -> np.ndarray:

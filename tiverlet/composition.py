@@ -128,7 +128,7 @@ class Composition(Substep):
     def stage(self, h, last, t, when, starts, iterations, final):
         """A stage of h after one of `last`."""
         if ti.static(self.springs):
-            self.kick(h)
+            self.kick(0, h)
         for i in range(self.n):
             self.propel(i, h, last, t, starts)
         for f in ti.static(self.drivers):
@@ -137,16 +137,16 @@ class Composition(Substep):
         if ti.static(len(self.systems) > 0):
             for it in range(ti.max(iterations, self.passes)):
                 first = ti.cast(it == 0, ti.i32)
-                self.tell(h, when, first, 0)
-                self.settle(first)
-                self.collect(h, when, first, 0, 0, final)
+                self.tell(0, h, when, first, 0)
+                self.settle(0, first)
+                self.collect(0, h, when, first, 0, 0, final)
 
     @ti.func
     def propel(self, i, h, last, t, starts):
         """Verlet with the force at x; at a start, d is the velocity."""
         if self.state.w[i] > 0:
             d = self.state.d[i]
-            a = self.accelerate(i, self.state.place(i), 0 * d, t)
+            a = self.accelerate(i, self.state.place(i), 0 * d, t, self.pull(t))
             if ti.static(self.springs):
                 a += self.slots.total_of(i) / (h * h)
             if starts != 0:

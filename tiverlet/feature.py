@@ -127,7 +127,7 @@ class Acceleration(Feature):
     """A force that acts on each particle by itself: gravity, drag, a field.
 
     accelerates: acceleration() adds something (a pure drag leaves it False).
-    uniform: it is the same everywhere, so it has no stiffness.
+    uniform: it is the same everywhere, so it has no stiffness. common: it is the same for all particles, and asked only once.
     uses_velocity: acceleration() reads v, which costs one more field to have it to second order.
     conservative: potential() is known, so the energy report can account for it.
     decays: it has a rate, a linear drag [1/s] that is solved exactly (exponential); several add up.
@@ -135,6 +135,7 @@ class Acceleration(Feature):
 
     accelerates = True
     uniform = False
+    common = False
     uses_velocity = False
     conservative = False
     decays = False

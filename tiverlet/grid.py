@@ -14,19 +14,25 @@ from .cells import Cells
 from .feature import Scene
 from .material import Table
 from .runtime import Memory
+from .team import LEAST, Team
 
 CROWDED = 300  # near pairs per particle beyond which the user is told
 FARTHEST = 1 << 22  # cells from the origin: beyond it, f32 cannot tell a cell from the next
+WORD, FULL = 32, 2**32 - 1  # entries that one word of bits is for
 APPEND, COUNT, FILL = range(3)  # what a scan of the cells around a particle does with the neighbours that it finds
 
 
 class Luggage:
-    """What each pair carries along: a number, or a vector of `width`. lasting: it is part of the state, beyond a substep."""
+    """What each pair carries along: a number, or a vector of `width`.
+
+    lasting: it is part of the state, beyond a substep. kept: it goes from list to list; what is not has to be worked out anew.
+    """
 
     field: Any
+    aside: Any
 
-    def __init__(self, name: str, width: int, lasting: bool):
-        self.name, self.width, self.lasting = name, width, lasting
+    def __init__(self, name: str, width: int, lasting: bool, kept: bool = True):
+        self.name, self.width, self.lasting, self.kept = name, width, lasting, kept
 
 
 class Grid:
@@ -36,17 +42,21 @@ class Grid:
     the entries of the list carry along when it is built anew.
     """
 
-    def __init__(self, scene: Scene, skin: float, linked: np.ndarray, table: Table, luggage: list["Luggage"], parallel: bool):
+    def __init__(
+        self, scene: Scene, skin: float, linked: np.ndarray, table: Table, luggage: list["Luggage"], team: Team, parallel: bool
+    ):  # fmt: skip
+        self.team = team
         n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
         self.n, self.dim, self.state, self.radius = n, dim, scene.state, scene.radius
         self.table, self.luggage = table, luggage
-        self.lasting = [piece for piece in luggage if piece.lasting]
+        self.lasting, self.lost = [p for p in luggage if p.lasting], [p for p in luggage if not p.kept]
+        self.bags = [p for p in luggage if p.kept]
         self.real, self.skin = scene.real, skin
-        self.cells = Cells(scene, scene.particles.radius, skin)
+        self.cells = Cells(scene, scene.particles.radius, skin, team)
         self.several = self.cells.levels > 1
         parallel = parallel and not self.several  # lists of several levels have parts of any length, in one piece
         self.blocks = 16 if parallel else 1  # parts of the list, each filled by one thread
-        self.spread = 512 if parallel else 1  # Taichi gives each CPU thread at least 512 iterations of a loop
+        self.spread = LEAST if parallel and team.size == 1 else 1
         self.origin = add("grid.built_at", n, width=dim)
         self.first = add("grid.first", n, kind=ti.i32)
         self.number = add("grid.number", n, kind=ti.i32)
@@ -60,11 +70,14 @@ class Grid:
             begin = np.searchsorted(both[:, 0], np.arange(n + 1))
             self.mates = add("grid.linked", len(both), kind=ti.i32, values=both[:, 1])
             self.mates_begin = add("grid.linked_begin", n + 1, kind=ti.i32, values=begin)
+        self.touching = add("grid.touching", n, kind=ti.u32)  # bits: which of the first entries touch, when last looked at
         self.old_first = add("grid.old_first", n, kind=ti.i32)
         self.old_number = add("grid.old_number", n, kind=ti.i32)
         self.kept = add("grid.kept", None, kind=ti.i32)  # 1: the old list is put aside for the one that is being built
-        self.half = add("grid.half", None, kind=ti.i32)  # of the entries, in which the list is; the old one is in the other
+        self.short = 8 if dim == 2 else 16  # entries of a list that is sorted without branches
+        self.network = sorting_network(self.short)
         self.near: Any = None
+        self.aside: Any = None  # those of the old list that carry something, while a new one is built; else free to use
         self.store: Memory | None = None
 
     def allocate(self, capacity: int) -> None:
@@ -74,11 +87,15 @@ class Grid:
         if self.store:
             self.store.destroy()
         self.capacity = max(1, -(-capacity // self.blocks))  # of one block
-        self.room = self.capacity * self.blocks  # of one list
+        self.pitch = self.capacity + self.short  # from one block to the next
+        self.room = self.pitch * self.blocks  # of one list
         self.store = Memory(self.real)
-        self.near = self.store.field("grid.near", 2 * self.room, kind=ti.i32)
+        self.near = self.store.field("grid.near", self.room, kind=ti.i32)
+        self.aside = self.store.field("grid.aside", self.room, kind=ti.i32)
         for piece in self.luggage:
-            piece.field = self.store.field(f"grid.{piece.name}", 2 * self.room, width=piece.width)
+            piece.field = self.store.field(f"grid.{piece.name}", self.room, width=piece.width)
+            if piece.kept:
+                piece.aside = self.store.field(f"grid.{piece.name}_aside", self.room, width=piece.width)
         self.store.place()
 
     def grow(self) -> None:
@@ -91,21 +108,19 @@ class Grid:
                 stacklevel=2,
             )
         assert self.store
-        before, old = self.room, 1 - self.half[None]
-        kept = [self.store.read(field)[old * before :][:before] for field in self._fields()]
+        kept = [self.store.read(field) for field in self._fields()]
         self.allocate(int(self.need[None] * 1.25 + 16) * self.blocks)
         for field, values in zip(self._fields(), kept, strict=True):
             self._aside(field, values)
-        self.old_first.from_numpy(self.old_first.to_numpy() + np.int32(old * (self.room - before)))
         self.stale[None] = 1
 
     def _fields(self) -> list:
-        return [self.near, *(piece.field for piece in self.luggage)]
+        return [self.aside, *(piece.aside for piece in self.bags)]
 
     def _aside(self, field, values: np.ndarray) -> None:
-        """Write the entries of the old list."""
-        room = np.zeros((2 * self.room, *values.shape[1:]), dtype=values.dtype)
-        room[(1 - self.half[None]) * self.room :][: len(values)] = values
+        """Write what was put aside."""
+        room = np.zeros((self.room, *values.shape[1:]), dtype=values.dtype)
+        room[: len(values)] = values
         self.store.write(field, room)  # type: ignore[union-attr]
 
     @property
@@ -144,8 +159,8 @@ class Grid:
         aside = bool(self.kept[None])  # given by restore(), and not built into a list yet
         first, number = (self.old_first, self.old_number) if aside else (self.first, self.number)
         i, at = self._entries(first, number)
-        near = self.store.read(self.near)[at]
-        values = {piece.name: self.store.read(piece.field)[at] for piece in self.lasting}
+        near = self.store.read(self.aside if aside else self.near)[at]
+        values = {piece.name: self.store.read(piece.aside if aside else piece.field)[at] for piece in self.lasting}
         some = np.zeros(len(i), dtype=bool)
         for value in values.values():
             some |= (value != 0) if value.ndim == 1 else (value != 0).any(axis=1)
@@ -155,28 +170,44 @@ class Grid:
         """Give what carried() returned to the next list that is built."""
         if len(pairs) > self.room:
             self.allocate(len(pairs))
-        self._aside(self.near, pairs[:, 1].astype(np.int32))
-        for piece in self.lasting:
-            self._aside(piece.field, values[piece.name])
+        self._aside(self.aside, pairs[:, 1].astype(np.int32))
+        for piece in self.bags:
+            self._aside(piece.aside, values[piece.name] if piece.lasting else np.zeros((1, *[piece.width] * (piece.width > 0))))
         counts = np.bincount(pairs[:, 0], minlength=max(1, self.n))
-        begin = (1 - self.half[None]) * self.room
-        self.old_first.from_numpy((begin + np.cumsum(counts) - counts).astype(np.int32))
+        self.old_first.from_numpy((np.cumsum(counts) - counts).astype(np.int32))
         self.old_number.from_numpy(counts.astype(np.int32))
         self.kept[None] = self.stale[None] = 1
 
     @ti.func
-    def keep(self):
+    def keep(self, me):
         """Put the list aside, unless one is there already, from a build that did not fit."""
         kept = self.kept[None]
-        for i in range(self.n):
+        for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
             if kept == 0:
-                self.old_first[i], self.old_number[i] = self.first[i], self.number[i]
+                self.pack(i)
+        self.team.wait()
         ti.loop_config(serialize=True)
-        for _ in range(1):
-            if self.kept[None] == 0:
-                self.half[None] = 1 - self.half[None]
+        for _ in range(self.team.one(1, me)):
             self.kept[None] = 1
             self.need[None] = 0
+
+    @ti.func
+    def pack(self, i):
+        """Put aside what carries something."""
+        at = self.first[i]
+        for e in range(self.first[i], self.first[i] + self.number[i]):
+            some = 0
+            self.aside[at] = self.near[e]
+            for piece in ti.static(self.bags):
+                value = piece.field[e]
+                piece.aside[at] = value
+                if ti.static(piece.width == 0):
+                    some |= ti.cast(value != 0, ti.i32)
+                else:
+                    for k in ti.static(range(piece.width)):
+                        some |= ti.cast(value[k] != 0, ti.i32)
+            at += some
+        self.old_first[i], self.old_number[i] = self.first[i], at - self.first[i]
 
     @ti.func
     def carry(self, i):
@@ -184,44 +215,46 @@ class Grid:
         old, end = self.old_first[i], self.old_first[i] + self.old_number[i]
         for e in range(self.first[i], self.first[i] + self.number[i]):
             j = self.near[e]
-            while old < end and self.near[old] < j:
+            while old < end and self.aside[old] < j:
                 old += 1
             for piece in ti.static(self.luggage):
                 piece.field[e] = ti.zero(piece.field[e])  # 0 times what is there could be -0
-                if old < end and self.near[old] == j:
-                    piece.field[e] = piece.field[old]
+            if old < end:
+                if self.aside[old] == j:
+                    for piece in ti.static(self.bags):
+                        piece.field[e] = piece.aside[old]
 
     @ti.func
-    def watch(self, i):
-        """The list is stale once a particle has moved by half the skin."""
+    def outrun(self, i):
+        """1 if the list is stale: once a particle has moved by half the skin."""
         r = self.state.x[i] - self.origin[i]
-        if not (r.dot(r) <= ti.cast((0.49 * self.skin) ** 2, self.real)):  # "not <=" also catches NaN
-            if self.stale[None] == 0:  # threads that all write to the same place wait for each other
-                self.stale[None] = 1
+        return ti.select(r.dot(r) <= ti.cast((0.49 * self.skin) ** 2, self.real), 0, 1)  # 1 for NaN
 
     @ti.func
-    def build(self):
-        """Sort the particles into cells, then list the near ones of each."""
-        self.keep()
-        self.cells.sort()
+    def build(self, me):
+        """Sort the particles into cells, then list the near ones of each. `me`: see Team."""
+        self.keep(me)
+        self.cells.sort(me)
         if ti.static(self.several):
-            self.pair_up()
+            self.pair_up(me)
         else:
-            for t in range(self.blocks * self.spread):
+            for t in range(self.team.low(self.blocks * self.spread, me), self.team.high(self.blocks * self.spread, me)):
                 if t % self.spread == 0:
                     self.fill(t // self.spread)
-        for i in range(self.n):
+        for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
             self.origin[i] = self.state.x[i]
+        self.team.wait()
         ti.loop_config(serialize=True)
-        for _ in range(1):
+        for _ in range(self.team.one(1, me)):
             self.stale[None] = 0
             if self.need[None] <= self.capacity:
                 self.kept[None] = 0
+        self.team.wait()
 
     @ti.func
     def fill(self, block):
         """One level: list the neighbours of a block of particles, one after the other. Beyond the room they are only counted."""
-        start, room = self.half[None] * self.room + block * self.capacity, self.capacity
+        start, room = block * self.pitch, self.capacity
         size = (self.n + self.blocks - 1) // self.blocks
         used = 0
         for i in range(block * size, ti.min((block + 1) * size, self.n)):
@@ -229,27 +262,30 @@ class Grid:
             begin = used
             used = self.scan(i, APPEND, start, used)
             self.number[i] = ti.max(ti.min(used, room) - begin, 0)
+        for i in range(block * size, ti.min((block + 1) * size, self.n)):
             self.finish(i)
         ti.atomic_max(self.need[None], used)
 
     @ti.func
-    def pair_up(self):
+    def pair_up(self, me):
         """Several levels: count, then list each pair that one of the two finds with both."""
-        for i in range(self.n):
+        for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
             self.number[i] = 0
+        self.team.wait()
         ti.loop_config(serialize=self.cells.serial)
-        for i in range(self.n):
+        for i in range(self.team.one(self.n, me)):
             self.scan(i, COUNT, 0, 0)
         ti.loop_config(serialize=True)
-        for i in range(self.n):
-            self.first[i] = self.half[None] * self.room + self.need[None]
-            self.need[None] += self.number[i]
+        for i in range(self.team.one(self.n, me)):
+            self.first[i] = self.need[None]
+            self.need[None] = self.need[None] + self.number[i]
             self.number[i] = 0
         ti.loop_config(serialize=self.cells.serial)
-        for i in range(self.n):
+        for i in range(self.team.one(self.n, me)):
             if self.need[None] <= self.capacity:
                 self.scan(i, FILL, 0, 0)
-        for i in range(self.n):
+        self.team.wait()
+        for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
             self.finish(i)
 
     @ti.func
@@ -257,6 +293,18 @@ class Grid:
         """Put the list of particle i in order."""
         self.order(self.first[i], self.number[i])
         self.carry(i)
+        self.touching[i] = self.whole(i, 0)
+
+    @ti.func
+    def words(self, i):
+        """How many words of bits the list of particle i has entries for."""
+        return (self.number[i] + (WORD - 1)) >> 5
+
+    @ti.func
+    def whole(self, i, word):
+        """Bits of all entries that the word is for."""
+        left = self.number[i] - word * WORD
+        return ti.select(left < WORD, (ti.u32(1) << ti.cast(left & (WORD - 1), ti.u32)) - ti.u32(1), ti.u32(FULL))
 
     @ti.func
     def scan(self, i, what: ti.template(), start, used):  # type: ignore[valid-type]
@@ -270,46 +318,64 @@ class Grid:
                     b = base + ((low + part) & mask)
                     for e in range(self.cells.edge[b + 1], self.cells.edge[b + span + 1]):
                         j = self.cells.sorted[e]
-                        if j != i and self.listed(i, j):
-                            if ti.static(what == APPEND):
-                                if used < self.capacity:
-                                    self.near[start + used] = j
-                                used += 1
-                            else:
-                                self.note(i, j, what)
-                                if m < own:
-                                    self.note(j, i, what)
+                        listed = self.listed(i, j, self.cells.apart(i, e))
+                        if ti.static(what == APPEND):
+                            # No branch: it would be taken at random. What is not listed is written over by the next.
+                            self.near[start + ti.min(used, self.capacity)] = j
+                            used += listed
+                        elif listed != 0:
+                            self.note(i, j, what)
+                            if m < own:
+                                self.note(j, i, what)
         return used
 
     @ti.func
     def note(self, i, j, what: ti.template()):  # type: ignore[valid-type]
         """Count j among the neighbours of i, and list it."""
-        k = ti.atomic_add(self.number[i], 1)
+        k = self.cells.raised(self.number, i, 1)
         if ti.static(what == FILL):
             self.near[self.first[i] + k] = j
 
     @ti.func
-    def listed(self, i, j):
-        """Whether a pair belongs on the list: near, not both immovable, not linked."""
-        r = self.state.apart(i, j)
+    def listed(self, i, j, r):
+        """1 if a pair, apart by r, belongs on the list: near, not both immovable, not linked."""
         far = self.radius.of(i) + self.radius.of(j) + ti.cast(self.skin, self.real)
-        yes = r.dot(r) < far * far
+        yes = ti.cast(r.dot(r) < far * far, ti.i32) & ti.cast(i != j, ti.i32)
         if ti.static(self.still):
-            if yes:
-                yes = self.state.w[i] + self.state.w[j] > 0
+            if yes != 0:
+                yes = ti.cast(self.state.w[i] + self.state.w[j] > 0, ti.i32)
         if ti.static(not self.table.uniform):
-            if yes:
-                yes = self.table.of(i, j)[3] > 0
+            if yes != 0:
+                yes = ti.cast(self.table.of(i, j)[3] > 0, ti.i32)
         if ti.static(self.linked):
-            if yes:
+            if yes != 0:
                 for e in range(self.mates_begin[i], self.mates_begin[i + 1]):
                     if self.mates[e] == j:
-                        yes = False
+                        yes = 0
         return yes
 
     @ti.func
     def order(self, begin, count):
-        """Insertion sort by index: lists are short, and this makes every sum over them independent of the table."""
+        """Sort by index, which makes every sum over the list independent of the table."""
+        if ti.static(self.several):
+            self.insert(begin, count)
+        elif count > ti.static(self.short):
+            self.insert(begin, count)
+        else:
+            # A network has no branches.
+            j = ti.Vector.zero(ti.i32, self.short)
+            for k in ti.static(range(self.short)):
+                j[k] = ti.select(k < count, self.near[begin + k], ti.static(2**31 - 1))
+            for layer in ti.static(self.network):
+                for a, b in ti.static(layer):
+                    j[a], j[b] = ti.min(j[a], j[b]), ti.max(j[a], j[b])
+            for k in ti.static(range(self.short)):
+                if k < count:
+                    self.near[begin + k] = j[k]
+
+    @ti.func
+    def insert(self, begin, count):
+        """Insertion sort."""
         for a in range(1, count):
             j = self.near[begin + a]
             b = a
@@ -317,3 +383,23 @@ class Grid:
                 self.near[begin + b] = self.near[begin + b - 1]
                 b -= 1
             self.near[begin + b] = j
+
+
+@ti.func
+def lowest(bits):
+    """The number of the lowest bit that is set."""
+    return ti.math.popcnt((bits - ti.u32(1)) & ~bits)
+
+
+def sorting_network(size: int) -> list[list[tuple[int, int]]]:
+    """Layers of pairs to put in order, to sort a power of two of numbers (Batcher's odd-even mergesort, 1968)."""
+    out, p = [], 1
+    while p < size:
+        k = p
+        while k >= 1:
+            begins = range(k % p, size - k, 2 * k)
+            pairs = [(i, i + k) for j in begins for i in range(j, j + min(k, size - j - k))]
+            out.append([(a, b) for a, b in pairs if a // (2 * p) == b // (2 * p)])
+            k //= 2
+        p *= 2
+    return out

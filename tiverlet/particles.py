@@ -214,7 +214,7 @@ class State:
     @ti.func
     def shift(self, i, move):
         """A correction: the same move to x_i and to d_i, so that x - d stays the start of the substep."""
-        self.d[i] += move
+        self.d[i] = self.d[i] + move
         self.advance(i, move)
 
 

@@ -4,13 +4,17 @@ from typing import Any
 
 import taichi as ti
 
+from . import runtime
+from .calm import EVERY
 from .feature import Acceleration, Batch, Scene
 from .scalar import Scalar
+from .team import LEAST, Team
 from .tools import golden_steps
 from .wall import Wall
 
 # Multiples of the golden ratio of two dimensions, mod 1, are the most even sequence of pairs: one for each of the two sums.
 DITHER = golden_steps(2)
+TILE = 1024  # particles that a thread takes at a time, through several loops: their state stays in its cache
 SWEEPS = 8  # rounds over the walls, for particles that several of them push
 
 
@@ -26,22 +30,29 @@ class Phases:
         contact,
         grid,
         walls,
+        team: Team,
         parallel: bool,
     ):
-        self.parallel = parallel
+        self.team, self.parallel = team, parallel
+        # On a GPU each thread has one particle. On a CPU Taichi gives each thread at least LEAST iterations of a loop.
+        cpu = runtime.architecture() == "cpu"
+        self.tile = TILE if cpu else 1
+        self.tiles = -(-scene.particles.count // self.tile)
+        self.gap = -(-LEAST * runtime.threads() // max(1, self.tiles)) if parallel and cpu else 1
         # For substeps made of stages: the share of the first, what accelerates in the last per h^2, omega^2 of springs.
         self.first, self.reaches, self.fastest = 1.0, 1.0, 0.0
         self.scene, self.state, self.slots = scene, scene.state, scene.slots
         self.n, self.dim, self.real = scene.particles.count, scene.particles.dim, scene.real
         self.accelerations = [f for f in accelerations if f.accelerates]
+        self.common, self.others = ([f for f in self.accelerations if f.common is it] for it in (True, False))
         self.uses_velocity = any(f.uses_velocity for f in accelerations)
         self.drags = [f for f in accelerations if f.decays]
         self.decays = bool(self.drags)
         self.batches: list[Batch] = [b for b in batches if b.count]
         self.systems = [scene.slots.system] if scene.slots and scene.slots.system else []
-        self.steps = max([s.steps for s in self.systems], default=0) if parallel else 0
+        self.steps = max([s.steps for s in self.systems], default=0) if parallel and team.size == 1 else 0
         for system in self.systems:
-            system.spread = 512 if parallel else 1
+            system.team, system.spread = team, LEAST if parallel and team.size == 1 else 1
         self.hurries = bool(scene.slots) and scene.slots.accelerates
         self.told = [b for b in self.batches if isinstance(b, Scalar) and b._on_told]
         self.ragged = [b for b in self.batches if b.blocks]
@@ -69,10 +80,18 @@ class Phases:
     # The bodies: what happens to one particle, one constraint.
 
     @ti.func
-    def accelerate(self, i, x, v, t):
-        """The sum of what accelerates particle i."""
-        a = 0 * x
-        for f in ti.static(self.accelerations):
+    def pull(self, t):
+        """The sum of what accelerates all particles alike."""
+        a = ti.zero(self.state.x[0])
+        for f in ti.static(self.common):
+            a += f.acceleration(0, a, a, t)
+        return a
+
+    @ti.func
+    def accelerate(self, i, x, v, t, pull):
+        """The sum of what accelerates particle i. pull: what pull() returned."""
+        a = pull
+        for f in ti.static(self.others):
             a += f.acceleration(i, x, v, t)
         return a
 
@@ -104,48 +123,69 @@ class Phases:
         return small
 
     @ti.func
-    def integrate(self, i, h, t, tick, fresh):
-        """d += h^2 a, x += d; at a start (d is v) x += h v + h^2 a / 2. Linear drag is exact in both."""
-        if ti.static(self.state.starts):
-            self.state.x0[i] = self.state.x[i]
-            if ti.static(self.state.compensated):
-                self.state.low0[i] = self.state.low[i]
-        if ti.static(self.state.leans):
-            self.state.lean[i] = 0 * self.state.x[i]
-        if self.state.w[i] > 0:
-            v = self.velocity_before(i, h, fresh)
-            a = self.accelerate(i, self.state.place(i), v, t)
-            d = self.state.d[i]
-            if ti.static(self.state.befores):
-                self.state.before[i] = d
-                if fresh != 0:
-                    self.state.before[i] = h * v - h * h / 2 * a
-            if ti.static(self.uses_velocity):
-                self.earlier[i] = d
-                if fresh != 0:
-                    self.earlier[i] = h * v - h * h / 2 * a
-            if fresh != 0:
-                if ti.static(self.decays):
-                    d = self.decay[None][1] * h * v + self.decay[None][2] * h * h * a
-                else:
-                    d = h * v + h * h / 2 * a
-            else:
-                if ti.static(self.decays):
-                    # d' = exp(-z) d + phi1 h^2 a, as a small change of d, which f32 holds to more digits.
-                    k = self.decay[None][1] * h * h * a - self.decay[None][4] * d
-                    d += self.dithered(d, k, tick, DITHER[0])
-                elif ti.static(len(self.accelerations) > 0):
-                    d += self.dithered(d, h * h * a, tick, DITHER[0])
+    def integrate(self, i, h, t, tick, fresh, pull, share, reach):
+        """d += h^2 a, x += d; at a start (d is v) x += h v + h^2 a / 2. Linear drag is exact in both.
+
+        Only the writes depend on whether it moves, so that several particles are integrated at once.
+        """
+        live, x, d = self.state.w[i] > 0, self.state.x[i], self.state.d[i]
+        v = self.velocity_before(i, h, fresh)
+        a = self.accelerate(i, self.state.place(i), v, t, pull)
+        before = ti.select(fresh != 0, h * v - h * h / 2 * a, d)
+        if ti.static(self.decays or len(self.accelerations) > 0):
+            kick = reach * a
+            if ti.static(self.decays):
+                # d' = exp(-z) d + phi1 h^2 a, as a small change of d, which f32 holds to more digits.
+                kick -= ti.select(fresh != 0, ti.zero(d), self.decay[None][4] * d)
+            d *= share
+            d += self.dithered(d, kick, tick, DITHER[0])
+        else:
+            d *= share
+        step = d
+        if ti.static(not self.state.compensated):
+            step = self.dithered(x, d, tick, DITHER[1])
+        if live:
             self.state.d[i] = d
             if ti.static(self.state.compensated):
                 self.state.advance(i, d)
             else:
-                self.state.advance(i, self.dithered(self.state.x[i], d, tick, DITHER[1]))
+                self.state.x[i] = x + step
+            if ti.static(self.state.befores):
+                self.state.before[i] = before
+            if ti.static(self.uses_velocity):
+                self.earlier[i] = before
         elif fresh != 0:
-            self.state.d[i] = 0 * self.state.d[i]
+            self.state.d[i] = ti.zero(d)
+
+    @ti.func
+    def advance(self, tile, h, t, tick, fresh, calming):
+        """Integrate a tile of particles. Short loops, so that each is done for several particles at once."""
+        first, end = tile * self.tile, ti.min((tile + 1) * self.tile, self.n)
+        if ti.static(self.state.starts):
+            for i in range(first, end):
+                self.state.x0[i] = self.state.x[i]
+                if ti.static(self.state.compensated):
+                    self.state.low0[i] = self.state.low[i]
+        if ti.static(self.state.leans):
+            if calming != 0:
+                for i in range(first, end):
+                    self.state.lean[i] = ti.zero(self.state.x[i])
+        pull, share, reach = self.pull(t), ti.cast(1, self.real), self.reach(h, fresh)
+        if fresh != 0:
+            share = h
+            if ti.static(self.decays):
+                share *= self.decay[None][1]
+        for i in range(first, end):
+            self.integrate(i, h, t, tick, fresh, pull, share, reach)
         for c in ti.static(self.contacts):
-            c.watch(i)
-            c.grow(i, h)
+            stale, fast = 0, 0
+            for i in range(first, end):
+                c.grow(i, h)
+            for i in range(first, end):
+                stale |= self.grid.outrun(i)
+            for i in range(first, end):
+                fast |= c.hurries(i)
+            c.heed(stale, fast)
 
     @ti.func
     def confine(self, i, h, when, last):
@@ -159,144 +199,195 @@ class Phases:
                         f.confine(i, self.radius.of(i), h, when, last)
                     moving = (self.state.d[i] != before).any()
 
-    # The phases: loops over the bodies, serial inside the fused kernel and parallel at the top of the others.
+    # The phases: loops over the bodies. `me` is the thread that goes through them; see Team. Where it has no team, loops are serial
+    # inside the fused kernel, and Taichi spreads them over threads at the top of the others.
 
     @ti.func
-    def predict(self, h, t, tick, fresh, when):
+    def predict(self, me, h, time, tick, fresh, when, calming):
         """1 Integrate, and move what walls are made of; 2 put driven particles on their targets."""
         for w in ti.static(self.posed):
             ti.loop_config(serialize=True)
-            for _ in range(1):
+            for _ in range(self.team.one(1, me)):
                 w.pose(when)
-        for i in range(self.n):
-            self.integrate(i, h, t, tick, fresh)
+        for t in range(self.team.low(self.tiles * self.gap, me), self.team.high(self.tiles * self.gap, me)):
+            if t % self.gap == 0:
+                self.advance(t // self.gap, h, time, tick, fresh, calming)
+        self.team.wait()
         for f in ti.static(self.drivers):
-            for c in range(f.count):
+            for c in range(self.team.low(f.count, me), self.team.high(f.count, me)):
                 f.drive(c, h, when[1])
                 for k in ti.static(self.contacts):
-                    k.watch(f.member(c, 0))
+                    k.heed(self.grid.outrun(f.member(c, 0)), k.hurries(f.member(c, 0)))
+            self.team.wait()
 
     @ti.func
-    def weigh(self, h, hh, first, fresh, some: ti.template()):  # type: ignore[valid-type]
+    def weigh(self, me, h, hh, first, fresh, some: ti.template()):  # type: ignore[valid-type]
         """The sums of constraints on many particles, by blocks. some: for which; those of the residual, or all."""
         for f in ti.static([f for f in self.ragged if f.reweighs or some]):
-            for b in range(f.blocks):
+            for b in range(self.team.low(f.blocks, me), self.team.high(f.blocks, me)):
                 f.weigh(b, h, hh, first, fresh)
+            self.team.wait()
 
     @ti.func
-    def spread(self, h, hh, first, fresh):
+    def spread(self, me, h, hh, first, fresh):
         """The moves of constraints on many particles."""
         for f in ti.static(self.ragged):
-            for e in range(f.corner_count):
+            for e in range(self.team.low(f.corner_count, me), self.team.high(f.corner_count, me)):
                 f.spread(e, h, hh, first, fresh)
+            self.team.wait()
 
     @ti.func
-    def kick(self, h):
+    def kick(self, me, h):
         """h^2 times what springs, at the present positions, accelerate: to the slots."""
-        self.weigh(h, h * h, -1, 0, True)
+        self.weigh(me, h, h * h, -1, 0, True)
         for f in ti.static(self.batches):
-            for c in range(f.count):
+            for c in range(self.team.low(f.count, me), self.team.high(f.count, me)):
                 f.kick(c, h)
-        self.spread(h, h * h, -1, 0)
+        self.team.wait()
+        self.spread(me, h, h * h, -1, 0)
 
     @ti.func
-    def tell(self, h, when, first, fresh):
+    def tell(self, me, h, when, first, fresh):
         """3a Every constraint leaves the moves that it wants in its slots, or tells its system what it is about."""
         hh = self.reach(h, fresh)
-        self.weigh(h, hh, first, fresh, True)
+        self.weigh(me, h, hh, first, fresh, True)
         if ti.static(self.hurries):
             ti.loop_config(serialize=True)
-            for _ in range(1):
+            for _ in range(self.team.one(1, me)):
                 self.slots.hurry(first)
+            self.team.wait()
         for f in ti.static(self.batches):
-            for c in range(f.count):
+            for c in range(self.team.low(f.count, me), self.team.high(f.count, me)):
                 f.relax(c, h, hh, when, first, fresh)
-        self.spread(h, hh, first, fresh)
+        if ti.static(len(self.batches) > 0):
+            self.team.wait()
+        self.spread(me, h, hh, first, fresh)
 
     @ti.func
-    def settle(self, first):
+    def settle(self, me, first):
         """3b Systems are solved."""
         for system in ti.static(self.systems):
-            for b in range(system.parts):
-                system.solve(b)
-        self.take(first)
+            if ti.static(system.steps > 0):
+                system.open(me)
+                for _ in range(system.steps):
+                    system.go(me)
+            else:
+                for b in range(self.team.low(system.parts, me), self.team.high(system.parts, me)):
+                    system.solve(b)
+                self.team.wait()
+        self.take(me, first)
 
     @ti.func
-    def take(self, first):
+    def take(self, me, first):
         """What systems found goes to the multipliers."""
         for f in ti.static(self.told):
-            for c in range(f.count):
+            for c in range(self.team.low(f.count, me), self.team.high(f.count, me)):
                 f.take(c, first)
+        if ti.static(len(self.told) > 0):
+            self.team.wait()
 
     @ti.func
-    def collect(self, h, when, first, last, fresh, final):
+    def collect(self, me, h, when, first, last, fresh, final):
         """3c Particles gather their moves; contacts; walls."""
         for c in ti.static(self.contacts):
             if ti.static(len(self.batches) > 0):
-                for i in range(self.n):
+                for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
                     self.slots.gather(i, first, final)
+                self.team.wait()
             if ti.static(c.measures):
-                for i in range(self.n):
+                for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
                     c.measure(i)
-            for i in range(self.n):
+                self.team.wait()
+            for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
                 c.count(i, first)
-            for i in range(self.n):
+            self.team.wait()
+            for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
                 c.relax(i, first, fresh)
+            self.team.wait()
         if ti.static(len(self.batches) > 0 or len(self.contacts) > 0 or len(self.walls) > 0):
-            for i in range(self.n):
-                if ti.static(len(self.batches) > 0 and len(self.contacts) == 0):
-                    self.slots.gather(i, first, final)
-                before = self.state.d[i]
-                for c in ti.static(self.contacts):
-                    c.gather(i, last)
-                if ti.static(len(self.walls) > 0):
-                    self.confine(i, h, when, last)
-                for c in ti.static(self.contacts):
-                    self.grid.watch(i)
-                if ti.static(len(self.walls) > 0 or len(self.contacts) > 0):
-                    if final != 0:
-                        if first != 0:
-                            self.thrust[i] = self.state.d[i] - before
-                        else:
-                            self.thrust[i] += self.state.d[i] - before
+            for t in range(self.team.low(self.tiles * self.gap, me), self.team.high(self.tiles * self.gap, me)):
+                if t % self.gap == 0:
+                    self.move(t // self.gap, h, when, first, last, final)
+            self.team.wait()
 
     @ti.func
-    def rebound(self):
+    def move(self, tile, h, when, first, last, final):
+        """What a tile of particles gathers."""
+        begin, end = tile * self.tile, ti.min((tile + 1) * self.tile, self.n)
+        if ti.static(len(self.batches) > 0 and len(self.contacts) == 0):
+            for i in range(begin, end):
+                self.slots.gather(i, first, final)
+        if ti.static(len(self.walls) > 0 or len(self.contacts) > 0):
+            if final != 0:
+                for i in range(begin, end):
+                    if first != 0:
+                        self.thrust[i] = -self.state.d[i]
+                    else:
+                        self.thrust[i] = self.thrust[i] - self.state.d[i]
+        for c in ti.static(self.contacts):
+            for i in range(begin, end):
+                c.gather(i, last)
+        if ti.static(len(self.walls) > 0):
+            for i in range(begin, end):
+                self.confine(i, h, when, last)
+        for c in ti.static(self.contacts):
+            stale = 0
+            for i in range(begin, end):
+                stale |= self.grid.outrun(i)
+            c.heed(stale, 0)
+        if ti.static(len(self.walls) > 0 or len(self.contacts) > 0):
+            if final != 0:
+                for i in range(begin, end):
+                    self.thrust[i] = self.thrust[i] + self.state.d[i]
+
+    @ti.func
+    def rebound(self, me):
         """4 One pass of restitution, over displacements alone. Several let pairs that are struck at once agree."""
         for c in ti.static(self.contacts):
             if ti.static(c.bounces):
-                for i in range(self.n):
+                for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
                     c.rebound(i)
-                for i in range(self.n):
+                self.team.wait()
+                for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
                     if self.state.w[i] > 0:
-                        self.state.d[i] += c._on_kick[i]
+                        self.state.d[i] = self.state.d[i] + c._on_kick[i]
+                self.team.wait()
 
     @ti.func
-    def remember(self, h, tick):
+    def remember(self, me, h, tick):
         """The end of a substep with constraints that break, or contacts that rub or bounce.
 
         A rigid constraint may find a whole kick in a start that follows another step, so loads are never taken for half a kick.
         """
         for f in ti.static(self.breakers):
-            for c in range(f.count):
+            for c in range(self.team.low(f.count, me), self.team.high(f.count, me)):
                 f.tear(c, self.reach(h, 0), tick)
         for c in ti.static(self.contacts):
             if ti.static(c.rubs):
-                for i in range(self.n):
+                for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
                     c.remember(i)
+            self.team.wait()
             if ti.static(c.bounces):
                 ti.loop_config(serialize=True)
-                for _ in range(1):
+                for _ in range(self.team.one(1, me)):
                     c._on_hit[None] = 0
+        self.team.wait()
 
     @ti.func
-    def calm(self, k):
+    def calming(self, since):
+        """1 in a substep after which sound is taken out; since: substeps since the last start."""
+        return ti.cast(since % EVERY == EVERY - 1, ti.i32)
+
+    @ti.func
+    def calm(self, me, k):
         """5 Now and then: pass k of taking the sound out of loaded contacts."""
         for c in ti.static(self.contacts):
-            for i in range(self.n):
+            for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
                 c._on_calm.want(i, k)
-            for i in range(self.n):
+            self.team.wait()
+            for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
                 c._on_calm.move(i)
+            self.team.wait()
 
     @ti.func
     def struck(self):
@@ -308,12 +399,12 @@ class Phases:
         return out
 
     @ti.func
-    def pass_(self, h, when, it, iterations, fresh, s, substeps):
+    def pass_(self, me, h, when, it, iterations, fresh, s, substeps):
         """Pass `it` of substep s."""
         first, last = ti.cast(it == 0, ti.i32), ti.cast(it == iterations - 1, ti.i32)
-        self.tell(h, when, first, fresh)
-        self.settle(first)
-        self.collect(h, when, first, last, fresh, ti.cast(s == substeps - 1, ti.i32))
+        self.tell(me, h, when, first, fresh)
+        self.settle(me, first)
+        self.collect(me, h, when, first, last, fresh, ti.cast(s == substeps - 1, ti.i32))
 
     @ti.func
     def reach(self, h, fresh):
@@ -357,7 +448,7 @@ class Phases:
         if self.state.w[i] > 0:
             if ti.static(self.uses_velocity):
                 v = (3 * d - self.earlier[i]) / (2 * h)
-            force = h * h * self.accelerate(i, self.state.place(i), v, t) + bond
+            force = h * h * self.accelerate(i, self.state.place(i), v, t, self.pull(t)) + bond
             if ti.static(self.decays):
                 v = (d + self.decay[None][3] * force) * self.decay[None][0] / (self.decay[None][1] * h)
             else:
@@ -377,7 +468,7 @@ class Phases:
         if ti.static(len(self.walls) > 0 or len(self.contacts) > 0):
             push = self.thrust[i]
             v = self.state.d[i] / h
-            limit = (h * h * self.accelerate(i, self.state.place(i), v, t) + bond).norm()
+            limit = (h * h * self.accelerate(i, self.state.place(i), v, t, self.pull(t)) + bond).norm()
             size = push.norm()
             if size > limit:
                 push *= limit / size

@@ -59,6 +59,7 @@ def init(arch: str = "cpu", threads: int | None = None, debug: bool = False, see
     if arch != "cpu" and not _available(arch):
         offer = ", ".join(map(repr, available()))
         raise RuntimeError(f'init: arch "{arch}" is not available on this machine. Available: {offer}.')
+    running = _threads()
     options: dict[str, Any] = {} if threads is None else {"cpu_max_num_threads": threads}
     with contextlib.redirect_stdout(io.StringIO()):  # ti.init prints its banner whatever the log level
         ti.init(
@@ -70,6 +71,27 @@ def init(arch: str = "cpu", threads: int | None = None, debug: bool = False, see
         ti.reset()
         raise RuntimeError(f'init: arch "{arch}" was asked for, but Taichi started "{found}". Use tv.init(arch="cpu").')
     _adopt(wanted)
+    _settle(sorted(_threads() - running)[-int(_config().cpu_max_num_threads) :])
+
+
+def _threads() -> set[int]:
+    """The threads of this process, where the system tells."""
+    with contextlib.suppress(OSError):
+        return {int(name) for name in os.listdir("/proc/self/task")}
+    return set()
+
+
+def _settle(workers: list[int]) -> None:
+    """Give each of Taichi's workers a core of its own, if it has them all.
+
+    They sleep between loops. Linux wakes those of a loop on one core, and moves one of them away only milliseconds later: a loop of
+    1.7 ms on one thread took 1.7 ms on two, and 0.9 ms with this; ten short loops took 0.45 and 0.16 ms.
+    """
+    with contextlib.suppress(AttributeError, OSError):
+        cores = sorted(os.sched_getaffinity(0))
+        if len(workers) >= len(cores) > 1:
+            for k, worker in enumerate(workers):
+                os.sched_setaffinity(worker, {cores[k % len(cores)]})
 
 
 def architecture() -> str:
@@ -86,6 +108,12 @@ def available() -> list[str]:
 def threads() -> int:
     """The number of CPU threads that Taichi may use."""
     return int(_config().cpu_max_num_threads)
+
+
+def cores() -> int:
+    """The number of CPU threads that can run at the same time; 1 where Taichi runs on something else."""
+    here = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(threads(), here) if architecture() == "cpu" else 1
 
 
 def fast_math() -> bool:
@@ -313,7 +341,7 @@ class Memory:
         return self._transfers[key]
 
 
-_NUMPY = {ti.f32: np.float32, ti.f64: np.float64, ti.i32: np.int32}
+_NUMPY = {ti.f32: np.float32, ti.f64: np.float64, ti.i32: np.int32, ti.u32: np.uint32}
 
 
 def _shape(entry: Entry) -> tuple[int, ...]:

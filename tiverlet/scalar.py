@@ -388,7 +388,7 @@ class Scalar(Breaking):
                 if first != 0:
                     self._on_lam[c] = step
                 else:
-                    self._on_lam[c] += step
+                    self._on_lam[c] = self._on_lam[c] + step
 
     @ti.func
     def kick(self, c, h):

@@ -1,14 +1,15 @@
 """The substep on the device, and two ways to run it that give the same bits.
 
-fused: a whole frame in one serial launch, for small scenes, where launching and waking threads costs more than the work.
-parallel: a few launches per substep, one static chunk of each loop per thread.
+fused: a whole frame in one launch, by one CPU thread or by a team of them.
+parallel: a few launches per substep, whose loops Taichi spreads over the threads of a GPU.
 """
 
 import numpy as np
 import taichi as ti
 
-from .calm import EVERY, PASSES
+from .calm import PASSES
 from .phases import Phases
+from .team import LEAST
 
 REBOUNDS = 8  # passes of restitution in a substep in which a pair bounces
 
@@ -22,60 +23,74 @@ class Substep(Phases):
         self, h64: ti.f64, t: ti.f64, tick: ti.i32, since: ti.i32, fresh: ti.i32, substeps: ti.i32, iterations: ti.i32,
         begin: ti.i32, it0: ti.i32, skip: ti.i32,
     ):  # fmt: skip
-        """All substeps of a frame, in one thread."""
-        ti.loop_config(serialize=True)
+        """All substeps of a frame, in one launch."""
+        ti.loop_config(serialize=self.team.size == 1)
+        for thread in range(self.team.spread):
+            if thread % LEAST == 0:
+                self.frame(thread // LEAST, h64, t, tick, since, fresh, substeps, iterations, begin, it0, skip)
+
+    @ti.func
+    def frame(self, me, h64, t, tick, since, fresh, substeps, iterations, begin, it0, skip):
+        """What thread `me` does of a frame. All threads of a team take the same branches, for what they depend on is written only
+        where the others wait."""
         for s in range(begin, substeps):
             h = ti.cast(h64, self.real)
             when = self.clock(s, substeps)
             starts = fresh if s == 0 else 0
             resumed = skip if s == begin else 0
-            if self.halted() == 0:
+            if self.team.works(me) and self.halted() == 0:
                 if resumed == 0:
-                    self.predict(h, ti.cast(t + s * h64, self.real), tick + s, starts, when)
+                    self.predict(
+                        me, h, ti.cast(t + s * h64, self.real), tick + s, starts, when, self.calming(since + s)
+                    )  # fmt: skip
                 for it in range(it0 if resumed != 0 else 0, iterations):
                     if ti.static(self.hashes):
                         if self.halted() == 0 and self.is_stale() != 0:
-                            self.grid.build()
+                            self.grid.build(me)
                             if self.grid.need[None] > self.grid.capacity:
                                 self.halt[None] = [1, s, it]
+                        self.team.wait()
                     if self.halted() == 0:
-                        self.pass_(h, when, it, iterations, starts, s, substeps)
+                        self.pass_(me, h, when, it, iterations, starts, s, substeps)
                 if ti.static(self.concludes):
                     if self.halted() == 0:
                         if self.struck() != 0:
                             for _ in range(REBOUNDS):
-                                self.rebound()
-                        self.remember(h, tick + s)
+                                self.rebound(me)
+                        self.remember(me, h, tick + s)
                 if ti.static(self.calms):
-                    if self.halted() == 0 and (since + s) % EVERY == EVERY - 1:
+                    if self.halted() == 0 and self.calming(since + s) != 0:
                         for k in range(PASSES):
-                            self.calm(k)
+                            self.calm(me, k)
 
     @ti.kernel
-    def predicted(self, h64: ti.f64, t: ti.f64, tick: ti.i32, fresh: ti.i32, s: ti.i32, substeps: ti.i32) -> ti.i32:
+    def predicted(
+        self, h64: ti.f64, t: ti.f64, tick: ti.i32, since: ti.i32, fresh: ti.i32, s: ti.i32, substeps: ti.i32
+    ) -> ti.i32:  # fmt: skip
         """Phases 1 and 2 of substep s; returns whether the neighbour list is stale."""
         h = ti.cast(h64, self.real)
-        self.predict(h, ti.cast(t + s * h64, self.real), tick + s, fresh, self.clock(s, substeps))
+        when, calming = self.clock(s, substeps), self.calming(since + s)
+        self.predict(0, h, ti.cast(t + s * h64, self.real), tick + s, fresh, when, calming)
         return self.is_stale()
 
     @ti.kernel
     def relaxed(self, h64: ti.f64, s: ti.i32, substeps: ti.i32, it: ti.i32, iterations: ti.i32, fresh: ti.i32) -> ti.i32:
         """One pass of phase 3; returns whether the neighbour list is stale, and 2 more if a pair bounces."""
-        self.pass_(ti.cast(h64, self.real), self.clock(s, substeps), it, iterations, fresh, s, substeps)
+        self.pass_(0, ti.cast(h64, self.real), self.clock(s, substeps), it, iterations, fresh, s, substeps)
         return self.is_stale() + 2 * self.struck()
 
     @ti.kernel
     def opened(self, h64: ti.f64, s: ti.i32, substeps: ti.i32, it: ti.i32, fresh: ti.i32):
         """The start of a pass in which a system iterates."""
-        self.tell(ti.cast(h64, self.real), self.clock(s, substeps), ti.cast(it == 0, ti.i32), fresh)
+        self.tell(0, ti.cast(h64, self.real), self.clock(s, substeps), ti.cast(it == 0, ti.i32), fresh)
         for system in ti.static(self.systems):
-            system.open()
+            system.open(0)
 
     @ti.kernel
     def iterated(self):
         """One step of such a system."""
         for system in ti.static(self.systems):
-            system.go()
+            system.go(0)
 
     @ti.kernel
     def collected(
@@ -84,34 +99,35 @@ class Substep(Phases):
         """The end of the pass; returns what relaxed() does."""
         h, when = ti.cast(h64, self.real), self.clock(s, substeps)
         first, last, final = ti.cast(it == 0, ti.i32), ti.cast(it == iterations - 1, ti.i32), ti.cast(s == substeps - 1, ti.i32)
-        self.take(first)
-        self.collect(h, when, first, last, fresh, final)
+        self.take(0, first)
+        self.collect(0, h, when, first, last, fresh, final)
         return self.is_stale() + 2 * self.struck()
 
     @ti.kernel
     def rebounded(self):
         """One pass of phase 4."""
-        self.rebound()
+        self.rebound(0)
 
     @ti.kernel
     def remembered(self, h64: ti.f64, tick: ti.i32):
         """The end of a substep with constraints that break, or contacts that rub or bounce."""
-        self.remember(ti.cast(h64, self.real), tick)
+        self.remember(0, ti.cast(h64, self.real), tick)
 
     @ti.kernel
     def calmed(self, k: ti.i32):
         """Pass k of phase 5."""
-        self.calm(k)
+        self.calm(0, k)
 
     @ti.kernel
     def listed(self) -> ti.i32:
         """Build the neighbour list; returns the largest number of entries that a block needs."""
-        if ti.static(self.parallel):
-            self.grid.build()
+        if ti.static(self.parallel and self.team.size == 1):
+            self.grid.build(0)
         else:
-            ti.loop_config(serialize=True)
-            for _ in range(1):
-                self.grid.build()
+            ti.loop_config(serialize=self.team.size == 1)
+            for thread in range(self.team.spread):
+                if thread % LEAST == 0:
+                    self.grid.build(thread // LEAST)
         return self.grid.need[None]
 
     @ti.kernel
@@ -130,7 +146,12 @@ class Substep(Phases):
         """
         h = ti.cast(h64, self.real)
         if ti.static(self.springs):
-            self.kick(h)
+            if ti.static(self.team.size == 1):
+                self.kick(0, h)
+            else:
+                for thread in range(self.team.spread):
+                    if thread % LEAST == 0:
+                        self.kick(thread // LEAST, h)
         for i in range(self.n):
             bond = 0 * self.state.d[i]
             if ti.static(self.springs):
@@ -147,15 +168,6 @@ class Substep(Phases):
                 v = self.velocity_after(i, h, time, self.felt(i, h, time))
             for k in ti.static(range(self.dim)):
                 out[i, k] = v[k]
-
-    @ti.kernel
-    def positions(self, out: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
-        """Positions, low words added in f64."""
-        for i in range(self.n):
-            for k in ti.static(range(self.dim)):
-                out[i, k] = self.state.x[i][k]
-                if ti.static(self.state.compensated):
-                    out[i, k] += self.state.low[i][k]
 
 
 def decay(rate: float, h: float) -> list[float]:

@@ -12,6 +12,7 @@ from .grid import FARTHEST
 from .particles import LARGEST
 from .scalar import TENSEST
 from .substep import Substep
+from .team import LEAST
 
 BLOCKS = 64  # partial sums: their number is fixed, so the total has the same bits on any number of threads
 TURNS = (0, 26, 41)  # degrees, for nothing, BENT and FAR
@@ -180,6 +181,16 @@ class Survey:
                     figures[1] = ti.max(figures[1], ti.cast(f.miss(c, h, self.sub.reach(h, fresh), when, fresh), ti.f64))
         return figures, low, high
 
+    @ti.func
+    def weigh(self, h, fresh):
+        """The sums behind residuals."""
+        if ti.static(self.sub.team.size == 1):
+            self.sub.weigh(0, h, self.sub.reach(h, fresh), 0, fresh, False)
+        elif ti.static(len(self.sub.ragged) > 0):
+            for thread in range(self.sub.team.spread):
+                if thread % LEAST == 0:
+                    self.sub.weigh(thread // LEAST, h, self.sub.reach(h, fresh), 0, fresh, False)
+
     @ti.kernel
     def measure(
         self,
@@ -191,7 +202,7 @@ class Survey:
     ):
         """All figures; fresh: the last substep was a start; begin: d holds velocities, no step was made yet."""
         h32 = ti.cast(h64, self.sub.real)
-        self.sub.weigh(h32, self.sub.reach(h32, fresh), 0, fresh, False)
+        self.weigh(h32, fresh)
         ti.loop_config(serialize=not self.sub.parallel)
         for thread in range(BLOCKS * self.spread):
             if thread % self.spread == 0:
@@ -210,6 +221,7 @@ class Survey:
                 self.parts[0] = total
                 self.low[0] = ti.min(self.low[0], self.low[b])
                 self.high[0] = ti.max(self.high[0], self.high[b])
+            self.sub.team.rest()
             flags = 0
             for c in ti.static(self.contacts):
                 flags += c._on_fast[None]
@@ -300,13 +312,13 @@ class Residuals:
     """The kernel behind the residual of one batch."""
 
     def __init__(self, survey: Survey, batch):
-        self.sub, self.batch = survey.sub, batch
+        self.survey, self.sub, self.batch = survey, survey.sub, batch
 
     @ti.kernel
     def measure(self, h64: ti.f64, fresh: ti.i32, out: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
         """Of every constraint."""
         h32 = ti.cast(h64, self.sub.real)
-        self.sub.weigh(h32, self.sub.reach(h32, fresh), 0, fresh, False)
+        self.survey.weigh(h32, fresh)
         for c in range(self.batch.count):
             h = ti.cast(h64, self.sub.real)
             out[c] = self.batch.miss(c, h, self.sub.reach(h, fresh), self.sub.clock(0, 1), fresh)

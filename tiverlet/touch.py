@@ -40,25 +40,34 @@ class Touch(Feature):
         return overlap, n
 
     @ti.func
-    def meet(self, i, j, far):
-        """As touch(), but a pair that came together in this substep has the direction that it had when it met.
+    def meet(self, i, j, far, shared):
+        """Overlap, overlap / shared, and direction, as in touch(), of a pair that touches.
 
-        |r0 + s d| = far, with r0 at the start and d the relative displacement; what is left of d along n is the overlap. This is
-        exact for free flight, where the direction at the end is off by the way that a pair slides past each other.
+        A pair that came together in this substep has the direction that it had when it met: |r0 + s d| = far, with r0 at the start
+        and d the relative displacement; what is left of d along n is the overlap. This is exact for free flight, where the
+        direction at the end is off by the way that a pair slides past each other.
         """
-        overlap, n = self.touch(i, j, far)
-        if overlap > 0:
-            d = self._on_state.d[i] - self._on_state.d[j]
-            r = self._on_state.apart(i, j) - d
-            c = r.dot(r) - far * far
-            if c > 0:
-                a, b = d.dot(d), r.dot(d)
-                root = ti.sqrt(ti.max(b * b - a * c, 0)) - b
-                if b < 0 and root > 0:
-                    s = ti.min(c / root, 1)
-                    n = (r + s * d) / far
-                    overlap = ti.max((s - 1) * d.dot(n), 0)
-        return overlap, n
+        r = self._on_state.apart(i, j)
+        rr = r.dot(r)
+        length = ti.sqrt(rr)
+        per = 1 / (shared * length)  # of all that takes time, divisions take most
+        overlap = far - length
+        part, n = overlap * (per * length), (per * shared) * r
+        if rr <= far * far * ti.static(2.0**-80):
+            overlap, n = far, self.part(i, j, r)
+            part = overlap / shared
+        d = self._on_state.d[i] - self._on_state.d[j]
+        r -= d
+        c = r.dot(r) - far * far
+        if c > 0:
+            a, b = d.dot(d), r.dot(d)
+            root = ti.sqrt(ti.max(b * b - a * c, 0)) - b
+            if b < 0 and root > 0:
+                s = ti.min(c / root, 1)
+                n = (r + s * d) / far
+                overlap = ti.max((s - 1) * d.dot(n), 0)
+                part = overlap / shared
+        return overlap, part, n
 
     @ti.func
     def part(self, i, j, r):

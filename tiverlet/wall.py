@@ -85,7 +85,7 @@ class Wall(Feature):
                     rise, after = self.bounce(gap, leaving, (self._on_state.before[i] - moved).dot(n), after)
             change = (after - leaving) * n
             if ti.static(self._on_state.leans):
-                self._on_state.lean[i] += change
+                self._on_state.lean[i] = self._on_state.lean[i] + change
             shift = (move + rise) * n
             stuck = False
             if ti.static(self._on_rubs):
@@ -97,7 +97,7 @@ class Wall(Feature):
                     stuck = rise == 0
                 change -= slip
                 shift -= slip
-            self._on_state.d[i] += change
+            self._on_state.d[i] = self._on_state.d[i] + change
             if ti.static(self._on_rubs):
                 if stuck:
                     self._on_state.restart(i)

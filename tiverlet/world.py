@@ -128,7 +128,7 @@ class World(Access):
             if self._sub.hurries:
                 self._sub.slots.kappa[None] = self._solver.condition(iterations)
             if len(self._particles):
-                (self._fused if self._path == "fused" else self._parallel)(substeps, iterations)
+                (self._fused if self._path == "fused" or self._sub.team.size > 1 else self._parallel)(substeps, iterations)
             self._tick = (self._tick + substeps) % 2**31
             self._since = (self._since + substeps) % 2**31
             self._pass(dt)
@@ -198,6 +198,7 @@ class World(Access):
     def _fused(self, substeps: int, iterations: int) -> None:
         """All substeps in one launch, resumed where the neighbour list had to grow."""
         begin = it0 = skip = 0
+        self._sub.team.muster()
         while True:
             fresh = int(self._fresh)
             clock = self._time, self._tick, self._since
@@ -214,7 +215,7 @@ class World(Access):
         for s in range(n):
             fresh = int(self._fresh and s == 0)
             struck = 0
-            stale = self._sub.predicted(h, self._time, self._tick, fresh, s, n)
+            stale = self._sub.predicted(h, self._time, self._tick, self._since, fresh, s, n)
             for it in range(iterations if relaxes else 0):
                 if stale:
                     self._list()

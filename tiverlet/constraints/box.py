@@ -40,6 +40,7 @@ class Box(Wall):
     """
 
     dim = 0
+    poses = True
     widest = 0.0
     lower = Knob(_corner("lower"), "Lower corner [m].")
     upper = Knob(_corner("upper"), "Upper corner [m].")
@@ -60,6 +61,7 @@ class Box(Wall):
         Wall.bind(self, scene)
         sides = np.concatenate([self.lower, self.upper])
         self._on_sides = scene.memory.field("Box.sides", len(sides), width=2, values=np.stack([sides, sides], 1), state=True)
+        self._on_now = scene.memory.field("Box.sides_now", len(sides), width=2)  # the plane, and how far it goes in the substep
         self.changed = False
 
     def upload(self) -> None:
@@ -84,19 +86,32 @@ class Box(Wall):
         return corners[np.array(edges)], 0.0
 
     @ti.func
-    def confine(self, i, radius, h, when, last):
-        """Two planes per axis, lower ones first."""
+    def pose(self, when):
+        """Where the planes are; what stands is where it stands, to the bit, and at infinity too."""
         for side in range(ti.static(2 * self.dim)):
             a, b = self._on_sides[side][0], self._on_sides[side][1]
-            wall, shift = b, ti.cast(0, self._on_real)
+            at, shift = b, 0 * b
             if a != b:
-                wall = a * (1 - when[1]) + b * when[1]
-                shift = (b - a) * (when[1] - when[0])
-            x, n, moved = self._on_state.place(i), 0 * self._on_state.x[i], 0 * self._on_state.x[i]
-            depth = ti.cast(0, self._on_real)
-            for k in ti.static(range(self.dim)):
-                if side == k:
-                    n[k], moved[k], depth = 1, shift, wall + radius - x[k]
-                elif side == k + self.dim:
-                    n[k], moved[k], depth = -1, shift, x[k] + radius - wall
-            self.press(i, depth, n, moved, h, last)
+                at, shift = a * (1 - when[1]) + b * when[1], (b - a) * (when[1] - when[0])
+            else:
+                shift = 0
+            self._on_now[side] = ti.Vector([at, shift])
+
+    @ti.func
+    def confine(self, i, radius, h, when, last):
+        """Two planes per axis, lower ones first."""
+        touches, inside, close = False, self._on_state.place(i), self._on_state.digits(i)
+        for k in ti.static(range(self.dim)):
+            touches |= self._on_now[k][0] + radius - inside[k] > -close
+            touches |= inside[k] + radius - self._on_now[k + self.dim][0] > -close
+        if touches:  # else there is nothing to press()
+            for side in range(ti.static(2 * self.dim)):
+                wall, shift = self._on_now[side][0], self._on_now[side][1]
+                x, n, moved, depth = self._on_state.place(i), ti.zero(inside), ti.zero(inside), ti.zero(wall)
+                for k in ti.static(range(self.dim)):
+                    if side == k:
+                        n[k], moved[k], depth = 1, shift, wall + radius - x[k]
+                    elif side == k + self.dim:
+                        n[k], moved[k], depth = -1, shift, x[k] + radius - wall
+                if depth > -self._on_state.digits(i):
+                    self.press(i, depth, n, moved, h, last)

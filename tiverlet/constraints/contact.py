@@ -8,9 +8,10 @@ import taichi as ti
 from .. import checks
 from ..calm import Calm
 from ..feature import Batch, Scene
-from ..grid import FARTHEST, Grid, Luggage
+from ..grid import FARTHEST, WORD, Grid, Luggage, lowest
 from ..material import Table
 from ..particles import Particles
+from ..team import Team
 from ..touch import Touch
 
 CARRY = 0.4  # of its last push that a pair keeps; below 1/2
@@ -101,7 +102,7 @@ class Contact(Touch):
                 f"from the origin, but f32 tells only {FARTHEST} apart. Shift the scene towards the origin."
             )
 
-    def join(self, scene: Scene, batches: list[Batch], parallel: bool) -> Grid:
+    def join(self, scene: Scene, batches: list[Batch], team: Team, parallel: bool) -> Grid:
         """Declare the fields, among them the grid's."""
         n, dim = scene.particles.count, scene.particles.dim
         pairs = [b.partners(b.start) for b in batches]
@@ -123,63 +124,100 @@ class Contact(Touch):
         self._on_slip = Luggage("slip", dim, lasting=True)
         self._on_aim = Luggage("aim", dim, lasting=False)
         luggage = [self._on_push, *([self._on_slip] if self.rubs else []), *([self._on_aim] if self.bounces else [])]
-        self._on_grid = Grid(scene, self._on_size, linked, self.table, luggage, parallel)
+        self._on_grid = Grid(scene, self._on_size, linked, self.table, luggage, team, parallel)
         self._on_calm = Calm(self)
         return self._on_grid
 
     @ti.func
-    def watch(self, i):
-        """Notice particles that outrun the list, or that cross more than their own size in one substep."""
-        self._on_grid.watch(i)
-        d = self._on_state.d[i]
-        limit = self._on_radius.stride(i)
-        if not (d.dot(d) <= limit * limit):
+    def hurries(self, i):
+        """1 if particle i crosses more than its own size in one substep."""
+        d, limit = self._on_state.d[i], self._on_radius.stride(i)
+        return ti.select(d.dot(d) <= limit * limit, 0, 1)
+
+    @ti.func
+    def heed(self, stale, fast):
+        """Write down what was noticed; threads that all write to the same place would wait for each other."""
+        if stale != 0:
+            if self._on_grid.stale[None] == 0:
+                self._on_grid.stale[None] = 1
+        if fast != 0:
             if self._on_fast[None] == 0:
                 self._on_fast[None] = 1
 
     @ti.func
-    def count(self, i, first):
-        """How often the mass of particle i is split. What touches nothing any more pushes nothing in the next substep."""
-        begin, end = self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]
-        zero = ti.cast(0, self.scene.real)
-        tensor, pairs, deepest = ti.Matrix.zero(self.scene.real, self._on_state.dim, self._on_state.dim), zero, zero + 1
-        for e in range(begin, end):
-            j = self._on_grid.near[e]
+    def touches(self, i, word):
+        """Bits for the entries of particle i that the word is for: which touch, as in touch(), to the last digit."""
+        out, begin = ti.u32(0), self._on_grid.first[i] + word * WORD
+        for k in range(ti.min(self._on_grid.number[i] - word * WORD, WORD)):
+            j = self._on_grid.near[begin + k]
             r, far = self._on_state.apart(i, j), self.far(i, j)
-            rr, ff = r.dot(r), far * far
-            one = ti.select(rr < ff, zero + 1, zero)  # as in touch(), to the last digit; no branch: it would be taken at random
-            scale = 1 / ff
-            share = rr * scale
-            pairs += one
-            if ti.static(not self._on_rubs):
-                tensor += (one * scale) * r.outer_product(r)
-                deepest = ti.min(deepest, share)
+            out |= ti.cast(r.dot(r) < far * far, ti.u32) << ti.cast(k, ti.u32)  # no branch: it would be taken at random
+        return out
+
+    @ti.func
+    def touching(self, i, word):
+        """The same bits, of the first word as count() left them."""
+        out = self._on_grid.touching[i]
+        if word > 0:
+            out = self.touches(i, word)
+        return out
+
+    @ti.func
+    def count(self, i, first):
+        """Which pairs of particle i touch, and how often its mass is split. What does not touch has no push to keep."""
+        bits = self.touches(i, 0)
+        pairs = ti.math.popcnt(bits)
+        self.forget(i, 0, self._on_grid.touching[i] & ~bits)
+        self._on_grid.touching[i] = bits
+        for word in range(1, self._on_grid.words(i)):
+            bits = self.touches(i, word)
+            pairs += ti.math.popcnt(bits)
+            self.forget(i, word, self._on_grid.whole(i, word) & ~bits)
+        split = ti.cast(pairs, self.scene.real)
         if ti.static(not self._on_rubs):
-            if pairs > 2 and deepest > 0.25:
-                pairs = ti.min(largest(tensor) / deepest, pairs)
-        if self._on_split[i] > 0 and pairs == 0:
-            if first != 0:
-                for e in range(begin, end):
-                    self._on_push.field[e] = 0
-            else:
-                pairs = 1  # it has pushes of an earlier pass
-        self._on_split[i] = pairs * self._on_state.w[i]
+            if pairs > 2:
+                tensor = ti.Matrix.zero(self.scene.real, self._on_state.dim, self._on_state.dim)
+                deepest = ti.cast(1, self.scene.real)
+                for word in range(self._on_grid.words(i)):
+                    bits = self.touching(i, word)
+                    while bits != 0:
+                        j = self._on_grid.near[self._on_grid.first[i] + word * WORD + lowest(bits)]
+                        bits &= bits - ti.u32(1)
+                        r, far = self._on_state.apart(i, j), self.far(i, j)
+                        scale = 1 / (far * far)
+                        tensor += scale * r.outer_product(r)
+                        deepest = ti.min(deepest, r.dot(r) * scale)
+                if deepest > 0.25:
+                    split = ti.min(largest(tensor) / deepest, split)
+        self._on_split[i] = split * self._on_state.w[i]
+
+    @ti.func
+    def forget(self, i, word, gone):
+        """Some pairs do not touch any more."""
+
+        while gone != 0:
+            self._on_push.field[self._on_grid.first[i] + word * WORD + lowest(gone)] = 0
+            gone &= gone - ti.u32(1)
 
     @ti.func
     def relax(self, i, first, fresh):
         """What the pairs of particle i want of it."""
         total, lifts = 0 * self._on_state.x[i], 0 * self._on_state.x[i]
         w = self._on_state.w[i]
+        if ti.static(self._on_bounces):
+            if first != 0:
+                for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
+                    self._on_aim.field[e] = ti.zero(total)
         if self._on_split[i] > 0:
-            for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
-                j = self._on_grid.near[e]
-                overlap, n = self.meet(i, j, self.far(i, j))
-                kick, push = 0 * overlap, 0 * overlap
-                if ti.static(self._on_bounces):
-                    if first != 0:
-                        self._on_aim.field[e] = 0 * n
-                if overlap > 0:
-                    shared = self._on_split[i] + self._on_split[j]
+            for word in range(self._on_grid.words(i)):
+                bits = self.touching(i, word)
+                while bits != 0:
+                    e = self._on_grid.first[i] + word * WORD + lowest(bits)
+                    bits &= bits - ti.u32(1)
+                    j = self._on_grid.near[e]
+                    shared, last = self._on_split[i] + self._on_split[j], self._on_push.field[e]
+                    overlap, part, n = self.meet(i, j, self.far(i, j), shared)
+                    kick, push = ti.zero(part), part
                     if ti.static(self._on_bounces):
                         if first != 0:
                             aim, kick, lift = self.bounce(i, j, n, overlap)
@@ -188,17 +226,19 @@ class Contact(Touch):
                                 self._on_aim.field[e] = aim * n
                                 if self._on_hit[None] == 0:
                                     self._on_hit[None] = 1
-                    part, last = overlap / shared, self._on_push.field[e]
                     if first == 0:
-                        push = last
+                        push += last
                     elif fresh == 0:
-                        part = ti.min(part + ti.static(CARRY) * last, overlap / (w + self._on_state.w[j]))
-                    push += part
+                        part += ti.static(CARRY) * last
+                        both = w + self._on_state.w[j]
+                        if part * both > overlap:
+                            part = overlap / both
+                        push = part
                     want = part * n
                     if ti.static(self._on_rubs):
                         want -= self.rub(i, j, n, part * shared + kick, self._on_slip.field[e]) / shared
                     total += w * want
-                self._on_push.field[e] = push
+                    self._on_push.field[e] = push
         self._on_move[i] = total
         if ti.static(self._on_bounces):
             if first != 0:
@@ -273,5 +313,6 @@ class Contact(Touch):
 
 @ti.func
 def largest(tensor):
-    """At least the largest eigenvalue of a symmetric matrix S >= 0: tr(S^4)^(1/4)."""
+    """At least the largest eigenvalue of a symmetric matrix S >= 0: tr(S^4)^(1/4). The largest itself is 3 for a disc among six,
+    and makes piles that overlap by 8 % less, but sound in them does not fade below 1e-6 m g r."""
     return ti.sqrt((tensor @ tensor).norm())

@@ -14,6 +14,7 @@ from ..feature import Batch, Scene
 from ..grid import Grid, Luggage
 from ..material import Table
 from ..particles import Particles, Radii
+from ..team import Team
 from .contact import Contact
 from .rim import VERTEX, Rim, area_of, depth_of
 
@@ -120,7 +121,7 @@ class Polygons(Rim):
                         f"({edge:.3g} m), so there is no telling where it came from. Move it out."
                     )
 
-    def join(self, scene: Scene, batches: list[Batch], parallel: bool) -> Grid:
+    def join(self, scene: Scene, batches: list[Batch], team: Team, parallel: bool) -> Grid:
         """Declare the fields, among them the grid's, which lists particles by their reach."""
         n, p, add = scene.particles.count, scene.particles, scene.memory.field
         self.scene, self._on_state, self._on_radius, self._on_w = scene, scene.state, scene.radius, scene.state.w
@@ -145,7 +146,7 @@ class Polygons(Rim):
         linked = np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=np.int32)
         # For each entry the contact of which its particle is the vertex: overlap, place on the edge (-1: discs), normal; where
         # in the list of the other particle those are in which it is the start, and the end, of the edge (-1: nowhere).
-        self._on_met, self._on_back = Luggage("met", 4, lasting=False), Luggage("back", 2, lasting=False)
+        self._on_met, self._on_back = Luggage("met", 4, False, kept=False), Luggage("back", 2, False, kept=False)
         self._on_slip, self._on_aim = Luggage("slip", 2, lasting=True), Luggage("aim", 2, lasting=False)
         luggage = [
             self._on_met,
@@ -154,7 +155,7 @@ class Polygons(Rim):
             *([self._on_aim] if self.bounces else []),
         ]
         apart: Any = _Apart(self)
-        self._on_grid = Grid(reach, self._on_size, linked, apart, luggage, parallel)
+        self._on_grid = Grid(reach, self._on_size, linked, apart, luggage, team, parallel)
         return self._on_grid
 
     def ease(self) -> None:
@@ -178,19 +179,20 @@ class Polygons(Rim):
         self._on_less[i] = ti.max(self._on_less[i] - self.push_out * h / 2, 0)
 
     @ti.func
-    def watch(self, i):
-        """Notice particles that outrun the list or a quarter of an edge in one substep, and edges that are too long for it."""
-        self._on_grid.watch(i)
+    def hurries(self, i):
+        """1 if particle i crosses a quarter of an edge in one substep, or begins an edge that is too long for the list."""
+        out = 0
         d, limit = self._on_state.d[i], ti.cast(self._on_reach, self.scene.real)
         after = self.after(i)
         if after >= 0:
             u = self._on_state.apart(after, i)
             if u.dot(u) > self._on_limit[i] ** 2:
-                self._on_fast[None] = 1
+                out = 1
         else:
             limit = ti.min(limit, self._on_radius.stride(i) if ti.static(self._on_radius.least > 0) else limit)
         if not (d.dot(d) <= limit * limit):
-            self._on_fast[None] = 1
+            out = 1
+        return out
 
     @ti.func
     def split(self, count: ti.template(), v, a, b, t):  # type: ignore[valid-type]

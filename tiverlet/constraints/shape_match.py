@@ -288,7 +288,7 @@ class ShapeMatch(Ragged, Breaking):
             if ti.static(not self._on_soft):
                 move = ti.cast(-relaxation * C / n, self._on_real)
                 if first >= 0:
-                    self._on_pull[e] += move
+                    self._on_pull[e] = self._on_pull[e] + move
                 self.give(e, move)
             elif first < 0:
                 self.give(e, ti.cast(self.spring(e, c, C, h), self._on_real))
@@ -298,7 +298,7 @@ class ShapeMatch(Ragged, Breaking):
                     self.look_back(e, c, h, now, last)
                 C = self.wrong(e, c, C, rigid, soft, give)
                 move = ti.cast(-relaxation * C / ((rigid + soft) * n + give), self._on_real)
-                self._on_pull[e] += move
+                self._on_pull[e] = self._on_pull[e] + move
                 self.give(e, move)
 
     @ti.func
@@ -318,7 +318,7 @@ class ShapeMatch(Ragged, Breaking):
             size = body.norm()
             if size > self._on_yield[c]:
                 flow = (1 - ti.exp(-self._on_creep[c] * h)) * (1 - self._on_yield[c] / size) * body
-                self._on_shape[e] += flow
+                self._on_shape[e] = self._on_shape[e] + flow
                 body -= flow
         self._on_last[e] = body
 

@@ -73,7 +73,7 @@ class Snap(Tether):
         x, start = self._on_state.place(i), self._on_state.place(i) - self._on_state.d[i]
         if first != 0:
             node = self.nearest(start)
-            self._on_last[c] += self._on_node[c] - node
+            self._on_last[c] = self._on_last[c] + (self._on_node[c] - node)
             for k in ti.static(range(self._on_state.dim)):
                 if self._on_grid[1][k] == 0:
                     self._on_last[c][k] = 0

@@ -21,7 +21,7 @@ class Gravity(Acceleration):
     """
 
     conservative = True
-    uniform = True
+    uniform = common = True
     dim = 0
     g = Knob(_vector, "Acceleration [m/s^2]: a number along -y, or a vector.")
 

@@ -106,22 +106,24 @@ class Krylov(System):
         return out
 
     @ti.func
-    def open(self):
+    def open(self, me):
         """r . z of the first residual."""
-        for k in range(BLOCKS * self.spread):
+        for k in range(self.team.low(BLOCKS * self.spread, me), self.team.high(BLOCKS * self.spread, me)):
             if k % self.spread == 0:
                 b, total = k // self.spread, ti.cast(0, ti.f64)
                 for r in range(self.begin_of(b), ti.min(self.begin_of(b + 1), self.rows)):
                     total += ti.cast(self.rest[r], ti.f64) * self.ahead[r]
                 self.part[b] = total
+        self.team.wait()
         ti.loop_config(serialize=True)
-        for _ in range(1):
+        for _ in range(self.team.one(1, me)):
             self.sums[None][0] = self.summed()
+        self.team.wait()
 
     @ti.func
-    def go(self):
+    def go(self, me):
         """One step of conjugate gradients. One that needs a tension too large for the substep is taken back, and is the last."""
-        for i in range(self.n):
+        for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
             if self.w[i] > 0:
                 total = 0 * self.pull[i]
                 for s in range(self.begin[i], self.begin[i + 1]):
@@ -131,7 +133,8 @@ class Krylov(System):
                 if ti.static(self.shares):
                     total *= self.share[i]
                 self.pull[i] = total
-        for k in range(BLOCKS * self.spread):
+        self.team.wait()
+        for k in range(self.team.low(BLOCKS * self.spread, me), self.team.high(BLOCKS * self.spread, me)):
             if k % self.spread == 0:
                 b, total = k // self.spread, ti.cast(0, ti.f64)
                 for r in range(self.begin_of(b), ti.min(self.begin_of(b + 1), self.rows)):
@@ -142,23 +145,26 @@ class Krylov(System):
                     self.applied[r] = value
                     total += ti.cast(value, ti.f64) * self.ahead[r]
                 self.part[b] = total
+        self.team.wait()
         ti.loop_config(serialize=True)
-        for _ in range(1):
+        for _ in range(self.team.one(1, me)):
             curve = self.summed()
             self.sums[None][1] = ti.select(curve > 0, self.sums[None][0] / curve, ti.cast(0, ti.f64))
-        for k in range(BLOCKS * self.spread):
+        self.team.wait()
+        for k in range(self.team.low(BLOCKS * self.spread, me), self.team.high(BLOCKS * self.spread, me)):
             if k % self.spread == 0:
                 b, total, worst = k // self.spread, ti.cast(0, ti.f64), ti.cast(0, ti.f64)
                 far = self.sums[None][1]
                 for r in range(self.begin_of(b), ti.min(self.begin_of(b + 1), self.rows)):
-                    self.step[r] += far * self.ahead[r]
+                    self.step[r] = self.step[r] + far * self.ahead[r]
                     rest = self.rest[r] - ti.cast(far, self.real) * self.applied[r]
                     self.rest[r] = rest
                     total += ti.cast(self.scaled[r] * rest, ti.f64) * rest
                     worst = ti.max(worst, self.lever[r] * ti.abs(self.lam[r] + self.step[r]))
                 self.part[b], self.worst[b] = total, worst
+        self.team.wait()
         ti.loop_config(serialize=True)
-        for _ in range(1):
+        for _ in range(self.team.one(1, me)):
             now, before, worst = self.summed(), self.sums[None][0], self.worst[0]
             for b in range(1, BLOCKS):
                 worst = ti.max(worst, self.worst[b])
@@ -167,15 +173,10 @@ class Krylov(System):
             if worst > TENSEST:
                 now = 0
             self.sums[None] = ti.Vector([now, ti.select(before > 0, now / before, 0 * now), back], ti.f64)
-        for r in range(self.rows):
+        self.team.wait()
+        for r in range(self.team.low(self.rows, me), self.team.high(self.rows, me)):
             if self.sums[None][2] != 0:
-                self.step[r] -= self.sums[None][2] * self.ahead[r]
+                self.step[r] = self.step[r] - self.sums[None][2] * self.ahead[r]
                 self.rest[r] = 0
             self.ahead[r] = self.scaled[r] * self.rest[r] + ti.cast(self.sums[None][1], self.real) * self.ahead[r]
-
-    @ti.func
-    def solve(self, b):
-        """All steps, one after the other."""
-        self.open()
-        for _ in range(self.steps):
-            self.go()
+        self.team.wait()

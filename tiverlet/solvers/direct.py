@@ -122,8 +122,8 @@ class Elimination(System):
             if self.acts(r):
                 for q in range(self.product_begin[r], self.product_begin[r + 1]):
                     at = self.product[q]
-                    self.value[at[0]] += self.scale[r] * self.coupling(at)
-                self.value[r] += self.alpha[r] + soft
+                    self.value[at[0]] = self.value[at[0]] + self.scale[r] * self.coupling(at)
+                self.value[r] = self.value[r] + (self.alpha[r] + soft)
                 self.step[r] = -self.violation[r]
             else:
                 self.value[r] = 1
@@ -152,9 +152,9 @@ class Elimination(System):
                 u = self.update_begin[r]
                 for e in range(first, last):
                     part = self.value[self.rows + self.entries + e] / self.value[r]
-                    self.step[self.column[e]] -= part * self.step[r]
+                    self.step[self.column[e]] = self.step[self.column[e]] - part * self.step[r]
                     for k in range(first, last):
-                        self.value[self.update[u]] -= part * self.value[self.rows + k]
+                        self.value[self.update[u]] = self.value[self.update[u]] - part * self.value[self.rows + k]
                         u += 1
         for k in range(end - begin):
             r = end - 1 - k
@@ -172,7 +172,7 @@ class Elimination(System):
         for r in range(begin, end):
             for q in range(self.product_begin[r], self.product_begin[r + 1]):
                 at = self.product[q]
-                self.left[r] += self.scale[r] * self.coupling(at) * self.step[self.row_of[at[2]]]
+                self.left[r] = self.left[r] + self.scale[r] * self.coupling(at) * self.step[self.row_of[at[2]]]
             if self.side[r] != 0 and self.scale[r] != 0:
                 new = self.lam[r] + self.step[r]
                 left = self.violation[r] + self.left[r] + self.alpha[r] * self.step[r]

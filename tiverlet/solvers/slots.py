@@ -121,4 +121,4 @@ class Slots:
                 if first != 0:
                     self.pull[i] = total
                 else:
-                    self.pull[i] += total
+                    self.pull[i] = self.pull[i] + total

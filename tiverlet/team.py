@@ -1,0 +1,102 @@
+"""CPU threads that go through a whole frame together, in one launch.
+
+Taichi's threads sleep between two loops, and waking them takes some 50 us for each: as long as 10 000 particles take for a whole
+phase. So a frame is one loop over threads. Each does its share of every loop inside, and then waits for the others, which takes
+0.1 us as long as each has a core. Where other programs want the cores too, a thread waits for one that does not run, for
+milliseconds: after a few such waits the first thread goes on alone, and the others join it some frames later.
+"""
+
+import taichi as ti
+
+from .runtime import Memory
+
+LEAST = 512  # iterations of a loop that Taichi gives to a CPU thread, at least
+PATIENCE = 20_000  # looks at the counter, of 50 ns or less, and one more for each particle: then a wait was long
+LONG = 4  # long waits in a frame after which one thread goes on alone
+ALONE = 32  # frames until the others come back
+
+
+class Team:
+    """size: the number of threads; 1 where there is nobody to wait for, because Taichi itself spreads loops over threads or
+    because there is one thread only. A share of n is what thread `me` does of it; what the shares are shows in no result."""
+
+    def __init__(self, memory: Memory, size: int, particles: int):
+        self.size, self.patience = size, PATIENCE + particles
+        self.spread = LEAST * size if size > 1 else 1
+        self._alone = 0
+        if size > 1:
+            self.arrived = memory.field("team.arrived", None, kind=ti.i32)
+            self.hands = memory.field("team.hands", None, kind=ti.i32, values=size)  # how many of them are at work
+            self.late = memory.field("team.long_waits", None, kind=ti.i32)
+
+    def muster(self) -> None:
+        """Before a frame: those who left some frames ago come back."""
+        if self.size > 1:
+            if self._alone == 0 and self.hands[None] == 1:
+                self._alone = ALONE
+            elif self._alone > 0:
+                self._alone -= 1
+                if self._alone == 0:
+                    self.hands[None] = self.size
+
+    @ti.func
+    def works(self, me):
+        """Whether thread `me` takes part in the coming substep; all must ask."""
+        out = True
+        if ti.static(self.size > 1):
+            hands = self.hands[None]
+            out = me < hands
+            if out:
+                self.meet(hands)
+                if me == 0 and self.late[None] >= LONG:
+                    self.hands[None] = 1
+                self.meet(hands)
+                out = me < self.hands[None]
+        return out
+
+    @ti.func
+    def low(self, n: ti.template(), me):  # type: ignore[valid-type]
+        """Where the share begins."""
+        if ti.static(self.size > 1):
+            hands = self.hands[None]
+            return ti.min(me * ((n + hands - 1) // hands), n)
+        return 0
+
+    @ti.func
+    def high(self, n: ti.template(), me):  # type: ignore[valid-type]
+        """Where it ends."""
+        if ti.static(self.size > 1):
+            hands = self.hands[None]
+            return ti.min((me + 1) * ((n + hands - 1) // hands), n)
+        return n
+
+    @ti.func
+    def one(self, n: ti.template(), me):  # type: ignore[valid-type]
+        """All of it for one of them, nothing for the others."""
+        if ti.static(self.size > 1):
+            return ti.select(me == 0, n, 0)
+        return n
+
+    @ti.func
+    def wait(self):
+        """Go on once all have come here, with what they have written."""
+        if ti.static(self.size > 1):
+            self.meet(self.hands[None])
+
+    @ti.func
+    def meet(self, hands):
+        """Wait for so many."""
+        if hands > 1:
+            goal = (ti.atomic_add(self.arrived[None], 1) // hands + 1) * hands
+            looks = 0
+            while ti.atomic_add(self.arrived[None], 0) < goal:
+                looks += 1
+            if looks > self.patience:
+                ti.atomic_add(self.late[None], 1)
+
+    @ti.func
+    def rest(self):
+        """Count from 0 again, while nobody waits."""
+        if ti.static(self.size > 1):
+            self.arrived[None] = 0
+            self.late[None] = 0
