@@ -74,6 +74,8 @@ def test_bouncing_ball(world, e, dim):
     peaks = y[1:-1][(y[1:-1] >= y[:-2]) & (y[1:-1] > y[2:])]
     np.testing.assert_allclose(peaks[:5], want["heights"], rtol=1e-2)
     assert t_rest == pytest.approx(want["t_rest"], rel=0.05) and np.abs(w.velocity).max() < 2 * 9.81 / 600
+    ends = [rerun(w, 0.7, 1 / 600, iterations=k).position[0, 1] for k in (1, 2, 3)]  # more passes change nothing
+    np.testing.assert_allclose(ends, ends[0], rtol=1e-12)
 
 
 def test_newtons_cradle(world):
@@ -92,6 +94,50 @@ def test_newtons_cradle(world):
     for (_, e), got in zip(rows, w.velocity.reshape(3, n, 2), strict=True):
         np.testing.assert_allclose(got[:, 0], want["e0p9_v_final" if e else "v_final"], atol=1e-9)
         assert got[:, 0].sum() == pytest.approx(1.0, rel=1e-12)
+
+
+def by_events(x, v, mass, seconds):
+    """Where a few elastic balls of diameter 1 go, from blow to blow: |r + s u| = 1, s = c / (sqrt(b^2 - a c) - b)."""
+    x, v = x.copy(), v.copy()
+    while seconds > 0:
+        following, pair = seconds, None
+        for i, j in ((0, 1), (0, 2), (1, 2)):
+            r, u = x[i] - x[j], v[i] - v[j]
+            a, b, c = u @ u, r @ u, r @ r - 1
+            if b < 0 and b * b > a * c and c / (np.sqrt(b * b - a * c) - b) < following:
+                following, pair = c / (np.sqrt(b * b - a * c) - b), (i, j)
+        x, seconds = x + following * v, seconds - following
+        if pair:
+            i, j = pair
+            blow = 2 / (1 / mass[i] + 1 / mass[j]) * (v[i] - v[j]) @ (x[i] - x[j]) * (x[i] - x[j])
+            v[i], v[j] = v[i] - blow / mass[i], v[j] + blow / mass[j]
+    return x, v
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_struck_by_two_in_one_substep(world, dim):
+    # Two come at a third, which is thrown from the one to the other, up to four blows in one substep of 1/240 s. Each is between
+    # two, at its own time and place, so this is exact.
+    rng = np.random.default_rng(5)
+    sides = rng.normal(size=(100, 2, dim))
+    sides[:, 1] -= 1.2 * sides[:, 0]
+    sides /= np.linalg.norm(sides, axis=2, keepdims=True)
+    x, v, mass = np.zeros((100, 3, dim)), rng.normal(size=(100, 3, dim)), rng.uniform(0.5, 2, size=(100, 3))
+    x[:, 0, 1] = 4.0 * np.arange(100)
+    x[:, 1:] = x[:, :1] + sides * rng.uniform(1.0, 1.04, size=(100, 2, 1))
+    v[:, 1:] -= sides * rng.uniform(10, 20, size=(100, 2, 1))
+    # Only where both would be inside the third at the end: a blow that is due to another one is seen in the next substep.
+    there = x + v / 240
+    struck = (np.linalg.norm(there[:, 1:] - there[:, :1], axis=2) < 1).all(axis=1)
+    keep = struck & (np.linalg.norm(x[:, 1] - x[:, 2], axis=1) > 1.5)
+    x, v, mass = x[keep], v[keep], mass[keep]
+    assert len(x) > 50
+    start = tv.Particles(x.reshape(-1, dim), velocity=v.reshape(-1, dim), mass=mass.ravel(), radius=0.5)
+    w = world(start, [tv.Contact(restitution=1.0)], precision="f64", substeps=1)
+    w.step(1 / 240)
+    ends = [by_events(*three, 1 / 240) for three in zip(x, v, mass, strict=True)]
+    np.testing.assert_allclose(w.position, np.concatenate([x for x, _ in ends]), atol=1e-12)
+    np.testing.assert_allclose(w.velocity, np.concatenate([v for _, v in ends]), atol=1e-10)
 
 
 @pytest.mark.parametrize("dim", [2, 3])

@@ -36,8 +36,7 @@ class Calm:
         out = self.contact._on_push.field[e] > 0
         if ti.static(self.contact._on_bounces):
             if self.contact._on_struck[i] > 0:
-                aim = self.contact._on_aim.field[e]
-                out = out and aim.dot(aim) == 0
+                out = out and self.contact._on_blow.field[e] == 0
         return out
 
     @ti.func

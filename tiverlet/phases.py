@@ -61,6 +61,7 @@ class Phases:
         self.grid, self.hashes = grid, bool(grid)
         self.breakers: list[Any] = [b for b in self.batches if b.breaks]
         self.concludes = any(c.rubs or c.bounces for c in self.contacts) or bool(self.breakers)
+        self.bounces = any(c.bounces for c in self.contacts)
         self.calms = any(c.calms for c in self.contacts)
         self.walls: list[Wall] = walls
         self.posed = [w for w in walls if w.poses]
@@ -188,7 +189,7 @@ class Phases:
             c.heed(stale, fast)
 
     @ti.func
-    def confine(self, i, h, when, last):
+    def confine(self, i, h, when):
         """The walls, which have the last word; several take turns until they agree, or for SWEEPS rounds in a sharp corner."""
         if self.state.w[i] > 0:
             moving = True
@@ -196,7 +197,7 @@ class Phases:
                 if moving:
                     before = self.state.d[i]
                     for f in ti.static(self.walls):
-                        f.confine(i, self.radius.of(i), h, when, last)
+                        f.confine(i, self.radius.of(i), h, when)
                     moving = (self.state.d[i] != before).any()
 
     # The phases: loops over the bodies. `me` is the thread that goes through them; see Team. Where it has no team, loops are serial
@@ -287,8 +288,8 @@ class Phases:
             self.team.wait()
 
     @ti.func
-    def collect(self, me, h, when, first, last, fresh, final):
-        """3c Particles gather their moves; contacts; walls."""
+    def meet(self, me, first, fresh, final):
+        """3c Contacts: which there are, and what they want."""
         for c in ti.static(self.contacts):
             if ti.static(len(self.batches) > 0):
                 for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
@@ -304,14 +305,35 @@ class Phases:
             for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
                 c.relax(i, first, fresh)
             self.team.wait()
+
+    @ti.func
+    def rebound(self, me):
+        """3d One round of restitution, in the first pass; hit tells whether another one is needed."""
+        for c in ti.static(self.contacts):
+            if ti.static(c.bounces):
+                self.team.wait()
+                ti.loop_config(serialize=True)
+                for _ in range(self.team.one(1, me)):
+                    c._on_hit[None] = 0
+                self.team.wait()
+                for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
+                    c.rebound(i)
+                self.team.wait()
+                for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
+                    c.part_ways(i)
+                self.team.wait()
+
+    @ti.func
+    def collect(self, me, h, when, first, final):
+        """3e Particles gather their moves; walls."""
         if ti.static(len(self.batches) > 0 or len(self.contacts) > 0 or len(self.walls) > 0):
             for t in range(self.team.low(self.tiles * self.gap, me), self.team.high(self.tiles * self.gap, me)):
                 if t % self.gap == 0:
-                    self.move(t // self.gap, h, when, first, last, final)
+                    self.move(t // self.gap, h, when, first, final)
             self.team.wait()
 
     @ti.func
-    def move(self, tile, h, when, first, last, final):
+    def move(self, tile, h, when, first, final):
         """What a tile of particles gathers."""
         begin, end = tile * self.tile, ti.min((tile + 1) * self.tile, self.n)
         if ti.static(len(self.batches) > 0 and len(self.contacts) == 0):
@@ -326,10 +348,10 @@ class Phases:
                         self.thrust[i] = self.thrust[i] - self.state.d[i]
         for c in ti.static(self.contacts):
             for i in range(begin, end):
-                c.gather(i, last)
+                c.gather(i, first)
         if ti.static(len(self.walls) > 0):
             for i in range(begin, end):
-                self.confine(i, h, when, last)
+                self.confine(i, h, when)
         for c in ti.static(self.contacts):
             stale = 0
             for i in range(begin, end):
@@ -339,19 +361,6 @@ class Phases:
             if final != 0:
                 for i in range(begin, end):
                     self.thrust[i] = self.thrust[i] + self.state.d[i]
-
-    @ti.func
-    def rebound(self, me):
-        """4 One pass of restitution, over displacements alone. Several let pairs that are struck at once agree."""
-        for c in ti.static(self.contacts):
-            if ti.static(c.bounces):
-                for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
-                    c.rebound(i)
-                self.team.wait()
-                for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
-                    if self.state.w[i] > 0:
-                        self.state.d[i] = self.state.d[i] + c._on_kick[i]
-                self.team.wait()
 
     @ti.func
     def remember(self, me, h, tick):
@@ -397,14 +406,6 @@ class Phases:
             if ti.static(c.bounces):
                 out = c._on_hit[None]
         return out
-
-    @ti.func
-    def pass_(self, me, h, when, it, iterations, fresh, s, substeps):
-        """Pass `it` of substep s."""
-        first, last = ti.cast(it == 0, ti.i32), ti.cast(it == iterations - 1, ti.i32)
-        self.tell(me, h, when, first, fresh)
-        self.settle(me, first)
-        self.collect(me, h, when, first, last, fresh, ti.cast(s == substeps - 1, ti.i32))
 
     @ti.func
     def reach(self, h, fresh):

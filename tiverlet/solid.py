@@ -141,7 +141,7 @@ class Solid(Wall):
         return ti.cast(2, self._on_real), 0 * far, 0 * e
 
     @ti.func
-    def confine(self, i, radius, h, when, last):
+    def confine(self, i, radius, h, when):
         """Touch by touch along the way.
 
         The wall moves by what its point under the start of the particle moves, so what sticks rides along and does not creep.
@@ -163,7 +163,7 @@ class Solid(Wall):
                 if s > 1:
                     going = False
                 elif k < ROUNDS:
-                    shift = self.press(i, depth, self.outward(1, n), moved, h, last)
+                    shift = self.press(i, depth, self.outward(1, n), moved, h)
                     a += s * e
                     e += self.inward(1, shift) - s * e
                 else:

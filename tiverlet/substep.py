@@ -11,7 +11,7 @@ from .calm import PASSES
 from .phases import Phases
 from .team import LEAST
 
-REBOUNDS = 8  # passes of restitution in a substep in which a pair bounces
+REBOUNDS = 8  # rounds of restitution in a substep, at most
 
 
 @ti.data_oriented
@@ -51,12 +51,17 @@ class Substep(Phases):
                                 self.halt[None] = [1, s, it]
                         self.team.wait()
                     if self.halted() == 0:
-                        self.pass_(me, h, when, it, iterations, starts, s, substeps)
+                        first, final = ti.cast(it == 0, ti.i32), ti.cast(s == substeps - 1, ti.i32)
+                        self.tell(me, h, when, first, starts)
+                        self.settle(me, first)
+                        self.meet(me, first, starts, final)
+                        if ti.static(self.bounces):
+                            for _ in range(REBOUNDS):
+                                if it == 0 and self.struck() != 0:
+                                    self.rebound(me)
+                        self.collect(me, h, when, first, final)
                 if ti.static(self.concludes):
                     if self.halted() == 0:
-                        if self.struck() != 0:
-                            for _ in range(REBOUNDS):
-                                self.rebound(me)
                         self.remember(me, h, tick + s)
                 if ti.static(self.calms):
                     if self.halted() == 0 and self.calming(since + s) != 0:
@@ -74,9 +79,15 @@ class Substep(Phases):
         return self.is_stale()
 
     @ti.kernel
-    def relaxed(self, h64: ti.f64, s: ti.i32, substeps: ti.i32, it: ti.i32, iterations: ti.i32, fresh: ti.i32) -> ti.i32:
-        """One pass of phase 3; returns whether the neighbour list is stale, and 2 more if a pair bounces."""
-        self.pass_(0, ti.cast(h64, self.real), self.clock(s, substeps), it, iterations, fresh, s, substeps)
+    def relaxed(self, h64: ti.f64, s: ti.i32, substeps: ti.i32, it: ti.i32, fresh: ti.i32) -> ti.i32:
+        """One pass of phase 3, or what comes before bounces; returns whether the list is stale, and 2 more if a pair bounces."""
+        h, when = ti.cast(h64, self.real), self.clock(s, substeps)
+        first, final = ti.cast(it == 0, ti.i32), ti.cast(s == substeps - 1, ti.i32)
+        self.tell(0, h, when, first, fresh)
+        self.settle(0, first)
+        self.meet(0, first, fresh, final)
+        if ti.static(not self.bounces):
+            self.collect(0, h, when, first, final)
         return self.is_stale() + 2 * self.struck()
 
     @ti.kernel
@@ -93,20 +104,28 @@ class Substep(Phases):
             system.go(0)
 
     @ti.kernel
-    def collected(
-        self, h64: ti.f64, s: ti.i32, substeps: ti.i32, it: ti.i32, iterations: ti.i32, fresh: ti.i32
-    ) -> ti.i32:  # fmt: skip
-        """The end of the pass; returns what relaxed() does."""
+    def collected(self, h64: ti.f64, s: ti.i32, substeps: ti.i32, it: ti.i32, fresh: ti.i32) -> ti.i32:
+        """The end of the pass, or what comes before bounces; returns what relaxed() does."""
         h, when = ti.cast(h64, self.real), self.clock(s, substeps)
-        first, last, final = ti.cast(it == 0, ti.i32), ti.cast(it == iterations - 1, ti.i32), ti.cast(s == substeps - 1, ti.i32)
+        first, final = ti.cast(it == 0, ti.i32), ti.cast(s == substeps - 1, ti.i32)
         self.take(0, first)
-        self.collect(0, h, when, first, last, fresh, final)
+        self.meet(0, first, fresh, final)
+        if ti.static(not self.bounces):
+            self.collect(0, h, when, first, final)
         return self.is_stale() + 2 * self.struck()
 
     @ti.kernel
-    def rebounded(self):
-        """One pass of phase 4."""
+    def rebounded(self) -> ti.i32:
+        """One round of bounces; returns whether another one is needed."""
         self.rebound(0)
+        return self.struck()
+
+    @ti.kernel
+    def gathered(self, h64: ti.f64, s: ti.i32, substeps: ti.i32, it: ti.i32) -> ti.i32:
+        """What comes after bounces; returns whether the list is stale."""
+        first, final = ti.cast(it == 0, ti.i32), ti.cast(s == substeps - 1, ti.i32)
+        self.collect(0, ti.cast(h64, self.real), self.clock(s, substeps), first, final)
+        return self.is_stale()
 
     @ti.kernel
     def remembered(self, h64: ti.f64, tick: ti.i32):

@@ -59,11 +59,11 @@ class Wall(Feature):
         return np.zeros((0, 2, len(low))), 0.0
 
     @ti.func
-    def confine(self, i, radius, h, when, last):
-        """Move particle i out of the wall, with self.press. last: 1 in the last iteration of a substep."""
+    def confine(self, i, radius, h, when):
+        """Move particle i out of the wall, with self.press."""
 
     @ti.func
-    def press(self, i, depth, n, moved, h, last):
+    def press(self, i, depth, n, moved, h):
         """Take particle i out of a wall that it entered by `depth` [m], along the normal n; the wall itself moved by `moved`.
 
         What comes as close as the last digits of the position can tell touches: it does not sink, or slip, by these digits.
@@ -81,8 +81,10 @@ class Wall(Feature):
             rise = 0 * depth
             if ti.static(self._on_bounces):
                 gap = -depth - leaving
-                if last != 0 and gap >= 0 and leaving < 0:
+                if gap >= 0 and leaving < 0:
                     rise, after = self.bounce(gap, leaving, (self._on_state.before[i] - moved).dot(n), after)
+                    if rise > 0:
+                        self._on_state.before[i] = self._on_state.before[i] + (after - leaving) * n
             change = (after - leaving) * n
             if ti.static(self._on_state.leans):
                 self._on_state.lean[i] = self._on_state.lean[i] + change

@@ -214,7 +214,6 @@ class World(Access):
         h, relaxes = self._h, self._batches or self._grid or self._sub.walls
         for s in range(n):
             fresh = int(self._fresh and s == 0)
-            struck = 0
             stale = self._sub.predicted(h, self._time, self._tick, self._since, fresh, s, n)
             for it in range(iterations if relaxes else 0):
                 if stale:
@@ -223,13 +222,16 @@ class World(Access):
                     self._sub.opened(h, s, n, it, fresh)
                     for _ in range(self._sub.steps):
                         self._sub.iterated()
-                    state = self._sub.collected(h, s, n, it, iterations, fresh)
+                    state = self._sub.collected(h, s, n, it, fresh)
                 else:
-                    state = self._sub.relaxed(h, s, n, it, iterations, fresh)
-                stale, struck = state & 1, state & 2
+                    state = self._sub.relaxed(h, s, n, it, fresh)
+                if self._sub.bounces:
+                    rounds = REBOUNDS if it == 0 and state & 2 else 0
+                    while rounds and self._sub.rebounded():
+                        rounds -= 1
+                    state = self._sub.gathered(h, s, n, it)
+                stale = state & 1
             if self._sub.concludes:
-                for _ in range(REBOUNDS if struck else 0):
-                    self._sub.rebounded()
                 self._sub.remembered(h, self._tick + s)
             if self._sub.calms and (self._since + s) % EVERY == EVERY - 1:
                 for k in range(PASSES):

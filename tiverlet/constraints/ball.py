@@ -66,7 +66,7 @@ class Ball(Wall):
         return np.array(circles), 0.0
 
     @ti.func
-    def confine(self, i, radius, h, when, last):
+    def confine(self, i, radius, h, when):
         """The surface where it was met, or where it is nearest."""
         center, moved = self._on_center.at(when[1]), self._on_center.step(when)
         r = self._on_state.place(i) - center
@@ -83,7 +83,7 @@ class Ball(Wall):
                 if s < 1:
                     n = (start + s * d).normalized()
                     depth = (s - 1) * d.dot(n)
-        self.press(i, depth, n, moved, h, last)
+        self.press(i, depth, n, moved, h)
 
     @ti.func
     def nearest(self, r, far, radius):

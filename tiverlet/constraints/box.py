@@ -98,7 +98,7 @@ class Box(Wall):
             self._on_now[side] = ti.Vector([at, shift])
 
     @ti.func
-    def confine(self, i, radius, h, when, last):
+    def confine(self, i, radius, h, when):
         """Two planes per axis, lower ones first."""
         touches, inside, close = False, self._on_state.place(i), self._on_state.digits(i)
         for k in ti.static(range(self.dim)):
@@ -114,4 +114,4 @@ class Box(Wall):
                     elif side == k + self.dim:
                         n[k], moved[k], depth = -1, shift, x[k] + radius - wall
                 if depth > -self._on_state.digits(i):
-                    self.press(i, depth, n, moved, h, last)
+                    self.press(i, depth, n, moved, h)

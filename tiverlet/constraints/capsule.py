@@ -77,7 +77,7 @@ class Capsule(Wall):
         return t, length, n
 
     @ti.func
-    def confine(self, i, radius, h, when, last):
+    def confine(self, i, radius, h, when):
         """The surface where it was met, or where it is nearest."""
         a, b = self._on_a.at(when[1]), self._on_b.at(when[1])
         x, far = self._on_state.place(i), ti.cast(self.radius, self._on_real) + radius
@@ -99,4 +99,4 @@ class Capsule(Wall):
             if s < 1:
                 _t, _gap, n = self.nearest(x - (1 - s) * d, a, b)
                 depth = (s - 1) * d.dot(n)
-        self.press(i, depth, n, moved, h, last)
+        self.press(i, depth, n, moved, h)

@@ -45,7 +45,12 @@ class Contact(Touch):
 
     Friction wants back the slip s of a pair, up to friction times the overlap: what a pair has moved across its normal since it
     touched, kept as long as it touches (Cundall and Strack 1979). Restitution gives the pair the normal velocity -e times the one
-    that it had before the substep, and reflects the overlap. Neither depends on h. Particles do not spin.
+    that it had before the substep, from the moment on when it met. Neither depends on h. Particles do not spin.
+
+    What is struck by several in one substep bounces off one after the other. Of the pairs that were struck, those take their turn
+    that come first for both of their particles; then the next ones, on the new ways. Each blow is between two, so it keeps
+    momentum, and energy if e = 1, however many there are. A pair that overlaps since a third one struck it, and is on its way
+    out, is let go; to push it out would make energy.
     """
 
     def __init__(self, friction=0.0, restitution=0.0, *, skin="auto", groups=None, push_out=1.0):
@@ -117,13 +122,14 @@ class Contact(Touch):
         if self.bounces:
             self._on_struck = scene.memory.field("Contact.struck", n)
             self._on_kick = scene.memory.field("Contact.kick", n, width=dim)
-            self._on_lift = scene.memory.field("Contact.lift", n, width=dim)
+            self._on_left = scene.memory.field("Contact.left", n)
+            self._on_partner = scene.memory.field("Contact.partner", n, kind=ti.i32)
             self._on_hit = scene.memory.field("Contact.hit", None, kind=ti.i32)
         self.table.bind(scene)
         self._on_push = Luggage("push", 0, lasting=True)  # what parted the pair in the last substep, per inverse mass [kg m]
         self._on_slip = Luggage("slip", dim, lasting=True)
-        self._on_aim = Luggage("aim", dim, lasting=False)
-        luggage = [self._on_push, *([self._on_slip] if self.rubs else []), *([self._on_aim] if self.bounces else [])]
+        self._on_blow = Luggage("blow", 0, lasting=False)
+        luggage = [self._on_push, *([self._on_slip] if self.rubs else []), *([self._on_blow] if self.bounces else [])]
         self._on_grid = Grid(scene, self._on_size, linked, self.table, luggage, team, parallel)
         self._on_calm = Calm(self)
         return self._on_grid
@@ -202,12 +208,12 @@ class Contact(Touch):
     @ti.func
     def relax(self, i, first, fresh):
         """What the pairs of particle i want of it."""
-        total, lifts = 0 * self._on_state.x[i], 0 * self._on_state.x[i]
-        w = self._on_state.w[i]
+        total, w = ti.zero(self._on_state.x[i]), self._on_state.w[i]
         if ti.static(self._on_bounces):
             if first != 0:
+                self._on_struck[i] = self._on_split[i]
                 for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
-                    self._on_aim.field[e] = ti.zero(total)
+                    self._on_blow.field[e] = 0
         if self._on_split[i] > 0:
             for word in range(self._on_grid.words(i)):
                 bits = self.touching(i, word)
@@ -217,66 +223,84 @@ class Contact(Touch):
                     j = self._on_grid.near[e]
                     shared, last = self._on_split[i] + self._on_split[j], self._on_push.field[e]
                     overlap, part, n = self.meet(i, j, self.far(i, j), shared)
-                    kick, push = ti.zero(part), part
-                    if ti.static(self._on_bounces):
-                        if first != 0:
-                            aim, kick, lift = self.bounce(i, j, n, overlap)
-                            lifts += w / shared * lift * n
-                            if kick > 0:
-                                self._on_aim.field[e] = aim * n
-                                if self._on_hit[None] == 0:
-                                    self._on_hit[None] = 1
+                    given, push = ti.zero(part), ti.zero(part)
                     if first == 0:
-                        push += last
+                        push = last
                     elif fresh == 0:
                         part += ti.static(CARRY) * last
                         both = w + self._on_state.w[j]
                         if part * both > overlap:
                             part = overlap / both
-                        push = part
+                    if ti.static(self._on_bounces):
+                        given, rests = self.bounce(i, j, n, overlap, last, first)
+                        if given > 0:
+                            self._on_blow.field[e] = 1
+                            if self._on_hit[None] == 0:
+                                self._on_hit[None] = 1
+                            if given <= overlap:  # deep from before: what remains of it rests in the next substep
+                                push = part
+                        if not rests:
+                            part = ti.zero(part)
+                    push += part
                     want = part * n
                     if ti.static(self._on_rubs):
-                        want -= self.rub(i, j, n, part * shared + kick, self._on_slip.field[e]) / shared
+                        want -= self.rub(i, j, n, part * shared + given, self._on_slip.field[e]) / shared
                     total += w * want
                     self._on_push.field[e] = push
         self._on_move[i] = total
-        if ti.static(self._on_bounces):
-            if first != 0:
-                self._on_lift[i] = lifts
-                self._on_struck[i] = self._on_split[i]
 
     @ti.func
-    def bounce(self, i, j, n, overlap):
-        """How a pair should leave: the normal displacement to aim at, what it lacks after the overlap is taken back, and how far
-        beyond touching it is by the end of the substep.
+    def bounce(self, i, j, n, overlap, last, first):
+        """The displacement that takes a pair that was struck in this substep from coming together to leaving, 0 for others; and
+        whether it rests, so that its overlap is pushed out, as it was in the last substep."""
+        given, here, a = self.leap(i, j, n)
+        rests = True
+        if self.table.of(i, j)[2] > 0:
+            if a > 0:
+                rests = last > 0 and (first == 0 or given <= overlap)
+            elif a < 0:
+                rests = last > 0 or overlap <= here
+        if rests or a < 0 or first == 0:
+            given = 0 * given
+        return given, rests
 
-        It came together by a before the substep and by `here` in it, and aims at restitution * a. Where there was a gap before,
-        the overlap is reflected.
-        """
-        restitution = self.table.of(i, j)[2]
+    @ti.func
+    def leap(self, i, j, n):
+        """What takes a pair from coming together to leaving; how far it comes together in this substep, and without forces."""
         a = -(self._on_state.before[i] - self._on_state.before[j]).dot(n)
         here = -(self._on_state.d[i] - self._on_state.d[j]).dot(n)
-        aim, kick, lift = restitution * ti.max(a, 0), 0 * overlap, 0 * overlap
-        if a > 0:
-            kick = ti.max(aim - (overlap - here), 0)
-            if overlap <= here:
-                lift = restitution * overlap
-        return aim, kick, lift
+        return here + self.table.of(i, j)[2] * ti.max(a, 0), here, a
 
     @ti.func
     def rebound(self, i):
-        """One Jacobi pass over displacements alone: what the pairs of particle i that bounce lack."""
-        total = 0 * self._on_state.x[i]
+        """The first of the pairs of particle i that were struck and still come together, and what it does to i."""
+        partner, most, w = -1, 0 * self._on_struck[i], self._on_state.w[i]
         if self._on_struck[i] > 0:
             for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
-                aim = self._on_aim.field[e]
-                size = aim.norm()
-                if size > 0:
-                    j, n = self._on_grid.near[e], aim / size
-                    lack = size - (self._on_state.d[i] - self._on_state.d[j]).dot(n)
-                    if lack > 0:
-                        total += self._on_state.w[i] * lack / (self._on_struck[i] + self._on_struck[j]) * n
-        self._on_kick[i] = total
+                if self._on_blow.field[e] > 0:
+                    j = self._on_grid.near[e]
+                    overlap, _part, n = self.meet(i, j, self.far(i, j), self._on_struck[i])
+                    given, here, a = self.leap(i, j, n)
+                    if overlap > 0 and a > 0 and given > 0:
+                        left = ti.select(overlap < here, overlap / here, 1)
+                        if left > most or (left == most and earlier(i, j, partner)):
+                            partner, most = j, left
+                            self._on_kick[i] = w / (w + self._on_state.w[j]) * given * n
+                            if self._on_hit[None] == 0:
+                                self._on_hit[None] = 1
+        self._on_partner[i] = partner
+        self._on_left[i] = most
+
+    @ti.func
+    def part_ways(self, i):
+        """Let particle i bounce off its partner, if it is the partner's partner."""
+        j = self._on_partner[i]
+        if j >= 0:
+            if self._on_partner[j] == i or self._on_state.w[j] == 0:
+                kick = self._on_kick[i]
+                self._on_state.d[i] = self._on_state.d[i] + kick
+                self._on_state.before[i] = self._on_state.before[i] + kick
+                self._on_state.advance(i, self._on_left[i] * kick)
 
     @ti.func
     def rub(self, i, j, n, normal, slip):
@@ -289,14 +313,10 @@ class Contact(Touch):
         return s
 
     @ti.func
-    def gather(self, i, last):
-        """Move particle i as its pairs want; what bounced rises at the end of the substep."""
-        if self._on_state.w[i] > 0:
-            if self._on_split[i] > 0:
-                self._on_state.shift(i, self._on_move[i])
-            if ti.static(self._on_bounces):
-                if last != 0:
-                    self._on_state.advance(i, self._on_lift[i])
+    def gather(self, i, first):
+        """Move particle i as its pairs want."""
+        if self._on_state.w[i] > 0 and self._on_split[i] > 0:
+            self._on_state.shift(i, self._on_move[i])
 
     @ti.func
     def remember(self, i):
@@ -316,3 +336,10 @@ def largest(tensor):
     """At least the largest eigenvalue of a symmetric matrix S >= 0: tr(S^4)^(1/4). The largest itself is 3 for a disc among six,
     and makes piles that overlap by 8 % less, but sound in them does not fade below 1e-6 m g r."""
     return ti.sqrt((tensor @ tensor).norm())
+
+
+@ti.func
+def earlier(i, j, k):
+    """Whether (i, j) comes before (i, k) among pairs that are struck at the same time: an order of all pairs, whichever is i."""
+    a, b = ti.min(i, j), ti.min(i, k)
+    return a < b or (a == b and ti.max(i, j) < ti.max(i, k))

@@ -61,11 +61,11 @@ class HalfSpace(Wall):
         return np.stack([foot - reach * across, foot + reach * across], axis=1), 0.0
 
     @ti.func
-    def confine(self, i, radius, h, when, last):
+    def confine(self, i, radius, h, when):
         """One plane."""
         n, offset = self._on_normal[None], self._on_offset[None]
         before, now = (
             offset[0] * (1 - when[0]) + offset[1] * when[0],
             offset[0] * (1 - when[1]) + offset[1] * when[1],
         )
-        self.press(i, now + radius - n.dot(self._on_state.place(i)), n, (now - before) * n, h, last)
+        self.press(i, now + radius - n.dot(self._on_state.place(i)), n, (now - before) * n, h)

@@ -228,15 +228,17 @@ class Polygons(Rim):
                     if overlap > 0:
                         d = self.relative(v, a, b, t)
                         share, kick = part * self._on_w[i] / self.split(self._on_active, v, a, b, t), 0 * overlap
+                        back = overlap  # what is taken back of the position and of the displacement
                         if ti.static(self._on_bounces):
                             if first != 0:
                                 aim, kick, lift = self.leap(v, a, b, t, n, overlap, d.dot(n))
-                                lifts += share * lift * n
                                 if kick > 0:
+                                    lifts += share * (overlap + lift) * n
+                                    back = 0 * overlap
                                     self._on_hit[None] = 1
                                     if role == VERTEX:
                                         self._on_aim.field[e] = aim * n
-                        want = overlap * n
+                        want = back * n
                         if ti.static(self._on_rubs):
                             want -= self.held(v, a, n, overlap + kick, self._on_slip.field[at] + d)
                         total += share * want
@@ -247,13 +249,13 @@ class Polygons(Rim):
                 self._on_struck[i] = self._on_active[i]
 
     @ti.func
-    def gather(self, i, last):
-        """Move particle i as its contacts want; what bounced rises at the end of the substep."""
+    def gather(self, i, first):
+        """Move particle i as its contacts want; what bounced goes where it is at the end of the substep."""
         if self._on_w[i] > 0:
             if self._on_active[i] > 0:
                 self._on_state.shift(i, self._on_move[i])
             if ti.static(self._on_bounces):
-                if last != 0:
+                if first != 0:
                     self._on_state.advance(i, self._on_lift[i])
 
     @ti.func
@@ -292,8 +294,15 @@ class Polygons(Rim):
                             n = aim / size
                             lack = size - self.relative(v, a, b, t).dot(n)
                             if lack > 0:
+                                self._on_hit[None] = 1
                                 total += part * self._on_w[i] * lack / self.split(self._on_struck, v, a, b, t) * n
         self._on_kick[i] = total
+
+    @ti.func
+    def part_ways(self, i):
+        """Change the displacement of particle i, and the one before the substep with it."""
+        self._on_state.d[i] = self._on_state.d[i] + self._on_kick[i]
+        self._on_state.before[i] = self._on_state.before[i] + self._on_kick[i]
 
     @ti.func
     def remember(self, i):
