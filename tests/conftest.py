@@ -1,5 +1,6 @@
 """One Taichi for the whole run; worlds are closed after each test."""
 
+import contextlib
 import os
 import pathlib
 import subprocess
@@ -11,6 +12,7 @@ import taichi as ti
 from taichi.lang import ops
 
 import tiverlet as tv
+from tiverlet import team
 from tiverlet.report.cases import entries, known
 
 # Taichi keeps kernels that it has compiled, by their content, and finds them when a worker comes by the same tests in the same
@@ -45,11 +47,9 @@ def world():
     made = []
 
     def build(*args, **kwargs):
-        with pytest.MonkeyPatch.context() as patch:
-            if kwargs.get("path") == "launched":
-                kwargs["path"] = "parallel"
-                patch.setattr(tv.runtime, "cores", lambda: 1)  # nobody to make a team with
-            made.append(tv.World(*args, **kwargs))
+        launched = kwargs.get("path") == "launched"
+        with team.launching() if launched else contextlib.nullcontext():
+            made.append(tv.World(*args, **(kwargs | {"path": "parallel"} if launched else kwargs)))
         return made[-1]
 
     yield build

@@ -116,8 +116,8 @@ def test_what_is_absent_has_no_field_and_no_kernel(world):
 
 
 def test_launches_count_what_the_scene_needs(world):
-    # Kernel launches of a frame, counted at Taichi's door: one for all of it on a CPU; else one per substep without constraints, and
-    # one more per pass with them.
+    # Kernel launches of a frame, counted at Taichi's door: one for all of it on a CPU; else one per substep without constraints,
+    # and one more per pass with them.
     import taichi.lang.kernel_impl as impl
 
     launches = []

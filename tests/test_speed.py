@@ -95,7 +95,7 @@ def test_bytes_are_those_of_the_fields(world):
 
 
 def test_launches_are_counted(world):
-    w = world(tv.Particles([[0.0, 0], [1, 0]]), [tv.Gravity(1.0), tv.Distance([[0, 1]])], path="parallel", substeps=5)
+    w = world(tv.Particles([[0.0, 0], [1, 0]]), [tv.Gravity(1.0), tv.Distance([[0, 1]])], path="launched", substeps=5)
     w.step(0.01)
     with counting.launches() as count:
         w.step(0.01)

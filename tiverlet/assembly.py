@@ -20,7 +20,7 @@ from .solvers.slots import Slots
 from .solvers.solver import Solver
 from .substep import Substep
 from .survey import Survey
-from .team import Team
+from .team import Team, size_of
 from .wall import Wall
 
 T = TypeVar("T", bound=Feature)
@@ -106,7 +106,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
         if scene.order > 2:
             composition.check_solved(batches, scene, solver)
     parallel = path == "parallel"
-    team = Team(memory, runtime.cores() if parallel else 1, len(particles))
+    team = Team(memory, size_of(path), len(particles))
     grid = contact.join(scene, batches, team, parallel) if contact else None
     for feature in [*accelerations, *drivers, *batches, *walls]:
         feature.bind(scene)

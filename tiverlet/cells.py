@@ -109,7 +109,7 @@ class Cells:
 
     @ti.func
     def raised(self, field: ti.template(), at, by):  # type: ignore[valid-type]
-        """Add to a counter; returns what it was. Where one thread counts, without an atomic operation, which takes 10 times longer."""
+        """Add to a counter; returns what it was. Where one thread counts, no atomic operation, which takes longer."""
         old = field[at]
         if ti.static(self.serial):
             field[at] = old + by

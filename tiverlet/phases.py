@@ -200,8 +200,8 @@ class Phases:
                         f.confine(i, self.radius.of(i), h, when)
                     moving = (self.state.d[i] != before).any()
 
-    # The phases: loops over the bodies. `me` is the thread that goes through them; see Team. Where it has no team, loops are serial
-    # inside the fused kernel, and Taichi spreads them over threads at the top of the others.
+    # The phases: loops over the bodies. `me` is the thread that goes through them, see Team. Where it has no team, loops are
+    # serial inside the fused kernel, and Taichi spreads them over threads at the top of the others.
 
     @ti.func
     def predict(self, me, h, time, tick, fresh, when, calming):

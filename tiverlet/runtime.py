@@ -84,8 +84,8 @@ def _threads() -> set[int]:
 def _settle(workers: list[int]) -> None:
     """Give each of Taichi's workers a core of its own, if it has them all.
 
-    They sleep between loops. Linux wakes those of a loop on one core, and moves one of them away only milliseconds later: a loop of
-    1.7 ms on one thread took 1.7 ms on two, and 0.9 ms with this; ten short loops took 0.45 and 0.16 ms.
+    They sleep between loops. Linux wakes those of a loop on one core, and moves one of them away only milliseconds later: a loop
+    of 1.7 ms on one thread took 1.7 ms on two, and 0.9 ms with this; ten short loops took 0.45 and 0.16 ms.
     """
     with contextlib.suppress(AttributeError, OSError):
         cores = sorted(os.sched_getaffinity(0))

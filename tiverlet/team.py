@@ -6,14 +6,37 @@ phase. So a frame is one loop over threads. Each does its share of every loop in
 milliseconds: after a few such waits the first thread goes on alone, and the others join it some frames later.
 """
 
+import contextlib
+from collections.abc import Iterator
+
 import taichi as ti
 
+from . import runtime
 from .runtime import Memory
 
 LEAST = 512  # iterations of a loop that Taichi gives to a CPU thread, at least
 PATIENCE = 20_000  # looks at the counter, of 50 ns or less, and one more for each particle: then a wait was long
 LONG = 4  # long waits in a frame after which one thread goes on alone
 ALONE = 32  # frames until the others come back
+
+
+_apart = False
+
+
+@contextlib.contextmanager
+def launching() -> Iterator[None]:
+    """Worlds that are built within it, on the parallel path, are launched phase by phase, as they are on a GPU."""
+    global _apart
+    before, _apart = _apart, True
+    try:
+        yield
+    finally:
+        _apart = before
+
+
+def size_of(path: str) -> int:
+    """How many threads make up the team of a world."""
+    return runtime.cores() if path == "parallel" and not _apart else 1
 
 
 class Team:

@@ -43,9 +43,9 @@ class Touch(Feature):
     def meet(self, i, j, far, shared):
         """Overlap, overlap / shared, and direction, as in touch(), of a pair that touches.
 
-        A pair that came together in this substep has the direction that it had when it met: |r0 + s d| = far, with r0 at the start
-        and d the relative displacement; what is left of d along n is the overlap. This is exact for free flight, where the
-        direction at the end is off by the way that a pair slides past each other.
+        A pair that came together in this substep has the direction that it had when it met: |r0 + s d| = far, with r0 at the
+        start and d the relative displacement; what is left of d along n is the overlap. This is exact for free flight, where
+        the direction at the end is off by the way that a pair slides past each other.
         """
         r = self._on_state.apart(i, j)
         rr = r.dot(r)

@@ -1,5 +1,7 @@
 """Constraints that are solved together: what they tell, and what particles make of the answer."""
 
+from typing import Any
+
 import numpy as np
 import taichi as ti
 
@@ -15,7 +17,9 @@ class System:
     """
 
     parts = 1  # systems that have nothing to do with each other
-    steps = 0  # of an iteration in launches of their own; 0 for a solution by solve()
+    steps = 0  # of an iteration, by open() and go(); 0 for a solution by solve()
+    team: Any  # the threads that share the loops of open() and go(), given when the kernels are made
+    spread: int  # iterations of such a loop for each block of rows
 
     def __init__(self, scene: Scene, batches: list[Batch], slots: Slots, scalars: list[Scalar], rows: np.ndarray):
         self.real, self.dim, self.move, self.tension = scene.real, scene.state.dim, slots.move, slots.tension

@@ -10,6 +10,8 @@ import taichi as ti
 from taichi.lang import common_ops, impl, kernel_impl
 from taichi.lang.ast.ast_transformer import ASTTransformer
 
+from ...team import launching
+
 DT = 1 / 60  # [s] of a frame
 ATOMIC = (ti.atomic_add, ti.atomic_sub, ti.atomic_max, ti.atomic_min)
 
@@ -154,7 +156,7 @@ def traffic(world, frames: int) -> dict[str, tuple[float, float]]:
     fetched once, and if every branch were taken. The fields are those that the kernels name while they are translated.
     """
     tracer, known, count = Tracer(), -1, Launches()
-    with tracer.watching(), world.clone(path="parallel") as clone:
+    with tracer.watching(), launching(), world.clone(path="parallel") as clone:
         while known < len(tracer.sweeps):  # until no kernel was compiled on the way
             known = len(tracer.sweeps)
             with launches(timed=True) as count:
