@@ -416,8 +416,8 @@ def test_the_default_suits_the_structure(world):
 
 def test_ropes_that_touch_are_solved_and_come_to_rest(world):
     # Elimination and contacts take turns in f32: ropes fall into a box, keep their length, and lie still. Before they touch the
-    # walls, what they do to each other leaves their momentum: m g t per particle. Thrown a little harder they pile up another way;
-    # about one pile in four goes on trembling, with some 1e-4 m g r.
+    # walls, what they do to each other leaves their momentum: m g t per particle. Thrown a little harder they pile up another
+    # way; about one pile in four goes on trembling, with some 1e-4 m g r.
     x = np.vstack([tv.shapes.rope((-0.3, 0.3 + 0.06 * k), (0.3, 0.33 + 0.06 * k), points=20).position for k in range(6)])
     pairs = np.vstack([links(19, 20 * k) for k in range(6)])
     speed = np.zeros_like(x)

@@ -329,8 +329,8 @@ PLANTS = {
         [
             (
                 "phases.py",
-                "self.state.advance(i, self.dithered(self.state.x[i], d, tick, DITHER[1]))",
-                "before = self.state.x[i]; self.state.x[i] += d; self.state.d[i] = self.state.x[i] - before",
+                "self.state.x[i] = x + step",
+                "self.state.x[i] = x + d; self.state.d[i] = self.state.x[i] - x",
             )
         ],
     ),

@@ -28,7 +28,7 @@ PRECISIONS = {"f32": ti.f32, "f32-compensated": ti.f32, "f64": ti.f64}
 PATHS = ("auto", "fused", "parallel")
 # Near pairs per particle, in 2D and 3D, for which a list has room at first, by whether all radii are equal. Within 1.25
 # diameters equal discs have fewer than 6 neighbours on average: lines between these do not cross, which makes a planar graph.
-ROOM = {True: (7, 14), False: (12, 32)}
+ROOM = {True: (6.5, 14), False: (12, 32)}
 # Particles and constraints from which waking threads pays. A falling pile of discs took, fused and on 2 threads, 4.1 and 8.1 ms a
 # frame with 10 000 of them, 8.9 and 11.5 with 30 000, 25.8 and 24.2 with 100 000.
 CROSSOVER = 100_000
@@ -115,7 +115,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     survey = Survey(substep)
     memory.place()
     if grid and contact:
-        grid.allocate(len(particles) * max(ROOM[scene.radius.uniform][particles.dim - 2], contact.room) + 64)
+        grid.allocate(int(len(particles) * max(ROOM[scene.radius.uniform][particles.dim - 2], contact.room)) + 64)
     return Assembly(path, solver, memory, scene, batches, grid, substep, survey)
 
 

@@ -10,6 +10,8 @@ the largest, each next level radii down to half of those before. A particle look
 its neighbours are in the 3^dim cells around it; of the finer ones it hears when they find it.
 """
 
+from typing import Any
+
 import numpy as np
 import taichi as ti
 
@@ -22,8 +24,9 @@ LEVELS = 14  # the last one holds all that are smaller, down to points
 class Cells:
     """The tables. radius: (n,) [m]. skin: what is added to the distance at which two touch [m]."""
 
-    def __init__(self, scene: Scene, radius: np.ndarray, skin: float, team: Team):
+    def __init__(self, scene: Scene, radius: np.ndarray, skin: float, team: Team, scratch: Any):
         self.team = team
+        self.place = scratch  # of the particles as they are sorted, while a list is built: read one after the other
         n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
         self.n, self.dim, self.state, self.real = n, dim, scene.state, scene.real
         self.serial = True  # counting in order, on one thread, beats atomic counters in parallel on a CPU
@@ -41,7 +44,6 @@ class Cells:
         self._shapes = self.shapes(np.ptp(scene.particles.position, axis=0))
         self.edge = add("grid.edge", self.buckets + 2, kind=ti.i32)
         self.sorted = add("grid.sorted", n, kind=ti.i32)
-        self.place = add("grid.place", n, width=dim)  # of the particles as they are sorted: read one after the other
         if self.state.compensated:
             self.low = add("grid.place_low", n, width=dim)
         self.shape = add("grid.shape", self.levels, width=dim, kind=ti.i32, values=self._shapes)

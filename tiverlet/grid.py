@@ -39,11 +39,12 @@ class Grid:
     """The list of near pairs, and what pairs carry along.
 
     skin: what is listed beyond touching [m]. linked: (m, 2) pairs that are never listed. table: which groups touch. luggage: what
-    the entries of the list carry along when it is built anew.
+    the entries of the list carry along when it is built anew. scratch: a field of vectors, (n,), to use while it is built.
     """
 
     def __init__(
-        self, scene: Scene, skin: float, linked: np.ndarray, table: Table, luggage: list["Luggage"], team: Team, parallel: bool
+        self, scene: Scene, skin: float, linked: np.ndarray, table: Table, luggage: list["Luggage"], team: Team, parallel: bool,
+        scratch: Any,
     ):  # fmt: skip
         self.team = team
         n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
@@ -52,7 +53,7 @@ class Grid:
         self.lasting, self.lost = [p for p in luggage if p.lasting], [p for p in luggage if not p.kept]
         self.bags = [p for p in luggage if p.kept]
         self.real, self.skin = scene.real, skin
-        self.cells = Cells(scene, scene.particles.radius, skin, team)
+        self.cells = Cells(scene, scene.particles.radius, skin, team, scratch)
         self.several = self.cells.levels > 1
         parallel = parallel and not self.several  # lists of several levels have parts of any length, in one piece
         self.blocks = 16 if parallel else 1  # parts of the list, each filled by one thread

@@ -130,7 +130,7 @@ class Contact(Touch):
         self._on_slip = Luggage("slip", dim, lasting=True)
         self._on_blow = Luggage("blow", 0, lasting=False)
         luggage = [self._on_push, *([self._on_slip] if self.rubs else []), *([self._on_blow] if self.bounces else [])]
-        self._on_grid = Grid(scene, self._on_size, linked, self.table, luggage, team, parallel)
+        self._on_grid = Grid(scene, self._on_size, linked, self.table, luggage, team, parallel, self._on_move)
         self._on_calm = Calm(self)
         return self._on_grid
 

@@ -155,7 +155,7 @@ class Polygons(Rim):
             *([self._on_aim] if self.bounces else []),
         ]
         apart: Any = _Apart(self)
-        self._on_grid = Grid(reach, self._on_size, linked, apart, luggage, team, parallel)
+        self._on_grid = Grid(reach, self._on_size, linked, apart, luggage, team, parallel, self._on_move)
         return self._on_grid
 
     def ease(self) -> None:
