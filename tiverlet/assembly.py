@@ -29,9 +29,9 @@ PATHS = ("auto", "fused", "parallel")
 # Near pairs per particle, in 2D and 3D, for which a list has room at first, by whether all radii are equal. Within 1.25
 # diameters equal discs have fewer than 6 neighbours on average: lines between these do not cross, which makes a planar graph.
 ROOM = {True: (6.5, 14), False: (12, 32)}
-# Particles and constraints from which waking threads pays. A falling pile of discs took, fused and on 2 threads, 4.1 and 8.1 ms a
-# frame with 10 000 of them, 8.9 and 11.5 with 30 000, 25.8 and 24.2 with 100 000.
-CROSSOVER = 100_000
+# Particles and constraints from which a team of threads pays. On one thread and on two a frame took, of 8 substeps of a falling
+# pile, 0.71 and 0.67 ms with 4000 discs, 2.7 and 1.9 with 20 000; of 20 substeps of cloth with 2500 particles 1.9 and 1.2.
+CROSSOVER = 5000
 WIDTH = 2  # of the systems that are solved directly where the user names no solver: chains, loops, joints of up to 3 rods
 
 
@@ -181,7 +181,7 @@ def check_settings(precision: str, path: str, order: int, features: tuple[Featur
 
 
 def _chosen(path: str, particles: Particles, features: tuple[Feature, ...]) -> str:
-    """The path for "auto": fused on one CPU thread while waking the others would cost more than their work."""
+    """The path for "auto": on one CPU thread while others would cost more than they do."""
     if path != "auto":
         return path
     if runtime.architecture() != "cpu":

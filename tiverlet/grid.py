@@ -5,6 +5,7 @@ something has moved by half the skin, and no sum over it depends on when it was 
 """
 
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,7 @@ class Grid:
         self.lasting, self.lost = [p for p in luggage if p.lasting], [p for p in luggage if not p.kept]
         self.bags = [p for p in luggage if p.kept]
         self.real, self.skin = scene.real, skin
+        self._extent: Sequence[float] = [-1.0] * dim
         self.cells = Cells(scene, scene.particles.radius, skin, team, scratch)
         self.several = self.cells.levels > 1
         parallel = parallel and not self.several  # lists of several levels have parts of any length, in one piece
@@ -129,10 +131,12 @@ class Grid:
         """The size of the smallest cells [m]."""
         return float(self.cells.sizes.min())
 
-    def fit(self, extent: np.ndarray) -> None:
-        """Shape the hash for the extent of the particles [m]; affects speed only."""
-        if self.cells.fit(extent):
-            self.stale[None] = 1
+    def fit(self, extent: Sequence[float]) -> None:
+        """Shape the hash for the extent of the particles [m], if it is another one by an eighth; affects speed only."""
+        if not all(abs(new - old) <= old / 8 for new, old in zip(extent, self._extent, strict=True)):
+            self._extent = extent
+            if self.cells.fit(np.asarray(extent)):
+                self.stale[None] = 1
 
     def pairs(self) -> tuple[np.ndarray, np.ndarray]:
         """The listed pairs (m, 2) with i < j, in order, and where they are in the list."""

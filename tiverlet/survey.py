@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
+from .compiling import Quick
 from .feature import FAR
 from .grid import FARTHEST
 from .particles import LARGEST
@@ -101,11 +102,14 @@ class Survey:
         self.high = add("survey.high", BLOCKS, width=self.dim, kind=ti.f64)
         self.flags = add("survey.flags", None, kind=ti.i32)
         self.details: dict[int, Residuals] = {}  # compiled when asked for
+        self.out = np.zeros(FIGURES)
+        self.quick = Quick(self, "measure", substep.scene.memory.compiler)
 
     def of(self, substep: Substep) -> "Survey":
         """The same fields, with kernels for another Substep."""
         new = copy.copy(self)
         new.sub, new.details = substep, {}
+        new.quick = Quick(new, "measure", substep.scene.memory.compiler)
         return new
 
     @ti.func
@@ -251,24 +255,26 @@ class Survey:
         return out[: batch.count]
 
     def report(
-        self, time: float, h: float, substeps: int, iterations: int, fresh: bool, begin: bool
-    ) -> tuple[StepReport, np.ndarray]:
-        """The report of a frame (without energy_change), and the size of the bounding box [m]."""
-        out = np.zeros(FIGURES)
-        self.measure(h, time, int(fresh), int(begin), out)
-        energy, residual, overlap, stiff, contacts, bad, flags = (float(v) for v in out[:7])
-        stiff = max(stiff, self.sub.fastest * h * h)
-        low, high = out[7 : 7 + self.dim], out[10 : 10 + self.dim]
+        self, time: float, h: float, substeps: int, iterations: int, fresh: bool, begin: bool, before: float | None
+    ) -> tuple[StepReport, list[float]]:
+        """The report of a frame, and the size of the bounding box [m]. before: the energy one frame ago [J]."""
+        mine = vars(self)  # whose attributes Taichi looks at in Python, one by one
+        mine["quick"](h, time, int(fresh), int(begin), mine["out"])
+        out, n, dim = mine["out"].tolist(), mine["n"], mine["dim"]
+        energy, residual, overlap, stiff, contacts, bad, flags = out[:7]
+        stiff = max(stiff, mine["sub"].fastest * h * h)
+        low, high = out[7 : 7 + dim], out[10 : 10 + dim]
+        extent = [max(b - a, 0.0) for a, b in zip(low, high, strict=True)]
         notes = {}
-        first = int(bad) if bad < self.n else None
+        first = int(bad) if bad < n else None
         if first is not None:
             notes["non-finite"] = (
                 f"The state of particle {first} is not finite (the first of them); go back and use a smaller step."
             )
-        reach = float(np.abs([low, high]).max()) if (high >= low).all() else 0.0
-        if reach >= self.farthest:
+        reach = max(map(abs, low + high)) if high[0] >= low[0] else 0.0
+        if reach >= mine["farthest"]:
             notes["out-of-range"] = (
-                f"A coordinate is out of range: it reached {reach:g} m, and beyond {self.farthest:g} m the precision fails."
+                f"A coordinate is out of range: it reached {reach:g} m, and beyond {mine['farthest']:g} m the precision fails."
             )
         if flags > 0:
             notes["tunnelling-risk"] = (
@@ -296,7 +302,7 @@ class Survey:
             overlap,
             int(contacts),
             energy,
-            0.0,
+            0.0 if before is None else energy - before,
             frozenset(notes),
             tuple(notes.values()),
             first,
@@ -304,7 +310,7 @@ class Survey:
             TURNS[int(out[15])],
             float(out[14]),
         )
-        return done, np.where(high >= low, high - low, 0.0)
+        return done, extent
 
 
 @ti.data_oriented

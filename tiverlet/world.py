@@ -3,7 +3,6 @@
 import copy
 import weakref
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from time import perf_counter
 from typing import Any
 
@@ -14,6 +13,7 @@ from . import checks, composition, snapshot
 from .access import Access
 from .assembly import Assembly, assemble, check_settings, checked_features, checked_solver
 from .calm import EVERY, PASSES
+from .compiling import Quick
 from .explain import explain
 from .feature import Acceleration, Feature
 from .guard import Guard
@@ -89,6 +89,7 @@ class World(Access):
         self._memory, self._scene, self._batches = parts.memory, parts.scene, parts.batches
         self._grid, self._sub, self._survey, self._path = parts.grid, parts.substep, parts.survey, parts.path
         self._solver = parts.solver
+        self._frames = Quick(self._sub, "fused", self._memory.compiler)
         self._search = None  # compiled when it is first asked
         parts.scene.residuals = self._residuals
 
@@ -110,50 +111,52 @@ class World(Access):
         for watcher in self._watchers:
             watcher.before()
         clock = perf_counter()
-        with self._memory.compiler():
-            self._heed()
-            if self._guard.auto or tolerance is not None or budget is not None:
+        self._heed()
+        if self._guard.auto or tolerance is not None or budget is not None:
+            with self._memory.compiler():
                 report = self._guard.advance(self, dt, tolerance, budget)
-            else:
-                self._begin(dt / self.substeps * self._sub.first)
-                report = self._advance(dt, self.substeps, self.iterations)
-        self._last = report = replace(report, seconds=perf_counter() - clock)
+        else:
+            self._begin(dt / self.substeps * self._sub.first)
+            report = self._advance(dt, self.substeps, self.iterations)
+        report.__dict__["seconds"] = perf_counter() - clock  # which is no part of what it says
+        self._last = report
         for watcher in self._watchers:
             watcher.after(dt, report)
         return report
 
     def _advance(self, dt: float, substeps: int, iterations: int) -> StepReport:
         """One frame from where _begin() left off."""
-        with self._memory.compiler():
-            if self._sub.hurries:
+        sub = vars(self._sub)  # whose attributes Taichi looks at in Python, one by one
+        if sub["hurries"]:
+            with self._memory.compiler():
                 self._sub.slots.kappa[None] = self._solver.condition(iterations)
-            if len(self._particles):
-                (self._fused if self._path == "fused" or self._sub.team.size > 1 else self._parallel)(substeps, iterations)
-            self._tick = (self._tick + substeps) % 2**31
-            self._since = (self._since + substeps) % 2**31
-            self._pass(dt)
-            self._started, self._fresh = self._fresh and substeps == 1, False
-            _, phi1, phi2, *_ = self._drag or decay(0.0, self._h)
-            self._scene.hh = self._h**2 * self._sub.reaches * (phi2 if self._started else phi1)
-            report = self._look(substeps, iterations)
-        change = report.energy - self._energy  # type: ignore[operator]
+        if len(self._particles):
+            (self._fused if self._path == "fused" or sub["team"].size > 1 else self._parallel)(substeps, iterations)
+        self._pass(dt, substeps)
+        _, phi1, phi2, *_ = self._drag or decay(0.0, self._h)
+        self._scene.hh = self._h**2 * sub["reaches"] * (phi2 if self._started else phi1)
+        report = self._look(substeps, iterations)
         self._energy = report.energy
-        return replace(report, energy_change=change)
+        return report
 
-    def _pass(self, dt: float) -> None:
+    def _pass(self, dt: float, substeps: int) -> None:
         """Advance the clock: frames of the same length are counted, not summed, so that they add no rounding errors."""
-        if dt != self._frame[1]:
-            self._frame = (self._time, dt, 0)
-        since, _, count = self._frame
-        self._frame = (since, dt, count + 1)
-        self._time = since + (count + 1) * dt
+        since, length, count = self._frame
+        if dt != length:
+            since, count = self._time, 0
+        self.__dict__.update(
+            _tick=(self._tick + substeps) % 2**31, _since=(self._since + substeps) % 2**31,
+            _started=self._fresh and substeps == 1, _fresh=False,
+            _frame=(since, dt, count + 1), _time=since + (count + 1) * dt,
+        )  # fmt: skip
 
     def _heed(self) -> None:
         """Bring the knobs to the device; where a force has changed, start anew while the device still has what it was."""
-        with self._memory.compiler():
-            if any(f.changed and isinstance(f, Acceleration) for f in self._features):
-                self._restart()
-            self._upload()
+        if any(f.changed or f.moving for f in self._features):
+            with self._memory.compiler():
+                if any(f.changed and isinstance(f, Acceleration) for f in self._features):
+                    self._restart()
+                self._upload()
 
     def _upload(self) -> None:
         """Write what was changed in Python since the last frame."""
@@ -167,8 +170,10 @@ class World(Access):
 
     def _begin(self, h: float) -> None:
         """Take h for the substep; with another one than before, displacements mean something else: start anew from velocities."""
+        drag = decay(sum(f.rate for f in self._sub.drags), h) if self._sub.decays else None
+        if h == self._h and drag == self._drag and not self._fresh and self._energy is not None and self._placed is None:
+            return
         with self._memory.compiler():
-            drag = decay(sum(f.rate for f in self._sub.drags), h) if self._sub.decays else None
             if h != self._h or drag != self._drag:
                 self._restart()
             if self._fresh:
@@ -198,11 +203,13 @@ class World(Access):
     def _fused(self, substeps: int, iterations: int) -> None:
         """All substeps in one launch, resumed where the neighbour list had to grow."""
         begin = it0 = skip = 0
-        self._sub.team.muster()
+        vars(self._sub)["team"].muster()
         while True:
             fresh = int(self._fresh)
             clock = self._time, self._tick, self._since
-            self._sub.fused(self._h, *clock, fresh, substeps, iterations, begin, it0, skip)
+            if self._frames.owner is not self._sub:
+                self._frames = Quick(self._sub, "fused", self._memory.compiler)
+            self._frames(self._h, *clock, fresh, substeps, iterations, begin, it0, skip)
             if not self._grid or not self._sub.halt[None][0]:
                 return
             (_, begin, it0), skip = (int(v) for v in self._sub.halt[None]), 1
@@ -267,8 +274,8 @@ class World(Access):
         """Survey the state."""
         if self._grid and self._grid.stale[None]:
             self._list()
-        with self._memory.compiler():
-            report, extent = self._survey.report(self._time, self._h, substeps, iterations, self._started, begin)
+        before = None if begin else self._energy
+        report, extent = self._survey.report(self._time, self._h, substeps, iterations, self._started, begin, before)
         if self._grid:
             self._grid.fit(extent)
         return report
