@@ -101,7 +101,11 @@ class Quick:
                 getattr(self.owner, self.name)(*args)
                 if _patched:
                     self._ready = self._prepared(args)
-            return
+        else:
+            self.launch(args)
+
+    def launch(self, args: tuple) -> None:
+        """Launch it when it is compiled."""
         program, kernel, compiled, reals = self._ready
         context = kernel.make_launch_context()
         for k, (value, real) in enumerate(zip(args, reals, strict=True)):

@@ -10,6 +10,7 @@ import taichi as ti
 from taichi.lang import common_ops, impl, kernel_impl
 from taichi.lang.ast.ast_transformer import ASTTransformer
 
+from ...compiling import Quick
 from ...team import launching
 
 DT = 1 / 60  # [s] of a frame
@@ -41,18 +42,23 @@ class Launches(Counter[str]):
 def launches(timed: bool = False) -> Iterator[Launches]:
     """The kernels that are launched while this lasts. timed: wait for the end of each."""
     count = Launches()
-    launch = kernel_impl.Kernel.launch_kernel
 
-    def counted(self, *args):
-        name, clock = self.func.__name__, perf_counter()
-        out = launch(self, *args)
-        count[name] += 1
-        if timed:
-            ti.sync()
-            count.seconds[name] = count.seconds.get(name, 0.0) + perf_counter() - clock
-        return out
+    def counted(launch, name):
+        def run(self, *args):
+            clock = perf_counter()
+            out = launch(self, *args)
+            count[name(self)] += 1
+            if timed:
+                ti.sync()
+                count.seconds[name(self)] = count.seconds.get(name(self), 0.0) + perf_counter() - clock
+            return out
 
-    with replaced((kernel_impl.Kernel, "launch_kernel", counted)):
+        return run
+
+    with replaced(
+        (kernel_impl.Kernel, "launch_kernel", counted(kernel_impl.Kernel.launch_kernel, lambda kernel: kernel.func.__name__)),
+        (Quick, "launch", counted(Quick.launch, lambda quick: quick.name)),
+    ):
         yield count
 
 
