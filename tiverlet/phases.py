@@ -14,7 +14,7 @@ from .wall import Wall
 
 # Multiples of the golden ratio of two dimensions, mod 1, are the most even sequence of pairs: one for each of the two sums.
 DITHER = golden_steps(2)
-TILE = 1024  # particles that a thread takes at a time, through several loops: their state stays in its cache
+TILE = 256  # particles that a thread takes at a time, through several loops: their state stays in its cache
 SWEEPS = 8  # rounds over the walls, for particles that several of them push
 
 
@@ -38,7 +38,7 @@ class Phases:
         cpu = runtime.architecture() == "cpu"
         self.tile = TILE if cpu else 1
         self.tiles = -(-scene.particles.count // self.tile)
-        self.gap = -(-LEAST * runtime.threads() // max(1, self.tiles)) if parallel and cpu else 1
+        self.gap = -(-LEAST * runtime.threads() // max(1, self.tiles)) if parallel and cpu and team.size == 1 else 1
         # For substeps made of stages: the share of the first, what accelerates in the last per h^2, omega^2 of springs.
         self.first, self.reaches, self.fastest = 1.0, 1.0, 0.0
         self.scene, self.state, self.slots = scene, scene.state, scene.slots
