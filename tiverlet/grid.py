@@ -53,7 +53,7 @@ class Grid:
         self.table, self.luggage = table, luggage
         self.lasting, self.lost = [p for p in luggage if p.lasting], [p for p in luggage if not p.kept]
         self.bags = [p for p in luggage if p.kept]
-        self.real, self.skin = scene.real, skin
+        self.real, self.memory, self.skin = scene.real, scene.memory, skin
         self._extent: Sequence[float] = [-1.0] * dim
         self.cells = Cells(scene, scene.particles.radius, skin, team, scratch)
         self.several = self.cells.levels > 1
@@ -153,7 +153,7 @@ class Grid:
 
     def _entries(self, first, number) -> tuple[np.ndarray, np.ndarray]:
         """For every entry of the lists, whose it is and where it is."""
-        first, number = first.to_numpy()[: self.n], number.to_numpy()[: self.n]
+        first, number = self.memory.read(first)[: self.n], self.memory.read(number)[: self.n]
         i = np.repeat(np.arange(self.n), number)
         return i, np.repeat(first, number) + np.arange(len(i)) - np.repeat(np.cumsum(number) - number, number)
 
@@ -179,8 +179,8 @@ class Grid:
         for piece in self.bags:
             self._aside(piece.aside, values[piece.name] if piece.lasting else np.zeros((1, *[piece.width] * (piece.width > 0))))
         counts = np.bincount(pairs[:, 0], minlength=max(1, self.n))
-        self.old_first.from_numpy((np.cumsum(counts) - counts).astype(np.int32))
-        self.old_number.from_numpy(counts.astype(np.int32))
+        self.memory.write(self.old_first, np.cumsum(counts) - counts)
+        self.memory.write(self.old_number, counts)
         self.kept[None] = self.stale[None] = 1
 
     @ti.func
