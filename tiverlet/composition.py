@@ -104,7 +104,7 @@ class Composition(Substep):
     @ti.kernel
     def fused(
         self, h64: ti.f64, t: ti.f64, tick: ti.i32, since: ti.i32, fresh: ti.i32, substeps: ti.i32, iterations: ti.i32,
-        begin: ti.i32, it0: ti.i32, skip: ti.i32,
+        begin: ti.i32, it0: ti.i32, what: ti.i32,
     ):  # fmt: skip
         """All substeps of a frame. h64: the first stage, which is as long as the last."""
         whole = h64 / self.first

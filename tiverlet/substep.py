@@ -11,33 +11,35 @@ from .calm import PASSES
 from .phases import Phases
 from .team import LEAST
 
+RESUMED, LISTS = 1, 2  # what a launch does other than a whole frame
 REBOUNDS = 8  # rounds of restitution in a substep, at most
 
 
 @ti.data_oriented
 class Substep(Phases):
-    """The kernels of one world. `skip` says that substep `begin` stopped before iteration `it0` to have the list grown."""
+    """The kernels of one world. what: 0 for a frame; RESUMED if it stopped in substep `begin`, before iteration `it0`, to have
+    the list grown; LISTS to do no more than build the list."""
 
     @ti.kernel
     def fused(
         self, h64: ti.f64, t: ti.f64, tick: ti.i32, since: ti.i32, fresh: ti.i32, substeps: ti.i32, iterations: ti.i32,
-        begin: ti.i32, it0: ti.i32, skip: ti.i32,
+        begin: ti.i32, it0: ti.i32, what: ti.i32,
     ):  # fmt: skip
         """All substeps of a frame, in one launch."""
         ti.loop_config(serialize=self.team.size == 1)
         for thread in range(self.team.spread):
             if thread % LEAST == 0:
-                self.frame(thread // LEAST, h64, t, tick, since, fresh, substeps, iterations, begin, it0, skip)
+                self.frame(thread // LEAST, h64, t, tick, since, fresh, substeps, iterations, begin, it0, what)
 
     @ti.func
-    def frame(self, me, h64, t, tick, since, fresh, substeps, iterations, begin, it0, skip):
+    def frame(self, me, h64, t, tick, since, fresh, substeps, iterations, begin, it0, what):
         """What thread `me` does of a frame. All threads of a team take the same branches, for what they depend on is written only
         where the others wait."""
         for s in range(begin, substeps):
             h = ti.cast(h64, self.real)
             when = self.clock(s, substeps)
             starts = fresh if s == 0 else 0
-            resumed = skip if s == begin else 0
+            resumed = what if s == begin else 0
             if self.team.works(me) and self.halted() == 0:
                 if resumed == 0:
                     self.predict(
@@ -50,7 +52,7 @@ class Substep(Phases):
                             if self.grid.need[None] > self.grid.capacity:
                                 self.halt[None] = [1, s, it]
                         self.team.wait()
-                    if self.halted() == 0:
+                    if self.halted() == 0 and what != LISTS:
                         first, final = ti.cast(it == 0, ti.i32), ti.cast(s == substeps - 1, ti.i32)
                         self.tell(me, h, when, first, starts)
                         self.settle(me, first)
@@ -61,10 +63,10 @@ class Substep(Phases):
                                     self.rebound(me)
                         self.collect(me, h, when, first, final)
                 if ti.static(self.concludes):
-                    if self.halted() == 0:
+                    if self.halted() == 0 and what != LISTS:
                         self.remember(me, h, tick + s)
                 if ti.static(self.calms):
-                    if self.halted() == 0 and self.calming(since + s) != 0:
+                    if self.halted() == 0 and what != LISTS and self.calming(since + s) != 0:
                         for k in range(PASSES):
                             self.calm(me, k)
 

@@ -20,7 +20,7 @@ from .guard import Guard
 from .particles import Particles
 from .regroup import Handle
 from .solvers.solver import Solver
-from .substep import REBOUNDS, decay
+from .substep import LISTS, REBOUNDS, RESUMED, decay
 from .survey import StepReport
 
 
@@ -202,19 +202,23 @@ class World(Access):
 
     def _fused(self, substeps: int, iterations: int) -> None:
         """All substeps in one launch, resumed where the neighbour list had to grow."""
-        begin = it0 = skip = 0
         vars(self._sub)["team"].muster()
-        while True:
-            fresh = int(self._fresh)
-            clock = self._time, self._tick, self._since
-            if self._frames.owner is not self._sub:
-                self._frames = Quick(self._sub, "fused", self._memory.compiler)
-            self._frames(self._h, *clock, fresh, substeps, iterations, begin, it0, skip)
-            if not self._grid or not self._sub.halt[None][0]:
-                return
-            (_, begin, it0), skip = (int(v) for v in self._sub.halt[None]), 1
-            self._sub.halt[None] = [0, 0, 0]
-            self._grow()
+        halt = self._launched(substeps, iterations, 0, 0, 0)
+        while halt:
+            halt = self._launched(substeps, iterations, *halt, RESUMED)
+
+    def _launched(self, substeps: int, iterations: int, begin: int, it0: int, what: int) -> tuple[int, int] | None:
+        """One launch, and more room if it stopped for that: where it goes on then."""
+        if self._frames.owner is not self._sub:
+            self._frames = Quick(self._sub, "fused", self._memory.compiler)
+        clock = self._time, self._tick, self._since
+        self._frames(self._h, *clock, int(self._fresh), substeps, iterations, begin, it0, what)
+        if not self._grid or not self._sub.halt[None][0]:
+            return None
+        _, begin, it0 = (int(v) for v in self._sub.halt[None])
+        self._sub.halt[None] = [0, 0, 0]
+        self._grow()
+        return begin, it0
 
     def _parallel(self, n: int, iterations: int) -> None:
         """A few launches per substep."""
@@ -247,6 +251,11 @@ class World(Access):
     def _list(self) -> None:
         """Build the neighbour list, growing it until everything fits."""
         assert self._grid
+        if self._path == "fused" or self._sub.team.size > 1:
+            self._grid.stale[None] = 1
+            while self._launched(1, 1, 0, 0, LISTS):  # by the kernel that there is anyway
+                pass
+            return
         with self._memory.compiler():
             while self._sub.listed() > self._grid.capacity:
                 self._grow()
