@@ -41,7 +41,7 @@ def _owner(field: str) -> str:
 
 
 def _launches(world: "World") -> str:
-    if world.path == "fused" or world._sub.team.size > 1:
+    if not world._sub.launched:
         return "2 launches per frame (all substeps, then the survey)"
     passes = world.iterations if world._sub.batches or world._grid or world._sub.walls else 0
     more = ", and one for each neighbour list" if world._grid else ""

@@ -51,8 +51,7 @@ class Grid:
         n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
         self.n, self.dim, self.state, self.radius = n, dim, scene.state, scene.radius
         self.table, self.luggage = table, luggage
-        self.lasting, self.lost = [p for p in luggage if p.lasting], [p for p in luggage if not p.kept]
-        self.bags = [p for p in luggage if p.kept]
+        self.lasting, self.bags = [p for p in luggage if p.lasting], [p for p in luggage if p.kept]
         self.real, self.memory, self.skin = scene.real, scene.memory, skin
         self._extent: Sequence[float] = [-1.0] * dim
         self.cells = Cells(scene, scene.particles.radius, skin, team, scratch)
@@ -80,7 +79,7 @@ class Grid:
         self.short = 8 if dim == 2 else 16  # entries of a list that is sorted without branches
         self.network = sorting_network(self.short)
         self.near: Any = None
-        self.aside: Any = None  # those of the old list that carry something, while a new one is built; else free to use
+        self.aside: Any = None  # those of the old list that carry something, while a new one is built
         self.store: Memory | None = None
 
     def allocate(self, capacity: int) -> None:
@@ -303,7 +302,7 @@ class Grid:
     @ti.func
     def words(self, i):
         """How many words of bits the list of particle i has entries for."""
-        return (self.number[i] + (WORD - 1)) >> 5
+        return (self.number[i] + (WORD - 1)) >> 5  # a division by WORD would look at the sign
 
     @ti.func
     def whole(self, i, word):

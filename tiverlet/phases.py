@@ -34,11 +34,12 @@ class Phases:
         parallel: bool,
     ):
         self.team, self.parallel = team, parallel
+        self.launched = parallel and team.size == 1  # phase by phase
         # On a GPU each thread has one particle. On a CPU Taichi gives each thread at least LEAST iterations of a loop.
         cpu = runtime.architecture() == "cpu"
         self.tile = TILE if cpu else 1
         self.tiles = -(-scene.particles.count // self.tile)
-        self.gap = -(-LEAST * runtime.threads() // max(1, self.tiles)) if parallel and cpu and team.size == 1 else 1
+        self.gap = -(-LEAST * runtime.threads() // max(1, self.tiles)) if self.launched and cpu else 1
         # For substeps made of stages: the share of the first, what accelerates in the last per h^2, omega^2 of springs.
         self.first, self.reaches, self.fastest = 1.0, 1.0, 0.0
         self.scene, self.state, self.slots = scene, scene.state, scene.slots
@@ -50,9 +51,9 @@ class Phases:
         self.decays = bool(self.drags)
         self.batches: list[Batch] = [b for b in batches if b.count]
         self.systems = [scene.slots.system] if scene.slots and scene.slots.system else []
-        self.steps = max([s.steps for s in self.systems], default=0) if parallel and team.size == 1 else 0
+        self.steps = max([s.steps for s in self.systems], default=0) if self.launched else 0
         for system in self.systems:
-            system.team, system.spread = team, LEAST if parallel and team.size == 1 else 1
+            system.team, system.spread = team, LEAST if self.launched else 1
         self.hurries = bool(scene.slots) and scene.slots.accelerates
         self.told = [b for b in self.batches if isinstance(b, Scalar) and b._on_told]
         self.ragged = [b for b in self.batches if b.blocks]
@@ -185,7 +186,7 @@ class Phases:
             for i in range(first, end):
                 stale |= self.grid.outrun(i)
             for i in range(first, end):
-                fast |= c.hurries(i)
+                fast |= c.overshoots(i)
             c.heed(stale, fast)
 
     @ti.func
@@ -218,7 +219,7 @@ class Phases:
             for c in range(self.team.low(f.count, me), self.team.high(f.count, me)):
                 f.drive(c, h, when[1])
                 for k in ti.static(self.contacts):
-                    k.heed(self.grid.outrun(f.member(c, 0)), k.hurries(f.member(c, 0)))
+                    k.heed(self.grid.outrun(f.member(c, 0)), k.overshoots(f.member(c, 0)))
             self.team.wait()
 
     @ti.func
@@ -300,7 +301,7 @@ class Phases:
                     c.measure(i)
                 self.team.wait()
             for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
-                c.count(i, first)
+                c.count(i)
             self.team.wait()
             for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
                 c.relax(i, first, fresh)

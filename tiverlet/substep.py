@@ -141,14 +141,8 @@ class Substep(Phases):
 
     @ti.kernel
     def listed(self) -> ti.i32:
-        """Build the neighbour list; returns the largest number of entries that a block needs."""
-        if ti.static(self.parallel and self.team.size == 1):
-            self.grid.build(0)
-        else:
-            ti.loop_config(serialize=self.team.size == 1)
-            for thread in range(self.team.spread):
-                if thread % LEAST == 0:
-                    self.grid.build(thread // LEAST)
+        """Build the neighbour list where frames do not; returns the largest number of entries that a block needs."""
+        self.grid.build(0)
         return self.grid.need[None]
 
     @ti.kernel

@@ -132,7 +132,7 @@ class World(Access):
             with self._memory.compiler():
                 self._sub.slots.kappa[None] = self._solver.condition(iterations)
         if len(self._particles):
-            (self._fused if self._path == "fused" or sub["team"].size > 1 else self._parallel)(substeps, iterations)
+            (self._parallel if sub["launched"] else self._fused)(substeps, iterations)
         self._pass(dt, substeps)
         _, phi1, phi2, *_ = self._drag or decay(0.0, self._h)
         self._scene.hh = self._h**2 * sub["reaches"] * (phi2 if self._started else phi1)
@@ -252,7 +252,7 @@ class World(Access):
     def _list(self) -> None:
         """Build the neighbour list, growing it until everything fits."""
         assert self._grid
-        if self._path == "fused" or self._sub.team.size > 1:
+        if not self._sub.launched:
             self._grid.stale[None] = 1
             while self._launched(1, 1, 0, 0, LISTS):  # by the kernel that there is anyway
                 pass

@@ -90,11 +90,9 @@ class Box(Wall):
         """Where the planes are; what stands is where it stands, to the bit, and at infinity too."""
         for side in range(ti.static(2 * self.dim)):
             a, b = self._on_sides[side][0], self._on_sides[side][1]
-            at, shift = b, 0 * b
+            at, shift = b, ti.zero(b)
             if a != b:
                 at, shift = a * (1 - when[1]) + b * when[1], (b - a) * (when[1] - when[0])
-            else:
-                shift = 0
             self._on_now[side] = ti.Vector([at, shift])
 
     @ti.func
@@ -113,5 +111,4 @@ class Box(Wall):
                         n[k], moved[k], depth = 1, shift, wall + radius - x[k]
                     elif side == k + self.dim:
                         n[k], moved[k], depth = -1, shift, x[k] + radius - wall
-                if depth > -self._on_state.digits(i):
-                    self.press(i, depth, n, moved, h)
+                self.press(i, depth, n, moved, h)

@@ -135,7 +135,7 @@ class Contact(Touch):
         return self._on_grid
 
     @ti.func
-    def hurries(self, i):
+    def overshoots(self, i):
         """1 if particle i crosses more than its own size in one substep."""
         d, limit = self._on_state.d[i], self._on_radius.stride(i)
         return ti.select(d.dot(d) <= limit * limit, 0, 1)
@@ -169,7 +169,7 @@ class Contact(Touch):
         return out
 
     @ti.func
-    def count(self, i, first):
+    def count(self, i):
         """Which pairs of particle i touch, and how often its mass is split. What does not touch has no push to keep."""
         bits = self.touches(i, 0)
         pairs = ti.math.popcnt(bits)
@@ -200,7 +200,6 @@ class Contact(Touch):
     @ti.func
     def forget(self, i, word, gone):
         """Some pairs do not touch any more."""
-
         while gone != 0:
             self._on_push.field[self._on_grid.first[i] + word * WORD + lowest(gone)] = 0
             gone &= gone - ti.u32(1)

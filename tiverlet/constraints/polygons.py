@@ -179,7 +179,7 @@ class Polygons(Rim):
         self._on_less[i] = ti.max(self._on_less[i] - self.push_out * h / 2, 0)
 
     @ti.func
-    def hurries(self, i):
+    def overshoots(self, i):
         """1 if particle i crosses a quarter of an edge in one substep, or begins an edge that is too long for the list."""
         out = 0
         d, limit = self._on_state.d[i], ti.cast(self._on_reach, self.scene.real)
@@ -201,7 +201,7 @@ class Polygons(Rim):
         return count[v] * self._on_w[v] + at_a + at_b
 
     @ti.func
-    def count(self, i, first):
+    def count(self, i):
         """How many contacts particle i is in."""
         active = 0
         for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):

@@ -8,6 +8,7 @@ import numpy as np
 from ..tools import golden_colors
 from .baselines import BASELINES
 from .cases import CASES
+from .output import canvas
 from .points import Point
 
 if TYPE_CHECKING:
@@ -16,11 +17,7 @@ if TYPE_CHECKING:
 
 def plot(report: "ErrorReport", folder) -> list[str]:
     """One PNG for each case; diverged points are crosses on the top edge."""
-    try:
-        from matplotlib.figure import Figure  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise RuntimeError('plot: matplotlib is not there. Install it with the extra: pip install "tiverlet[plots]".') from error
-    os.makedirs(folder, exist_ok=True)
+    Figure = canvas(folder)
     out = []
     for name in report.cases:
         curves = [c for c in report.curves(name) if c]

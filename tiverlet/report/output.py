@@ -1,5 +1,6 @@
 """What all reports print with: text, Markdown, and numbers that JSON has."""
 
+import os
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -24,3 +25,13 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 def plain(row: dict) -> dict:
     """With None for numbers that JSON does not have."""
     return {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in row.items()}
+
+
+def canvas(folder) -> Any:
+    """The Figure of matplotlib, to plot into a folder, which is made. Raises RuntimeError where there is no matplotlib."""
+    try:
+        from matplotlib.figure import Figure  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise RuntimeError('plot: matplotlib is not there. Install it with the extra: pip install "tiverlet[plots]".') from error
+    os.makedirs(folder, exist_ok=True)
+    return Figure

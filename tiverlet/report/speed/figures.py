@@ -4,6 +4,7 @@ import os
 from typing import TYPE_CHECKING
 
 from ...tools import golden_colors
+from ..output import canvas
 
 if TYPE_CHECKING:
     from .result import SpeedReport
@@ -11,11 +12,7 @@ if TYPE_CHECKING:
 
 def plot(report: "SpeedReport", folder) -> list[str]:
     """speed.png: rates by size, with the yardstick dashed; start.png: the first step, cold and warm; memory.png: bytes."""
-    try:
-        from matplotlib.figure import Figure  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise RuntimeError('plot: matplotlib is not there. Install it with the extra: pip install "tiverlet[plots]".') from error
-    os.makedirs(folder, exist_ok=True)
+    Figure = canvas(folder)
     curves = list(report.curves())
     scenes = list(dict.fromkeys(scene for scene, _, _ in curves))
     colors = dict(zip(scenes, golden_colors(max(1, len(scenes))) / 255, strict=False))
