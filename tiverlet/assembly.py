@@ -74,7 +74,7 @@ def assemble(
             "Use tv.init(), or ti.init(fast_math=False)."
         )
     path = _chosen(path, particles, features) if order == 2 else "fused"
-    memory = runtime.Memory(PRECISIONS[precision])
+    memory = runtime.Memory(PRECISIONS[precision], len(particles))
     try:
         state = State(memory, particles, inv_mass, precision == "f32-compensated")
         return _bind(Scene(memory, state, particles, inv_mass, order=order), features, solver, path)

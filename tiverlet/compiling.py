@@ -9,6 +9,7 @@ Everything here knows the inside of Taichi 1.7.4; with another one, kernels are 
 """
 
 import contextlib
+import linecache
 import os
 import pathlib
 import textwrap
@@ -16,7 +17,7 @@ import threading
 import weakref
 from collections.abc import Iterator
 from functools import lru_cache
-from types import SimpleNamespace
+from types import CodeType, SimpleNamespace
 from typing import Any
 
 import taichi as ti
@@ -29,6 +30,11 @@ HOSTS = ("Arch.x64", "Arch.arm64")  # whose kernels LLVM makes as fast without i
 # No analysis of control flow, and, since that one would find that two addresses are the same, no variables for what loops read
 # and write at one address: it would become two variables.
 LEAN = {"cfg_optimization": False, "cache_loop_invariant_global_vars": False}
+# In small worlds, no search for equal expressions either: compiling takes two thirds of the time, and frames with contacts a
+# tenth more, because the address of the fields is looked up again after every store.
+BRIEF = {"opt_level": 0}
+NOTHING = 8  # bytes of code of a function that has nothing but a docstring
+FEW = 1000  # particles from which it pays
 _INSIDE = contextlib.nullcontext()
 _lock = threading.RLock()  # the type of literals is one for all threads
 _active: list["Compiler"] = []  # whose kernels are being compiled or launched, the innermost last
@@ -40,12 +46,13 @@ class Compiler:
     """How the kernels of one world are compiled, while it is called as a context.
 
     real: the type of their literals. Taichi rounds the literal 0.1 to its default type even next to f64 operands; a world of
-    precision "f64" (and the user's own functions in it) must not lose half of the digits that way. Kernels compile at their
-    first launch.
+    precision "f64" (and the user's own functions in it) must not lose half of the digits that way. particles: how many they are
+    for. Kernels compile at their first launch.
     """
 
-    def __init__(self, real):
+    def __init__(self, real, particles: int = FEW):
         self.real = real
+        self.lean = LEAN | BRIEF if particles < FEW else LEAN
         self.thorough = not _patched  # once and for all, since what Taichi fails to compile may be tried again
         self._settings: dict[str, Any] = {}  # that Taichi was started with
         self._thread = 0
@@ -61,11 +68,11 @@ class Compiler:
         runtime: Any = impl.get_runtime()
         with _lock:
             config, literals = runtime.prog.config(), runtime.default_fp
-            before = {name: getattr(config, name) for name in LEAN}
+            before = {name: getattr(config, name) for name in LEAN | BRIEF}
             self._settings = _active[0]._settings if _active else before
             runtime.set_default_fp(self.real)
             if str(config.arch) in HOSTS and not self.thorough:
-                _set(config, LEAN)
+                _set(config, self.lean)
             _active.append(self)
             self._thread = threading.get_ident()
             try:
@@ -140,8 +147,23 @@ def _lines_of(function) -> tuple[list[str], int]:
     if not function.__code__.co_filename.startswith(HOME):
         _active[-1].beware()
     if function not in _lines:
-        _lines[function] = _find_lines(function)
+        _lines[function] = _cut_out(function.__code__) or _find_lines(function)
     return _lines[function]
+
+
+def _cut_out(code: CodeType) -> tuple[list[str], int] | None:
+    """The lines of a function from where its code begins to where it ends; inspect looks for the end token by token.
+
+    None for one that does nothing, whose code does not tell.
+    """
+    first, lines = code.co_firstlineno, linecache.getlines(code.co_filename)
+    return (lines[first - 1 : _end(code)], first) if lines and len(code.co_code) > NOTHING else None
+
+
+def _end(code: CodeType) -> int:
+    """The last line of a function and of those inside it."""
+    inside = [_end(const) for const in code.co_consts if isinstance(const, CodeType)]
+    return max([code.co_firstlineno, *inside, *(end for _, end, _, _ in code.co_positions() if end)])
 
 
 def _file_of(function) -> str:
@@ -166,12 +188,12 @@ def _patch() -> bool:
     if (
         ti.__version__ != (1, 7, 4)
         or not all(hasattr(kernel_impl, name) for name in names)
-        or not all(hasattr(config, name) for name in LEAN)
+        or not all(hasattr(config, name) for name in LEAN | BRIEF)
     ):
         return False
     kernel_impl.getsourcelines, kernel_impl.getsourcefile = _lines_of, _file_of
     # Every line of a function is expanded at every call of it.
-    kernel_impl.textwrap = SimpleNamespace(fill=lru_cache(1 << 14)(textwrap.fill), dedent=textwrap.dedent)
+    kernel_impl.textwrap = SimpleNamespace(fill=lru_cache(1 << 14)(textwrap.fill), dedent=lru_cache(1 << 10)(textwrap.dedent))
     ASTTransformerContext.get_pos_info = _place_of
     return True
 

@@ -27,13 +27,14 @@ class Luggage:
     """What each pair carries along: a number, or a vector of `width`.
 
     lasting: it is part of the state, beyond a substep. kept: it goes from list to list; what is not has to be worked out anew.
+    marked: only pairs whose bit in Grid.touching is set have other than 0.
     """
 
     field: Any
     aside: Any
 
-    def __init__(self, name: str, width: int, lasting: bool, kept: bool = True):
-        self.name, self.width, self.lasting, self.kept = name, width, lasting, kept
+    def __init__(self, name: str, width: int, lasting: bool, kept: bool = True, marked: bool = False):
+        self.name, self.width, self.lasting, self.kept, self.marked = name, width, lasting, kept, marked
 
 
 class Grid:
@@ -52,6 +53,7 @@ class Grid:
         self.n, self.dim, self.state, self.radius = n, dim, scene.state, scene.radius
         self.table, self.luggage = table, luggage
         self.lasting, self.bags = [p for p in luggage if p.lasting], [p for p in luggage if p.kept]
+        self.marked = all(p.marked for p in self.bags)
         self.real, self.memory, self.skin = scene.real, scene.memory, skin
         self._extent: Sequence[float] = [-1.0] * dim
         self.cells = Cells(scene, scene.particles.radius, skin, team, scratch)
@@ -198,35 +200,48 @@ class Grid:
     @ti.func
     def pack(self, i):
         """Put aside what carries something."""
-        at = self.first[i]
-        for e in range(self.first[i], self.first[i] + self.number[i]):
-            some = 0
-            self.aside[at] = self.near[e]
-            for piece in ti.static(self.bags):
-                value = piece.field[e]
-                piece.aside[at] = value
-                if ti.static(piece.width == 0):
-                    some |= ti.cast(value != 0, ti.i32)
-                else:
-                    for k in ti.static(range(piece.width)):
-                        some |= ti.cast(value[k] != 0, ti.i32)
-            at += some
-        self.old_first[i], self.old_number[i] = self.first[i], at - self.first[i]
+        first = self.first[i]
+        at = first
+        for word in range(self.words(i)):
+            bits = self.whole(i, word)
+            if ti.static(self.marked):
+                if word == 0:
+                    bits = self.touching[i]
+            while bits != 0:
+                e = first + word * WORD + lowest(bits)
+                bits &= bits - ti.u32(1)
+                some = 0
+                self.aside[at] = self.near[e]
+                for piece in ti.static(self.bags):
+                    value = piece.field[e]
+                    piece.aside[at] = value
+                    if ti.static(piece.width == 0):
+                        some |= ti.cast(value != 0, ti.i32)
+                    else:
+                        for k in ti.static(range(piece.width)):
+                            some |= ti.cast(value[k] != 0, ti.i32)
+                at += some
+        self.old_first[i], self.old_number[i] = first, at - first
 
     @ti.func
     def carry(self, i):
-        """Give each neighbour of particle i what it carried in the old list; both are sorted."""
-        old, end = self.old_first[i], self.old_first[i] + self.old_number[i]
-        for e in range(self.first[i], self.first[i] + self.number[i]):
-            j = self.near[e]
-            while old < end and self.aside[old] < j:
-                old += 1
-            for piece in ti.static(self.luggage):
+        """Give each neighbour of particle i what it carried in the old list; both are sorted. Returns bits for those that got
+        something, among the first."""
+        first, number = self.first[i], self.number[i]
+        for piece in ti.static(self.luggage):
+            for e in range(first, first + number):
                 piece.field[e] = ti.zero(piece.field[e])  # 0 times what is there could be -0
-            if old < end:
-                if self.aside[old] == j:
+        bits, at = ti.u32(0), 0
+        for old in range(self.old_first[i], self.old_first[i] + self.old_number[i]):
+            while at < number and self.near[first + at] < self.aside[old]:
+                at += 1
+            if at < number:
+                if self.near[first + at] == self.aside[old]:
                     for piece in ti.static(self.bags):
-                        piece.field[e] = piece.aside[old]
+                        piece.field[first + at] = piece.aside[old]
+                    if at < WORD:
+                        bits |= ti.u32(1) << ti.cast(at, ti.u32)
+        return bits
 
     @ti.func
     def outrun(self, i):
@@ -296,8 +311,7 @@ class Grid:
     def finish(self, i):
         """Put the list of particle i in order."""
         self.order(self.first[i], self.number[i])
-        self.carry(i)
-        self.touching[i] = self.whole(i, 0)
+        self.touching[i] = self.carry(i)
 
     @ti.func
     def words(self, i):
@@ -366,16 +380,20 @@ class Grid:
         elif count > ti.static(self.short):
             self.insert(begin, count)
         else:
-            # A network has no branches.
+            # A network has no branches. Where neighbours in space are neighbours in number too, they are in order as they come.
             j = ti.Vector.zero(ti.i32, self.short)
             for k in ti.static(range(self.short)):
                 j[k] = ti.select(k < count, self.near[begin + k], ti.static(2**31 - 1))
-            for layer in ti.static(self.network):
-                for a, b in ti.static(layer):
-                    j[a], j[b] = ti.min(j[a], j[b]), ti.max(j[a], j[b])
-            for k in ti.static(range(self.short)):
-                if k < count:
-                    self.near[begin + k] = j[k]
+            mixed = 0
+            for k in ti.static(range(self.short - 1)):
+                mixed |= ti.cast(j[k] > j[k + 1], ti.i32)
+            if mixed != 0:
+                for layer in ti.static(self.network):
+                    for a, b in ti.static(layer):
+                        j[a], j[b] = ti.min(j[a], j[b]), ti.max(j[a], j[b])
+                for k in ti.static(range(self.short)):
+                    if k < count:
+                        self.near[begin + k] = j[k]
 
     @ti.func
     def insert(self, begin, count):

@@ -22,7 +22,7 @@ import numpy as np
 import taichi as ti
 from taichi.lang import impl
 
-from .compiling import Compiler
+from .compiling import FEW, Compiler
 
 ARCHITECTURES = ("cpu", "cuda", "metal", "vulkan")
 GROUP = 16  # fields that one transfer kernel serves; Taichi unrolls the loop over them
@@ -179,17 +179,18 @@ class Entry:
 class Memory:
     """The fields of one world: declared first, then placed together in one tree, freed together.
 
-    `real` is ti.f32 or ti.f64. Every method that touches the fields checks first that they still exist.
+    `real` is ti.f32 or ti.f64; particles: how many the world has, see Compiler. Every method that touches the fields checks first
+    that they still exist.
     """
 
-    def __init__(self, real):
+    def __init__(self, real, particles: int = FEW):
         if _trees >= MAX_TREES:
             raise RuntimeError(
                 f"{_trees} worlds are alive, and Taichi crashes near 512. Close worlds that you no longer need: "
                 "world.close(), or `with tv.World(...) as world:`."
             )
         self.real = real
-        self.compiler = Compiler(real)
+        self.compiler = Compiler(real, particles)
         self.entries: list[Entry] = []
         self._later: list[tuple[Entry, np.ndarray]] = []
         self._builder = ti.FieldsBuilder()

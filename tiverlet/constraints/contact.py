@@ -126,7 +126,8 @@ class Contact(Touch):
             self._on_partner = scene.memory.field("Contact.partner", n, kind=ti.i32)
             self._on_hit = scene.memory.field("Contact.hit", None, kind=ti.i32)
         self.table.bind(scene)
-        self._on_push = Luggage("push", 0, lasting=True)  # what parted the pair in the last substep, per inverse mass [kg m]
+        # What parted the pair in the last substep, per inverse mass [kg m].
+        self._on_push = Luggage("push", 0, lasting=True, marked=True)
         self._on_slip = Luggage("slip", dim, lasting=True)
         self._on_blow = Luggage("blow", 0, lasting=False)
         luggage = [self._on_push, *([self._on_slip] if self.rubs else []), *([self._on_blow] if self.bounces else [])]
