@@ -78,7 +78,8 @@ def test_pairs_equal_brute_force(world, name, radius, several, path):
         if filled:
             in_bucket = np.diff(w._grid.cells.edge.to_numpy())
             assert ((in_bucket > 0).sum(), in_bucket.max()) == filled
-        touching = w._look(begin=True)
+        w._look()
+        touching = w._report()
         brute, depth = tv.measure.overlapping(position, radius)
         assert touching.contacts == len(brute)
         both = np.asarray(radius)[brute]

@@ -103,10 +103,11 @@ class Composition(Substep):
 
     @ti.kernel
     def fused(
-        self, h64: ti.f64, t: ti.f64, tick: ti.i32, since: ti.i32, fresh: ti.i32, substeps: ti.i32, iterations: ti.i32,
-        begin: ti.i32, it0: ti.i32, what: ti.i32,
+        self, h64: ti.f64, t: ti.f64, end: ti.f64, tick: ti.i32, since: ti.i32, fresh: ti.i32, substeps: ti.i32,
+        iterations: ti.i32, begin: ti.i32, it0: ti.i32, resumed: ti.i32, came: ti.i32,
+        out: ti.types.ndarray(ti.f64, 1),  # type: ignore[valid-type]
     ):  # fmt: skip
-        """All substeps of a frame. h64: the first stage, which is as long as the last."""
+        """All substeps of a frame, and the survey. h64: the first stage, which is as long as the last."""
         whole = h64 / self.first
         ti.loop_config(serialize=True)
         for s in range(substeps):
@@ -116,6 +117,8 @@ class Composition(Substep):
                 when = ti.Vector([(s + g[2]) / substeps, (s + g[3]) / substeps])
                 final = ti.cast(s == substeps - 1 and q == self.count - 1, ti.i32)
                 self.stage(g[0] * whole, g[1] * whole, t + (s + g[2]) * whole, when, starts, iterations, final)
+        self.survey.weigh(0, h64, came)
+        self.survey.sum_up(0, h64, end, came, out)
 
     @ti.kernel
     def probed(self, h: ti.f64, last: ti.f64, t: ti.f64, end: ti.f64, iterations: ti.i32):

@@ -40,6 +40,7 @@ class Phases:
         self.tile = TILE if cpu else 1
         self.tiles = -(-scene.particles.count // self.tile)
         self.gap = -(-LEAST * runtime.threads() // max(1, self.tiles)) if self.launched and cpu else 1
+        self.stride = LEAST if self.launched and cpu else 1  # iterations of a loop for each of few pieces of work
         # For substeps made of stages: the share of the first, what accelerates in the last per h^2, omega^2 of springs.
         self.first, self.reaches, self.fastest = 1.0, 1.0, 0.0
         self.scene, self.state, self.slots = scene, scene.state, scene.slots

@@ -4,6 +4,8 @@ fused: a whole frame in one launch, by one CPU thread or by a team of them.
 parallel: a few launches per substep, whose loops Taichi spreads over the threads of a GPU.
 """
 
+from typing import Any
+
 import numpy as np
 import taichi as ti
 
@@ -11,48 +13,54 @@ from .calm import PASSES
 from .phases import Phases
 from .team import LEAST
 
-RESUMED, LISTS = 1, 2  # what a launch does other than a whole frame
+HALT = 16  # among the figures of a frame: whether, in which substep and before which iteration it stopped to have the list grown
 REBOUNDS = 8  # rounds of restitution in a substep, at most
 
 
 @ti.data_oriented
 class Substep(Phases):
-    """The kernels of one world. what: 0 for a frame; RESUMED if it stopped in substep `begin`, before iteration `it0`, to have
-    the list grown; LISTS to do no more than build the list."""
+    """The kernels of one world. resumed: 1 if the frame stopped in substep `begin`, before iteration `it0`, to have the list
+    grown. end, came, out: of the survey, see there."""
+
+    survey: Any  # what sums up a frame; given once it is there
 
     @ti.kernel
     def fused(
-        self, h64: ti.f64, t: ti.f64, tick: ti.i32, since: ti.i32, fresh: ti.i32, substeps: ti.i32, iterations: ti.i32,
-        begin: ti.i32, it0: ti.i32, what: ti.i32,
+        self, h64: ti.f64, t: ti.f64, end: ti.f64, tick: ti.i32, since: ti.i32, fresh: ti.i32, substeps: ti.i32,
+        iterations: ti.i32, begin: ti.i32, it0: ti.i32, resumed: ti.i32, came: ti.i32,
+        out: ti.types.ndarray(ti.f64, 1),  # type: ignore[valid-type]
     ):  # fmt: skip
-        """All substeps of a frame, in one launch."""
+        """All substeps of a frame, in one launch, and what it came to; without substeps that alone."""
         ti.loop_config(serialize=self.team.size == 1)
         for thread in range(self.team.spread):
             if thread % LEAST == 0:
-                self.frame(thread // LEAST, h64, t, tick, since, fresh, substeps, iterations, begin, it0, what)
+                me = thread // LEAST
+                self.frame(me, h64, t, end, tick, since, fresh, substeps, iterations, begin, it0, resumed, came, out)
 
     @ti.func
-    def frame(self, me, h64, t, tick, since, fresh, substeps, iterations, begin, it0, what):
+    def frame(
+        self, me, h64, t, end, tick, since, fresh, substeps, iterations, begin, it0, resumed, came, out: ti.template()  # type: ignore[valid-type]
+    ):  # fmt: skip
         """What thread `me` does of a frame. All threads of a team take the same branches, for what they depend on is written only
         where the others wait."""
-        for s in range(begin, substeps):
-            h = ti.cast(h64, self.real)
+        for s in range(begin, substeps + 1):
+            h, more = ti.cast(h64, self.real), s < substeps
             when = self.clock(s, substeps)
             starts = fresh if s == 0 else 0
-            resumed = what if s == begin else 0
+            again = resumed if s == begin else 0
             if self.team.works(me) and self.halted() == 0:
-                if resumed == 0:
+                if more and again == 0:
                     self.predict(
                         me, h, ti.cast(t + s * h64, self.real), tick + s, starts, when, self.calming(since + s)
                     )  # fmt: skip
-                for it in range(it0 if resumed != 0 else 0, iterations):
+                for it in range(it0 if again != 0 else 0, iterations if more else 1):
                     if ti.static(self.hashes):
                         if self.halted() == 0 and self.is_stale() != 0:
                             self.grid.build(me)
                             if self.grid.need[None] > self.grid.capacity:
                                 self.halt[None] = [1, s, it]
                         self.team.wait()
-                    if self.halted() == 0 and what != LISTS:
+                    if more and self.halted() == 0:
                         first, final = ti.cast(it == 0, ti.i32), ti.cast(s == substeps - 1, ti.i32)
                         self.tell(me, h, when, first, starts)
                         self.settle(me, first)
@@ -63,12 +71,20 @@ class Substep(Phases):
                                     self.rebound(me)
                         self.collect(me, h, when, first, final)
                 if ti.static(self.concludes):
-                    if self.halted() == 0 and what != LISTS:
+                    if more and self.halted() == 0:
                         self.remember(me, h, tick + s)
                 if ti.static(self.calms):
-                    if self.halted() == 0 and what != LISTS and self.calming(since + s) != 0:
+                    if more and self.halted() == 0 and self.calming(since + s) != 0:
                         for k in range(PASSES):
                             self.calm(me, k)
+                if not more and self.halted() == 0:
+                    self.survey.weigh(me, h, came)
+                    self.survey.sum_up(me, h64, end, came, out)
+                    self.team.forgive()
+        if ti.static(self.hashes):
+            if me == 0:
+                for k in ti.static(range(3)):
+                    out[HALT + k] = self.halt[None][k]
 
     @ti.kernel
     def predicted(

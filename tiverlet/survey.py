@@ -7,12 +7,11 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from .compiling import Quick
 from .feature import FAR
 from .grid import FARTHEST
 from .particles import LARGEST
 from .scalar import TENSEST
-from .substep import Substep
+from .substep import HALT, Substep
 from .team import LEAST
 
 BLOCKS = 64  # partial sums: their number is fixed, so the total has the same bits on any number of threads
@@ -20,7 +19,8 @@ TURNS = (0, 26, 41)  # degrees, for nothing, BENT and FAR
 STIFF = 4.0  # (omega h)^2 beyond which Verlet diverges
 
 
-FIGURES = 16
+FIGURES = HALT + 3
+STEPPED, STARTED, UNSTEPPED = range(3)  # how a state came about: by a substep, by the first one after a start, by none yet
 
 
 @dataclass(frozen=True)
@@ -83,10 +83,15 @@ class StepReport:
 
 @ti.data_oriented
 class Survey:
-    """The kernel behind a StepReport."""
+    """The figures behind a StepReport: those of out, in the order in which report() reads them.
+
+    came: how the state came about. A frame that is one launch ends with them; where it is launched phase by phase, measure() is
+    the last one.
+    """
 
     def __init__(self, substep: Substep):
         self.sub: Any = substep
+        self.team = substep.team
         self.n, self.dim, self.state = substep.n, substep.dim, substep.state
         self.batches = substep.batches
         self.contacts = substep.contacts
@@ -95,21 +100,20 @@ class Survey:
         if substep.grid:
             self.farthest = min(LARGEST, substep.grid.finest * FARTHEST)
         self.probes = [f for f in substep.accelerations if not f.uniform]
-        self.spread = 512 if substep.parallel else 1  # Taichi gives each CPU thread at least 512 iterations
+        self.stride = substep.stride
         add = substep.scene.memory.field
         self.parts = add("survey.figures", BLOCKS, width=6, kind=ti.f64)
         self.low = add("survey.low", BLOCKS, width=self.dim, kind=ti.f64)
         self.high = add("survey.high", BLOCKS, width=self.dim, kind=ti.f64)
-        self.flags = add("survey.flags", None, kind=ti.i32)
         self.details: dict[int, Residuals] = {}  # compiled when asked for
         self.out = np.zeros(FIGURES)
-        self.quick = Quick(self, "measure", substep.scene.memory.compiler)
+        substep.survey = self
 
     def of(self, substep: Substep) -> "Survey":
-        """The same fields, with kernels for another Substep."""
+        """The same fields, for another Substep."""
         new = copy.copy(self)
         new.sub, new.details = substep, {}
-        new.quick = Quick(new, "measure", substep.scene.memory.compiler)
+        substep.survey = new
         return new
 
     @ti.func
@@ -186,35 +190,28 @@ class Survey:
         return figures, low, high
 
     @ti.func
-    def weigh(self, h, fresh):
+    def weigh(self, me, h64, came):
         """The sums behind residuals."""
-        if ti.static(self.sub.team.size == 1):
-            self.sub.weigh(0, h, self.sub.reach(h, fresh), 0, fresh, False)
-        elif ti.static(len(self.sub.ragged) > 0):
-            for thread in range(self.sub.team.spread):
-                if thread % LEAST == 0:
-                    self.sub.weigh(thread // LEAST, h, self.sub.reach(h, fresh), 0, fresh, False)
+        h, fresh = ti.cast(h64, self.sub.real), ti.cast(came == STARTED, ti.i32)
+        self.sub.weigh(me, h, self.sub.reach(h, fresh), 0, fresh, False)
 
     @ti.kernel
-    def measure(
-        self,
-        h64: ti.f64,
-        t64: ti.f64,
-        fresh: ti.i32,
-        begin: ti.i32,
-        out: ti.types.ndarray(ti.f64, 1),  # type: ignore[valid-type]
-    ):
-        """All figures; fresh: the last substep was a start; begin: d holds velocities, no step was made yet."""
-        h32 = ti.cast(h64, self.sub.real)
-        self.weigh(h32, fresh)
-        ti.loop_config(serialize=not self.sub.parallel)
-        for thread in range(BLOCKS * self.spread):
-            if thread % self.spread == 0:
-                h, t = ti.cast(h64, self.sub.real), ti.cast(t64, self.sub.real)
-                b = thread // self.spread
+    def measure(self, h64: ti.f64, t64: ti.f64, came: ti.i32, out: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
+        """All figures."""
+        self.weigh(0, h64, came)
+        self.sum_up(0, h64, t64, came, out)
+
+    @ti.func
+    def sum_up(self, me, h64, t64, came, out: ti.template()):  # type: ignore[valid-type]
+        """By blocks, then by one thread."""
+        for k in range(self.team.low(BLOCKS * self.stride, me), self.team.high(BLOCKS * self.stride, me)):
+            if k % self.stride == 0:
+                h, t, b = ti.cast(h64, self.sub.real), ti.cast(t64, self.sub.real), k // self.stride
+                fresh, begin = ti.cast(came == STARTED, ti.i32), ti.cast(came == UNSTEPPED, ti.i32)
                 self.parts[b], self.low[b], self.high[b] = self.block(b, h, t, self.sub.clock(0, 1), fresh, begin)
+        self.team.wait()
         ti.loop_config(serialize=True)
-        for _ in range(1):
+        for _ in range(self.team.one(1, me)):
             for b in range(1, BLOCKS):
                 part, total = self.parts[b], self.parts[0]
                 total[0] += part[0]
@@ -225,26 +222,22 @@ class Survey:
                 self.parts[0] = total
                 self.low[0] = ti.min(self.low[0], self.low[b])
                 self.high[0] = ti.max(self.high[0], self.high[b])
-            self.sub.team.rest()
-            flags = 0
+            for k in ti.static(range(6)):
+                out[k] = self.parts[0][k]
+            for k in ti.static(range(self.dim)):
+                out[7 + k], out[10 + k] = self.low[0][k], self.high[0][k]
             for c in ti.static(self.contacts):
-                flags += c._on_fast[None]
+                out[6] = c._on_fast[None]
                 c._on_fast[None] = 0
+            if ti.static(len(self.sub.breakers) > 0):
+                out[13] = self.sub.slots.broken[None]
+                self.sub.slots.broken[None] = 0
             if ti.static(len(self.batches) > 0):
                 out[15] = self.sub.slots.turned[None]
                 self.sub.slots.turned[None] = 0
                 if ti.static(self.sub.slots.converges):
                     out[14] = self.sub.slots.tension[None]
                     self.sub.slots.tension[None] = 0
-            self.flags[None] = flags
-        for k in ti.static(range(6)):
-            out[k] = self.parts[0][k]
-        out[6] = self.flags[None]
-        if ti.static(len(self.sub.breakers) > 0):
-            out[13] = self.sub.slots.broken[None]
-            self.sub.slots.broken[None] = 0
-        for k in ti.static(range(self.dim)):
-            out[7 + k], out[10 + k] = self.low[0][k], self.high[0][k]
 
     def residuals(self, batch, h: float, fresh: bool) -> np.ndarray:
         """What the last substep left of each violation in a batch, (m,)."""
@@ -255,11 +248,10 @@ class Survey:
         return out[: batch.count]
 
     def report(
-        self, time: float, h: float, substeps: int, iterations: int, fresh: bool, begin: bool, before: float | None
+        self, time: float, h: float, substeps: int, iterations: int, before: float | None
     ) -> tuple[StepReport, list[float]]:
         """The report of a frame, and the size of the bounding box [m]. before: the energy one frame ago [J]."""
         mine = vars(self)  # whose attributes Taichi looks at in Python, one by one
-        mine["quick"](h, time, int(fresh), int(begin), mine["out"])
         out, n, dim = mine["out"].tolist(), mine["n"], mine["dim"]
         energy, residual, overlap, stiff, contacts, bad, flags = out[:7]
         stiff = max(stiff, mine["sub"].fastest * h * h)
@@ -323,8 +315,12 @@ class Residuals:
     @ti.kernel
     def measure(self, h64: ti.f64, fresh: ti.i32, out: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
         """Of every constraint."""
-        h32 = ti.cast(h64, self.sub.real)
-        self.survey.weigh(h32, fresh)
+        if ti.static(self.sub.team.size == 1):
+            self.survey.weigh(0, h64, fresh)
+        elif ti.static(len(self.sub.ragged) > 0):
+            for thread in range(self.sub.team.spread):
+                if thread % LEAST == 0:
+                    self.survey.weigh(thread // LEAST, h64, fresh)
         for c in range(self.batch.count):
             h = ti.cast(h64, self.sub.real)
             out[c] = self.batch.miss(c, h, self.sub.reach(h, fresh), self.sub.clock(0, 1), fresh)

@@ -18,6 +18,7 @@ LEAST = 512  # iterations of a loop that Taichi gives to a CPU thread, at least
 PATIENCE = 20_000  # looks at the counter, of 50 ns or less, and one more for each particle: then a wait was long
 LONG = 4  # long waits in a frame after which one thread goes on alone
 ALONE = 32  # frames until the others come back
+SHIFT = 4096  # frames after which arrivals are counted from 0 again, while nobody waits
 
 
 _apart = False
@@ -46,7 +47,7 @@ class Team:
     def __init__(self, memory: Memory, size: int, particles: int):
         self.size, self.patience = size, PATIENCE + particles
         self.spread = LEAST * size if size > 1 else 1
-        self._alone = 0
+        self._alone, self._frames = 0, 0
         if size > 1:
             self.arrived = memory.field("team.arrived", None, kind=ti.i32)
             self.hands = memory.field("team.hands", None, kind=ti.i32, values=size)  # how many of them are at work
@@ -55,6 +56,9 @@ class Team:
     def muster(self) -> None:
         """Before a frame: those who left some frames ago come back."""
         if self.size > 1:
+            self._frames += 1
+            if self._frames % SHIFT == 0:
+                self.arrived[None] = 0
             if self._alone == 0 and self.hands[None] == 1:
                 self._alone = ALONE
             elif self._alone > 0:
@@ -118,8 +122,7 @@ class Team:
                 ti.atomic_add(self.late[None], 1)
 
     @ti.func
-    def rest(self):
-        """Count from 0 again, while nobody waits."""
+    def forgive(self):
+        """Count long waits from 0 again."""
         if ti.static(self.size > 1):
-            self.arrived[None] = 0
             self.late[None] = 0

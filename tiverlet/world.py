@@ -20,8 +20,10 @@ from .guard import Guard
 from .particles import Particles
 from .regroup import Handle
 from .solvers.solver import Solver
-from .substep import LISTS, REBOUNDS, RESUMED, decay
-from .survey import StepReport
+from .substep import HALT, REBOUNDS, decay
+from .survey import STARTED, STEPPED, UNSTEPPED, StepReport
+
+FREE = decay(0.0, 1.0)  # what no drag makes of a substep
 
 
 class World(Access):
@@ -90,7 +92,7 @@ class World(Access):
         self._memory, self._scene, self._batches = parts.memory, parts.scene, parts.batches
         self._grid, self._sub, self._survey, self._path = parts.grid, parts.substep, parts.survey, parts.path
         self._solver = parts.solver
-        self._frames = Quick(self._sub, "fused", self._memory.compiler)
+        self._make()
         self._search = None  # compiled when it is first asked
         parts.scene.residuals = self._residuals
 
@@ -117,7 +119,7 @@ class World(Access):
             with self._memory.compiler():
                 report = self._guard.advance(self, dt, tolerance, budget)
         else:
-            self._begin(dt / self.substeps * self._sub.first)
+            self._begin(dt / self.substeps * self._plain["first"])
             report = self._advance(dt, self.substeps, self.iterations)
         report.__dict__["seconds"] = perf_counter() - clock  # which is no part of what it says
         self._last = report
@@ -127,29 +129,33 @@ class World(Access):
 
     def _advance(self, dt: float, substeps: int, iterations: int) -> StepReport:
         """One frame from where _begin() left off."""
-        sub = vars(self._sub)  # whose attributes Taichi looks at in Python, one by one
+        sub = self._plain
         if sub["hurries"]:
             with self._memory.compiler():
                 self._sub.slots.kappa[None] = self._solver.condition(iterations)
-        if len(self._particles):
-            (self._parallel if sub["launched"] else self._fused)(substeps, iterations)
-        self._pass(dt, substeps)
-        _, phi1, phi2, *_ = self._drag or decay(0.0, self._h)
-        self._scene.hh = self._h**2 * sub["reaches"] * (phi2 if self._started else phi1)
-        report = self._look(substeps, iterations)
+        done, frame = substeps if len(self._particles) else 0, self._counted(dt)
+        started, end = self._fresh and substeps == 1, frame[0] + frame[1] * frame[2]
+        if sub["launched"]:
+            self._parallel(done, iterations)
+        else:
+            self._fused(done, iterations, end, STARTED if started else STEPPED)
+        self.__dict__.update(  # which is quicker than one after the other
+            _tick=(self._tick + substeps) % 2**31, _since=(self._since + substeps) % 2**31,
+            _started=started, _fresh=False, _frame=frame, _time=end,
+        )  # fmt: skip
+        if sub["launched"]:
+            self._look()
+        _, phi1, phi2, *_ = self._drag or FREE
+        self._scene.hh = self._h**2 * sub["reaches"] * (phi2 if started else phi1)
+        report = self._report(substeps, iterations)
         self._energy = report.energy
         return report
 
-    def _pass(self, dt: float, substeps: int) -> None:
-        """Advance the clock: frames of the same length are counted, not summed, so that they add no rounding errors."""
+    def _counted(self, dt: float) -> tuple[float, float, int]:
+        """When frames of this length began, their length, and their number, with one more: frames of the same length are counted,
+        not summed, so that they add no rounding errors."""
         since, length, count = self._frame
-        if dt != length:
-            since, count = self._time, 0
-        self.__dict__.update(
-            _tick=(self._tick + substeps) % 2**31, _since=(self._since + substeps) % 2**31,
-            _started=self._fresh and substeps == 1, _fresh=False,
-            _frame=(since, dt, count + 1), _time=since + (count + 1) * dt,
-        )  # fmt: skip
+        return (since, dt, count + 1) if dt == length else (self._time, dt, 1)
 
     def _heed(self) -> None:
         """Bring the knobs to the device; where a force has changed, start anew while the device still has what it was."""
@@ -181,7 +187,8 @@ class World(Access):
                 self._since = 0
             self._set(h, drag)
             if self._energy is None:
-                report = self._look(begin=self._fresh)
+                self._look()
+                report = self._report()
                 self._energy = report.energy
                 if report.overlap > 0 and self._placed is not None:
                     self._ease(self._placed)
@@ -201,25 +208,20 @@ class World(Access):
                 self._memory.write(self._scene.state.d, composition.velocity(self))
             self._fresh = True
 
-    def _fused(self, substeps: int, iterations: int) -> None:
-        """All substeps in one launch, resumed where the neighbour list had to grow."""
-        vars(self._sub)["team"].muster()
-        halt = self._launched(substeps, iterations, 0, 0, 0)
-        while halt:
-            halt = self._launched(substeps, iterations, *halt, RESUMED)
-
-    def _launched(self, substeps: int, iterations: int, begin: int, it0: int, what: int) -> tuple[int, int] | None:
-        """One launch, and more room if it stopped for that: where it goes on then."""
-        if self._frames.owner is not self._sub:
-            self._frames = Quick(self._sub, "fused", self._memory.compiler)
-        clock = self._time, self._tick, self._since
-        self._frames(self._h, *clock, int(self._fresh), substeps, iterations, begin, it0, what)
-        if not self._grid or not self._sub.halt[None][0]:
-            return None
-        _, begin, it0 = (int(v) for v in self._sub.halt[None])
-        self._sub.halt[None] = [0, 0, 0]
-        self._grow()
-        return begin, it0
+    def _fused(self, substeps: int, iterations: int, end: float, came: int) -> None:
+        """All substeps and the survey in one launch, resumed where the neighbour list had to grow."""
+        self._plain["team"].muster()
+        begin = it0 = resumed = 0
+        while True:
+            self._frames(
+                self._h, self._time, end, self._tick, self._since, int(self._fresh), substeps, iterations, begin, it0, resumed,
+                came, self._figures,
+            )  # fmt: skip
+            if not self._figures[HALT]:
+                return
+            resumed, begin, it0 = (int(v) for v in self._figures[HALT:])
+            self._sub.halt[None] = [0, 0, 0]
+            self._grow()
 
     def _parallel(self, n: int, iterations: int) -> None:
         """A few launches per substep."""
@@ -254,8 +256,7 @@ class World(Access):
         assert self._grid
         if not self._sub.launched:
             self._grid.stale[None] = 1
-            while self._launched(1, 1, 0, 0, LISTS):  # by the kernel that there is anyway
-                pass
+            self._fused(0, 1, self._time, STEPPED)  # by the kernel that there is anyway
             return
         with self._memory.compiler():
             while self._sub.listed() > self._grid.capacity:
@@ -272,20 +273,35 @@ class World(Access):
         contact = self._sub.contacts[0]
         if not contact._on_eases:
             contact.ease()
-            self._sub = copy.copy(self._sub)  # kernels that know of the new field; the survey has no use for it
+            self._renew()
         self._sub.shrunk(first)
 
     def _renew(self) -> None:
         """Kernels that know of a new field; Taichi compiles them for each Substep anew."""
         self._sub = copy.copy(self._sub)
         self._survey = self._survey.of(self._sub)
+        self._make()
 
-    def _look(self, substeps: int = 1, iterations: int = 1, begin: bool = False) -> StepReport:
-        """Survey the state."""
+    def _make(self) -> None:
+        """The kernels that are launched in every frame."""
+        compiler = self._memory.compiler
+        self._frames = Quick(self._sub, "fused", compiler)
+        self._sums = Quick(self._survey, "measure", compiler)
+        self._plain, self._figures = vars(self._sub), self._survey.out  # which Taichi looks at in Python whenever we do
+
+    def _look(self) -> None:
+        """Survey the state where no frame did."""
+        came = UNSTEPPED if self._fresh else STARTED if self._started else STEPPED
+        if not self._sub.launched:
+            self._fused(0, 1, self._time, came)
+            return
         if self._grid and self._grid.stale[None]:
             self._list()
-        before = None if begin else self._energy
-        report, extent = self._survey.report(self._time, self._h, substeps, iterations, self._started, begin, before)
+        self._sums(self._h, self._time, came, self._figures)
+
+    def _report(self, substeps: int = 1, iterations: int = 1) -> StepReport:
+        """What the survey found."""
+        report, extent = self._survey.report(self._time, self._h, substeps, iterations, self._energy)
         if self._grid:
             self._grid.fit(extent)
         return report
