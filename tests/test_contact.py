@@ -92,7 +92,7 @@ def test_a_hundred_thousand_particles(world):
     position = rng.uniform(-100, 100, (100_000, 2))
     radius = rng.uniform(0.1, 0.5, 100_000)
     w = world(tv.Particles(position, radius=radius), [tv.Contact(skin=0.05)], precision="f64")
-    assert w.path == ("parallel" if tv.runtime.threads() > 1 else "fused")
+    assert w.path == ("parallel" if tv.runtime.cores() > 1 else "fused")
     w._list()
     first, number = w._grid.first.to_numpy(), w._grid.number.to_numpy()
     near = w._grid.store.read(w._grid.near)

@@ -150,7 +150,7 @@ def test_37_a_million_particles(world):
     x = np.stack([i % side, i // side], axis=1) * 1.05 + 0.5 + rng.uniform(0, 0.02, (side * side, 2))
     w = world(tv.Particles(x, radius=0.5), [tv.Gravity(), tv.Contact(), tv.Box((0, 0), (1100, 1200))], substeps=2)
     report = w.step(1 / 60)
-    assert report.clean and w.path == ("parallel" if tv.runtime.threads() > 1 else "fused")
+    assert report.clean and w.path == ("parallel" if tv.runtime.cores() > 1 else "fused")
     assert sum(w.fields.values()) <= 200 * len(x)
 
 

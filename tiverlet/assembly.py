@@ -30,8 +30,9 @@ PATHS = ("auto", "fused", "parallel")
 # diameters equal discs have fewer than 6 neighbours on average: lines between these do not cross, which makes a planar graph.
 ROOM = {True: (6.5, 14), False: (12, 32)}
 # Particles and constraints from which a team of threads pays. On one thread and on two a frame took, of 8 substeps of a falling
-# pile, 0.71 and 0.67 ms with 4000 discs, 2.7 and 1.9 with 20 000; of 20 substeps of cloth with 2500 particles 1.9 and 1.2.
-CROSSOVER = 5000
+# pile, 0.122 and 0.136 ms with 500 discs, 0.169 and 0.170 with 1000, 0.50 and 0.37 with 4000; of 20 substeps of cloth with 225
+# particles (1200 with constraints) 0.55 and 0.35; of ropes with 205 (405) 0.18 and 0.18, with 820 (1620) 0.64 and 0.40.
+CROSSOVER = 1000
 WIDTH = 2  # of the systems that are solved directly where the user names no solver: chains, loops, joints of up to 3 rods
 
 
@@ -106,7 +107,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
         if scene.order > 2:
             composition.check_solved(batches, scene, solver)
     parallel = path == "parallel"
-    team = Team(memory, size_of(path), len(particles))
+    team = Team(memory, size_of(path, _work(particles, features)), len(particles))
     grid = contact.join(scene, batches, team, parallel) if contact else None
     for feature in [*accelerations, *drivers, *batches, *walls]:
         feature.bind(scene)
@@ -186,5 +187,8 @@ def _chosen(path: str, particles: Particles, features: tuple[Feature, ...]) -> s
         return path
     if runtime.architecture() != "cpu":
         return "parallel"
-    work = len(particles) + sum(f.count for f in features if isinstance(f, Batch))
-    return "fused" if work < CROSSOVER or runtime.threads() == 1 else "parallel"
+    return "fused" if _work(particles, features) < CROSSOVER or runtime.cores() == 1 else "parallel"
+
+
+def _work(particles: Particles, features: tuple[Feature, ...]) -> int:
+    return len(particles) + sum(f.count for f in features if isinstance(f, Batch))

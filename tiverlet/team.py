@@ -15,6 +15,7 @@ from . import runtime
 from .runtime import Memory
 
 LEAST = 512  # iterations of a loop that Taichi gives to a CPU thread, at least
+SHARE = 500  # particles and constraints for each thread, at least; with fewer they wait for each other longer than they work
 PATIENCE = 20_000  # looks at the counter, of 50 ns or less, and one more for each particle: then a wait was long
 LONG = 4  # long waits in a frame after which one thread goes on alone
 ALONE = 32  # frames until the others come back
@@ -35,9 +36,9 @@ def launching() -> Iterator[None]:
         _apart = before
 
 
-def size_of(path: str) -> int:
-    """How many threads make up the team of a world."""
-    return runtime.cores() if path == "parallel" and not _apart else 1
+def size_of(path: str, work: int) -> int:
+    """How many threads make up the team of a world. work: particles and constraints."""
+    return min(runtime.cores(), max(2, work // SHARE)) if path == "parallel" and not _apart else 1
 
 
 class Team:

@@ -36,8 +36,8 @@ class World(Access):
     takes Direct for what hangs together like chains and Jacobi for the rest; explain() says what was chosen.
     precision: "f32" (position and displacement; the digits of a coordinate end at 6e-8 of it, 1 mm at 10 km and 6 cm at 1000 km),
     "f32-compensated" (the position carries a low word, which keeps 1e-4 m at any of these), "f64".
-    path: "auto", "fused" (one launch per frame, one thread) or "parallel" (one launch, a team of all CPU threads; several on a
-    GPU); the bits are the same.
+    path: "auto", "fused" (one launch per frame, one thread) or "parallel" (one launch, a team of CPU threads; several launches on
+    a GPU); the bits are the same.
     order: of the error in the substep: 2, or 4, 6 or 8 in f64 for motion without contacts, walls, damping and limits, where
     every rigid constraint is solved directly. A substep is then made of 5, 9 or 15 stages, see composition.py.
 
