@@ -36,6 +36,37 @@ BODIES = {
 }
 
 
+def test_bodies_in_order_are_the_same_bodies():
+    for name, body in BODIES.items():
+        rng = np.random.default_rng(len(body))
+        one = body.in_order()
+        np.testing.assert_array_equal(np.sort(one.position, axis=0), np.sort(body.position, axis=0), err_msg=name)
+        # Tuples of corners, by where these are, are the same ones; a random number at each place tells places apart.
+        places = np.unique(np.concatenate([body.position, one.position]), axis=0, return_inverse=True)[1].ravel()
+        mark = rng.permutation(len(body) * 2)[places]
+        for what in INDICES:
+            old, new = mark[: len(body)][getattr(body, what)], mark[len(body) :][getattr(one, what)]
+            assert sorted(map(tuple, old.tolist())) == sorted(map(tuple, new.tolist())), (name, what)
+        assert [mark[: len(body)][k].tolist() for k in body.loops] == [mark[len(body) :][k].tolist() for k in one.loops], name
+        limits = [
+            sorted(zip(map(tuple, m[s.limits].tolist()), s.lower, s.upper, strict=True))
+            for m, s in ((mark[: len(body)], body), (mark[len(body) :], one))
+        ]
+        assert limits[0] == limits[1], name
+        assert np.allclose(one.radius.sum(), body.radius.sum())
+
+
+def test_order_is_along_a_curve():
+    # On a grid of 2^k cells a side Morton's curve visits cell (a, b) at the number whose bits are those of b and a in turn.
+    k = 4
+    a, b = (v.ravel() for v in np.meshgrid(np.arange(2**k), np.arange(2**k)))
+    at = sum(((a >> i & 1) << 2 * i) + ((b >> i & 1) << 2 * i + 1) for i in range(k))
+    grid = np.stack([a, b], axis=1) + 0.25
+    shuffled = S.Shape(grid[np.random.default_rng(0).permutation(len(grid))])
+    np.testing.assert_array_equal(shuffled.in_order().position, grid[np.argsort(at)])
+    assert len(S.Shape(np.zeros((0, 3))).in_order()) == 0 and len(S.Shape(np.ones((2, 3))).in_order()) == 2
+
+
 def volumes(shape):
     """Areas of the faces in 2D, volumes of the tetrahedra in 3D."""
     cells = shape.faces if shape.position.shape[1] == 2 else shape.tetrahedra

@@ -42,7 +42,8 @@ def _owner(field: str) -> str:
 
 def _launches(world: "World") -> str:
     if not world._sub.launched:
-        return "1 launch per frame"
+        size = world._sub.team.size
+        return "1 launch per frame" + f", of {size} threads" * (size > 1)
     passes = world.iterations if world._sub.batches or world._grid or world._sub.walls else 0
     more = ", and one for each neighbour list" if world._grid else ""
     return f"{world.substeps * (1 + passes) + 1} launches per frame{more}"

