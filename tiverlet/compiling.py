@@ -12,6 +12,7 @@ import contextlib
 import linecache
 import os
 import pathlib
+import sys
 import textwrap
 import threading
 import weakref
@@ -27,14 +28,15 @@ from taichi.lang.ast import ASTTransformerContext
 # Where functions come from that are known to be safe.
 HOME = tuple(str(pathlib.Path(file).parent) + os.sep for file in (__file__, ti.__file__))
 HOSTS = ("Arch.x64", "Arch.arm64")  # whose kernels LLVM makes as fast without it; measured on x64
-# No analysis of control flow, and, since that one would find that two addresses are the same, no variables for what loops read
-# and write at one address: it would become two variables.
-LEAN = {"cfg_optimization": False, "cache_loop_invariant_global_vars": False}
+# No variables for what loops read and write at one address: Taichi does not see that another address may be the same place, such
+# as field[k] for field[0].
+SAFE = {"cache_loop_invariant_global_vars": False}
+LEAN = SAFE | {"cfg_optimization": False}  # and no analysis of control flow
 # In small worlds, no search for equal expressions either: compiling takes two thirds of the time, and frames with contacts a
 # tenth more, because the address of the fields is looked up again after every store.
 BRIEF = {"opt_level": 0}
-NOTHING = 8  # bytes of code of a function that has nothing but a docstring
 FEW = 1000  # particles from which it pays
+NOTHING = 8  # bytes of code of a function that has nothing but a docstring
 _INSIDE = contextlib.nullcontext()
 _lock = threading.RLock()  # the type of literals is one for all threads
 _active: list["Compiler"] = []  # whose kernels are being compiled or launched, the innermost last
@@ -71,8 +73,8 @@ class Compiler:
             before = {name: getattr(config, name) for name in LEAN | BRIEF}
             self._settings = _active[0]._settings if _active else before
             runtime.set_default_fp(self.real)
-            if str(config.arch) in HOSTS and not self.thorough:
-                _set(config, self.lean)
+            if str(config.arch) in HOSTS:
+                _set(config, SAFE if self.thorough else self.lean)
             _active.append(self)
             self._thread = threading.get_ident()
             try:
@@ -86,7 +88,7 @@ class Compiler:
         """Be thorough from here on: a function that is not ours is being compiled."""
         runtime: Any = impl.get_runtime()
         self.thorough = True
-        _set(runtime.prog.config(), self._settings)
+        _set(runtime.prog.config(), self._settings | SAFE)
 
 
 class Quick:
@@ -181,9 +183,18 @@ def _place_of(self: Any, node: Any) -> str:
     return f'File "{self.file}", line {node.lineno + self.lineno_offset}, in {name}:\n{line}\n'
 
 
+def _in_class(level_of_class_stackframe: int) -> bool:
+    """Whether a decorator is at work in the body of a class; Taichi looks for the source of the statement around it, which for
+    all of ours took half of the time that importing them took."""
+    body = sys._getframe(level_of_class_stackframe - 1)
+    if body.f_code.co_filename.startswith(HOME):
+        return "__qualname__" in body.f_locals
+    return _look_around(level_of_class_stackframe + 1)
+
+
 def _patch() -> bool:
     """Put these in the place of what Taichi calls; whether it is the Taichi that they are made for."""
-    names = ("getsourcelines", "getsourcefile", "textwrap")
+    names = ("getsourcelines", "getsourcefile", "textwrap", "_inside_class")
     config = impl.default_cfg()
     if (
         ti.__version__ != (1, 7, 4)
@@ -191,7 +202,7 @@ def _patch() -> bool:
         or not all(hasattr(config, name) for name in LEAN | BRIEF)
     ):
         return False
-    kernel_impl.getsourcelines, kernel_impl.getsourcefile = _lines_of, _file_of
+    kernel_impl.getsourcelines, kernel_impl.getsourcefile, kernel_impl._inside_class = _lines_of, _file_of, _in_class
     # Every line of a function is expanded at every call of it.
     kernel_impl.textwrap = SimpleNamespace(fill=lru_cache(1 << 14)(textwrap.fill), dedent=lru_cache(1 << 10)(textwrap.dedent))
     ASTTransformerContext.get_pos_info = _place_of
@@ -200,5 +211,6 @@ def _patch() -> bool:
 
 _find_lines: Any = getattr(kernel_impl, "getsourcelines", None)
 _find_file: Any = getattr(kernel_impl, "getsourcefile", None)
+_look_around: Any = getattr(kernel_impl, "_inside_class", None)
 _draw: Any = getattr(ASTTransformerContext, "get_pos_info", None)
 _patched = _patch()

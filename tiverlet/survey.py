@@ -156,13 +156,15 @@ class Survey:
         return out
 
     @ti.func
+    def nothing(self):
+        """Figures to begin with."""
+        zero = ti.Vector.zero(ti.f64, self.dim)
+        return ti.Vector([0, 0, 0, 0, 0, 2.0**31], ti.f64), zero + ti.math.inf, zero - ti.math.inf
+
+    @ti.func
     def block(self, b, h, t, when, fresh, begin):
         """One block of particles and constraints. Returns energy, residual, overlap, stiffness, contacts, bad; low, high."""
-        figures = ti.Vector([0, 0, 0, 0, 0, 2.0**31], ti.f64)
-        low, high = (
-            ti.Vector.zero(ti.f64, self.dim) + ti.math.inf,
-            ti.Vector.zero(ti.f64, self.dim) - ti.math.inf,
-        )
+        figures, low, high = self.nothing()
         scale, back = ti.cast(1, ti.f64), ti.cast(0, self.sub.real)
         if begin == 0:
             scale, back = 1 / ti.cast(h, ti.f64), ti.cast(0.5, self.sub.real)
@@ -212,20 +214,19 @@ class Survey:
         self.team.wait()
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, me)):
-            for b in range(1, BLOCKS):
-                part, total = self.parts[b], self.parts[0]
+            total, low, high = self.nothing()
+            for b in range(BLOCKS):
+                part = self.parts[b]
                 total[0] += part[0]
                 total[4] += part[4]
                 for k in ti.static(range(1, 4)):
                     total[k] = ti.max(total[k], part[k])
                 total[5] = ti.min(total[5], part[5])
-                self.parts[0] = total
-                self.low[0] = ti.min(self.low[0], self.low[b])
-                self.high[0] = ti.max(self.high[0], self.high[b])
+                low, high = ti.min(low, self.low[b]), ti.max(high, self.high[b])
             for k in ti.static(range(6)):
-                out[k] = self.parts[0][k]
+                out[k] = total[k]
             for k in ti.static(range(self.dim)):
-                out[7 + k], out[10 + k] = self.low[0][k], self.high[0][k]
+                out[7 + k], out[10 + k] = low[k], high[k]
             for c in ti.static(self.contacts):
                 out[6] = c._on_fast[None]
                 c._on_fast[None] = 0

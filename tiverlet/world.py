@@ -7,7 +7,6 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from rich.progress import track
 
 from . import checks, composition, snapshot
 from .access import Access
@@ -326,6 +325,8 @@ class World(Access):
         dt = checks.number("World.run", "dt", dt, above=0.0)
         frames: Any = range(max(1, round(seconds / dt)))
         if progress:
+            from rich.progress import track  # noqa: PLC0415
+
             frames = track(frames, description=f"{len(self._particles)} particles")
         worst = None
         for _ in frames:
