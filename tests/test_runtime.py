@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from tiverlet.runtime import Memory
+from tiverlet.memory import Memory
 
 from .conftest import python
 
@@ -148,10 +148,10 @@ def test_worlds_are_capped_and_freed():
     python(
         START
         + """
-import tiverlet.runtime as runtime
+from tiverlet import memory
 tv.init()
 point = tv.Particles([[0.0, 0.0]])
-runtime.MAX_TREES = 12  # the rule, without the minutes that 400 worlds take
+memory.MAX_TREES = 12  # the rule, without the minutes that 400 worlds take
 many = [tv.World(point) for _ in range(12)]
 expect(RuntimeError, "worlds are alive", lambda: tv.World(point))
 for w in many:

@@ -5,13 +5,14 @@ from typing import Any
 
 import numpy as np
 
-from . import checks, composition, regroup, runtime
+from . import checks, composition, regroup
 from .breaking import BREAKS
 from .feature import Feature
+from .memory import Memory
 from .particles import Particles, in_range
 from .queries import Contacts, Search, near_by_all, nearest
 from .regroup import Handle
-from .survey import StepReport
+from .step_report import StepReport
 
 
 class Access:
@@ -19,7 +20,7 @@ class Access:
 
     _particles: Particles
     _features: tuple[Feature, ...]
-    _memory: runtime.Memory
+    _memory: Memory
     _solver: Any
     _scene: Any
     _sub: Any
@@ -246,7 +247,7 @@ class Access:
         return regroup.handle(self, regroup.chosen(self, "World.handle", particles))
 
     @property
-    def _memories(self) -> list[runtime.Memory]:
+    def _memories(self) -> list[Memory]:
         """The trees of fields: one from the start, others where a list or a need has grown."""
         grown = [self._grid.store if self._grid else None, *(c._on_store for c in self._sub.contacts)]
         return [self._memory, *(m for m in grown if m)]

@@ -11,6 +11,7 @@ from . import composition, runtime
 from .constraints.contact import Contact
 from .feature import Acceleration, Batch, Feature, Scene
 from .grid import Grid
+from .memory import Memory
 from .particles import Particles, Radii, State
 from .scalar import LOST, Scalar
 from .solvers.direct import Direct
@@ -42,7 +43,7 @@ class Assembly:
 
     path: str
     solver: Solver
-    memory: runtime.Memory
+    memory: Memory
     scene: Scene
     batches: list[Batch]
     grid: Grid | None
@@ -75,7 +76,7 @@ def assemble(
             "Use tv.init(), or ti.init(fast_math=False)."
         )
     path = _chosen(path, particles, features) if order == 2 else "fused"
-    memory = runtime.Memory(PRECISIONS[precision], len(particles))
+    memory = Memory(PRECISIONS[precision], len(particles))
     try:
         state = State(memory, particles, inv_mass, precision == "f32-compensated")
         return _bind(Scene(memory, state, particles, inv_mass, order=order), features, solver, path)

@@ -6,6 +6,7 @@ import numpy as np
 import taichi as ti
 
 from . import runtime
+from .compiling import Compiler
 
 STEP = 2.0**-20  # of central differences, relative to the distance between corners
 
@@ -20,7 +21,7 @@ class Slopes:
     """
 
     def __init__(self, function: tuple, gradient: tuple | None, arity: int, dim: int, fixed: int, size: float):
-        self.compiler = runtime.Compiler(ti.f64)
+        self.compiler = Compiler(ti.f64)
         self.function, self.counts = function
         self.given: Any = gradient[0] if gradient else None
         self.gradient_counts = bool(gradient and gradient[1])

@@ -26,8 +26,8 @@ import numpy as np
 import taichi as ti
 
 from .arguments import Noted
+from .memory import Memory
 from .particles import Particles, State
-from .runtime import Memory
 
 BENT, FAR = 1, 2  # how far a constraint turned in a substep: by more than 26 degrees, by more than 41
 

@@ -14,7 +14,7 @@ import taichi as ti
 from .cells import Cells
 from .feature import Scene
 from .material import Table
-from .runtime import Memory
+from .memory import Memory
 from .team import LEAST, Team
 
 CROWDED = 300  # near pairs per particle beyond which the user is told

@@ -5,7 +5,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING
 
 from . import checks, snapshot
-from .survey import StepReport
+from .step_report import StepReport
 
 if TYPE_CHECKING:
     from .world import World

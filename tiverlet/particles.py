@@ -5,7 +5,7 @@ import taichi as ti
 from numpy.typing import ArrayLike
 
 from . import checks
-from .runtime import Memory
+from .memory import Memory
 
 LARGEST = 1e15  # [m] beyond this, squared lengths near 1e38 leave f32; nothing physical is that far
 

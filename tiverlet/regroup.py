@@ -5,10 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from . import checks, runtime, snapshot
+from . import checks, snapshot
 from .assembly import assemble, check_settings, checked_features
 from .constraints.contact import Contact
 from .feature import Acceleration, Batch, Feature
+from .memory import Memory
 from .particles import Particles
 from .substep import decay
 
@@ -169,7 +170,7 @@ def _drives(feature: Feature, number: np.ndarray) -> bool:
 
 
 def _carried(
-    world: Any, memory: runtime.Memory, old: dict[str, np.ndarray], attributes: dict[Feature, dict], masks: dict, some: np.ndarray
+    world: Any, memory: Memory, old: dict[str, np.ndarray], attributes: dict[Feature, dict], masks: dict, some: np.ndarray
 ) -> dict[str, np.ndarray]:
     """The state of a world that was built anew: the rows of what stayed are as they were."""
     new = memory.state()

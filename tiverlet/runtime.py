@@ -1,16 +1,9 @@
-"""The one door to Taichi: starting it, asking about it, and holding memory in it.
-
-Taichi 1.7.4 ends the process, without an exception, when a field outlives its runtime, when 512 trees of fields are
-alive, when a field has no elements or when a child made by fork launches a kernel. The checks here turn each of
-these into an error that says what to do, so that no other module has to know.
-"""
+"""The door to Taichi: starting it, and asking about it."""
 
 import contextlib
-import ctypes
 import io
 import os
 import threading
-from dataclasses import dataclass
 from typing import Any
 
 # Quiet and offline: no banner, no version check over the network. Taichi reads these when it is imported.
@@ -18,19 +11,13 @@ os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
 os.environ.setdefault("TI_LOG_LEVEL", "error")
 
-import numpy as np
 import taichi as ti
 from taichi.lang import impl
 
-from .compiling import FEW, Compiler
-
 ARCHITECTURES = ("cpu", "cuda", "metal", "vulkan")
-GROUP = 16  # fields that one transfer kernel serves; Taichi unrolls the loop over them
-SMALL = 300_000  # numbers that one thread copies in a millisecond
-MAX_TREES = 400  # Taichi holds at most 511 trees of fields and does not check; the rest is left to the user's own fields.
 
 _started: dict = {}  # what init() was asked for, and by which process and thread
-_trees = 0  # live trees of fields, of this runtime
+trees = 0  # of fields that are alive, of this runtime; memory.py counts them
 
 
 def init(arch: str = "cpu", threads: int | None = None, debug: bool = False, seed: int = 0) -> None:
@@ -132,13 +119,18 @@ def ensure_started() -> None:
         init()
     if _started.get("runtime") is not impl.get_runtime():
         _adopt()
-    if _started["pid"] != os.getpid():
+    if forked():
         raise RuntimeError(
             "Taichi was started before this process was forked, and hangs in the child. Use the start method "
             '"spawn": multiprocessing.get_context("spawn").'
         )
     if _started["thread"] != threading.get_ident():
         raise RuntimeError("A World must be built in the thread that started Taichi; stepping it elsewhere is fine.")
+
+
+def forked() -> bool:
+    """Whether this process was forked after Taichi was started."""
+    return _started["pid"] != os.getpid()
 
 
 def _config() -> Any:
@@ -154,286 +146,6 @@ def _available(arch: str) -> bool:
 
 def _adopt(wanted: dict | None = None) -> None:
     """Remember the running Taichi, and what it was asked for if it was started here."""
-    global _trees
-    _trees = 0
+    global trees
+    trees = 0
     _started.update(runtime=impl.get_runtime(), pid=os.getpid(), thread=threading.get_ident(), wanted=wanted)
-
-
-@dataclass(frozen=True)
-class Entry:
-    """One field: its place in memory, and what explain() says of it."""
-
-    name: str
-    field: Any
-    width: int  # components of one element; 0 for a scalar
-    length: int  # elements; 0 for a single one
-    kind: np.dtype
-    state: bool  # part of the exact state, hence of hash() and clone()
-
-    @property
-    def bytes(self) -> int:
-        """Size in memory [bytes]."""
-        return self.kind.itemsize * max(1, self.width) * max(1, self.length)
-
-
-class Memory:
-    """The fields of one world: declared first, then placed together in one tree, freed together.
-
-    `real` is ti.f32 or ti.f64; particles: how many the world has, see Compiler. Every method that touches the fields checks first
-    that they still exist.
-    """
-
-    def __init__(self, real, particles: int = FEW):
-        if _trees >= MAX_TREES:
-            raise RuntimeError(
-                f"{_trees} worlds are alive, and Taichi crashes near 512. Close worlds that you no longer need: "
-                "world.close(), or `with tv.World(...) as world:`."
-            )
-        self.real = real
-        self.compiler = Compiler(real, particles)
-        self.entries: list[Entry] = []
-        self._later: list[tuple[Entry, np.ndarray]] = []
-        self._builder = ti.FieldsBuilder()
-        self._tree = None
-        self._runtime = impl.get_runtime()
-        self._transfers: dict[tuple, _Transfer] = {}  # compiled once, since that costs more than running them
-        self._views: dict[int, np.ndarray] | None = None  # see _seen()
-
-    def field(self, name: str, length: int | None, *, width: int = 0, kind=None, values=None, state: bool = False) -> Any:
-        """Declare a field of `length` elements (None: a single one, of 0 dimensions) and give it its first values."""
-        kind = self.real if kind is None else kind
-        made = ti.Vector.field(width, kind) if width else ti.field(kind)
-        if length is None:
-            self._builder.place(made)
-        else:
-            self._builder.dense(ti.i, max(1, length)).place(made)  # a field of 0 elements poisons the runtime
-        same = sum(e.name == name or e.name.startswith(f"{name} #") for e in self.entries)
-        name = f"{name} #{same + 1}" if same else name  # two batches of a kind
-        entry = Entry(name, made, width, 0 if length is None else max(1, length), np.dtype(_NUMPY[kind]), state)
-        self.entries.append(entry)
-        if values is not None and np.size(values):
-            self._later.append((entry, np.asarray(values, dtype=np.float64)))
-        return made
-
-    def place(self) -> None:
-        """Allocate what was declared and write the first values (everything else is zero)."""
-        global _trees
-        self._tree = self._builder.finalize()
-        _trees += 1
-        if self._later:
-            self._load([entry for entry, _ in self._later], [values for _, values in self._later])
-            self._later.clear()
-
-    def _seen(self) -> dict[int, np.ndarray]:
-        """Arrays that are the fields, by the id of the entry; none where the host cannot see them.
-
-        Reading and writing fields by kernels takes longer to compile than all else takes to run.
-        """
-        if self._views is None:
-            self._views = self._look() if architecture() == "cpu" else {}
-        return self._views
-
-    def _look(self) -> dict[int, np.ndarray]:
-        first, out = self.entries[0], {}
-        with self.compiler():
-            address = _Place(first.field, bool(first.length)).address()
-        (start, *_), tree = _chain(first.field)
-        memory = (ctypes.c_char * tree.cell_size_bytes).from_address(address - start)
-        for e in self.entries:
-            offsets, _ = _chain(e.field)
-            cell = e.field.parent().ptr.cell_size_bytes
-            steps = (cell, offsets[1] - offsets[0] if e.width > 1 else e.kind.itemsize)
-            if any(b - a != steps[1] for a, b in zip(offsets, offsets[1:], strict=False)):
-                return {}  # laid out as never seen yet: by kernels, then
-            out[id(e)] = np.ndarray(_shape(e), e.kind, memory, offsets[0], steps[: 1 + bool(e.width)])
-        return out
-
-    def abandon(self) -> None:
-        """Give up before place(): a builder that is never finished would poison everything that Taichi does later.
-
-        So would fields that are gone before Taichi has looked at them, which it does before the next kernel.
-        """
-        if self._tree is None:
-            self.field("abandoned", None)
-            tree = self._builder.finalize()
-            self._runtime.materialize()
-            tree.destroy()
-
-    def check(self) -> None:
-        """Raise RuntimeError when the fields are gone or belong to a runtime that is."""
-        if impl.get_runtime() is not self._runtime:
-            raise RuntimeError(
-                "Taichi was started again after this world was built, which destroyed its fields. Build the world anew."
-            )
-        if self._tree is None:
-            raise RuntimeError("This world is closed; build a new one.")
-        if _started["pid"] != os.getpid():
-            raise RuntimeError('This world was built before a fork and cannot run in the child; use "spawn".')
-
-    def destroy(self) -> None:
-        """Free the fields. Calling it twice, or after another ti.init, does nothing."""
-        global _trees
-        if self._tree is not None and impl.get_runtime() is self._runtime and _started["pid"] == os.getpid():
-            self._tree.destroy()
-            _trees -= 1
-        self._tree = None
-        self._views = None
-
-    def write(self, field, values) -> None:
-        """Overwrite a whole field."""
-        self.check()
-        if np.size(values):
-            self._load([self._find(field)], [np.asarray(values, dtype=np.float64)])
-
-    def read(self, field) -> np.ndarray:
-        """A copy of a whole field, in its own type."""
-        self.check()
-        entry = self._find(field)
-        return self._dump([entry])[0]
-
-    def state(self) -> dict[str, np.ndarray]:
-        """Copies of the fields that make up the exact state, by name."""
-        self.check()
-        chosen = [e for e in self.entries if e.state]
-        return dict(zip((e.name for e in chosen), self._dump(chosen), strict=True))
-
-    def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Write back what state() returned, bit for bit; 0 to fields that were not there then."""
-        self.check()
-        chosen = [e for e in self.entries if e.state]
-        if chosen:
-            self._load(chosen, [state.get(e.name, np.zeros(1)) for e in chosen])
-
-    def _find(self, field) -> Entry:
-        return next(e for e in self.entries if e.field is field)
-
-    def _load(self, entries: list[Entry], arrays: list[np.ndarray]) -> None:
-        views = self._seen()
-        if views:
-            for e, a in zip(entries, arrays, strict=True):
-                views[id(e)][...] = np.broadcast_to(a, _shape(e))
-            return
-        # Every number that we hold (f32, f64, i32) is exact in f64, so one kernel and one flat array serve all.
-        for k in range(0, len(entries), GROUP):
-            some = entries[k : k + GROUP]
-            parts = [np.broadcast_to(a, _shape(e)).ravel() for e, a in zip(some, arrays[k : k + GROUP], strict=True)]
-            with self.compiler():
-                self._transfer(some).load(np.concatenate(parts).astype(np.float64))
-
-    def _dump(self, entries: list[Entry]) -> list[np.ndarray]:
-        views = self._seen()
-        if views:
-            return [views[id(e)].copy() for e in entries]
-        out = []
-        for k in range(0, len(entries), GROUP):
-            some = entries[k : k + GROUP]
-            sizes = [e.bytes // e.kind.itemsize for e in some]
-            flat = np.empty(sum(sizes), dtype=np.float64)
-            with self.compiler():
-                self._transfer(some).dump(flat)
-            parts = np.split(flat, np.cumsum(sizes)[:-1])
-            out += [p.astype(e.kind).reshape(_shape(e)) for p, e in zip(parts, some, strict=True)]
-        return out
-
-    def _transfer(self, entries: list[Entry]) -> "_Transfer":
-        key = tuple(id(e) for e in entries)
-        if key not in self._transfers:
-            self._transfers[key] = _Transfer(entries)
-        return self._transfers[key]
-
-
-_NUMPY = {ti.f32: np.float32, ti.f64: np.float64, ti.i32: np.int32, ti.u32: np.uint32}
-
-
-def _shape(entry: Entry) -> tuple[int, ...]:
-    return (max(1, entry.length),) + ((entry.width,) if entry.width else ())
-
-
-def _chain(field) -> tuple[list[int], Any]:
-    """How many bytes from the begin of its tree each component of the first element is, and the root of the tree."""
-    offsets, node = [], None
-    for component in field._get_field_members():
-        node, offset = component.ptr.snode(), 0
-        while node.parent is not None:
-            offset, node = offset + node.offset_bytes_in_parent_cell, node.parent
-        offsets.append(offset)
-    return offsets, node
-
-
-@ti.data_oriented
-class _Place:
-    """Where a field is."""
-
-    def __init__(self, field, many: bool):
-        self.field, self.at = field, [0] if many else []
-
-    @ti.kernel
-    def address(self) -> ti.u64:  # type: ignore[valid-type]
-        """Of its first element."""
-        return ti.get_addr(self.field, ti.static(self.at))
-
-
-@ti.data_oriented
-class _Transfer:
-    """Kernels between a list of fields and one flat f64 array."""
-
-    def __init__(self, entries: list[Entry]):
-        offset, self.plan = 0, []
-        for e in entries:
-            self.plan.append((e.field, e.field.dtype, max(1, e.length), e.width, bool(e.length), offset))
-            offset += e.bytes // e.kind.itemsize
-        self.serial = offset < SMALL and architecture() == "cpu"  # in one piece, which compiles in half the time
-
-    @ti.kernel
-    def load(self, flat: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
-        """From the array to the fields."""
-        if ti.static(self.serial):
-            ti.loop_config(serialize=True)
-            for _ in range(1):
-                self.put(flat)
-        else:
-            self.put(flat)
-
-    @ti.kernel
-    def dump(self, flat: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
-        """From the fields to the array."""
-        if ti.static(self.serial):
-            ti.loop_config(serialize=True)
-            for _ in range(1):
-                self.get(flat)
-        else:
-            self.get(flat)
-
-    @ti.func
-    def put(self, flat: ti.template()):  # type: ignore[valid-type]
-        """All fields, one after the other."""
-        for field, kind, length, width, many, offset in ti.static(self.plan):
-            for i in range(length):
-                if ti.static(width == 0):
-                    if ti.static(many):
-                        field[i] = ti.cast(flat[offset + i], kind)
-                    else:
-                        field[None] = ti.cast(flat[offset], kind)
-                else:
-                    for k in ti.static(range(width)):
-                        if ti.static(many):
-                            field[i][k] = ti.cast(flat[offset + i * width + k], kind)
-                        else:
-                            field[None][k] = ti.cast(flat[offset + k], kind)
-
-    @ti.func
-    def get(self, flat: ti.template()):  # type: ignore[valid-type]
-        """All fields, one after the other."""
-        for field, kind, length, width, many, offset in ti.static(self.plan):
-            for i in range(length):
-                if ti.static(width == 0):
-                    if ti.static(many):
-                        flat[offset + i] = field[i]
-                    else:
-                        flat[offset] = field[None]
-                else:
-                    for k in ti.static(range(width)):
-                        if ti.static(many):
-                            flat[offset + i * width + k] = field[i][k]
-                        else:
-                            flat[offset + k] = field[None][k]

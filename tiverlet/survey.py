@@ -1,7 +1,6 @@
-"""What a frame came to: one pass over the state when it ends, and the report that the user gets."""
+"""What a frame came to: one pass over the state when it ends."""
 
 import copy
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ from .feature import FAR
 from .grid import FARTHEST
 from .particles import LARGEST
 from .scalar import TENSEST
+from .step_report import StepReport
 from .substep import HALT, Substep
 from .team import LEAST
 
@@ -21,64 +21,6 @@ STIFF = 4.0  # (omega h)^2 beyond which Verlet diverges
 
 FIGURES = HALT + 3
 STEPPED, STARTED, UNSTEPPED = range(3)  # how a state came about: by a substep, by the first one after a start, by none yet
-
-
-@dataclass(frozen=True)
-class StepReport:
-    """The frame that world.step() has just finished.
-
-    residual: worst violation of a constraint, relative to its rest value. overlap: of the worst contact, in radii of the
-    smaller particle. contacts: number of overlapping pairs. energy: kinetic and potential energy [J], of what has a potential,
-    half a substep ago; energy_change: since the frame before [J]. bad: index of the first particle whose state is not finite,
-    or None. broken: number of constraints that broke; world.broken has them. turn: 26 or 41 where a constraint turned by more
-    than so many degrees in a substep, else 0. tension: (omega h)^2 of the fastest vibration across a tension that a solver
-    converged to; 4 is the limit of stability. tries: how often the frame was made, see Guard. seconds: what the frame took.
-
-    flags: words for what the user should know; notes: one sentence for each, with the cause and a remedy.
-        "non-finite"        a position or displacement is NaN or infinite
-        "out-of-range"      a coordinate is too large for the precision, or for the cells of the contact grid
-        "tunnelling-risk"   a particle moved by more than its own size in one substep, so it may have passed another
-        "stiff-force"       a force changes too fast for the substep (omega h > 2) and makes energy grow
-        "softened"          a system was made to give way, because its tension is too large for the substep
-        "turned"            a constraint turned by more than 41 degrees in a substep and lost its second order there
-        "substeps-capped"   the guard would have taken more substeps, but they are at most 4096, or the budget was spent
-        "stuck"             neither more substeps nor more iterations bring the residual or the overlap to the tolerance
-    """
-
-    time: float
-    substeps: int
-    iterations: int
-    residual: float = 0.0
-    overlap: float = 0.0
-    contacts: int = 0
-    energy: float = 0.0
-    energy_change: float = 0.0
-    flags: frozenset[str] = frozenset()
-    notes: tuple[str, ...] = field(default=(), repr=False)
-    bad: int | None = None
-    broken: int = 0
-    turn: int = 0
-    tension: float = 0.0
-    tries: int = 1
-    seconds: float = field(default=0.0, compare=False, repr=False)
-
-    @property
-    def clean(self) -> bool:
-        """Whether nothing was flagged."""
-        return not self.flags
-
-    def worse(self, other: "StepReport") -> "StepReport":
-        """The later of two reports, with the worst figures of both."""
-        first, last = (self, other) if self.time <= other.time else (other, self)
-        return StepReport(
-            last.time, max(first.substeps, last.substeps), max(first.iterations, last.iterations),
-            max(first.residual, last.residual), max(first.overlap, last.overlap), max(first.contacts, last.contacts),
-            last.energy, first.energy_change + last.energy_change, first.flags | last.flags,
-            tuple({n.partition(":")[0]: n for n in first.notes + last.notes}.values()),
-            last.bad if first.bad is None else first.bad,
-            first.broken + last.broken, max(first.turn, last.turn), max(first.tension, last.tension),
-            max(first.tries, last.tries), max(first.seconds, last.seconds),
-        )  # fmt: skip
 
 
 @ti.data_oriented

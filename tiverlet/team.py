@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import taichi as ti
 
 from . import runtime
-from .runtime import Memory
+from .memory import Memory
 
 LEAST = 512  # iterations of a loop that Taichi gives to a CPU thread, at least
 SHARE = 500  # particles and constraints for each thread, at least; with fewer they wait for each other longer than they work

@@ -5,7 +5,7 @@ from typing import Any
 import taichi as ti
 
 from .feature import Feature
-from .runtime import Memory
+from .memory import Memory
 
 
 class Touch(Feature):

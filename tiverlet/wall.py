@@ -8,7 +8,7 @@ import taichi as ti
 from . import checks
 from .feature import Feature, Scene
 from .material import friction_of, restitution_of
-from .runtime import Memory
+from .memory import Memory
 
 TOUCH = 2.0**-20  # of the size of a wall: a start that is no deeper inside than this counts as on the surface
 

@@ -19,8 +19,9 @@ from .guard import Guard
 from .particles import Particles
 from .regroup import Handle
 from .solvers.solver import Solver
+from .step_report import StepReport
 from .substep import HALT, REBOUNDS, decay
-from .survey import STARTED, STEPPED, UNSTEPPED, StepReport
+from .survey import STARTED, STEPPED, UNSTEPPED
 
 FREE = decay(0.0, 1.0)  # what no drag makes of a substep
 

@@ -7,6 +7,7 @@ import numpy as np
 import taichi as ti
 
 from .. import checks, runtime
+from ..compiling import Compiler
 from ..feature import Scene
 from ..particles import Particles
 from ..solid import Solid, rotation_matrix
@@ -193,7 +194,7 @@ class _Probe:
     """The function at many places, in Python and f64."""
 
     def __init__(self, wall: Sdf):
-        self.compiler = runtime.Compiler(ti.f64)
+        self.compiler = Compiler(ti.f64)
         self.wall: Any = wall
         self.dim = wall.dim
 

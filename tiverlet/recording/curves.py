@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..snapshot import Kept
-from ..survey import StepReport
+from ..step_report import StepReport
 from .layout import CURVES
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import snapshot
-from ..survey import StepReport
+from ..step_report import StepReport
 from . import rrd, scene
 
 if TYPE_CHECKING:

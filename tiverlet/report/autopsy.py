@@ -10,7 +10,7 @@ import numpy as np
 from .. import checks
 from ..feature import Batch
 from ..snapshot import keep, put_back
-from ..survey import StepReport
+from ..step_report import StepReport
 from ..world import World
 
 

@@ -15,8 +15,8 @@ from ..compiling import Quick
 from ..constraints import Distance
 from ..feature import Feature
 from ..forces import Drag, Gravity
+from ..memory import Memory
 from ..particles import Particles
-from ..runtime import Memory
 
 KINDS = (Gravity, Drag, Distance)  # what they know
 STIFFNESS = 0.5  # of the article, per pass

@@ -22,7 +22,7 @@ from . import output
 from .sweep import said
 
 if TYPE_CHECKING:
-    from ..survey import StepReport
+    from ..step_report import StepReport
 
 STANDS, REFUSED, BREAKS, UNTRIED = "stands it", "refused by name", "BREAKS", "not tried"
 LOOSE = 0.1  # relative violation of a constraint beyond which it no longer holds

@@ -12,7 +12,7 @@ from ...feature import Feature
 from ...measure import angular_momentum
 from ...particles import Particles
 from ...solvers import Chebyshev, ConjugateGradient, Direct, Jacobi
-from ...survey import StepReport
+from ...step_report import StepReport
 from ...world import World
 
 FRAME = 1 / 60

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...feature import Feature
 from ...particles import Particles
-from ...survey import StepReport
+from ...step_report import StepReport
 from ...world import World
 
 NAN, INF = float("nan"), float("inf")
