@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
+from . import runtime
 from .feature import FAR
 from .grid import FARTHEST
 from .particles import LARGEST
@@ -14,7 +15,7 @@ from .step_report import StepReport
 from .substep import HALT, Substep
 from .team import LEAST
 
-BLOCKS = 64  # partial sums: their number is fixed, so the total has the same bits on any number of threads
+BLOCKS = 64  # partial sums: their number is fixed, so the total has the same bits on any number of threads; squared on a GPU
 TURNS = (0, 26, 41)  # degrees, for nothing, BENT and FAR
 STIFF = 4.0  # (omega h)^2 beyond which Verlet diverges
 
@@ -44,9 +45,10 @@ class Survey:
         self.probes = [f for f in substep.accelerations if not f.uniform]
         self.stride = substep.stride
         add = substep.scene.memory.field
-        self.parts = add("survey.figures", BLOCKS, width=6, kind=ti.f64)
-        self.low = add("survey.low", BLOCKS, width=self.dim, kind=ti.f64)
-        self.high = add("survey.high", BLOCKS, width=self.dim, kind=ti.f64)
+        self.blocks = BLOCKS if runtime.architecture() == "cpu" else BLOCKS**2
+        self.parts = add("survey.figures", self.blocks, width=6, kind=ti.f64)
+        self.low = add("survey.low", self.blocks, width=self.dim, kind=ti.f64)
+        self.high = add("survey.high", self.blocks, width=self.dim, kind=ti.f64)
         self.details: dict[int, Residuals] = {}  # compiled when asked for
         self.out = np.zeros(FIGURES)
         substep.survey = self
@@ -110,7 +112,7 @@ class Survey:
         scale, back = ti.cast(1, ti.f64), ti.cast(0, self.sub.real)
         if begin == 0:
             scale, back = 1 / ti.cast(h, ti.f64), ti.cast(0.5, self.sub.real)
-        size = (self.n + BLOCKS - 1) // BLOCKS
+        size = (self.n + self.blocks - 1) // self.blocks
         for i in range(b * size, ti.min((b + 1) * size, self.n)):
             x = self.state.place(i)
             if self.finite(x) == 0 or self.finite(self.state.d[i]) == 0:
@@ -126,7 +128,7 @@ class Survey:
                     figures[2] = ti.max(figures[2], worst)
                     figures[4] += touching
         for f in ti.static(self.batches):
-            part = (f.count + BLOCKS - 1) // BLOCKS
+            part = (f.count + self.blocks - 1) // self.blocks
             for c in range(b * part, ti.min((b + 1) * part, f.count)):
                 figures[0] += f.energy(c, back)
                 if begin == 0:
@@ -147,24 +149,19 @@ class Survey:
 
     @ti.func
     def sum_up(self, me, h64, t64, came, out: ti.template()):  # type: ignore[valid-type]
-        """By blocks, then by one thread."""
-        for k in range(self.team.low(BLOCKS * self.stride, me), self.team.high(BLOCKS * self.stride, me)):
+        """By blocks, by blocks of these on a GPU, then by one thread."""
+        for k in range(self.team.low(self.blocks * self.stride, me), self.team.high(self.blocks * self.stride, me)):
             if k % self.stride == 0:
                 h, t, b = ti.cast(h64, self.sub.real), ti.cast(t64, self.sub.real), k // self.stride
                 fresh, begin = ti.cast(came == STARTED, ti.i32), ti.cast(came == UNSTEPPED, ti.i32)
                 self.parts[b], self.low[b], self.high[b] = self.block(b, h, t, self.sub.clock(0, 1), fresh, begin)
         self.team.wait()
+        if ti.static(self.blocks > BLOCKS):
+            for k in range(BLOCKS):
+                self.parts[k * BLOCKS], self.low[k * BLOCKS], self.high[k * BLOCKS] = self.fold(k * BLOCKS, 1)
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, me)):
-            total, low, high = self.nothing()
-            for b in range(BLOCKS):
-                part = self.parts[b]
-                total[0] += part[0]
-                total[4] += part[4]
-                for k in ti.static(range(1, 4)):
-                    total[k] = ti.max(total[k], part[k])
-                total[5] = ti.min(total[5], part[5])
-                low, high = ti.min(low, self.low[b]), ti.max(high, self.high[b])
+            total, low, high = self.fold(0, self.blocks // BLOCKS)
             for k in ti.static(range(6)):
                 out[k] = total[k]
             for k in ti.static(range(self.dim)):
@@ -181,6 +178,21 @@ class Survey:
                 if ti.static(self.sub.slots.converges):
                     out[14] = self.sub.slots.tension[None]
                     self.sub.slots.tension[None] = 0
+
+    @ti.func
+    def fold(self, begin, step: ti.template()):  # type: ignore[valid-type]
+        """Of BLOCKS parts, `step` apart."""
+        total, low, high = self.nothing()
+        for b in range(BLOCKS):
+            at = begin + b * step
+            part = self.parts[at]
+            total[0] += part[0]
+            total[4] += part[4]
+            for k in ti.static(range(1, 4)):
+                total[k] = ti.max(total[k], part[k])
+            total[5] = ti.min(total[5], part[5])
+            low, high = ti.min(low, self.low[at]), ti.max(high, self.high[at])
+        return total, low, high
 
     def residuals(self, batch, h: float, fresh: bool) -> np.ndarray:
         """What the last substep left of each violation in a batch, (m,)."""
