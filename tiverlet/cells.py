@@ -3,7 +3,8 @@
 The hash folds space onto a torus of cells, cell (a, b, ...) to bucket (a mod A, b mod B, ...) with A, B powers of two
 of at least 4. The three cells around a particle along each axis thus fall into different buckets, so every bucket is read
 once and every pair is seen once, however many far cells share a bucket; those are told apart by the distance itself. Cells
-of a row stand side by side in memory. Counting sort with atomic counters; no cell has a capacity.
+of a row stand side by side in memory. Counting sort; no cell has a capacity. On a GPU the counters are atomic, and the order
+within a cell is another one in every run: no result may depend on it.
 
 Particles whose radii differ by more than a factor of two stand in tables of their own, with cells of their size: level 0 holds
 the largest, each next level radii down to half of those before. A particle looks at its own level and at the coarser ones, where
@@ -16,20 +17,21 @@ import numpy as np
 import taichi as ti
 
 from .feature import Scene
+from .sums import Sums
 from .team import Team
 
 LEVELS = 14  # the last one holds all that are smaller, down to points
 
 
 class Cells:
-    """The tables. radius: (n,) [m]. skin: what is added to the distance at which two touch [m]."""
+    """The tables. radius: (n,) [m]. skin: what is added to the distance at which two touch [m]. launched: for a GPU."""
 
-    def __init__(self, scene: Scene, radius: np.ndarray, skin: float, team: Team, scratch: Any):
+    def __init__(self, scene: Scene, radius: np.ndarray, skin: float, team: Team, launched: bool, scratch: Any):
         self.team = team
         self.place = scratch  # of the particles as they are sorted, while a list is built: read one after the other
         n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
         self.n, self.dim, self.state, self.real = n, dim, scene.state, scene.real
-        self.serial = True  # counting in order, on one thread, beats atomic counters in parallel on a CPU
+        self.serial = not launched  # counting in order, on one thread, beats atomic counters in parallel on a CPU
         with np.errstate(divide="ignore"):
             level = np.minimum(np.floor(np.log2(radius.max() / radius)), LEVELS - 1).astype(int)
         used, level = np.unique(level, return_inverse=True)
@@ -42,7 +44,8 @@ class Cells:
         offsets = np.concatenate([[0], np.cumsum(1 << self.bits)])
         self.buckets = int(offsets[-1])
         self._shapes = self.shapes(np.ptp(scene.particles.position, axis=0))
-        self.edge = add("grid.edge", self.buckets + 2, kind=ti.i32)
+        self.sums = Sums(self.buckets + 2, team, launched)
+        self.edge = add("grid.edge", self.sums.room, kind=ti.i32)
         self.sorted = add("grid.sorted", n, kind=ti.i32)
         if self.state.compensated:
             self.low = add("grid.place_low", n, width=dim)
@@ -128,9 +131,7 @@ class Cells:
         ti.loop_config(serialize=self.serial)
         for i in range(self.team.one(self.n, me)):
             self.raised(self.edge, self.where(i) + 1, 1)
-        ti.loop_config(serialize=True)
-        for b in range(1, self.team.one(self.buckets + 2, me)):
-            self.edge[b] = self.edge[b] + self.edge[b - 1]
+        self.sums.run(self.edge, me)
         ti.loop_config(serialize=self.serial)
         for back in range(self.team.one(self.n, me)):
             # Filling a bucket from its end turns the end of each into its begin, and the next one's begin is its end. From the

@@ -15,7 +15,9 @@ from .cells import Cells
 from .feature import Scene
 from .material import Table
 from .memory import Memory
-from .team import LEAST, Team
+from .sorting import exchange, sort, sorting_network
+from .sums import MOST, Sums
+from .team import Team
 
 CROWDED = 300  # near pairs per particle beyond which the user is told
 FARTHEST = 1 << 22  # cells from the origin: beyond it, f32 cannot tell a cell from the next
@@ -56,13 +58,14 @@ class Grid:
         self.marked = all(p.marked for p in self.bags)
         self.real, self.memory, self.skin = scene.real, scene.memory, skin
         self._extent: Sequence[float] = [-1.0] * dim
-        self.cells = Cells(scene, scene.particles.radius, skin, team, scratch)
+        self.launched = parallel and team.size == 1  # phase by phase
+        self.cells = Cells(scene, scene.particles.radius, skin, team, self.launched, scratch)
         self.several = self.cells.levels > 1
-        parallel = parallel and not self.several  # lists of several levels have parts of any length, in one piece
-        self.blocks = 16 if parallel else 1  # parts of the list, each filled by one thread
-        self.spread = LEAST if parallel and team.size == 1 else 1
+        self.counts = self.several or self.launched  # before it lists
+        self.blocks = 16 if team.size > 1 and not self.counts else 1  # parts of the list, each filled by one thread
         self.origin = add("grid.built_at", n, width=dim)
-        self.first = add("grid.first", n, kind=ti.i32)
+        self.sums = Sums(n, team, self.launched, capped=True)
+        self.first = add("grid.first", self.sums.room, kind=ti.i32)
         self.number = add("grid.number", n, kind=ti.i32)
         self.stale = add("grid.stale", None, kind=ti.i32, values=1)
         self.need = add("grid.need", None, kind=ti.i32)
@@ -254,12 +257,11 @@ class Grid:
         """Sort the particles into cells, then list the near ones of each. `me`: see Team."""
         self.keep(me)
         self.cells.sort(me)
-        if ti.static(self.several):
+        if ti.static(self.counts):
             self.pair_up(me)
         else:
-            for t in range(self.team.low(self.blocks * self.spread, me), self.team.high(self.blocks * self.spread, me)):
-                if t % self.spread == 0:
-                    self.fill(t // self.spread)
+            for block in range(self.team.low(self.blocks, me), self.team.high(self.blocks, me)):
+                self.fill(block)
         for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
             self.origin[i] = self.state.x[i]
         self.team.wait()
@@ -279,7 +281,7 @@ class Grid:
         for i in range(block * size, ti.min((block + 1) * size, self.n)):
             self.first[i] = start + ti.min(used, room)
             begin = used
-            used = self.scan(i, APPEND, start, used)
+            used = self.scan(i, APPEND, start, ti.min(used, MOST))
             self.number[i] = ti.max(ti.min(used, room) - begin, 0)
         for i in range(block * size, ti.min((block + 1) * size, self.n)):
             self.finish(i)
@@ -287,22 +289,33 @@ class Grid:
 
     @ti.func
     def pair_up(self, me):
-        """Several levels: count, then list each pair that one of the two finds with both."""
+        """Count, then list: on a GPU, by a thread for each particle; and for several levels, each pair that one of the two finds
+        with both. What does not fit is only counted."""
         for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
             self.number[i] = 0
         self.team.wait()
         ti.loop_config(serialize=self.cells.serial)
         for i in range(self.team.one(self.n, me)):
-            self.scan(i, COUNT, 0, 0)
+            self.cells.raised(self.number, i, self.scan(i, COUNT, 0, 0))
+        self.team.wait()
+        for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
+            self.first[i] = self.number[i]
+        self.team.wait()
+        self.sums.run(self.first, me)
         ti.loop_config(serialize=True)
-        for i in range(self.team.one(self.n, me)):
-            self.first[i] = self.need[None]
-            self.need[None] = self.need[None] + self.number[i]
+        for _ in range(self.team.one(1, me)):
+            self.need[None] = self.first[self.n - 1]
+        self.team.wait()
+        for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
+            self.first[i] = self.first[i] - self.number[i]
             self.number[i] = 0
+        self.team.wait()
         ti.loop_config(serialize=self.cells.serial)
         for i in range(self.team.one(self.n, me)):
             if self.need[None] <= self.capacity:
-                self.scan(i, FILL, 0, 0)
+                used = self.scan(i, FILL, self.first[i], 0)
+                if ti.static(not self.several):
+                    self.number[i] = used
         self.team.wait()
         for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
             self.finish(i)
@@ -326,7 +339,8 @@ class Grid:
 
     @ti.func
     def scan(self, i, what: ti.template(), start, used):  # type: ignore[valid-type]
-        """Look for neighbours in the cells around particle i, at its own level and the coarser ones."""
+        """Look for neighbours in the cells around particle i, at its own level and the coarser ones. Its list begins at `start`
+        and has `used` entries; returns how many it has then."""
         own = self.cells.level_of(i)
         for m in range(own + 1):
             cell = self.cells.home(i, m)
@@ -341,18 +355,20 @@ class Grid:
                             # No branch: it would be taken at random. What is not listed is written over by the next.
                             self.near[start + ti.min(used, self.capacity)] = j
                             used += listed
+                        elif ti.static(what == COUNT):
+                            used += listed
+                            if ti.static(self.several):
+                                if m < own and listed != 0:
+                                    self.cells.raised(self.number, j, 1)
                         elif listed != 0:
-                            self.note(i, j, what)
-                            if m < own:
-                                self.note(j, i, what)
+                            at = used
+                            if ti.static(self.several):  # others write to this list, too
+                                at = self.cells.raised(self.number, i, 1)
+                                if m < own:
+                                    self.near[self.first[j] + self.cells.raised(self.number, j, 1)] = i
+                            self.near[start + at] = j
+                            used += 1
         return used
-
-    @ti.func
-    def note(self, i, j, what: ti.template()):  # type: ignore[valid-type]
-        """Count j among the neighbours of i, and list it."""
-        k = self.cells.raised(self.number, i, 1)
-        if ti.static(what == FILL):
-            self.near[self.first[i] + k] = j
 
     @ti.func
     def listed(self, i, j, r):
@@ -376,52 +392,15 @@ class Grid:
     def order(self, begin, count):
         """Sort by index, which makes every sum over the list independent of the table."""
         if ti.static(self.several):
-            self.insert(begin, count)
+            sort(self.near, begin, count, self.launched)
         elif count > ti.static(self.short):
-            self.insert(begin, count)
+            sort(self.near, begin, count, self.launched)
         else:
-            # A network has no branches. Where neighbours in space are neighbours in number too, they are in order as they come.
-            j = ti.Vector.zero(ti.i32, self.short)
-            for k in ti.static(range(self.short)):
-                j[k] = ti.select(k < count, self.near[begin + k], ti.static(2**31 - 1))
-            mixed = 0
-            for k in ti.static(range(self.short - 1)):
-                mixed |= ti.cast(j[k] > j[k + 1], ti.i32)
-            if mixed != 0:
-                for layer in ti.static(self.network):
-                    for a, b in ti.static(layer):
-                        j[a], j[b] = ti.min(j[a], j[b]), ti.max(j[a], j[b])
-                for k in ti.static(range(self.short)):
-                    if k < count:
-                        self.near[begin + k] = j[k]
-
-    @ti.func
-    def insert(self, begin, count):
-        """Insertion sort."""
-        for a in range(1, count):
-            j = self.near[begin + a]
-            b = a
-            while b > 0 and self.near[begin + b - 1] > j:
-                self.near[begin + b] = self.near[begin + b - 1]
-                b -= 1
-            self.near[begin + b] = j
+            # Where neighbours in space are neighbours in number too, they are in order as they come.
+            exchange(self.near, begin, count, self.network, self.short)
 
 
 @ti.func
 def lowest(bits):
     """The number of the lowest bit that is set."""
     return ti.math.popcnt((bits - ti.u32(1)) & ~bits)
-
-
-def sorting_network(size: int) -> list[list[tuple[int, int]]]:
-    """Layers of pairs to put in order, to sort a power of two of numbers (Batcher's odd-even mergesort, 1968)."""
-    out, p = [], 1
-    while p < size:
-        k = p
-        while k >= 1:
-            begins = range(k % p, size - k, 2 * k)
-            pairs = [(i, i + k) for j in begins for i in range(j, j + min(k, size - j - k))]
-            out.append([(a, b) for a, b in pairs if a // (2 * p) == b // (2 * p)])
-            k //= 2
-        p *= 2
-    return out

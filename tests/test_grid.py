@@ -1,0 +1,156 @@
+"""The list of near pairs as a GPU builds it, on a CPU: running sums, sorting, and the same lists as those of one thread."""
+
+import numpy as np
+import pytest
+import taichi as ti
+
+import tiverlet as tv
+from tiverlet.memory import Memory
+from tiverlet.sorting import LONG, sort
+from tiverlet.sums import MOST, RADIX, Sums
+from tiverlet.team import Team
+
+N = 1600  # more than Taichi gives to one thread
+LENGTHS = (0, 1, 2, RADIX, RADIX + 1, 3 * RADIX - 1, RADIX**2, RADIX**2 + 1, 2 * RADIX**2 + 7, RADIX**3 + 1)
+
+
+@ti.data_oriented
+class Bench:
+    """Running sums over fields of several lengths, and sorting within another one."""
+
+    def __init__(self, launched: bool):
+        self.memory = Memory(ti.f32)
+        team = Team(self.memory, 1, 0)
+        self.sums = [Sums(length, team, launched, capped=True) for length in LENGTHS]
+        self.fields = [self.memory.field(f"sums {s.lengths[0]}", s.room, kind=ti.i32) for s in self.sums]
+        self.list = self.memory.field("list", 4 * LONG + 2, kind=ti.i32)
+        self.memory.place()
+
+    @ti.kernel
+    def add(self):
+        for s, field in ti.static(zip(self.sums, self.fields, strict=True)):
+            s.run(field, 0)
+
+    @ti.kernel
+    def sort(self, count: ti.i32, shuffled: ti.template()):  # type: ignore[valid-type]
+        for _ in range(1):
+            sort(self.list, 1, count, shuffled)
+
+
+def test_running_sums():
+    rng = np.random.default_rng(0)
+    for launched in (False, True):
+        bench = Bench(launched)
+        assert max(s.levels for s in bench.sums) == (4 if launched else 1)
+        for top in (10, 2**20, MOST):  # the last two beyond what an i32 holds
+            values = [rng.integers(0, top, length, endpoint=True) for length in LENGTHS]
+            for field, a in zip(bench.fields, values, strict=True):
+                bench.memory.write(field, np.resize(np.append(a, [7]), max(1, field.shape[0])))
+            bench.add()
+            for field, a in zip(bench.fields, values, strict=True):
+                np.testing.assert_array_equal(bench.memory.read(field)[: len(a)], np.minimum(np.cumsum(a), MOST))
+        bench.memory.destroy()
+
+
+def test_sorting():
+    # Within a field, and nothing beside it. One more and less than where the way changes.
+    rng = np.random.default_rng(1)
+    bench = Bench(False)
+    for count in (0, 1, 2, 3, LONG - 1, LONG, LONG + 1, LONG + 2, 4 * LONG - 1, 4 * LONG):
+        for values in (rng.permutation(count), np.arange(count), np.arange(count)[::-1]):
+            for shuffled in (False, True):
+                bench.memory.write(bench.list, np.r_[-5, values, np.full(4 * LONG + 1 - count, -7)])
+                bench.sort(count, shuffled)
+                made = bench.memory.read(bench.list)
+                np.testing.assert_array_equal(made[1 : count + 1], np.arange(count))
+                assert made[0] == -5 and (made[count + 1 :] == -7).all()
+    bench.memory.destroy()
+
+
+@ti.data_oriented
+class Again:
+    """Lists once more, from cells that are sorted."""
+
+    def __init__(self, grid):
+        self.grid = grid
+
+    @ti.kernel
+    def run(self):
+        self.grid.pair_up(0)
+
+
+def lists(w) -> tuple[np.ndarray, np.ndarray]:
+    """How many neighbours each particle has, and all of them, one list after the other."""
+    _, at = w._grid._entries(w._grid.first, w._grid.number)
+    return w._memory.read(w._grid.number), w._grid.store.read(w._grid.near)[at]
+
+
+def shuffle(w, rng) -> None:
+    """Put the particles of each bucket into another order."""
+    cells = w._grid.cells
+    begin, who, place = (w._memory.read(f) for f in (cells.edge, cells.sorted, cells.place))
+    bucket = np.repeat(np.arange(cells.buckets), np.diff(begin[1 : cells.buckets + 2]))
+    order = np.lexsort((rng.random(N), bucket))
+    assert (order != np.arange(N)).sum() > N / 8
+    w._memory.write(cells.sorted, who[order])
+    w._memory.write(cells.place, place[order])
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("sizes", ["one", "several"])
+@pytest.mark.filterwarnings("ignore:.*near pairs per particle")
+def test_lists_of_a_gpu_are_those_of_one_thread(world, dim, sizes):
+    # Against all pairs, one by one. From room for one entry, with crowds whose lists are long, some static, some linked, in
+    # groups; and whatever the order within cells, which on a GPU is another one in every run.
+    rng = np.random.default_rng(2)
+    x = rng.uniform(-3, 3, (N, dim))
+    x[:150] = rng.uniform(-0.1, 0.1, (150, dim))
+    x = x[rng.permutation(N)]
+    radius = np.full(N, 0.1) if sizes == "one" else 10.0 ** rng.uniform(-3, -0.7, N)
+    if sizes == "several":
+        radius[3] = 1.5
+    static, group = np.arange(0, N, 5), np.arange(N) % 3
+    pairs = np.stack([np.arange(0, 200, 2), np.arange(1, 200, 2)], axis=1)
+    features = [tv.Contact(skin=0.04, groups=[(0, 0), (0, 1), (1, 1), (2, 2)]), tv.Distance(pairs, compliance=1.0)]
+    start = tv.Particles(x, radius=radius, pinned=static, group=group)
+    w = world(start, features, precision="f64", path="launched")
+    w._grid.allocate(1)
+    w._renew()
+    w._list()
+    far = radius[:, None] + radius + w._grid.skin
+    near = ((x[:, None] - x) ** 2).sum(axis=2) < far**2
+    free = np.ones(N, dtype=bool)
+    free[static] = False
+    apart = (group[:, None] == 2) != (group == 2)
+    near &= (free[:, None] | free) & ~apart & ~np.eye(N, dtype=bool)
+    near[pairs[:, 0], pairs[:, 1]] = near[pairs[:, 1], pairs[:, 0]] = False
+    number, entries = lists(w)
+    np.testing.assert_array_equal(number, near.sum(axis=1))
+    np.testing.assert_array_equal(entries, np.nonzero(near)[1])
+    assert number.max() > LONG and w._grid.need[None] == number.sum() <= w._grid.capacity
+    again = Again(w._grid)
+    for _ in range(2):
+        shuffle(w, rng)
+        w._memory.write(w._grid.number, 0)
+        with w._memory.compiler():
+            again.run()
+        for a, b in zip(lists(w), (number, entries), strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_what_pairs_carry_goes_with_them(world):
+    # A pile of many sizes with friction and bounces, which keep something for each pair, from lists that are too small at first.
+    rng = np.random.default_rng(3)
+    radius = 10.0 ** rng.uniform(-1.5, -0.5, N)
+    x = rng.uniform(0.4, 9.6, (N, 2))
+    made = []
+    for path in ("fused", "launched"):
+        features = [tv.Gravity(9.81), tv.Contact(friction=0.3, restitution=0.2), tv.Box((0, 0), (10, 12))]
+        w = world(tv.Particles(x, radius=radius, mass=radius**2), features, path=path)
+        if path == "launched":
+            w._grid.allocate(1)
+            w._renew()
+        w.run(0.2)
+        made.append((w.hash(), w._grid.need[None]))
+        assert w._grid.cells.levels > 3
+    assert made[0] == made[1]
