@@ -32,9 +32,9 @@ class Bench:
             s.run(field, 0)
 
     @ti.kernel
-    def sort(self, count: ti.i32, shuffled: ti.template()):  # type: ignore[valid-type]
+    def sort(self, count: ti.i32, runs: ti.template()):  # type: ignore[valid-type]
         for _ in range(1):
-            sort(self.list, 1, count, shuffled)
+            sort(self.list, 1, count, runs)
 
 
 def test_running_sums():
@@ -58,9 +58,9 @@ def test_sorting():
     bench = Bench(False)
     for count in (0, 1, 2, 3, LONG - 1, LONG, LONG + 1, LONG + 2, 4 * LONG - 1, 4 * LONG):
         for values in (rng.permutation(count), np.arange(count), np.arange(count)[::-1]):
-            for shuffled in (False, True):
+            for runs in (False, True):
                 bench.memory.write(bench.list, np.r_[-5, values, np.full(4 * LONG + 1 - count, -7)])
-                bench.sort(count, shuffled)
+                bench.sort(count, runs)
                 made = bench.memory.read(bench.list)
                 np.testing.assert_array_equal(made[1 : count + 1], np.arange(count))
                 assert made[0] == -5 and (made[count + 1 :] == -7).all()
@@ -139,13 +139,13 @@ def test_lists_of_a_gpu_are_those_of_one_thread(world, dim, sizes):
 
 
 def test_what_pairs_carry_goes_with_them(world):
-    # A pile of many sizes with friction and bounces, which keep something for each pair, from lists that are too small at first.
+    # A pile of many sizes with friction, which keeps something for each pair, from lists that are too small at first.
     rng = np.random.default_rng(3)
     radius = 10.0 ** rng.uniform(-1.5, -0.5, N)
     x = rng.uniform(0.4, 9.6, (N, 2))
     made = []
     for path in ("fused", "launched"):
-        features = [tv.Gravity(9.81), tv.Contact(friction=0.3, restitution=0.2), tv.Box((0, 0), (10, 12))]
+        features = [tv.Gravity(9.81), tv.Contact(friction=0.3), tv.Box((0, 0), (10, 12))]
         w = world(tv.Particles(x, radius=radius, mass=radius**2), features, path=path)
         if path == "launched":
             w._grid.allocate(1)

@@ -113,16 +113,6 @@ class Cells:
         return self.bucket(self.home(i, m), m)
 
     @ti.func
-    def raised(self, field: ti.template(), at, by):  # type: ignore[valid-type]
-        """Add to a counter; returns what it was. Where one thread counts, no atomic operation, which takes longer."""
-        old = field[at]
-        if ti.static(self.serial):
-            field[at] = old + by
-        else:
-            old = ti.atomic_add(field[at], by)
-        return old
-
-    @ti.func
     def sort(self, me):
         """Sort the particles into buckets."""
         for b in range(self.team.low(self.buckets + 2, me), self.team.high(self.buckets + 2, me)):
@@ -130,14 +120,14 @@ class Cells:
         self.team.wait()
         ti.loop_config(serialize=self.serial)
         for i in range(self.team.one(self.n, me)):
-            self.raised(self.edge, self.where(i) + 1, 1)
+            raised(self.edge, self.where(i) + 1, 1, self.serial)
         self.sums.run(self.edge, me)
         ti.loop_config(serialize=self.serial)
         for back in range(self.team.one(self.n, me)):
             # Filling a bucket from its end turns the end of each into its begin, and the next one's begin is its end. From the
             # last particle on, so that each bucket comes out in order (on one thread) and leaves little to sort.
             i = self.n - 1 - back
-            k = self.raised(self.edge, self.where(i) + 1, -1) - 1
+            k = raised(self.edge, self.where(i) + 1, -1, self.serial) - 1
             self.sorted[k] = i
             self.place[k] = self.state.x[i]
             if ti.static(self.state.compensated):
@@ -166,3 +156,14 @@ class Cells:
         if low + 2 <= mask:
             span = 3
         return self.bucket(at, m), low, mask, span
+
+
+@ti.func
+def raised(field: ti.template(), at, by, serial: ti.template()):  # type: ignore[valid-type]
+    """Add to a counter; returns what it was. serial: one thread counts, without atomic operations, which take longer."""
+    old = field[at]
+    if ti.static(serial):
+        field[at] = old + by
+    else:
+        old = ti.atomic_add(field[at], by)
+    return old

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from .cells import Cells
+from .cells import Cells, raised
 from .feature import Scene
 from .material import Table
 from .memory import Memory
@@ -62,6 +62,7 @@ class Grid:
         self.cells = Cells(scene, scene.particles.radius, skin, team, self.launched, scratch)
         self.several = self.cells.levels > 1
         self.counts = self.several or self.launched  # before it lists
+        self.serial = not self.counts or (team.size == 1 and not self.launched)  # one thread makes a list, in order
         self.blocks = 16 if team.size > 1 and not self.counts else 1  # parts of the list, each filled by one thread
         self.origin = add("grid.built_at", n, width=dim)
         self.sums = Sums(n, team, self.launched, capped=True)
@@ -294,9 +295,8 @@ class Grid:
         for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
             self.number[i] = 0
         self.team.wait()
-        ti.loop_config(serialize=self.cells.serial)
-        for i in range(self.team.one(self.n, me)):
-            self.cells.raised(self.number, i, self.scan(i, COUNT, 0, 0))
+        for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
+            raised(self.number, i, self.scan(i, COUNT, 0, 0), self.serial)
         self.team.wait()
         for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
             self.first[i] = self.number[i]
@@ -310,8 +310,7 @@ class Grid:
             self.first[i] = self.first[i] - self.number[i]
             self.number[i] = 0
         self.team.wait()
-        ti.loop_config(serialize=self.cells.serial)
-        for i in range(self.team.one(self.n, me)):
+        for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
             if self.need[None] <= self.capacity:
                 used = self.scan(i, FILL, self.first[i], 0)
                 if ti.static(not self.several):
@@ -359,13 +358,13 @@ class Grid:
                             used += listed
                             if ti.static(self.several):
                                 if m < own and listed != 0:
-                                    self.cells.raised(self.number, j, 1)
+                                    raised(self.number, j, 1, self.serial)
                         elif listed != 0:
                             at = used
                             if ti.static(self.several):  # others write to this list, too
-                                at = self.cells.raised(self.number, i, 1)
+                                at = raised(self.number, i, 1, self.serial)
                                 if m < own:
-                                    self.near[self.first[j] + self.cells.raised(self.number, j, 1)] = i
+                                    self.near[self.first[j] + raised(self.number, j, 1, self.serial)] = i
                             self.near[start + at] = j
                             used += 1
         return used
@@ -392,9 +391,9 @@ class Grid:
     def order(self, begin, count):
         """Sort by index, which makes every sum over the list independent of the table."""
         if ti.static(self.several):
-            sort(self.near, begin, count, self.launched)
+            sort(self.near, begin, count, self.serial)
         elif count > ti.static(self.short):
-            sort(self.near, begin, count, self.launched)
+            sort(self.near, begin, count, self.serial)
         else:
             # Where neighbours in space are neighbours in number too, they are in order as they come.
             exchange(self.near, begin, count, self.network, self.short)

@@ -6,13 +6,12 @@ LONG = 64  # numbers that heapsort puts in order before insertion does
 
 
 @ti.func
-def sort(field: ti.template(), begin, count, shuffled: ti.template()):  # type: ignore[valid-type]
-    """The `count` numbers from `begin` on. shuffled: they may be in any order, not in a few runs."""
-    if ti.static(shuffled):
-        if count > LONG:
-            heap(field, begin, count)
-        else:
-            insert(field, begin, count)
+def sort(field: ti.template(), begin, count, runs: ti.template()):  # type: ignore[valid-type]
+    """The `count` numbers from `begin` on. runs: they come in a few runs, not in any order."""
+    if ti.static(runs):
+        insert(field, begin, count)
+    elif count > LONG:
+        heap(field, begin, count)
     else:
         insert(field, begin, count)
 
