@@ -15,8 +15,8 @@ CONDITION = 400.0  # modes with an eigenvalue of at least 1 / CONDITION keep 1 /
 class Calm:
     """Pairs that bear a load move neither towards nor away from each other.
 
-    With one pass per substep loaded contacts are springs, and sound in them decays by half its eigenvalue L per substep, which
-    for the longest wave in a column of N is (pi / 4 N)^2. So every EVERY substeps the displacements are projected onto those
+    With one pass per substep loaded contacts are springs, and sound in them decays by a third of its eigenvalue L per substep,
+    which for the longest wave in a column of N is (pi / 4 N)^2. So every EVERY substeps displacements are projected onto those
     that keep the lengths of loaded pairs, (d_i - d_j) . n = 0, by PASSES Jacobi passes with Chebyshev's acceleration: the slow
     modes lose PASSES^2 L of their velocity, not PASSES L. The polynomial is within -1 ... 1 on all eigenvalues 0 ... 1, so no
     energy is made; moves come in pairs, so momentum is conserved. Particles that lean on a wall do not move into it or off it.
@@ -45,7 +45,8 @@ class Calm:
         want, w = 0 * self.state.d[i], self.state.w[i]
         if self.contact._on_split[i] > 0:
             for word in range(self.contact._on_grid.words(i)):
-                bits = self.contact.touching(i, word)
+                # Not touches(): the pair may have parted in this pass, and both of it have to agree.
+                bits = ti.select(word == 0, self.contact._on_grid.touching[i], self.contact._on_grid.whole(i, word))
                 while bits != 0:
                     e = self.contact._on_grid.first[i] + word * WORD + lowest(bits)
                     bits &= bits - ti.u32(1)

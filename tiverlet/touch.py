@@ -41,7 +41,7 @@ class Touch(Feature):
 
     @ti.func
     def meet(self, i, j, far, shared):
-        """Overlap, overlap / shared, and direction, as in touch(), of a pair that touches.
+        """Overlap, 1 / shared, and direction, as in touch(), of a pair that touches.
 
         A pair that came together in this substep has the direction that it had when it met: |r0 + s d| = far, with r0 at the
         start and d the relative displacement; what is left of d along n is the overlap. This is exact for free flight, where
@@ -52,10 +52,10 @@ class Touch(Feature):
         length = ti.sqrt(rr)
         per = 1 / (shared * length)  # of all that takes time, divisions take most
         overlap = far - length
-        part, n = overlap * (per * length), (per * shared) * r
+        each, n = per * length, (per * shared) * r
         if rr <= far * far * ti.static(2.0**-80):
             overlap, n = far, self.part(i, j, r)
-            part = overlap / shared
+            each = 1 / shared
         d = self._on_state.d[i] - self._on_state.d[j]
         r -= d
         c = r.dot(r) - far * far
@@ -66,8 +66,7 @@ class Touch(Feature):
                 s = ti.min(c / root, 1)
                 n = (r + s * d) / far
                 overlap = ti.max((s - 1) * d.dot(n), 0)
-                part = overlap / shared
-        return overlap, part, n
+        return overlap, each, n
 
     @ti.func
     def part(self, i, j, r):

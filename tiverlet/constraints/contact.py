@@ -14,7 +14,9 @@ from ..particles import Particles
 from ..team import Team
 from ..touch import Touch
 
-CARRY = 0.4  # of its last push that a pair keeps; below 1/2
+RELAXATION = 1.25  # below 4/3, see Contact
+CARRY = 0.4  # of its last push that a pair keeps, at most; below 1/2
+FADE = 31 / 32  # of how much more often than needed a mass was split, what is left a pass later
 
 
 class Contact(Touch):
@@ -30,15 +32,17 @@ class Contact(Touch):
 
     A Jacobi pass: each pair wants C back along the current n, split by mass, p = C / (m_i w_i + m_j w_j), which conserves
     momentum. A particle has its mass split m times, where m bounds the eigenvalues of S, the sum of n n^T over its overlapping
-    pairs: then sum w J J^T <= diag(sum w m) for the rows J of its pairs, and no eigenvalue of a pass exceeds 1. m = tr(S^4)^(1/4)
-    is 3.6 for a disc among six neighbours (counting pairs gives 6) and 5.3 for a sphere among twelve. With friction tangents are
-    taken back too; n n^T and t t^T sum up to the count, which is taken then, and for up to two pairs.
+    pairs: then sum w J J^T <= diag(sum w m) for the rows J of its pairs, and no eigenvalue of a pass exceeds 1. m is 3 for a disc
+    among six neighbours (counting pairs gives 6) and 4 for a sphere among twelve. With friction tangents are taken back too;
+    n n^T and t t^T sum up to the count, which is taken then, and for up to two pairs. m grows at once, and falls slowly: if it
+    followed pairs that just touch, the stiffness of what is around them would jump whenever they part, and keep them going.
 
-    A pair that overlapped in the last substep keeps a part of its push, p = CARRY p_last + C / (...), as far as that is not more
-    than what parts the pair alone, C / (w_i + w_j). For a mode with eigenvalue L of a pass, stepping has the characteristic
-    polynomial z^3 - (g + 2 - 2 L) z^2 + (2 g + 1 - L) z - g with g = CARRY, stable if and only if g < 1/2 and L < 4 (1 + g) / 3.
-    A load is held by 1 - g of the overlap: the k-th contact below the top of a stack, with m = 2, overlaps by 4 (1 - g) k g h^2.
-    Sound that is left in a pile is taken out now and then, see calm.py.
+    Pushes are over-relaxed by r = 5/4, and a pair that overlapped in the last substep keeps a part of what it got. With M =
+    m_i w_i + m_j w_j, p = r C / M + c p_last, but no more than what parts the pair alone, C / (w_i + w_j). For a mode with
+    eigenvalue L of a pass, stepping has the characteristic polynomial (z - 1)^2 (z - c) + r L z (2 z - 1), stable if and only if
+    c < 1/2 and r L < 4 (1 + c) / 3. A load is held by (1 - c) / r of the overlap; c = 0.4, or less where p would pass that bound
+    at rest. So the k-th contact below the top of a stack overlaps by 2 k g h^2. Sound that is left in a pile is taken out now and
+    then, see calm.py.
 
     Particles that are in the same place part in the direction of a golden-ratio angle made from their indices. Linked particles
     (Distance, Rope, Spacer) do not touch.
@@ -196,7 +200,10 @@ class Contact(Touch):
                         deepest = ti.min(deepest, r.dot(r) * scale)
                 if deepest > 0.25:
                     split = ti.min(largest(tensor) / deepest, split)
-        self._on_split[i] = split * self._on_state.w[i]
+        split *= self._on_state.w[i]
+        if pairs > 0:
+            split += ti.static(FADE) * ti.max(self._on_split[i] - split, 0)
+        self._on_split[i] = split
 
     @ti.func
     def forget(self, i, word, gone):
@@ -222,15 +229,15 @@ class Contact(Touch):
                     bits &= bits - ti.u32(1)
                     j = self._on_grid.near[e]
                     shared, last = self._on_split[i] + self._on_split[j], self._on_push.field[e]
-                    overlap, part, n = self.meet(i, j, self.far(i, j), shared)
-                    given, push = ti.zero(part), ti.zero(part)
+                    overlap, each, n = self.meet(i, j, self.far(i, j), shared)
+                    each *= ti.static(RELAXATION)
+                    part = overlap * each
+                    given, push, alone = ti.zero(part), ti.zero(part), w + self._on_state.w[j]
                     if first == 0:
                         push = last
                     elif fresh == 0:
-                        part += ti.static(CARRY) * last
-                        both = w + self._on_state.w[j]
-                        if part * both > overlap:
-                            part = overlap / both
+                        part += ti.max(ti.min(1 - alone * each, ti.static(CARRY)), 0) * last
+                    part = ti.min(part, overlap / alone)  # without a branch: it would be taken at random
                     if ti.static(self._on_bounces):
                         given, rests = self.bounce(i, j, n, overlap, last, first)
                         if given > 0:
@@ -279,7 +286,7 @@ class Contact(Touch):
             for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
                 if self._on_blow.field[e] > 0:
                     j = self._on_grid.near[e]
-                    overlap, _part, n = self.meet(i, j, self.far(i, j), self._on_struck[i])
+                    overlap, _each, n = self.meet(i, j, self.far(i, j), self._on_struck[i])
                     given, here, a = self.leap(i, j, n)
                     if overlap > 0 and a > 0 and given > 0:
                         left = ti.select(overlap < here, overlap / here, 1)
@@ -333,9 +340,12 @@ class Contact(Touch):
 
 @ti.func
 def largest(tensor):
-    """At least the largest eigenvalue of a symmetric matrix S >= 0: tr(S^4)^(1/4). The largest itself is 3 for a disc among six,
-    and makes piles that overlap by 8 % less, but sound in them does not fade below 1e-6 m g r."""
-    return ti.sqrt((tensor @ tensor).norm())
+    """The largest eigenvalue of a symmetric 2 x 2 matrix, and an upper bound for 3 x 3 ones (Wolkowicz and Styan 1980)."""
+    n = ti.static(tensor.n)
+    mean = tensor.trace() / n
+    for k in ti.static(range(n)):
+        tensor[k, k] -= mean
+    return mean + ti.static(((n - 1) / n) ** 0.5) * tensor.norm()
 
 
 @ti.func
