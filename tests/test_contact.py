@@ -173,7 +173,7 @@ def test_coincident_particles_part_gently(world, dim):
     # and 1000, far from each other.
     speed, counts = 0.25, (2, 100, 1000)
     x = np.repeat(np.arange(3), counts)[:, None] * (50 * np.eye(dim)[0])
-    w = world(tv.Particles(x, radius=0.01), [tv.Contact(push_out=speed)], precision="f64", substeps=5)
+    w = world(tv.Particles(x, radius=0.01), [tv.Contact(push_out=speed)], precision="f64", substeps=8)
     made = []
     for _ in range(2):
         w.position, w.velocity = x, 0 * x
