@@ -1,17 +1,19 @@
 """Many bodies in contact against what is known of them: piles, gases, packings. `python -m tiverlet.report.granular`."""
 
 import argparse
-from time import process_time
+import tempfile
+from time import perf_counter
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from .. import measure, tools
+from .. import measure, runtime, tools
 from ..constraints import Box, Contact
-from ..forces import Drag, Gravity
+from ..forces import Drag
 from ..particles import Particles
 from ..world import World
+from .speed import scenes, yardstick
 
 GASES = (
     (2, 0.1, 400.0),
@@ -21,6 +23,7 @@ GASES = (
     (3, 0.2, 80.0),
     (3, 0.3, 80.0),
 )  # dim, fraction, time [s]
+FRAMES = 120  # of a pile
 BEATS = 0.1, 0.05, 0.025  # substeps over the mean time between two collisions
 
 
@@ -35,26 +38,27 @@ def lattice(n: int, dim: int, size: float) -> np.ndarray:
     return (np.stack(np.meshgrid(*[np.arange(m)] * dim, indexing="ij"), -1).reshape(-1, dim)[:n] + 0.5) * (size / m)
 
 
-def pile(n: int, dim: int, substeps: int, frames: int = 120) -> dict[str, float]:
+def pile(n: int, dim: int, substeps: int) -> dict[str, float]:
     """Equal discs or spheres, dropped from a loose lattice into a box 1.3 times as wide and twice as high.
 
-    Returns the mean overlap in diameters, the kinetic energy per particle in m g r, and the median time of a frame [s].
+    Returns the mean overlap in diameters, the kinetic energy per particle in m g r, and the mean time of a frame [s].
     """
-    side = int(np.ceil(n ** (1 / dim) - 1e-9))
-    x = lattice(side**dim, dim, 1.1 * side)[:, ::-1] if dim == 2 else lattice(side**dim, dim, 1.1 * side)[:, [1, 2, 0]]
-    x = x[:n] + 0.05 * tools.golden(np.arange(n), dim)
-    wide = [1.3 * side] * dim
-    wide[1] = 2 * side
-    features = [Gravity(9.81), Box([0] * dim, wide), Contact()]
-    with World(Particles(x, radius=0.5), features, substeps=substeps) as world:
-        times = []
-        for _ in range(frames):
-            before = process_time()
-            world.step(1 / 60)
-            times.append(process_time() - before)
+    particles, features = scenes.pile(n, dim)
+    with World(particles, features, substeps=substeps) as world:
+        world.step(1 / 60)
+        before = perf_counter()
+        world.run((FRAMES - 1) / 60)
+        seconds = (perf_counter() - before) / (FRAMES - 1)
         energy = measure.kinetic_energy(world) / n / (9.81 * 0.5)
-        overlap = world.contacts.overlap
-        return {"overlap": float(overlap.mean()), "energy": energy, "seconds": float(np.median(times))}
+        return {"overlap": float(world.contacts.overlap.mean()), "energy": energy, "seconds": seconds}
+
+
+def pile_in_c(program: str, n: int, substeps: int) -> dict[str, float]:
+    """The same discs by hand: mean overlap and time of a frame, on as many threads."""
+    with yardstick.Yardstick(program, n, substeps, runtime.threads()) as talker:
+        talker.ask("restart")
+        seconds = talker.ask(f"run {FRAMES}") / FRAMES
+        return {"overlap": talker.ask("quality")["overlap"], "seconds": seconds}
 
 
 def compressibility(fraction: float, dim: int) -> float:
@@ -177,15 +181,28 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="piles only")
     given = parser.parse_args()
     console = Console()
-    table = Table(
-        "dim", "substeps", "mean overlap (% d)", "kinetic energy (m g r)", "ms per frame", title="Piles after 120 frames"
+    heads = (
+        "dim",
+        "substeps",
+        "mean overlap (% d)",
+        "kinetic energy (m g r)",
+        "ms per frame",
+        "C: mean overlap",
+        "C: ms per frame",
     )
-    for dim in (2, 3):
-        for substeps in (4, 8, 20):
-            figures = pile(given.particles, dim, substeps)
-            row = f"{100 * figures['overlap']:.3f}", f"{figures['energy']:.3g}", f"{1e3 * figures['seconds']:.2f}"
-            table.add_row(str(dim), str(substeps), *row)
+    table = Table(*heads, title=f"Piles after {FRAMES} frames")
+    with tempfile.TemporaryDirectory() as folder:
+        program, how = yardstick.build(folder)
+        for dim in (2, 3):
+            for substeps in (4, 8, 20):
+                figures = pile(given.particles, dim, substeps)
+                row = [f"{100 * figures['overlap']:.3f}", f"{figures['energy']:.3g}", f"{1e3 * figures['seconds']:.2f}"]
+                if program and dim == 2:
+                    figures = pile_in_c(program, given.particles, substeps)
+                    row += [f"{100 * figures['overlap']:.3f}", f"{1e3 * figures['seconds']:.2f}"]
+                table.add_row(str(dim), str(substeps), *row)
     console.print(table)
+    console.print(f"C: {how}, {runtime.threads()} threads")
     if given.quick:
         return
     table = Table("scene", "pressure / known", "<v^4>/<v^2>^2 / Maxwell", title="Elastic gases, 4096 particles")
