@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 import taichi as ti
 
+from tiverlet import memory as fields
+from tiverlet import runtime
 from tiverlet.memory import Memory
 
 from .conftest import python
@@ -48,6 +50,51 @@ def test_the_host_sees_the_fields_as_kernels_do():
     memory.destroy()
     with pytest.raises(RuntimeError, match="closed"):
         memory.state()
+
+
+def test_f64_fields_can_stand_apart(monkeypatch):
+    # As on Vulkan: in a tree of their own, which shows in nothing else. Lengths that would put an f64 between two multiples of 8.
+    monkeypatch.setattr(fields, "aligned", lambda: False)
+    alive, rng = runtime.trees, np.random.default_rng(0)
+    plans = {
+        "two": [(ti.i32, 3, 0), (ti.f64, 4, 0), (ti.f32, 5, 3), (ti.f64, None, 2), (ti.u32, 1, 0), (ti.i32, None, 0)],
+        "wide": [(ti.f64, 3, 2), (ti.f64, None, 0)],
+        "narrow": [(ti.i32, 3, 0), (ti.f32, None, 0)],
+    }
+    for name, plan in plans.items():
+        memory, want, made = Memory(ti.f32), {}, {}
+        for k, (kind, length, width) in enumerate(plan):
+            value = rng.integers(0, 2**20, (length or 1,) + ((width,) if width else ())).astype(fields._NUMPY[kind])
+            want[f"f{k}"] = value if kind in (ti.i32, ti.u32) else value / 7
+            made[f"f{k}"] = memory.field(f"f{k}", length, width=width, kind=kind, values=want[f"f{k}"], state=True)
+        memory.place()
+        roots = {e.name: fields._chain(e.field)[1].id for e in memory.entries}
+        wide = {roots[e.name] for e in memory.entries if e.kind == np.float64}
+        narrow = {roots[e.name] for e in memory.entries if e.kind != np.float64}
+        assert not wide & narrow and len(wide | narrow) == runtime.trees - alive == (2 if name == "two" else 1)
+        before = memory.state()
+        for key, field in made.items():
+            np.testing.assert_array_equal(memory.read(field), want[key])
+            memory.write(field, 2 * want[key])
+            np.testing.assert_array_equal(memory.read(field), 2 * want[key])
+        memory.restore(before)
+        for key, value in memory.state().items():
+            np.testing.assert_array_equal(value, want[key])
+        memory.destroy()
+        memory.destroy()
+        assert runtime.trees == alive
+        with pytest.raises(RuntimeError, match="closed"):
+            memory.state()
+        given_up = Memory(ti.f32)
+        for k, (kind, length, width) in enumerate(plan):
+            given_up.field(f"f{k}", length, width=width, kind=kind)
+        given_up.abandon()
+    Memory(ti.f32).abandon()
+    after = Memory(ti.f64)  # nothing was poisoned
+    last = after.field("last", 2, values=[1.5, 2.5])
+    after.place()
+    assert after.read(last).tolist() == [1.5, 2.5] and runtime.trees == alive + 1
+    after.destroy()
 
 
 def test_import_is_quiet_and_starts_nothing():

@@ -1,4 +1,4 @@
-"""Fields: declared together, placed in one tree, freed together.
+"""Fields: declared together, placed in one tree, or two, freed together.
 
 Taichi 1.7.4 ends the process, without an exception, when a field outlives its runtime, when 512 trees of fields are
 alive, when a field has no elements or when a child made by fork launches a kernel. The checks here turn each of
@@ -39,7 +39,7 @@ class Entry:
 
 
 class Memory:
-    """The fields of one world: declared first, then placed together in one tree, freed together.
+    """The fields of one world: declared first, then placed together, freed together.
 
     `real` is ti.f32 or ti.f64; particles: how many the world has, see Compiler. Every method that touches the fields checks first
     that they still exist.
@@ -48,15 +48,16 @@ class Memory:
     def __init__(self, real, particles: int = FEW):
         if runtime.trees >= MAX_TREES:
             raise RuntimeError(
-                f"{runtime.trees} worlds are alive, and Taichi crashes near 512. Close worlds that you no longer need: "
-                "world.close(), or `with tv.World(...) as world:`."
+                f"So many worlds are alive that they have {runtime.trees} trees of fields, and Taichi crashes near 512. "
+                "Close worlds that you no longer need: world.close(), or `with tv.World(...) as world:`."
             )
         self.real = real
         self.compiler = Compiler(real, particles)
         self.entries: list[Entry] = []
         self._later: list[tuple[Entry, np.ndarray]] = []
-        self._builder = ti.FieldsBuilder()
-        self._tree = None
+        self._apart = not aligned()
+        self._builders: dict[bool, Any] = {}  # of the trees, by whether what they hold stands apart
+        self._trees: list = []
         self._runtime = impl.get_runtime()
         self._transfers: dict[tuple, _Transfer] = {}  # compiled once, since that costs more than running them
         self._views: dict[int, np.ndarray] | None = None  # see _seen()
@@ -65,10 +66,13 @@ class Memory:
         """Declare a field of `length` elements (None: a single one, of 0 dimensions) and give it its first values."""
         kind = self.real if kind is None else kind
         made = ti.Vector.field(width, kind) if width else ti.field(kind)
+        apart = self._apart and kind == ti.f64
+        if apart not in self._builders:
+            self._builders[apart] = ti.FieldsBuilder()
         if length is None:
-            self._builder.place(made)
+            self._builders[apart].place(made)
         else:
-            self._builder.dense(ti.i, max(1, length)).place(made)  # a field of 0 elements poisons the runtime
+            self._builders[apart].dense(ti.i, max(1, length)).place(made)  # a field of 0 elements poisons the runtime
         same = sum(e.name == name or e.name.startswith(f"{name} #") for e in self.entries)
         name = f"{name} #{same + 1}" if same else name  # two batches of a kind
         entry = Entry(name, made, width, 0 if length is None else max(1, length), np.dtype(_NUMPY[kind]), state)
@@ -79,8 +83,8 @@ class Memory:
 
     def place(self) -> None:
         """Allocate what was declared and write the first values (everything else is zero)."""
-        self._tree = self._builder.finalize()
-        runtime.trees += 1
+        self._trees = [builder.finalize() for builder in self._builders.values()]
+        runtime.trees += len(self._trees)
         if self._later:
             self._load([entry for entry, _ in self._later], [values for _, values in self._later])
             self._later.clear()
@@ -91,7 +95,7 @@ class Memory:
         Reading and writing fields by kernels takes longer to compile than all else takes to run.
         """
         if self._views is None:
-            self._views = self._look() if runtime.architecture() == "cpu" else {}
+            self._views = self._look() if runtime.architecture() == "cpu" and not self._apart else {}
         return self._views
 
     def _look(self) -> dict[int, np.ndarray]:
@@ -114,11 +118,11 @@ class Memory:
 
         So would fields that are gone before Taichi has looked at them, which it does before the next kernel.
         """
-        if self._tree is None:
-            self.field("abandoned", None)
-            tree = self._builder.finalize()
+        if not self._trees:
+            trees = [builder.finalize() for builder in self._builders.values()]
             self._runtime.materialize()
-            tree.destroy()
+            for tree in trees:
+                tree.destroy()
 
     def check(self) -> None:
         """Raise RuntimeError when the fields are gone or belong to a runtime that is."""
@@ -126,17 +130,18 @@ class Memory:
             raise RuntimeError(
                 "Taichi was started again after this world was built, which destroyed its fields. Build the world anew."
             )
-        if self._tree is None:
+        if not self._trees:
             raise RuntimeError("This world is closed; build a new one.")
         if runtime.forked():
             raise RuntimeError('This world was built before a fork and cannot run in the child; use "spawn".')
 
     def destroy(self) -> None:
         """Free the fields. Calling it twice, or after another ti.init, does nothing."""
-        if self._tree is not None and impl.get_runtime() is self._runtime and not runtime.forked():
-            self._tree.destroy()
-            runtime.trees -= 1
-        self._tree = None
+        if impl.get_runtime() is self._runtime and not runtime.forked():
+            for tree in self._trees:
+                tree.destroy()
+            runtime.trees -= len(self._trees)
+        self._trees = []
         self._views = None
 
     def write(self, field, values) -> None:
@@ -203,6 +208,16 @@ class Memory:
 
 
 _NUMPY = {ti.f32: np.float32, ti.f64: np.float64, ti.i32: np.int32, ti.u32: np.uint32}
+
+
+def aligned() -> bool:
+    """Whether a field of f64 may stand in one tree with others.
+
+    LLVM lays out trees on a CPU and in CUDA, so that all is aligned. Elsewhere Taichi 1.7.4 puts one field behind the other, the
+    smallest first, and finds an f64 by its address divided by 8: of a tree of 3 i32 and 4 f64, the first f64 begins at byte 12
+    and is written to byte 8, over the last i32. Alone in their tree all f64 are aligned.
+    """
+    return runtime.architecture() in ("cpu", "cuda")
 
 
 def _shape(entry: Entry) -> tuple[int, ...]:
