@@ -73,18 +73,28 @@ class Touch(Feature):
         """A direction for two particles in the same place: opposite for (j, i), different for other pairs."""
         low, high = ti.cast(ti.min(i, j), ti.u32), ti.cast(ti.max(i, j), ti.u32)
         mixed = (low * ti.u32(2654435769)) ^ ((high + ti.u32(1)) * ti.u32(2246822519))
-        u = ti.cast(mixed * ti.u32(2654435769), ti.f64) / 4294967296.0
         n = 0 * r
-        turn = ti.f64(6.283185307179586) * u
-        if ti.static(self._on_state.dim == 2):
-            n[0], n[1] = ti.cos(turn), ti.sin(turn)
-        else:
-            z = 2 * ti.cast(mixed * ti.u32(3242174889), ti.f64) / 4294967296.0 - 1
-            across = ti.sqrt(ti.max(1 - z * z, 0))
-            n[0], n[1], n[2] = across * ti.cos(turn), across * ti.sin(turn), z
+        n[0], n[1] = self.around(mixed * ti.u32(2654435769))
+        if ti.static(self._on_state.dim == 3):
+            z = self.fraction(mixed * ti.u32(3242174889))
+            n *= ti.sqrt(1 - z * z)
+            n[2] = z
         if i > j:
             n = -n
         return n
+
+    @ti.func
+    def around(self, bits):
+        """A point of the unit circle: (1 - t^2, 2 t) / (1 + t^2), on its right half for t in (-1, 1), or the opposite one. Cosines
+        have other bits elsewhere, and none in f64 on some GPUs."""
+        t = self.fraction(bits << ti.u32(1))
+        per = (1 - 2 * ti.cast(bits >> ti.u32(31), ti.i32)) / (1 + t * t)
+        return (1 - t * t) * per, 2 * t * per
+
+    @ti.func
+    def fraction(self, bits):
+        """In (-1, 1): an odd multiple of 2^-23, which f32 can hold."""
+        return ti.cast(2 * ti.cast(bits >> ti.u32(9), ti.i32) + 1 - 2**23, self.scene.real) * ti.static(2.0**-23)
 
     def ease(self) -> None:
         """From now on particles may be smaller than they are; the field for it exists only once it is needed."""

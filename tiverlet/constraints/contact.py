@@ -44,7 +44,7 @@ class Contact(Touch):
     at rest. So the k-th contact below the top of a stack overlaps by 2 k g h^2. Sound that is left in a pile is taken out now and
     then, see calm.py.
 
-    Particles that are in the same place part in the direction of a golden-ratio angle made from their indices. Linked particles
+    Particles that are in the same place part in a direction made from their indices, another one for each pair. Linked particles
     (Distance, Rope, Spacer) do not touch.
 
     Friction wants back the slip s of a pair, up to friction times the overlap: what a pair has moved across its normal since it
