@@ -85,8 +85,8 @@ class Touch(Feature):
 
     @ti.func
     def around(self, bits):
-        """A point of the unit circle: (1 - t^2, 2 t) / (1 + t^2), on its right half for t in (-1, 1), or the opposite one. Cosines
-        have other bits elsewhere, and none in f64 on some GPUs."""
+        """A point of the unit circle: (1 - t^2, 2 t) / (1 + t^2), on its right half for t in (-1, 1), or the opposite one. A
+        cosine has other bits elsewhere, and some GPUs have none of f64."""
         t = self.fraction(bits << ti.u32(1))
         per = (1 - 2 * ti.cast(bits >> ti.u32(31), ti.i32)) / (1 + t * t)
         return (1 - t * t) * per, 2 * t * per
