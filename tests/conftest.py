@@ -1,4 +1,4 @@
-"""One Taichi for the whole run; worlds are closed after each test."""
+"""One Taichi for the whole run, of the architecture TIVERLET_ARCH (cpu); worlds are closed after each test."""
 
 import contextlib
 import os
@@ -19,13 +19,14 @@ from tiverlet.report.cases import entries, known
 # order: a second run takes half of the time or less. All of them are about as large as what it keeps by default, 100 MB.
 os.environ.setdefault("TI_OFFLINE_CACHE_MAX_SIZE_OF_FILES", str(512 << 20))
 
+ARCH = os.environ.get("TIVERLET_ARCH", "cpu")
 SOURCES = str(pathlib.Path(tv.__file__).parent)
 CASES = {name: known(name) for name in entries()}
 
 
 @pytest.fixture(scope="session", autouse=True)
 def taichi():
-    tv.init()
+    tv.init(arch=ARCH)
     assign = ops.assign
 
     def checked(to, value):
