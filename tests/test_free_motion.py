@@ -154,10 +154,11 @@ def test_literals_of_a_users_force_keep_all_digits_in_f64(world):
         return ti.Vector([0.1, 0.3 * t])
 
     # m x'' = (0.1, 0.3 t): x = 0.05 t^2 / m, exactly; y = 0.05 t^3 / m to second order.
-    w = world(tv.Particles([[0.0, 0.0]], mass=2.0), [tv.Force(push)], substeps=4, precision="f64")
-    w.run(1.0, dt=0.25)
-    assert w.position[0, 0] == pytest.approx(0.025, rel=1e-14)
-    assert w.position[0, 1] == pytest.approx(0.025, rel=1e-2)
+    for path in ("auto", "launched"):
+        w = world(tv.Particles([[0.0, 0.0]], mass=2.0), [tv.Force(push)], substeps=4, precision="f64", path=path)
+        w.run(1.0, dt=0.25)
+        assert w.position[0, 0] == pytest.approx(0.025, rel=1e-14)
+        assert w.position[0, 1] == pytest.approx(0.025, rel=1e-2)
 
 
 def test_forces_that_read_velocities_are_second_order(world):

@@ -73,8 +73,7 @@ class Compiler:
             before = {name: getattr(config, name) for name in LEAN | BRIEF}
             self._settings = _active[0]._settings if _active else before
             runtime.set_default_fp(self.real)
-            if str(config.arch) in HOSTS:
-                _set(config, SAFE if self.thorough else self.lean)
+            _set(config, self.lean if str(config.arch) in HOSTS and not self.thorough else SAFE)
             _active.append(self)
             self._thread = threading.get_ident()
             try:

@@ -136,7 +136,8 @@ class World(Access):
         done, frame = substeps if len(self._particles) else 0, self._counted(dt)
         started, end = self._fresh and substeps == 1, frame[0] + frame[1] * frame[2]
         if sub["launched"]:
-            self._parallel(done, iterations)
+            with self._memory.compiler():
+                self._parallel(done, iterations)
         else:
             self._fused(done, iterations, end, STARTED if started else STEPPED)
         self.__dict__.update(  # which is quicker than one after the other
