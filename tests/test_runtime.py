@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import taichi as ti
 
+import tiverlet as tv
+from tiverlet import assembly, runtime
 from tiverlet import memory as fields
-from tiverlet import runtime
 from tiverlet.memory import Memory
 
 from .conftest import python
@@ -95,6 +96,21 @@ def test_f64_fields_can_stand_apart(monkeypatch):
     after.place()
     assert after.read(last).tolist() == [1.5, 2.5] and runtime.trees == alive + 1
     after.destroy()
+
+
+def test_what_spirv_lacks_is_refused(monkeypatch):
+    x, k = np.eye(4, 3), np.arange(4)
+    flowing = tv.ShapeMatch([k], compliance=1.0, creep=1.0)
+    asked = (tv.Bend([k[:3]]), tv.AngleLimit([k[:3]], 0.0, 1.0), tv.Dihedral([k]), tv.Volume([k]), flowing)
+    monkeypatch.setattr(runtime, "architecture", lambda: "vulkan")
+    for feature in asked:
+        with pytest.raises(ValueError, match=f"World: {feature!r} takes an angle.*, which vulkan has for f32 only"):
+            tv.World(tv.Particles(x), [feature], precision="f64")
+    with pytest.raises(ValueError, match='"f32-compensated" needs exact rounding, which Taichi does not have on vulkan'):
+        tv.World(tv.Particles(x), precision="f32-compensated")
+    for feature in (tv.ShapeMatch([k]), tv.Distance([k[:2]])):
+        assembly.check_architecture("f64", (feature,))
+    assembly.check_architecture("f32", asked)
 
 
 def test_import_is_quiet_and_starts_nothing():

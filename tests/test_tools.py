@@ -5,6 +5,7 @@ import pytest
 import taichi as ti
 
 import tiverlet as tv
+from tiverlet.angle import cos_sin
 
 
 def test_mix_is_exact_at_both_ends():
@@ -56,6 +57,21 @@ def test_colors_differ():
     assert colors.shape == (12, 3) and colors.dtype == np.uint8
     assert len(np.unique(colors, axis=0)) == 12
     assert tv.golden_colors(0).shape == (0, 3)
+
+
+def test_cosines_of_f64_are_right_to_the_last_digit():
+    @ti.kernel
+    def run(x: ti.types.ndarray(ti.f64, 1), out: ti.types.ndarray(ti.f64, 2)):
+        for i in range(x.shape[0]):
+            out[i, 0], out[i, 1] = cos_sin(x[i])
+
+    rng = np.random.default_rng(0)
+    quarters = np.arange(-9, 10) * np.pi / 4
+    x = np.r_[0.0, quarters, quarters * (1 + 2.0**-50), rng.uniform(-7, 7, 1000), rng.uniform(-6e6, 6e6, 1000), 1e-300]
+    out = np.zeros((len(x), 2))
+    run(x, out)
+    np.testing.assert_allclose(out, np.stack([np.cos(x), np.sin(x)], axis=1), rtol=0, atol=2.0**-52)
+    assert out[0].tolist() == [1.0, 0.0] and out[-1].tolist() == [1.0, 1e-300]
 
 
 def test_tools_work_inside_kernels():

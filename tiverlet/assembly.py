@@ -70,11 +70,7 @@ def assemble(
         else:
             feature.admit(particles, first)
     runtime.ensure_started()
-    if precision == "f32-compensated" and runtime.fast_math():
-        raise ValueError(
-            'World: precision = "f32-compensated" needs exact rounding, but Taichi was started with fast_math=True. '
-            "Use tv.init(), or ti.init(fast_math=False)."
-        )
+    check_architecture(precision, features)
     path = _chosen(path, particles, features) if order == 2 else "fused"
     memory = Memory(PRECISIONS[precision], len(particles))
     try:
@@ -180,6 +176,29 @@ def check_settings(precision: str, path: str, order: int, features: tuple[Featur
         raise ValueError(f"World: order = {order!r}, but it must be one of {', '.join(map(str, composition.ORDERS))}.")
     if order > 2:
         composition.refuse(order, features, precision, path)
+
+
+def check_architecture(precision: str, features: tuple[Feature, ...]) -> None:
+    """Refuse what the running Taichi cannot compile, or not so that it is right."""
+    arch = runtime.architecture()
+    if precision == "f32-compensated" and runtime.fast_math():
+        raise ValueError(
+            'World: precision = "f32-compensated" needs exact rounding, but Taichi was started with fast_math=True. '
+            "Use tv.init(), or ti.init(fast_math=False)."
+        )
+    if arch in runtime.LLVM:
+        return
+    if precision == "f32-compensated":  # Taichi does not mark sums as exact there, and drivers replace (a + b) - a by b
+        raise ValueError(
+            f'World: precision = "f32-compensated" needs exact rounding, which Taichi does not have on {arch}. '
+            'Use "f64", or tv.init(arch="cpu").'
+        )
+    for feature in features:
+        if precision == "f64" and isinstance(feature, Batch) and feature.transcends:
+            raise ValueError(
+                f"World: {feature!r} takes an angle, a cube root or an exponential, which {arch} has for f32 only, but precision = "
+                '"f64". Use "f32", or tv.init(arch="cpu").'
+            )
 
 
 def _chosen(path: str, particles: Particles, features: tuple[Feature, ...]) -> str:

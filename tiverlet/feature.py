@@ -165,6 +165,7 @@ class Batch(Feature):
     soft = False  # has springs, which act at a start
     breaks = False  # has constraints that a load can break
     drives = False  # puts its particles in place instead of relaxing them
+    transcends = False  # takes angles, cube roots or exponentials, which SPIR-V has for f32 only
     indices: np.ndarray  # (m, arity)
     each: tuple[str, ...] = ()  # its arrays with one row for each constraint, beside the indices
     index_name = "indices"  # the argument of __init__ that they are, as `listing` gives them

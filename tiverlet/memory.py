@@ -213,11 +213,11 @@ _NUMPY = {ti.f32: np.float32, ti.f64: np.float64, ti.i32: np.int32, ti.u32: np.u
 def aligned() -> bool:
     """Whether a field of f64 may stand in one tree with others.
 
-    LLVM lays out trees on a CPU and in CUDA, so that all is aligned. Elsewhere Taichi 1.7.4 puts one field behind the other, the
+    LLVM lays out trees so that all is aligned. Elsewhere Taichi 1.7.4 puts one field behind the other, the
     smallest first, and finds an f64 by its address divided by 8: of a tree of 3 i32 and 4 f64, the first f64 begins at byte 12
     and is written to byte 8, over the last i32. Alone in their tree all f64 are aligned.
     """
-    return runtime.architecture() in ("cpu", "cuda")
+    return runtime.architecture() in runtime.LLVM
 
 
 def _shape(entry: Entry) -> tuple[int, ...]:

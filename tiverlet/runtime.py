@@ -15,6 +15,7 @@ import taichi as ti
 from taichi.lang import impl
 
 ARCHITECTURES = ("cpu", "cuda", "metal", "vulkan")
+LLVM = ("cpu", "cuda")  # what LLVM compiles for; for the others Taichi writes SPIR-V
 
 _started: dict = {}  # what init() was asked for, and by which process and thread
 trees = 0  # of fields that are alive, of this runtime; memory.py counts them

@@ -6,6 +6,7 @@ import numpy as np
 import taichi as ti
 
 from . import checks
+from .angle import cos_sin
 from .feature import Knob, Scene
 from .particles import Particles
 from .wall import Track, Wall
@@ -101,13 +102,13 @@ class Solid(Wall):
         """R of an angle or a rotation vector (Rodrigues); exactly 1 at 0."""
         angle, out = rotation.norm(), ti.Matrix.identity(ti.f64, self.dim)
         if angle > 0:
-            c, s = ti.cos(angle), ti.sin(angle)
             if ti.static(self.dim == 2):
-                s = ti.sin(rotation[0])
+                c, s = cos_sin(rotation[0])
                 out = ti.Matrix([[c, -s], [s, c]])
             else:
                 u = rotation / angle
-                half = ti.sin(angle / 2)
+                c, s = cos_sin(angle)
+                _, half = cos_sin(angle / 2)
                 out = c * out + 2 * half * half * u.outer_product(u)
                 for a in ti.static(range(3)):
                     b, d = ti.static((a + 1) % 3, (a + 2) % 3)

@@ -14,7 +14,7 @@ SHORT = 1e-24  # [m^2] squared length below which a link has no direction, in f3
 class Angle(Scalar):
     """What all constraints on an angle share: C is the wrapped difference, in (-pi, pi], and residuals are in radians."""
 
-    unit = 1.0
+    unit, transcends = 1.0, True
     rest = Knob(lambda f, v: checks.per_item(repr(f), f.rest_name, v, f.count, least=-TURN, most=TURN), "Rest angle [rad].")
 
     def violation(self, position: np.ndarray) -> np.ndarray:

@@ -75,6 +75,11 @@ class ShapeMatch(Ragged, Breaking):
         return bool((self.compliance > 0).any())
 
     @property
+    def transcends(self) -> bool:
+        """Whether any cluster flows, at an exponential rate."""
+        return bool((self.creep > 0).any())
+
+    @property
     def load(self) -> np.ndarray:
         """The largest force on a particle of each cluster during the last substep [N], (m,)."""
         if not self.count:

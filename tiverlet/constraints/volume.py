@@ -32,7 +32,7 @@ class Volume(Scalar):
 
     index_name = "cells"
     each = (*Scalar.each, "pressure")
-    collapses = 3
+    collapses, transcends = 3, True
     rest = Knob(lambda f, v: checks.per_item("Volume", "rest", v, f.count, least=0.0), "Volume at pressure 1 [m^3].")
     pressure = Knob(lambda f, v: checks.per_item("Volume", "pressure", v, f.count, least=0.0), "Factor on the rest volume.")
 
