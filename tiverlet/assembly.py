@@ -196,8 +196,8 @@ def check_architecture(precision: str, features: tuple[Feature, ...]) -> None:
     for feature in features:
         if precision == "f64" and isinstance(feature, Batch) and feature.transcends:
             raise ValueError(
-                f"World: {feature!r} takes an angle, a cube root or an exponential, which {arch} has for f32 only, but precision = "
-                '"f64". Use "f32", or tv.init(arch="cpu").'
+                f"World: {feature!r} takes an angle, a cube root or an exponential, which {arch} has for f32 only, but "
+                'precision = "f64". Use "f32", or tv.init(arch="cpu").'
             )
 
 
