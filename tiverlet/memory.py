@@ -137,7 +137,8 @@ class Memory:
 
     def destroy(self) -> None:
         """Free the fields. Calling it twice, or after another ti.init, does nothing."""
-        if impl.get_runtime() is self._runtime and not runtime.forked():
+        if self._trees and impl.get_runtime() is self._runtime and not runtime.forked():
+            self._runtime.materialize()  # see abandon(); no kernel may have run since place()
             for tree in self._trees:
                 tree.destroy()
             runtime.trees -= len(self._trees)
