@@ -10,6 +10,8 @@ from tiverlet.sorting import LONG, sort
 from tiverlet.sums import MOST, RADIX, Sums
 from tiverlet.team import Team
 
+from .conftest import ARCH
+
 N = 1600  # more than Taichi gives to one thread
 LENGTHS = (0, 1, 2, RADIX, RADIX + 1, 3 * RADIX - 1, RADIX**2, RADIX**2 + 1, 2 * RADIX**2 + 7, RADIX**3 + 1)
 
@@ -39,7 +41,7 @@ class Bench:
 
 def test_running_sums():
     rng = np.random.default_rng(0)
-    for launched in (False, True):
+    for launched in (False, True)[ARCH != "cpu" :]:  # by one thread only on a CPU: a driver may cut loops as long as that short
         bench = Bench(launched)
         assert max(s.levels for s in bench.sums) == (4 if launched else 1)
         for top in (10, 2**20, MOST):  # the last two beyond what an i32 holds
