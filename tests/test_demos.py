@@ -38,7 +38,8 @@ def test_hello_is_the_readmes_example_and_runs():
     block = next(b for b in blocks if b.startswith("StepReport("))
     # The report's figures may differ between processors; what the scene is made of may not, but for the number of threads.
     want, got = (re.sub(r"\d+ threads", "threads", text).strip().splitlines() for text in (block, done.stdout))
-    assert want[1:] == got[1:] and got[0].startswith("StepReport(time=5.0, substeps=32, iterations=1, residual=0.009")
+    head = re.match(r"StepReport\(time=5.0, substeps=\d+, iterations=1, residual=0.0\d\d", want[0])
+    assert want[1:] == got[1:] and head and got[0].startswith(head[0])
 
 
 def test_article_runs_and_checks_itself(printed, tmp_path):
