@@ -7,10 +7,12 @@ import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from statistics import mean
+from time import sleep
 from typing import Any
 
 ROOT = str(pathlib.Path(__file__).parents[3])
 PATIENCE = 600.0  # [s] that ending a process may take
+REST = 0.02  # [s] before a turn: threads of OpenMP look out for work for some milliseconds after the last, on the other's cores
 
 
 class Talker:
@@ -79,6 +81,7 @@ def side_by_side(talkers: Sequence[Talker], frames: int, group: int, rounds: int
         total = [0.0] * len(talkers)
         for begin in range(0, frames, group):
             for k, talker in enumerate(talkers):
+                sleep(REST)
                 total[k] += talker.ask(f"run {min(group, frames - begin)}")
         spent += total[0]
         for times, t in zip(out, total, strict=True):
