@@ -103,13 +103,13 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
         scene.slots = Slots(scene, batches, solver)
         if scene.order > 2:
             composition.check_solved(batches, scene, solver)
-    parallel = path == "parallel"
-    team = Team(memory, size_of(path, _work(particles, features)), len(particles))
-    grid = contact.join(scene, batches, team, parallel) if contact else None
+    size = size_of(path, _work(particles, features))
+    team = Team(memory, size, len(particles), launched=path == "parallel" and size == 1)
+    grid = contact.join(scene, batches, team) if contact else None
     for feature in [*accelerations, *drivers, *batches, *walls]:
         feature.bind(scene)
     kind = Substep if scene.order == 2 else composition.Composition
-    substep = kind(scene, accelerations, batches, drivers, contact, grid, walls, team, parallel)
+    substep = kind(scene, accelerations, batches, drivers, contact, grid, walls, team)
     survey = Survey(substep)
     memory.place()
     if grid and contact:

@@ -24,14 +24,14 @@ LEVELS = 14  # the last one holds all that are smaller, down to points
 
 
 class Cells:
-    """The tables. radius: (n,) [m]. skin: what is added to the distance at which two touch [m]. launched: for a GPU."""
+    """The tables. radius: (n,) [m]. skin: what is added to the distance at which two touch [m]."""
 
-    def __init__(self, scene: Scene, radius: np.ndarray, skin: float, team: Team, launched: bool, scratch: Any):
+    def __init__(self, scene: Scene, radius: np.ndarray, skin: float, team: Team, scratch: Any):
         self.team = team
         self.place = scratch  # of the particles as they are sorted, while a list is built: read one after the other
         n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
         self.n, self.dim, self.state, self.real = n, dim, scene.state, scene.real
-        self.serial = not launched  # counting in order, on one thread, beats atomic counters in parallel on a CPU
+        self.serial = not team.launched  # counting in order, on one thread, beats atomic counters in parallel on a CPU
         with np.errstate(divide="ignore"):
             level = np.minimum(np.floor(np.log2(radius.max() / radius)), LEVELS - 1).astype(int)
         used, level = np.unique(level, return_inverse=True)
@@ -44,7 +44,7 @@ class Cells:
         offsets = np.concatenate([[0], np.cumsum(1 << self.bits)])
         self.buckets = int(offsets[-1])
         self._shapes = self.shapes(np.ptp(scene.particles.position, axis=0))
-        self.sums = Sums(self.buckets + 2, team, launched)
+        self.sums = Sums(self.buckets + 2, team)
         self.edge = add("grid.edge", self.sums.room, kind=ti.i32)
         self.sorted = add("grid.sorted", n, kind=ti.i32)
         if self.state.compensated:

@@ -47,8 +47,7 @@ class Grid:
     """
 
     def __init__(
-        self, scene: Scene, skin: float, linked: np.ndarray, table: Table, luggage: list["Luggage"], team: Team, parallel: bool,
-        scratch: Any,
+        self, scene: Scene, skin: float, linked: np.ndarray, table: Table, luggage: list["Luggage"], team: Team, scratch: Any
     ):  # fmt: skip
         self.team = team
         n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
@@ -58,14 +57,13 @@ class Grid:
         self.marked = all(p.marked for p in self.bags)
         self.real, self.memory, self.skin = scene.real, scene.memory, skin
         self._extent: Sequence[float] = [-1.0] * dim
-        self.launched = parallel and team.size == 1  # phase by phase
-        self.cells = Cells(scene, scene.particles.radius, skin, team, self.launched, scratch)
+        self.cells = Cells(scene, scene.particles.radius, skin, team, scratch)
         self.several = self.cells.levels > 1
-        self.counts = self.several or self.launched  # before it lists
-        self.serial = not self.counts or (team.size == 1 and not self.launched)  # one thread makes a list, in order
+        self.counts = self.several or team.launched  # before it lists
+        self.serial = not self.counts or (team.size == 1 and not team.launched)  # one thread makes a list, in order
         self.blocks = 16 if team.size > 1 and not self.counts else 1  # parts of the list, each filled by one thread
         self.origin = add("grid.built_at", n, width=dim)
-        self.sums = Sums(n, team, self.launched, capped=True)
+        self.sums = Sums(n, team, capped=True)
         self.first = add("grid.first", self.sums.room, kind=ti.i32)
         self.number = add("grid.number", n, kind=ti.i32)
         self.stale = add("grid.stale", None, kind=ti.i32, values=1)

@@ -83,11 +83,14 @@ class Memory:
 
     def place(self) -> None:
         """Allocate what was declared and write the first values (everything else is zero)."""
-        self._trees = [builder.finalize() for builder in self._builders.values()]
-        runtime.trees += len(self._trees)
+        self._finish()
         if self._later:
             self._load([entry for entry, _ in self._later], [values for _, values in self._later])
             self._later.clear()
+
+    def _finish(self) -> None:
+        self._trees = [builder.finalize() for builder in self._builders.values()]
+        runtime.trees += len(self._trees)
 
     def _seen(self) -> dict[int, np.ndarray]:
         """Arrays that are the fields, by the id of the entry; none where the host cannot see them.
@@ -119,10 +122,8 @@ class Memory:
         So would fields that are gone before Taichi has looked at them, which it does before the next kernel.
         """
         if not self._trees:
-            trees = [builder.finalize() for builder in self._builders.values()]
-            self._runtime.materialize()
-            for tree in trees:
-                tree.destroy()
+            self._finish()
+            self.destroy()
 
     def check(self) -> None:
         """Raise RuntimeError when the fields are gone or belong to a runtime that is."""

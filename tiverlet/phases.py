@@ -31,10 +31,8 @@ class Phases:
         grid,
         walls,
         team: Team,
-        parallel: bool,
     ):
-        self.team, self.parallel = team, parallel
-        self.launched = parallel and team.size == 1  # phase by phase
+        self.team, self.launched = team, team.launched
         # On a GPU each thread has one particle. On a CPU Taichi gives each thread at least LEAST iterations of a loop.
         cpu = runtime.architecture() == "cpu"
         self.tile = TILE if cpu else 1
@@ -54,7 +52,7 @@ class Phases:
         self.systems = [scene.slots.system] if scene.slots and scene.slots.system else []
         self.steps = max([s.steps for s in self.systems], default=0) if self.launched else 0
         for system in self.systems:
-            system.team, system.spread = team, LEAST if self.launched else 1
+            system.team, system.spread = team, self.stride
         self.hurries = bool(scene.slots) and scene.slots.accelerates
         self.told = [b for b in self.batches if isinstance(b, Scalar) and b._on_told]
         self.ragged = [b for b in self.batches if b.blocks]

@@ -11,15 +11,16 @@ MOST = 2**30 - 1  # two of them are still an i32
 class Sums:
     """field[k] becomes field[0] + ... + field[k]; with `capped`, MOST where that is more.
 
-    launched: in parallel. Each thread adds up a block of RADIX entries, then of the sums of RADIX blocks, and so on until one
-    block is left; then each block goes on from the sum of those before it. A level is a loop in each direction, and none takes
-    more than RADIX steps. The sums of the blocks stand behind the `length` entries, so the field has to have `room` for both.
+    Where the team is launched, in parallel. Each thread adds up a block of RADIX entries, then of the sums of RADIX blocks, and
+    so on until one block is left; then each block goes on from the sum of those before it. A level is a loop in each direction,
+    and none takes more than RADIX steps. The sums of the blocks stand behind the `length` entries, so the field has to have
+    `room` for both.
     """
 
-    def __init__(self, length: int, team: Team, launched: bool, capped: bool = False):
+    def __init__(self, length: int, team: Team, capped: bool = False):
         self.team, self.capped = team, capped
         self.lengths, self.begins = [length], [0]  # of each level
-        while launched and self.lengths[-1] > RADIX:
+        while team.launched and self.lengths[-1] > RADIX:
             self.begins.append(self.begins[-1] + self.lengths[-1])
             self.lengths.append(-(-self.lengths[-1] // RADIX))
         self.levels = len(self.lengths)

@@ -43,10 +43,11 @@ def size_of(path: str, work: int) -> int:
 
 class Team:
     """size: the number of threads; 1 where there is nobody to wait for, because Taichi itself spreads loops over threads or
-    because there is one thread only. A share of n is what thread `me` does of it; what the shares are shows in no result."""
+    because there is one thread only. launched: which of the two; phase by phase, as on a GPU. A share of n is what thread `me`
+    does of it; what the shares are shows in no result."""
 
-    def __init__(self, memory: Memory, size: int, particles: int):
-        self.size, self.patience = size, PATIENCE + particles
+    def __init__(self, memory: Memory, size: int, particles: int, launched: bool):
+        self.size, self.launched, self.patience = size, launched, PATIENCE + particles
         self.spread = LEAST * size if size > 1 else 1
         self._alone, self._frames = 0, 0
         if size > 1:

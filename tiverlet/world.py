@@ -257,7 +257,7 @@ class World(Access):
         assert self._grid
         if not self._sub.launched:
             self._grid.stale[None] = 1
-            self._fused(0, 1, self._time, STEPPED)  # by the kernel that there is anyway
+            self._look()  # whose kernel is there anyway, and lists
             return
         with self._memory.compiler():
             while self._sub.listed() > self._grid.capacity:

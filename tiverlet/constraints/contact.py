@@ -111,7 +111,7 @@ class Contact(Touch):
                 f"from the origin, but f32 tells only {FARTHEST} apart. Shift the scene towards the origin."
             )
 
-    def join(self, scene: Scene, batches: list[Batch], team: Team, parallel: bool) -> Grid:
+    def join(self, scene: Scene, batches: list[Batch], team: Team) -> Grid:
         """Declare the fields, among them the grid's."""
         n, dim = scene.particles.count, scene.particles.dim
         pairs = [b.partners(b.start) for b in batches]
@@ -135,7 +135,7 @@ class Contact(Touch):
         self._on_slip = Luggage("slip", dim, lasting=True)
         self._on_blow = Luggage("blow", 0, lasting=False)
         luggage = [self._on_push, *([self._on_slip] if self.rubs else []), *([self._on_blow] if self.bounces else [])]
-        self._on_grid = Grid(scene, self._on_size, linked, self.table, luggage, team, parallel, self._on_move)
+        self._on_grid = Grid(scene, self._on_size, linked, self.table, luggage, team, self._on_move)
         self._on_calm = Calm(self)
         return self._on_grid
 

@@ -121,7 +121,7 @@ class Polygons(Rim):
                         f"({edge:.3g} m), so there is no telling where it came from. Move it out."
                     )
 
-    def join(self, scene: Scene, batches: list[Batch], team: Team, parallel: bool) -> Grid:
+    def join(self, scene: Scene, batches: list[Batch], team: Team) -> Grid:
         """Declare the fields, among them the grid's, which lists particles by their reach."""
         n, p, add = scene.particles.count, scene.particles, scene.memory.field
         self.scene, self._on_state, self._on_radius, self._on_w = scene, scene.state, scene.radius, scene.state.w
@@ -155,7 +155,7 @@ class Polygons(Rim):
             *([self._on_aim] if self.bounces else []),
         ]
         apart: Any = _Apart(self)
-        self._on_grid = Grid(reach, self._on_size, linked, apart, luggage, team, parallel, self._on_move)
+        self._on_grid = Grid(reach, self._on_size, linked, apart, luggage, team, self._on_move)
         return self._on_grid
 
     def ease(self) -> None:
