@@ -42,7 +42,7 @@ class Calm:
     @ti.func
     def want(self, i, k):
         """Pass k for particle i: what changes d. change' = (factor - 1) change + factor 2 / (1 + 1 / CONDITION) want."""
-        want, w = 0 * self.state.d[i], self.state.w[i]
+        want, w = 0 * self.state.d[i], self.state.w.of(i)
         if self.contact._on_split[i] > 0:
             for word in range(self.contact._on_grid.words(i)):
                 # Not touches(): the pair may have parted in this pass, and both of it have to agree.

@@ -147,7 +147,7 @@ class Composition(Substep):
     @ti.func
     def propel(self, i, h, last, t, starts):
         """Verlet with the force at x; at a start, d is the velocity."""
-        if self.state.w[i] > 0:
+        if self.state.w.of(i) > 0:
             d = self.state.d[i]
             a = self.accelerate(i, self.state.place(i), 0 * d, t, self.pull(t))
             if ti.static(self.springs):

@@ -374,7 +374,7 @@ class Grid:
         yes = ti.cast(r.dot(r) < far * far, ti.i32) & ti.cast(i != j, ti.i32)
         if ti.static(self.still):
             if yes != 0:
-                yes = ti.cast(self.state.w[i] + self.state.w[j] > 0, ti.i32)
+                yes = ti.cast(self.state.w.of(i) + self.state.w.of(j) > 0, ti.i32)
         if ti.static(not self.table.uniform):
             if yes != 0:
                 yes = ti.cast(self.table.of(i, j)[3] > 0, ti.i32)

@@ -127,7 +127,7 @@ class State:
         self.starts = self.befores = self.leans = False
         self.x = memory.field("position", n, width=dim, values=particles.position, state=True)
         self.d = memory.field("displacement", n, width=dim, values=particles.velocity, state=True)
-        self.w = memory.field("inv_mass", n, values=inv_mass)
+        self.w = Shared(memory, "inv_mass", inv_mass)
         if compensated:
             high = particles.position.astype(np.float32)
             low = particles.position - high
@@ -218,26 +218,33 @@ class State:
         self.advance(i, move)
 
 
-class Radii:
-    """Radii on the device: a constant of the kernel where all are equal, a field otherwise."""
+class Shared:
+    """A number for each particle: a constant of the kernel where all are equal, a field otherwise."""
 
-    def __init__(self, memory: Memory, radius: np.ndarray):
+    def __init__(self, memory: Memory, name: str, values: np.ndarray):
         self.real = memory.real
-        self.uniform = bool(len(radius) == 0 or (radius == radius[0]).all())
-        self.constant = float(radius[0]) if len(radius) else 0.0
-        positive = radius[radius > 0]
-        self.least = float(positive.min()) if len(positive) else 0.0
-        self.points = bool((radius == 0).any())
+        self.uniform = bool(len(values) == 0 or (values == values[0]).all())
+        self.constant = float(values[0]) if len(values) else 0.0
         if not self.uniform:
-            self.field = memory.field("radius", len(radius), values=radius)
+            self.field = memory.field(name, len(values), values=values)
 
     @ti.func
     def of(self, i):
-        """Radius of particle i."""
-        r = ti.cast(self.constant, self.real)
+        """That of particle i."""
+        value = ti.cast(self.constant, self.real)
         if ti.static(not self.uniform):
-            r = self.field[i]
-        return r
+            value = self.field[i]
+        return value
+
+
+class Radii(Shared):
+    """Radii on the device."""
+
+    def __init__(self, memory: Memory, radius: np.ndarray):
+        super().__init__(memory, "radius", radius)
+        positive = radius[radius > 0]
+        self.least = float(positive.min()) if len(positive) else 0.0
+        self.points = bool((radius == 0).any())
 
     @ti.func
     def stride(self, i):

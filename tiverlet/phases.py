@@ -15,6 +15,7 @@ from .wall import Wall
 # Multiples of the golden ratio of two dimensions, mod 1, are the most even sequence of pairs: one for each of the two sums.
 DITHER = golden_steps(2)
 TILE = 256  # particles that a thread takes at a time, through several loops: their state stays in its cache
+BLOCK = 16  # of them that are asked at once whether any is near a wall
 SWEEPS = 8  # rounds over the walls, for particles that several of them push
 
 
@@ -129,7 +130,7 @@ class Phases:
 
         Only the writes depend on whether it moves, so that several particles are integrated at once.
         """
-        live, x, d = self.state.w[i] > 0, self.state.x[i], self.state.d[i]
+        live, x, d = self.state.w.of(i) > 0, self.state.x[i], self.state.d[i]
         v = self.velocity_before(i, h, fresh)
         a = self.accelerate(i, self.state.place(i), v, t, pull)
         before = ti.select(fresh != 0, h * v - h * h / 2 * a, d)
@@ -191,7 +192,7 @@ class Phases:
     @ti.func
     def confine(self, i, h, when):
         """The walls, which have the last word; several take turns until they agree, or for SWEEPS rounds in a sharp corner."""
-        if self.state.w[i] > 0:
+        if self.state.w.of(i) > 0:
             moving = True
             for _ in range(ti.static(SWEEPS if len(self.walls) > 1 else 1)):
                 if moving:
@@ -350,8 +351,15 @@ class Phases:
             for i in range(begin, end):
                 c.gather(i, first)
         if ti.static(len(self.walls) > 0):
-            for i in range(begin, end):
-                self.confine(i, h, when)
+            for b in range((end - begin + (BLOCK - 1)) // BLOCK):
+                low, high = begin + b * BLOCK, ti.min(begin + (b + 1) * BLOCK, end)
+                near = 0
+                for i in range(low, high):
+                    for f in ti.static(self.walls):
+                        near |= f.near(i, self.radius.of(i))
+                if near != 0:
+                    for i in range(low, high):
+                        self.confine(i, h, when)
         for c in ti.static(self.contacts):
             stale = 0
             for i in range(begin, end):
@@ -446,7 +454,7 @@ class Phases:
         """
         d = self.state.d[i]
         v = d / h
-        if self.state.w[i] > 0:
+        if self.state.w.of(i) > 0:
             if ti.static(self.uses_velocity):
                 v = (3 * d - self.earlier[i]) / (2 * h)
             force = h * h * self.accelerate(i, self.state.place(i), v, t, self.pull(t)) + bond

@@ -173,12 +173,12 @@ class Content(Scalar, Ragged):
             g, n = self.slope(e, 0), self.slope(e, 1)
             sums[0] += self.arm(e, i0, 0).dot(g)
             sums[1] += self.arm(e, i0, 1).dot(n)
-            sums[2] += self._on_w[i] * g.dot(g)
+            sums[2] += self._on_w.of(i) * g.dot(g)
             sums[3] += self._on_slots.split[i] * g.dot(n)
             sums[4] += self._on_slots.split[i] * g.dot(g)
             sums[5] += self._on_slots.split[i] * n.dot(n)
             sums[6] += self.arm(e, i0, 0).norm_sqr()
-            sums[7] += self._on_w[i] ** 2 * ti.max(g.dot(g), n.dot(n))
+            sums[7] += self._on_w.of(i) ** 2 * ti.max(g.dot(g), n.dot(n))
             self._on_start[e] = n
         self._on_sums[b] = sums
 
@@ -210,7 +210,7 @@ class Content(Scalar, Ragged):
         n = self._on_start[e]
         if self._on_astray[c] != 0:
             n = self.slope(e, 0)
-        self.give(e, self._on_w[self._on_members[e]] * self._on_change[c] * n)
+        self.give(e, self._on_w.of(self._on_members[e]) * self._on_change[c] * n)
 
     @ti.func
     def kick(self, c, h):
@@ -226,7 +226,7 @@ class Content(Scalar, Ragged):
         new, left = self.answer(violation, A, alpha, lam, W, turn)
         if w == 0:  # collapsed, or static
             for e in range(self._on_starts[c], self._on_starts[c + 1]):
-                if self._on_w[self._on_members[e]] > 0 and self.holds(c):
+                if self._on_w.of(self._on_members[e]) > 0 and self.holds(c):
                     left = ti.abs(f - self._on_rest[c])
         return left / self.extent(c)
 

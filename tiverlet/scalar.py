@@ -263,7 +263,7 @@ class Scalar(Breaking):
         for k in ti.static(range(self.arity)):
             i = self.member(c, k)
             gg = g[k, :].dot(g[k, :])
-            w += self._on_w[i] * gg
+            w += self._on_w.of(i) * gg
             both += self._on_slots.split[i] * g[k, :].dot(n[k, :])
             here += self._on_slots.split[i] * gg
             there += self._on_slots.split[i] * n[k, :].dot(n[k, :])
@@ -348,7 +348,7 @@ class Scalar(Breaking):
                 if ti.static(self.collapses > 0):
                     move = ti.cast(0, self._on_real)
                     for k in ti.static(range(self.arity)):
-                        move += self._on_w[self.member(c, k)] ** 2 * n[k, :].dot(n[k, :])
+                        move += self._on_w.of(self.member(c, k)) ** 2 * n[k, :].dot(n[k, :])
                     new = self.tempered(c, lam, new, self.corners(c, 0).norm_sqr(), move)
                 step = new - lam
                 if ti.static(self._on_hurries):
@@ -363,7 +363,7 @@ class Scalar(Breaking):
                     new = lam + step
                 self._on_lam[c] = new
         for k in ti.static(range(self.arity)):
-            self.push(c, k, self._on_w[self.member(c, k)] * step * n[k, :])
+            self.push(c, k, self._on_w.of(self.member(c, k)) * step * n[k, :])
 
     @ti.func
     def lever(self, c, W):
@@ -402,10 +402,10 @@ class Scalar(Breaking):
         if ti.static(self._on_damped):
             f0, _ = self.measure(c, self.corners(c, 1))
         for k in ti.static(range(self.arity)):
-            w += self._on_w[self.member(c, k)] * g[k, :].dot(g[k, :])
+            w += self._on_w.of(self.member(c, k)) * g[k, :].dot(g[k, :])
         force = self.force(c, f, self.near(f0, f), w, h)
         for k in ti.static(range(self.arity)):
-            self.push(c, k, h * h * self._on_w[self.member(c, k)] * force * g[k, :])
+            self.push(c, k, h * h * self._on_w.of(self.member(c, k)) * force * g[k, :])
 
     @ti.func
     def force(self, c, f, f0, w, h):

@@ -79,12 +79,12 @@ class Survey:
         """Kinetic and potential energy at x - back d, f64: second order at the middle of a substep, where d / h is v."""
         d = self.state.d[i] * ti.cast(1, ti.f64)
         out = ti.cast(0, ti.f64)
-        if self.state.w[i] > 0:
+        if self.state.w.of(i) > 0:
             out = 0.5 * scale * scale * d.dot(d)
             for f in ti.static(self.sub.accelerations):
                 if ti.static(f.conservative):
                     out += f.potential(i, ti.cast(x, ti.f64) - back * d)
-            out /= self.state.w[i]
+            out /= self.state.w.of(i)
         return out
 
     @ti.func
@@ -92,7 +92,7 @@ class Survey:
         """(omega h)^2 of the motion that dominates: the force's Rayleigh quotient along the last move."""
         d = self.state.d[i]
         dd, out = d.dot(d), ti.cast(0, ti.f64)
-        if dd > 0 and self.state.w[i] > 0:
+        if dd > 0 and self.state.w.of(i) > 0:
             change = 0 * d
             for f in ti.static(self.probes):
                 change += f.acceleration(i, x, d / h, t) - f.acceleration(i, x - d, d / h, t)

@@ -95,7 +95,7 @@ class Tether(Batch):
     @ti.func
     def solve(self, c, h, hh, when, first, fresh):
         """Multiplier before and after, and the size of the violation that this removes."""
-        w = self._on_w[self.member(c, 0)]
+        w = self._on_w.of(self.member(c, 0))
         C, C0 = self.offsets(c, when, first, fresh)
         lam, B = self._on_lam[c], 0 * C
         if first != 0:
@@ -120,14 +120,14 @@ class Tether(Batch):
         """Draw the particle to its place."""
         lam, new, size = self.solve(c, h, hh, when, first, fresh)
         self._on_lam[c] = new
-        self.push(c, 0, self._on_w[self.member(c, 0)] * (new - lam))
+        self.push(c, 0, self._on_w.of(self.member(c, 0)) * (new - lam))
 
     @ti.func
     def kick(self, c, h):
         """As in Scalar, for each axis."""
         move = 0 * self._on_state.d[0]
         if ti.static(self._on_soft):
-            w, alpha = self._on_w[self.member(c, 0)], self._on_alpha[c]
+            w, alpha = self._on_w.of(self.member(c, 0)), self._on_alpha[c]
             if w > 0 and alpha > 0:
                 C = self.present(c, 0)
                 rate = self.change(c) / h

@@ -96,16 +96,21 @@ class Box(Wall):
             self._on_now[side] = ti.Vector([at, shift])
 
     @ti.func
+    def near(self, i, radius):
+        """1 if there may be something to press()."""
+        out, x, close = 0, self._on_state.place(i), self._on_state.digits(i)
+        for k in ti.static(range(self.dim)):
+            out |= ti.cast(self._on_now[k][0] + radius - x[k] > -close, ti.i32)
+            out |= ti.cast(x[k] + radius - self._on_now[k + self.dim][0] > -close, ti.i32)
+        return out
+
+    @ti.func
     def confine(self, i, radius, h, when):
         """Two planes per axis, lower ones first."""
-        touches, inside, close = False, self._on_state.place(i), self._on_state.digits(i)
-        for k in ti.static(range(self.dim)):
-            touches |= self._on_now[k][0] + radius - inside[k] > -close
-            touches |= inside[k] + radius - self._on_now[k + self.dim][0] > -close
-        if touches:  # else there is nothing to press()
+        if self.near(i, radius) != 0:
             for side in range(ti.static(2 * self.dim)):
-                wall, shift = self._on_now[side][0], self._on_now[side][1]
-                x, n, moved, depth = self._on_state.place(i), ti.zero(inside), ti.zero(inside), ti.zero(wall)
+                wall, shift, x = self._on_now[side][0], self._on_now[side][1], self._on_state.place(i)
+                n, moved, depth = ti.zero(x), ti.zero(x), ti.zero(wall)
                 for k in ti.static(range(self.dim)):
                     if side == k:
                         n[k], moved[k], depth = 1, shift, wall + radius - x[k]

@@ -200,10 +200,9 @@ class Contact(Touch):
                         deepest = ti.min(deepest, r.dot(r) * scale)
                 if deepest > 0.25:
                     split = ti.min(largest(tensor) / deepest, split)
-        split *= self._on_state.w[i]
-        if pairs > 0:
-            split += ti.static(FADE) * ti.max(self._on_split[i] - split, 0)
-        self._on_split[i] = split
+        split *= self._on_state.w.of(i)
+        rest = ti.static(FADE) * ti.max(self._on_split[i] - split, 0)
+        self._on_split[i] = ti.select(pairs > 0, split + rest, split)
 
     @ti.func
     def forget(self, i, word, gone):
@@ -215,7 +214,7 @@ class Contact(Touch):
     @ti.func
     def relax(self, i, first, fresh):
         """What the pairs of particle i want of it."""
-        total, w = ti.zero(self._on_state.x[i]), self._on_state.w[i]
+        total, w = ti.zero(self._on_state.x[i]), self._on_state.w.of(i)
         if ti.static(self._on_bounces):
             if first != 0:
                 self._on_struck[i] = self._on_split[i]
@@ -232,7 +231,7 @@ class Contact(Touch):
                     overlap, each, n = self.meet(i, j, self.far(i, j), shared)
                     each *= ti.static(RELAXATION)
                     part = overlap * each
-                    given, push, alone = ti.zero(part), ti.zero(part), w + self._on_state.w[j]
+                    given, push, alone = ti.zero(part), ti.zero(part), w + self._on_state.w.of(j)
                     if first == 0:
                         push = last
                     elif fresh == 0:
@@ -281,7 +280,7 @@ class Contact(Touch):
     @ti.func
     def rebound(self, i):
         """The first of the pairs of particle i that were struck and still come together, and what it does to i."""
-        partner, most, w = -1, 0 * self._on_struck[i], self._on_state.w[i]
+        partner, most, w = -1, 0 * self._on_struck[i], self._on_state.w.of(i)
         if self._on_struck[i] > 0:
             for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
                 if self._on_blow.field[e] > 0:
@@ -292,7 +291,7 @@ class Contact(Touch):
                         left = ti.select(overlap < here, overlap / here, 1)
                         if left > most or (left == most and earlier(i, j, partner)):
                             partner, most = j, left
-                            self._on_kick[i] = w / (w + self._on_state.w[j]) * given * n
+                            self._on_kick[i] = w / (w + self._on_state.w.of(j)) * given * n
                             if self._on_hit[None] == 0:
                                 self._on_hit[None] = 1
         self._on_partner[i] = partner
@@ -303,7 +302,7 @@ class Contact(Touch):
         """Let particle i bounce off its partner, if it is the partner's partner."""
         j = self._on_partner[i]
         if j >= 0:
-            if self._on_partner[j] == i or self._on_state.w[j] == 0:
+            if self._on_partner[j] == i or self._on_state.w.of(j) == 0:
                 kick = self._on_kick[i]
                 self._on_state.d[i] = self._on_state.d[i] + kick
                 self._on_state.before[i] = self._on_state.before[i] + kick
@@ -322,7 +321,7 @@ class Contact(Touch):
     @ti.func
     def gather(self, i, first):
         """Move particle i as its pairs want."""
-        if self._on_state.w[i] > 0 and self._on_split[i] > 0:
+        if self._on_state.w.of(i) > 0:  # what touches nothing moves by 0, without a branch
             self._on_state.shift(i, self._on_move[i])
 
     @ti.func

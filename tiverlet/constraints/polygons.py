@@ -165,7 +165,7 @@ class Polygons(Rim):
     def shrink(self, i, first):
         """Allow particle i the overlap that it has as a vertex, as far as particles from number `first` on have to do with it."""
         self.look(i, False)
-        less = ti.select(first > 0, self._on_less[i], 0 * self._on_w[i])
+        less = ti.select(first > 0, self._on_less[i], 0 * self._on_w.of(i))
         for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
             if ti.max(i, self._on_grid.near[e]) >= first:
                 less = ti.max(less, self._on_met.field[e][0])
@@ -197,8 +197,8 @@ class Polygons(Rim):
     @ti.func
     def split(self, count: ti.template(), v, a, b, t):  # type: ignore[valid-type]
         """The mass-split weight of a contact."""
-        at_a, at_b = (1 - t) * (1 - t) * count[a] * self._on_w[a], t * t * count[b] * self._on_w[b]
-        return count[v] * self._on_w[v] + at_a + at_b
+        at_a, at_b = (1 - t) * (1 - t) * count[a] * self._on_w.of(a), t * t * count[b] * self._on_w.of(b)
+        return count[v] * self._on_w.of(v) + at_a + at_b
 
     @ti.func
     def count(self, i):
@@ -227,7 +227,7 @@ class Polygons(Rim):
                     overlap, n = met[0], ti.Vector([met[2], met[3]])
                     if overlap > 0:
                         d = self.relative(v, a, b, t)
-                        share, kick = part * self._on_w[i] / self.split(self._on_active, v, a, b, t), 0 * overlap
+                        share, kick = part * self._on_w.of(i) / self.split(self._on_active, v, a, b, t), 0 * overlap
                         back = overlap  # what is taken back of the position and of the displacement
                         if ti.static(self._on_bounces):
                             if first != 0:
@@ -251,7 +251,7 @@ class Polygons(Rim):
     @ti.func
     def gather(self, i, first):
         """Move particle i as its contacts want; what bounced goes where it is at the end of the substep."""
-        if self._on_w[i] > 0:
+        if self._on_w.of(i) > 0:
             if self._on_active[i] > 0:
                 self._on_state.shift(i, self._on_move[i])
             if ti.static(self._on_bounces):
@@ -295,7 +295,7 @@ class Polygons(Rim):
                             lack = size - self.relative(v, a, b, t).dot(n)
                             if lack > 0:
                                 self._on_hit[None] = 1
-                                total += part * self._on_w[i] * lack / self.split(self._on_struck, v, a, b, t) * n
+                                total += part * self._on_w.of(i) * lack / self.split(self._on_struck, v, a, b, t) * n
         self._on_kick[i] = total
 
     @ti.func

@@ -128,7 +128,7 @@ class Rim(Contact):
         """As measure(), with or without the overlap that is allowed."""
         for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
             j = self._on_grid.near[e]
-            overlap, n, t = 0 * self._on_w[i] - 1, 0 * self._on_state.x[i], 0 * self._on_w[i]
+            overlap, n, t = 0 * self._on_w.of(i) - 1, 0 * self._on_state.x[i], 0 * self._on_w.of(i)
             front = self.corner(i, j)
             if self.after(j) >= 0:
                 overlap, n, t = self.edge(i, j, front, eased)
@@ -179,7 +179,7 @@ class Rim(Contact):
                 a, at = self.before(i), ti.cast(back[1], ti.i32)
             if at >= 0:
                 at += self._on_grid.first[j]
-        b, t, part = a, 0 * self._on_w[i], 0 * self._on_w[i] + 1
+        b, t, part = a, 0 * self._on_w.of(i), 0 * self._on_w.of(i) + 1
         if at >= 0:
             t = self._on_met.field[at][1]
             if t >= 0:

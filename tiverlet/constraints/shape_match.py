@@ -283,7 +283,7 @@ class ShapeMatch(Ragged, Breaking):
     def spread(self, e, h, hh, first, fresh):
         """Move corner e towards its place."""
         c, i = self._on_owner[e], self._on_members[e]
-        w, relaxation = self._on_w[i], self._on_slots.relaxation
+        w, relaxation = self._on_w.of(i), self._on_slots.relaxation
         if first > 0:
             self._on_pull[e] = 0 * self._on_pull[e]
         if not self.holds(c):
@@ -333,7 +333,7 @@ class ShapeMatch(Ragged, Breaking):
         if self.holds(c):
             most = ti.cast(0, self._on_real)
             for e in range(self._on_starts[c], self._on_starts[c + 1]):
-                w = self._on_w[self._on_members[e]]
+                w = self._on_w.of(self._on_members[e])
                 if w > 0:
                     most = ti.max(most, self._on_pull[e].norm() / w)
             if most > self._on_strength[c] * hh:
@@ -358,7 +358,7 @@ class ShapeMatch(Ragged, Breaking):
             total += self.weight(e, c)
             mean += self.weight(e, c) * self.off(e, c)
         for e in range(self._on_starts[c], self._on_starts[c + 1]):
-            if self._on_w[self._on_members[e]] > 0 and holds:
+            if self._on_w.of(self._on_members[e]) > 0 and holds:
                 C = self.off(e, c) - mean / total  # places are relative to a particle that has moved since
                 if ti.static(self._on_soft):
                     C = self.wrong(e, c, C, rigid, soft, give)
@@ -386,15 +386,15 @@ class ShapeMatch(Ragged, Breaking):
                 R = rotation.matrix(rotation.fit(K - total * q.outer_product(s), self._on_turn[c], LEAST))
                 for e in range(self._on_starts[c], self._on_starts[c + 1]):
                     C = self.arm(e, i0, back) - s - R @ (self._on_shape[e] - q)
-                    if self._on_w[self._on_members[e]] > 0:
-                        out += C.dot(C) / (2 * alpha * mass * self._on_w[self._on_members[e]])
+                    if self._on_w.of(self._on_members[e]) > 0:
+                        out += C.dot(C) / (2 * alpha * mass * self._on_w.of(self._on_members[e]))
         return out
 
     @ti.func
     def share(self, e, A, give):
         """mu of corner e in a pass: its mass, times what a violation of 1 moves it."""
         i = self._on_members[e]
-        w, mu = self._on_w[i], ti.cast(HEAVY * self._on_mass[self._on_owner[e]], ti.f64)
+        w, mu = self._on_w.of(i), ti.cast(HEAVY * self._on_mass[self._on_owner[e]], ti.f64)
         if w > 0:
             mu = 1 / ti.cast(A * self._on_slots.split[i] + give * w, ti.f64)
         return mu
@@ -402,7 +402,7 @@ class ShapeMatch(Ragged, Breaking):
     @ti.func
     def weight(self, e, c):
         """The mass of corner e in a fit."""
-        w, mu = self._on_w[self._on_members[e]], ti.cast(HEAVY * self._on_mass[c], ti.f64)
+        w, mu = self._on_w.of(self._on_members[e]), ti.cast(HEAVY * self._on_mass[c], ti.f64)
         if w > 0:
             mu = ti.cast(1, ti.f64) / w
         return mu

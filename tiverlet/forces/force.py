@@ -60,4 +60,4 @@ class Force(Acceleration):
             out = self.function(x, v, t)
         else:
             out = self.function(x, v, t, i)
-        return self._on_w[i] * out
+        return self._on_w.of(i) * out

@@ -124,7 +124,7 @@ class Krylov(System):
     def go(self, me):
         """One step of conjugate gradients. One that needs a tension too large for the substep is taken back, and is the last."""
         for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
-            if self.w[i] > 0:
+            if self.w.of(i) > 0:
                 total = 0 * self.pull[i]
                 for s in range(self.begin[i], self.begin[i + 1]):
                     r = self.row_of[s]
