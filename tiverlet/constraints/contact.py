@@ -26,7 +26,7 @@ class Contact(Touch):
 
     friction: Coulomb, a number or (static, dynamic), or a mapping from pairs of groups to these: {(0, 1): 0.5}. restitution:
     0 to 1, or such a mapping. groups: the pairs of groups that touch, None for all. skin: how far beyond touching pairs are
-    listed [m], "auto" for 0.5 of the median radius; speed only, never the result. push_out: particles that overlap at the
+    listed [m], "auto" for 0.75 of the median radius; speed only, never the result. push_out: particles that overlap at the
     start, or after positions were assigned, part at this speed [m/s] at most: they act as if they were small enough to fit, and
     grow back.
 
@@ -83,7 +83,7 @@ class Contact(Touch):
         """Choose the skin, and refuse positions too far out for cells to be told apart."""
         radius = particles.radius
         some = radius[radius > 0]
-        auto = 0.5 * float(np.median(some)) if len(some) else 1.0
+        auto = 0.75 * float(np.median(some)) if len(some) else 1.0
         self._on_size = auto if self.skin == "auto" else float(self.skin)
         self._on_finest = float(radius.min(initial=np.inf))
         self.matters = len(some) > 0
