@@ -11,13 +11,15 @@ def number(who: str, name: str, value: Any, *, above=None, least=None, most=None
     """A finite real number within the bounds given."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (numbers.Real, np.ndarray)):
         raise TypeError(f"{who}: {name} = {value!r} is a {type(value).__name__}, but a number is needed.")
-    array = np.asarray(value)
-    if array.ndim or array.dtype.kind not in "iuf":
-        raise TypeError(f"{who}: {name} has shape {array.shape}, but one real number is needed.")
+    if not isinstance(value, float):
+        array = np.asarray(value)
+        if array.ndim or array.dtype.kind not in "iuf":
+            raise TypeError(f"{who}: {name} has shape {array.shape}, but one real number is needed.")
     value = float(value)
     if not math.isfinite(value):
         raise ValueError(f"{who}: {name} = {value}, but it must be finite.")
-    _bounds(who, name, np.array([value]), above, least, most, below, scalar=True)
+    if words := _missed(value, above, least, most, below):
+        raise ValueError(f"{who}: {name} = {value:g}, but it must be {words}.")
     return value
 
 
@@ -117,13 +119,22 @@ def _floats(who: str, name: str, value) -> np.ndarray:
     return np.array(array, dtype=np.float64)
 
 
-def _bounds(who, name, array, above=None, least=None, most=None, below=None, scalar=False) -> None:
-    rules = (
-        (above, lambda a: a > above, "above"), (least, lambda a: a >= least, "at least"),
-        (most, lambda a: a <= most, "at most"), (below, lambda a: a < below, "below"),
-    )  # fmt: skip
-    for bound, holds, words in rules:
-        if bound is not None and not (ok := holds(array)).all():
-            i = int(np.argmin(ok))
-            where = name if scalar else f"{name}[{i}]"
-            raise ValueError(f"{who}: {where} = {array[i]:g}, but it must be {words} {bound:g}.")
+def _missed(value: float, above=None, least=None, most=None, below=None) -> str:
+    """What it must be and is not, in words; empty if it is within the bounds."""
+    if above is not None and not value > above:
+        return f"above {above:g}"
+    if least is not None and not value >= least:
+        return f"at least {least:g}"
+    if most is not None and not value <= most:
+        return f"at most {most:g}"
+    if below is not None and not value < below:
+        return f"below {below:g}"
+    return ""
+
+
+def _bounds(who, name, array, **bounds) -> None:
+    """The same of all, told of the lowest or the highest of them."""
+    for i in (int(np.argmin(array)), int(np.argmax(array))) if len(array) else ():
+        if words := _missed(array[i], **bounds):
+            i = next(k for k, value in enumerate(array) if _missed(value, **bounds) == words)
+            raise ValueError(f"{who}: {name}[{i}] = {array[i]:g}, but it must be {words}.")

@@ -21,6 +21,7 @@ from functools import lru_cache
 from types import CodeType, SimpleNamespace
 from typing import Any
 
+import numpy as np
 import taichi as ti
 from taichi.lang import impl, kernel_impl
 from taichi.lang.ast import ASTTransformerContext
@@ -94,46 +95,43 @@ class Quick:
     """A kernel of one object, for many launches: after the first one, past the door at which Taichi looks at the object and at
     each argument anew, which takes 25 us.
 
-    Its arguments are numbers, and arrays that the caller keeps. It returns nothing. What Taichi freezes at the first compile is
-    frozen, as ever: an object that has changed takes a new Quick.
+    Its arguments are arrays, which stay where they are; what they hold may change from launch to launch. It returns nothing. What
+    Taichi freezes at the first compile is frozen, as ever: an object that has changed takes a new Quick.
     """
 
-    def __init__(self, owner: Any, name: str, compiler: Compiler):
-        self.owner, self.name, self.compiler = owner, name, compiler
+    def __init__(self, owner: Any, name: str, compiler: Compiler, *arrays: np.ndarray):
+        self.owner, self.name, self.compiler, self.arrays = owner, name, compiler, arrays
         self._ready: Any = None
 
-    def __call__(self, *args: Any) -> None:
+    def __call__(self) -> None:
         """Launch it."""
         if self._ready is None:
             with self.compiler():
-                getattr(self.owner, self.name)(*args)
+                getattr(self.owner, self.name)(*self.arrays)
                 if _patched:
-                    self._ready = self._prepared(args)
+                    self._ready = self._prepared()
         else:
-            self.launch(args)
+            self.launch()
 
-    def launch(self, args: tuple) -> None:
+    def launch(self) -> None:
         """Launch it when it is compiled."""
-        program, kernel, compiled, reals = self._ready
-        context = kernel.make_launch_context()
-        for k, (value, real) in enumerate(zip(args, reals, strict=True)):
-            if real is None:
-                address = value.__array_interface__["data"][0]
-                context.set_arg_external_array_with_shape((k,), address, value.nbytes, value.shape, 0)
-            elif real:
-                context.set_arg_float((k,), value)
-            else:
-                context.set_arg_int((k,), value)
-        program.launch_kernel(compiled, context)
+        program, kernel, compiled, context = self._ready
+        program.launch_kernel(compiled, context or self._context(kernel))
 
-    def _prepared(self, args: tuple) -> tuple:
-        """What a launch needs; for each argument, whether it is a real number, None for an array."""
+    def _prepared(self) -> tuple:
+        """What a launch needs; for one on a GPU, which copies arrays to and fro, a context of its own."""
         primal: Any = getattr(type(self.owner), self.name)._primal
-        kernel = primal.compiled_kernels[primal.ensure_compiled(self.owner, *args)]
+        kernel = primal.compiled_kernels[primal.ensure_compiled(self.owner, *self.arrays)]
         program: Any = impl.get_runtime().prog
         compiled = program.compile_kernel(program.config(), program.get_device_caps(), kernel)
-        kinds = [a.annotation for a in primal.arguments[1:]]
-        return program, kernel, compiled, [None if hasattr(k, "ndim") else k in (ti.f32, ti.f64) for k in kinds]
+        return program, kernel, compiled, self._context(kernel) if str(program.config().arch) in HOSTS else None
+
+    def _context(self, kernel: Any) -> Any:
+        """Where the arrays are."""
+        context = kernel.make_launch_context()
+        for k, array in enumerate(self.arrays):
+            context.set_arg_external_array_with_shape((k,), array.ctypes.data, array.nbytes, array.shape, 0)
+        return context
 
 
 def _set(config, settings: dict[str, Any]) -> None:

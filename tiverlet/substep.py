@@ -13,36 +13,38 @@ from .calm import PASSES
 from .phases import Phases
 from .team import LEAST
 
-HALT = 16  # among the figures of a frame: whether, in which substep and before which iteration it stopped to have the list grown
+# What a frame is given, as f64, which holds every i32: the substep and the times at its start and end [s]; substeps so far, and
+# since the last start; whether it starts; how many substeps and iterations; where it goes on if it stopped to have the list grown
+# (substep, iteration, 1); how the state that it leaves came about, see Survey.
+GIVEN = 12
+HALT = 16  # among the figures of a frame: whether, in which substep and before which iteration it stopped to have the list grown;
+# how many threads of a team were at work
 REBOUNDS = 8  # rounds of restitution in a substep, at most
 
 
 @ti.data_oriented
 class Substep(Phases):
-    """The kernels of one world. resumed: 1 if the frame stopped in substep `begin`, before iteration `it0`, to have the list
-    grown. end, came, out: of the survey, see there."""
+    """The kernels of one world."""
 
     survey: Any  # what sums up a frame; given once it is there
 
     @ti.kernel
-    def fused(
-        self, h64: ti.f64, t: ti.f64, end: ti.f64, tick: ti.i32, since: ti.i32, fresh: ti.i32, substeps: ti.i32,
-        iterations: ti.i32, begin: ti.i32, it0: ti.i32, resumed: ti.i32, came: ti.i32,
-        out: ti.types.ndarray(ti.f64, 1),  # type: ignore[valid-type]
-    ):  # fmt: skip
+    def fused(self, given: ti.types.ndarray(ti.f64, 1), out: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
         """All substeps of a frame, in one launch, and what it came to; without substeps that alone."""
         ti.loop_config(serialize=self.team.size == 1)
         for thread in range(self.team.spread):
             if thread % LEAST == 0:
                 me = thread // LEAST
-                self.frame(me, h64, t, end, tick, since, fresh, substeps, iterations, begin, it0, resumed, came, out)
+                self.frame(me, given, out)
 
     @ti.func
-    def frame(
-        self, me, h64, t, end, tick, since, fresh, substeps, iterations, begin, it0, resumed, came, out: ti.template()  # type: ignore[valid-type]
-    ):  # fmt: skip
+    def frame(self, me, given: ti.template(), out: ti.template()):  # type: ignore[valid-type]
         """What thread `me` does of a frame. All threads of a team take the same branches, for what they depend on is written only
         where the others wait."""
+        h64, t, end = given[0], given[1], given[2]
+        tick, since, fresh = ti.cast(given[3], ti.i32), ti.cast(given[4], ti.i32), ti.cast(given[5], ti.i32)
+        substeps, iterations, begin = ti.cast(given[6], ti.i32), ti.cast(given[7], ti.i32), ti.cast(given[8], ti.i32)
+        it0, resumed, came = ti.cast(given[9], ti.i32), ti.cast(given[10], ti.i32), ti.cast(given[11], ti.i32)
         for s in range(begin, substeps + 1):
             h, more = ti.cast(h64, self.real), s < substeps
             when = self.clock(s, substeps)
@@ -81,10 +83,12 @@ class Substep(Phases):
                     self.survey.weigh(me, h, came)
                     self.survey.sum_up(me, h64, end, came, out)
                     self.team.forgive()
-        if ti.static(self.hashes):
-            if me == 0:
+        if me == 0:
+            if ti.static(self.hashes):
                 for k in ti.static(range(3)):
                     out[HALT + k] = self.halt[None][k]
+            if ti.static(self.team.size > 1):
+                out[HALT + 3] = self.team.hands[None]
 
     @ti.kernel
     def predicted(

@@ -20,7 +20,7 @@ TURNS = (0, 26, 41)  # degrees, for nothing, BENT and FAR
 STIFF = 4.0  # (omega h)^2 beyond which Verlet diverges
 
 
-FIGURES = HALT + 3
+FIGURES = HALT + 4
 STEPPED, STARTED, UNSTEPPED = range(3)  # how a state came about: by a substep, by the first one after a start, by none yet
 
 
@@ -142,8 +142,9 @@ class Survey:
         self.sub.weigh(me, h, self.sub.reach(h, fresh), 0, fresh, False)
 
     @ti.kernel
-    def measure(self, h64: ti.f64, t64: ti.f64, came: ti.i32, out: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
+    def measure(self, given: ti.types.ndarray(ti.f64, 1), out: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
         """All figures."""
+        h64, t64, came = given[0], given[2], ti.cast(given[11], ti.i32)
         self.weigh(0, h64, came)
         self.sum_up(0, h64, t64, came, out)
 

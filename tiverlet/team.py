@@ -55,13 +55,13 @@ class Team:
             self.hands = memory.field("team.hands", None, kind=ti.i32, values=size)  # how many of them are at work
             self.late = memory.field("team.long_waits", None, kind=ti.i32)
 
-    def muster(self) -> None:
-        """Before a frame: those who left some frames ago come back."""
+    def muster(self, hands: int) -> None:
+        """Before a frame: those who left some frames ago come back. hands: how many were at work in the last one."""
         if self.size > 1:
             self._frames += 1
             if self._frames % SHIFT == 0:
                 self.arrived[None] = 0
-            if self._alone == 0 and self.hands[None] == 1:
+            if self._alone == 0 and hands == 1:
                 self._alone = ALONE
             elif self._alone > 0:
                 self._alone -= 1

@@ -20,7 +20,7 @@ from .particles import Particles
 from .regroup import Handle
 from .solvers.solver import Solver
 from .step_report import StepReport
-from .substep import HALT, REBOUNDS, decay
+from .substep import GIVEN, HALT, REBOUNDS, decay
 from .survey import STARTED, STEPPED, UNSTEPPED
 
 FREE = decay(0.0, 1.0)  # what no drag makes of a substep
@@ -211,16 +211,16 @@ class World(Access):
 
     def _fused(self, substeps: int, iterations: int, end: float, came: int) -> None:
         """All substeps and the survey in one launch, resumed where the neighbour list had to grow."""
-        self._plain["team"].muster()
+        self._plain["team"].muster(self._figures[HALT + 3])
         begin = it0 = resumed = 0
         while True:
-            self._frames(
-                self._h, self._time, end, self._tick, self._since, int(self._fresh), substeps, iterations, begin, it0, resumed,
-                came, self._figures,
+            self._given[:] = (
+                self._h, self._time, end, self._tick, self._since, self._fresh, substeps, iterations, begin, it0, resumed, came
             )  # fmt: skip
+            self._frames()
             if not self._figures[HALT]:
                 return
-            resumed, begin, it0 = (int(v) for v in self._figures[HALT:])
+            resumed, begin, it0 = (int(v) for v in self._figures[HALT : HALT + 3])
             self._sub.halt[None] = [0, 0, 0]
             self._grow()
 
@@ -286,9 +286,10 @@ class World(Access):
     def _make(self) -> None:
         """The kernels that are launched in every frame."""
         compiler = self._memory.compiler
-        self._frames = Quick(self._sub, "fused", compiler)
-        self._sums = Quick(self._survey, "measure", compiler)
-        self._plain, self._figures = vars(self._sub), self._survey.out  # which Taichi looks at in Python whenever we do
+        self._given, self._figures = np.zeros(GIVEN), self._survey.out
+        self._frames = Quick(self._sub, "fused", compiler, self._given, self._figures)
+        self._sums = Quick(self._survey, "measure", compiler, self._given, self._figures)
+        self._plain = vars(self._sub)  # which Taichi looks at in Python whenever we do
 
     def _look(self) -> None:
         """Survey the state where no frame did."""
@@ -298,7 +299,8 @@ class World(Access):
             return
         if self._grid and self._grid.stale[None]:
             self._list()
-        self._sums(self._h, self._time, came, self._figures)
+        self._given[[0, 2, 11]] = self._h, self._time, came
+        self._sums()
 
     def _report(self, substeps: int = 1, iterations: int = 1) -> StepReport:
         """What the survey found."""

@@ -52,7 +52,8 @@ class Baseline:
         self.pull = add("g", None, width=self.dim, values=self.g)
         self.memory.place()
         self.pull[None] = self.g
-        self.quick = Quick(self, "frame", self.memory.compiler)
+        self.given = np.zeros(5)  # the substep, what drag leaves, substeps, iterations, whether it starts
+        self.quick = Quick(self, "frame", self.memory.compiler, self.given)
         self.restart()
 
     @classmethod
@@ -79,6 +80,14 @@ class Baseline:
             self.x[i] += self.w[i] * step
             self.x[j] -= self.w[j] * step
 
+    @ti.kernel
+    def frame(self, given: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
+        """What step() asks for."""
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            substeps, iterations, fresh = ti.cast(given[2], ti.i32), ti.cast(given[3], ti.i32), ti.cast(given[4], ti.i32)
+            self.advance(given[0], given[1], substeps, iterations, fresh)
+
     def restart(self) -> None:
         """Go back to the start."""
         moves = (self.particles.inv_mass > 0)[:, None]
@@ -90,7 +99,8 @@ class Baseline:
         """A frame of dt [s]."""
         mine = vars(self)  # as in a World: past the doors at which Taichi looks at everything anew
         h = dt / mine["substeps"]
-        mine["quick"](h, math.exp(-mine["rate"] * h), mine["substeps"], mine["iterations"], int(mine["fresh"]))
+        mine["given"][:] = h, math.exp(-mine["rate"] * h), mine["substeps"], mine["iterations"], mine["fresh"]
+        mine["quick"]()
         mine["fresh"] = False
 
     @property
@@ -136,10 +146,9 @@ class Article(Baseline):
 
     name = "article"
 
-    @ti.kernel
-    def frame(self, h: ti.f64, keep: ti.f64, substeps: ti.i32, iterations: ti.i32, fresh: ti.i32):
+    @ti.func
+    def advance(self, h, keep, substeps, iterations, fresh):
         """All substeps. `before` is the position of the step before."""
-        ti.loop_config(serialize=True)
         for s in range(substeps):
             for i in range(self.n):
                 if s == 0 and fresh != 0:
@@ -151,7 +160,6 @@ class Article(Baseline):
             for it in range(iterations):
                 for c in range(self.m):
                     self.relax(c, STIFFNESS, 0.0)
-        ti.loop_config(serialize=True)
         for i in range(self.n):
             self.v[i] = (self.x[i] - self.before[i]) / h
 
@@ -162,10 +170,9 @@ class Xpbd(Baseline):
 
     name, soft = "XPBD", True
 
-    @ti.kernel
-    def frame(self, h: ti.f64, keep: ti.f64, substeps: ti.i32, iterations: ti.i32, fresh: ti.i32):
+    @ti.func
+    def advance(self, h, keep, substeps, iterations, fresh):
         """All substeps. Multipliers are those of one pass, so that they start at 0; more passes are for rigid links."""
-        ti.loop_config(serialize=True)
         for s in range(substeps):
             for i in range(self.n):
                 self.before[i] = self.x[i]
