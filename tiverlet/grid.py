@@ -232,7 +232,11 @@ class Grid:
         first, number = self.first[i], self.number[i]
         for piece in ti.static(self.luggage):
             for e in range(first, first + number):
-                piece.field[e] = ti.zero(piece.field[e])  # 0 times what is there could be -0
+                if ti.static(piece.width == 0):
+                    piece.field[e] = 0
+                else:
+                    for k in ti.static(range(piece.width)):
+                        piece.field[e][k] = 0
         bits, at = ti.u32(0), 0
         for old in range(self.old_first[i], self.old_first[i] + self.old_number[i]):
             while at < number and self.near[first + at] < self.aside[old]:

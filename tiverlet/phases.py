@@ -84,7 +84,7 @@ class Phases:
     @ti.func
     def pull(self, t):
         """The sum of what accelerates all particles alike."""
-        a = ti.zero(self.state.x[0])
+        a = ti.Vector.zero(self.real, self.dim)
         for f in ti.static(self.common):
             a += f.acceleration(0, a, a, t)
         return a
