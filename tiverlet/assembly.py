@@ -21,7 +21,7 @@ from .solvers.slots import Slots
 from .solvers.solver import Solver
 from .substep import Substep
 from .survey import Survey
-from .team import Team, size_of
+from .team import PIECES, Team, size_of
 from .wall import Wall
 
 T = TypeVar("T", bound=Feature)
@@ -104,7 +104,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
         if scene.order > 2:
             composition.check_solved(batches, scene, solver)
     size = size_of(path, _work(particles, features))
-    team = Team(memory, size, len(particles), launched=path == "parallel" and size == 1)
+    team = Team(memory, size, len(particles), path == "parallel" and size == 1, pieces=PIECES if contact else size)
     grid = contact.join(scene, batches, team) if contact else None
     for feature in [*accelerations, *drivers, *batches, *walls]:
         feature.bind(scene)

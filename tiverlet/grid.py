@@ -61,7 +61,8 @@ class Grid:
         self.several = self.cells.levels > 1
         self.counts = self.several or team.launched  # before it lists
         self.serial = not self.counts or (team.size == 1 and not team.launched)  # one thread makes a list, in order
-        self.blocks = 16 if team.size > 1 and not self.counts else 1  # parts of the list, each filled by one thread
+        # Parts of the list, each filled by one thread.
+        self.blocks = max(1, -(-n // team.piece)) if team.size > 1 and not self.counts else 1
         self.origin = add("grid.built_at", n, width=dim)
         self.sums = Sums(n, team, capped=True)
         self.first = add("grid.first", self.sums.room, kind=ti.i32)
@@ -263,8 +264,8 @@ class Grid:
         if ti.static(self.counts):
             self.pair_up(me)
         else:
-            for block in range(self.team.low(self.blocks, me), self.team.high(self.blocks, me)):
-                self.fill(block)
+            for k in range(self.team.deal(self.blocks, 1, me)):
+                self.fill(self.team.turn(k, 1, me))
         for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
             self.origin[i] = self.state.x[i]
         self.team.wait()
@@ -279,7 +280,7 @@ class Grid:
     def fill(self, block):
         """One level: list the neighbours of a block of particles, one after the other. Beyond the room they are only counted."""
         start, room = block * self.pitch, self.capacity
-        size = (self.n + self.blocks - 1) // self.blocks
+        size = ti.static(-(-self.n // self.blocks))
         used = 0
         for i in range(block * size, ti.min((block + 1) * size, self.n)):
             self.first[i] = start + ti.min(used, room)

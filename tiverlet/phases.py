@@ -34,12 +34,11 @@ class Phases:
         team: Team,
     ):
         self.team, self.launched = team, team.launched
-        # On a GPU each thread has one particle. On a CPU Taichi gives each thread at least LEAST iterations of a loop.
-        cpu = runtime.architecture() == "cpu"
-        self.tile = TILE if cpu else 1
-        self.tiles = -(-scene.particles.count // self.tile)
-        self.gap = -(-LEAST * runtime.threads() // max(1, self.tiles)) if self.launched and cpu else 1
-        self.stride = LEAST if self.launched and cpu else 1  # iterations of a loop for each of few pieces of work
+        self.pieces = -(-scene.particles.count // team.piece)
+        self.tile = min(TILE, team.piece)
+        self.each = -(-team.piece // self.tile)  # tiles of a piece
+        # Iterations of a loop for each of few pieces of work: to each CPU thread Taichi gives LEAST of them, at least.
+        self.stride = LEAST if self.launched and runtime.architecture() == "cpu" else 1
         # For substeps made of stages: the share of the first, what accelerates in the last per h^2, omega^2 of springs.
         self.first, self.reaches, self.fastest = 1.0, 1.0, 0.0
         self.scene, self.state, self.slots = scene, scene.state, scene.slots
@@ -160,9 +159,16 @@ class Phases:
             self.state.d[i] = ti.zero(d)
 
     @ti.func
+    def within(self, tile):
+        """The particles of a tile: the first, and where it ends."""
+        piece = tile // self.each
+        first = piece * self.team.piece + tile % self.each * self.tile
+        return first, ti.min(first + self.tile, (piece + 1) * self.team.piece, self.n)
+
+    @ti.func
     def advance(self, tile, h, t, tick, fresh, calming):
         """Integrate a tile of particles. Short loops, so that each is done for several particles at once."""
-        first, end = tile * self.tile, ti.min((tile + 1) * self.tile, self.n)
+        first, end = self.within(tile)
         if ti.static(self.state.starts):
             for i in range(first, end):
                 self.state.x0[i] = self.state.x[i]
@@ -211,9 +217,8 @@ class Phases:
             ti.loop_config(serialize=True)
             for _ in range(self.team.one(1, me)):
                 w.pose(when)
-        for t in range(self.team.low(self.tiles * self.gap, me), self.team.high(self.tiles * self.gap, me)):
-            if t % self.gap == 0:
-                self.advance(t // self.gap, h, time, tick, fresh, calming)
+        for k in range(self.team.deal(self.pieces * self.each, self.each, me)):
+            self.advance(self.team.turn(k, self.each, me), h, time, tick, fresh, calming)
         self.team.wait()
         for f in ti.static(self.drivers):
             for c in range(self.team.low(f.count, me), self.team.high(f.count, me)):
@@ -300,11 +305,15 @@ class Phases:
                 for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
                     c.measure(i)
                 self.team.wait()
-            for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
-                c.count(i)
+            for k in range(self.team.deal(self.pieces, 1, me)):
+                piece = self.team.turn(k, 1, me)
+                for i in range(piece * self.team.piece, ti.min((piece + 1) * self.team.piece, self.n)):
+                    c.count(i)
             self.team.wait()
-            for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
-                c.relax(i, first, fresh)
+            for k in range(self.team.deal(self.pieces, 1, me)):
+                piece = self.team.turn(k, 1, me)
+                for i in range(piece * self.team.piece, ti.min((piece + 1) * self.team.piece, self.n)):
+                    c.relax(i, first, fresh)
             self.team.wait()
 
     @ti.func
@@ -328,15 +337,14 @@ class Phases:
     def collect(self, me, h, when, first, final):
         """3e Particles gather their moves; walls."""
         if ti.static(len(self.batches) > 0 or len(self.contacts) > 0 or len(self.walls) > 0):
-            for t in range(self.team.low(self.tiles * self.gap, me), self.team.high(self.tiles * self.gap, me)):
-                if t % self.gap == 0:
-                    self.move(t // self.gap, h, when, first, final)
+            for k in range(self.team.deal(self.pieces * self.each, self.each, me)):
+                self.move(self.team.turn(k, self.each, me), h, when, first, final)
             self.team.wait()
 
     @ti.func
     def move(self, tile, h, when, first, final):
         """What a tile of particles gathers."""
-        begin, end = tile * self.tile, ti.min((tile + 1) * self.tile, self.n)
+        begin, end = self.within(tile)
         if ti.static(len(self.batches) > 0 and len(self.contacts) == 0):
             for i in range(begin, end):
                 self.slots.gather(i, first, final)
@@ -399,11 +407,15 @@ class Phases:
     def calm(self, me, k):
         """5 Now and then: pass k of taking the sound out of loaded contacts."""
         for c in ti.static(self.contacts):
-            for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
-                c._on_calm.want(i, k)
+            for p in range(self.team.deal(self.pieces, 1, me)):
+                piece = self.team.turn(p, 1, me)
+                for i in range(piece * self.team.piece, ti.min((piece + 1) * self.team.piece, self.n)):
+                    c._on_calm.want(i, k)
             self.team.wait()
-            for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
-                c._on_calm.move(i)
+            for p in range(self.team.deal(self.pieces, 1, me)):
+                piece = self.team.turn(p, 1, me)
+                for i in range(piece * self.team.piece, ti.min((piece + 1) * self.team.piece, self.n)):
+                    c._on_calm.move(i)
             self.team.wait()
 
     @ti.func

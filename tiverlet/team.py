@@ -15,6 +15,8 @@ from . import runtime
 from .memory import Memory
 
 LEAST = 512  # iterations of a loop that Taichi gives to a CPU thread, at least
+PIECES = 16  # into which a team divides particles that touch
+EVEN = 64  # particles in a piece, or a multiple: they fill whole lines of a cache
 SHARE = 500  # particles and constraints for each thread, at least; with fewer they wait for each other longer than they work
 PATIENCE = 20_000  # looks at the counter, of 50 ns or less, and one more for each particle: then a wait was long
 LONG = 4  # long waits in a frame after which one thread goes on alone
@@ -44,10 +46,13 @@ def size_of(path: str, work: int) -> int:
 class Team:
     """size: the number of threads; 1 where there is nobody to wait for, because Taichi itself spreads loops over threads or
     because there is one thread only. launched: which of the two; phase by phase, as on a GPU. A share of n is what thread `me`
-    does of it; what the shares are shows in no result."""
+    does of it; what the shares are shows in no result. Particles are dealt out piece by piece, `pieces` in all: in a heap those
+    below have more to do than those above, and one thread would wait for the other."""
 
-    def __init__(self, memory: Memory, size: int, particles: int, launched: bool):
+    def __init__(self, memory: Memory, size: int, particles: int, launched: bool, pieces: int):
         self.size, self.launched, self.patience = size, launched, PATIENCE + particles
+        even = -(-particles // (max(pieces, size) * EVEN)) * EVEN
+        self.piece = max(1, 1 if launched else particles if size == 1 else even)
         self.spread = LEAST * size if size > 1 else 1
         self._alone, self._frames = 0, 0
         if size > 1:
@@ -98,6 +103,26 @@ class Team:
             hands = self.hands[None]
             return ti.min((me + 1) * ((n + hands - 1) // hands), n)
         return n
+
+    @ti.func
+    def deal(self, n: ti.template(), unit: ti.template(), me):  # type: ignore[valid-type]
+        """How many of n things fall to thread `me` where they are dealt out in turn, `unit` at a time."""
+        out = n
+        if ti.static(self.size > 1):
+            hands, units = self.hands[None], ti.static(-(-n // unit))
+            out = (units - me + hands - 1) // hands * unit
+            if (units - 1) % hands == me:
+                out -= ti.static(-(-n // unit) * unit - n)
+        return out
+
+    @ti.func
+    def turn(self, k, unit: ti.template(), me):  # type: ignore[valid-type]
+        """Which of them is the k-th."""
+        out = k
+        if ti.static(self.size > 1):
+            before = ti.cast(ti.cast(k, ti.u32) // ti.u32(unit), ti.i32)  # i32 would look at the sign
+            out = k + (before * (self.hands[None] - 1) + me) * unit
+        return out
 
     @ti.func
     def one(self, n: ti.template(), me):  # type: ignore[valid-type]
