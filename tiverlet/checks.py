@@ -133,8 +133,8 @@ def _missed(value: float, above=None, least=None, most=None, below=None) -> str:
 
 
 def _bounds(who, name, array, **bounds) -> None:
-    """The same of all, told of the lowest or the highest of them."""
-    for i in (int(np.argmin(array)), int(np.argmax(array))) if len(array) else ():
-        if words := _missed(array[i], **bounds):
-            i = next(k for k, value in enumerate(array) if _missed(value, **bounds) == words)
-            raise ValueError(f"{who}: {name}[{i}] = {array[i]:g}, but it must be {words}.")
+    """The same of all."""
+    ends = {int(np.argmin(array)), int(np.argmax(array))} if len(array) else set()
+    if any(_missed(array[i], **bounds) for i in ends):
+        i, words = next((i, words) for i, value in enumerate(array) if (words := _missed(value, **bounds)))
+        raise ValueError(f"{who}: {name}[{i}] = {array[i]:g}, but it must be {words}.")

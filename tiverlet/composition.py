@@ -102,12 +102,12 @@ class Composition(Substep):
         self.fastest = (float(np.abs(g).max()) / self.first) ** 2 * fastest(self.batches, scene)
 
     @ti.kernel
-    def fused(self, given: ti.types.ndarray(ti.f64, 1), out: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
+    def fused(self, reals: ti.types.ndarray(ti.f64, 1), counts: ti.types.ndarray(ti.i32, 1), out: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
         """All substeps of a frame, and the survey. The substep that is given is the first stage, which is as long as the last."""
         ti.loop_config(serialize=True)
         for _ in range(1):
-            h64, whole, t, fresh = given[0], given[0] / self.first, given[1], ti.cast(given[5], ti.i32)
-            substeps, iterations, came = ti.cast(given[6], ti.i32), ti.cast(given[7], ti.i32), ti.cast(given[11], ti.i32)
+            h64, whole, t = reals[0], reals[0] / self.first, reals[1]
+            fresh, substeps, iterations, came = counts[2], counts[3], counts[4], counts[8]
             for s in range(substeps):
                 for q in range(self.count):
                     g = self.table[q]
@@ -116,7 +116,7 @@ class Composition(Substep):
                     final = ti.cast(s == substeps - 1 and q == self.count - 1, ti.i32)
                     self.stage(g[0] * whole, g[1] * whole, t + (s + g[2]) * whole, when, starts, iterations, final)
             self.survey.weigh(0, h64, came)
-            self.survey.sum_up(0, h64, given[2], came, out)
+            self.survey.sum_up(0, h64, reals[2], came, out)
 
     @ti.kernel
     def probed(self, h: ti.f64, last: ti.f64, t: ti.f64, end: ti.f64, iterations: ti.i32):

@@ -159,8 +159,14 @@ class Phases:
             self.state.d[i] = ti.zero(d)
 
     @ti.func
+    def part(self, k, me):
+        """The particles of the k-th piece of thread `me`: the first, and where they end."""
+        first = self.team.turn(k, 1, me) * self.team.piece
+        return first, ti.min(first + self.team.piece, self.n)
+
+    @ti.func
     def within(self, tile):
-        """The particles of a tile: the first, and where it ends."""
+        """Those of a tile of a piece."""
         piece = tile // self.each
         first = piece * self.team.piece + tile % self.each * self.tile
         return first, ti.min(first + self.tile, (piece + 1) * self.team.piece, self.n)
@@ -306,13 +312,13 @@ class Phases:
                     c.measure(i)
                 self.team.wait()
             for k in range(self.team.deal(self.pieces, 1, me)):
-                piece = self.team.turn(k, 1, me)
-                for i in range(piece * self.team.piece, ti.min((piece + 1) * self.team.piece, self.n)):
+                begin, end = self.part(k, me)
+                for i in range(begin, end):
                     c.count(i)
             self.team.wait()
             for k in range(self.team.deal(self.pieces, 1, me)):
-                piece = self.team.turn(k, 1, me)
-                for i in range(piece * self.team.piece, ti.min((piece + 1) * self.team.piece, self.n)):
+                begin, end = self.part(k, me)
+                for i in range(begin, end):
                     c.relax(i, first, fresh)
             self.team.wait()
 
@@ -408,13 +414,13 @@ class Phases:
         """5 Now and then: pass k of taking the sound out of loaded contacts."""
         for c in ti.static(self.contacts):
             for p in range(self.team.deal(self.pieces, 1, me)):
-                piece = self.team.turn(p, 1, me)
-                for i in range(piece * self.team.piece, ti.min((piece + 1) * self.team.piece, self.n)):
+                begin, end = self.part(p, me)
+                for i in range(begin, end):
                     c._on_calm.want(i, k)
             self.team.wait()
             for p in range(self.team.deal(self.pieces, 1, me)):
-                piece = self.team.turn(p, 1, me)
-                for i in range(piece * self.team.piece, ti.min((piece + 1) * self.team.piece, self.n)):
+                begin, end = self.part(p, me)
+                for i in range(begin, end):
                     c._on_calm.move(i)
             self.team.wait()
 

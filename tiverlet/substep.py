@@ -13,10 +13,10 @@ from .calm import PASSES
 from .phases import Phases
 from .team import LEAST
 
-# What a frame is given, as f64, which holds every i32: the substep and the times at its start and end [s]; substeps so far, and
+# What a frame is given. REALS: the substep, and the times at the start and the end of the frame [s]. COUNTS: substeps so far, and
 # since the last start; whether it starts; how many substeps and iterations; where it goes on if it stopped to have the list grown
 # (substep, iteration, 1); how the state that it leaves came about, see Survey.
-GIVEN = 12
+REALS, COUNTS = 3, 9
 HALT = 16  # among the figures of a frame: whether, in which substep and before which iteration it stopped to have the list grown;
 # how many threads of a team were at work
 REBOUNDS = 8  # rounds of restitution in a substep, at most
@@ -29,22 +29,21 @@ class Substep(Phases):
     survey: Any  # what sums up a frame; given once it is there
 
     @ti.kernel
-    def fused(self, given: ti.types.ndarray(ti.f64, 1), out: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
+    def fused(self, reals: ti.types.ndarray(ti.f64, 1), counts: ti.types.ndarray(ti.i32, 1), out: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
         """All substeps of a frame, in one launch, and what it came to; without substeps that alone."""
         ti.loop_config(serialize=self.team.size == 1)
         for thread in range(self.team.spread):
             if thread % LEAST == 0:
                 me = thread // LEAST
-                self.frame(me, given, out)
+                self.frame(me, reals, counts, out)
 
     @ti.func
-    def frame(self, me, given: ti.template(), out: ti.template()):  # type: ignore[valid-type]
+    def frame(self, me, reals: ti.template(), counts: ti.template(), out: ti.template()):  # type: ignore[valid-type]
         """What thread `me` does of a frame. All threads of a team take the same branches, for what they depend on is written only
         where the others wait."""
-        h64, t, end = given[0], given[1], given[2]
-        tick, since, fresh = ti.cast(given[3], ti.i32), ti.cast(given[4], ti.i32), ti.cast(given[5], ti.i32)
-        substeps, iterations, begin = ti.cast(given[6], ti.i32), ti.cast(given[7], ti.i32), ti.cast(given[8], ti.i32)
-        it0, resumed, came = ti.cast(given[9], ti.i32), ti.cast(given[10], ti.i32), ti.cast(given[11], ti.i32)
+        h64, t, end = reals[0], reals[1], reals[2]
+        tick, since, fresh, substeps, iterations = counts[0], counts[1], counts[2], counts[3], counts[4]
+        begin, it0, resumed, came = counts[5], counts[6], counts[7], counts[8]
         for s in range(begin, substeps + 1):
             h, more = ti.cast(h64, self.real), s < substeps
             when = self.clock(s, substeps)

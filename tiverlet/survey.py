@@ -142,9 +142,9 @@ class Survey:
         self.sub.weigh(me, h, self.sub.reach(h, fresh), 0, fresh, False)
 
     @ti.kernel
-    def measure(self, given: ti.types.ndarray(ti.f64, 1), out: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
+    def measure(self, reals: ti.types.ndarray(ti.f64, 1), counts: ti.types.ndarray(ti.i32, 1), out: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
         """All figures."""
-        h64, t64, came = given[0], given[2], ti.cast(given[11], ti.i32)
+        h64, t64, came = reals[0], reals[2], counts[8]
         self.weigh(0, h64, came)
         self.sum_up(0, h64, t64, came, out)
 

@@ -20,7 +20,7 @@ from .particles import Particles
 from .regroup import Handle
 from .solvers.solver import Solver
 from .step_report import StepReport
-from .substep import GIVEN, HALT, REBOUNDS, decay
+from .substep import COUNTS, HALT, REALS, REBOUNDS, decay
 from .survey import STARTED, STEPPED, UNSTEPPED
 
 FREE = decay(0.0, 1.0)  # what no drag makes of a substep
@@ -214,9 +214,8 @@ class World(Access):
         self._plain["team"].muster(self._figures[HALT + 3])
         begin = it0 = resumed = 0
         while True:
-            self._given[:] = (
-                self._h, self._time, end, self._tick, self._since, self._fresh, substeps, iterations, begin, it0, resumed, came
-            )  # fmt: skip
+            self._reals[:] = self._h, self._time, end
+            self._counts[:] = self._tick, self._since, self._fresh, substeps, iterations, begin, it0, resumed, came
             self._frames()
             if not self._figures[HALT]:
                 return
@@ -286,9 +285,10 @@ class World(Access):
     def _make(self) -> None:
         """The kernels that are launched in every frame."""
         compiler = self._memory.compiler
-        self._given, self._figures = np.zeros(GIVEN), self._survey.out
-        self._frames = Quick(self._sub, "fused", compiler, self._given, self._figures)
-        self._sums = Quick(self._survey, "measure", compiler, self._given, self._figures)
+        self._reals, self._counts, self._figures = np.zeros(REALS), np.zeros(COUNTS, dtype=np.int32), self._survey.out
+        arrays = self._reals, self._counts, self._figures
+        self._frames = Quick(self._sub, "fused", compiler, *arrays)
+        self._sums = Quick(self._survey, "measure", compiler, *arrays)
         self._plain = vars(self._sub)  # which Taichi looks at in Python whenever we do
 
     def _look(self) -> None:
@@ -299,7 +299,7 @@ class World(Access):
             return
         if self._grid and self._grid.stale[None]:
             self._list()
-        self._given[[0, 2, 11]] = self._h, self._time, came
+        self._reals[:], self._counts[-1] = (self._h, self._time, self._time), came
         self._sums()
 
     def _report(self, substeps: int = 1, iterations: int = 1) -> StepReport:

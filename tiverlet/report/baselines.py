@@ -28,7 +28,7 @@ class Baseline:
 
     name = ""
     soft = False  # knows compliance
-    frame: Any  # the kernel: (h, exp(-rate h), substeps, iterations, fresh)
+    advance: Any  # goes through a frame: (h, exp(-rate h), substeps, iterations, fresh)
 
     def __init__(self, particles: Particles, features: Sequence[Feature]):
         runtime.ensure_started()
@@ -52,8 +52,8 @@ class Baseline:
         self.pull = add("g", None, width=self.dim, values=self.g)
         self.memory.place()
         self.pull[None] = self.g
-        self.given = np.zeros(5)  # the substep, what drag leaves, substeps, iterations, whether it starts
-        self.quick = Quick(self, "frame", self.memory.compiler, self.given)
+        self.reals, self.counts = np.zeros(2), np.zeros(3, dtype=np.int32)
+        self.quick = Quick(self, "frame", self.memory.compiler, self.reals, self.counts)
         self.restart()
 
     @classmethod
@@ -81,12 +81,11 @@ class Baseline:
             self.x[j] -= self.w[j] * step
 
     @ti.kernel
-    def frame(self, given: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
+    def frame(self, reals: ti.types.ndarray(ti.f64, 1), counts: ti.types.ndarray(ti.i32, 1)):  # type: ignore[valid-type]
         """What step() asks for."""
         ti.loop_config(serialize=True)
         for _ in range(1):
-            substeps, iterations, fresh = ti.cast(given[2], ti.i32), ti.cast(given[3], ti.i32), ti.cast(given[4], ti.i32)
-            self.advance(given[0], given[1], substeps, iterations, fresh)
+            self.advance(reals[0], reals[1], counts[0], counts[1], counts[2])
 
     def restart(self) -> None:
         """Go back to the start."""
@@ -99,7 +98,10 @@ class Baseline:
         """A frame of dt [s]."""
         mine = vars(self)  # as in a World: past the doors at which Taichi looks at everything anew
         h = dt / mine["substeps"]
-        mine["given"][:] = h, math.exp(-mine["rate"] * h), mine["substeps"], mine["iterations"], mine["fresh"]
+        mine["reals"][:], mine["counts"][:] = (
+            (h, math.exp(-mine["rate"] * h)),
+            (mine["substeps"], mine["iterations"], mine["fresh"]),
+        )
         mine["quick"]()
         mine["fresh"] = False
 
