@@ -207,3 +207,10 @@ def test_explain_names_what_is_in_and_what_is_out(world):
         assert part in text
     stated = int(text.split(" fields, ")[1].split(" bytes")[0])
     assert stated == sum(w.fields.values())
+
+
+def test_explain_tells_of_a_numbering_that_costs_time(world):
+    lattice = np.stack(np.divmod(np.arange(10_000), 100), axis=1) * 1.0
+    mixed = np.random.default_rng(1).permutation(lattice)
+    for x, told in ((lattice, False), (mixed, True), (tv.shapes.Shape(mixed).in_order().position, False), (mixed[:9999], False)):
+        assert ("Numbered at random" in world(tv.Particles(x), []).explain()) == told
