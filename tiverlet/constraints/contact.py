@@ -197,9 +197,9 @@ class Contact(Touch):
                         r, far = self._on_state.apart(i, j), self.far(i, j)
                         scale = 1 / (far * far)
                         tensor += scale * r.outer_product(r)
-                        deepest = ti.min(deepest, r.dot(r) * scale)
+                        deepest = lesser(r.dot(r) * scale, deepest)
                 if deepest > 0.25:
-                    split = ti.min(largest(tensor) / deepest, split)
+                    split = lesser(largest(tensor) / deepest, split)
         split *= self._on_state.w.of(i)
         rest = ti.static(FADE) * ti.max(self._on_split[i] - split, 0)
         self._on_split[i] = ti.select(pairs > 0, split + rest, split)
@@ -236,7 +236,7 @@ class Contact(Touch):
                         push = last
                     elif fresh == 0:
                         part += ti.max(ti.min(1 - alone * each, ti.static(CARRY)), 0) * last
-                    part = ti.min(part, overlap / alone)  # without a branch: it would be taken at random
+                    part = lesser(part, overlap / alone)  # without a branch: it would be taken at random
                     if ti.static(self._on_bounces):
                         given, rests = self.bounce(i, j, n, overlap, last, first)
                         if given > 0:
@@ -335,6 +335,12 @@ class Contact(Touch):
                 pressed = self._on_push.field[e] * (self._on_split[i] + self._on_split[j])
                 slip = self.rub(i, j, n, ti.max(overlap, pressed), self._on_slip.field[e])
             self._on_slip.field[e] = slip
+
+
+@ti.func
+def lesser(a, b):
+    """The lesser of two numbers; ti.min asks whether either is NaN, which takes longer."""
+    return ti.select(a < b, a, b)
 
 
 @ti.func
