@@ -5,6 +5,8 @@ import pytest
 
 import tiverlet as tv
 
+from .outlines import outside
+
 
 def bodies(shapes):
     """Positions, loops and links of rigid bodies from lists of corners: each corner is linked to all others of its body."""
@@ -25,8 +27,6 @@ def regular(sides: int, radius: float, center, turn: float = 0.0):
 
 def depths(points: np.ndarray, loop: np.ndarray) -> np.ndarray:
     """How deep points are inside of a polygon, 0 outside; by brute force."""
-    from .test_solids import outside
-
     return np.maximum(-outside(points, loop), 0)
 
 
@@ -127,8 +127,6 @@ def test_a_pile_settles_without_overlap_and_alike_on_both_paths(world):
         edge = np.linalg.norm(settled[loop] - settled[np.roll(loop, 1)], axis=1).min()
         others = np.setdiff1d(np.arange(n), loop)
         assert depths(settled[others], settled[loop]).max() < 0.01 * edge
-        from .test_solids import outside
-
         assert outside(settled[n:], settled[loop]).min() > 0.08 * 0.98
     apart = np.linalg.norm(settled[n:, None] - settled[n:], axis=2)[np.triu_indices(discs, 1)]
     assert apart.min() > 0.16 * 0.98

@@ -10,8 +10,8 @@ import tiverlet as tv
 @pytest.mark.parametrize("kind", ["one size", "many sizes", "no contacts"])
 def test_near_and_nearest_equal_brute_force(world, dim, kind):
     rng = np.random.default_rng(5)
-    x = rng.uniform(-3, 3, (400, dim))
-    radius = 10.0 ** rng.uniform(-2.5, -0.5, 400) if kind == "many sizes" else 0.05
+    x = 6 * tv.golden(np.arange(400), dim=dim) - 3
+    radius = 10.0 ** rng.uniform(-3, -1, 400) if kind == "many sizes" else 0.05
     features = [] if kind == "no contacts" else [tv.Contact()]
     w = world(tv.Particles(x, radius=radius), [tv.Gravity(9.81), *features], precision="f64")
     w.run(0.05)

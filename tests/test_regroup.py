@@ -14,7 +14,7 @@ def half(x: float):
     rope = np.stack([np.linspace(0, 1.5, 6), np.full(6, 2.0)], axis=1)
     ring = 0.4 * np.stack([np.cos(np.arange(7) * 0.9), np.sin(np.arange(7) * 0.9)], axis=1) + [0.5, 0.9]
     block = np.array([[2.0, 1], [2.4, 1], [2.4, 1.4], [2.0, 1.4]])
-    heap = np.stack(np.meshgrid([0.3, 0.499], [0.1, 0.299]), axis=-1).reshape(-1, 2) + [2.4, 0]
+    heap = np.stack(np.meshgrid([0.3, 0.501], [0.1, 0.301]), axis=-1).reshape(-1, 2) + [2.4, 0]
     rails = np.array([[3.0, 2], [3.5, 2.5], [3.2, 1]])
     return np.concatenate([rope, ring, block, heap, rails]) + [x, 0]
 

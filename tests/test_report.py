@@ -187,19 +187,6 @@ def test_the_certificate_tells_what_holds_and_what_does_not(monkeypatch, tmp_pat
         tv.report.stress(rows=[99])
 
 
-@pytest.mark.parametrize("number", [10, 13, 19, 20, 28, 38, 59, 60, 63, 65, 66])
-def test_rows_about_doors_pass(number):
-    result = certify(number)
-    assert result.verdict == "passed", result
-
-
-@pytest.mark.parametrize("number", [2, 22, 45, 55, 62])
-def test_some_rows_about_scenes_pass(number):
-    # All 70 take a minute: python -m tiverlet stress.
-    result = certify(number)
-    assert result.verdict == "passed", result
-
-
 def test_commands(capsys):
     assert main(["info"]) == 0 and "taichi" in capsys.readouterr().out
     assert main(["report", "--list"]) == 0 and "S05_tennis_racket" in capsys.readouterr().out
@@ -286,7 +273,7 @@ def test_an_autopsy_names_what_went_wrong_first(world, tmp_path):
     # Frames of 0.05 s with 5 substeps: t = 0.14 is at the end of substep 3 of frame 2; the force acts in the next one.
     chain = tv.Distance([[0, 1], [1, 2], [2, 3], [3, 4]])
     start = tv.Particles(np.arange(10.0).reshape(5, 2), pinned=[0])
-    w = world(start, [tv.Gravity(), chain, tv.Force(spoilt)], substeps=5, precision="f64")
+    w = world(start, [tv.Gravity(), chain, tv.Force(spoilt)], substeps=5, precision="f64", solver=tv.Jacobi())
     before = w.hash()
     found = tv.report.autopsy(w, 1.0, dt=0.05)
     assert w.hash() == before and found.found and "non-finite" in found.report.flags and found.particle == 3

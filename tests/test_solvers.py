@@ -123,16 +123,17 @@ def test_64_chebyshev_refuses_what_is_unstable(world):
 
 
 @pytest.mark.parametrize("make", [tv.Chebyshev, tv.ConjugateGradient])
-def test_all_paths_have_the_same_bits(world, make):
+def test_a_solver_has_the_same_bits_phase_by_phase(world, make):
+    # With a team of threads too, see test_every_solver_has_the_same_bits_on_1_and_8_threads.
     hashes = []
-    for path in ("fused", "parallel", "launched"):
+    for path in ("fused", "launched"):
         x, pairs = cloth(8)
         features = [tv.Gravity(9.81), tv.Distance(pairs), tv.Rope([[0, 9], [63, 54]])]
         w = world(tv.Particles(x, pinned=np.arange(8)), features, solver=make(), path=path, iterations=4, substeps=3)
         w.run(0.2)
         assert w.last.residual < 0.2 and "non-finite" not in w.last.flags
         hashes.append(w.hash())
-    assert hashes[0] == hashes[1] == hashes[2]
+    assert hashes[0] == hashes[1]
 
 
 def test_the_report_compares_at_equal_work():

@@ -6,7 +6,7 @@ import taichi as ti
 
 import tiverlet as tv
 
-from .test_solids import CUBE, CUBE_FACES, SQUARE
+from .outlines import CUBE, CUBE_FACES, SQUARE
 
 
 @ti.func
