@@ -1,5 +1,6 @@
 """The demos run, and the README tells the truth about the first of them."""
 
+import functools
 import importlib.util
 import pathlib
 import re
@@ -13,15 +14,17 @@ ROOT = pathlib.Path(__file__).parent.parent
 
 @pytest.fixture
 def printed(tmp_path, monkeypatch, capsys):
-    """What a demo prints: its main() is called in a folder of its own."""
+    """What a demo prints: its main() is called in a folder of its own. built: arguments of its build()."""
 
-    def run(name: str, *, settings=(), **arguments) -> str:
+    def run(name: str, *, settings=(), built=None, **arguments) -> str:
         spec = importlib.util.spec_from_file_location(name, ROOT / "demos" / f"{name}.py")
         assert spec and spec.loader
         module = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
         for setting, value in settings:
             setattr(module, setting, value)
+        if built:
+            module.build = functools.partial(module.build, **built)
         monkeypatch.chdir(tmp_path)
         module.main(**arguments)
         return capsys.readouterr().out
@@ -57,10 +60,13 @@ def test_pay_finds_that_features_only_add(printed):
     [
         ("cradle", {}, "formula"),
         ("net", {}, "carries 1.0"),
-        ("hourglass", {"seconds": 3.0}, "through the neck"),
+        ("hourglass", {"built": {"grains": 500}, "seconds": 2.5}, "through the neck"),
         ("polygons", {"seconds": 1.5}, "36 bodies"),
-        *((name, {}, f"{name}.rrd") for name in ("soft", "bead", "tidy", "cloth", "ragdoll", "machine")),
+        ("cloth", {"built": {"points": 23}}, "cloth.rrd"),
+        ("soft", {"seconds": 2.5}, "soft.rrd"),
+        *((name, {}, f"{name}.rrd") for name in ("bead", "tidy", "ragdoll", "machine")),
     ],
+    ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_demos_check_themselves(printed, name, arguments, words):
     # Each raises SystemExit where its check fails.

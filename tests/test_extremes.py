@@ -10,8 +10,8 @@ from tiverlet import team
 from tiverlet.report.certificate import certify
 from tiverlet.report.extremes.motion import spoilt
 
+from .chains import beyond
 from .conftest import CASES, case, figures, pendulums, rerun, rms
-from .test_direct import beyond
 
 DOORS = (10, 13, 19, 20, 28, 38, 59, 60, 63, 65, 66)
 MOTION = (2, 4, 6, 7, 11, 15, 17, 18, 22, 29, 37, 45, 48, 50, 51, 52, 55, 61, 62, 67)

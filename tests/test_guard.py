@@ -5,8 +5,8 @@ import pytest
 
 import tiverlet as tv
 
+from .chains import Scene, hung
 from .conftest import rerun
-from .test_direct import Scene, hung
 
 
 def test_whip_and_mass_ratios_from_one_substep(world):

@@ -45,7 +45,7 @@ def test_kernels_agree_with_the_prototype(world, dim, iterations):
 
 @pytest.mark.parametrize(
     "name, efforts",
-    [("N10_alpha1e-3", ((20, 4), (20, 16), (50, 4))), ("N100_alpha1e-5", ((50, 40), (100, 20)))],
+    [("N10_alpha1e-3", ((20, 4), (20, 16), (50, 4))), ("N100_alpha1e-5", ((50, 40),))],
 )
 def test_static_elongation_is_alpha_times_load(world, name, efforts):
     # Link k from the bottom carries k m g, so it is longer by alpha k m g, for all substeps and iterations that converge.

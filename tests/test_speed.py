@@ -120,8 +120,8 @@ def test_scenes_are_sound():
 
 
 def test_what_is_stripped_runs_and_has_the_same_fields():
-    # The copy has three features and what the package itself needs.
-    report = speed("pile", sizes=[20], threads=[1], quick=True, peers=False, yardstick=False)
+    # The copy has two features and what the package itself needs.
+    report = speed("rope", sizes=[20], threads=[1], quick=True, peers=False, yardstick=False)
     (absent,) = report.absent
     assert absent.fields[0] == absent.fields[1] and absent.bytes[0] == absent.bytes[1] and absent.launches == (1, 1)
     assert absent.ratio > 0 and SpeedReport.of_json(report.json()) == report

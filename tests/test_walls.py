@@ -39,6 +39,10 @@ def scenes(dim):
     }
 
 
+# What takes most to compile, and is tested by another dimension with the same restitution.
+SLOW = (("sdf", 2, 0.0), ("sdf", 3, 0.7))
+
+
 @pytest.mark.parametrize("name", scenes(2))
 @pytest.mark.parametrize("dim", [2, 3])
 def test_no_particle_is_ever_inside(world, name, dim):
@@ -52,6 +56,8 @@ def test_no_particle_is_ever_inside(world, name, dim):
     speed = 10.0 ** rng.uniform(-2, 2, len(x)) * r / h
     v = aim / np.linalg.norm(aim, axis=1)[:, None] * speed[:, None]
     for restitution in (0.0, 0.7):
+        if (name, dim, restitution) in SLOW:
+            continue
         start = tv.Particles(x, velocity=v, radius=r)
         w = world(start, [tv.Gravity(9.81), make(restitution=restitution)], precision="f64", substeps=1)
         energy = tv.measure.kinetic_energy(w)

@@ -1,0 +1,128 @@
+"""The list of near pairs: all are there, by brute force, and nothing depends on when and where it is built."""
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+
+
+def near_pairs(position, radius, skin):
+    """All pairs closer than the sum of radii plus skin, by sweeping along x: nothing shared with the grid."""
+    radius = np.broadcast_to(radius, len(position))
+    order = np.argsort(position[:, 0], kind="stable")
+    x, r = position[order], radius[order]
+    out = []
+    reach = 2 * radius.max() + skin
+    ends = np.searchsorted(x[:, 0], x[:, 0] + reach, side="right")
+    for k in range(len(x)):
+        a = slice(k + 1, ends[k])
+        hit = np.flatnonzero(((x[a] - x[k]) ** 2).sum(axis=1) < (r[a] + r[k] + skin) ** 2) + k + 1
+        out += [(min(order[k], order[j]), max(order[k], order[j])) for j in hit]
+    return np.array(sorted(out), dtype=np.int64).reshape(-1, 2)
+
+
+def roomy(w: tv.World, entries: int) -> None:
+    """Give the list of near pairs room before anything compiles; a list that grows makes all compile anew."""
+    w._grid.allocate(entries)
+    w._renew()
+
+
+SKIN = 0.03
+
+
+CELL = (2 * 0.15 + SKIN) * (1 + 2.0**-12)  # of particles of radius 0.15
+
+
+def clouds():
+    """By name: radii, and clouds of as many particles; with how many buckets they fill, and how many are in one at most, where
+    that is the point."""
+    rng = np.random.default_rng(7)
+    n = 600
+    k = np.stack(np.divmod(np.arange(n), 24), axis=1) - 12
+    far = rng.permutation(81 * 81)[
+        :75
+    ]  # clusters at multiples of 256 cells fold onto one bucket, whatever the shape of the table
+    far = np.repeat(np.stack(np.divmod(far, 81), axis=1) - 40, 8, axis=0) * 256 * CELL
+    yield (
+        "plane", np.full(n, 0.15),
+        [
+            (rng.uniform(-5, 5, (n, 2)), None),
+            (rng.uniform(0, 0.1, (n, 2)), (1, n)),  # rows 32 to 34: all in one cell
+            (far + rng.uniform(0.1, 0.9, (n, 2)) * CELL, (1, n)),  # all in one bucket
+            ((k + 0.5) * CELL / 2, (13 * 12, 4)),  # row 30: cells are as wide at the origin as elsewhere
+            (k * CELL / 2, None),  # on their borders
+        ],
+    )  # fmt: skip
+    outliers = [[1e5, -1e5, 3e5], [1e5, -1e5, 3e5 + 0.3]]
+    space = [
+        rng.uniform(-2, 2, (n, 3)),
+        np.concatenate([rng.uniform(-1, 1, (n - 2, 3)), outliers]),
+        rng.uniform(-900, -895, (n, 3)),
+    ]
+    yield "space", np.full(n, 0.15), [(x, None) for x in space]
+    # Row 25: radii from 1 to 1000 in one scene, large ones among crowds of small ones and points.
+    wide = np.concatenate([10.0 ** rng.uniform(-3, 0, 750), rng.choice([0.0, 0.02, 0.1, 1.0], 230)])
+    yield "radii 1:1000", wide, [(rng.uniform(-3, 3, (980, 2)), None)]
+    yield "radii 1:1000 in space", wide, [(rng.uniform(-1.5, 1.5, (980, 3)), None), (rng.uniform(-900, -890, (980, 3)), None)]
+    yield "two", np.full(2, 0.3), [([[0.0, 0], [0.5, 0]], None), ([[-7.0, 0], [-7, 0.5]], None)]
+
+
+@pytest.mark.filterwarnings("ignore:.*near pairs per particle")
+@pytest.mark.parametrize("name, radius, several", list(clouds()))
+@pytest.mark.parametrize("path", ["fused", "parallel", "launched"])
+def test_pairs_equal_brute_force(world, name, radius, several, path):
+    w = world(tv.Particles(several[0][0], radius=radius), [tv.Contact(skin=SKIN)], precision="f64", path=path)
+    wanted = [near_pairs(np.asarray(position), radius, SKIN) for position, _ in several]
+    roomy(w, 4 * max(map(len, wanted)))
+    for (position, filled), want in zip(several, wanted, strict=True):
+        position = np.asarray(position)
+        w._memory.write(w._scene.state.x, position)
+        w._grid.fit(np.ptp(position, axis=0))
+        w._grid.stale[None] = 1
+        w._list()
+        pairs, _ = w._grid.pairs()
+        np.testing.assert_array_equal(pairs, want)
+        found = w._grid.number.to_numpy()[: len(position)]
+        np.testing.assert_array_equal(found, np.bincount(pairs.ravel(), minlength=len(position)))  # each by both
+        if filled:
+            in_bucket = np.diff(w._grid.cells.edge.to_numpy()[: w._grid.cells.buckets + 2])
+            assert ((in_bucket > 0).sum(), in_bucket.max()) == filled
+        w._look()
+        touching = w._report()
+        brute, depth = tv.measure.overlapping(position, radius)
+        assert touching.contacts == len(brute)
+        both = np.asarray(radius)[brute]
+        small = np.where(both.min(axis=1) > 0, both.min(axis=1), both.max(axis=1))
+        assert touching.overlap == pytest.approx((depth / small).max(initial=0.0), rel=1e-12)
+
+
+def test_many_particles(world):
+    rng = np.random.default_rng(8)
+    position = rng.uniform(-63, 63, (40_000, 2))
+    radius = rng.uniform(0.1, 0.5, 40_000)
+    w = world(tv.Particles(position, radius=radius), [tv.Contact(skin=0.05)], precision="f64")
+    assert w.path == ("parallel" if tv.runtime.cores() > 1 else "fused")
+    w._list()
+    first, number = w._grid.first.to_numpy(), w._grid.number.to_numpy()
+    near = w._grid.store.read(w._grid.near)
+    i = np.repeat(np.arange(len(position)), number)
+    j = near[np.repeat(first, number) + np.arange(len(i)) - np.repeat(np.cumsum(number) - number, number)]
+    assert (np.diff(j)[np.diff(i) == 0] > 0).all()  # sorted, no pair twice
+    got = np.stack([i, j], axis=1)[i < j]
+    np.testing.assert_array_equal(got, near_pairs(position, radius, 0.05))
+
+
+def test_neither_room_nor_skin_nor_path_changes_a_bit(world):
+    # Row 35: the hash with room for one entry of the list is that with room for all, and no contact is missing. Nor does it
+    # matter when lists are built: with the least skin in nearly all substeps.
+    rng = np.random.default_rng(9)
+    position = rng.uniform(-1, 1, (200, 2))
+    hashes = set()
+    for path, capacity, skin in (("fused", 100_000, "auto"), ("fused", 1, 0.001), ("parallel", 1, 0.3), ("launched", 1, 0.05)):
+        features = [tv.Gravity(9.81), tv.Contact(skin=skin), tv.Box((-1.2, -1.2), (1.2, 3))]
+        w = world(tv.Particles(position, radius=0.1), features, path=path)
+        roomy(w, capacity)
+        w.run(0.2)
+        hashes.add(w.hash())
+        assert w._grid.capacity * w._grid.blocks >= 2 * len(w._grid.pairs()[0]) > 0
+    assert len(hashes) == 1

@@ -1,0 +1,252 @@
+"""Files of recordings: what they hold, what becomes of them when they are cut, changed or not finished, and the commands."""
+
+import json
+import pathlib
+import re
+import resource
+import struct
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+from tiverlet.__main__ import main
+from tiverlet.recording import journal, rrd, viewer
+
+from .conftest import python
+
+
+@pytest.fixture(scope="module")
+def falling(tmp_path_factory):
+    """The file of a small recording, and the energy curve."""
+    path = tmp_path_factory.mktemp("falling") / "a.rrd"
+    gravity = tv.Gravity(9.81)
+    with tv.World(tv.Particles(np.eye(3), velocity=(1, 2, 3)), [gravity], substeps=2) as world:
+        with tv.Recorder(path, world, every=2) as recorder:
+            for frame in range(20):
+                if frame == 11:
+                    gravity.g = 5.0
+                world.step(1 / 60)
+                recorder.log()
+                recorder.flush()
+    return path
+
+
+def rewrite(path, to, change, seal=True):
+    """Copy a recording with entries changed by change(number, text) -> text; sealed with new checksums, or not."""
+    import rerun as rr
+
+    stream = rr.RecordingStream("tiverlet_3d")
+    stream.save(to)
+    with rrd.chunks(str(path)) as (chunks, _):
+        rows = [
+            row for c in chunks if c.entity_path == f"/{journal.JOURNAL}"
+            for row in zip(*(rrd.rows(c, name) for name in ("text", "blob", "checksum")), strict=True)
+        ]  # fmt: skip
+        stream.send_chunks([c for c in chunks if c.entity_path != f"/{journal.JOURNAL}"])
+    mark = ""
+    for text, blob, old in rows:
+        text = change(text)
+        mark = journal.checksum(mark, text, blob.tobytes()) if seal else old
+        stream.log(journal.JOURNAL, rr.AnyValues(text=text, blob=blob, checksum=mark))
+    stream.disconnect()
+    return to
+
+
+def test_what_was_recorded_reads_back(falling, tmp_path):
+    recording = tv.replay(falling)
+    assert list(recording.frames) == list(range(0, 21, 2)) and recording.times[-1] == pytest.approx(20 / 60)
+    assert recording.position(20).dtype == np.float32
+    with recording.world(20) as world:
+        np.testing.assert_array_equal(recording.position(20), world.position.astype(np.float32))
+        assert world.time == recording.times[-1] and world.features[0].g == 5.0
+    # x = t, y = 2 t - g t^2 / 2 without step errors
+    np.testing.assert_allclose(recording.position(10)[0], [1 + 1 / 6, 2 / 6 - 9.81 / 72, 3 / 6], rtol=1e-6)
+    assert list(recording.curves["energy"][0]) == list(range(2, 21, 2))
+    np.testing.assert_allclose(recording.curves["momentum/x"][1], 3.0, rtol=1e-6)
+    recording.export(str(tmp_path / "a.npz"))
+    with np.load(tmp_path / "a.npz") as out:
+        assert out["position"].shape == (11, 3, 3) and (out["position"][-1] == recording.position(20)).all()
+    recording.export(str(tmp_path / "a.csv"))
+    table = (tmp_path / "a.csv").read_text().splitlines()
+    assert table[0] == "frame,time,particle,x,y,z" and len(table) == 34
+    assert [np.float32(v) for v in table[-1].split(",")[3:]] == recording.position(20)[2].tolist()
+    with pytest.raises(ValueError, match="no frame 3; the nearest is"):
+        recording.world(3)
+    with pytest.raises(ValueError, match="csv can be written"):
+        recording.export("a.txt")
+
+
+def test_damage_is_named(falling, tmp_path):
+    whole = falling.read_bytes()
+    path = tmp_path / "b.rrd"
+
+    path.write_bytes(b"not an rrd, but some text")
+    with pytest.raises(ValueError, match="not an .rrd file"):
+        tv.replay(path)
+    with pytest.raises(FileNotFoundError):
+        tv.replay(tmp_path / "none.rrd")
+    path.write_bytes(whole[:200])
+    with pytest.raises(ValueError, match="cut short before anything"):
+        tv.replay(path)
+
+    # Cut in the middle of every message: what comes before it is read, and it is said where that ends.
+    ends, at = [], rrd.HEADER
+    while at < len(whole) and (kind := struct.unpack_from("<QQ", whole, at))[0]:
+        at += 16 + kind[1]
+        ends.append(at)
+    seen = set()
+    for end in ends:
+        path.write_bytes(whole[: end - 5])
+        try:
+            part = tv.replay(path)
+        except ValueError as e:
+            assert "cut short before anything" in str(e) and not seen
+            continue
+        seen.add(len(part.frames))
+        assert not part.complete and "not closed: it " in part.text
+    assert seen and max(seen) == 11
+    assert part.verify()
+
+
+def test_tampering_is_found(falling, tmp_path):
+    def turn(text):
+        entry = json.loads(text)
+        if entry["kind"] == "turned" and entry["data"]["features"]["0"]:
+            entry["data"]["features"]["0"]["g"] = 5.5
+        return json.dumps(entry)
+
+    with pytest.raises(ValueError, match="changed after it was recorded: entry [0-9]+, 'turned' of frame 10"):
+        tv.replay(rewrite(falling, tmp_path / "a.rrd", turn, seal=False))
+    verdict = tv.replay(rewrite(falling, tmp_path / "b.rrd", turn)).verify()
+    assert not verdict and (verdict.frame, verdict.particle) == (12, 0) and "first particle 0" in str(verdict)
+
+    def older(text):
+        return text.replace(f'"format": {journal.FORMAT}', '"format": 99')
+
+    with pytest.raises(ValueError, match=f"is in format 99, of tiverlet .* reads format {journal.FORMAT}"):
+        tv.replay(rewrite(falling, tmp_path / "c.rrd", older))
+
+    def elsewhere(text):
+        return re.sub(r'"g": 5.0', '"g": 5.5', text.replace('"taichi": "1', '"taichi": "0'))
+
+    with pytest.raises(RuntimeError, match="frame 12 .* not as it was: taichi 0.7.4 then, 1.7.4 now"):
+        tv.replay(rewrite(falling, tmp_path / "d.rrd", elsewhere)).world(12)
+
+    # One coordinate of the picture: its bytes are in the file as they are, since LZ4 finds nothing to save in them.
+    whole, x = bytearray(falling.read_bytes()), tv.replay(falling).position(8)
+    at = whole.find(x[1].tobytes())
+    if at >= 0:
+        whole[at] ^= 1
+        (tmp_path / "e.rrd").write_bytes(whole)
+        recording = tv.replay(tmp_path / "e.rrd")
+        with pytest.raises(ValueError, match="picture of frame 8"):
+            recording.position(8)
+        verdict = recording.verify()
+        assert not verdict and (verdict.frame, verdict.particle) == (8, 1) and "picture" in str(verdict)
+
+
+def test_a_killed_process_leaves_what_was_flushed(tmp_path):
+    code = f"""
+import os, signal, sys
+import numpy as np
+sys.path.insert(0, {str(tmp_path)!r})
+import tiverlet as tv
+tv.init(threads=1)
+rope = tv.shapes.rope((0, 0), (1, 0), 30)
+w = tv.World(tv.Particles(rope.position, pinned=[0]), [tv.Gravity(), tv.Distance(rope.links)], path="parallel")
+recorder = tv.Recorder({str(tmp_path / "k.rrd")!r}, w)
+for k in range(30):
+    w.step(1 / 60)
+    recorder.log()
+    if k == 24:
+        recorder.flush()
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+    assert python(code, check=False).returncode == -9
+    recording = tv.replay(tmp_path / "k.rrd")
+    assert not recording.complete and recording.frames[-1] >= 25 and "not closed: it ends with frame" in recording.text
+    assert recording.verify()
+
+
+def test_a_full_disk_is_an_error_and_loses_nothing_that_was_written(world, tmp_path):
+    w = world(tv.Particles(np.random.default_rng(0).uniform(0, 1, (2000, 3))), [tv.Gravity()], substeps=1)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, hard))  # bytes in a file, as if the disk were full
+    try:
+        with pytest.raises(OSError, match="writing failed at frame [0-9]+ .File too large.*can be replayed"):
+            with tv.Recorder(tmp_path / "full.rrd", w) as recorder:
+                for _ in range(40):
+                    w.step(1 / 60)
+                    recorder.log()
+                    recorder.flush()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not w._watchers
+    recording = tv.replay(tmp_path / "full.rrd")
+    assert not recording.complete and 3 < len(recording.frames) < 20
+    assert recording.verify()
+    with pytest.raises(OSError, match="writing failed"):
+        with tv.Recorder("/dev/full", w):
+            pass
+    with pytest.raises(IsADirectoryError, match="cannot be written"):
+        tv.Recorder(tmp_path, w)
+
+
+def test_a_budget_is_kept_and_said(world, tmp_path):
+    w = world(tv.Particles(np.random.default_rng(0).uniform(0, 1, (500, 2))), [tv.Gravity()], substeps=1)
+    with pytest.raises(ValueError, match="Give at least"):
+        tv.Recorder(tmp_path / "a.rrd", w, budget=1000)
+    assert not (tmp_path / "a.rrd").exists()
+    with pytest.warns(UserWarning, match=r"of 401 frames are drawn: from frame [0-9]+ on one of 2, .*All steps are in the file"):
+        with tv.Recorder(tmp_path / "b.rrd", w, budget=500_000) as recorder:
+            w.run(400 / 60, recorder=recorder)
+    assert (tmp_path / "b.rrd").stat().st_size < 500_000
+    recording = tv.replay(tmp_path / "b.rrd")
+    assert 60 < len(recording.frames) < 300 and recording.frames[-1] > 150
+    assert recording.verify()
+
+
+def test_command_line(falling, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "a.rrd"
+    path.write_bytes(falling.read_bytes())
+    assert main(["replay", str(path), "--verify"]) == 0 and "all 11 frames come out" in capsys.readouterr().out
+    wrong = rewrite(falling, tmp_path / "b.rrd", lambda text: text.replace('"g": 5.0', '"g": 5.5'))
+    assert main(["replay", str(wrong), "--verify"]) == 1 and "first particle 0" in capsys.readouterr().out
+    assert main(["replay", str(path), "--export", "csv"]) == 0 and (tmp_path / "a.csv").exists()
+    assert main(["replay", "none.rrd"]) == 2 and "none.rrd" in capsys.readouterr().err
+
+    # A script that records nothing itself, and whose function has to be given to verify().
+    (tmp_path / "mine.py").write_text("""
+import sys
+import taichi as ti
+import tiverlet as tv
+
+@ti.func
+def swing(x):
+    return -10.0 * x
+
+if __name__ == "__main__":
+    assert sys.argv[1:] == ["5"]
+    with tv.World(tv.Particles([[0.0, 1.0]]), [tv.Force(swing)], substeps=2) as world:
+        for _ in range(int(sys.argv[1])):
+            world.step(1 / 60)
+    raise SystemExit(3)
+""")
+    assert main(["run", "mine.py", "5", "--out", "mine.rrd"]) == 3
+    assert "6 frames (0 ... 5)" in capsys.readouterr().out and not hasattr(tv.World.step, "__wrapped__")
+    assert main(["replay", "mine.rrd", "--verify"]) == 2 and "given=[swing]" in capsys.readouterr().err
+    assert main(["replay", "mine.rrd", "--verify", "--given", "mine.py"]) == 0
+    assert main(["run", "nobody"]) == 2 and "no demo of that name" in capsys.readouterr().err
+
+
+def test_a_picture_without_a_window(falling, tmp_path):
+    places = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d", "/usr/local/share/vulkan/icd.d")
+    if not any(pathlib.Path(place).glob("*.json") for place in places):
+        pytest.skip("no Vulkan driver here; apt-get install mesa-vulkan-drivers")
+    one, other = viewer.picture(str(falling), str(tmp_path / "%d.png"), [0, 20], scene=True)
+    first, last = (viewer.pixels_of(png).astype(int) for png in (one, other))
+    assert first.shape == last.shape and first.shape[0] > 300
+    assert (np.abs(first - last).max(axis=2) > 60).sum() > 50  # particles have moved, on a background that has not
+    assert (np.abs(first - last).max(axis=2) < 20).mean() > 0.5
