@@ -59,7 +59,7 @@ def test_pay_finds_that_features_only_add(printed):
     "name, arguments, words",
     [
         ("cradle", {}, "formula"),
-        ("net", {"settings": [("CELLS", 12), ("STRENGTH", 20.0)]}, "carries 1.0"),
+        ("net", {"settings": [("CELLS", 12), ("STRENGTH", 20.0)]}, "times its weight"),
         ("hourglass", {"built": {"grains": 500}, "seconds": 2.5}, "through the neck"),
         ("polygons", {"seconds": 1.5}, "36 bodies"),
         ("cloth", {"built": {"points": 23}}, "cloth.rrd"),

@@ -22,7 +22,7 @@ class Bench:
 
     def __init__(self, launched: bool):
         self.memory = Memory(ti.f32)
-        team = Team(self.memory, 1, 0, launched)
+        team = Team(self.memory, 1, 0, launched, pieces=1)
         self.sums = [Sums(length, team, capped=True) for length in LENGTHS]
         self.fields = [self.memory.field(f"sums {s.lengths[0]}", s.room, kind=ti.i32) for s in self.sums]
         self.list = self.memory.field("list", 4 * LONG + 2, kind=ti.i32)
