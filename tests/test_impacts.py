@@ -40,6 +40,33 @@ def test_head_on_collisions(world, dim, precision, limit):
         np.testing.assert_allclose(momentum, m1 * u1 + m2 * u2, rtol=limit)
 
 
+def test_blows_are_reported(world):
+    # The impulses of all substeps add up to (1 + e) u / (w1 + w2), and each is what the disc's momentum changed by; likewise with
+    # a disc that cannot move, and for one that throws the next one onto a third in the same substep.
+    e, mass = np.repeat([0.0, 0.5, 1.0], 3), np.tile([[1.0, 1.0], [1.0, 1000.0], [np.inf, 2.0]], (3, 1))
+    x = np.stack([np.c_[-0.6 + 0 * e, 3.0 * np.arange(9)], np.c_[0.55 + 0 * e, 3.0 * np.arange(9)]], axis=1)
+    v, group = np.zeros((9, 2, 2)), np.repeat(np.arange(3), 6)
+    v[:, 1, 0] = -20.0
+    x = np.concatenate([x.reshape(-1, 2), [[5.0, 0.0], [6.001, 0.0], [7.002, 0.0]]])
+    v = np.concatenate([v.reshape(-1, 2), [[1.0, 0.0], [0.0, 0.0], [0.0, 0.0]]])
+    mass, group = np.r_[mass.ravel(), np.ones(3)], np.r_[group, 2, 2, 2]
+    contact = tv.Contact(restitution={(k, k): k / 2 for k in range(3)})
+    w = world(tv.Particles(x, velocity=v, mass=mass, radius=0.5, group=group), [contact], precision="f64", substeps=1)
+    total = np.zeros(20)
+    for _ in range(20):
+        before = w.velocity
+        w.step(1 / 240)
+        found = w.contacts
+        total += np.bincount(found.pairs[:, 0], weights=found.impulse, minlength=20)
+        each = np.zeros((21, 2))
+        for k, sign in ((0, 1), (1, -1)):
+            np.add.at(each, found.pairs[:, k], sign * found.impulse[:, None] * found.normal)
+        live = np.isfinite(mass)
+        np.testing.assert_allclose(each[live], mass[live, None] * (w.velocity - before)[live], atol=1e-9)
+    np.testing.assert_allclose(total[:18:2], (1 + e) * 20.0 / (1 / mass[:18]).reshape(9, 2).sum(axis=1), rtol=1e-9)
+    np.testing.assert_allclose(total[18:], 1.0, rtol=1e-9)
+
+
 def test_oblique_discs(world):
     # R15: v1 = u - (1 + e)/2 (u . n) n, direction to 1e-3 rad at v h / r = 0.01. One pair for each e, a group each.
     p, values = case("R15_oblique_discs")["params"], case("R15_oblique_discs")["values"]
@@ -194,6 +221,9 @@ def test_friction_between_particles(world):
     w.run(0.5)
     for k, (mu, stays) in enumerate(rows):
         assert (np.hypot(*(w.position - x)[2 * k + 1]) < 1e-9) == stays, mu
+    # What stays weighs on the fixed one with m g cos, though it does not overlap it any more.
+    held = w.contacts.impulse[np.isin(w.contacts.pairs[:, 0], [4, 6])]
+    np.testing.assert_allclose(held * 1200, 9.81 * np.cos(a), rtol=1e-9)
     for friction, error in ((-0.1, "at least 0"), (float("nan"), "finite"), ((0.2, 0.5), "must not exceed")):
         with pytest.raises(ValueError, match=error):
             tv.Contact(friction=friction)
@@ -277,6 +307,7 @@ def test_friction_and_restitution_have_the_same_bits_on_both_paths(world):
     assert hashes[0] == hashes[1]
     worlds[0].run(0.1)
     snapshot.transfer(worlds[1], worlds[0])
+    np.testing.assert_array_equal(worlds[0].contacts.impulse, worlds[1].contacts.impulse)
     for w in worlds:
         w.run(0.2)
     assert worlds[0].hash() == worlds[1].hash() != hashes[0]

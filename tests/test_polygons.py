@@ -37,7 +37,7 @@ def test_boxes_stand_on_each_other_and_on_slopes(world):
     mu, side = 0.45, 0.2
     shapes = [regular(4, side / np.sqrt(2), (0.0, (k + 0.5) * side)) for k in range(3)]
     pinned = []
-    for x, degrees in ((2.0, 20.0), (6.0, 30.0)):
+    for x, degrees in ((2.0, 20.0), (6.0, 30.0), (10.0, 0.0)):
         a = np.radians(degrees)
         t, n = np.array([np.cos(a), -np.sin(a)]), np.array([np.sin(a), np.cos(a)])
         top = np.array([x, 1.5])
@@ -62,6 +62,46 @@ def test_boxes_stand_on_each_other_and_on_slopes(world):
     way = 9.81 * (np.sin(a) - mu * np.cos(a)) * (1.0**2 - 0.7**2) / 2
     assert np.linalg.norm((got - start)[24:28].mean(axis=0)) == pytest.approx(way, rel=0.02)
     assert w.last.clean
+    # The impulses on each slope add up to m g h cos in a substep, and those on the level to m g h.
+    found, body = w.contacts, np.repeat(np.arange(9), 4)
+    for k, degrees in ((4, 20), (6, 30), (8, 0)):
+        load = found.impulse[(body[found.pairs] == k).any(axis=1)].sum() * 1200
+        assert load == pytest.approx(4 * 9.81 * np.cos(np.radians(degrees)), rel=1e-3)
+
+
+def test_impulses_are_what_momentum_changes_by(world):
+    # A point of 1 kg meets a free edge at a quarter of it: its gradients are 1, -3/4 and -1/4, so it gets (1 + e) u / (w_v + 9/16
+    # w_a + 1/16 w_b). Another one meets an edge that is pinned, and a small square a large one, corners on edge: in each substep
+    # what a body gets is the sum of impulse times normal, by its shares.
+    e, u = 0.5, 3.0
+    shapes = [regular(4, np.sqrt(0.5), (4.0 * k, 0.0)) for k in range(2)]
+    shapes += [regular(4, np.sqrt(0.5), (8.0, 0.0)), regular(4, np.sqrt(0.125), (9.0, 0.1))]
+    loops = [4 * k + np.arange(4) for k in range(4)]
+    x = np.concatenate([*shapes, [[0.6, 0.25], [4.6, 0.1]]])
+    mass = np.r_[1.0, 2.0, 3.0, 4.0, np.ones(14)]
+    v = np.zeros_like(x)
+    v[12:, 0] = -u
+    start = tv.Particles(x, velocity=v, mass=mass, pinned=range(4, 8))
+    w = world(start, [tv.Polygons(loops, restitution=e)], precision="f64", substeps=1)
+    body, total = np.r_[np.repeat(np.arange(4), 4), 4, 5], np.zeros((6, 2))
+    before = v
+    for _ in range(60):
+        w.step(1 / 600)
+        found = w.contacts
+        each = np.zeros_like(x)
+        shares = ((found.pairs[:, 0], 1 + 0 * found.place), (found.pairs[:, 1], found.place - 1), (found.ends, -found.place))
+        for who, share in shares:
+            np.add.at(each, who, (share * found.impulse)[:, None] * found.normal)
+        change = mass[:, None] * (w.velocity - before)
+        np.testing.assert_allclose(each[start.inv_mass > 0], change[start.inv_mass > 0], atol=1e-9)
+        before = w.velocity
+        np.add.at(total, body, each)
+    a, b = (k for k in range(4) if x[k, 0] > 0)
+    t = (0.25 - x[a, 1]) / (x[b, 1] - x[a, 1])
+    blow = (1 + e) * u / (1 + (1 - t) ** 2 / mass[a] + t**2 / mass[b])
+    np.testing.assert_allclose(total[4], [blow, 0], atol=1e-9)
+    np.testing.assert_allclose(total[5], [(1 + e) * u, 0], atol=1e-9)
+    assert total[3, 0] > u and np.abs(total[2] + total[3]).max() < 1e-9
 
 
 def test_collisions_conserve_momentum_and_angular_momentum(world):

@@ -41,6 +41,7 @@ class Access:
     _watchers: list[Any]
     _restart: Any
     _list: Any
+    _look: Any
 
     @property
     def position(self) -> np.ndarray:
@@ -123,19 +124,16 @@ class Access:
 
     @property
     def contacts(self) -> Contacts:
-        """The pairs of discs or spheres that overlap now, as arrays. Empty without a Contact; Polygons keep no impulses (NaN)."""
-        x, r = self.position, self._particles.radius
-        pairs, push = np.zeros((0, 2), dtype=np.int64), np.zeros(0)
-        if self._grid:
-            self._list()
-            pairs, at = self._grid.pairs()
-            push = self._grid.read(self._sub.contacts[0]._on_push, at) if self._sub.calms else np.full(len(pairs), np.nan)
-        d = x[pairs[:, 0]] - x[pairs[:, 1]]
-        length = np.linalg.norm(d, axis=1)
-        overlap = r[pairs].sum(axis=1) - length
-        some = overlap > 0
-        normal = d[some] / np.where(length > 0, length, 1.0)[some, None]
-        return Contacts(pairs[some], overlap[some], normal, push[some] / (self._h or 1.0))
+        """What touches now, as arrays: discs or spheres, and vertices and edges of Polygons. Empty without a Contact."""
+        if not self._grid:
+            none, index = np.zeros(0), np.zeros((0, 2), dtype=np.int64)
+            vectors = np.zeros((0, self._particles.dim))
+            return Contacts(index, index[:, 0], none, none, vectors, vectors, none)
+        self._list()
+        contact = self._sub.contacts[0]
+        if contact.measures and self._sub.launched:
+            self._look()  # which measures; elsewhere it makes the list, too
+        return contact.found(self.position, self._h or 1.0)
 
     @property
     def broken(self) -> list[tuple[Feature, np.ndarray]]:

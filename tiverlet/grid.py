@@ -142,13 +142,11 @@ class Grid:
             if self.cells.fit(np.asarray(extent)):
                 self.stale[None] = 1
 
-    def pairs(self) -> tuple[np.ndarray, np.ndarray]:
-        """The listed pairs (m, 2) with i < j, in order, and where they are in the list."""
+    def entries(self) -> tuple[np.ndarray, np.ndarray]:
+        """The listed pairs (m, 2) either way round, in order, and where they are in the list."""
         assert self.store
         i, at = self._entries(self.first, self.number)
-        pairs = np.stack([i, self.store.read(self.near)[at]], axis=1).astype(np.int64)
-        some = pairs[:, 0] < pairs[:, 1]
-        return pairs[some], at[some]
+        return np.stack([i, self.store.read(self.near)[at]], axis=1).astype(np.int64), at
 
     def read(self, piece: Luggage, at: np.ndarray) -> np.ndarray:
         """What some entries of the list carry."""

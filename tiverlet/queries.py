@@ -10,12 +10,21 @@ from .grid import Grid
 
 @dataclass(frozen=True)
 class Contacts:
-    """The pairs that overlap now. pairs: (m, 2), i < j. overlap: (m,) [m]. normal: (m, dim), from j to i. impulse: (m,) [N s]
-    along the normal in the last substep, without what a bounce adds; divided by the substep it is the force."""
+    """What touches: overlaps now, or was pushed apart in the last substep.
+
+    pairs: (m, 2), two discs or spheres i < j, or a vertex and the particle where the edge begins that it touches. ends: (m,), the
+    particle where the edge ends; j for discs. place: (m,), where on the edge, 0 at its begin and 1 at its end; 0 for discs.
+    overlap: (m,) [m], 0 or less for what has just been pushed apart. normal: (m, dim), from j or the edge to i. point: (m, dim)
+    [m], in the middle of the overlap. impulse: (m,) [N s] along the normal in the last substep; divided by the substep it is the
+    force. i got impulse * normal, and -(1 - place) and -place of that went to j and the end of the edge.
+    """
 
     pairs: np.ndarray
+    ends: np.ndarray
+    place: np.ndarray
     overlap: np.ndarray
     normal: np.ndarray
+    point: np.ndarray
     impulse: np.ndarray
 
     def __len__(self) -> int:

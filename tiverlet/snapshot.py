@@ -10,6 +10,8 @@ if TYPE_CHECKING:
     from .world import World
 
 HASHED = ("_time", "_tick", "_since", "_h", "_fresh")  # of the clock; the rest follows from the same past
+CARRIED = ("Contact.push", "Contact.slip")  # by pairs, for the next substep
+TOLD = "Contact.given"  # by pairs, of the last substep, for reports
 CLOCK = (*HASHED, "_frame", "_drag", "_started", "_placed", "_energy")
 
 
@@ -24,10 +26,22 @@ class Kept:
     def digest(self) -> str:
         """SHA-256 of the exact state, the clock, and what the guard remembers."""
         out = hashlib.sha256(repr((*(self.clock[name] for name in HASHED), *self.guard)).encode())
-        for name, values in self.values.items():
+        for name, values in self._lasting().items():
             out.update(name.encode())
             out.update(values.tobytes())
         return out.hexdigest()
+
+    def _lasting(self) -> dict[str, np.ndarray]:
+        """Without what pairs carry for reports: a pair that has just bounced may be on the list or far off it, by the skin."""
+        if TOLD not in self.values:
+            return self.values
+        carried = [name for name in CARRIED if name in self.values]
+        some = np.zeros(len(self.values["Contact.pairs"]), dtype=bool)
+        for name in carried:
+            values = self.values[name]
+            some |= values.any(axis=tuple(range(1, values.ndim)))
+        rows = {name: self.values[name][some] for name in ("Contact.pairs", *carried)}
+        return {name: rows.get(name, values) for name, values in self.values.items() if name != TOLD}
 
     def position(self, count: int) -> np.ndarray:
         """Positions [m] of `count` particles, in f64 where there is more than one word of f32."""

@@ -2,10 +2,12 @@
 
 from typing import Any
 
+import numpy as np
 import taichi as ti
 
 from .feature import Feature
 from .memory import Memory
+from .queries import Contacts
 
 
 class Touch(Feature):
@@ -15,6 +17,9 @@ class Touch(Feature):
     _on_grid: Any
     _on_state: Any
     _on_radius: Any
+    _on_push: Any
+    _on_given: Any
+    _on_bounces: bool
     _on_eases, _on_store = False, None
 
     @ti.func
@@ -139,3 +144,22 @@ class Touch(Feature):
                     worst = ti.max(worst, overlap / small)
                     touching += 1
         return touching, worst
+
+    def found(self, x: np.ndarray, h: float) -> Contacts:
+        """The pairs that touch, of particles at x (n, dim) [m], for world.contacts."""
+        r = self.scene.particles.radius
+        pairs, at = self._on_grid.entries()
+        push = self._on_grid.read(self._on_given if self._on_bounces else self._on_push, at)
+        low = pairs[:, 0] < pairs[:, 1]
+        if self._on_grid.still:  # what is static does not keep what it gives: the other one of the pair does
+            back = np.lexsort(pairs[~low].T)  # (j, i) in the order of (i, j)
+            push[low] = np.maximum(push[low], push[~low][back])
+        pairs, push = pairs[low], push[low]
+        d = x[pairs[:, 0]] - x[pairs[:, 1]]
+        length = np.linalg.norm(d, axis=1)
+        overlap = r[pairs].sum(axis=1) - length
+        some = (overlap > 0) | (push > 0)
+        pairs, overlap, j = pairs[some], overlap[some], pairs[some, 1]
+        normal = d[some] / np.where(length > 0, length, 1.0)[some, None]
+        point = x[j] + (r[j] - overlap / 2)[:, None] * normal
+        return Contacts(pairs, j, np.zeros(len(j)), overlap, normal, point, push[some] / h)

@@ -128,13 +128,17 @@ class Contact(Touch):
             self._on_kick = scene.memory.field("Contact.kick", n, width=dim)
             self._on_left = scene.memory.field("Contact.left", n)
             self._on_partner = scene.memory.field("Contact.partner", n, kind=ti.i32)
+            self._on_first = scene.memory.field("Contact.first", n, kind=ti.i32)
             self._on_hit = scene.memory.field("Contact.hit", None, kind=ti.i32)
         self.table.bind(scene)
         # What parted the pair in the last substep, per inverse mass [kg m].
         self._on_push = Luggage("push", 0, lasting=True, marked=True)
         self._on_slip = Luggage("slip", dim, lasting=True)
         self._on_blow = Luggage("blow", 0, lasting=False)
-        luggage = [self._on_push, *([self._on_slip] if self.rubs else []), *([self._on_blow] if self.bounces else [])]
+        luggage = [self._on_push, *([self._on_slip] if self.rubs else [])]
+        if self.bounces:
+            self._on_given = Luggage("given", 0, lasting=True)  # pushes and blows in the last substep [kg m]
+            luggage += [self._on_blow, self._on_given]
         self._on_grid = Grid(scene, self._on_size, linked, self.table, luggage, team, self._on_move)
         self._on_calm = Calm(self)
         return self._on_grid
@@ -220,6 +224,7 @@ class Contact(Touch):
                 self._on_struck[i] = self._on_split[i]
                 for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
                     self._on_blow.field[e] = 0
+                    self._on_given.field[e] = 0
         if self._on_split[i] > 0:
             for word in range(self._on_grid.words(i)):
                 bits = self.touching(i, word)
@@ -247,6 +252,7 @@ class Contact(Touch):
                                 push = part
                         if not rests:
                             part = ti.zero(part)
+                        self._on_given.field[e] = self._on_given.field[e] + part
                     push += part
                     want = part * n
                     if ti.static(self._on_rubs):
@@ -280,7 +286,7 @@ class Contact(Touch):
     @ti.func
     def rebound(self, i):
         """The first of the pairs of particle i that were struck and still come together, and what it does to i."""
-        partner, most, w = -1, 0 * self._on_struck[i], self._on_state.w.of(i)
+        first, partner, most, w = -1, -1, 0 * self._on_struck[i], self._on_state.w.of(i)
         if self._on_struck[i] > 0:
             for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
                 if self._on_blow.field[e] > 0:
@@ -290,10 +296,11 @@ class Contact(Touch):
                     if overlap > 0 and a > 0 and given > 0:
                         left = ti.select(overlap < here, overlap / here, 1)
                         if left > most or (left == most and earlier(i, j, partner)):
-                            partner, most = j, left
+                            first, partner, most = e, j, left
                             self._on_kick[i] = w / (w + self._on_state.w.of(j)) * given * n
                             if self._on_hit[None] == 0:
                                 self._on_hit[None] = 1
+        self._on_first[i] = first
         self._on_partner[i] = partner
         self._on_left[i] = most
 
@@ -303,7 +310,8 @@ class Contact(Touch):
         j = self._on_partner[i]
         if j >= 0:
             if self._on_partner[j] == i or self._on_state.w.of(j) == 0:
-                kick = self._on_kick[i]
+                e, kick = self._on_first[i], self._on_kick[i]
+                self._on_given.field[e] = self._on_given.field[e] + kick.norm() / self._on_state.w.of(i)
                 self._on_state.d[i] = self._on_state.d[i] + kick
                 self._on_state.before[i] = self._on_state.before[i] + kick
                 self._on_state.advance(i, self._on_left[i] * kick)

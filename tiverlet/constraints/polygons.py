@@ -148,9 +148,11 @@ class Polygons(Rim):
         # in the list of the other particle those are in which it is the start, and the end, of the edge (-1: nowhere).
         self._on_met, self._on_back = Luggage("met", 4, False, kept=False), Luggage("back", 2, False, kept=False)
         self._on_slip, self._on_aim = Luggage("slip", 2, lasting=True), Luggage("aim", 2, lasting=False)
+        self._on_given = Luggage("given", 0, lasting=True)  # pushes and blows in the last substep [kg m]
         luggage = [
             self._on_met,
             self._on_back,
+            self._on_given,
             *([self._on_slip] if self.rubs else []),
             *([self._on_aim] if self.bounces else []),
         ]
@@ -217,8 +219,9 @@ class Polygons(Rim):
         """What the contacts of particle i want of it."""
         total, lifts = 0 * self._on_state.x[i], 0 * self._on_state.x[i]
         for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
-            if ti.static(self._on_bounces):
-                if first != 0:
+            if first != 0:
+                self._on_given.field[e] = 0
+                if ti.static(self._on_bounces):
                     self._on_aim.field[e] = 0 * self._on_aim.field[e]
             for role in range(3):
                 at, v, a, b, t, part = self.meeting(i, e, role)
@@ -226,8 +229,8 @@ class Polygons(Rim):
                     met = self._on_met.field[at]
                     overlap, n = met[0], ti.Vector([met[2], met[3]])
                     if overlap > 0:
-                        d = self.relative(v, a, b, t)
-                        share, kick = part * self._on_w.of(i) / self.split(self._on_active, v, a, b, t), 0 * overlap
+                        d, shared = self.relative(v, a, b, t), self.split(self._on_active, v, a, b, t)
+                        share, kick = part * self._on_w.of(i) / shared, 0 * overlap
                         back = overlap  # what is taken back of the position and of the displacement
                         if ti.static(self._on_bounces):
                             if first != 0:
@@ -238,6 +241,8 @@ class Polygons(Rim):
                                     self._on_hit[None] = 1
                                     if role == VERTEX:
                                         self._on_aim.field[e] = aim * n
+                        if role == VERTEX:
+                            self._on_given.field[e] = self._on_given.field[e] + back / shared
                         want = back * n
                         if ti.static(self._on_rubs):
                             want -= self.held(v, a, n, overlap + kick, self._on_slip.field[at] + d)
@@ -294,8 +299,11 @@ class Polygons(Rim):
                             n = aim / size
                             lack = size - self.relative(v, a, b, t).dot(n)
                             if lack > 0:
+                                shared = self.split(self._on_struck, v, a, b, t)
                                 self._on_hit[None] = 1
-                                total += part * self._on_w.of(i) * lack / self.split(self._on_struck, v, a, b, t) * n
+                                total += part * self._on_w.of(i) * lack / shared * n
+                                if role == VERTEX:
+                                    self._on_given.field[e] = self._on_given.field[e] + lack / shared
         self._on_kick[i] = total
 
     @ti.func

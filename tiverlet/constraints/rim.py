@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
+from ..queries import Contacts
 from .contact import Contact
 
 SLACK = 1 / 512  # of an edge: as much further it goes at its ends, so that bodies of the same width stand on each other
@@ -22,6 +23,7 @@ class Rim(Contact):
     _on_back: Any
     _on_h: Any
     _on_less: Any
+    _on_ends: Any
 
     @ti.func
     def after(self, i):
@@ -199,6 +201,25 @@ class Rim(Contact):
     def relative(self, v, a, b, t):
         """The displacement of v relative to the point t of the edge from a to b."""
         return self._on_state.d[v] - (1 - t) * self._on_state.d[a] - t * self._on_state.d[b]
+
+    def found(self, x: np.ndarray, h: float) -> Contacts:
+        """Vertices and edges, and pairs of discs, by what look() found last; also those that were pushed apart since."""
+        grid, r = self._on_grid, self.scene.particles.radius
+        pairs, at = grid.entries()
+        met, push = grid.read(self._on_met, at), grid.read(self._on_given, at)
+        some = (met[:, 0] > 0) | (push > 0)
+        pairs, met, push = pairs[some], met[some], push[some]
+        (i, j), overlap, t, n = pairs.T, met[:, 0], met[:, 1], met[:, 2:]
+        parted, no_way = overlap <= 0, (n == 0).all(axis=1)
+        discs = (t < 0) | (no_way & (r[i] + r[j] > 0))
+        ends, t = np.where(discs, j, self._on_ends[j, 0]), np.where(discs, 0.0, t)
+        edge, apart = x[ends] - x[j], x[i] - (1 - t)[:, None] * x[j] - t[:, None] * x[ends]
+        straight = np.where(discs[:, None], apart, np.stack([edge[:, 1], -edge[:, 0]], axis=1))
+        n = np.where(no_way[:, None], straight / np.linalg.norm(straight, axis=1)[:, None], n)
+        far = (1 - t) * r[j] + t * r[ends]
+        overlap = np.where(parted, r[i] + far - (apart * n).sum(axis=1), overlap)
+        point = x[i] - apart + (far - overlap / 2)[:, None] * n
+        return Contacts(pairs, ends, t, overlap, n, point, push / h)
 
 
 def area_of(loop: np.ndarray) -> float:

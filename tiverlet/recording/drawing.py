@@ -85,7 +85,7 @@ class Drawing:
         for k in turned:
             self._wall(k)
         if self._contacts:
-            self._contact(x32)
+            self._contact()
         if torn or self._torn:
             self._breaks(x)
             self._torn = torn
@@ -115,19 +115,13 @@ class Drawing:
             self._log(f"{self._root}/walls/{k}", self._strips(strips, colors=[[120, 125, 140]], radii=[radius]))
             self.bytes += strips.nbytes
 
-    def _contact(self, x: np.ndarray) -> None:
-        """Where particles touch: between the two, as a short line across."""
+    def _contact(self) -> None:
+        """Where particles touch: between the two."""
         world = self._world
-        found = world.contacts if world.last is not None else None
-        pairs = np.zeros((0, 2), dtype=int) if found is None else found.pairs
-        if not len(pairs) and not self._touched:
+        middle = world.contacts.point if world.last is not None else np.zeros((0, world.particles.dim))
+        if not len(middle) and not self._touched:
             return
-        self._touched = bool(len(pairs))
-        r = world.particles.radius
-        if found is not None:
-            middle = x[pairs[:, 1]] + found.normal * (r[pairs[:, 1]] - found.overlap / 2)[:, None]
-        else:
-            middle = np.zeros((0, world.particles.dim))
+        self._touched = bool(len(middle))
         self._log(f"{self._root}/contacts", self._points(middle.astype(np.float32), radii=[-1.2], colors=[[20, 22, 28]]))
         self.bytes += middle.nbytes // 2
 
