@@ -394,7 +394,7 @@ class Phases:
             for c in range(self.team.low(f.count, me), self.team.high(f.count, me)):
                 f.tear(c, self.reach(h, 0), tick)
         for c in ti.static(self.contacts):
-            if ti.static(c.rubs):
+            if ti.static(c.rubs or c.bounces):
                 for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
                     c.remember(i)
             self.team.wait()

@@ -16,6 +16,7 @@ from ..touch import Touch
 
 RELAXATION = 1.25  # below 4/3, see Contact
 CARRY = 0.4  # of its last push that a pair keeps, at most; below 1/2
+UPTAKE = 1 / 8  # of the slack of a pair, what a substep takes back
 FADE = 31 / 32  # of how much more often than needed a mass was split, what is left a pass later
 
 
@@ -53,8 +54,13 @@ class Contact(Touch):
 
     What is struck by several in one substep bounces off one after the other. Of the pairs that were struck, those take their turn
     that come first for both of their particles; then the next ones, on the new ways. Each blow is between two, so it keeps
-    momentum, and energy if e = 1, however many there are. A pair that overlaps since a third one struck it, and is on its way
-    out, is let go; to push it out would make energy.
+    momentum, and energy if e = 1, however many there are.
+
+    Pushes act like springs, which give back what they took. So among pairs that bounce they are only for overlap that came to be
+    while they acted, or in the substep in which the pair comes to rest. What a blow leaves of an overlap is slack: a third one
+    threw the pair together while no spring was there, and to push it out would make energy. Slack is taken back of the positions
+    alone, an eighth in each substep. A pair with slack rests once it is pressed together more slowly than that is deep; on its
+    way out it is let go.
     """
 
     def __init__(self, friction=0.0, restitution=0.0, *, skin="auto", groups=None, push_out=1.0):
@@ -126,6 +132,7 @@ class Contact(Touch):
         if self.bounces:
             self._on_struck = scene.memory.field("Contact.struck", n)
             self._on_kick = scene.memory.field("Contact.kick", n, width=dim)
+            self._on_lift = scene.memory.field("Contact.lift", n, width=dim)
             self._on_left = scene.memory.field("Contact.left", n)
             self._on_partner = scene.memory.field("Contact.partner", n, kind=ti.i32)
             self._on_first = scene.memory.field("Contact.first", n, kind=ti.i32)
@@ -137,8 +144,9 @@ class Contact(Touch):
         self._on_blow = Luggage("blow", 0, lasting=False)
         luggage = [self._on_push, *([self._on_slip] if self.rubs else [])]
         if self.bounces:
+            self._on_slack = Luggage("slack", 0, lasting=True)  # of the overlap, what no push is for
             self._on_given = Luggage("given", 0, lasting=True)  # pushes and blows in the last substep [kg m]
-            luggage += [self._on_blow, self._on_given]
+            luggage += [self._on_slack, self._on_blow, self._on_given]
         self._on_grid = Grid(scene, self._on_size, linked, self.table, luggage, team, self._on_move)
         self._on_calm = Calm(self)
         return self._on_grid
@@ -212,13 +220,16 @@ class Contact(Touch):
     def forget(self, i, word, gone):
         """Some pairs do not touch any more."""
         while gone != 0:
-            self._on_push.field[self._on_grid.first[i] + word * WORD + lowest(gone)] = 0
+            e = self._on_grid.first[i] + word * WORD + lowest(gone)
+            self._on_push.field[e] = 0
+            if ti.static(self._on_bounces):
+                self._on_slack.field[e] = 0
             gone &= gone - ti.u32(1)
 
     @ti.func
     def relax(self, i, first, fresh):
         """What the pairs of particle i want of it."""
-        total, w = ti.zero(self._on_state.x[i]), self._on_state.w.of(i)
+        total, lift, w = ti.zero(self._on_state.x[i]), ti.zero(self._on_state.x[i]), self._on_state.w.of(i)
         if ti.static(self._on_bounces):
             if first != 0:
                 self._on_struck[i] = self._on_split[i]
@@ -235,21 +246,25 @@ class Contact(Touch):
                     shared, last = self._on_split[i] + self._on_split[j], self._on_push.field[e]
                     overlap, each, n = self.meet(i, j, self.far(i, j), shared)
                     each *= ti.static(RELAXATION)
-                    part = overlap * each
-                    given, push, alone = ti.zero(part), ti.zero(part), w + self._on_state.w.of(j)
+                    paid, given, rests, alone = overlap, ti.zero(overlap), True, w + self._on_state.w.of(j)
+                    if ti.static(self._on_bounces):
+                        given, slack, rests = self.bounce(i, j, n, overlap, self._on_slack.field[e], last, first)
+                        if first != 0:
+                            back = ti.static(UPTAKE) * ti.min(slack * each, slack / alone)
+                            lift += w * back * n
+                            self._on_slack.field[e] = slack - alone * back
+                        paid -= slack
+                    part, push = paid * each, ti.zero(overlap)
                     if first == 0:
                         push = last
                     elif fresh == 0:
                         part += ti.max(ti.min(1 - alone * each, ti.static(CARRY)), 0) * last
-                    part = lesser(part, overlap / alone)  # without a branch: it would be taken at random
+                    part = lesser(part, paid / alone)  # without a branch: it would be taken at random
                     if ti.static(self._on_bounces):
-                        given, rests = self.bounce(i, j, n, overlap, last, first)
                         if given > 0:
                             self._on_blow.field[e] = 1
                             if self._on_hit[None] == 0:
                                 self._on_hit[None] = 1
-                            if given <= overlap:  # deep from before: what remains of it rests in the next substep
-                                push = part
                         if not rests:
                             part = ti.zero(part)
                         self._on_given.field[e] = self._on_given.field[e] + part
@@ -260,21 +275,28 @@ class Contact(Touch):
                     total += w * want
                     self._on_push.field[e] = push
         self._on_move[i] = total
+        if ti.static(self._on_bounces):
+            self._on_lift[i] = lift
 
     @ti.func
-    def bounce(self, i, j, n, overlap, last, first):
-        """The displacement that takes a pair that was struck in this substep from coming together to leaving, 0 for others; and
-        whether it rests, so that its overlap is pushed out, as it was in the last substep."""
+    def bounce(self, i, j, n, overlap, slack, last, first):
+        """The displacement that takes a pair that was struck in this substep from coming together to leaving, 0 for others; its
+        slack; and whether it rests, so that it is pushed apart, as it was in the last substep."""
         given, here, a = self.leap(i, j, n)
         rests = True
         if self.table.of(i, j)[2] > 0:
+            deep = ti.select(last > 0, overlap, slack)
+            if last == 0:
+                slack = ti.max(slack, overlap - ti.max(here, 0))
             if a > 0:
-                rests = last > 0 and (first == 0 or given <= overlap)
+                rests = deep > 0 and (first == 0 or given <= deep)
             elif a < 0:
                 rests = last > 0 or overlap <= here
         if rests or a < 0 or first == 0:
             given = 0 * given
-        return given, rests
+        if not rests:
+            slack = ti.select(given > 0, ti.max(overlap - given, 0), 0)
+        return given, ti.min(slack, overlap), rests
 
     @ti.func
     def leap(self, i, j, n):
@@ -331,18 +353,25 @@ class Contact(Touch):
         """Move particle i as its pairs want."""
         if self._on_state.w.of(i) > 0:  # what touches nothing moves by 0, without a branch
             self._on_state.shift(i, self._on_move[i])
+            if ti.static(self._on_bounces):
+                self._on_state.advance(i, self._on_lift[i])
 
     @ti.func
     def remember(self, i):
-        """At the end of a substep: add to each pair's slip what it has moved, as far as friction can hold it."""
+        """At the end of a substep: add to each pair's slip what it has moved, as far as friction can hold it; a pair that parted
+        has no slack."""
         for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
             j = self._on_grid.near[e]
             overlap, n = self.touch(i, j, self.far(i, j))
-            slip = 0 * self._on_state.x[i]
-            if overlap > 0:
-                pressed = self._on_push.field[e] * (self._on_split[i] + self._on_split[j])
-                slip = self.rub(i, j, n, ti.max(overlap, pressed), self._on_slip.field[e])
-            self._on_slip.field[e] = slip
+            if ti.static(self._on_rubs):
+                slip = 0 * self._on_state.x[i]
+                if overlap > 0:
+                    pressed = self._on_push.field[e] * (self._on_split[i] + self._on_split[j])
+                    slip = self.rub(i, j, n, ti.max(overlap, pressed), self._on_slip.field[e])
+                self._on_slip.field[e] = slip
+            if ti.static(self._on_bounces):
+                if overlap <= 0:
+                    self._on_slack.field[e] = 0
 
 
 @ti.func

@@ -315,15 +315,16 @@ class Polygons(Rim):
     @ti.func
     def remember(self, i):
         """At the end of a substep: add to the slip of each contact what it has moved, as far as friction can hold it."""
-        for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
-            slip = 0 * self._on_state.x[i]
-            at, v, a, b, t, _ = self.meeting(i, e, VERTEX)
-            if at >= 0:
-                met = self._on_met.field[at]
-                if met[0] > 0:
-                    n = ti.Vector([met[2], met[3]])
-                    slip = self.held(v, a, n, met[0], self._on_slip.field[e] + self.relative(v, a, b, t))
-            self._on_slip.field[e] = slip
+        if ti.static(self._on_rubs):
+            for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
+                slip = 0 * self._on_state.x[i]
+                at, v, a, b, t, _ = self.meeting(i, e, VERTEX)
+                if at >= 0:
+                    met = self._on_met.field[at]
+                    if met[0] > 0:
+                        n = ti.Vector([met[2], met[3]])
+                        slip = self.held(v, a, n, met[0], self._on_slip.field[e] + self.relative(v, a, b, t))
+                self._on_slip.field[e] = slip
 
     @ti.func
     def overlaps(self, i):
