@@ -360,18 +360,23 @@ class Contact(Touch):
     def remember(self, i):
         """At the end of a substep: add to each pair's slip what it has moved, as far as friction can hold it; a pair that parted
         has no slack."""
-        for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
-            j = self._on_grid.near[e]
-            overlap, n = self.touch(i, j, self.far(i, j))
-            if ti.static(self._on_rubs):
+        if ti.static(self._on_rubs):
+            for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
+                j = self._on_grid.near[e]
+                overlap, n = self.touch(i, j, self.far(i, j))
                 slip = 0 * self._on_state.x[i]
                 if overlap > 0:
                     pressed = self._on_push.field[e] * (self._on_split[i] + self._on_split[j])
                     slip = self.rub(i, j, n, ti.max(overlap, pressed), self._on_slip.field[e])
                 self._on_slip.field[e] = slip
-            if ti.static(self._on_bounces):
-                if overlap <= 0:
-                    self._on_slack.field[e] = 0
+        if ti.static(self._on_bounces):
+            if self._on_split[i] > 0:
+                for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
+                    if self._on_slack.field[e] > 0:
+                        j = self._on_grid.near[e]
+                        overlap, _n = self.touch(i, j, self.far(i, j))
+                        if overlap <= 0:
+                            self._on_slack.field[e] = 0
 
 
 @ti.func
