@@ -59,8 +59,8 @@ class Contact(Touch):
     Pushes act like springs, which give back what they took. So among pairs that bounce they are only for overlap that came to be
     while they acted, or in the substep in which the pair comes to rest. What a blow leaves of an overlap is slack: a third one
     threw the pair together while no spring was there, and to push it out would make energy. Slack is taken back of the positions
-    alone, an eighth in each substep. A pair with slack rests once it is pressed together more slowly than that is deep; on its
-    way out it is let go.
+    alone, an eighth in each substep. A pair with slack rests unless it is thrown together by more than that in a substep, or e is
+    1; otherwise it bounces again, or is let go on its way out.
     """
 
     def __init__(self, friction=0.0, restitution=0.0, *, skin="auto", groups=None, push_out=1.0):
@@ -283,15 +283,15 @@ class Contact(Touch):
         """The displacement that takes a pair that was struck in this substep from coming together to leaving, 0 for others; its
         slack; and whether it rests, so that it is pushed apart, as it was in the last substep."""
         given, here, a = self.leap(i, j, n)
-        rests = True
-        if self.table.of(i, j)[2] > 0:
-            deep = ti.select(last > 0, overlap, slack)
+        rests, e = True, self.table.of(i, j)[2]
+        if e > 0:
+            deep = ti.select(last > 0, overlap, ti.select(e < 1, slack, 0))  # nothing that is elastic rests where nothing pulls
             if last == 0:
                 slack = ti.max(slack, overlap - ti.max(here, 0))
             if a > 0:
                 rests = deep > 0 and (first == 0 or given <= deep)
             elif a < 0:
-                rests = last > 0 or overlap <= here
+                rests = deep > 0 or overlap <= here
         if rests or a < 0 or first == 0:
             given = 0 * given
         if not rests:
