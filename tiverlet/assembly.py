@@ -111,9 +111,9 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     kind = Substep if scene.order == 2 else composition.Composition
     substep = kind(scene, accelerations, batches, drivers, contact, grid, walls, team)
     survey = Survey(substep)
-    memory.place()
     if grid and contact:
         grid.allocate(int(len(particles) * max(ROOM[scene.radius.uniform][particles.dim - 2], contact.room)) + 64)
+    memory.place()
     return Assembly(path, solver, memory, scene, batches, grid, substep, survey)
 
 

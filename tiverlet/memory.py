@@ -6,6 +6,7 @@ these into an error that says what to do, so that no other module has to know.
 """
 
 import ctypes
+import weakref
 from dataclasses import dataclass
 from typing import Any
 
@@ -61,6 +62,7 @@ class Memory:
         self._runtime = impl.get_runtime()
         self._transfers: dict[tuple, _Transfer] = {}  # compiled once, since that costs more than running them
         self._views: dict[int, np.ndarray] | None = None  # see _seen()
+        self._address = 0  # of the first element of the first field
 
     def field(self, name: str, length: int | None, *, width: int = 0, kind=None, values=None, state: bool = False) -> Any:
         """Declare a field of `length` elements (None: a single one, of 0 dimensions) and give it its first values."""
@@ -91,6 +93,7 @@ class Memory:
     def _finish(self) -> None:
         self._trees = [builder.finalize() for builder in self._builders.values()]
         runtime.trees += len(self._trees)
+        _unseen[self] = None
 
     def _seen(self) -> dict[int, np.ndarray]:
         """Arrays that are the fields, by the id of the entry; none where the host cannot see them.
@@ -102,11 +105,16 @@ class Memory:
         return self._views
 
     def _look(self) -> dict[int, np.ndarray]:
-        first, out = self.entries[0], {}
-        with self.compiler():
-            address = _Place(first.field, bool(first.length)).address()
-        (start, *_), tree = _chain(first.field)
-        memory = (ctypes.c_char * tree.cell_size_bytes).from_address(address - start)
+        if self in _unseen:  # for all that wait for it by one kernel, since that takes as long as for one
+            waiting = [m for m in _unseen if m._trees and m._runtime is self._runtime]
+            addresses = np.zeros(len(waiting), dtype=np.uint64)
+            with self.compiler():
+                _Places([m.entries[0] for m in waiting]).find(addresses)
+            for memory, address in zip(waiting, addresses.tolist(), strict=True):
+                memory._address = address
+            _unseen.clear()
+        (start, *_), tree = _chain(self.entries[0].field)
+        memory, out = (ctypes.c_char * tree.cell_size_bytes).from_address(self._address - start), {}
         for e in self.entries:
             offsets, _ = _chain(e.field)
             cell = e.field.parent().ptr.cell_size_bytes
@@ -209,6 +217,7 @@ class Memory:
         return self._transfers[key]
 
 
+_unseen: weakref.WeakKeyDictionary[Memory, None] = weakref.WeakKeyDictionary()  # placed, nobody knows where
 _NUMPY = {ti.f32: np.float32, ti.f64: np.float64, ti.i32: np.int32, ti.u32: np.uint32}
 
 
@@ -238,16 +247,17 @@ def _chain(field) -> tuple[list[int], Any]:
 
 
 @ti.data_oriented
-class _Place:
-    """Where a field is."""
+class _Places:
+    """Where fields are."""
 
-    def __init__(self, field, many: bool):
-        self.field, self.at = field, [0] if many else []
+    def __init__(self, entries: list[Entry]):
+        self.plan = [(k, e.field, [0] if e.length else []) for k, e in enumerate(entries)]
 
     @ti.kernel
-    def address(self) -> ti.u64:  # type: ignore[valid-type]
-        """Of its first element."""
-        return ti.get_addr(self.field, ti.static(self.at))
+    def find(self, out: ti.types.ndarray(ti.u64, 1)):  # type: ignore[valid-type]
+        """The addresses of their first elements."""
+        for k, field, at in ti.static(self.plan):
+            out[k] = ti.get_addr(field, ti.static(at))
 
 
 @ti.data_oriented
