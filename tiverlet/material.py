@@ -8,6 +8,7 @@ import taichi as ti
 
 from . import checks
 from .feature import Scene
+from .tools import distinct
 
 
 def friction_of(who: str, name: str, value: Any) -> tuple[float, float]:
@@ -46,7 +47,7 @@ class Table:
 
     def rows(self, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The rank of each particle's group, (n,), and the table, (ranks * ranks, 4)."""
-        names, rank = np.unique(group, return_inverse=True)
+        names, rank, _ = distinct(group)
         at = {int(name): k for k, name in enumerate(names)}
         m = len(names)
         table = np.zeros((m, m, 4))

@@ -12,6 +12,7 @@ from ..grid import FARTHEST, WORD, Grid, Luggage, lowest
 from ..material import Table
 from ..particles import Particles
 from ..team import Team
+from ..tools import median
 from ..touch import Touch
 
 RELAXATION = 1.25  # below 4/3, see Contact
@@ -89,7 +90,7 @@ class Contact(Touch):
         """Choose the skin, and refuse positions too far out for cells to be told apart."""
         radius = particles.radius
         some = radius[radius > 0]
-        auto = 0.75 * float(np.median(some)) if len(some) else 1.0
+        auto = 0.75 * median(some) if len(some) else 1.0
         self._on_size = auto if self.skin == "auto" else float(self.skin)
         self._on_finest = float(radius.min(initial=np.inf))
         self.matters = len(some) > 0

@@ -15,6 +15,7 @@ from ..grid import Grid, Luggage
 from ..material import Table
 from ..particles import Particles, Radii
 from ..team import Team
+from ..tools import median
 from .contact import Contact
 from .rim import VERTEX, Rim, area_of, depth_of
 
@@ -85,11 +86,11 @@ class Polygons(Rim):
         # Two particles are listed when their reaches add up: a vertex with both ends of an edge that it is beside.
         self._on_length = length
         far = 1.5 * STRETCH * length
-        share = float(np.median(far[far > 0])) / 2 if self.loops else 0.0
+        share = median(far[far > 0]) / 2 if self.loops else 0.0
         self._on_cover = particles.radius + np.maximum(share, far - share)
         loops = self._on_body >= 0
         self._on_reach = float(length[loops].min(initial=np.inf)) / 4
-        self._on_size = 0.15 * float(np.median(self._on_cover)) if self.skin == "auto" else float(self.skin)
+        self._on_size = 0.15 * median(self._on_cover) if self.skin == "auto" else float(self.skin)
         self._on_finest = float(self._on_cover.min(initial=np.inf))
         self.table = copy.copy(self.table)  # which is bound to one world
         self.matters = n > 0 and bool(self.loops or (particles.radius > 0).any())

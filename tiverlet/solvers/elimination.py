@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ..tools import distinct
+
 
 @dataclass
 class Plan:
@@ -55,8 +57,8 @@ def plan(count: int, owner: np.ndarray, item: np.ndarray, width: int) -> Plan:
     """
     label = components(count, owner, item)
     crowd = np.bincount(item, minlength=1)
-    refused = np.unique(label[owner[crowd[item] > width + 1]])
-    touched = np.unique(owner)
+    refused = distinct(label[owner[crowd[item] > width + 1]])[0]
+    touched = distinct(owner)[0]
     touched = touched[~np.isin(label[touched], refused)]
     corners: dict[int, list[int]] = defaultdict(list)
     sharing: dict[int, list[int]] = defaultdict(list)
