@@ -107,7 +107,7 @@ class Composition(Substep):
         ti.loop_config(serialize=True)
         for _ in range(1):
             h64, whole, t = reals[0], reals[0] / self.first, reals[1]
-            fresh, substeps, iterations, came = counts[2], counts[3], counts[4], counts[8]
+            fresh, substeps, iterations, came = counts[2], counts[3], counts[4], counts[9]
             for s in range(substeps):
                 for q in range(self.count):
                     g = self.table[q]

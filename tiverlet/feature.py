@@ -26,6 +26,7 @@ import numpy as np
 import taichi as ti
 
 from .arguments import Noted
+from .compiling import at, inline
 from .memory import Memory
 from .particles import Particles, State
 
@@ -237,10 +238,10 @@ class Batch(Feature):
                 f"{self!r}.slots", self.count, width=self.arity, kind=ti.i32, values=scene.slots.places(self)
             )
 
-    @ti.func
-    def member(self, c, k: ti.template()):  # type: ignore[valid-type]
+    @inline
+    def member(self, c, k):
         """The particle at corner k of constraint c."""
-        return self._on_members[c][k]
+        return at(at(self._on_members, c), k)
 
     @ti.func
     def push(self, c, k: ti.template(), move):  # type: ignore[valid-type]

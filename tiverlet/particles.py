@@ -5,6 +5,7 @@ import taichi as ti
 from numpy.typing import ArrayLike
 
 from . import checks
+from .compiling import at, inline
 from .memory import Memory
 
 LARGEST = 1e15  # [m] beyond this, squared lengths near 1e38 leave f32; nothing physical is that far
@@ -144,21 +145,16 @@ class State:
         if self.compensated:
             memory.write(self.low, position - position.astype(np.float32))
 
-    @ti.func
+    @inline
     def apart(self, i, j):
         """x_i - x_j, with the low words where there are any."""
-        r = self.x[i] - self.x[j]
-        if ti.static(self.compensated):
-            r += self.low[i] - self.low[j]
-        return r
+        r = at(self.x, i) - at(self.x, j)
+        return r + (at(self.low, i) - at(self.low, j)) if self.compensated else r
 
-    @ti.func
+    @inline
     def place(self, i):
         """x_i as one number per axis."""
-        x = self.x[i]
-        if ti.static(self.compensated):
-            x += self.low[i]
-        return x
+        return at(self.x, i) + at(self.low, i) if self.compensated else at(self.x, i)
 
     @ti.func
     def begin(self, i):
@@ -228,13 +224,10 @@ class Shared:
         if not self.uniform:
             self.field = memory.field(name, len(values), values=values)
 
-    @ti.func
+    @inline
     def of(self, i):
         """That of particle i."""
-        value = ti.cast(self.constant, self.real)
-        if ti.static(not self.uniform):
-            value = self.field[i]
-        return value
+        return ti.cast(self.constant, self.real) if self.uniform else at(self.field, i)
 
 
 class Radii(Shared):

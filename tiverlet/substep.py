@@ -15,8 +15,8 @@ from .team import LEAST
 
 # What a frame is given. REALS: the substep, and the times at the start and the end of the frame [s]. COUNTS: substeps so far, and
 # since the last start; whether it starts; how many substeps and iterations; where it goes on if it stopped to have the list grown
-# (substep, iteration, 1); how the state that it leaves came about, see Survey.
-REALS, COUNTS = 3, 9
+# (substep, iteration, 1); 0, the number of the first thread; how the state that it leaves came about, see Survey.
+REALS, COUNTS = 3, 10
 HALT = 16  # among the figures of a frame: whether, in which substep and before which iteration it stopped to have the list grown;
 # how many threads of a team were at work
 REBOUNDS = 8  # rounds of restitution in a substep, at most
@@ -34,8 +34,7 @@ class Substep(Phases):
         ti.loop_config(serialize=self.team.size == 1)
         for thread in range(self.team.spread):
             if thread % LEAST == 0:
-                me = thread // LEAST
-                self.frame(me, reals, counts, out)
+                self.frame(counts[8] + thread // LEAST, reals, counts, out)
 
     @ti.func
     def frame(self, me, reals: ti.template(), counts: ti.template(), out: ti.template()):  # type: ignore[valid-type]
@@ -43,18 +42,17 @@ class Substep(Phases):
         where the others wait."""
         h64, t, end = reals[0], reals[1], reals[2]
         tick, since, fresh, substeps, iterations = counts[0], counts[1], counts[2], counts[3], counts[4]
-        begin, it0, resumed, came = counts[5], counts[6], counts[7], counts[8]
+        begin, it0, resumed, came = counts[5], counts[6], counts[7], counts[9]
         for s in range(begin, substeps + 1):
             h, more = ti.cast(h64, self.real), s < substeps
             when = self.clock(s, substeps)
-            starts = fresh if s == 0 else 0
-            again = resumed if s == begin else 0
+            starts, again = ti.select(s == 0, fresh, 0), ti.select(s == begin, resumed, 0)
             if self.team.works(me) and self.halted() == 0:
                 if more and again == 0:
                     self.predict(
                         me, h, ti.cast(t + s * h64, self.real), tick + s, starts, when, self.calming(since + s)
                     )  # fmt: skip
-                for it in range(it0 if again != 0 else 0, iterations if more else 1):
+                for it in range(ti.select(again != 0, it0, 0), ti.select(more, iterations, 1)):
                     if ti.static(self.hashes):
                         if self.halted() == 0 and self.is_stale() != 0:
                             self.grid.build(me)

@@ -144,7 +144,7 @@ class Survey:
     @ti.kernel
     def measure(self, reals: ti.types.ndarray(ti.f64, 1), counts: ti.types.ndarray(ti.i32, 1), out: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
         """All figures."""
-        h64, t64, came = reals[0], reals[2], counts[8]
+        h64, t64, came = reals[0], reals[2], counts[9]
         self.weigh(0, h64, came)
         self.sum_up(0, h64, t64, came, out)
 
@@ -162,7 +162,7 @@ class Survey:
                 self.parts[k * BLOCKS], self.low[k * BLOCKS], self.high[k * BLOCKS] = self.fold(k * BLOCKS, 1)
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, me)):
-            for k in ti.static(range(FIGURES)):
+            for k in range(FIGURES):
                 out[k] = 0  # what nobody writes comes back from a GPU as it was there
             total, low, high = self.fold(0, self.blocks // BLOCKS)
             for k in ti.static(range(6)):

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 import taichi as ti
 
 from . import runtime
+from .compiling import inline
 from .memory import Memory
 
 LEAST = 512  # iterations of a loop that Taichi gives to a CPU thread, at least
@@ -73,69 +74,75 @@ class Team:
                 if self._alone == 0:
                     self.hands[None] = self.size
 
-    @ti.func
+    @inline
     def works(self, me):
         """Whether thread `me` takes part in the coming substep; all must ask."""
-        out = True
-        if ti.static(self.size > 1):
-            hands = self.hands[None]
-            out = me < hands
-            if out:
-                self.meet(hands)
-                if me == 0 and self.late[None] >= LONG:
-                    self.hands[None] = 1
-                self.meet(hands)
-                out = me < self.hands[None]
-        return out
+        return self._works(me) if self.size > 1 else True
 
-    @ti.func
-    def low(self, n: ti.template(), me):  # type: ignore[valid-type]
-        """Where the share begins."""
-        if ti.static(self.size > 1):
-            hands = self.hands[None]
-            return ti.min(me * ((n + hands - 1) // hands), n)
-        return 0
+    @inline
+    def low(self, n, me):
+        """Where the share begins. That of a single thread begins at 0, which LLVM must not know: it would write out loops over
+        few particles, one by one, and take half as long again for all."""
+        return self._share(n, me) if self.size > 1 else me * n
 
-    @ti.func
-    def high(self, n: ti.template(), me):  # type: ignore[valid-type]
+    @inline
+    def high(self, n, me):
         """Where it ends."""
-        if ti.static(self.size > 1):
-            hands = self.hands[None]
-            return ti.min((me + 1) * ((n + hands - 1) // hands), n)
-        return n
+        return self._share(n, me + 1) if self.size > 1 else n
 
-    @ti.func
-    def deal(self, n: ti.template(), unit: ti.template(), me):  # type: ignore[valid-type]
+    @inline
+    def deal(self, n, unit, me):
         """How many of n things fall to thread `me` where they are dealt out in turn, `unit` at a time."""
-        out = n
-        if ti.static(self.size > 1):
-            hands, units = self.hands[None], ti.static(-(-n // unit))
-            out = (units - me + hands - 1) // hands * unit
-            if (units - 1) % hands == me:
-                out -= ti.static(-(-n // unit) * unit - n)
-        return out
+        return self._deal(n, unit, me) if self.size > 1 else n
 
-    @ti.func
-    def turn(self, k, unit: ti.template(), me):  # type: ignore[valid-type]
+    @inline
+    def turn(self, k, unit, me):
         """Which of them is the k-th."""
-        out = k
-        if ti.static(self.size > 1):
-            before = ti.cast(ti.cast(k, ti.u32) // ti.u32(unit), ti.i32)  # i32 would look at the sign
-            out = k + (before * (self.hands[None] - 1) + me) * unit
-        return out
+        return self._turn(k, unit, me) if self.size > 1 else me + k
 
-    @ti.func
-    def one(self, n: ti.template(), me):  # type: ignore[valid-type]
+    @inline
+    def one(self, n, me):
         """All of it for one of them, nothing for the others."""
-        if ti.static(self.size > 1):
-            return ti.select(me == 0, n, 0)
-        return n
+        return ti.select(me == 0, n, 0) if self.size > 1 else n
 
-    @ti.func
+    @inline
     def wait(self):
         """Go on once all have come here, with what they have written."""
-        if ti.static(self.size > 1):
-            self.meet(self.hands[None])
+        return self._wait() if self.size > 1 else None
+
+    @ti.func
+    def _works(self, me):
+        hands = self.hands[None]
+        out = me < hands
+        if out:
+            self.meet(hands)
+            if me == 0 and self.late[None] >= LONG:
+                self.hands[None] = 1
+            self.meet(hands)
+            out = me < self.hands[None]
+        return out
+
+    @ti.func
+    def _share(self, n: ti.template(), k):  # type: ignore[valid-type]
+        hands = self.hands[None]
+        return ti.min(k * ((n + hands - 1) // hands), n)
+
+    @ti.func
+    def _deal(self, n: ti.template(), unit: ti.template(), me):  # type: ignore[valid-type]
+        hands, units = self.hands[None], ti.static(-(-n // unit))
+        out = (units - me + hands - 1) // hands * unit
+        if (units - 1) % hands == me:
+            out -= ti.static(-(-n // unit) * unit - n)
+        return out
+
+    @ti.func
+    def _turn(self, k, unit: ti.template(), me):  # type: ignore[valid-type]
+        before = ti.cast(ti.cast(k, ti.u32) // ti.u32(unit), ti.i32)  # i32 would look at the sign
+        return k + (before * (self.hands[None] - 1) + me) * unit
+
+    @ti.func
+    def _wait(self):
+        self.meet(self.hands[None])
 
     @ti.func
     def meet(self, hands):
