@@ -178,7 +178,7 @@ class Content(Scalar, Ragged):
             sums[4] += self._on_slots.split[i] * g.dot(g)
             sums[5] += self._on_slots.split[i] * n.dot(n)
             sums[6] += self.arm(e, i0, 0).norm_sqr()
-            sums[7] += self._on_w.of(i) ** 2 * ti.max(g.dot(g), n.dot(n))
+            sums[7] += self._on_w.of(i) * self._on_w.of(i) * ti.max(g.dot(g), n.dot(n))
             self._on_start[e] = n
         self._on_sums[b] = sums
 

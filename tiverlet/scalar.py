@@ -11,6 +11,7 @@ from .breaking import Breaking
 from .compliance import law, stiff
 from .feature import FAR, Scene
 from .particles import Particles
+from .tools import distinct
 
 # Where constraints converge within a substep, SHAKE is an explicit method for what is across them, with its limits:
 TENSEST = 4.0  # (omega h)^2 of a vibration across a tension, beyond which Verlet diverges
@@ -137,7 +138,7 @@ class Scalar(Breaking):
         ordered = self.indices.copy()
         for group in [range(self.arity)] if self.exchangeable is None else self.exchangeable:
             ordered[:, group] = np.sort(ordered[:, group], axis=1)
-        unique, counts = np.unique(ordered, axis=0, return_counts=True)
+        unique, _, counts = distinct(ordered)
         if len(unique) < len(ordered):
             first = tuple(int(v) for v in unique[int(np.argmax(counts > 1))])
             warnings.warn(
@@ -223,6 +224,19 @@ class Scalar(Breaking):
         return q
 
     @ti.func
+    def ends(self, c):
+        """Corners of constraint c, as above, now and at the start of the substep."""
+        i = self.member(c, 0)
+        now = ti.Matrix.zero(self._on_real, self.arity, self._on_state.dim)
+        start = now
+        for k in ti.static(range(1, self.arity)):
+            j = self.member(c, k)
+            r, moved = self._on_state.apart(j, i), self._on_state.d[j] - self._on_state.d[i]
+            for a in ti.static(range(self._on_state.dim)):
+                now[k, a], start[k, a] = r[a] - 0 * moved[a], r[a] - moved[a]
+        return now, start
+
+    @ti.func
     def dashpot(self, c):
         """Damping of constraint c."""
         out = ti.cast(0, self._on_real)
@@ -254,19 +268,20 @@ class Scalar(Breaking):
         """
         if first != 0:
             self.begin(c, fresh)
-        f, g = self.measure(c, self.corners(c, 0))
-        f0, n = self.measure(c, self.corners(c, 1))
+        now, start = self.ends(c)
+        f, g = self.measure(c, now)
+        f0, n = self.measure(c, start)
         f0 = self.near(f0, self._on_rest[c])
         f = self.near(f, f0)
         w = ti.cast(0, self._on_real)  # sum of w |grad|^2, then mass-split: along both, current, start
         both, here, there = ti.cast(0, self._on_real), ti.cast(0, self._on_real), ti.cast(0, self._on_real)
         for k in ti.static(range(self.arity)):
             i = self.member(c, k)
-            gg = g[k, :].dot(g[k, :])
+            gg, split = g[k, :].dot(g[k, :]), self._on_slots.split[i]
             w += self._on_w.of(i) * gg
-            both += self._on_slots.split[i] * g[k, :].dot(n[k, :])
-            here += self._on_slots.split[i] * gg
-            there += self._on_slots.split[i] * n[k, :].dot(n[k, :])
+            both += split * g[k, :].dot(n[k, :])
+            here += split * gg
+            there += split * n[k, :].dot(n[k, :])
         turn = self._on_slots.turn(both, ti.sqrt(here * there))
         lost = turn == FAR
         if ti.static(self._on_firm):
@@ -310,7 +325,12 @@ class Scalar(Breaking):
 
         extent: squared size of the body. move: squared size of what a multiplier of 1 moves.
         """
-        reach = ti.sqrt(extent) + ti.pow(ti.abs(self._on_rest[c]), ti.static(1 / self.collapses))
+        size = ti.abs(self._on_rest[c])
+        if ti.static(self.collapses == 2):
+            size = ti.sqrt(size)
+        else:
+            size = ti.pow(size, ti.static(1 / self.collapses))
+        reach = ti.sqrt(extent) + size
         far = ti.abs(new - lam) * ti.sqrt(move)
         if far > reach:
             new = lam + (new - lam) * (reach / far)
@@ -348,7 +368,8 @@ class Scalar(Breaking):
                 if ti.static(self.collapses > 0):
                     move = ti.cast(0, self._on_real)
                     for k in ti.static(range(self.arity)):
-                        move += self._on_w.of(self.member(c, k)) ** 2 * n[k, :].dot(n[k, :])
+                        w = self._on_w.of(self.member(c, k))
+                        move += w * w * n[k, :].dot(n[k, :])
                     new = self.tempered(c, lam, new, self.corners(c, 0).norm_sqr(), move)
                 step = new - lam
                 if ti.static(self._on_hurries):

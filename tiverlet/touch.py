@@ -31,6 +31,18 @@ class Touch(Feature):
         return far
 
     @ti.func
+    def depth(self, i, j, far):
+        """The overlap alone."""
+        r = self._on_state.apart(i, j)
+        rr = r.dot(r)
+        overlap = 0 * far - 1
+        if rr < far * far:
+            overlap = far
+            if rr > far * far * ti.static(2.0**-80):
+                overlap = far - ti.sqrt(rr)
+        return overlap
+
+    @ti.func
     def touch(self, i, j, far):
         """Overlap [m] of a pair that touches at a distance `far` (negative where apart) and its direction, from j to i."""
         r = self._on_state.apart(i, j)
@@ -136,7 +148,7 @@ class Touch(Feature):
             j = self._on_grid.near[e]
             if j > i:
                 a, b = self._on_radius.of(i), self._on_radius.of(j)
-                overlap, _ = self.touch(i, j, a + b)
+                overlap = self.depth(i, j, a + b)
                 if overlap > 0:
                     small = ti.min(a, b)
                     if small == 0:

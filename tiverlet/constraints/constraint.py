@@ -163,6 +163,11 @@ class Constraint(Scalar):
         return q
 
     @ti.func
+    def ends(self, c):
+        """Corners now and at the start."""
+        return self.corners(c, 0), self.corners(c, 1)
+
+    @ti.func
     def measure(self, c, q):
         """The function and its gradient; nothing where they are not finite."""
         f, g = self._on_slopes.both(c, ti.cast(q, ti.f64))

@@ -142,8 +142,8 @@ class Elimination(System):
     def eliminate(self, begin, end):
         """Each row from those that it is coupled to, then back."""
         for r in range(begin, end):
-            first, last = self.entry_begin[r], self.entry_begin[r + 1]
-            if ti.abs(self.value[r]) <= REDUNDANT * self.weight[r]:
+            first, last, pivot, step = self.entry_begin[r], self.entry_begin[r + 1], self.value[r], self.step[r]
+            if ti.abs(pivot) <= REDUNDANT * self.weight[r]:
                 self.value[r] = 1
                 self.step[r] = 0
                 for e in range(first, last):
@@ -151,10 +151,11 @@ class Elimination(System):
             else:
                 u = self.update_begin[r]
                 for e in range(first, last):
-                    part = self.value[self.rows + self.entries + e] / self.value[r]
-                    self.step[self.column[e]] = self.step[self.column[e]] - part * self.step[r]
+                    part, later = self.value[self.rows + self.entries + e] / pivot, self.column[e]
+                    self.step[later] = self.step[later] - part * step
                     for k in range(first, last):
-                        self.value[self.update[u]] = self.value[self.update[u]] - part * self.value[self.rows + k]
+                        at = self.update[u]
+                        self.value[at] = self.value[at] - part * self.value[self.rows + k]
                         u += 1
         for k in range(end - begin):
             r = end - 1 - k
@@ -203,9 +204,10 @@ class Elimination(System):
         """The largest (omega h)^2 of a transverse vibration under the multipliers found, and the stiffness behind it."""
         worst, size, steps = ti.cast(0, ti.f64), ti.cast(0, ti.f64), ti.cast(0, ti.f64)
         for r in range(begin, end):
-            worst = ti.max(worst, self.lever[r] * ti.abs(self.lam[r] + self.step[r]))
+            step = self.step[r]
+            worst = ti.max(worst, self.lever[r] * ti.abs(self.lam[r] + step))
             size += ti.abs(self.violation[r])
-            steps += ti.abs(self.step[r])
+            steps += ti.abs(step)
         return worst, ti.select(steps > 0, size / steps, 0 * size)
 
     @ti.func
