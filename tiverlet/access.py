@@ -64,7 +64,7 @@ class Access:
             self._scene.state.put(self._memory, value)
         self._energy, self._placed = None, 0
         if self._grid:
-            self._grid.stale[None] = 1
+            self._grid.age()
 
     @property
     def velocity(self) -> np.ndarray:

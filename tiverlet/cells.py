@@ -19,6 +19,7 @@ import taichi as ti
 from .feature import Scene
 from .sums import Sums
 from .team import Team
+from .tools import distinct
 
 LEVELS = 14  # the last one holds all that are smaller, down to points
 
@@ -29,12 +30,13 @@ class Cells:
     def __init__(self, scene: Scene, radius: np.ndarray, skin: float, team: Team, scratch: Any):
         self.team = team
         self.place = scratch  # of the particles as they are sorted, while a list is built: read one after the other
+        self.memory = scene.memory
         n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
         self.n, self.dim, self.state, self.real = n, dim, scene.state, scene.real
         self.serial = not team.launched  # counting in order, on one thread, beats atomic counters in parallel on a CPU
         with np.errstate(divide="ignore"):
             level = np.minimum(np.floor(np.log2(radius.max() / radius)), LEVELS - 1).astype(int)
-        used, level = np.unique(level, return_inverse=True)
+        used, level, _ = distinct(level)
         self.levels = len(used)
         largest = np.array([radius[level == m].max() for m in range(self.levels)])
         # Rounding of floor(x * scale) must not hide a neighbour.
@@ -70,8 +72,7 @@ class Cells:
         changed = not np.array_equal(shapes, self._shapes)
         if changed:
             self._shapes = shapes
-            for m in range(self.levels):
-                self.shape[m] = shapes[m].tolist()
+            self.memory.write(self.shape, shapes)
         return changed
 
     @ti.func

@@ -12,12 +12,14 @@ import numpy as np
 import taichi as ti
 
 from .cells import Cells, raised
+from .compiling import FEW
 from .feature import Scene
 from .material import Table
 from .memory import Memory
 from .sorting import exchange, sort, sorting_network
 from .sums import MOST, Sums
 from .team import Team
+from .tools import distinct
 
 CROWDED = 300  # near pairs per particle beyond which the user is told
 FARTHEST = 1 << 22  # cells from the origin: beyond it, f32 cannot tell a cell from the next
@@ -73,7 +75,7 @@ class Grid:
         self.linked = len(linked) > 0
         if self.linked:
             both = np.concatenate([linked, linked[:, ::-1]])
-            both = np.unique(both, axis=0)
+            both = distinct(both)[0]
             begin = np.searchsorted(both[:, 0], np.arange(n + 1))
             self.mates = add("grid.linked", len(both), kind=ti.i32, values=both[:, 1])
             self.mates_begin = add("grid.linked_begin", n + 1, kind=ti.i32, values=begin)
@@ -81,7 +83,8 @@ class Grid:
         self.old_first = add("grid.old_first", n, kind=ti.i32)
         self.old_number = add("grid.old_number", n, kind=ti.i32)
         self.kept = add("grid.kept", None, kind=ti.i32)  # 1: the old list is put aside for the one that is being built
-        self.short = 8 if dim == 2 else 16  # entries of a list that is sorted without branches
+        # Entries of a list that is sorted without branches; to compile that takes an eighth of all.
+        self.short = 1 if n < FEW else 8 if dim == 2 else 16
         self.network = sorting_network(self.short)
         self.near: Any = None
         self.aside: Any = None  # those of the old list that carry something, while a new one is built
@@ -107,7 +110,8 @@ class Grid:
 
     def grow(self) -> None:
         """Make room for what the last build needed, and a quarter more."""
-        each = self.need[None] * self.blocks / self.n
+        need = int(self.memory.read(self.need)[0])
+        each = need * self.blocks / self.n
         if each > CROWDED:
             warnings.warn(
                 f"Contact: up to {each:.0f} near pairs per particle, so steps cost as the square of their number. Particles "
@@ -116,10 +120,10 @@ class Grid:
             )
         assert self.store
         kept = [self.store.read(field) for field in self._fields()]
-        self.allocate(int(self.need[None] * 1.25 + 16) * self.blocks)
+        self.allocate(int(need * 1.25 + 16) * self.blocks)
         for field, values in zip(self._fields(), kept, strict=True):
             self._aside(field, values)
-        self.stale[None] = 1
+        self.age()
 
     def _fields(self) -> list:
         return [self.aside, *(piece.aside for piece in self.bags)]
@@ -140,7 +144,11 @@ class Grid:
         if not all(abs(new - old) <= old / 8 for new, old in zip(extent, self._extent, strict=True)):
             self._extent = extent
             if self.cells.fit(np.asarray(extent)):
-                self.stale[None] = 1
+                self.age()
+
+    def age(self) -> None:
+        """Have a new list built in the next frame."""
+        self.memory.write(self.stale, 1)  # Taichi would compile a kernel for stale[None] = 1
 
     def entries(self) -> tuple[np.ndarray, np.ndarray]:
         """The listed pairs (m, 2) either way round, in order, and where they are in the list."""
@@ -163,7 +171,7 @@ class Grid:
         """Every listed pair (i, j) that carries something lasting other than 0, in order, and what: the same whatever the list's
         layout."""
         assert self.store
-        aside = bool(self.kept[None])  # given by restore(), and not built into a list yet
+        aside = bool(self.memory.read(self.kept)[0])  # given by restore(), and not built into a list yet
         first, number = (self.old_first, self.old_number) if aside else (self.first, self.number)
         i, at = self._entries(first, number)
         near = self.store.read(self.aside if aside else self.near)[at]
@@ -183,7 +191,8 @@ class Grid:
         counts = np.bincount(pairs[:, 0], minlength=max(1, self.n))
         self.memory.write(self.old_first, np.cumsum(counts) - counts)
         self.memory.write(self.old_number, counts)
-        self.kept[None] = self.stale[None] = 1
+        self.memory.write(self.kept, 1)
+        self.age()
 
     @ti.func
     def keep(self, me):
@@ -391,7 +400,7 @@ class Grid:
     @ti.func
     def order(self, begin, count):
         """Sort by index, which makes every sum over the list independent of the table."""
-        if ti.static(self.several):
+        if ti.static(self.several or self.short == 1):
             sort(self.near, begin, count, self.serial)
         elif count > ti.static(self.short):
             sort(self.near, begin, count, self.serial)

@@ -132,7 +132,7 @@ class World(Access):
         sub = self._plain
         if sub["hurries"]:
             with self._memory.compiler():
-                self._sub.slots.kappa[None] = self._solver.condition(iterations)
+                self._memory.write(self._sub.slots.kappa, self._solver.condition(iterations))
         done, frame = substeps if len(self._particles) else 0, self._counted(dt)
         started, end = self._fresh and substeps == 1, frame[0] + frame[1] * frame[2]
         if sub["launched"]:
@@ -215,12 +215,12 @@ class World(Access):
         begin = it0 = resumed = 0
         while True:
             self._reals[:] = self._h, self._time, end
-            self._counts[:] = self._tick, self._since, self._fresh, substeps, iterations, begin, it0, resumed, came
+            self._counts[:] = self._tick, self._since, self._fresh, substeps, iterations, begin, it0, resumed, 0, came
             self._frames()
             if not self._figures[HALT]:
                 return
             resumed, begin, it0 = (int(v) for v in self._figures[HALT : HALT + 3])
-            self._sub.halt[None] = [0, 0, 0]
+            self._memory.write(self._sub.halt, 0)
             self._grow()
 
     def _parallel(self, n: int, iterations: int) -> None:
@@ -255,7 +255,7 @@ class World(Access):
         """Build the neighbour list, growing it until everything fits."""
         assert self._grid
         if not self._sub.launched:
-            self._grid.stale[None] = 1
+            self._grid.age()
             self._look()  # whose kernel is there anyway, and lists
             return
         with self._memory.compiler():
@@ -297,7 +297,7 @@ class World(Access):
         if not self._sub.launched:
             self._fused(0, 1, self._time, came)
             return
-        if self._grid and self._grid.stale[None]:
+        if self._grid and self._memory.read(self._grid.stale)[0]:
             self._list()
         self._reals[:], self._counts[-1] = (self._h, self._time, self._time), came
         self._sums()

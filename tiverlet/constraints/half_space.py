@@ -46,12 +46,14 @@ class HalfSpace(Wall):
 
     def upload(self) -> None:
         """Move from the last offset to the new one."""
-        self._on_offset[None] = [self._on_offset[None][1], self.offset]
+        memory = self.scene.memory
+        memory.write(self._on_offset, [memory.read(self._on_offset)[0, 1], self.offset])
         self.moving = True
 
     def settle(self) -> None:
         """Stay."""
-        self._on_offset[None] = [self._on_offset[None][1]] * 2
+        memory = self.scene.memory
+        memory.write(self._on_offset, memory.read(self._on_offset)[0, 1])
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
         """Lines across the scene: one in 2D, two at right angles in 3D."""

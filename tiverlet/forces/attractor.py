@@ -38,8 +38,8 @@ class Attractor(Acceleration):
 
     def upload(self) -> None:
         """Write both."""
-        self._on_center[None] = list(self.center)
-        self._on_strength[None] = self.strength
+        self.scene.memory.write(self._on_center, self.center)
+        self.scene.memory.write(self._on_strength, self.strength)
 
     @ti.func
     def acceleration(self, i, x, v, t):

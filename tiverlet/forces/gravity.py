@@ -46,7 +46,7 @@ class Gravity(Acceleration):
 
     def upload(self) -> None:
         """Write g."""
-        self._on_g[None] = self._vector()
+        self.scene.memory.write(self._on_g, self._vector())
 
     @ti.func
     def acceleration(self, i, x, v, t):

@@ -37,7 +37,7 @@ class Wind(Acceleration):
 
     def upload(self) -> None:
         """Write rate * velocity."""
-        self._on_push[None] = list(self.rate * self.velocity)
+        self.scene.memory.write(self._on_push, self.rate * self.velocity)
 
     @ti.func
     def acceleration(self, i, x, v, t):
