@@ -9,6 +9,7 @@ Everything here knows the inside of Taichi 1.7.4; with another one, kernels are 
 """
 
 import contextlib
+import gc
 import threading
 from collections.abc import Iterator
 from types import SimpleNamespace
@@ -66,6 +67,8 @@ class Compiler:
             active.append(self)
             forget()
             self._thread = threading.get_ident()
+            collects = gc.isenabled()
+            gc.disable()  # trees are many small objects, none of them garbage
             try:
                 yield
             finally:
@@ -73,6 +76,8 @@ class Compiler:
                 runtime.set_default_fp(literals)
                 _set(config, before)
                 forget()
+                if collects:
+                    gc.enable()
 
     def beware(self) -> None:
         """Be thorough from here on: a function that is not ours is being compiled."""
@@ -89,12 +94,6 @@ def inline(function: Any) -> Any:
     """
     function._is_taichi_function, function.func = True, SimpleNamespace(has_print=False)  # it asks functions for these two
     return function
-
-
-def at(field: Any, index: Any) -> Any:
-    """field[index], in such a function."""
-    runtime: Any = impl.get_runtime()
-    return impl.subscript(runtime.compiling_callable.ast_builder(), field, index)
 
 
 class Quick:

@@ -5,8 +5,9 @@ import taichi as ti
 from numpy.typing import ArrayLike
 
 from . import checks
-from .compiling import at, inline
+from .compiling import inline
 from .memory import Memory
+from .reading import at
 
 LARGEST = 1e15  # [m] beyond this, squared lengths near 1e38 leave f32; nothing physical is that far
 

@@ -6,6 +6,7 @@ import taichi as ti
 
 from . import runtime
 from .calm import EVERY
+from .compiling import FEW
 from .feature import Acceleration, Batch, Scene
 from .scalar import Scalar
 from .team import LEAST, Team
@@ -167,8 +168,10 @@ class Phases:
     @ti.func
     def within(self, tile):
         """Those of a tile of a piece."""
-        piece = tile // self.each
-        first = piece * self.team.piece + tile % self.each * self.tile
+        piece, first = tile, tile * self.team.piece
+        if ti.static(self.each > 1):
+            piece = tile // self.each
+            first = piece * self.team.piece + tile % self.each * self.tile
         return first, ti.min(first + self.tile, (piece + 1) * self.team.piece, self.n)
 
     @ti.func
@@ -205,13 +208,17 @@ class Phases:
     def confine(self, i, h, when):
         """The walls, which have the last word; several take turns until they agree, or for SWEEPS rounds in a sharp corner."""
         if self.state.w.of(i) > 0:
-            moving = True
-            for _ in range(ti.static(SWEEPS if len(self.walls) > 1 else 1)):
-                if moving:
-                    before = self.state.d[i]
-                    for f in ti.static(self.walls):
-                        f.confine(i, self.radius.of(i), h, when)
-                    moving = (self.state.d[i] != before).any()
+            if ti.static(len(self.walls) == 1):
+                for f in ti.static(self.walls):
+                    f.confine(i, self.radius.of(i), h, when)
+            else:
+                moving = True
+                for _ in range(SWEEPS):
+                    if moving:
+                        before = self.state.d[i]
+                        for f in ti.static(self.walls):
+                            f.confine(i, self.radius.of(i), h, when)
+                        moving = (self.state.d[i] != before).any()
 
     # The phases: loops over the bodies. `me` is the thread that goes through them, see Team. Where it has no team, loops are
     # serial inside the fused kernel, and Taichi spreads them over threads at the top of the others.
@@ -364,7 +371,10 @@ class Phases:
         for c in ti.static(self.contacts):
             for i in range(begin, end):
                 c.gather(i, first)
-        if ti.static(len(self.walls) > 0):
+        if ti.static(len(self.walls) > 0 and self.n < FEW):
+            for i in range(begin, end):
+                self.confine(i, h, when)
+        elif ti.static(len(self.walls) > 0):
             for b in range((end - begin + (BLOCK - 1)) // BLOCK):
                 low, high = begin + b * BLOCK, ti.min(begin + (b + 1) * BLOCK, end)
                 near = 0

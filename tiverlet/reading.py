@@ -106,6 +106,15 @@ def _grown(tree: Any, ctx: Any) -> Any:
     return out
 
 
+def _decorated(ctx: Any, node: Any) -> str:
+    """Which of Taichi's own a call is; it is asked for every call, and again for every turn of a static loop."""
+    if not active:
+        return _decorator(ctx, node)
+    if not hasattr(node, "decorator"):
+        node.decorator = _decorator(ctx, node)
+    return node.decorator
+
+
 @cache
 def _method(kind: type) -> Any:
     return getattr(ASTTransformer, f"build_{kind.__name__}", None)
@@ -151,12 +160,14 @@ def _product(x: Any, y: Any) -> Any:
     vectors = isinstance(x, expr.Expr) and isinstance(y, expr.Expr) and x.is_tensor() and x.get_shape() == y.get_shape()
     if not active or not impl.inside_kernel() or not vectors or len(x.get_shape()) > 1:
         return _dot(x, y)
+    parts = impl.expr_init(x * y)
+    return sum((at(parts, k) for k in range(1, x.get_shape()[0])), at(parts, 0))
+
+
+def at(field: Any, index: Any) -> Any:
+    """field[index], in a Python function that a kernel calls as it is; see compiling.inline."""
     runtime: Any = impl.get_runtime()
-    builder, parts = runtime.compiling_callable.ast_builder(), impl.expr_init(x * y)
-    out = impl.subscript(builder, parts, 0)
-    for k in range(1, x.get_shape()[0]):
-        out = out + impl.subscript(builder, parts, k)
-    return out
+    return impl.subscript(runtime.compiling_callable.ast_builder(), field, index)
 
 
 def _roomy(function: Any) -> Any:
@@ -215,7 +226,7 @@ def _patch() -> bool:
     kernel_impl.Kernel.materialize = _roomy(kernel_impl.Kernel.materialize)
     context: Any = ASTTransformerContext
     context.get_pos_info, context.line, context.place = _place_of, 0, ""
-    ASTTransformer.__call__ = _visited
+    ASTTransformer.__call__, ASTTransformer.get_decorator = _visited, staticmethod(_decorated)
     matrix_ops.dot = wraps(_dot)(_product)
     for name in CONSTANT:
         setattr(expr, name, cache(getattr(expr, name)))
@@ -230,6 +241,7 @@ _draw: Any = getattr(ASTTransformerContext, "get_pos_info", None)
 _read_it: Any = getattr(kernel_impl, "_get_tree_and_ctx", None)
 _grow: Any = getattr(kernel_impl, "transform_tree", None)
 _visit: Any = ASTTransformer.__call__
+_decorator: Any = ASTTransformer.get_decorator
 _who: Any = getattr(snode, "get_traceback", None)
 _dot: Any = matrix_ops.dot
 patched = _patch()
