@@ -49,8 +49,8 @@ def init(arch: str = "cpu", threads: int | None = None, debug: bool = False, see
         raise RuntimeError(f'init: arch "{arch}" is not available on this machine. Available: {offer}.')
     running = _threads()
     options: dict[str, Any] = {} if threads is None else {"cpu_max_num_threads": threads}
-    if arch == "cpu":  # where kernels are one task each; threads that compile would have to load what all kernels share
-        options["num_compile_threads"] = 0
+    if arch == "cpu":  # where kernels are one task each; every thread that compiles has to load first what all kernels share
+        options["num_compile_threads"] = 1  # 0 would be the thread that asks: one that did not start Taichi ends the process
     with contextlib.redirect_stdout(io.StringIO()):  # ti.init prints its banner whatever the log level
         ti.init(
             arch=getattr(ti, arch), default_fp=ti.f32, fast_math=False, debug=debug, random_seed=seed,
