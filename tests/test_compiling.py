@@ -1,8 +1,13 @@
 """Compiling in less time changes no bit, and nothing of what the user compiles."""
 
+import gc
+import inspect
+import sys
+
 import numpy as np
 
 import tiverlet as tv
+from tiverlet import reading
 
 from .conftest import python
 
@@ -62,3 +67,21 @@ assert own() == -200.0
 """,
         TI_OFFLINE_CACHE="0",
     )
+
+
+def test_functions_are_cut_out_of_their_files_as_python_does_it():
+    modules = [module for name, module in sys.modules.items() if name.startswith("tiverlet")]
+    owners = {o for m in modules for o in vars(m).values() if inspect.isclass(o) and o.__module__.startswith("tiverlet")}
+    made = [f.func.func for o in owners for f in vars(o).values() if hasattr(getattr(f, "func", None), "func")]
+    assert len(made) > 300
+    for function in made:
+        lines, first = reading._cut_out(function.__code__)
+        want = inspect.getsourcelines(function)
+        assert ("".join(lines).rstrip(), first) == ("".join(want[0]).rstrip(), want[1]), function
+
+
+def test_compiling_leaves_nothing_behind(world):
+    # Trees of functions know what they were compiled with, worlds among them; and Python goes on to collect garbage.
+    w = world(tv.Particles([[0.0, 1.0], [1.0, 1.0]], radius=0.1), [tv.Gravity(9.81), tv.Contact()])
+    w.run(0.1)
+    assert not reading._read and not reading.active and gc.isenabled()

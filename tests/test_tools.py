@@ -6,6 +6,7 @@ import taichi as ti
 
 import tiverlet as tv
 from tiverlet.angle import cos_sin
+from tiverlet.tools import distinct, median
 
 
 def test_mix_is_exact_at_both_ends():
@@ -103,3 +104,13 @@ def test_tools_work_inside_kernels():
     np.testing.assert_allclose(out.to_numpy(), want, rtol=1e-15)
     np.testing.assert_array_equal(out.to_numpy()[-2:], third)  # exact at both ends
     np.testing.assert_array_equal(back.to_numpy(), [some] * 3)
+
+
+def test_medians_and_distinct_rows_are_those_of_numpy():
+    rng = np.random.default_rng(0)
+    for values in (rng.normal(size=7), rng.normal(size=8), np.array([3.0])):
+        assert median(values) == np.median(values)
+    for rows in (rng.integers(0, 9, 50), rng.integers(0, 3, (40, 2)), np.zeros(0, int), np.zeros((0, 2), int)):
+        want = np.unique(rows, axis=0, return_inverse=True, return_counts=True)
+        for mine, numpys in zip(distinct(rows), want, strict=True):
+            np.testing.assert_array_equal(mine, numpys.reshape(mine.shape))
