@@ -360,13 +360,13 @@ class Contact(Touch):
     @ti.func
     def remember(self, i):
         """At the end of a substep: add to each pair's slip what it has moved, as far as friction can hold it; a pair that parted
-        has no slack."""
+        has no slack. What came to overlap after pairs were pushed, which a list with a narrow skin may not know yet, waits."""
         if ti.static(self._on_rubs):
             for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
                 j = self._on_grid.near[e]
                 overlap, n = self.touch(i, j, self.far(i, j))
                 slip = 0 * self._on_state.x[i]
-                if overlap > 0:
+                if overlap > 0 and self._on_push.field[e] > 0:
                     pressed = self._on_push.field[e] * (self._on_split[i] + self._on_split[j])
                     slip = self.rub(i, j, n, ti.max(overlap, pressed), self._on_slip.field[e])
                 self._on_slip.field[e] = slip
