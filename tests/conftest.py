@@ -12,7 +12,7 @@ import taichi as ti
 from taichi.lang import ops
 
 import tiverlet as tv
-from tiverlet import compiling, team
+from tiverlet import reading, team
 from tiverlet.report.cases import entries, known
 
 # Taichi keeps kernels that it has compiled, by their content, and finds them when a worker comes by the same tests in the same
@@ -43,9 +43,9 @@ def taichi():
         return assign(to, value)
 
     ops.assign = checked
-    home, compiling.HOME = compiling.HOME, compiling.HOME + OURS
+    home, reading.HOME = reading.HOME, reading.HOME + OURS
     yield
-    ops.assign, compiling.HOME = assign, home
+    ops.assign, reading.HOME = assign, home
 
 
 @pytest.fixture
