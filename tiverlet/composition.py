@@ -140,7 +140,7 @@ class Composition(Substep):
                 first = ti.cast(it == 0, ti.i32)
                 self.tell(0, h, when, first, 0)
                 self.settle(0, first)
-                self.collect(0, h, when, first, final)
+                self.collect(0, h, when, first, final, 0)
 
     @ti.func
     def propel(self, i, h, last, t, starts):

@@ -347,15 +347,15 @@ class Phases:
                 self.team.wait()
 
     @ti.func
-    def collect(self, me, h, when, first, final):
-        """3e Particles gather their moves; walls."""
+    def collect(self, me, h, when, first, final, looks):
+        """3e Particles gather their moves; walls. looks: 0 if predict() is next, which asks for the list, too."""
         if ti.static(len(self.batches) > 0 or len(self.contacts) > 0 or len(self.walls) > 0):
             for k in range(self.team.deal(self.pieces * self.each, self.each, me)):
-                self.move(self.team.turn(k, self.each, me), h, when, first, final)
+                self.move(self.team.turn(k, self.each, me), h, when, first, final, looks)
             self.team.wait()
 
     @ti.func
-    def move(self, tile, h, when, first, final):
+    def move(self, tile, h, when, first, final, looks):
         """What a tile of particles gathers."""
         begin, end = self.within(tile)
         if ti.static(len(self.batches) > 0 and len(self.contacts) == 0):
@@ -385,10 +385,11 @@ class Phases:
                     for i in range(low, high):
                         self.confine(i, h, when)
         for c in ti.static(self.contacts):
-            stale = 0
-            for i in range(begin, end):
-                stale |= self.grid.outrun(i)
-            c.heed(stale, 0)
+            if looks != 0:
+                stale = 0
+                for i in range(begin, end):
+                    stale |= self.grid.outrun(i)
+                c.heed(stale, 0)
         if ti.static(len(self.walls) > 0 or len(self.contacts) > 0):
             if final != 0:
                 for i in range(begin, end):

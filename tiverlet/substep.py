@@ -68,7 +68,7 @@ class Substep(Phases):
                             for _ in range(REBOUNDS):
                                 if it == 0 and self.struck() != 0:
                                     self.rebound(me)
-                        self.collect(me, h, when, first, final)
+                        self.collect(me, h, when, first, final, ti.cast(final != 0 or it + 1 < iterations, ti.i32))
                 if ti.static(self.concludes):
                     if more and self.halted() == 0:
                         self.remember(me, h, tick + s)
@@ -106,7 +106,7 @@ class Substep(Phases):
         self.settle(0, first)
         self.meet(0, first, fresh, final)
         if ti.static(not self.bounces):
-            self.collect(0, h, when, first, final)
+            self.collect(0, h, when, first, final, 1)
         return self.is_stale() + 2 * self.struck()
 
     @ti.kernel
@@ -130,7 +130,7 @@ class Substep(Phases):
         self.take(0, first)
         self.meet(0, first, fresh, final)
         if ti.static(not self.bounces):
-            self.collect(0, h, when, first, final)
+            self.collect(0, h, when, first, final, 1)
         return self.is_stale() + 2 * self.struck()
 
     @ti.kernel
@@ -143,7 +143,7 @@ class Substep(Phases):
     def gathered(self, h64: ti.f64, s: ti.i32, substeps: ti.i32, it: ti.i32) -> ti.i32:
         """What comes after bounces; returns whether the list is stale."""
         first, final = ti.cast(it == 0, ti.i32), ti.cast(s == substeps - 1, ti.i32)
-        self.collect(0, ti.cast(h64, self.real), self.clock(s, substeps), first, final)
+        self.collect(0, ti.cast(h64, self.real), self.clock(s, substeps), first, final, 1)
         return self.is_stale()
 
     @ti.kernel
