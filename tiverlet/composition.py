@@ -20,7 +20,7 @@ from .constraints.contact import Contact
 from .feature import Acceleration, Batch, Feature, Scene
 from .scalar import Scalar
 from .solvers.solver import Solver
-from .substep import Substep
+from .substep import CAME, END, FRESH, ITERATIONS, START, SUBSTEPS, H, Substep
 from .wall import Wall
 
 # The first half of the stages; the one in the middle is what is missing to 1.
@@ -106,8 +106,8 @@ class Composition(Substep):
         """All substeps of a frame, and the survey. The substep that is given is the first stage, which is as long as the last."""
         ti.loop_config(serialize=True)
         for _ in range(1):
-            h64, whole, t = reals[0], reals[0] / self.first, reals[1]
-            fresh, substeps, iterations, came = counts[2], counts[3], counts[4], counts[9]
+            h64, whole, t = reals[H], reals[H] / self.first, reals[START]
+            fresh, substeps, iterations, came = counts[FRESH], counts[SUBSTEPS], counts[ITERATIONS], counts[CAME]
             for s in range(substeps):
                 for q in range(self.count):
                     g = self.table[q]
@@ -116,7 +116,7 @@ class Composition(Substep):
                     final = ti.cast(s == substeps - 1 and q == self.count - 1, ti.i32)
                     self.stage(g[0] * whole, g[1] * whole, t + (s + g[2]) * whole, when, starts, iterations, final)
             self.survey.weigh(0, h64, came)
-            self.survey.sum_up(0, h64, reals[2], came, out)
+            self.survey.sum_up(0, h64, reals[END], came, out)
 
     @ti.kernel
     def probed(self, h: ti.f64, last: ti.f64, t: ti.f64, end: ti.f64, iterations: ti.i32):

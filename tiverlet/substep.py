@@ -13,10 +13,11 @@ from .calm import PASSES
 from .phases import Phases
 from .team import LEAST
 
-# What a frame is given. REALS: the substep, and the times at the start and the end of the frame [s]. COUNTS: substeps so far, and
+# What a frame is given. Reals: the substep, and the times at the start and the end of the frame [s]. Counts: substeps so far, and
 # since the last start; whether it starts; how many substeps and iterations; where it goes on if it stopped to have the list grown
 # (substep, iteration, 1); 0, the number of the first thread; how the state that it leaves came about, see Survey.
-REALS, COUNTS = 3, 10
+REALS = H, START, END = range(3)
+COUNTS = TICK, SINCE, FRESH, SUBSTEPS, ITERATIONS, BEGIN, PASS, RESUMED, FIRST, CAME = range(10)
 HALT = 16  # among the figures of a frame: whether, in which substep and before which iteration it stopped to have the list grown;
 # how many threads of a team were at work
 REBOUNDS = 8  # rounds of restitution in a substep, at most
@@ -34,15 +35,17 @@ class Substep(Phases):
         ti.loop_config(serialize=self.team.size == 1)
         for thread in range(self.team.spread):
             if thread % LEAST == 0:
-                self.frame(counts[8] + thread // LEAST, reals, counts, out)
+                self.frame(counts[FIRST] + thread // LEAST, reals, counts, out)
 
     @ti.func
     def frame(self, me, reals: ti.template(), counts: ti.template(), out: ti.template()):  # type: ignore[valid-type]
         """What thread `me` does of a frame. All threads of a team take the same branches, for what they depend on is written only
         where the others wait."""
-        h64, t, end = reals[0], reals[1], reals[2]
-        tick, since, fresh, substeps, iterations = counts[0], counts[1], counts[2], counts[3], counts[4]
-        begin, it0, resumed, came = counts[5], counts[6], counts[7], counts[9]
+        h64, t, end = reals[H], reals[START], reals[END]
+        tick, since, fresh, substeps, iterations = (
+            counts[TICK], counts[SINCE], counts[FRESH], counts[SUBSTEPS], counts[ITERATIONS]
+        )  # fmt: skip
+        begin, it0, resumed, came = counts[BEGIN], counts[PASS], counts[RESUMED], counts[CAME]
         for s in range(begin, substeps + 1):
             h, more = ti.cast(h64, self.real), s < substeps
             when = self.clock(s, substeps)

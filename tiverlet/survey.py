@@ -12,7 +12,7 @@ from .grid import FARTHEST
 from .particles import LARGEST
 from .scalar import TENSEST
 from .step_report import StepReport
-from .substep import HALT, Substep
+from .substep import CAME, END, HALT, H, Substep
 from .team import LEAST
 
 BLOCKS = 64  # partial sums: their number is fixed, so the total has the same bits on any number of threads; squared on a GPU
@@ -144,7 +144,7 @@ class Survey:
     @ti.kernel
     def measure(self, reals: ti.types.ndarray(ti.f64, 1), counts: ti.types.ndarray(ti.i32, 1), out: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
         """All figures."""
-        h64, t64, came = reals[0], reals[2], counts[9]
+        h64, t64, came = reals[H], reals[END], counts[CAME]
         self.weigh(0, h64, came)
         self.sum_up(0, h64, t64, came, out)
 

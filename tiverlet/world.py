@@ -20,7 +20,7 @@ from .particles import Particles
 from .regroup import Handle
 from .solvers.solver import Solver
 from .step_report import StepReport
-from .substep import COUNTS, HALT, REALS, REBOUNDS, decay
+from .substep import CAME, COUNTS, HALT, REALS, REBOUNDS, decay
 from .survey import STARTED, STEPPED, UNSTEPPED
 
 FREE = decay(0.0, 1.0)  # what no drag makes of a substep
@@ -285,7 +285,7 @@ class World(Access):
     def _make(self) -> None:
         """The kernels that are launched in every frame."""
         compiler = self._memory.compiler
-        self._reals, self._counts, self._figures = np.zeros(REALS), np.zeros(COUNTS, dtype=np.int32), self._survey.out
+        self._reals, self._counts, self._figures = np.zeros(len(REALS)), np.zeros(len(COUNTS), dtype=np.int32), self._survey.out
         arrays = self._reals, self._counts, self._figures
         self._frames = Quick(self._sub, "fused", compiler, *arrays)
         self._sums = Quick(self._survey, "measure", compiler, *arrays)
@@ -299,7 +299,7 @@ class World(Access):
             return
         if self._grid and self._memory.read(self._grid.stale)[0]:
             self._list()
-        self._reals[:], self._counts[-1] = (self._h, self._time, self._time), came
+        self._reals[:], self._counts[CAME] = (self._h, self._time, self._time), came
         self._sums()
 
     def _report(self, substeps: int = 1, iterations: int = 1) -> StepReport:
