@@ -24,10 +24,14 @@ class Calm:
     It is what inelastic rigid discs do: there is no sound in them. Pairs that bounce (restitution) are left out.
     """
 
-    def __init__(self, contact: Any):
+    def __init__(self, contact: Any, pieces: int):
         scene = contact.scene
-        self.contact, self.state = contact, scene.state
+        self.contact, self.grid, self.state = contact, contact._on_grid, scene.state
         self.change = contact._on_move  # is free at the end of a substep
+        # So is what is put aside while lists are built: here for the loaded pairs of each particle, how many they are, and for
+        # those who have any, piece by piece.
+        self.number, self.loaded = self.grid.old_number, self.grid.old_first
+        self.count = scene.memory.field("Contact.loaded", pieces, kind=ti.i32)
         self.factors = scene.memory.field("Contact.chebyshev", PASSES, values=chebyshev(PASSES, CONDITION))
 
     @ti.func
@@ -40,36 +44,63 @@ class Calm:
         return out
 
     @ti.func
-    def want(self, i, k):
-        """Pass k for particle i: what changes d. change' = (factor - 1) change + factor 2 / (1 + 1 / CONDITION) want."""
-        want, w = 0 * self.state.d[i], self.state.w.of(i)
+    def find(self, i):
+        """Put aside the loaded pairs of particle i, each with what all passes multiply by; returns how many there are."""
+        first, w = self.grid.first[i], self.state.w.of(i)
+        at = first
         if self.contact._on_split[i] > 0:
-            for word in range(self.contact._on_grid.words(i)):
+            for word in range(self.grid.words(i)):
                 # Not touches(): the pair may have parted in this pass, and both of it have to agree.
-                bits = ti.select(word == 0, self.contact._on_grid.touching[i], self.contact._on_grid.whole(i, word))
+                bits = ti.select(word == 0, self.grid.touching[i], self.grid.whole(i, word))
                 while bits != 0:
-                    e = self.contact._on_grid.first[i] + word * WORD + lowest(bits)
+                    e = first + word * WORD + lowest(bits)
                     bits &= bits - ti.u32(1)
                     if self.bears(i, e):
-                        j = self.contact._on_grid.near[e]
+                        j = self.grid.near[e]
                         r = self.state.apart(i, j)
                         rr = r.dot(r)
                         if rr > 0:
                             shared = self.contact._on_split[i] + self.contact._on_split[j]
-                            want -= w * (self.state.d[i] - self.state.d[j]).dot(r) / (rr * shared) * r
-            if ti.static(self.state.leans):
-                lean = self.state.lean[i]
-                size = lean.dot(lean)
-                if size > 0:
-                    want -= want.dot(lean) / size * lean
-            factor = self.factors[k]
-            self.change[i] = (factor - 1) * self.change[i] + (factor * ti.static(2 / (1 + 1 / CONDITION))) * want
+                            self.grid.aside[at] = j
+                            self.contact._on_push.aside[at] = w / (rr * shared)
+                            at += 1
+        return at - first
+
+    @ti.func
+    def open(self, piece, begin, end):
+        """The loaded pairs of a piece of the particles. They move in no pass, so what depends on positions is worked out once."""
+        count = 0
+        for i in range(begin, end):
+            number = self.find(i)
+            self.number[i] = number
+            if number > 0:
+                self.loaded[begin + count] = i
+                count += 1
+        self.count[piece] = count
+
+    @ti.func
+    def want(self, i, k):
+        """Pass k for particle i: what changes d. change' = (factor - 1) change + factor 2 / (1 + 1 / CONDITION) want."""
+        want, first = 0 * self.state.d[i], self.grid.first[i]
+        for e in range(first, first + self.number[i]):
+            j = self.grid.aside[e]
+            r = self.state.apart(i, j)
+            want -= self.contact._on_push.aside[e] * (self.state.d[i] - self.state.d[j]).dot(r) * r
+        if ti.static(self.state.leans):
+            lean = self.state.lean[i]
+            size = lean.dot(lean)
+            if size > 0:
+                want -= want.dot(lean) / size * lean
+        factor = self.factors[k]
+        want *= factor * ti.static(2 / (1 + 1 / CONDITION))
+        if k > 0:
+            want += (factor - 1) * self.change[i]
+        self.change[i] = want
 
     @ti.func
     def move(self, i):
         """Change d."""
-        if self.contact._on_split[i] > 0:
-            self.state.d[i] = self.state.d[i] + self.change[i]
+        self.state.d[i] = self.state.d[i] + self.change[i]
 
 
 def chebyshev(passes: int, condition: float) -> np.ndarray:

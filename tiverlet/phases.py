@@ -426,13 +426,16 @@ class Phases:
         for c in ti.static(self.contacts):
             for p in range(self.team.deal(self.pieces, 1, me)):
                 begin, end = self.part(p, me)
-                for i in range(begin, end):
-                    c._on_calm.want(i, k)
+                piece = self.team.turn(p, 1, me)
+                if k == 0:
+                    c._on_calm.open(piece, begin, end)
+                for m in range(begin, begin + c._on_calm.count[piece]):
+                    c._on_calm.want(c._on_calm.loaded[m], k)
             self.team.wait()
             for p in range(self.team.deal(self.pieces, 1, me)):
                 begin, end = self.part(p, me)
-                for i in range(begin, end):
-                    c._on_calm.move(i)
+                for m in range(begin, begin + c._on_calm.count[self.team.turn(p, 1, me)]):
+                    c._on_calm.move(c._on_calm.loaded[m])
             self.team.wait()
 
     @ti.func

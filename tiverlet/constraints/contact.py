@@ -149,7 +149,7 @@ class Contact(Touch):
             self._on_given = Luggage("given", 0, lasting=True)  # pushes and blows in the last substep [kg m]
             luggage += [self._on_slack, self._on_blow, self._on_given]
         self._on_grid = Grid(scene, self._on_size, linked, self.table, luggage, team, self._on_move)
-        self._on_calm = Calm(self)
+        self._on_calm = Calm(self, -(-n // team.piece))
         return self._on_grid
 
     @ti.func
