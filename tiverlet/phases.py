@@ -16,7 +16,7 @@ from .wall import Wall
 # Multiples of the golden ratio of two dimensions, mod 1, are the most even sequence of pairs: one for each of the two sums.
 DITHER = golden_steps(2)
 TILE = 256  # particles that a thread takes at a time, through several loops: their state stays in its cache
-BLOCK = 16  # of them that are asked at once whether any is near a wall
+BLOCK = 16  # of them that are asked at once whether any is near a wall, or touches another
 SWEEPS = 8  # rounds over the walls, for particles that several of them push
 
 
@@ -320,8 +320,8 @@ class Phases:
                 self.team.wait()
             for k in range(self.team.deal(self.pieces, 1, me)):
                 begin, end = self.part(k, me)
-                for i in range(begin, end):
-                    c.count(i)
+                for b in range((end - begin + (BLOCK - 1)) // BLOCK):
+                    c.count(begin + b * BLOCK, ti.min(begin + (b + 1) * BLOCK, end))
             self.team.wait()
             for k in range(self.team.deal(self.pieces, 1, me)):
                 begin, end = self.part(k, me)

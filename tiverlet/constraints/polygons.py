@@ -204,16 +204,17 @@ class Polygons(Rim):
         return count[v] * self._on_w.of(v) + at_a + at_b
 
     @ti.func
-    def count(self, i):
-        """How many contacts particle i is in."""
-        active = 0
-        for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
-            for role in range(3):
-                at, _, _, _, _, _ = self.meeting(i, e, role)
-                if at >= 0:
-                    if self._on_met.field[at][0] > 0:
-                        active += 1
-        self._on_active[i] = active
+    def count(self, begin, end):
+        """How many contacts some particles are in."""
+        for i in range(begin, end):
+            active = 0
+            for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
+                for role in range(3):
+                    at, _, _, _, _, _ = self.meeting(i, e, role)
+                    if at >= 0:
+                        if self._on_met.field[at][0] > 0:
+                            active += 1
+            self._on_active[i] = active
 
     @ti.func
     def relax(self, i, first, fresh):
