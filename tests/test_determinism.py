@@ -91,6 +91,24 @@ def results(path):
     assert len(made) == 8 and len(set(made[:4])) == 4 and made[:4] == made[4:]
 
 
+def test_a_large_pile_has_the_same_bits_on_all_paths_and_where_a_team_breaks_up(world):
+    # From 1000 particles on blocks of them are asked whether any touches. Where every wait of a team is a long one, the first
+    # thread goes on alone after a few of them, and the others come back 32 frames later.
+    k = np.arange(1200)
+    x = np.stack([k % 30 * 1.02, k // 30 * 1.02], axis=1) + 0.5 + 0.01 * tv.golden(k, dim=2)
+    made = []
+    for path, patience in (("fused", 0), ("launched", 0), ("parallel", 0), ("parallel", -1)):
+        features = [tv.Gravity(9.81), tv.Box((0, 0), (31, 60)), tv.Contact()]
+        w = world(tv.Particles(x, radius=0.5), features, path=path, substeps=3)
+        if patience:
+            w._sub.team.patience = patience
+        alone = [w.step(1 / 60) and w._figures[survey.HALT + 3] == 1 for _ in range(40)]
+        assert not patience or w._sub.team.size == 1 or all(alone)
+        assert w.last.contacts > 1000
+        made.append(w.hash())
+    assert len(set(made)) == 1
+
+
 def test_all_paths_have_the_same_bits(world):
     n = 300
     x = tv.golden(np.arange(n), dim=3) * [1.6, 3, 1.6]

@@ -233,6 +233,7 @@ class Phases:
         for k in range(self.team.deal(self.pieces * self.each, self.each, me)):
             self.advance(self.team.turn(k, self.each, me), h, time, tick, fresh, calming)
         self.team.wait()
+        self.team.watch(me)
         for f in ti.static(self.drivers):
             for c in range(self.team.low(f.count, me), self.team.high(f.count, me)):
                 f.drive(c, h, when[1])
@@ -352,7 +353,7 @@ class Phases:
         if ti.static(len(self.batches) > 0 or len(self.contacts) > 0 or len(self.walls) > 0):
             for k in range(self.team.deal(self.pieces * self.each, self.each, me)):
                 self.move(self.team.turn(k, self.each, me), h, when, first, final, looks)
-            self.team.wait()
+        self.team.wait()
 
     @ti.func
     def move(self, tile, h, when, first, final, looks):

@@ -60,8 +60,7 @@ class Substep(Phases):
                         if self.halted() == 0 and self.is_stale() != 0:
                             self.grid.build(me)
                             if self.grid.need[None] > self.grid.capacity:
-                                self.halt[None] = [1, s, it]
-                        self.team.wait()
+                                self.halt[None] = [1, s, it]  # all write the same
                     if more and self.halted() == 0:
                         first, final = ti.cast(it == 0, ti.i32), ti.cast(s == substeps - 1, ti.i32)
                         self.tell(me, h, when, first, starts)

@@ -60,6 +60,7 @@ class Team:
             self.arrived = memory.field("team.arrived", None, kind=ti.i32)
             self.hands = memory.field("team.hands", None, kind=ti.i32, values=size)  # how many of them are at work
             self.late = memory.field("team.long_waits", None, kind=ti.i32)
+            self.ends = memory.field("team.ends", None, kind=ti.i32)  # 1: in the next substep all but the first leave
 
     def muster(self, hands: int) -> None:
         """Before a frame: those who left some frames ago come back. hands: how many were at work in the last one."""
@@ -115,12 +116,20 @@ class Team:
         hands = self.hands[None]
         out = me < hands
         if out:
-            self.meet(hands)
-            if me == 0 and self.late[None] >= LONG:
-                self.hands[None] = 1
-            self.meet(hands)
-            out = me < self.hands[None]
+            if self.ends[None] != 0:
+                self.meet(hands)
+                if me == 0:
+                    self.hands[None], self.ends[None] = 1, 0
+                self.meet(hands)
+                out = me == 0
         return out
+
+    @ti.func
+    def watch(self, me):
+        """Once in a substep, between two waits, so that all know the same when they ask whether they take part in the next."""
+        if ti.static(self.size > 1):
+            if me == 0 and self.late[None] >= LONG and self.hands[None] > 1:
+                self.ends[None] = 1
 
     @ti.func
     def _share(self, n: ti.template(), k):  # type: ignore[valid-type]
