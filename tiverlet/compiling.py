@@ -11,7 +11,8 @@ Everything here knows the inside of Taichi 1.7.4; with another one, kernels are 
 import contextlib
 import gc
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -120,16 +121,17 @@ class Quick:
 
     def launch(self) -> None:
         """Launch it when it is compiled."""
-        program, kernel, compiled, context = self._ready
-        program.launch_kernel(compiled, context or self._context(kernel))
+        self._ready()
 
-    def _prepared(self) -> tuple:
-        """What a launch needs; for one on a GPU, which copies arrays to and fro, a context of its own."""
+    def _prepared(self) -> Callable[[], Any]:
+        """A launch; each one on a GPU, which copies arrays to and fro, has a context of its own."""
         primal: Any = getattr(type(self.owner), self.name)._primal
         kernel = primal.compiled_kernels[primal.ensure_compiled(self.owner, *self.arrays)]
         program: Any = impl.get_runtime().prog
         compiled = program.compile_kernel(program.config(), program.get_device_caps(), kernel)
-        return program, kernel, compiled, self._context(kernel) if str(program.config().arch) in HOSTS else None
+        if str(program.config().arch) in HOSTS:
+            return partial(program.launch_kernel, compiled, self._context(kernel))
+        return lambda: program.launch_kernel(compiled, self._context(kernel))
 
     def _context(self, kernel: Any) -> Any:
         """Where the arrays are."""
