@@ -9,18 +9,22 @@ import numpy as np
 
 def number(who: str, name: str, value: Any, *, above=None, least=None, most=None, below=None) -> float:
     """A finite real number within the bounds given."""
-    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (numbers.Real, np.ndarray)):
-        raise TypeError(f"{who}: {name} = {value!r} is a {type(value).__name__}, but a number is needed.")
-    if not isinstance(value, float):
-        array = np.asarray(value)
-        if array.ndim or array.dtype.kind not in "iuf":
-            raise TypeError(f"{who}: {name} has shape {array.shape}, but one real number is needed.")
-    value = float(value)
+    if type(value) is not float:
+        value = _real(who, name, value)
     if not math.isfinite(value):
         raise ValueError(f"{who}: {name} = {value}, but it must be finite.")
     if words := _missed(value, above, least, most, below):
         raise ValueError(f"{who}: {name} = {value:g}, but it must be {words}.")
     return value
+
+
+def _real(who: str, name: str, value: Any) -> float:
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (numbers.Real, np.ndarray)):
+        raise TypeError(f"{who}: {name} = {value!r} is a {type(value).__name__}, but a number is needed.")
+    array = np.asarray(value)
+    if array.ndim or array.dtype.kind not in "iuf":
+        raise TypeError(f"{who}: {name} has shape {array.shape}, but one real number is needed.")
+    return float(value)
 
 
 def integer(who: str, name: str, value, *, least: int) -> int:
