@@ -141,10 +141,12 @@ class Grid:
 
     def fit(self, extent: Sequence[float]) -> None:
         """Shape the hash for the extent of the particles [m], if it is another one by an eighth; affects speed only."""
-        if not all(abs(new - old) <= old / 8 for new, old in zip(extent, self._extent, strict=True)):
-            self._extent = extent
-            if self.cells.fit(np.asarray(extent)):
-                self.age()
+        for new, old in zip(extent, self._extent, strict=True):
+            if not abs(new - old) <= old / 8:
+                self._extent = extent
+                if self.cells.fit(np.asarray(extent)):
+                    self.age()
+                return
 
     def age(self) -> None:
         """Have a new list built in the next frame."""
