@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 
 import tiverlet as tv
-from tiverlet import survey
+from tiverlet import substep, survey
 from tiverlet.report.speed import counting
 from tiverlet.runtime import cores
 
@@ -102,7 +102,7 @@ def test_a_large_pile_has_the_same_bits_on_all_paths_and_where_a_team_breaks_up(
         w = world(tv.Particles(x, radius=0.5), features, path=path, substeps=3)
         if patience:
             w._sub.team.patience = patience
-        alone = [w.step(1 / 60) and w._figures[survey.HALT + 3] == 1 for _ in range(40)]
+        alone = [w.step(1 / 60) and w._sheet[substep.HANDS] == 1 for _ in range(40)]
         assert not patience or w._sub.team.size == 1 or all(alone)
         assert w.last.contacts > 1000
         made.append(w.hash())

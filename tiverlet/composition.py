@@ -20,7 +20,7 @@ from .constraints.contact import Contact
 from .feature import Acceleration, Batch, Feature, Scene
 from .scalar import Scalar
 from .solvers.solver import Solver
-from .substep import CAME, END, FRESH, ITERATIONS, START, SUBSTEPS, H, Substep
+from .substep import CAME, END, FRESH, ITERATIONS, START, SUBSTEPS, H, Substep, integer
 from .wall import Wall
 
 # The first half of the stages; the one in the middle is what is missing to 1.
@@ -102,12 +102,13 @@ class Composition(Substep):
         self.fastest = (float(np.abs(g).max()) / self.first) ** 2 * fastest(self.batches, scene)
 
     @ti.kernel
-    def fused(self, reals: ti.types.ndarray(ti.f64, 1), counts: ti.types.ndarray(ti.i32, 1), out: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
+    def fused(self, sheet: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
         """All substeps of a frame, and the survey. The substep that is given is the first stage, which is as long as the last."""
         ti.loop_config(serialize=True)
         for _ in range(1):
-            h64, whole, t = reals[H], reals[H] / self.first, reals[START]
-            fresh, substeps, iterations, came = counts[FRESH], counts[SUBSTEPS], counts[ITERATIONS], counts[CAME]
+            h64, whole, t = sheet[H], sheet[H] / self.first, sheet[START]
+            fresh, came = integer(sheet, FRESH), integer(sheet, CAME)
+            substeps, iterations = integer(sheet, SUBSTEPS), integer(sheet, ITERATIONS)
             for s in range(substeps):
                 for q in range(self.count):
                     g = self.table[q]
@@ -116,7 +117,7 @@ class Composition(Substep):
                     final = ti.cast(s == substeps - 1 and q == self.count - 1, ti.i32)
                     self.stage(g[0] * whole, g[1] * whole, t + (s + g[2]) * whole, when, starts, iterations, final)
             self.survey.weigh(0, h64, came)
-            self.survey.sum_up(0, h64, reals[END], came, out)
+            self.survey.sum_up(0, h64, sheet[END], came, sheet)
 
     @ti.kernel
     def probed(self, h: ti.f64, last: ti.f64, t: ti.f64, end: ti.f64, iterations: ti.i32):

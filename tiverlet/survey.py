@@ -12,21 +12,19 @@ from .grid import FARTHEST
 from .particles import LARGEST
 from .scalar import TENSEST
 from .step_report import StepReport
-from .substep import CAME, END, HALT, H, Substep
+from .substep import CAME, END, FIGURES, SHEET, H, Substep, integer
 from .team import LEAST
 
 BLOCKS = 64  # partial sums: their number is fixed, so the total has the same bits on any number of threads; squared on a GPU
 TURNS = (0, 26, 41)  # degrees, for nothing, BENT and FAR
 STIFF = 4.0  # (omega h)^2 beyond which Verlet diverges
 
-
-FIGURES = HALT + 4
 STEPPED, STARTED, UNSTEPPED = range(3)  # how a state came about: by a substep, by the first one after a start, by none yet
 
 
 @ti.data_oriented
 class Survey:
-    """The figures behind a StepReport: those of out, in the order in which report() reads them.
+    """The figures behind a StepReport, on the sheet of a frame in the order in which report() reads them.
 
     came: how the state came about. A frame that is one launch ends with them; where it is launched phase by phase, measure() is
     the last one.
@@ -50,7 +48,8 @@ class Survey:
         self.low = add("survey.low", self.blocks, width=self.dim, kind=ti.f64)
         self.high = add("survey.high", self.blocks, width=self.dim, kind=ti.f64)
         self.details: dict[int, Residuals] = {}  # compiled when asked for
-        self.out = np.zeros(FIGURES)
+        self.sheet: Any = np.zeros(SHEET)
+        self.figures = self.sheet[: 11 + self.dim]
         substep.survey = self
 
     def of(self, substep: Substep) -> "Survey":
@@ -142,14 +141,14 @@ class Survey:
         self.sub.weigh(me, h, self.sub.reach(h, fresh), 0, fresh, False)
 
     @ti.kernel
-    def measure(self, reals: ti.types.ndarray(ti.f64, 1), counts: ti.types.ndarray(ti.i32, 1), out: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
+    def measure(self, sheet: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
         """All figures."""
-        h64, t64, came = reals[H], reals[END], counts[CAME]
+        h64, t64, came = sheet[H], sheet[END], integer(sheet, CAME)
         self.weigh(0, h64, came)
-        self.sum_up(0, h64, t64, came, out)
+        self.sum_up(0, h64, t64, came, sheet)
 
     @ti.func
-    def sum_up(self, me, h64, t64, came, out: ti.template()):  # type: ignore[valid-type]
+    def sum_up(self, me, h64, t64, came, sheet: ti.template()):  # type: ignore[valid-type]
         """By blocks, by blocks of these on a GPU, then by one thread."""
         for k in range(self.team.low(self.blocks * self.stride, me), self.team.high(self.blocks * self.stride, me)):
             if k % self.stride == 0:
@@ -163,23 +162,25 @@ class Survey:
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, me)):
             for k in range(FIGURES):
-                out[k] = 0  # what nobody writes comes back from a GPU as it was there
+                sheet[k] = 0  # what nobody writes comes back from a GPU as it was there
             total, low, high = self.fold(0, self.blocks // BLOCKS)
             for k in ti.static(range(6)):
-                out[k] = total[k]
-            for k in ti.static(range(self.dim)):
-                out[7 + k], out[10 + k] = low[k], high[k]
+                sheet[k] = total[k]
+            if low[0] <= high[0]:
+                for k in ti.static(range(self.dim)):
+                    sheet[7] = ti.max(sheet[7], -low[k], high[k])
+                    sheet[11 + k] = high[k] - low[k]
             for c in ti.static(self.contacts):
-                out[6] = c._on_fast[None]
+                sheet[6] = c._on_fast[None]
                 c._on_fast[None] = 0
             if ti.static(len(self.sub.breakers) > 0):
-                out[13] = self.sub.slots.broken[None]
+                sheet[8] = self.sub.slots.broken[None]
                 self.sub.slots.broken[None] = 0
             if ti.static(len(self.batches) > 0):
-                out[15] = self.sub.slots.turned[None]
+                sheet[10] = self.sub.slots.turned[None]
                 self.sub.slots.turned[None] = 0
                 if ti.static(self.sub.slots.converges):
-                    out[14] = self.sub.slots.tension[None]
+                    sheet[9] = self.sub.slots.tension[None]
                     self.sub.slots.tension[None] = 0
 
     @ti.func
@@ -210,32 +211,28 @@ class Survey:
     ) -> tuple[StepReport, list[float]]:
         """The report of a frame, and the size of the bounding box [m]. before: the energy one frame ago [J]."""
         mine = vars(self)  # whose attributes Taichi looks at in Python, one by one
-        out, n, dim = mine["out"].tolist(), mine["n"], mine["dim"]
-        energy, residual, overlap, stiff, contacts, bad, flags = out[:7]
+        energy, residual, overlap, stiff, contacts, bad, fast, reach, broken, tension, turned, *extent = mine["figures"].tolist()
         stiff = max(stiff, mine["sub"].fastest * h * h)
-        low, high = out[7 : 7 + dim], out[10 : 10 + dim]
-        extent = [max(b - a, 0.0) for a, b in zip(low, high, strict=True)]
         notes = {}
-        first = int(bad) if bad < n else None
+        first = int(bad) if bad < mine["n"] else None
         if first is not None:
             notes["non-finite"] = (
                 f"The state of particle {first} is not finite (the first of them); go back and use a smaller step."
             )
-        reach = max(map(abs, low + high)) if high[0] >= low[0] else 0.0
         if reach >= mine["farthest"]:
             notes["out-of-range"] = (
                 f"A coordinate is out of range: it reached {reach:g} m, and beyond {mine['farthest']:g} m the precision fails."
             )
-        if flags > 0:
+        if fast > 0:
             notes["tunnelling-risk"] = (
                 "A particle moved by more than its own size in one substep and may have passed another; use more substeps."
             )
-        if out[15] == FAR:
+        if turned == FAR:
             notes["turned"] = "A constraint turned by more than 41 degrees in one substep and is damped there; use more substeps."
-        if out[14] >= TENSEST:
-            need = int(np.ceil(substeps * np.sqrt(out[14] / STIFF)))
+        if tension >= TENSEST:
+            need = int(np.ceil(substeps * np.sqrt(tension / STIFF)))
             notes["softened"] = (
-                f"A tension makes particles vibrate too fast for the substep: omega h >= {np.sqrt(out[14]):.3g}, stable below 2. "
+                f"A tension makes particles vibrate too fast for the substep: omega h >= {np.sqrt(tension):.3g}, stable below 2. "
                 f"Its constraints give way instead. Use about {need} substeps."
             )
         if stiff > STIFF:
@@ -244,7 +241,7 @@ class Survey:
                 f"A force changes too fast for the substep: omega h = {np.sqrt(stiff):.3g}, stable below 2. "
                 f"Use at least {need} substeps."
             )
-        done = StepReport(
+        report = StepReport(
             time,
             substeps,
             iterations,
@@ -256,11 +253,11 @@ class Survey:
             frozenset(notes),
             tuple(notes.values()),
             first,
-            int(out[13]),
-            TURNS[int(out[15])],
-            float(out[14]),
+            int(broken),
+            TURNS[int(turned)],
+            tension,
         )
-        return done, extent
+        return report, extent
 
 
 @ti.data_oriented

@@ -20,7 +20,7 @@ from .particles import Particles
 from .regroup import Handle
 from .solvers.solver import Solver
 from .step_report import StepReport
-from .substep import CAME, COUNTS, HALT, REALS, REBOUNDS, decay
+from .substep import CAME, END, GIVE, HALT, HANDS, REBOUNDS, H, decay
 from .survey import STARTED, STEPPED, UNSTEPPED
 
 FREE = decay(0.0, 1.0)  # what no drag makes of a substep
@@ -211,15 +211,17 @@ class World(Access):
 
     def _fused(self, substeps: int, iterations: int, end: float, came: int) -> None:
         """All substeps and the survey in one launch, resumed where the neighbour list had to grow."""
-        self._plain["team"].muster(self._figures[HALT + 3])
+        self._plain["team"].muster(self._sheet[HANDS])
         begin = it0 = resumed = 0
         while True:
-            self._reals[:] = self._h, self._time, end
-            self._counts[:] = self._tick, self._since, self._fresh, substeps, iterations, begin, it0, resumed, 0, came
+            GIVE(
+                self._given, 0, self._h, self._time, end, self._tick, self._since, self._fresh, substeps, iterations,
+                begin, it0, resumed, 0, came,
+            )  # fmt: skip
             self._frames()
-            if not self._figures[HALT]:
+            if not self._sheet[HALT]:
                 return
-            resumed, begin, it0 = (int(v) for v in self._figures[HALT : HALT + 3])
+            resumed, begin, it0 = (int(v) for v in self._sheet[HALT:HANDS])
             self._memory.write(self._sub.halt, 0)
             self._grow()
 
@@ -284,11 +286,10 @@ class World(Access):
 
     def _make(self) -> None:
         """The kernels that are launched in every frame."""
-        compiler = self._memory.compiler
-        self._reals, self._counts, self._figures = np.zeros(len(REALS)), np.zeros(len(COUNTS), dtype=np.int32), self._survey.out
-        arrays = self._reals, self._counts, self._figures
-        self._frames = Quick(self._sub, "fused", compiler, *arrays)
-        self._sums = Quick(self._survey, "measure", compiler, *arrays)
+        compiler, sheet = self._memory.compiler, self._survey.sheet
+        self._frames = Quick(self._sub, "fused", compiler, sheet)
+        self._sums = Quick(self._survey, "measure", compiler, sheet)
+        self._sheet, self._given = sheet.data, sheet.data[H:]
         self._plain = vars(self._sub)  # which Taichi looks at in Python whenever we do
 
     def _look(self) -> None:
@@ -299,7 +300,7 @@ class World(Access):
             return
         if self._grid and self._memory.read(self._grid.stale)[0]:
             self._list()
-        self._reals[:], self._counts[CAME] = (self._h, self._time, self._time), came
+        self._sheet[H], self._sheet[END], self._sheet[CAME] = self._h, self._time, came
         self._sums()
 
     def _report(self, substeps: int = 1, iterations: int = 1) -> StepReport:
