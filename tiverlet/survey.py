@@ -36,6 +36,7 @@ class Survey:
         self.n, self.dim, self.state = substep.n, substep.dim, substep.state
         self.batches = substep.batches
         self.contacts = substep.contacts
+        self.fastest = substep.fastest
         self.single = substep.real == ti.f32
         self.farthest = LARGEST
         if substep.grid:
@@ -212,7 +213,7 @@ class Survey:
         """The report of a frame, and the size of the bounding box [m]. before: the energy one frame ago [J]."""
         mine = vars(self)  # whose attributes Taichi looks at in Python, one by one
         energy, residual, overlap, stiff, contacts, bad, fast, reach, broken, tension, turned, *extent = mine["figures"].tolist()
-        stiff = max(stiff, mine["sub"].fastest * h * h)
+        stiff = max(stiff, mine["fastest"] * h * h)
         notes = {}
         first = int(bad) if bad < mine["n"] else None
         if first is not None:
@@ -241,21 +242,25 @@ class Survey:
                 f"A force changes too fast for the substep: omega h = {np.sqrt(stiff):.3g}, stable below 2. "
                 f"Use at least {need} substeps."
             )
-        report = StepReport(
-            time,
-            substeps,
-            iterations,
-            residual,
-            overlap,
-            int(contacts),
-            energy,
-            0.0 if before is None else energy - before,
-            frozenset(notes),
-            tuple(notes.values()),
-            first,
-            int(broken),
-            TURNS[int(turned)],
-            tension,
+        report = StepReport.of(
+            {
+                "time": time,
+                "substeps": substeps,
+                "iterations": iterations,
+                "residual": residual,
+                "overlap": overlap,
+                "contacts": int(contacts),
+                "energy": energy,
+                "energy_change": 0.0 if before is None else energy - before,
+                "flags": frozenset(notes),
+                "notes": tuple(notes.values()),
+                "bad": first,
+                "broken": int(broken),
+                "turn": TURNS[int(turned)],
+                "tension": tension,
+                "tries": 1,
+                "seconds": 0.0,
+            }
         )
         return report, extent
 

@@ -290,7 +290,7 @@ class World(Access):
         self._frames = Quick(self._sub, "fused", compiler, sheet)
         self._sums = Quick(self._survey, "measure", compiler, sheet)
         self._sheet, self._given = sheet.data, sheet.data[H:]
-        self._plain = vars(self._sub)  # which Taichi looks at in Python whenever we do
+        self._plain, self._told = vars(self._sub), self._survey.report  # Taichi looks at attributes in Python whenever we do
 
     def _look(self) -> None:
         """Survey the state where no frame did."""
@@ -305,7 +305,7 @@ class World(Access):
 
     def _report(self, substeps: int = 1, iterations: int = 1) -> StepReport:
         """What the survey found."""
-        report, extent = self._survey.report(self._time, self._h, substeps, iterations, self._energy)
+        report, extent = self._told(self._time, self._h, substeps, iterations, self._energy)
         if self._grid:
             self._grid.fit(extent)
         return report
