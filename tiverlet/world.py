@@ -119,10 +119,10 @@ class World(Access):
             with self._memory.compiler():
                 report = self._guard.advance(self, dt, tolerance, budget)
         else:
-            self._begin(dt / self.substeps * self._plain["first"])
-            report = self._advance(dt, self.substeps, self.iterations)
+            self._begin(dt / self._substeps * self._plain["first"])
+            report = self._advance(dt, self._substeps, self._iterations)
         report.__dict__["seconds"] = perf_counter() - clock  # which is no part of what it says
-        self._last = report
+        self.__dict__.update(_last=report, _energy=report.energy)  # which is quicker than one after the other
         for watcher in self._watchers:
             watcher.after(dt, report)
         return report
@@ -133,24 +133,21 @@ class World(Access):
         if sub["hurries"]:
             with self._memory.compiler():
                 self._memory.write(self._sub.slots.kappa, self._solver.condition(iterations))
-        done, frame = substeps if len(self._particles) else 0, self._counted(dt)
+        done, frame = substeps if sub["n"] else 0, self._counted(dt)
         started, end = self._fresh and substeps == 1, frame[0] + frame[1] * frame[2]
         if sub["launched"]:
             with self._memory.compiler():
                 self._parallel(done, iterations)
         else:
             self._fused(done, iterations, end, STARTED if started else STEPPED)
-        self.__dict__.update(  # which is quicker than one after the other
+        self.__dict__.update(
             _tick=(self._tick + substeps) % 2**31, _since=(self._since + substeps) % 2**31,
             _started=started, _fresh=False, _frame=frame, _time=end,
         )  # fmt: skip
         if sub["launched"]:
             self._look()
-        _, phi1, phi2, *_ = self._drag or FREE
-        self._scene.hh = self._h**2 * sub["reaches"] * (phi2 if started else phi1)
-        report = self._report(substeps, iterations)
-        self._energy = report.energy
-        return report
+        self._scene.hh = self._h**2 * sub["reaches"] * (self._drag or FREE)[2 if started else 1]
+        return self._report(substeps, iterations)
 
     def _counted(self, dt: float) -> tuple[float, float, int]:
         """When frames of this length began, their length, and their number, with one more: frames of the same length are counted,
@@ -160,11 +157,13 @@ class World(Access):
 
     def _heed(self) -> None:
         """Bring the knobs to the device; where a force has changed, start anew while the device still has what it was."""
-        if any(f.changed or f.moving for f in self._features):
-            with self._memory.compiler():
-                if any(f.changed and isinstance(f, Acceleration) for f in self._features):
-                    self._restart()
-                self._upload()
+        for feature in self._features:
+            if feature.changed or feature.moving:
+                with self._memory.compiler():
+                    if any(f.changed and isinstance(f, Acceleration) for f in self._features):
+                        self._restart()
+                    self._upload()
+                return
 
     def _upload(self) -> None:
         """Write what was changed in Python since the last frame."""
@@ -178,7 +177,7 @@ class World(Access):
 
     def _begin(self, h: float) -> None:
         """Take h for the substep; with another one than before, displacements mean something else: start anew from velocities."""
-        drag = decay(sum(f.rate for f in self._sub.drags), h) if self._sub.decays else None
+        drag = decay(sum(f.rate for f in self._sub.drags), h) if self._plain["decays"] else None
         if h == self._h and drag == self._drag and not self._fresh and self._energy is not None and self._placed is None:
             return
         with self._memory.compiler():
