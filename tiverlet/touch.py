@@ -144,17 +144,20 @@ class Touch(Feature):
     def overlaps(self, i):
         """For the report: contacts of particle i with later ones, and the worst overlap in radii of the smaller."""
         touching, worst = 0, ti.cast(0, ti.f64)
-        for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
-            j = self._on_grid.near[e]
-            if j > i:
-                a, b = self._on_radius.of(i), self._on_radius.of(j)
-                overlap = self.depth(i, j, a + b)
-                if overlap > 0:
-                    small = ti.min(a, b)
-                    if small == 0:
-                        small = ti.max(a, b)
-                    worst = ti.max(worst, overlap / small)
-                    touching += 1
+        number = self._on_grid.number[i]
+        last = self._on_grid.first[i] + number - 1
+        for k in range(number):
+            j = self._on_grid.near[last - k]
+            if j < i:  # and so are the rest
+                break
+            a, b = self._on_radius.of(i), self._on_radius.of(j)
+            overlap = self.depth(i, j, a + b)
+            if overlap > 0:
+                small = ti.min(a, b)
+                if small == 0:
+                    small = ti.max(a, b)
+                worst = ti.max(worst, overlap / small)
+                touching += 1
         return touching, worst
 
     def found(self, x: np.ndarray, h: float) -> Contacts:
