@@ -5,6 +5,7 @@ Each is one kernel for all substeps of a frame, serial, in f64, without any repo
 
 import math
 from collections.abc import Sequence
+from struct import Struct
 from typing import Any
 
 import numpy as np
@@ -17,9 +18,11 @@ from ..feature import Feature
 from ..forces import Drag, Gravity
 from ..memory import Memory
 from ..particles import Particles
+from ..substep import integer
 
 KINDS = (Gravity, Drag, Distance)  # what they know
 STIFFNESS = 0.5  # of the article, per pass
+GIVE = Struct("5d").pack_into  # the substep, what drag leaves of velocities, substeps, iterations, whether it starts
 
 
 @ti.data_oriented
@@ -52,8 +55,8 @@ class Baseline:
         self.pull = add("g", None, width=self.dim, values=self.g)
         self.memory.place()
         self.pull[None] = self.g
-        self.reals, self.counts = np.zeros(2), np.zeros(3, dtype=np.int32)
-        self.quick = Quick(self, "frame", self.memory.compiler, self.reals, self.counts)
+        given: Any = np.zeros(5)
+        self.given, self.quick = given.data, Quick(self, "frame", self.memory.compiler, given)
         self.restart()
 
     @classmethod
@@ -81,11 +84,11 @@ class Baseline:
             self.x[j] -= self.w[j] * step
 
     @ti.kernel
-    def frame(self, reals: ti.types.ndarray(ti.f64, 1), counts: ti.types.ndarray(ti.i32, 1)):  # type: ignore[valid-type]
+    def frame(self, given: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
         """What step() asks for."""
         ti.loop_config(serialize=True)
         for _ in range(1):
-            self.advance(reals[0], reals[1], counts[0], counts[1], counts[2])
+            self.advance(given[0], given[1], integer(given, 2), integer(given, 3), integer(given, 4))
 
     def restart(self) -> None:
         """Go back to the start."""
@@ -98,10 +101,7 @@ class Baseline:
         """A frame of dt [s]."""
         mine = vars(self)  # as in a World: past the doors at which Taichi looks at everything anew
         h = dt / mine["substeps"]
-        mine["reals"][:], mine["counts"][:] = (
-            (h, math.exp(-mine["rate"] * h)),
-            (mine["substeps"], mine["iterations"], mine["fresh"]),
-        )
+        GIVE(mine["given"], 0, h, math.exp(-mine["rate"] * h), mine["substeps"], mine["iterations"], mine["fresh"])
         mine["quick"]()
         mine["fresh"] = False
 
