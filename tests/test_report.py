@@ -222,7 +222,7 @@ PLANTS = {
         "stress(rows=[11])",
         [
             (
-                "phases.py",
+                "motion.py",
                 "self.state.x[i] = x + step",
                 "self.state.x[i] = x + d; self.state.d[i] = self.state.x[i] - x",
             )

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from .grid import WORD, lowest
+from .pairs import WORD, lowest
 
 EVERY = 32  # substeps from one projection to the next
 PASSES = 32

@@ -7,22 +7,21 @@ import taichi as ti
 
 from .. import checks
 from ..calm import Calm
-from ..compiling import FEW
 from ..feature import Batch, Scene
-from ..grid import FARTHEST, WORD, Grid, Luggage, lowest
+from ..grid import FARTHEST, Grid
 from ..material import Table
+from ..pairs import WORD, Luggage, lowest
 from ..particles import Particles
+from ..splitting import Splitting, lesser
 from ..team import Team
 from ..tools import median
-from ..touch import Touch
 
 RELAXATION = 1.25  # below 4/3, see Contact
 CARRY = 0.4  # of its last push that a pair keeps, at most; below 1/2
 UPTAKE = 1 / 8  # of the slack of a pair, what a substep takes back
-FADE = 31 / 32  # of how much more often than needed a mass was split, what is left a pass later
 
 
-class Contact(Touch):
+class Contact(Splitting):
     """Discs and spheres do not overlap.
 
     C(x) = |x_i - x_j| - (r_i + r_j) >= 0 for all pairs, grad_i C = n = (x_i - x_j) / |x_i - x_j|.
@@ -168,91 +167,6 @@ class Contact(Touch):
         if fast != 0:
             if self._on_fast[None] == 0:
                 self._on_fast[None] = 1
-
-    @ti.func
-    def touches(self, i, word):
-        """Bits for the entries of particle i that the word is for: which touch, as in touch(), to the last digit."""
-        out, begin = ti.u32(0), self._on_grid.first[i] + word * WORD
-        for k in range(ti.min(self._on_grid.number[i] - word * WORD, WORD)):
-            j = self._on_grid.near[begin + k]
-            r, far = self._on_state.apart(i, j), self.far(i, j)
-            out |= ti.cast(r.dot(r) < far * far, ti.u32) << ti.cast(k, ti.u32)  # no branch: it would be taken at random
-        return out
-
-    @ti.func
-    def touching(self, i, word):
-        """The same bits, of the first word as count() left them."""
-        out = self._on_grid.touching[i]
-        if word > 0:
-            out = self.touches(i, word)
-        return out
-
-    @ti.func
-    def count(self, begin, end):
-        """Which pairs of some particles touch, and how often their masses are split. Where none did, that none does is known in
-        half the time; small worlds compile faster without it."""
-        some = 1
-        if ti.static(self.scene.particles.count >= FEW):
-            some = 0
-            for i in range(begin, end):
-                some |= ti.cast(self._on_split[i] > 0, ti.i32)
-            if some == 0:
-                for i in range(begin, end):
-                    some |= self.meets(i)
-        if some != 0:
-            for i in range(begin, end):
-                self.tell(i)
-
-    @ti.func
-    def meets(self, i):
-        """1 if any pair of particle i touches, to the last digit."""
-        gap, begin = ti.cast(1, self.scene.real), self._on_grid.first[i]
-        for e in range(begin, begin + self._on_grid.number[i]):
-            j = self._on_grid.near[e]
-            r, far = self._on_state.apart(i, j), self.far(i, j)
-            gap = lesser(r.dot(r) - far * far, gap)  # below 0 if and only if one is less than the other
-        return ti.cast(gap < 0, ti.i32)
-
-    @ti.func
-    def tell(self, i):
-        """Which pairs of particle i touch, and how often its mass is split. What does not touch has no push to keep."""
-        bits = self.touches(i, 0)
-        pairs = ti.math.popcnt(bits)
-        self.forget(i, 0, self._on_grid.touching[i] & ~bits)
-        self._on_grid.touching[i] = bits
-        for word in range(1, self._on_grid.words(i)):
-            bits = self.touches(i, word)
-            pairs += ti.math.popcnt(bits)
-            self.forget(i, word, self._on_grid.whole(i, word) & ~bits)
-        split = ti.cast(pairs, self.scene.real)
-        if ti.static(not self._on_rubs):
-            if pairs > 2:
-                tensor = ti.Matrix.zero(self.scene.real, self._on_state.dim, self._on_state.dim)
-                deepest = ti.cast(1, self.scene.real)
-                for word in range(self._on_grid.words(i)):
-                    bits = self.touching(i, word)
-                    while bits != 0:
-                        j = self._on_grid.near[self._on_grid.first[i] + word * WORD + lowest(bits)]
-                        bits &= bits - ti.u32(1)
-                        r, far = self._on_state.apart(i, j), self.far(i, j)
-                        scale = 1 / (far * far)
-                        tensor += scale * r.outer_product(r)
-                        deepest = lesser(r.dot(r) * scale, deepest)
-                if deepest > 0.25:
-                    split = lesser(largest(tensor) / deepest, split)
-        split *= self._on_state.w.of(i)
-        rest = ti.static(FADE) * ti.max(self._on_split[i] - split, 0)
-        self._on_split[i] = ti.select(pairs > 0, split + rest, split)
-
-    @ti.func
-    def forget(self, i, word, gone):
-        """Some pairs do not touch any more."""
-        while gone != 0:
-            e = self._on_grid.first[i] + word * WORD + lowest(gone)
-            self._on_push.field[e] = 0
-            if ti.static(self._on_bounces):
-                self._on_slack.field[e] = 0
-            gone &= gone - ti.u32(1)
 
     @ti.func
     def relax(self, i, first, fresh):
@@ -406,22 +320,6 @@ class Contact(Touch):
                         overlap, _n = self.touch(i, j, self.far(i, j))
                         if overlap <= 0:
                             self._on_slack.field[e] = 0
-
-
-@ti.func
-def lesser(a, b):
-    """The lesser of two numbers; ti.min asks whether either is NaN, which takes longer."""
-    return ti.select(a < b, a, b)
-
-
-@ti.func
-def largest(tensor):
-    """The largest eigenvalue of a symmetric 2 x 2 matrix, and an upper bound for 3 x 3 ones (Wolkowicz and Styan 1980)."""
-    n = ti.static(tensor.n)
-    mean = tensor.trace() / n
-    for k in ti.static(range(n)):
-        tensor[k, k] -= mean
-    return mean + ti.static(((n - 1) / n) ** 0.5) * tensor.norm()
 
 
 @ti.func

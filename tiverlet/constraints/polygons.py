@@ -11,8 +11,9 @@ import taichi as ti
 
 from .. import checks
 from ..feature import Batch, Scene
-from ..grid import Grid, Luggage
+from ..grid import Grid
 from ..material import Table
+from ..pairs import Luggage
 from ..particles import Particles, Radii
 from ..team import Team
 from ..tools import median

@@ -1,0 +1,154 @@
+"""What happens to a tile of particles: loops so short that their state stays in a cache, and so simple that several are done at
+once."""
+
+import taichi as ti
+
+from .compiling import FEW
+from .feature import Acceleration, Batch, Scene
+from .motion import Motion
+from .team import Team
+from .wall import Wall
+
+TILE = 256  # particles that a thread takes at a time, through several loops: their state stays in its cache
+BLOCK = 16  # of them that are asked at once whether any is near a wall, or touches another
+SWEEPS = 8  # rounds over the walls, for particles that several of them push
+
+
+class Tiles(Motion):
+    """The motion of particles, and what they gather of constraints, contacts and walls. contact and grid may be None."""
+
+    def __init__(
+        self, scene: Scene, accelerations: list[Acceleration], batches: list[Batch], contact, grid, walls: list[Wall], team: Team
+    ):  # fmt: skip
+        super().__init__(scene, accelerations)
+        self.team = team
+        self.pieces = -(-self.n // team.piece)
+        self.tile = min(TILE, team.piece)
+        self.each = -(-team.piece // self.tile)  # tiles of a piece
+        self.slots, self.grid, self.walls, self.radius = scene.slots, grid, walls, scene.radius
+        self.batches: list[Batch] = [b for b in batches if b.count]
+        self.contacts = [contact] if contact else []
+        if walls or contact:
+            self.thrust = scene.memory.field("thrust", self.n, width=self.dim, state=True)
+
+    @ti.func
+    def part(self, k, me):
+        """The particles of the k-th piece of thread `me`: the first, and where they end."""
+        first = self.team.turn(k, 1, me) * self.team.piece
+        return first, ti.min(first + self.team.piece, self.n)
+
+    @ti.func
+    def within(self, tile):
+        """Those of a tile of a piece."""
+        piece, first = tile, tile * self.team.piece
+        if ti.static(self.each > 1):
+            piece = tile // self.each
+            first = piece * self.team.piece + tile % self.each * self.tile
+        return first, ti.min(first + self.tile, (piece + 1) * self.team.piece, self.n)
+
+    @ti.func
+    def advance(self, tile, h, t, tick, fresh, calming):
+        """Integrate a tile of particles. Short loops, so that each is done for several particles at once."""
+        first, end = self.within(tile)
+        if ti.static(self.state.starts):
+            for i in range(first, end):
+                self.state.x0[i] = self.state.x[i]
+                if ti.static(self.state.compensated):
+                    self.state.low0[i] = self.state.low[i]
+        if ti.static(self.state.leans):
+            if calming != 0:
+                for i in range(first, end):
+                    self.state.lean[i] = ti.zero(self.state.x[i])
+        pull, share, reach = self.pull(t), ti.cast(1, self.real), self.reach(h, fresh)
+        if fresh != 0:
+            share = h
+            if ti.static(self.decays):
+                share *= self.decay[None][1]
+        for i in range(first, end):
+            self.integrate(i, h, t, tick, fresh, pull, share, reach)
+        for c in ti.static(self.contacts):
+            stale, fast = 0, 0
+            for i in range(first, end):
+                c.grow(i, h)
+            for i in range(first, end):
+                stale |= self.grid.outrun(i)
+            for i in range(first, end):
+                fast |= c.overshoots(i)
+            c.heed(stale, fast)
+
+    @ti.func
+    def move(self, tile, h, when, first, final, looks):
+        """What a tile of particles gathers."""
+        begin, end = self.within(tile)
+        if ti.static(len(self.batches) > 0 and len(self.contacts) == 0):
+            for i in range(begin, end):
+                self.slots.gather(i, first, final)
+        if ti.static(len(self.walls) > 0 or len(self.contacts) > 0):
+            if final != 0:
+                for i in range(begin, end):
+                    if first != 0:
+                        self.thrust[i] = -self.state.d[i]
+                    else:
+                        self.thrust[i] = self.thrust[i] - self.state.d[i]
+        for c in ti.static(self.contacts):
+            for i in range(begin, end):
+                c.gather(i, first)
+        if ti.static(len(self.walls) > 0 and self.n < FEW):
+            for i in range(begin, end):
+                self.confine(i, h, when)
+        elif ti.static(len(self.walls) > 0):
+            for b in range((end - begin + (BLOCK - 1)) // BLOCK):
+                low, high = begin + b * BLOCK, ti.min(begin + (b + 1) * BLOCK, end)
+                near = 0
+                for i in range(low, high):
+                    for f in ti.static(self.walls):
+                        near |= f.near(i, self.radius.of(i))
+                if near != 0:
+                    for i in range(low, high):
+                        self.confine(i, h, when)
+        for c in ti.static(self.contacts):
+            if looks != 0:
+                stale = 0
+                for i in range(begin, end):
+                    stale |= self.grid.outrun(i)
+                c.heed(stale, 0)
+        if ti.static(len(self.walls) > 0 or len(self.contacts) > 0):
+            if final != 0:
+                for i in range(begin, end):
+                    self.thrust[i] = self.thrust[i] + self.state.d[i]
+
+    @ti.func
+    def confine(self, i, h, when):
+        """The walls, which have the last word; several take turns until they agree, or for SWEEPS rounds in a sharp corner."""
+        if self.state.w.of(i) > 0:
+            if ti.static(len(self.walls) == 1):
+                for f in ti.static(self.walls):
+                    f.confine(i, self.radius.of(i), h, when)
+            else:
+                moving = True
+                for _ in range(SWEEPS):
+                    if moving:
+                        before = self.state.d[i]
+                        for f in ti.static(self.walls):
+                            f.confine(i, self.radius.of(i), h, when)
+                        moving = (self.state.d[i] != before).any()
+
+    @ti.func
+    def felt(self, i, h, t):
+        """h^2 times what constraints, contacts and walls did to particle i in the last substep, for its velocity.
+
+        Contacts and walls count as far as they balance the rest: a body at rest has velocity 0, but one that has just bounced is
+        not credited with half of the blow.
+        """
+        bond = 0 * self.state.d[i]
+        if ti.static(len(self.batches) > 0):
+            bond = self.slots.pull[i]
+        if ti.static(len(self.walls) > 0 or len(self.contacts) > 0):
+            push = self.thrust[i]
+            v = self.state.d[i] / h
+            limit = (h * h * self.accelerate(i, self.state.place(i), v, t, self.pull(t)) + bond).norm()
+            size = push.norm()
+            if size > limit:
+                push *= limit / size
+            bond += push
+        return bond
