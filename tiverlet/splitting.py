@@ -54,12 +54,18 @@ class Splitting(Touch):
 
     @ti.func
     def meets(self, i):
-        """1 if any pair of particle i touches, to the last digit."""
-        gap, begin = ti.cast(1, self.scene.real), self._on_grid.first[i]
+        """1 if any pair of particle i touches, to the last digit: a difference is below 0 if and only if one is the lesser."""
+        same = ti.static(self._on_radius.uniform and not self._on_eases)
+        gap, begin = ti.cast(ti.math.inf, self.scene.real), self._on_grid.first[i]
         for e in range(begin, begin + self._on_grid.number[i]):
             j = self._on_grid.near[e]
-            r, far = self._on_state.apart(i, j), self.far(i, j)
-            gap = lesser(r.dot(r) - far * far, gap)  # below 0 if and only if one is less than the other
+            r = self._on_state.apart(i, j)
+            rr = r.dot(r)
+            if ti.static(not same):
+                rr -= self.far(i, j) * self.far(i, j)
+            gap = lesser(rr, gap)
+        if ti.static(same):
+            gap -= self.far(i, i) * self.far(i, i)
         return ti.cast(gap < 0, ti.i32)
 
     @ti.func

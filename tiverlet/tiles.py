@@ -10,7 +10,7 @@ from .team import Team
 from .wall import Wall
 
 TILE = 256  # particles that a thread takes at a time, through several loops: their state stays in its cache
-BLOCK = 16  # of them that are asked at once whether any is near a wall, or touches another
+BLOCK = 32  # of them that are asked at once whether any is near a wall, or touches another
 SWEEPS = 8  # rounds over the walls, for particles that several of them push
 
 
