@@ -3,7 +3,8 @@
 Most of that time goes into Taichi's analysis of control flow and, in small worlds, its simplifier; LLVM does both again. They are
 left out while a kernel of ours compiles, and only then: what the user compiles in the same process is compiled as ever. A kernel
 with the user's functions in it keeps them, because they can hide what LLVM ends the process for: a vector assigned to a variable
-that is a number, where nobody reads it (`_, gap, _ = nearest(x)`). How functions are read is in reading.py.
+that is a number, where nobody reads it (`_, gap, _ = nearest(x)`). How functions are read is in reading.py, and how they become
+statements in expanding.py.
 
 Everything here knows the inside of Taichi 1.7.4; with another one, kernels are compiled as Taichi does.
 """
@@ -47,6 +48,7 @@ class Compiler:
         self.real = real
         self.lean = LEAN | BRIEF if particles < FEW else LEAN
         self.thorough = not patched  # once and for all, since what Taichi fails to compile may be tried again
+        self.config: Any = None  # of Taichi, while kernels compile
         self._settings: dict[str, Any] = {}  # that Taichi was started with
         self._thread = 0
 
@@ -61,6 +63,7 @@ class Compiler:
         runtime: Any = impl.get_runtime()
         with _lock:
             config, literals = runtime.prog.config(), runtime.default_fp
+            self.config = config
             before = {name: getattr(config, name) for name in LEAN | BRIEF}
             self._settings = active[0]._settings if active else before
             runtime.set_default_fp(self.real)

@@ -27,9 +27,9 @@ import taichi as ti
 
 from .arguments import Noted
 from .compiling import inline
+from .expanding import at
 from .memory import Memory
 from .particles import Particles, State
-from .reading import at
 
 BENT, FAR = 1, 2  # how far a constraint turned in a substep: by more than 26 degrees, by more than 41
 

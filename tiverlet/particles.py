@@ -6,8 +6,8 @@ from numpy.typing import ArrayLike
 
 from . import checks
 from .compiling import inline
+from .expanding import at
 from .memory import Memory
-from .reading import at
 
 LARGEST = 1e15  # [m] beyond this, squared lengths near 1e38 leave f32; nothing physical is that far
 

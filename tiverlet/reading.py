@@ -15,14 +15,13 @@ import pathlib
 import sys
 import textwrap
 import weakref
-from functools import cache, wraps
+from functools import cache
 from types import CodeType, SimpleNamespace
 from typing import Any
 
 import taichi as ti
-from taichi.lang import expr, impl, kernel_impl, matrix, matrix_ops, snode
+from taichi.lang import expr, impl, kernel_impl, matrix, snode
 from taichi.lang.ast import ASTTransformerContext
-from taichi.lang.ast.ast_transformer import ASTTransformer
 
 # Where functions come from that are known to be safe.
 HOME = OURS, TAICHI = tuple(str(pathlib.Path(file).parent) + os.sep for file in (__file__, ti.__file__))
@@ -106,70 +105,6 @@ def _grown(tree: Any, ctx: Any) -> Any:
     return out
 
 
-def _decorated(ctx: Any, node: Any) -> str:
-    """Which of Taichi's own a call is; it is asked for every call, and again for every turn of a static loop."""
-    if not active:
-        return _decorator(ctx, node)
-    if not hasattr(node, "decorator"):
-        node.decorator = _decorator(ctx, node)
-    return node.decorator
-
-
-@cache
-def _method(kind: type) -> Any:
-    return getattr(ASTTransformer, f"build_{kind.__name__}", None)
-
-
-class _Failed:
-    """In the place of what compiles nodes: it fails with an error that is there already."""
-
-    def __init__(self, error: Exception):
-        self._error = error
-
-    def __getattr__(self, name: str) -> Any:
-        def fail(ctx, node):
-            raise self._error
-
-        return fail
-
-
-def _visited(self: Any, ctx: Any, node: Any) -> Any:
-    """Compile a node. Taichi works out anew for each where it is, which takes as long as all else that it does in Python."""
-    kind = type(node)
-    method = _method(kind)
-    if not active or method is None:
-        return _visit(self, ctx, node)
-    if kind is ast.Attribute:
-        node.__dict__.pop("caller", None)  # from the last time
-    line = getattr(node, "lineno", ctx.line)
-    if line != ctx.line:
-        ctx.line, ctx.place = line, ctx.get_pos_info(node)
-    places = impl.pytaichi.src_info_stack
-    places.append(ctx.place)
-    try:
-        return method(ctx, node)
-    except Exception as e:
-        return _visit(_Failed(e), ctx, node)  # which says where, as ever
-    finally:
-        places.pop()
-
-
-def _product(x: Any, y: Any) -> Any:
-    """The dot product of two vectors: the same sum in the same order, without the functions inside functions that Taichi makes
-    of it, which copy their arguments."""
-    vectors = isinstance(x, expr.Expr) and isinstance(y, expr.Expr) and x.is_tensor() and x.get_shape() == y.get_shape()
-    if not active or not impl.inside_kernel() or not vectors or len(x.get_shape()) > 1:
-        return _dot(x, y)
-    parts = impl.expr_init(x * y)
-    return sum((at(parts, k) for k in range(1, x.get_shape()[0])), at(parts, 0))
-
-
-def at(field: Any, index: Any) -> Any:
-    """field[index], in a Python function that a kernel calls as it is; see compiling.inline."""
-    runtime: Any = impl.get_runtime()
-    return impl.subscript(runtime.compiling_callable.ast_builder(), field, index)
-
-
 def _roomy(function: Any) -> Any:
     """The same, with room for all that it calls: Python gives frames memory in pieces, and takes back at once what is free.
 
@@ -226,8 +161,6 @@ def _patch() -> bool:
     kernel_impl.Kernel.materialize = _roomy(kernel_impl.Kernel.materialize)
     context: Any = ASTTransformerContext
     context.get_pos_info, context.line, context.place = _place_of, 0, ""
-    ASTTransformer.__call__, ASTTransformer.get_decorator = _visited, staticmethod(_decorated)
-    matrix_ops.dot = wraps(_dot)(_product)
     for name in CONSTANT:
         setattr(expr, name, cache(getattr(expr, name)))
     impl.get_traceback = matrix.get_traceback = snode.get_traceback = _trace
@@ -240,8 +173,5 @@ _look_around: Any = getattr(kernel_impl, "_inside_class", None)
 _draw: Any = getattr(ASTTransformerContext, "get_pos_info", None)
 _read_it: Any = getattr(kernel_impl, "_get_tree_and_ctx", None)
 _grow: Any = getattr(kernel_impl, "transform_tree", None)
-_visit: Any = ASTTransformer.__call__
-_decorator: Any = ASTTransformer.get_decorator
 _who: Any = getattr(snode, "get_traceback", None)
-_dot: Any = matrix_ops.dot
 patched = _patch()
