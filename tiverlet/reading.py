@@ -25,6 +25,7 @@ from taichi.lang.ast import ASTTransformerContext
 
 # Where functions come from that are known to be safe.
 HOME = OURS, TAICHI = tuple(str(pathlib.Path(file).parent) + os.sep for file in (__file__, ti.__file__))
+CLOSING = (")", "]", "}")  # what the last lines of a function may begin with that are not in its code
 NOTHING = 8  # bytes of code of a function that has nothing but a docstring
 ROOM = 70_000  # words on the stack of a frame, which with it gets 1 MB, of which half is left
 CONSTANT = ("_check_in_range", "_clamp_unsigned_to_range", "to_numpy_type")  # what Taichi works out for every whole number
@@ -53,6 +54,8 @@ def _lines_of(function) -> tuple[list[str], int]:
 def _cut_out(code: CodeType) -> tuple[list[str], int] | None:
     """The lines of a function from where its code begins to where it ends; inspect looks for the end token by token."""
     first, end, lines = code.co_firstlineno, _end(code), linecache.getlines(code.co_filename)
+    while lines[end : end + 1] and lines[end].lstrip().startswith(CLOSING):
+        end += 1
     if len(code.co_code) <= NOTHING:  # its code does not tell where the docstring ends
         end = next((k for k in range(end, len(lines) + 1) if _whole(lines[first - 1 : k])), 0)
     return (lines[first - 1 : end], first) if lines and end else None
@@ -68,6 +71,8 @@ def _whole(lines: list[str]) -> bool:
 def _end(code: CodeType) -> int:
     """The last line of a function and of those inside it."""
     inside = [_end(const) for const in code.co_consts if isinstance(const, CodeType)]
+    if code.co_filename.startswith(OURS):  # ours end with a line that does something, or with brackets that close
+        return max(code.co_firstlineno, *inside, *(line for _, _, line in code.co_lines() if line))
     return max([code.co_firstlineno, *inside, *(end for _, end, _, _ in code.co_positions() if end)])
 
 
@@ -84,6 +89,14 @@ def _filled(line: str, tabsize: int, width: int) -> str:
     if line[:-1].isprintable() and len(line) < width:
         return line.rstrip()
     return textwrap.fill(line, tabsize=tabsize, width=width)
+
+
+def _dedented(text: str) -> str:
+    """Lines without the space that all begin with, which is nearly always that of the first one."""
+    margin = text[: len(text) - len(text.lstrip())]
+    if all(line.startswith(margin) for line in text.split("\n") if line):
+        return text.removeprefix(margin).replace("\n" + margin, "\n")
+    return textwrap.dedent(text)
 
 
 def _reread(self: Any, is_kernel: bool = True, args: Any = None, ast_builder: Any = None, **options) -> tuple[Any, Any]:
@@ -156,7 +169,7 @@ def _patch() -> bool:
     ):
         return False
     kernel_impl.getsourcelines, kernel_impl.getsourcefile, kernel_impl._inside_class = _lines_of, _file_of, _in_class
-    kernel_impl.textwrap = SimpleNamespace(fill=_filled, dedent=textwrap.dedent)
+    kernel_impl.textwrap = SimpleNamespace(fill=_filled, dedent=_dedented)
     kernel_impl._get_tree_and_ctx, kernel_impl.transform_tree = _reread, _grown
     kernel_impl.Kernel.materialize = _roomy(kernel_impl.Kernel.materialize)
     context: Any = ASTTransformerContext
