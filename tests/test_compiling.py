@@ -3,6 +3,7 @@
 import gc
 import inspect
 import sys
+import tempfile
 
 import numpy as np
 
@@ -67,6 +68,48 @@ assert own() == -200.0
 """,
         TI_OFFLINE_CACHE="0",
     )
+
+
+def test_statements_are_those_that_taichi_makes():
+    # Its cache names a kernel by its statements. A version that is not known makes them by itself; all but dot products, which we
+    # write out.
+    code = """
+import os
+import taichi as ti
+if os.environ["ALONE"]:
+    ti.__version__ = (1, 7, 5)
+import tiverlet as tv
+from taichi.lang import matrix_ops
+from tiverlet import compiling, expanding
+assert compiling.patched != bool(os.environ["ALONE"])
+compiling.patched, matrix_ops.dot = False, expanding._product
+@ti.func
+def spring(x):
+    out = 0 * x
+    for k in ti.static(range(2)):
+        out[k] = -30.0 * x[k]
+        if ti.static(k == 0):
+            continue
+    a, b = x[0], x[1]
+    n, tall = 3, ti.Vector([b, -a])
+    while n > 1 and a < 1e3 or not b >= a:
+        n -= 1
+        if n == 2:
+            break
+        out += 0.25 * tall / (1 + abs(a)) ** n - ti.cast(n << 1, float) * ti.min(a, 2)
+    return out * min(ti.math.dot(x, x), 3) + tall.yx * (1.0 if a > b else ti.u32(7) % 4)
+world = tv.World(tv.Particles([[0.0, 0.0], [1.0, 0.0]]), [tv.Force(spring)])
+world.step(1 / 60)
+print(world.hash())
+ti.reset()  # which writes the cache
+print(*sorted(name for name in os.listdir(os.environ["TI_OFFLINE_CACHE_FILE_PATH"]) if name.endswith(".tic")))
+"""
+    with tempfile.TemporaryDirectory() as folder:
+        said = [
+            python(code, ALONE=alone, TI_OFFLINE_CACHE="1", TI_OFFLINE_CACHE_FILE_PATH=f"{folder}/cache{alone}").stdout
+            for alone in ("", "1")
+        ]
+    assert said[0].splitlines()[-2:] == said[1].splitlines()[-2:] and said[0].count(".tic") == 2, said
 
 
 def test_functions_are_cut_out_of_their_files_as_python_does_it():
