@@ -151,10 +151,9 @@ def _subscript(builder: Any, value: Any, *indices: Any, **options: Any) -> Any:
 def _target(value: Any) -> Any:
     """What the compiler takes for a field, an array or a vector; None for all else."""
     kind = type(value)
-    if kind is ScalarField or kind is MatrixField:
-        first = value.vars[0].ptr
-        return None if first.snode() is None else first if kind is ScalarField else value.ptr
-    return value.ptr if kind is AnyArray or kind is Expr and value.is_tensor() else None
+    if kind is ScalarField:
+        return value.vars[0].ptr
+    return value.ptr if kind in (MatrixField, AnyArray) or kind is Expr and value.is_tensor() else None
 
 
 def _product(x: Any, y: Any) -> Any:
