@@ -12,8 +12,8 @@ import taichi as ti
 
 from .calm import PASSES
 from .compiling import inline
+from .expanding import at
 from .phases import Phases
-from .reading import at
 from .team import LEAST
 
 # The sheet of a frame, one array, since a launch takes 0.25 us more for each. First what the frame came to, see Survey; then how
