@@ -9,6 +9,7 @@ milliseconds: after a few such waits the first thread goes on alone, and the oth
 import contextlib
 from collections.abc import Iterator
 
+import numpy as np
 import taichi as ti
 
 from . import runtime
@@ -22,6 +23,7 @@ SHARE = 500  # particles and constraints for each thread, at least; with fewer t
 PATIENCE = 20_000  # looks at the counter, of 50 ns or less, and one more for each particle: then a wait was long
 LONG = 4  # long waits in a frame after which one thread goes on alone
 ALONE = 32  # frames until the others come back
+LINE = 32  # integers that are not in the same line of a cache
 SHIFT = 4096  # frames after which arrivals are counted from 0 again, while nobody waits
 
 
@@ -56,8 +58,9 @@ class Team:
         self.piece = max(1, 1 if launched else particles if size == 1 else even)
         self.spread = LEAST * size if size > 1 else 1
         self._alone, self._frames = 0, 0
+        self.memory = memory
         if size > 1:
-            self.arrived = memory.field("team.arrived", None, kind=ti.i32)
+            self.arrived = memory.field("team.arrived", 2 * LINE, kind=ti.i32)
             self.hands = memory.field("team.hands", None, kind=ti.i32, values=size)  # how many of them are at work
             self.late = memory.field("team.long_waits", None, kind=ti.i32)
             self.ends = memory.field("team.ends", None, kind=ti.i32)  # 1: in the next substep all but the first leave
@@ -67,13 +70,13 @@ class Team:
         if self.size > 1:
             self._frames += 1
             if self._frames % SHIFT == 0:
-                self.arrived[None] = 0
+                self.memory.write(self.arrived, np.zeros(2 * LINE))
             if self._alone == 0 and hands == 1:
                 self._alone = ALONE
             elif self._alone > 0:
                 self._alone -= 1
                 if self._alone == 0:
-                    self.hands[None] = self.size
+                    self.memory.write(self.hands, self.size)
 
     @inline
     def works(self, me):
@@ -155,14 +158,18 @@ class Team:
 
     @ti.func
     def meet(self, hands):
-        """Wait for so many."""
+        """Wait for so many. The last one says so in another place than where all arrive, whom those who look would hold up."""
         if hands > 1:
-            goal = (ti.atomic_add(self.arrived[None], 1) // hands + 1) * hands
-            looks = 0
-            while ti.atomic_add(self.arrived[None], 0) < goal:
-                looks += 1
-            if looks > self.patience:
-                ti.atomic_add(self.late[None], 1)
+            before = ti.atomic_add(self.arrived[0], 1)
+            turn = before // hands + 1
+            if before + 1 == turn * hands:
+                ti.atomic_add(self.arrived[LINE], 1)
+            else:
+                looks = 0
+                while ti.atomic_add(self.arrived[LINE], 0) < turn:
+                    looks += 1
+                if looks > self.patience:
+                    ti.atomic_add(self.late[None], 1)
 
     @ti.func
     def forgive(self):
