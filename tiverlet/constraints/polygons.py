@@ -180,23 +180,25 @@ class Polygons(Rim):
         """Allow particle i less, and keep the length of the substep at hand."""
         if i == 0:
             self._on_h[None] = h
-        self._on_less[i] = ti.max(self._on_less[i] - self.push_out * h / 2, 0)
+        self._on_less[i] = ti.max(self._on_less[i] - self.push_out * h, 0)
 
     @ti.func
     def overshoots(self, i):
-        """1 if particle i crosses a quarter of an edge in one substep, or begins an edge that is too long for the list."""
-        out = 0
+        """1 if particle i crosses a quarter of an edge in one substep."""
         d, limit = self._on_state.d[i], ti.cast(self._on_reach, self.scene.real)
+        if self.after(i) < 0:
+            limit = ti.min(limit, self._on_radius.stride(i) if ti.static(self._on_radius.least > 0) else limit)
+        return ti.select(d.dot(d) <= limit * limit, 0, 1)
+
+    @ti.func
+    def measure(self, i):
+        """Find the contacts of particle i, see look(), and note an edge that is too long for the list."""
+        self.look(i, True)
         after = self.after(i)
         if after >= 0:
             u = self._on_state.apart(after, i)
             if u.dot(u) > self._on_limit[i] ** 2:
-                out = 1
-        else:
-            limit = ti.min(limit, self._on_radius.stride(i) if ti.static(self._on_radius.least > 0) else limit)
-        if not (d.dot(d) <= limit * limit):
-            out = 1
-        return out
+                self.heed(0, 1)
 
     @ti.func
     def split(self, count: ti.template(), v, a, b, t):  # type: ignore[valid-type]

@@ -51,11 +51,11 @@ class Rim(Contact):
         return out
 
     @ti.func
-    def edge(self, v, a, front, eased: ti.template()):  # type: ignore[valid-type]
+    def edge(self, v, a, front, moved: ti.template()):  # type: ignore[valid-type]
         """How far v overlaps the edge from a to the next, negative where it does not, the normal, and where on the edge.
 
         What was in front at the start of the substep came in over this edge if it crossed it between its ends. What was behind
-        already goes out over the nearest one that faces its own body, at push_out.
+        already goes out over the nearest one that faces its own body, at push_out. moved: as in look().
         """
         b = self.after(a)
         r, u = self._on_state.apart(v, a), self._on_state.apart(b, a)
@@ -66,12 +66,14 @@ class Rim(Contact):
             t, n = r.dot(u) / uu, ti.Vector([u[1], -u[0]]) / length
             height, cross, came, shared = r.dot(n), t, True, a
             if height < 0:
-                d = self._on_state.d[a]
-                r0, u0 = r - (self._on_state.d[v] - d), u - (self._on_state.d[b] - d)
-                height0, t0 = r0.dot(ti.Vector([u0[1], -u0[0]])) / length, r0.dot(u0) / ti.max(u0.dot(u0), uu * SLACK)
-                came = height0 >= -SLACK * length
-                if height0 > 0:
-                    cross = t0 + height0 / (height0 - height) * (t - t0)
+                came = height >= -SLACK * length
+                if ti.static(moved):
+                    d = self._on_state.d[a]
+                    r0, u0 = r - (self._on_state.d[v] - d), u - (self._on_state.d[b] - d)
+                    height0, t0 = r0.dot(ti.Vector([u0[1], -u0[0]])) / length, r0.dot(u0) / ti.max(u0.dot(u0), uu * SLACK)
+                    came = height0 >= -SLACK * length
+                    if height0 > 0:
+                        cross = t0 + height0 / (height0 - height) * (t - t0)
             beside = -SLACK <= cross <= 1 + SLACK
             if not came and t < 0:
                 beside = front < 0
@@ -81,15 +83,35 @@ class Rim(Contact):
             t = ti.min(ti.max(t, 0), 1)
             far = self._on_radius.of(v) + (1 - t) * self._on_radius.of(a) + t * self._on_radius.of(b)
             if beside and height < far and height >= -length / 2:
-                out = far - height
+                out, back = far - height, 0 * n
+                if ti.static(moved):
+                    out -= self._on_less[v]
                 if not came:
-                    back = self.inward(v)
-                    came = back.dot(n) >= 0 and self.nearest(v, a, shared, height, back)
-                    if ti.static(eased):
+                    if ti.static(moved):
                         out = ti.min(out, self.push_out * self._on_h[None] - self.relative(v, a, b, t).dot(n))
+                        back = self.inward(v)
+                    if back.dot(n) >= 0 and self.inside(v, a):
+                        came = self.nearest(v, a, shared, height, back)
                 if came:
                     overlap = out
         return overlap, n, t
+
+    @ti.func
+    def inside(self, v, a):
+        """Whether v is inside of the body of a: a ray from it along +x crosses the loop an odd number of times.
+
+        What is behind one edge may be in front of the next, where they meet at less than 90 degrees.
+        """
+        out, k, r = False, a, self._on_state.apart(a, v)
+        going = True
+        while going:
+            k = self.after(k)
+            s = self._on_state.apart(k, v)
+            up = s[1] > 0
+            if (r[1] > 0) != up and (r.cross(s) > 0) == up:
+                out = not out
+            r, going = s, k != a
+        return out
 
     @ti.func
     def inward(self, v):
@@ -121,27 +143,26 @@ class Rim(Contact):
         return out
 
     @ti.func
-    def measure(self, i):
-        """Find the contacts that particle i is the vertex of, or the first of two discs: at most one with each near particle."""
-        self.look(i, True)
+    def look(self, i, moved: ti.template()):  # type: ignore[valid-type]
+        """Find the contacts that particle i is the vertex of, or the first of two discs: at most one with each near particle.
 
-    @ti.func
-    def look(self, i, eased: ti.template()):  # type: ignore[valid-type]
-        """As measure(), with or without the overlap that is allowed."""
+        moved: in a substep, by how particles moved in it, and without the overlap that is allowed. Otherwise by where they are
+        and the nearest edges: before the first substep after a start, d is the velocity.
+        """
         for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
             j = self._on_grid.near[e]
             overlap, n, t = 0 * self._on_w.of(i) - 1, 0 * self._on_state.x[i], 0 * self._on_w.of(i)
             front = self.corner(i, j)
             if self.after(j) >= 0:
-                overlap, n, t = self.edge(i, j, front, eased)
+                overlap, n, t = self.edge(i, j, front, moved)
             if overlap <= 0 and i < j and front > 0:
                 overlap, n = self.touch(i, j, self._on_radius.of(i) + self._on_radius.of(j))
+                if ti.static(moved):
+                    overlap -= self._on_less[i]
                 if overlap > 0:
                     t = 0 * t - 1
                     if self.corner(j, i) <= 0:
                         overlap = -overlap
-            if ti.static(eased):
-                overlap -= self._on_less[i]
             self._on_met.field[e] = ti.Vector([overlap, t, n[0], n[1]])
             back = ti.Vector([self.find(j, i), -1])
             if self.before(i) >= 0:
