@@ -1,24 +1,16 @@
-"""Constraints that are one number, C = f - rest: what all of them share, from soft to rigid."""
+"""Constraints that are one number, C = f - rest: how a substep fulfils them, from soft to rigid."""
 
-import warnings
-from typing import Any
-
-import numpy as np
 import taichi as ti
 
-from . import checks
-from .breaking import Breaking
-from .compliance import law, stiff
+from .elastic import Elastic
 from .feature import FAR, Scene
-from .particles import Particles
-from .tools import distinct
 
 # Where constraints converge within a substep, SHAKE is an explicit method for what is across them, with its limits:
 TENSEST = 4.0  # (omega h)^2 of a vibration across a tension, beyond which Verlet diverges
 LOST = 0.015  # violation at the start of a substep, relative to the size, from where on its direction would bring in energy
 
 
-class Scalar(Breaking):
+class Scalar(Elastic):
     """Constraints C(x) = f(x) - rest = 0, >= 0 or <= 0, soft or rigid, from `measure`. numerics: one formula for all.
 
         theta = s^4 / (1 + s^4), s^2 = (omega h)^2 = w h^2 / alpha     0: resolved by the step, 1: rigid
@@ -36,138 +28,17 @@ class Scalar(Breaking):
     With drag, alpha' = alpha / (phi h^2) with the factor phi that the exact solution gives every other acceleration.
     """
 
-    side = 0  # 0: C = 0;  1: C <= 0, pulls when f > rest;  -1: C >= 0, pushes when f < rest
     collapses = 0  # the power of a length that f is, where gradients vanish with the size of the body; else 0
-    rest: Any  # a Knob in each constraint: (m,) array
-    compliance: np.ndarray
-    damping: np.ndarray
-
-    each = ("rest", "compliance", "damping", "break_at")
-    index_name = "pairs"
-    rest_name = "rest"
-    exchangeable: tuple[tuple[int, ...], ...] | None = None  # groups of corners that may swap; None: all of them
-    unit: float | None = None  # what residuals are relative to; None: the rest value
-
-    def setup(self, indices, rest, compliance, damping, break_at=None) -> None:
-        """Keep the arguments of __init__; what depends on the particles is checked in prepare()."""
-        self.lay(indices)
-        m = self.count
-        self.strengthen(break_at)
-        self._rest_given = rest
-        self.compliance = checks.per_item(repr(self), "compliance", compliance, m, least=0.0)
-        self.damping = checks.per_item(repr(self), "damping", damping, m, least=0.0)
-        for array in (self.indices, self.compliance, self.damping):
-            array.flags.writeable = False
-
-    def lay(self, indices) -> None:
-        """Keep the particles of each constraint."""
-        self.indices = checks.indices(repr(self), self.index_name, indices, 2**31 - 1, arity=self.arity)
-        self._warn_duplicates()
-
-    def fit(self, particles: Particles) -> None:
-        """Check the particles of each constraint against those that there are."""
-        checks.indices(repr(self), self.index_name, self.indices, particles.count, arity=self.arity)
-
-    @property
-    def goal(self) -> np.ndarray:
-        """What f is to be, (m,)."""
-        return self.rest
 
     @property
     def joins(self) -> bool:
         """Whether constraints of the batch can be solved together with others: few corners, and a direction everywhere."""
         return self.arity > 0 and not self.collapses
 
-    def rest_of(self, position: np.ndarray) -> np.ndarray:
-        """f at the given positions, (m,): the rest value when none is given."""
-        raise NotImplementedError
-
-    def slopes(self, position: np.ndarray) -> np.ndarray:
-        """grad_k f of every constraint, (m, arity, dim), by central differences: each constraint on particles of its own."""
-        twin: Any = self.copy()
-        twin.indices = np.arange(self.indices.size).reshape(self.indices.shape)
-        x = position[self.indices]
-        step = 1e-6 * (float(np.ptp(x, axis=1).max(initial=0.0)) or 1.0)
-        out = np.zeros_like(x)
-        for k in range(self.arity):
-            for a in range(x.shape[2]):
-                ends = np.stack([x, x])
-                ends[:, :, k, a] += [[step], [-step]]
-                up, down = (twin.rest_of(end.reshape(-1, x.shape[2])) for end in ends)
-                out[:, k, a] = (up - down) / (2 * step)
-        return out
-
-    def closeness(self, position: np.ndarray) -> np.ndarray:
-        """What makes C a share of the size of its constraint, (m,): 1 / length for links, 0 for what has no extent."""
-        x = position[self.indices]
-        size = np.linalg.norm(x - x[:, :1], axis=2).max(axis=1, initial=0.0)
-        size *= np.sqrt((self.slopes(position) ** 2).sum(axis=(1, 2)) / 2)
-        return np.divide(1, size, out=np.zeros(self.count), where=size > 0)
-
-    def violation(self, position: np.ndarray) -> np.ndarray:
-        """C at the given positions, (m,)."""
-        return self.rest_of(position) - self.goal
-
-    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Check indices against the number of particles and settle the rest values."""
-        self.fit(particles)
-        if "rest" not in self.__dict__:
-            if self._rest_given is None:
-                self.__dict__["rest"] = self.rest_of(particles.position)
-            else:
-                self.rest = self._rest_given
-
-    def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Warn of constraints that are violated between particles that cannot move."""
-        stuck = self.idle(inv_mass)
-        if stuck.any():
-            C = self.violation(particles.position)
-            wrong = stuck & (
-                np.abs(C if self.side == 0 else np.maximum(self.side * C, 0)) > 1e-6 * np.maximum(np.abs(self.goal), 1e-6)
-            )
-            if wrong.any():
-                k = int(np.argmax(wrong))
-                at = tuple(int(i) for i in self.members_of(k))
-                warnings.warn(
-                    f"{self!r}: {self.index_name}[{k}] = {at} is off by {C[k]:g}, but its particles cannot move "
-                    f"({int(wrong.sum())} such in all). They are skipped.",
-                    stacklevel=3,
-                )
-
-    def _warn_duplicates(self) -> None:
-        ordered = self.indices.copy()
-        for group in [range(self.arity)] if self.exchangeable is None else self.exchangeable:
-            ordered[:, group] = np.sort(ordered[:, group], axis=1)
-        unique, _, counts = distinct(ordered)
-        if len(unique) < len(ordered):
-            first = tuple(int(v) for v in unique[int(np.argmax(counts > 1))])
-            warnings.warn(
-                f"{self!r}: {len(ordered) - len(unique)} of the {self.index_name} are duplicates, the first of them {first}. "
-                "They act together: the same result where rigid, stiffer by their number where compliant.",
-                stacklevel=5,
-            )
-
-    @property
-    def soft(self) -> bool:
-        """Whether any constraint of the batch has compliance."""
-        return bool((self.compliance > 0).any())
-
-    def sprung(self, scene: Scene) -> np.ndarray:
-        """Which constraints act as forces, (m,): soft ones in substeps of an order above 2. See composition.py."""
-        return (self.compliance > 0) & (scene.order > 2)
-
     def bind(self, scene: Scene) -> None:
-        """Declare rest values, multipliers, and for soft ones the memory that the averaged constraint needs."""
+        """Declare what solvers need: which rows of a system constraints are, and how they are relaxed."""
         super().bind(scene)
-        self._on_real = scene.real
-        self._on_soft = self.soft
-        self._on_sprung = bool(self.sprung(scene).any())
-        self._on_damped = self.soft and bool((self.damping > 0).any())
-        start = self.rest_of(self.start.position) if self.count else np.zeros(0)
-        self._on_scale = self.unit or (float(np.abs(start).mean()) if np.any(start) else self.start.size)
         name, m, add = repr(self), self.count, scene.memory.field
-        self._on_rest = add(f"{name}.rest", m, values=self.goal)
-        self._on_lam = add(f"{name}.multiplier", m, state=True)
         rows = scene.slots.rows(self)
         self._on_told, self._on_alone = bool((rows >= 0).any()), bool((rows < 0).any())
         if self._on_told:
@@ -178,86 +49,6 @@ class Scalar(Breaking):
         self._on_hurries = self._on_firm and scene.slots.accelerates and self._on_alone and self.side == 0
         if self._on_hurries:
             self._on_step = add(f"{name}.step", m)
-        if self._on_soft:
-            self._on_alpha = add(f"{name}.compliance", m, values=self.compliance)
-            self._on_last = add(f"{name}.last", m, values=start, state=True)
-            self._on_history = add(f"{name}.history", m)
-        if self._on_damped:
-            self._on_damping = add(f"{name}.damping", m, values=self.damping)
-        self.bind_strength(scene)
-        self.changed = False
-
-    def upload(self) -> None:
-        """Write new rest values."""
-        if self.scene and self.count:
-            self.scene.memory.write(self._on_rest, self.goal)
-
-    @ti.func
-    def measure(self, c, q):
-        """f and its (arity, dim) gradients at corners q (arity, dim), which are relative to corner 0."""
-        return 0.0, q
-
-    @ti.func
-    def near(self, f, other):
-        """Of the values that mean the same as f, the one nearest to `other`; more than one only for angles."""
-        return f
-
-    @ti.func
-    def distinct(self, f, f0):
-        """Whether the direction is clear enough at f and f0, now and at the start, for a turn of 41 degrees to mean something."""
-        return True
-
-    @ti.func
-    def begin(self, c, fresh):
-        """Before the first pass of a substep: what `measure` has to remember of its start."""
-
-    @ti.func
-    def corners(self, c, back):
-        """Corners of constraint c relative to the first, at x - back d: near the origin, so nothing is lost in f32."""
-        i = self.member(c, 0)
-        q = ti.Matrix.zero(self._on_real, self.arity, self._on_state.dim)
-        for k in ti.static(range(1, self.arity)):
-            j = self.member(c, k)
-            r = self._on_state.apart(j, i) - back * (self._on_state.d[j] - self._on_state.d[i])
-            for a in ti.static(range(self._on_state.dim)):
-                q[k, a] = r[a]
-        return q
-
-    @ti.func
-    def ends(self, c):
-        """Corners of constraint c, as above, now and at the start of the substep."""
-        i = self.member(c, 0)
-        now = ti.Matrix.zero(self._on_real, self.arity, self._on_state.dim)
-        start = now
-        for k in ti.static(range(1, self.arity)):
-            j = self.member(c, k)
-            r, moved = self._on_state.apart(j, i), self._on_state.d[j] - self._on_state.d[i]
-            for a in ti.static(range(self._on_state.dim)):
-                now[k, a], start[k, a] = r[a] - 0 * moved[a], r[a] - moved[a]
-        return now, start
-
-    @ti.func
-    def dashpot(self, c):
-        """Damping of constraint c."""
-        out = ti.cast(0, self._on_real)
-        if ti.static(self._on_damped):
-            out = self._on_damping[c]
-        return out
-
-    @ti.func
-    def is_rigid(self, c):
-        """Whether constraint c has no compliance."""
-        out = True
-        if ti.static(self._on_soft):
-            out = self._on_alpha[c] == 0
-        return out
-
-    @ti.func
-    def bounded(self, value):
-        """`value` on the side on which the constraint acts, 0 on the other."""
-        if ti.static(self.side != 0):
-            value = ti.max(self.side * value, 0) * self.side
-        return value
 
     @ti.func
     def known(self, c, h, hh, first, fresh):
@@ -293,31 +84,17 @@ class Scalar(Breaking):
         return violation, A, alpha, lam, W, n, g, turn * ti.cast(self.distinct(f, f0), ti.i32)
 
     @ti.func
-    def equation(self, c, f, f0, w, W, h, hh, first, fresh):
-        """A C + B + alpha' lam, A, alpha', lam and W (0 where it is broken), from f at the end and at the start, and w."""
-        if ti.static(self.breaks):
-            if not self.holds(c):
-                W = 0
-        if ti.static(self._on_sprung):
-            if not self.is_rigid(c):
-                W = 0
-        C, A = f - self._on_rest[c], ti.cast(1, self._on_real)
-        B, alpha = ti.cast(0, self._on_real), ti.cast(0, self._on_real)
-        lam = self._on_lam[c]
-        if first != 0:
-            lam = 0
-        if ti.static(self._on_soft):
-            if W > 0:
-                A, now, last = law(self._on_alpha[c], self.dashpot(c), h, w, fresh)
-                alpha = self._on_alpha[c] / hh
-                if first != 0:
-                    rest = self._on_rest[c]
-                    B = now * self.bounded(f0 - rest) + last * self.bounded(self.near(self._on_last[c], f0) - rest)
-                    self._on_history[c] = B
-                    self._on_last[c] = f0
-                else:
-                    B = self._on_history[c]
-        return A * C + B + alpha * lam, A, alpha, lam, W
+    def answer(self, violation, A, alpha, lam, W, turn):
+        """The multiplier of a Jacobi pass, and the size of the violation that it removes."""
+        new, size = lam, ti.cast(0, self._on_real)
+        if W > 0:
+            new = lam - self._on_slots.relaxation * violation / (A * W + alpha)
+            if ti.static(self.side != 0):
+                new = -self.bounded(-new)
+            size = ti.abs(new - lam) * (A * W + alpha) / self._on_slots.relaxation
+            if new != lam:
+                self._on_slots.note(turn)
+        return new, size
 
     @ti.func
     def tempered(self, c, lam, new, extent, move):
@@ -335,19 +112,6 @@ class Scalar(Breaking):
         if far > reach:
             new = lam + (new - lam) * (reach / far)
         return new
-
-    @ti.func
-    def answer(self, violation, A, alpha, lam, W, turn):
-        """The multiplier of a Jacobi pass, and the size of the violation that it removes."""
-        new, size = lam, ti.cast(0, self._on_real)
-        if W > 0:
-            new = lam - self._on_slots.relaxation * violation / (A * W + alpha)
-            if ti.static(self.side != 0):
-                new = -self.bounded(-new)
-            size = ti.abs(new - lam) * (A * W + alpha) / self._on_slots.relaxation
-            if new != lam:
-                self._on_slots.note(turn)
-        return new, size
 
     @ti.func
     def relax(self, c, h, hh, when, first, fresh):
@@ -412,40 +176,6 @@ class Scalar(Breaking):
                     self._on_lam[c] = self._on_lam[c] + step
 
     @ti.func
-    def kick(self, c, h):
-        """h^2 w_j F grad_j C with F = -(1 - theta) (C / alpha + damping dC/dt).
-
-        Rigid links find their force in the next substep.
-        """
-        f, g = self.measure(c, self.corners(c, 0))
-        f = self.near(f, self._on_rest[c])
-        f0, w = f, ti.cast(0, self._on_real)
-        if ti.static(self._on_damped):
-            f0, _ = self.measure(c, self.corners(c, 1))
-        for k in ti.static(range(self.arity)):
-            w += self._on_w.of(self.member(c, k)) * g[k, :].dot(g[k, :])
-        force = self.force(c, f, self.near(f0, f), w, h)
-        for k in ti.static(range(self.arity)):
-            self.push(c, k, h * h * self._on_w.of(self.member(c, k)) * force * g[k, :])
-
-    @ti.func
-    def force(self, c, f, f0, w, h):
-        """F of kick(), from f now and a substep ago."""
-        force = ti.cast(0, self._on_real)
-        if ti.static(self._on_soft):
-            alpha = self._on_alpha[c]
-            if w > 0 and alpha > 0 and self.holds(c):
-                resolved = ti.cast(1, self._on_real)
-                if ti.static(not self._on_sprung):
-                    resolved -= stiff(alpha, h, w)
-                C = self.bounded(f - self._on_rest[c])
-                force = -resolved * C / alpha
-                if ti.static(self._on_damped):
-                    if ti.static(self.side == 0) or C != 0:
-                        force -= resolved * self._on_damping[c] * (f - f0) / h
-        return force
-
-    @ti.func
     def miss(self, c, h, hh, when, fresh):
         """The violation that is left, relative to the rest value (to the batch's mean f where that is 0)."""
         violation, A, alpha, lam, W, _, _, _ = self.known(c, h, hh, 0, fresh)
@@ -455,29 +185,3 @@ class Scalar(Breaking):
             if g.norm_sqr() == 0 and self.holds(c):
                 left = ti.abs(self.bounded(f - self._on_rest[c]))
         return left / self.extent(c)
-
-    @ti.func
-    def extent(self, c):
-        """What the residual of constraint c is relative to."""
-        size = ti.cast(self._on_scale, self._on_real)
-        if ti.static(not self.unit):
-            if self._on_rest[c] != 0:
-                size = ti.abs(self._on_rest[c])
-        return size
-
-    @ti.func
-    def energy(self, c, back):
-        """C^2 / (2 alpha) at x - back d."""
-        out = ti.cast(0, ti.f64)
-        if ti.static(self._on_soft):
-            alpha = self._on_alpha[c]
-            if alpha > 0 and self.holds(c):
-                C = self.bounded(self.near(self.value(c, back), self._on_rest[c]) - self._on_rest[c])
-                out = C * C / (2 * alpha)
-        return out
-
-    @ti.func
-    def value(self, c, back):
-        """f at x - back d."""
-        f, _ = self.measure(c, self.corners(c, back))
-        return f

@@ -83,7 +83,7 @@ class Rim(Contact):
             t = ti.min(ti.max(t, 0), 1)
             far = self._on_radius.of(v) + (1 - t) * self._on_radius.of(a) + t * self._on_radius.of(b)
             if beside and height < far and height >= -length / 2:
-                out, back = far - height, 0 * n
+                out, back = far - height, 0 * r
                 if ti.static(moved):
                     out -= self._on_less[v]
                 if not came:

@@ -1,0 +1,215 @@
+"""What is asked of a number of particles, from soft to rigid: C = f - rest, and the spring behind it."""
+
+import warnings
+from typing import Any
+
+import numpy as np
+import taichi as ti
+
+from . import checks
+from .breaking import Breaking
+from .compliance import law, stiff
+from .feature import Scene
+from .number import Number
+from .particles import Particles
+
+
+class Elastic(Number, Breaking):
+    """C = f - rest, and what a substep asks of it: A C + B + alpha' lam = 0, see Scalar for A and alpha'.
+
+    B is what C was at the start of the substep and of the one before, by their shares: the memory of a soft constraint. As a
+    force, F = -C / alpha - damping dC/dt, it acts at starts, and in substeps of an order above 2.
+    """
+
+    side = 0  # 0: C = 0;  1: C <= 0, pulls when f > rest;  -1: C >= 0, pushes when f < rest
+    rest: Any  # a Knob in each constraint: (m,) array
+    compliance: np.ndarray
+    damping: np.ndarray
+
+    each = ("rest", "compliance", "damping", "break_at")
+    rest_name = "rest"
+    unit: float | None = None  # what residuals are relative to; None: the rest value
+
+    def setup(self, indices, rest, compliance, damping, break_at=None) -> None:
+        """Keep the arguments of __init__; what depends on the particles is checked in prepare()."""
+        self.lay(indices)
+        m = self.count
+        self.strengthen(break_at)
+        self._rest_given = rest
+        self.compliance = checks.per_item(repr(self), "compliance", compliance, m, least=0.0)
+        self.damping = checks.per_item(repr(self), "damping", damping, m, least=0.0)
+        for array in (self.indices, self.compliance, self.damping):
+            array.flags.writeable = False
+
+    @property
+    def goal(self) -> np.ndarray:
+        """What f is to be, (m,)."""
+        return self.rest
+
+    def violation(self, position: np.ndarray) -> np.ndarray:
+        """C at the given positions, (m,)."""
+        return self.rest_of(position) - self.goal
+
+    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Check indices against the number of particles and settle the rest values."""
+        self.fit(particles)
+        if "rest" not in self.__dict__:
+            if self._rest_given is None:
+                self.__dict__["rest"] = self.rest_of(particles.position)
+            else:
+                self.rest = self._rest_given
+
+    def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Warn of constraints that are violated between particles that cannot move."""
+        stuck = self.idle(inv_mass)
+        if stuck.any():
+            C = self.violation(particles.position)
+            wrong = stuck & (
+                np.abs(C if self.side == 0 else np.maximum(self.side * C, 0)) > 1e-6 * np.maximum(np.abs(self.goal), 1e-6)
+            )
+            if wrong.any():
+                k = int(np.argmax(wrong))
+                at = tuple(int(i) for i in self.members_of(k))
+                warnings.warn(
+                    f"{self!r}: {self.index_name}[{k}] = {at} is off by {C[k]:g}, but its particles cannot move "
+                    f"({int(wrong.sum())} such in all). They are skipped.",
+                    stacklevel=3,
+                )
+
+    @property
+    def soft(self) -> bool:
+        """Whether any constraint of the batch has compliance."""
+        return bool((self.compliance > 0).any())
+
+    def sprung(self, scene: Scene) -> np.ndarray:
+        """Which constraints act as forces, (m,): soft ones in substeps of an order above 2. See composition.py."""
+        return (self.compliance > 0) & (scene.order > 2)
+
+    def bind(self, scene: Scene) -> None:
+        """Declare rest values, multipliers, and for soft ones the memory that the averaged constraint needs."""
+        super().bind(scene)
+        self._on_soft = self.soft
+        self._on_sprung = bool(self.sprung(scene).any())
+        self._on_damped = self.soft and bool((self.damping > 0).any())
+        start = self.rest_of(self.start.position) if self.count else np.zeros(0)
+        self._on_scale = self.unit or (float(np.abs(start).mean()) if np.any(start) else self.start.size)
+        name, m, add = repr(self), self.count, scene.memory.field
+        self._on_rest = add(f"{name}.rest", m, values=self.goal)
+        self._on_lam = add(f"{name}.multiplier", m, state=True)
+        if self._on_soft:
+            self._on_alpha = add(f"{name}.compliance", m, values=self.compliance)
+            self._on_last = add(f"{name}.last", m, values=start, state=True)
+            self._on_history = add(f"{name}.history", m)
+        if self._on_damped:
+            self._on_damping = add(f"{name}.damping", m, values=self.damping)
+        self.bind_strength(scene)
+        self.changed = False
+
+    def upload(self) -> None:
+        """Write new rest values."""
+        if self.scene and self.count:
+            self.scene.memory.write(self._on_rest, self.goal)
+
+    @ti.func
+    def dashpot(self, c):
+        """Damping of constraint c."""
+        out = ti.cast(0, self._on_real)
+        if ti.static(self._on_damped):
+            out = self._on_damping[c]
+        return out
+
+    @ti.func
+    def is_rigid(self, c):
+        """Whether constraint c has no compliance."""
+        out = True
+        if ti.static(self._on_soft):
+            out = self._on_alpha[c] == 0
+        return out
+
+    @ti.func
+    def bounded(self, value):
+        """`value` on the side on which the constraint acts, 0 on the other."""
+        if ti.static(self.side != 0):
+            value = ti.max(self.side * value, 0) * self.side
+        return value
+
+    @ti.func
+    def equation(self, c, f, f0, w, W, h, hh, first, fresh):
+        """A C + B + alpha' lam, A, alpha', lam and W (0 where it is broken), from f at the end and at the start, and w."""
+        if ti.static(self.breaks):
+            if not self.holds(c):
+                W = 0
+        if ti.static(self._on_sprung):
+            if not self.is_rigid(c):
+                W = 0
+        C, A = f - self._on_rest[c], ti.cast(1, self._on_real)
+        B, alpha = ti.cast(0, self._on_real), ti.cast(0, self._on_real)
+        lam = self._on_lam[c]
+        if first != 0:
+            lam = 0
+        if ti.static(self._on_soft):
+            if W > 0:
+                A, now, last = law(self._on_alpha[c], self.dashpot(c), h, w, fresh)
+                alpha = self._on_alpha[c] / hh
+                if first != 0:
+                    rest = self._on_rest[c]
+                    B = now * self.bounded(f0 - rest) + last * self.bounded(self.near(self._on_last[c], f0) - rest)
+                    self._on_history[c] = B
+                    self._on_last[c] = f0
+                else:
+                    B = self._on_history[c]
+        return A * C + B + alpha * lam, A, alpha, lam, W
+
+    @ti.func
+    def kick(self, c, h):
+        """h^2 w_j F grad_j C with F = -(1 - theta) (C / alpha + damping dC/dt).
+
+        Rigid links find their force in the next substep.
+        """
+        f, g = self.measure(c, self.corners(c, 0))
+        f = self.near(f, self._on_rest[c])
+        f0, w = f, ti.cast(0, self._on_real)
+        if ti.static(self._on_damped):
+            f0, _ = self.measure(c, self.corners(c, 1))
+        for k in ti.static(range(self.arity)):
+            w += self._on_w.of(self.member(c, k)) * g[k, :].dot(g[k, :])
+        force = self.force(c, f, self.near(f0, f), w, h)
+        for k in ti.static(range(self.arity)):
+            self.push(c, k, h * h * self._on_w.of(self.member(c, k)) * force * g[k, :])
+
+    @ti.func
+    def force(self, c, f, f0, w, h):
+        """F of kick(), from f now and a substep ago."""
+        force = ti.cast(0, self._on_real)
+        if ti.static(self._on_soft):
+            alpha = self._on_alpha[c]
+            if w > 0 and alpha > 0 and self.holds(c):
+                resolved = ti.cast(1, self._on_real)
+                if ti.static(not self._on_sprung):
+                    resolved -= stiff(alpha, h, w)
+                C = self.bounded(f - self._on_rest[c])
+                force = -resolved * C / alpha
+                if ti.static(self._on_damped):
+                    if ti.static(self.side == 0) or C != 0:
+                        force -= resolved * self._on_damping[c] * (f - f0) / h
+        return force
+
+    @ti.func
+    def energy(self, c, back):
+        """C^2 / (2 alpha) at x - back d."""
+        out = ti.cast(0, ti.f64)
+        if ti.static(self._on_soft):
+            alpha = self._on_alpha[c]
+            if alpha > 0 and self.holds(c):
+                C = self.bounded(self.near(self.value(c, back), self._on_rest[c]) - self._on_rest[c])
+                out = C * C / (2 * alpha)
+        return out
+
+    @ti.func
+    def extent(self, c):
+        """What the residual of constraint c is relative to."""
+        size = ti.cast(self._on_scale, self._on_real)
+        if ti.static(not self.unit):
+            if self._on_rest[c] != 0:
+                size = ti.abs(self._on_rest[c])
+        return size
