@@ -8,6 +8,7 @@ import tiverlet as tv
 from tiverlet import assembly, runtime
 from tiverlet import memory as fields
 from tiverlet.memory import Memory
+from tiverlet.transfer import chain
 
 from .conftest import python
 
@@ -69,7 +70,7 @@ def test_f64_fields_can_stand_apart(monkeypatch):
             want[f"f{k}"] = value if kind in (ti.i32, ti.u32) else value / 7
             made[f"f{k}"] = memory.field(f"f{k}", length, width=width, kind=kind, values=want[f"f{k}"], state=True)
         memory.place()
-        roots = {e.name: fields._chain(e.field)[1].id for e in memory.entries}
+        roots = {e.name: chain(e.field)[1].id for e in memory.entries}
         wide = {roots[e.name] for e in memory.entries if e.kind == np.float64}
         narrow = {roots[e.name] for e in memory.entries if e.kind != np.float64}
         assert not wide & narrow and len(wide | narrow) == runtime.trees - alive == (2 if name == "two" else 1)

@@ -7,7 +7,6 @@ these into an error that says what to do, so that no other module has to know.
 
 import ctypes
 import weakref
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,27 +15,10 @@ from taichi.lang import impl
 
 from . import runtime
 from .compiling import FEW, Compiler
+from .transfer import Entry, Places, Transfer, chain
 
 GROUP = 16  # fields that one transfer kernel serves; Taichi unrolls the loop over them
-SMALL = 300_000  # numbers that one thread copies in a millisecond
 MAX_TREES = 400  # Taichi holds at most 511 trees of fields and does not check; the rest is left to the user's own fields.
-
-
-@dataclass(frozen=True)
-class Entry:
-    """One field: its place in memory, and what explain() says of it."""
-
-    name: str
-    field: Any
-    width: int  # components of one element; 0 for a scalar
-    length: int  # elements; 0 for a single one
-    kind: np.dtype
-    state: bool  # part of the exact state, hence of hash() and clone()
-
-    @property
-    def bytes(self) -> int:
-        """Size in memory [bytes]."""
-        return self.kind.itemsize * max(1, self.width) * max(1, self.length)
 
 
 class Memory:
@@ -60,7 +42,7 @@ class Memory:
         self._builders: dict[bool, Any] = {}  # of the trees, by whether what they hold stands apart
         self._trees: list = []
         self._runtime = impl.get_runtime()
-        self._transfers: dict[tuple, _Transfer] = {}  # compiled once, since that costs more than running them
+        self._transfers: dict[tuple, Transfer] = {}  # compiled once, since that costs more than running them
         self._views: dict[int, np.ndarray] | None = None  # see _seen()
         self._address = 0  # of the first element of the first field
 
@@ -109,19 +91,19 @@ class Memory:
             waiting = [m for m in _unseen if m._trees and m._runtime is self._runtime]
             addresses = np.zeros(len(waiting), dtype=np.uint64)
             with self.compiler():
-                _Places([m.entries[0] for m in waiting]).find(addresses)
+                Places([m.entries[0] for m in waiting]).find(addresses)
             for memory, address in zip(waiting, addresses.tolist(), strict=True):
                 memory._address = address
             _unseen.clear()
-        (start, *_), tree = _chain(self.entries[0].field)
+        (start, *_), tree = chain(self.entries[0].field)
         memory, out = (ctypes.c_char * tree.cell_size_bytes).from_address(self._address - start), {}
         for e in self.entries:
-            offsets, _ = _chain(e.field)
+            offsets, _ = chain(e.field)
             cell = e.field.parent().ptr.cell_size_bytes
             steps = (cell, offsets[1] - offsets[0] if e.width > 1 else e.kind.itemsize)
             if any(b - a != steps[1] for a, b in zip(offsets, offsets[1:], strict=False)):
                 return {}  # laid out as never seen yet: by kernels, then
-            out[id(e)] = np.ndarray(_shape(e), e.kind, memory, offsets[0], steps[: 1 + bool(e.width)])
+            out[id(e)] = np.ndarray(e.shape, e.kind, memory, offsets[0], steps[: 1 + bool(e.width)])
         return out
 
     def abandon(self) -> None:
@@ -186,12 +168,12 @@ class Memory:
         views = self._seen()
         if views:
             for e, a in zip(entries, arrays, strict=True):
-                views[id(e)][...] = np.broadcast_to(a, _shape(e))
+                views[id(e)][...] = np.broadcast_to(a, e.shape)
             return
         # Every number that we hold (f32, f64, i32) is exact in f64, so one kernel and one flat array serve all.
         for k in range(0, len(entries), GROUP):
             some = entries[k : k + GROUP]
-            parts = [np.broadcast_to(a, _shape(e)).ravel() for e, a in zip(some, arrays[k : k + GROUP], strict=True)]
+            parts = [np.broadcast_to(a, e.shape).ravel() for e, a in zip(some, arrays[k : k + GROUP], strict=True)]
             with self.compiler():
                 self._transfer(some).load(np.concatenate(parts).astype(np.float64))
 
@@ -207,13 +189,13 @@ class Memory:
             with self.compiler():
                 self._transfer(some).dump(flat)
             parts = np.split(flat, np.cumsum(sizes)[:-1])
-            out += [p.astype(e.kind).reshape(_shape(e)) for p, e in zip(parts, some, strict=True)]
+            out += [p.astype(e.kind).reshape(e.shape) for p, e in zip(parts, some, strict=True)]
         return out
 
-    def _transfer(self, entries: list[Entry]) -> "_Transfer":
+    def _transfer(self, entries: list[Entry]) -> Transfer:
         key = tuple(id(e) for e in entries)
         if key not in self._transfers:
-            self._transfers[key] = _Transfer(entries)
+            self._transfers[key] = Transfer(entries)
         return self._transfers[key]
 
 
@@ -229,98 +211,3 @@ def aligned() -> bool:
     and is written to byte 8, over the last i32. Alone in their tree all f64 are aligned.
     """
     return runtime.architecture() in runtime.LLVM
-
-
-def _shape(entry: Entry) -> tuple[int, ...]:
-    return (max(1, entry.length),) + ((entry.width,) if entry.width else ())
-
-
-def _chain(field) -> tuple[list[int], Any]:
-    """How many bytes from the begin of its tree each component of the first element is, and the root of the tree."""
-    offsets, node = [], None
-    for component in field._get_field_members():
-        node, offset = component.ptr.snode(), 0
-        while node.parent is not None:
-            offset, node = offset + node.offset_bytes_in_parent_cell, node.parent
-        offsets.append(offset)
-    return offsets, node
-
-
-@ti.data_oriented
-class _Places:
-    """Where fields are."""
-
-    def __init__(self, entries: list[Entry]):
-        self.plan = [(k, e.field, [0] if e.length else []) for k, e in enumerate(entries)]
-
-    @ti.kernel
-    def find(self, out: ti.types.ndarray(ti.u64, 1)):  # type: ignore[valid-type]
-        """The addresses of their first elements."""
-        for k, field, at in ti.static(self.plan):
-            out[k] = ti.get_addr(field, ti.static(at))
-
-
-@ti.data_oriented
-class _Transfer:
-    """Kernels between a list of fields and one flat f64 array."""
-
-    def __init__(self, entries: list[Entry]):
-        offset, self.plan = 0, []
-        for e in entries:
-            self.plan.append((e.field, e.field.dtype, max(1, e.length), e.width, bool(e.length), offset))
-            offset += e.bytes // e.kind.itemsize
-        self.serial = offset < SMALL and runtime.architecture() == "cpu"  # in one piece, which compiles in half the time
-
-    @ti.kernel
-    def load(self, flat: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
-        """From the array to the fields."""
-        if ti.static(self.serial):
-            ti.loop_config(serialize=True)
-            for _ in range(1):
-                self.put(flat)
-        else:
-            self.put(flat)
-
-    @ti.kernel
-    def dump(self, flat: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
-        """From the fields to the array."""
-        if ti.static(self.serial):
-            ti.loop_config(serialize=True)
-            for _ in range(1):
-                self.get(flat)
-        else:
-            self.get(flat)
-
-    @ti.func
-    def put(self, flat: ti.template()):  # type: ignore[valid-type]
-        """All fields, one after the other."""
-        for field, kind, length, width, many, offset in ti.static(self.plan):
-            for i in range(length):
-                if ti.static(width == 0):
-                    if ti.static(many):
-                        field[i] = ti.cast(flat[offset + i], kind)
-                    else:
-                        field[None] = ti.cast(flat[offset], kind)
-                else:
-                    for k in ti.static(range(width)):
-                        if ti.static(many):
-                            field[i][k] = ti.cast(flat[offset + i * width + k], kind)
-                        else:
-                            field[None][k] = ti.cast(flat[offset + k], kind)
-
-    @ti.func
-    def get(self, flat: ti.template()):  # type: ignore[valid-type]
-        """All fields, one after the other."""
-        for field, kind, length, width, many, offset in ti.static(self.plan):
-            for i in range(length):
-                if ti.static(width == 0):
-                    if ti.static(many):
-                        flat[offset + i] = field[i]
-                    else:
-                        flat[offset] = field[None]
-                else:
-                    for k in ti.static(range(width)):
-                        if ti.static(many):
-                            flat[offset + i * width + k] = field[i][k]
-                        else:
-                            flat[offset + k] = field[None][k]

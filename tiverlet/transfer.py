@@ -1,0 +1,124 @@
+"""A field as NumPy sees it: its entry, where it is in memory of the host, and kernels that copy it where it is not."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import taichi as ti
+
+from . import runtime
+
+SMALL = 300_000  # numbers that one thread copies in a millisecond
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One field: its place in memory, and what explain() says of it."""
+
+    name: str
+    field: Any
+    width: int  # components of one element; 0 for a scalar
+    length: int  # elements; 0 for a single one
+    kind: np.dtype
+    state: bool  # part of the exact state, hence of hash() and clone()
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of the array that it is."""
+        return (max(1, self.length),) + ((self.width,) if self.width else ())
+
+    @property
+    def bytes(self) -> int:
+        """Size in memory [bytes]."""
+        return self.kind.itemsize * max(1, self.width) * max(1, self.length)
+
+
+def chain(field) -> tuple[list[int], Any]:
+    """How many bytes from the begin of its tree each component of the first element is, and the root of the tree."""
+    offsets, node = [], None
+    for component in field._get_field_members():
+        node, offset = component.ptr.snode(), 0
+        while node.parent is not None:
+            offset, node = offset + node.offset_bytes_in_parent_cell, node.parent
+        offsets.append(offset)
+    return offsets, node
+
+
+@ti.data_oriented
+class Places:
+    """Where fields are."""
+
+    def __init__(self, entries: list[Entry]):
+        self.plan = [(k, e.field, [0] if e.length else []) for k, e in enumerate(entries)]
+
+    @ti.kernel
+    def find(self, out: ti.types.ndarray(ti.u64, 1)):  # type: ignore[valid-type]
+        """The addresses of their first elements."""
+        for k, field, at in ti.static(self.plan):
+            out[k] = ti.get_addr(field, ti.static(at))
+
+
+@ti.data_oriented
+class Transfer:
+    """Kernels between a list of fields and one flat f64 array."""
+
+    def __init__(self, entries: list[Entry]):
+        offset, self.plan = 0, []
+        for e in entries:
+            self.plan.append((e.field, e.field.dtype, max(1, e.length), e.width, bool(e.length), offset))
+            offset += e.bytes // e.kind.itemsize
+        self.serial = offset < SMALL and runtime.architecture() == "cpu"  # in one piece, which compiles in half the time
+
+    @ti.kernel
+    def load(self, flat: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
+        """From the array to the fields."""
+        if ti.static(self.serial):
+            ti.loop_config(serialize=True)
+            for _ in range(1):
+                self.put(flat)
+        else:
+            self.put(flat)
+
+    @ti.kernel
+    def dump(self, flat: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
+        """From the fields to the array."""
+        if ti.static(self.serial):
+            ti.loop_config(serialize=True)
+            for _ in range(1):
+                self.get(flat)
+        else:
+            self.get(flat)
+
+    @ti.func
+    def put(self, flat: ti.template()):  # type: ignore[valid-type]
+        """All fields, one after the other."""
+        for field, kind, length, width, many, offset in ti.static(self.plan):
+            for i in range(length):
+                if ti.static(width == 0):
+                    if ti.static(many):
+                        field[i] = ti.cast(flat[offset + i], kind)
+                    else:
+                        field[None] = ti.cast(flat[offset], kind)
+                else:
+                    for k in ti.static(range(width)):
+                        if ti.static(many):
+                            field[i][k] = ti.cast(flat[offset + i * width + k], kind)
+                        else:
+                            field[None][k] = ti.cast(flat[offset + k], kind)
+
+    @ti.func
+    def get(self, flat: ti.template()):  # type: ignore[valid-type]
+        """All fields, one after the other."""
+        for field, kind, length, width, many, offset in ti.static(self.plan):
+            for i in range(length):
+                if ti.static(width == 0):
+                    if ti.static(many):
+                        flat[offset + i] = field[i]
+                    else:
+                        flat[offset] = field[None]
+                else:
+                    for k in ti.static(range(width)):
+                        if ti.static(many):
+                            flat[offset + i * width + k] = field[i][k]
+                        else:
+                            flat[offset + k] = field[None][k]
