@@ -9,16 +9,15 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from .. import checks
 from ..feature import Batch, Scene
 from ..grid import Grid
-from ..material import Table
 from ..pairs import Luggage
 from ..particles import Particles, Radii
 from ..team import Team
 from ..tools import median
 from .contact import Contact
-from .rim import VERTEX, Rim, area_of, depth_of
+from .loops import checked, laid, refuse_deep
+from .rim import VERTEX, Apart, Rim
 
 STRETCH = 1.25  # of an edge, beyond which a contact in its middle might not be listed
 
@@ -50,40 +49,15 @@ class Polygons(Rim):
 
     def __init__(self, loops: Iterable, friction=0.0, restitution=0.0, *, skin="auto", push_out=1.0):
         Contact.__init__(self, friction, restitution, skin=skin, push_out=push_out)
-        self.loops = [checks.indices("Polygons", f"loops[{k}]", loop, 2**31 - 1) for k, loop in enumerate(loops)]
-        seen: dict[int, int] = {}
-        for k, loop in enumerate(self.loops):
-            if len(loop) < 3:
-                raise ValueError(f"Polygons: loops[{k}] has {len(loop)} particles, but a body needs at least 3.")
-            for i in loop.tolist():
-                if i in seen:
-                    raise ValueError(f"Polygons: particle {i} is in loops[{seen[i]}] and again in loops[{k}]; once is enough.")
-                seen[i] = k
+        self.loops = checked(loops)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Turn all loops counterclockwise, and measure them; refuse flat ones, and particles deep inside of others."""
         if particles.dim != 2:
             raise ValueError("Polygons: bodies of particle loops are for 2D worlds; these particles are in 3D.")
         n, x = particles.count, particles.position
-        self._on_ends = np.full((n, 2), -1)  # the next and the one before, in the loop
-        self._on_body = np.full(n, -1)
-        length = np.zeros(n)  # of the longer edge
-        for k, loop in enumerate(self.loops):
-            checks.indices("Polygons", f"loops[{k}]", loop, n)
-            area = area_of(x[loop])
-            extent = float(np.ptp(x[loop], axis=0).max())
-            if abs(area) <= 1e-9 * extent**2:
-                raise ValueError(f"Polygons: loops[{k}] encloses an area of {area:g} m^2; its particles are on a line.")
-            loop = loop if area > 0 else loop[::-1]
-            after = np.roll(loop, -1)
-            edge = np.linalg.norm(x[after] - x[loop], axis=1)
-            if (edge <= 1e-6 * extent).any():
-                m = int(np.argmin(edge))
-                raise ValueError(f"Polygons: particles {loop[m]} and {after[m]} of loops[{k}] are in the same place.")
-            self._on_ends[loop, 0], self._on_ends[after, 1], self._on_body[loop] = after, loop, k
-            length[loop] = np.maximum(length[loop], edge)
-            length[after] = np.maximum(length[after], edge)
-        self._check_start(particles, 0)
+        self._on_ends, self._on_body, length = laid(self.loops, x)
+        refuse_deep(self.loops, self._on_body, x, 0)
         # Two particles are listed when their reaches add up: a vertex with both ends of an edge that it is beside.
         self._on_length = length
         far = 1.5 * STRETCH * length
@@ -101,27 +75,13 @@ class Polygons(Rim):
     def admit(self, particles: Particles, first: int) -> None:
         """Refuse positions too far out, or inside of bodies."""
         super().admit(particles, first)
-        self._check_start(particles, first)
+        refuse_deep(self.loops, self._on_body, particles.position, first)
 
     def renumber(self, number: np.ndarray, count: int) -> None:
         """Bodies stay as long as all of their particles do."""
         whole = [loop for loop in self.loops if (number[loop] >= 0).all()]
         self.loops = [number[loop].astype(np.int32) for loop in whole]
         self.arguments = {**self.arguments, "loops": self.loops}
-
-    def _check_start(self, particles: Particles, first: int) -> None:
-        """Refuse particles, from number `first` on, that start deeper inside of a body than half of the edge that is nearest."""
-        x = particles.position
-        for k, loop in enumerate(self.loops):
-            a = x[loop]
-            some = ((x >= a.min(axis=0)) & (x <= a.max(axis=0))).all(axis=1) & (self._on_body != k)
-            for i in np.flatnonzero(some[first:]) + first:
-                depth, edge = depth_of(x[i], a)
-                if depth > edge / 2:
-                    raise ValueError(
-                        f"Polygons: particle {i} starts {depth:.3g} m inside of loops[{k}], deeper than half of the nearest edge "
-                        f"({edge:.3g} m), so there is no telling where it came from. Move it out."
-                    )
 
     def join(self, scene: Scene, batches: list[Batch], team: Team) -> Grid:
         """Declare the fields, among them the grid's, which lists particles by their reach."""
@@ -158,7 +118,7 @@ class Polygons(Rim):
             *([self._on_slip] if self.rubs else []),
             *([self._on_aim] if self.bounces else []),
         ]
-        apart: Any = _Apart(self)
+        apart: Any = Apart(self)
         self._on_grid = Grid(reach, self._on_size, linked, apart, luggage, team, self._on_move)
         return self._on_grid
 
@@ -350,21 +310,3 @@ class Polygons(Rim):
                 worst = ti.max(worst, met[0] / size)
                 touching += 1
         return touching, worst
-
-
-class _Apart:
-    """What the grid asks which pairs may touch: those of different bodies, as far as their groups do."""
-
-    uniform = False
-
-    def __init__(self, polygons: Polygons):
-        self.table: Table = polygons.table
-        self.loop = polygons._on_loop
-
-    @ti.func
-    def of(self, i, j):
-        """The row of the table, with 0 at its end for two particles of one body."""
-        row = self.table.of(i, j)
-        if self.loop[i][2] >= 0 and self.loop[i][2] == self.loop[j][2]:
-            row[3] = 0
-        return row

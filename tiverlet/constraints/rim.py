@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
+from ..material import Table
 from ..queries import Contacts
 from .contact import Contact
 
@@ -243,23 +244,19 @@ class Rim(Contact):
         return Contacts(pairs, ends, t, overlap, n, point, push / h)
 
 
-def area_of(loop: np.ndarray) -> float:
-    """The area that a loop (k, 2) encloses, positive where it goes around counterclockwise [m^2]."""
-    after = np.roll(loop, -1, axis=0)
-    v = loop - loop.mean(axis=0)
-    w = after - loop.mean(axis=0)
-    return float((v[:, 0] * w[:, 1] - v[:, 1] * w[:, 0]).sum()) / 2
+class Apart:
+    """What the grid asks which pairs may touch: those of different bodies, as far as their groups do."""
 
+    uniform = False
 
-def depth_of(point: np.ndarray, loop: np.ndarray) -> tuple[float, float]:
-    """How deep a point is inside of a loop, 0 outside, and the length of the nearest edge."""
-    a, b = loop, np.roll(loop, -1, axis=0)
-    u, r = b - a, point - a
-    length = np.linalg.norm(u, axis=1)
-    t = np.clip((r * u).sum(axis=1) / length**2, 0, 1)
-    distance = np.linalg.norm(r - t[:, None] * u, axis=1)
-    k = int(np.argmin(distance))
-    above = (a[:, 1] > point[1]) != (b[:, 1] > point[1])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        right = a[:, 0] + r[:, 1] / u[:, 1] * u[:, 0] > point[0]
-    return (float(distance[k]) if (above & right).sum() % 2 else 0.0), float(length[k])
+    def __init__(self, rim: Rim):
+        self.table: Table = rim.table
+        self.loop = rim._on_loop
+
+    @ti.func
+    def of(self, i, j):
+        """The row of the table, with 0 at its end for two particles of one body."""
+        row = self.table.of(i, j)
+        if self.loop[i][2] >= 0 and self.loop[i][2] == self.loop[j][2]:
+            row[3] = 0
+        return row

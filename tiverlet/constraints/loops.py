@@ -1,0 +1,80 @@
+"""Bodies as loops of particles, in NumPy: which way round they go, how long their edges are, what starts inside of them (2D)."""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from .. import checks
+
+
+def checked(loops: Iterable) -> list[np.ndarray]:
+    """The particles of each body, at least 3, each in one body and once."""
+    out = [checks.indices("Polygons", f"loops[{k}]", loop, 2**31 - 1) for k, loop in enumerate(loops)]
+    seen: dict[int, int] = {}
+    for k, loop in enumerate(out):
+        if len(loop) < 3:
+            raise ValueError(f"Polygons: loops[{k}] has {len(loop)} particles, but a body needs at least 3.")
+        for i in loop.tolist():
+            if i in seen:
+                raise ValueError(f"Polygons: particle {i} is in loops[{seen[i]}] and again in loops[{k}]; once is enough.")
+            seen[i] = k
+    return out
+
+
+def laid(loops: list[np.ndarray], x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of particles at x (n, 2): the next and the one before, counterclockwise (n, 2), -1 where there is none; the number of the
+    loop (n,), or -1; and the length of the longer edge (n,) [m]. Refuses flat loops."""
+    n = len(x)
+    ends, body, length = np.full((n, 2), -1), np.full(n, -1), np.zeros(n)
+    for k, loop in enumerate(loops):
+        checks.indices("Polygons", f"loops[{k}]", loop, n)
+        area = area_of(x[loop])
+        extent = float(np.ptp(x[loop], axis=0).max())
+        if abs(area) <= 1e-9 * extent**2:
+            raise ValueError(f"Polygons: loops[{k}] encloses an area of {area:g} m^2; its particles are on a line.")
+        loop = loop if area > 0 else loop[::-1]
+        after = np.roll(loop, -1)
+        edge = np.linalg.norm(x[after] - x[loop], axis=1)
+        if (edge <= 1e-6 * extent).any():
+            m = int(np.argmin(edge))
+            raise ValueError(f"Polygons: particles {loop[m]} and {after[m]} of loops[{k}] are in the same place.")
+        ends[loop, 0], ends[after, 1], body[loop] = after, loop, k
+        length[loop] = np.maximum(length[loop], edge)
+        length[after] = np.maximum(length[after], edge)
+    return ends, body, length
+
+
+def refuse_deep(loops: list[np.ndarray], body: np.ndarray, x: np.ndarray, first: int) -> None:
+    """Raise for particles, from number `first` on, that are deeper inside of a body than half of the edge that is nearest."""
+    for k, loop in enumerate(loops):
+        a = x[loop]
+        some = ((x >= a.min(axis=0)) & (x <= a.max(axis=0))).all(axis=1) & (body != k)
+        for i in np.flatnonzero(some[first:]) + first:
+            depth, edge = depth_of(x[i], a)
+            if depth > edge / 2:
+                raise ValueError(
+                    f"Polygons: particle {i} starts {depth:.3g} m inside of loops[{k}], deeper than half of the nearest edge "
+                    f"({edge:.3g} m), so there is no telling where it came from. Move it out."
+                )
+
+
+def area_of(loop: np.ndarray) -> float:
+    """The area that a loop (k, 2) encloses, positive where it goes around counterclockwise [m^2]."""
+    after = np.roll(loop, -1, axis=0)
+    v = loop - loop.mean(axis=0)
+    w = after - loop.mean(axis=0)
+    return float((v[:, 0] * w[:, 1] - v[:, 1] * w[:, 0]).sum()) / 2
+
+
+def depth_of(point: np.ndarray, loop: np.ndarray) -> tuple[float, float]:
+    """How deep a point is inside of a loop, 0 outside, and the length of the nearest edge."""
+    a, b = loop, np.roll(loop, -1, axis=0)
+    u, r = b - a, point - a
+    length = np.linalg.norm(u, axis=1)
+    t = np.clip((r * u).sum(axis=1) / length**2, 0, 1)
+    distance = np.linalg.norm(r - t[:, None] * u, axis=1)
+    k = int(np.argmin(distance))
+    above = (a[:, 1] > point[1]) != (b[:, 1] > point[1])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        right = a[:, 0] + r[:, 1] / u[:, 1] * u[:, 0] > point[0]
+    return (float(distance[k]) if (above & right).sum() % 2 else 0.0), float(length[k])
