@@ -1,10 +1,8 @@
-"""What every constraint that is one number must do, for all of them at once: a new one is one row of ROWS.
+"""What every constraint that is one number must do, for all of them at once: a new one is one row of ROWS in rows.py.
 
 Each row makes one world of many blocks, the same corners again and again, each with something else to show; they do not touch.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -15,102 +13,7 @@ from tiverlet import constraints
 from tiverlet.wall import Wall
 
 from .conftest import order, rms
-
-
-@dataclass(frozen=True)
-class Row:
-    """A kind of constraint, and corners at which it shows all that it can.
-
-    make: (corners (m, arity), rest (m,), **options) -> feature, violated by f(points) - rest.
-    points: (arity, dim) [m] in general position. off: how far f is to be from rest, on the violated side.
-    internal: it moves no center of mass and turns nothing; False for constraints to the surroundings.
-    bilateral: holds on both sides, so that it is second order.
-    largest: [m] what f32 holds.
-    like: the row that shows for this one that batches can be divided and worlds be cloned, because the same code does it with
-    the same fields: Scalar's for all that have a fixed number of corners, Content's for loops and surfaces.
-    """
-
-    make: Callable
-    points: np.ndarray
-    off: float
-    internal: bool = True
-    bilateral: bool = True
-    largest: float = 1e15
-    like: str = "Bend 3D"
-
-
-LINK = np.array([[0.1, 0.2, -0.1], [0.7, -0.3, 0.4]])
-PATH = np.array([[-0.4, 0.3, 0.1], [0.1, -0.2, 0.0], [0.6, 0.4, 0.3]])
-WINGS = np.array([[0.0, -0.1, 0.0], [0.9, 0.1, 0.1], [0.3, 0.8, 0.2], [0.5, -0.6, 0.4]])
-
-
-def limit(corners, rest, **options):
-    """Corners that turn at most so far."""
-    return tv.AngleLimit(corners, np.zeros(len(corners)), rest, **options)
-
-
-def spread(a, b, c):
-    """A length and a product of lengths, of three corners."""
-    return (a - b).norm() + (b - c).norm() * (c - a).norm()
-
-
-def radius(x):
-    """Distance from the origin."""
-    return x.norm()
-
-
-def outward(x):
-    """Its gradient."""
-    return x / x.norm()
-
-
-def made(function, **more):
-    """Rows of the user's own."""
-    return lambda corners, rest, **options: tv.Constraint(function, corners, rest, **more, **options)
-
-
-ROWS = {
-    "Distance 3D": Row(tv.Distance, LINK, -0.1),
-    "Rope 2D": Row(tv.Rope, LINK[:, :2], 0.1, bilateral=False),
-    "Spacer 2D": Row(tv.Spacer, LINK[:, :2], -0.1, bilateral=False),
-    "Bend 2D": Row(tv.Bend, PATH[:, :2], 0.3),
-    "Bend 3D": Row(tv.Bend, PATH, -0.3),
-    "AngleLimit 3D": Row(limit, PATH, 0.3, bilateral=False),
-    "Dihedral 3D": Row(tv.Dihedral, WINGS, 0.3),
-    "Area 3D": Row(tv.Area, PATH, 0.02),
-    "Area of loops 2D": Row(tv.Area, WINGS[[0, 3, 1, 2], :2], 0.05, like="Volume of surfaces"),
-    "Volume 3D": Row(tv.Volume, WINGS, 0.01, largest=1e9),
-    "Constraint 2D": Row(made(spread), PATH[:, :2], 0.2),
-    "Constraint 3D": Row(made(radius, gradient=outward), LINK[1:], 0.1, internal=False),
-}
-
-TETRA = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
-
-
-def shells(corners):
-    """Closed surfaces of four faces."""
-    return tv.Volume(np.concatenate([row[TETRA] for row in np.asarray(corners)]), pressure=1.1)
-
-
-# What is not one number, or the same in other kernels, by its corners and how it is made of them, and the reason why it is no
-# row above; all of these run where batches are divided and cloned.
-OTHERS = {
-    "Pin": (
-        LINK[:1],
-        lambda c: tv.Pin(c[:, 0], (0.0, 1.0, 0.0), compliance=1e-3),
-        "a vector with unit gradients: none is degenerate",
-    ),
-    "Pin, driven": (LINK[:1], lambda c: tv.Pin(c[:, 0]), "puts particles in place, and solves nothing"),
-    "Snap": (LINK[:1], lambda c: tv.Snap(c[:, 0], 0.3, compliance=1e-2), "a vector with unit gradients: none is degenerate"),
-    "Path": (PATH[:1], lambda c: tv.Path(c[:, 0], PATH), "a vector across a curve; see test_paths.py for ends, corners, loops"),
-    "Path, driven": (PATH[:1], lambda c: tv.Path(c[:, 0], PATH, speed=0.3), "puts particles in place, and solves nothing"),
-    "ShapeMatch": (
-        WINGS[:, :2],
-        lambda c: tv.ShapeMatch(c, compliance=1e-3),
-        "a vector for each corner; see test_bodies.py for its extremes",
-    ),
-    "Volume of surfaces": (WINGS, shells, "the law of Area of loops 2D with other gradients, which test_bodies.py compares"),
-}
+from .rows import OTHERS, ROWS, Row
 
 BLOCKS = ("met", "off", "turned", "held", "stuck", "soft", "free", "swing", "loaded", "weak")
 MASS = np.array([1.0, 2.5, 0.7, 4.0])
