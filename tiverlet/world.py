@@ -16,6 +16,7 @@ from .compiling import Quick
 from .explain import explain
 from .feature import Acceleration, Feature
 from .guard import Guard
+from .overlap import overlapping
 from .particles import Particles
 from .regroup import Handle
 from .solvers.solver import Solver
@@ -53,6 +54,9 @@ class World(Access):
         features = checked_features(features)
         starts = [None] * len(features)
         self._build(particles, features, starts, substeps, iterations, solver, precision, path, order)
+        for contact in self._sub.contacts:
+            if not contact._on_eases and contact.table.uniform and overlapping(self._scene, self._batches):
+                contact.ease()  # before anything is compiled: later, the frame would be compiled again
 
     @staticmethod
     def _of(particles: Particles, features: tuple[Feature, ...], starts: Sequence[Particles | None], **settings) -> "World":

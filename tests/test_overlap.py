@@ -1,0 +1,36 @@
+"""Overlap at the start is known before anything is compiled."""
+
+from types import SimpleNamespace as Some
+from typing import Any
+
+import numpy as np
+
+import tiverlet as tv
+from tiverlet.overlap import overlapping
+
+
+def test_overlap_is_what_comparing_all_pairs_finds():
+    rng, seen = np.random.default_rng(0), [0, 0]
+    for k in range(300):
+        n, dim = int(rng.integers(2, 60)), 2 + k % 2
+        x = rng.uniform(-1, 1, (n, dim)) * rng.uniform(1, 9) + rng.choice([0, 50])
+        radius = rng.uniform(0.02, 0.1, n) if k % 3 else np.full(n, 0.06)
+        free = rng.random(n) < 0.8
+        pairs, _ = tv.measure.overlapping(x, radius)
+        want = bool(free[pairs].any())
+        scene: Any = Some(particles=Some(position=x, radius=radius), inv_mass=free * 2.0)
+        assert overlapping(scene, []) == want
+        seen[want] += 1
+    assert min(seen) > 30
+
+
+def test_only_scenes_that_start_with_overlap_have_the_field_for_it(world):
+    x = np.array([[0.0, 0.0], [0.19, 0.0], [0.5, 0.0], [0.7, 0.0]])
+    for features, start, want in (
+        ([tv.Contact()], x, True),
+        ([tv.Contact(), tv.Distance([[1, 0]])], x, False),  # linked
+        ([tv.Contact()], x * 1.1, False),
+        ([tv.Contact()], np.zeros((2, 2)), True),  # in one place
+    ):
+        w = world(tv.Particles(start, radius=0.1), features)
+        assert ("Contact.shrunk" in w.fields) == want
