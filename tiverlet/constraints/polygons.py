@@ -111,13 +111,8 @@ class Polygons(Rim):
         self._on_met, self._on_back = Luggage("met", 4, False, kept=False), Luggage("back", 2, False, kept=False)
         self._on_slip, self._on_aim = Luggage("slip", 2, lasting=True), Luggage("aim", 2, lasting=False)
         self._on_given = Luggage("given", 0, lasting=True)  # pushes and blows in the last substep [kg m]
-        luggage = [
-            self._on_met,
-            self._on_back,
-            self._on_given,
-            *([self._on_slip] if self.rubs else []),
-            *([self._on_aim] if self.bounces else []),
-        ]
+        luggage = [self._on_met, self._on_back, self._on_given, *([self._on_slip] if self.rubs else [])]
+        luggage += [self._on_aim] if self.bounces else []
         apart: Any = Apart(self)
         self._on_grid = Grid(reach, self._on_size, linked, apart, luggage, team, self._on_move)
         return self._on_grid
