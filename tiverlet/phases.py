@@ -8,8 +8,8 @@ from . import runtime
 from .calm import EVERY
 from .feature import Acceleration, Batch, Scene
 from .scalar import Scalar
-from .team import LEAST, Team
-from .tiles import BLOCK, Tiles
+from .team import BLOCK, LEAST, Team
+from .tiles import Tiles
 
 
 class Phases(Tiles):
@@ -155,8 +155,11 @@ class Phases(Tiles):
             self.team.wait()
             for k in range(self.team.deal(self.pieces, 1, me)):
                 begin, end = self.part(k, me)
-                for i in range(begin, end):
-                    c.relax(i, first, fresh)
+                for b in range((end - begin + (BLOCK - 1)) // BLOCK):
+                    low, high = begin + b * BLOCK, ti.min(begin + (b + 1) * BLOCK, end)
+                    if c.busy(low) != 0:
+                        for i in range(low, high):
+                            c.relax(i, first, fresh)
             self.team.wait()
 
     @ti.func

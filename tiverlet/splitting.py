@@ -15,6 +15,9 @@ class Splitting(Touch):
     """A particle has its mass split m times, so that all pairs which touch can be solved at once; see Contact."""
 
     _on_split: Any
+    _on_some: Any  # of the particles that are counted together, whether any touches another
+    _on_skips: bool
+    _on_block: int
     _on_slack: Any
     _on_rubs: bool
 
@@ -48,9 +51,19 @@ class Splitting(Touch):
             if some == 0:
                 for i in range(begin, end):
                     some |= self.meets(i)
+        if ti.static(self._on_skips):
+            self._on_some[begin // self._on_block] = some
         if some != 0:
             for i in range(begin, end):
                 self.tell(i)
+
+    @ti.func
+    def busy(self, begin):
+        """0 if none of the particles that were counted together, from `begin` on, touches another, and nothing is to be done."""
+        out = 1
+        if ti.static(self._on_skips):
+            out = self._on_some[begin // self._on_block]
+        return out
 
     @ti.func
     def meets(self, i):

@@ -19,6 +19,7 @@ from .memory import Memory
 LEAST = 512  # iterations of a loop that Taichi gives to a CPU thread, at least
 PIECES = 16  # into which a team divides particles that touch
 EVEN = 64  # particles in a piece, or a multiple: they fill whole lines of a cache
+BLOCK = 32  # of them that are asked at once whether any is near a wall, or touches another
 SHARE = 500  # particles and constraints for each thread, at least; with fewer they wait for each other longer than they work
 PATIENCE = 20_000  # looks at the counter, of 50 ns or less, and one more for each particle: then a wait was long
 LONG = 4  # long waits in a frame after which one thread goes on alone

@@ -6,11 +6,10 @@ import taichi as ti
 from .compiling import FEW
 from .feature import Acceleration, Batch, Scene
 from .motion import Motion
-from .team import Team
+from .team import BLOCK, Team
 from .wall import Wall
 
 TILE = 256  # particles that a thread takes at a time, through several loops: their state stays in its cache
-BLOCK = 32  # of them that are asked at once whether any is near a wall, or touches another
 SWEEPS = 8  # rounds over the walls, for particles that several of them push
 
 
@@ -91,8 +90,11 @@ class Tiles(Motion):
                     else:
                         self.thrust[i] = self.thrust[i] - self.state.d[i]
         for c in ti.static(self.contacts):
-            for i in range(begin, end):
-                c.gather(i, first)
+            for b in range((end - begin + (BLOCK - 1)) // BLOCK):
+                low, high = begin + b * BLOCK, ti.min(begin + (b + 1) * BLOCK, end)
+                if c.busy(low) != 0:
+                    for i in range(low, high):
+                        c.gather(i, first)
         if ti.static(len(self.walls) > 0 and self.n < FEW):
             for i in range(begin, end):
                 self.confine(i, h, when)

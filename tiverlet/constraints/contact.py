@@ -7,13 +7,14 @@ import taichi as ti
 
 from .. import checks
 from ..calm import Calm
+from ..compiling import FEW
 from ..feature import Batch, Scene
 from ..grid import FARTHEST, Grid
 from ..material import Table
 from ..pairs import WORD, Luggage, lowest
 from ..particles import Particles
 from ..splitting import Splitting, lesser
-from ..team import Team
+from ..team import BLOCK, Team
 from ..tools import median
 
 RELAXATION = 1.25  # below 4/3, see Contact
@@ -128,6 +129,10 @@ class Contact(Splitting):
         self._on_radius = scene.radius
         self._on_move = scene.memory.field("Contact.move", n, width=dim)
         self._on_split = scene.memory.field("Contact.split_mass", n, state=True)
+        self._on_block = min(BLOCK, team.piece)
+        self._on_skips = n >= FEW and not self.bounces  # in relax() what bounces forgets the last blow
+        if self._on_skips:
+            self._on_some = scene.memory.field("Contact.some_touch", -(-n // self._on_block), kind=ti.i32)
         self._on_fast = scene.memory.field("Contact.fast", None, kind=ti.i32)
         self._on_rubs, self._on_bounces = self.rubs, self.bounces
         if self.bounces:
