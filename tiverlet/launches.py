@@ -1,0 +1,130 @@
+"""How frames get to the device: launches, lists that grow, and kernels that are made anew for it."""
+
+import copy
+from typing import Any
+
+import numpy as np
+
+from .access import Access
+from .calm import EVERY, PASSES
+from .compiling import Quick
+from .step_report import StepReport
+from .substep import CAME, END, GIVE, HALT, HANDS, REBOUNDS, H
+from .survey import STARTED, STEPPED, UNSTEPPED
+
+
+class Launches(Access):
+    """What a World launches: a frame in one kernel or phase by phase, the survey after it, and the list where it does not fit."""
+
+    _batches: list[Any]
+    _since: int
+    _started: bool
+
+    def _make(self) -> None:
+        """The kernels that are launched in every frame."""
+        compiler, sheet = self._memory.compiler, self._survey.sheet
+        self._frames = Quick(self._sub, "fused", compiler, sheet)
+        self._sums = Quick(self._survey, "measure", compiler, sheet)
+        self._sheet, self._given = sheet.data, sheet.data[H:]
+        self._plain, self._told = vars(self._sub), self._survey.report  # Taichi looks at attributes in Python whenever we do
+
+    def _renew(self) -> None:
+        """Kernels that know of a new field; Taichi compiles them for each Substep anew."""
+        self._sub = copy.copy(self._sub)
+        self._survey = self._survey.of(self._sub)
+        self._make()
+
+    def _fused(self, substeps: int, iterations: int, end: float, came: int) -> None:
+        """All substeps and the survey in one launch, resumed where the neighbour list had to grow."""
+        self._plain["team"].muster(self._sheet[HANDS])
+        begin = it0 = resumed = 0
+        while True:
+            GIVE(
+                self._given, 0, self._h, self._time, end, self._tick, self._since, self._fresh, substeps, iterations,
+                begin, it0, resumed, 0, came,
+            )  # fmt: skip
+            self._frames()
+            if not self._sheet[HALT]:
+                return
+            resumed, begin, it0 = (int(v) for v in self._sheet[HALT:HANDS])
+            self._memory.write(self._sub.halt, 0)
+            self._grow()
+
+    def _parallel(self, n: int, iterations: int) -> None:
+        """A few launches per substep."""
+        h, relaxes = self._h, self._batches or self._grid or self._sub.walls
+        for s in range(n):
+            fresh = int(self._fresh and s == 0)
+            stale = self._sub.predicted(h, self._time, self._tick, self._since, fresh, s, n)
+            for it in range(iterations if relaxes else 0):
+                if stale:
+                    self._list()
+                if self._sub.steps:
+                    self._sub.opened(h, s, n, it, fresh)
+                    for _ in range(self._sub.steps):
+                        self._sub.iterated()
+                    state = self._sub.collected(h, s, n, it, fresh)
+                else:
+                    state = self._sub.relaxed(h, s, n, it, fresh)
+                if self._sub.bounces:
+                    rounds = REBOUNDS if it == 0 and state & 2 else 0
+                    while rounds and self._sub.rebounded():
+                        rounds -= 1
+                    state = self._sub.gathered(h, s, n, it)
+                stale = state & 1
+            if self._sub.concludes:
+                self._sub.remembered(h, self._tick + s)
+            if self._sub.calms and (self._since + s) % EVERY == EVERY - 1:
+                for k in range(PASSES):
+                    self._sub.calmed(k)
+
+    def _list(self) -> None:
+        """Build the neighbour list, growing it until everything fits."""
+        assert self._grid
+        if not self._sub.launched:
+            self._grid.age()
+            self._look()  # whose kernel is there anyway, and lists
+            return
+        with self._memory.compiler():
+            while self._sub.listed() > self._grid.capacity:
+                self._grow()
+
+    def _grow(self) -> None:
+        """More room for near pairs, and kernels that know of it. Nothing is lost: what did not fit was counted."""
+        assert self._grid
+        self._grid.grow()
+        self._renew()
+
+    def _ease(self, first: int) -> None:
+        """Let particles part gently that the user put into each other, from number `first` on."""
+        contact = self._sub.contacts[0]
+        if not contact._on_eases:
+            contact.ease()
+            self._renew()
+        self._sub.shrunk(first)
+
+    def _look(self) -> None:
+        """Survey the state where no frame did."""
+        came = UNSTEPPED if self._fresh else STARTED if self._started else STEPPED
+        if not self._sub.launched:
+            self._fused(0, 1, self._time, came)
+            return
+        if self._grid and self._memory.read(self._grid.stale)[0]:
+            self._list()
+        self._sheet[H], self._sheet[END], self._sheet[CAME] = self._h, self._time, came
+        self._sums()
+
+    def _report(self, substeps: int = 1, iterations: int = 1) -> StepReport:
+        """What the survey found."""
+        report, extent = self._told(self._time, self._h, substeps, iterations, self._energy)
+        if self._grid:
+            self._grid.fit(extent)
+        return report
+
+    def _residuals(self, batch) -> np.ndarray:
+        """What the last substep left of each violation in a batch."""
+        self._memory.check()
+        if not self._h:
+            raise RuntimeError(f"{batch!r}.residual: there is none before the world has been stepped.")
+        with self._memory.compiler():
+            return self._survey.residuals(batch, self._h, self._started)
