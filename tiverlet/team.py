@@ -17,8 +17,9 @@ from .compiling import inline
 from .memory import Memory
 
 LEAST = 512  # iterations of a loop that Taichi gives to a CPU thread, at least
-PIECES = 16  # into which a team divides particles that touch
-EVEN = 64  # particles in a piece, or a multiple: they fill whole lines of a cache
+PIECES = 16  # into which a team divides particles that touch, at most
+SMALL = 128  # of them in a piece, at least: to send what neighbours need from core to core takes as long as to compute it
+EVEN = 64  # or a multiple: they fill whole lines of a cache
 BLOCK = 32  # of them that are asked at once whether any is near a wall, or touches another
 SHARE = 500  # particles and constraints for each thread, at least; with fewer they wait for each other longer than they work
 PATIENCE = 20_000  # looks at the counter, of 50 ns or less, and one more for each particle: then a wait was long
@@ -50,12 +51,12 @@ def size_of(path: str, work: int) -> int:
 class Team:
     """size: the number of threads; 1 where there is nobody to wait for, because Taichi itself spreads loops over threads or
     because there is one thread only. launched: which of the two; phase by phase, as on a GPU. A share of n is what thread `me`
-    does of it; what the shares are shows in no result. Particles are dealt out piece by piece, `pieces` in all: in a heap those
-    below have more to do than those above, and one thread would wait for the other."""
+    does of it; what the shares are shows in no result. Particles are dealt out piece by piece, there and back, `pieces` in all:
+    in a heap those below have more to do than those above, and one thread would wait for the other."""
 
     def __init__(self, memory: Memory, size: int, particles: int, launched: bool, pieces: int):
         self.size, self.launched, self.patience = size, launched, PATIENCE + particles
-        even = -(-particles // (max(pieces, size) * EVEN)) * EVEN
+        even = -(-particles // (max(min(pieces, particles // SMALL), size) * EVEN)) * EVEN
         self.piece = max(1, 1 if launched else particles if size == 1 else even)
         self.spread = LEAST * size if size > 1 else 1
         self._alone, self._frames = 0, 0
@@ -143,15 +144,20 @@ class Team:
     @ti.func
     def _deal(self, n: ti.template(), unit: ti.template(), me):  # type: ignore[valid-type]
         hands, units = self.hands[None], ti.static(-(-n // unit))
-        out = (units - me + hands - 1) // hands * unit
-        if (units - 1) % hands == me:
+        out = (units // hands + ti.cast(self._place(units // hands, me) < units % hands, ti.i32)) * unit
+        if self._place((units - 1) // hands, (units - 1) % hands) == me:
             out -= ti.static(-(-n // unit) * unit - n)
         return out
 
     @ti.func
     def _turn(self, k, unit: ti.template(), me):  # type: ignore[valid-type]
         before = ti.cast(ti.cast(k, ti.u32) // ti.u32(unit), ti.i32)  # i32 would look at the sign
-        return k + (before * (self.hands[None] - 1) + me) * unit
+        return k + (before * (self.hands[None] - 1) + self._place(before, me)) * unit
+
+    @ti.func
+    def _place(self, turn, me):
+        """The place of thread `me` in a turn: there and back, so that it goes on where it was, and none has always the busier."""
+        return ti.select(turn & 1 == 0, me, self.hands[None] - 1 - me)
 
     @ti.func
     def _wait(self):

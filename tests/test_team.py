@@ -1,0 +1,50 @@
+"""What falls to each thread of a team."""
+
+import numpy as np
+import taichi as ti
+
+from tiverlet.memory import Memory
+from tiverlet.team import Team
+
+DEALS = ((1, 1), (7, 1), (16, 4), (23, 4), (64, 8))  # so many things, so many at a time
+
+
+@ti.data_oriented
+class Dealt:
+    """Who got what: a row for each of DEALS."""
+
+    def __init__(self, size: int):
+        memory = Memory(ti.f32)
+        self.team = Team(memory, size, 1000, False, pieces=16)
+        self.who = memory.field("who", len(DEALS) * 64, kind=ti.i32)
+        self.times = memory.field("times", len(DEALS) * 64, kind=ti.i32)
+        memory.place()
+        self.memory = memory
+
+    @ti.kernel
+    def deal(self, hands: ti.i32):
+        """One thread after the other."""
+        self.team.hands[None] = hands
+        for k in range(ti.static(len(DEALS) * 64)):
+            self.times[k] = 0
+        for _ in range(1):
+            for me in range(hands):
+                for row in ti.static(range(len(DEALS))):
+                    for k in range(self.team.deal(DEALS[row][0], DEALS[row][1], me)):
+                        at = row * 64 + self.team.turn(k, DEALS[row][1], me)
+                        self.who[at] = me
+                        self.times[at] += 1
+
+
+def test_all_is_dealt_out_once_there_and_back():
+    # By units, 0 1 2 2 1 0 0 1 2 ... for three threads, whatever is left for the last turn.
+    dealt = Dealt(5)
+    for hands in range(1, 6):
+        dealt.deal(hands)
+        who, times = (dealt.memory.read(field).reshape(len(DEALS), 64) for field in (dealt.who, dealt.times))
+        for row, (n, unit) in enumerate(DEALS):
+            units = np.arange(n) // unit
+            turn, place = units // hands, units % hands
+            assert (times[row, :n] == 1).all() and (times[row, n:] == 0).all(), (hands, n, unit)
+            assert (who[row, :n] == np.where(turn % 2 == 0, place, hands - 1 - place)).all(), (hands, n, unit)
+    dealt.memory.destroy()
