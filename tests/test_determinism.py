@@ -78,7 +78,7 @@ start = tv.Particles(
 def results(path):
     touching = [tv.Ball((0.5, 0.69, 0.5), 0.3, friction=0.3), tv.Contact(friction=0.3)]
     for solver, pairs, more in (
-        (tv.Direct(), ropes, touching), (tv.Jacobi("auto"), net, []), (tv.Chebyshev(), net, []),
+        (tv.Direct(), ropes, touching), (tv.Jacobi("auto"), net, []), (tv.Chebyshev(), net, [f.copy() for f in touching]),
         (tv.ConjugateGradient(steps=4), net, [f.copy() for f in touching]),
     ):
         features = [tv.Gravity(9.81), tv.Distance(pairs), *more]
