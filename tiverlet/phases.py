@@ -8,7 +8,7 @@ from . import runtime
 from .calm import EVERY
 from .feature import Acceleration, Batch, Scene
 from .scalar import Scalar
-from .team import BLOCK, LEAST, Team
+from .team import LEAST, Team, block, blocks
 from .tiles import Tiles
 
 
@@ -150,13 +150,14 @@ class Phases(Tiles):
                 self.team.wait()
             for k in range(self.team.deal(self.pieces, 1, me)):
                 begin, end = self.part(k, me)
-                for b in range((end - begin + (BLOCK - 1)) // BLOCK):
-                    c.count(begin + b * BLOCK, ti.min(begin + (b + 1) * BLOCK, end))
+                for b in range(blocks(begin, end)):
+                    low, high = block(b, begin, end)
+                    c.count(low, high)
             self.team.wait()
             for k in range(self.team.deal(self.pieces, 1, me)):
                 begin, end = self.part(k, me)
-                for b in range((end - begin + (BLOCK - 1)) // BLOCK):
-                    low, high = begin + b * BLOCK, ti.min(begin + (b + 1) * BLOCK, end)
+                for b in range(blocks(begin, end)):
+                    low, high = block(b, begin, end)
                     if c.busy(low) != 0:
                         for i in range(low, high):
                             c.relax(i, first, fresh)

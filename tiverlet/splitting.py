@@ -16,7 +16,7 @@ class Splitting(Touch):
 
     _on_split: Any
     _on_some: Any  # of the particles that are counted together, whether any touches another
-    _on_skips: bool
+    _on_skips = False
     _on_block: int
     _on_slack: Any
     _on_rubs: bool

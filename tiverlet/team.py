@@ -9,7 +9,6 @@ milliseconds: after a few such waits the first thread goes on alone, and the oth
 import contextlib
 from collections.abc import Iterator
 
-import numpy as np
 import taichi as ti
 
 from . import runtime
@@ -48,6 +47,18 @@ def size_of(path: str, work: int) -> int:
     return min(runtime.cores(), max(2, work // SHARE)) if path == "parallel" and not _apart else 1
 
 
+@inline
+def blocks(begin, end):
+    """How many blocks particles from `begin` up to `end` are."""
+    return (end - begin + (BLOCK - 1)) // BLOCK
+
+
+@inline
+def block(b, begin, end):
+    """The particles of the b-th of them: the first, and where they end."""
+    return begin + b * BLOCK, ti.min(begin + (b + 1) * BLOCK, end)
+
+
 class Team:
     """size: the number of threads; 1 where there is nobody to wait for, because Taichi itself spreads loops over threads or
     because there is one thread only. launched: which of the two; phase by phase, as on a GPU. A share of n is what thread `me`
@@ -72,7 +83,7 @@ class Team:
         if self.size > 1:
             self._frames += 1
             if self._frames % SHIFT == 0:
-                self.memory.write(self.arrived, np.zeros(2 * LINE))
+                self.memory.write(self.arrived, 0)
             if self._alone == 0 and hands == 1:
                 self._alone = ALONE
             elif self._alone > 0:

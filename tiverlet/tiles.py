@@ -6,7 +6,7 @@ import taichi as ti
 from .compiling import FEW
 from .feature import Acceleration, Batch, Scene
 from .motion import Motion
-from .team import BLOCK, Team
+from .team import Team, block, blocks
 from .wall import Wall
 
 TILE = 256  # particles that a thread takes at a time, through several loops: their state stays in its cache
@@ -90,8 +90,8 @@ class Tiles(Motion):
                     else:
                         self.thrust[i] = self.thrust[i] - self.state.d[i]
         for c in ti.static(self.contacts):
-            for b in range((end - begin + (BLOCK - 1)) // BLOCK):
-                low, high = begin + b * BLOCK, ti.min(begin + (b + 1) * BLOCK, end)
+            for b in range(blocks(begin, end)):
+                low, high = block(b, begin, end)
                 if c.busy(low) != 0:
                     for i in range(low, high):
                         c.gather(i, first)
@@ -99,8 +99,8 @@ class Tiles(Motion):
             for i in range(begin, end):
                 self.confine(i, h, when)
         elif ti.static(len(self.walls) > 0):
-            for b in range((end - begin + (BLOCK - 1)) // BLOCK):
-                low, high = begin + b * BLOCK, ti.min(begin + (b + 1) * BLOCK, end)
+            for b in range(blocks(begin, end)):
+                low, high = block(b, begin, end)
                 near = 0
                 for i in range(low, high):
                     for f in ti.static(self.walls):

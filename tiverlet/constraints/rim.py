@@ -98,11 +98,6 @@ class Rim(Contact):
         return overlap, n, t
 
     @ti.func
-    def busy(self, begin):
-        """What touches is not known before all are looked at."""
-        return 1
-
-    @ti.func
     def inside(self, v, a):
         """Whether v is inside of the body of a: a ray from it along +x crosses the loop an odd number of times.
 
