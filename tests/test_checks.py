@@ -1,10 +1,14 @@
 """Errors at the door: what is wrong, with index and value, before Taichi sees anything."""
 
+import pickle
+
 import numpy as np
 import pytest
 import taichi as ti
 
 import tiverlet as tv
+
+from .conftest import python
 
 NAN, INF = float("nan"), float("inf")
 
@@ -39,12 +43,22 @@ def scene(*features, **kwargs):
         (lambda: tv.Particles(np.zeros((3, 4))), ValueError, r"\(3, 4\), but \(n, 2\) or \(n, 3\)"),
         (lambda: tv.Particles([["a", "b"]]), TypeError, "real numbers"),
         (lambda: tv.Particles([[0, 1e19]]), ValueError, r"position\[0, 1\] = 1e\+19 m is out of range"),  # row 29
+        (particles(pinned=[[0], [1, 2]]), ValueError, "pinned is ragged"),
+        (particles(velocity=[[0], [1, 2]]), ValueError, "velocity is ragged"),
+        (particles(group=()), ValueError, r"group has shape \(0,\), but an integer or an array of shape \(4,\)"),
         # rows 10, 19, 20: links
         (scene(tv.Distance([[0, 1]], compliance=0.0), "gravity"), TypeError, r"features\[1\] = 'gravity'"),
         (scene(tv.Gravity), TypeError, r"write Gravity\(...\)"),
         (lambda: tv.Distance([[0, 1], [2, 2]]), ValueError, r"pairs\[1\] = \(2, 2\) names a particle twice"),
         (scene(tv.Distance([[0, 1], [3, 250]])), ValueError, r"Distance: pairs\[1\] = \(3, 250\), but there are 4 particles"),
-        (lambda: tv.Distance([[0, -1]]), ValueError, r"pairs\[0\] = \(0, -1\)"),
+        (lambda: tv.Distance([[0, -1]]), ValueError, r"pairs\[0\] = \(0, -1\), but particles are numbered from 0; .* not -1"),
+        (scene(tv.Distance([[0, 1]]), tv.Pin([2]), tv.Pin([1, 2])), ValueError, r"\[2\] = Pin holds particle 2, .* features\[1"),
+        (scene(tv.Path([2], [(0, 0), (1, 0)], speed=1), tv.Pin([2], compliance=1)), ValueError, r"held by features\[0\] = Path"),
+        (lambda: tv.World(tv.Particles([[0, 0]], pinned=[0]), [tv.Pin([0])]), ValueError, "particle 0, which is pinned"),
+        (lambda: tv.Polygons(1), TypeError, "loops = 1 is a int, but a sequence of index sequences"),
+        (lambda: tv.Polygons([0, 1, 2]), TypeError, r"is one body; write a list of bodies"),
+        (lambda: tv.Area(1.0), TypeError, "loops = 1.0 is a float"),
+        (lambda: tv.ShapeMatch("abc"), TypeError, "clusters = 'abc' is a str"),
         (lambda: tv.Distance([0, 1]), ValueError, r"shape \(2,\), but \(m, 2\)"),
         (lambda: tv.Distance([[0.5, 1]]), TypeError, "integers"),
         (lambda: tv.Distance([[0, 1]], compliance=-1e-3), ValueError, r"compliance\[0\] = -0.001"),
@@ -59,6 +73,8 @@ def scene(*features, **kwargs):
         (scene(tv.Pin([0], (0, 0, 0))), ValueError, r"target has shape \(1, 3\)"),
         (scene(tv.Pin([7])), ValueError, r"indices\[0\] = 7"),
         # walls, forces, contacts
+        (lambda: tv.Contact(groups=1), TypeError, r"groups = 1 is a int, but a list of pairs of groups, such as \[\(0, 1\)\]"),
+        (lambda: tv.Contact(skin=np.ones(2)), TypeError, r"skin has shape \(2,\)"),
         (lambda: tv.Box((0, 0), (1, -1)), ValueError, "along axis 1 it goes from 0 to -1"),
         (scene(tv.Box((0, 0), (9, 0.15))), ValueError, "does not hold a particle of radius 0.1"),  # row 26
         (scene(tv.Box((0, 0, 0), (1, 1, 1))), ValueError, "2 numbers are needed in a 2D world"),
@@ -73,6 +89,10 @@ def scene(*features, **kwargs):
         (lambda: tv.Contact(skin=0), ValueError, "skin = 0, but it must be above 0"),
         (scene(tv.Contact(), tv.Contact()), ValueError, "more than one Contact"),
         # rows 28, 63, 66: world
+        (lambda: tv.World(tv.Particles([[0.0, 0]]), tv.Gravity()), TypeError, r"features = Gravity is a Gravity; write a list"),
+        (lambda: tv.Recorder(tv.World(tv.Particles([[0.0, 0]])), "x.rrd"), TypeError, r"write tv.Recorder\(path, world\)"),
+        (lambda: pickle.dumps(tv.World(tv.Particles([[0.0, 0]]))), TypeError, r"Use world.clone\(\)"),
+        (lambda: tv.World(tv.Particles([[0.0, 0]])).run(1, recorder=3), TypeError, r"recorder = 3 is a int, but a path or a "),
         (lambda: tv.World(tv.Particles([[0, 0], [1e6, 0]], radius=0.05), [tv.Contact()]), ValueError, r"position\[1, 0\] = 1e"),
         (scene(substeps=0), ValueError, "substeps = 0, but it must be at least 1"),
         (scene(substeps=2.5), TypeError, "substeps = 2.5 is a float"),
@@ -88,6 +108,7 @@ def scene(*features, **kwargs):
         (lambda: tv.init(arch="gpu"), ValueError, "arch = 'gpu', but it must be one of 'cpu'"),
         (lambda: tv.init(threads=0), ValueError, "threads = 0"),
         (lambda: tv.shapes.rope((0, 0), (1, 0), points=1), ValueError, "points = 1"),
+        (lambda: tv.shapes.cloth((0, 0), (1, 0), (0, 1), 10), ValueError, r"points = 10, .*: \(10, 10\)"),
     ],
 )  # fmt: skip
 def test_bad_input_is_named(make, error, words):
@@ -132,6 +153,67 @@ def test_structure_is_fixed_and_says_so(world):
         w.substeps = 0
     with pytest.raises(TypeError, match="gravity cannot be changed"):
         w.clone(gravity=1)
+
+
+def test_what_does_nothing_is_said(world):
+    start = tv.Particles([[0.0, 0], [1, 0], [3.5, 0]])
+    with pytest.warns(UserWarning, match="all radii are 0, so nothing touches"):
+        world(start, [tv.Contact()])
+    with pytest.warns(UserWarning, match=r"particle 2 starts 1.5 m outside along axis 0 \(1 such in all\); push_out = 1 m/s"):
+        world(start, [tv.Box((-2, -2), (2, 2))])
+
+
+@ti.func
+def flat(x):
+    return -x[0]
+
+
+@ti.func
+def deep(x, v):
+    return ti.Vector([0.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize("function, words", [(flat, "flat returns a number"), (deep, "deep returns 3 components")])
+def test_a_force_is_a_vector_of_the_world(world, function, words):
+    w = world(tv.Particles([[0.0, 1.0]]), [tv.Force(function)])
+    for _ in range(2):  # and not only once
+        with pytest.raises(TypeError, match=f"{words}, but in 2D a force has 2 components"):
+            w.step(0.1)
+
+
+def test_what_taichi_says_of_a_start_is_said_in_our_words():
+    typed = (
+        "import taichi as ti\nimport tiverlet as tv\n"
+        "for make in (lambda: ti.field(ti.f32, 4), lambda: ti.Vector.field(2, ti.f32, 4)):\n"
+        "    try:\n        make()\n    except RuntimeError as e:\n        print(e)\n"
+        "space = {'ti': ti}\nexec('@ti.func\\ndef f(x):\\n    return -x', space)\n"
+        "try:\n    tv.Force(space['f'])\nexcept ValueError as e:\n    print(e)\n"
+        "tv.World(tv.Particles([[0.0, 0.0]]))\n"
+    )
+    done = python(typed, TI_LOG_LEVEL="")
+    said = done.stdout.splitlines()
+    assert sum("Call tv.init() first" in line for line in said) == 2 and "in a file or in a notebook" in said[-1]
+    assert "overridden" not in done.stdout + done.stderr
+
+
+def test_what_holds_or_drives_leaves_nothing_and_bears_no_load(world):
+    x = np.arange(10.0).reshape(5, 2)
+    held, pin = tv.Distance([[0, 1]], rest=2**1.5, break_at=1.0), tv.Pin([2])
+    snap, path = tv.Snap([1], 1.0, compliance=1.0), tv.Path([3], [(6, 7), (9, 7)], speed=1.0)
+    w = world(tv.Particles(x, pinned=[0, 1]), [tv.Gravity(), held, pin, path, snap])
+    for f in (held, pin, path, snap):
+        with pytest.raises(ValueError, match="already acts in another world"):
+            world(w.particles, [f])
+    w.step(1 / 60)
+    for f in (held, pin, path, snap):
+        assert f.residual.tolist() == [0.0]
+    assert held.load.tolist() == [0.0] and snap.load.tolist() == [[0.0, 0.0]] and not held.broken.any()
+    held.rest = 1.0
+    w.step(1 / 60)
+    w.close()
+    for ask in (lambda: held.load, lambda: held.residual, lambda: w.contacts, lambda: w.broken, w.add, w.hash, w.clone):
+        with pytest.raises(RuntimeError):
+            ask()
 
 
 def test_a_world_that_fails_to_build_leaves_its_features_free(world):

@@ -86,3 +86,11 @@ def test_an_empty_world_can_be_recorded(world, tmp_path):
     with tv.Recorder(tmp_path / "d.rrd", w) as recorder:
         w.run(0.1, recorder=recorder)
     assert len(read(tmp_path / "d.rrd", "/world/scene/particles", "Points2D:positions")) == 7
+
+
+def test_a_path_is_recorded_to_and_a_recorder_that_logs_nothing_says_so(world, tmp_path):
+    w = world(tv.Particles([[0.0, 0]]), [tv.Gravity()])
+    with pytest.warns(UserWarning, match=r"log\(\) was never called"), tv.Recorder(tmp_path / "a.rrd", w):
+        w.run(0.1)
+    w.run(0.1, recorder=tmp_path / "b.rrd")
+    assert len(tv.replay(tmp_path / "b.rrd").frames) == 7 and tv.replay(tmp_path / "b.rrd").world(6).hash() == w.hash()

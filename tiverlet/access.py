@@ -11,6 +11,7 @@ from .feature import Feature
 from .memory import Memory
 from .particles import Particles, in_range
 from .queries import Contacts, Search, near_by_all, nearest
+from .read_only import assign_whole, read_only
 from .regroup import Handle
 from .step_report import StepReport
 
@@ -46,9 +47,7 @@ class Access:
     @property
     def position(self) -> np.ndarray:
         """Positions [m], (n, dim), a read-only copy in f64. Assign an array to move particles; velocities are kept."""
-        out = self._scene.state.get(self._memory)
-        out.flags.writeable = False
-        return out
+        return read_only(self._scene.state.get(self._memory), assign_whole("World", "position"))
 
     @position.setter
     def position(self, value) -> None:
@@ -74,8 +73,7 @@ class Access:
         self._memory.check()
         with self._memory.compiler():
             out = composition.velocity(self)[: len(self._particles)]
-        out.flags.writeable = False
-        return out
+        return read_only(out, assign_whole("World", "velocity"))
 
     @velocity.setter
     def velocity(self, value) -> None:
@@ -91,9 +89,7 @@ class Access:
         out = np.zeros((max(1, len(self._particles)), self._particles.dim))
         with self._memory.compiler():
             kernel(*args, out)
-        out = out[: len(self._particles)]
-        out.flags.writeable = False
-        return out
+        return read_only(out[: len(self._particles)], assign_whole("World", "velocity"))
 
     def near(self, points, radius) -> np.ndarray:
         """The particles whose centers are within `radius` [m] of points: (m, 2), rows of `points` and particles, in order.
@@ -125,6 +121,7 @@ class Access:
     @property
     def contacts(self) -> Contacts:
         """What touches now, as arrays: discs or spheres, and vertices and edges of Polygons. Empty without a Contact."""
+        self._memory.check()
         if not self._grid:
             none, index = np.zeros(0), np.zeros((0, 2), dtype=np.int64)
             vectors = np.zeros((0, self._particles.dim))
@@ -138,6 +135,7 @@ class Access:
     @property
     def broken(self) -> list[tuple[Feature, np.ndarray]]:
         """What broke in the last frame: features, and the indices of their constraints. Those of all frames: feature.broken."""
+        self._memory.check()
         out = []
         if self._last and self._last.broken:
             for f in self._sub.breakers:
@@ -242,6 +240,7 @@ class Access:
 
     def handle(self, particles: Any) -> Handle:
         """A handle to some particles, by indices or a Boolean mask; it knows their numbers when others are removed."""
+        self._memory.check()
         return regroup.handle(self, regroup.chosen(self, "World.handle", particles))
 
     @property

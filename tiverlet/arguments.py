@@ -1,23 +1,89 @@
-"""The arguments that an object was made with: what a recording needs to make it again."""
+"""The arguments that an object was made with, what a recording needs to make it again; and which of them can be set later."""
 
+import difflib
 import functools
 import inspect
-from collections.abc import Iterator, Mapping
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
+from .read_only import assign_whole, read_only, structure
+
+
+class Knob:
+    """A live setting: checked when assigned, written to the device before the next frame.
+
+    check: a function (feature, value) -> value that raises for a wrong one.
+    """
+
+    def __init__(self, check: Callable, doc: str):
+        self.check = check
+        self.__doc__ = doc
+
+    def __set_name__(self, owner, name: str) -> None:
+        self.name = name
+
+    def __get__(self, feature, owner=None) -> Any:
+        return self if feature is None else feature.__dict__[self.name]
+
+    def __set__(self, feature, value) -> None:
+        value = self.check(feature, value)
+        if isinstance(value, np.ndarray):
+            value = read_only(value, assign_whole(type(feature).__name__, self.name))
+        feature.__dict__[self.name] = value
+        feature.changed = True
+
 
 class Noted:
-    """Objects whose class keeps the arguments of __init__ in `arguments`, by name, as they were then."""
+    """Objects whose class keeps the arguments of __init__ in `arguments`, by name, as they were then.
+
+    From outside, only knobs can be set: what else an object consists of is compiled into kernels. Its own methods set what they
+    like; arrays become read-only, since no kernel would see what is written to them.
+    """
 
     arguments: Mapping[str, Any] = MappingProxyType({})
+    kept_by_world: tuple[str, ...] = ()  # attributes that a world sets
 
     def __init_subclass__(cls, **kwargs) -> None:
         super().__init_subclass__(**kwargs)
         if "__init__" in vars(cls):
             type.__setattr__(cls, "__init__", _noting(cls.__init__))
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not name.startswith("_") and name not in self.kept_by_world and not isinstance(getattr(type(self), name, None), Knob):
+            if sys._getframe(1).f_locals.get("self") is not self:
+                raise AttributeError(self._refused(name))
+            if isinstance(value, np.ndarray):
+                value = read_only(value, structure(type(self).__name__, name))
+        object.__setattr__(self, name, value)
+
+    def __delattr__(self, name: str) -> None:
+        raise AttributeError(f"{self!r}.{name} cannot be deleted.")
+
+    def _refused(self, name: str) -> str:
+        live, given = knobs_of(type(self)), [*inspect.signature(type(self)).parameters]
+        can = f"Live are {', '.join(live)}" if live else "Nothing of it is live"
+        if name in given or hasattr(self, name):
+            return (
+                f"{self!r}.{name} cannot be set: it is fixed when {type(self).__name__} is made. {can}. For another {name} make "
+                f"a new {type(self).__name__}; in a world, world.remove(features=[old]) and world.add(features=[new])."
+            )
+        return f"{self!r} has no {name!r}{meant(name, [*live, *given])}. {can}."
+
+
+@functools.cache
+def knobs_of(kind: type) -> tuple[str, ...]:
+    """The names of the live settings of a class."""
+    return tuple(name for name in dir(kind) if isinstance(getattr(kind, name, None), Knob))
+
+
+def meant(name: str, names: Iterable[str]) -> str:
+    """A guess at what a misspelt name was to be, as the end of a sentence; empty if nothing is near."""
+    near = difflib.get_close_matches(name, [*names], 1)
+    return f"; did you mean {near[0]!r}?" if near else ""
 
 
 def _noting(init):

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import taichi as ti
@@ -22,6 +22,7 @@ from .solvers.solver import Solver
 from .substep import Substep
 from .survey import Survey
 from .team import PIECES, Team, size_of
+from .tether import Tether
 from .wall import Wall
 
 T = TypeVar("T", bound=Feature)
@@ -64,6 +65,7 @@ def assemble(
     for feature, start in zip(features, starts, strict=True):
         feature.start = particles if start is None else start
         feature.prepare(feature.start, inv_mass)
+    refuse_held_twice(particles, features)
     for feature, start in zip(features, starts, strict=True):
         if start is None:
             feature.review(particles, inv_mass)
@@ -106,6 +108,8 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     size = size_of(path, _work(particles, features))
     team = Team(memory, size, len(particles), path == "parallel" and size == 1, pieces=PIECES if contact else size)
     grid = contact.join(scene, batches, team) if contact else None
+    for feature in of(Batch):
+        feature.scene = scene  # also of those that do nothing, because all of their particles are held
     for feature in [*accelerations, *drivers, *batches, *walls]:
         feature.bind(scene)
     kind = Substep if scene.order == 2 else composition.Composition
@@ -119,7 +123,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
 
 def checked_features(features: Iterable[Feature]) -> tuple[Feature, ...]:
     """The features of a new world, each free and listed once."""
-    features = tuple(features)
+    features = listed("World", features)
     for k, feature in enumerate(features):
         if not isinstance(feature, Feature):
             hint = f"; write {feature.__name__}(...)" if isinstance(feature, type) else ""
@@ -133,6 +137,30 @@ def checked_features(features: Iterable[Feature]) -> tuple[Feature, ...]:
     if sum(isinstance(f, Contact) for f in features) > 1:
         raise ValueError("World: more than one Contact; one covers all particles.")
     return features
+
+
+def listed(who: str, features: Any) -> tuple[Feature, ...]:
+    """Features as a tuple."""
+    if isinstance(features, Feature) or not isinstance(features, Iterable):
+        raise TypeError(f"{who}: features = {features!r} is a {type(features).__name__}; write a list, [...].")
+    return tuple(features)
+
+
+def refuse_held_twice(particles: Particles, features: tuple[Feature, ...]) -> None:
+    """A particle has one place: refuse pins and driven paths on one that is pinned, or that another one holds."""
+    holder = np.full(len(particles), -1)
+    tethers = [(k, f) for k, f in enumerate(features) if isinstance(f, Tether) and f.exclusive]
+    for k, f in sorted(tethers, key=lambda item: not item[1].drives):  # springs are lost on what is driven
+        rows = f.indices[:, 0]
+        wrong = particles.pinned[rows] | (holder[rows] >= 0)
+        if wrong.any():
+            i = int(rows[np.argmax(wrong)])
+            other = "is pinned" if particles.pinned[i] else f"is held by features[{holder[i]}] = {features[holder[i]]!r}"
+            raise ValueError(
+                f"World: features[{k}] = {f!r} holds particle {i}, which {other}. It has one place; leave one of them out."
+            )
+        if f.drives:
+            holder[rows] = k
 
 
 def by_structure(batches: list[Batch], inv_mass: np.ndarray) -> Solver:

@@ -49,6 +49,8 @@ class Breaking(Batch):
             return np.zeros(0)
         if self.scene is None:
             raise RuntimeError(f"{self!r}.load: there is none before a world has been stepped with it.")
+        if not self.acts:
+            return np.zeros(self.count)
         scale = 1 / self.scene.hh if self.scene.hh else 0.0
         return -scale * self.scene.memory.read(self._on_lam)[: self.count].astype(np.float64)
 
@@ -59,7 +61,7 @@ class Breaking(Batch):
 
     def stamps(self) -> np.ndarray:
         """When each constraint broke, (m,): the number of the substep from 1 on, modulo BREAKS; 0 where it holds."""
-        if not self.breaks or self.scene is None or not self.count:
+        if not self.breaks or not self.acts:
             return np.zeros(self.count, dtype=np.int32)
         return self.scene.memory.read(self._on_broken)
 

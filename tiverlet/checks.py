@@ -2,9 +2,12 @@
 
 import math
 import numbers
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
+
+ANY = 2**31 - 1  # particles, while it is not known yet how many there are
 
 
 def number(who: str, name: str, value: Any, *, above=None, least=None, most=None, below=None) -> float:
@@ -87,7 +90,7 @@ def finite(who: str, name: str, array: np.ndarray) -> None:
 
 def indices(who: str, name: str, value, count: int, *, arity: int | None = None) -> np.ndarray:
     """Particle indices below `count`: (m,), or (m, arity) with distinct members in each row."""
-    array = np.asarray(value)
+    array = plain(who, name, value)
     if array.size == 0:
         return np.zeros((0, arity) if arity else (0,), dtype=np.int32)
     if array.dtype.kind not in "iu":
@@ -99,7 +102,10 @@ def indices(who: str, name: str, value, count: int, *, arity: int | None = None)
     rows = bad.any(axis=1) if arity else bad
     if rows.any():
         i = int(np.argmax(rows))
-        raise ValueError(f"{who}: {name}[{i}] = {_show(array[i])}, but there are {count} particles (0 ... {count - 1}).")
+        least = int(array[i].min())
+        why = f"there are {count} particles (0 ... {count - 1})" if count < ANY else "particles are numbered from 0"
+        end = f"; count from the start, not {least} from the end" if least < 0 else ""
+        raise ValueError(f"{who}: {name}[{i}] = {_show(array[i])}, but {why}{end}.")
     if arity:
         ordered = np.sort(array, axis=1)
         same = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
@@ -113,11 +119,23 @@ def _show(row) -> str:
     return str(tuple(int(v) for v in row)) if np.ndim(row) else str(int(row))
 
 
-def _floats(who: str, name: str, value) -> np.ndarray:
+def rows(who: str, name: str, value: Any, what: str) -> list:
+    """A sequence as a list. what: that it is to be, for the error."""
+    if isinstance(value, (str, bytes)) or not isinstance(value, Iterable) or (isinstance(value, np.ndarray) and not value.ndim):
+        raise TypeError(f"{who}: {name} = {value!r} is a {type(value).__name__}, but {what} is needed.")
+    return list(value)
+
+
+def plain(who: str, name: str, value: Any) -> np.ndarray:
+    """An array of anything that has the same length in all rows."""
     try:
-        array = np.asarray(value)
+        return np.asarray(value)
     except ValueError:
         raise ValueError(f"{who}: {name} is ragged; its rows must have the same length.") from None
+
+
+def _floats(who: str, name: str, value) -> np.ndarray:
+    array = plain(who, name, value)
     if array.dtype.kind not in "iuf" and array.size:
         raise TypeError(f"{who}: {name} has type {array.dtype}, but real numbers are needed.")
     return np.array(array, dtype=np.float64)

@@ -18,7 +18,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from taichi.lang import impl
+from taichi.lang import _wrap_inspect, impl
 
 from .reading import active, forget, patched
 
@@ -51,6 +51,7 @@ class Compiler:
         self.config: Any = None  # of Taichi, while kernels compile
         self._settings: dict[str, Any] = {}  # that Taichi was started with
         self._thread = 0
+        self.refused: Exception | None = None  # what is wrong with a function that is being compiled, see refuse()
 
     def __call__(self) -> contextlib.AbstractContextManager[None]:
         """The context; inside itself it has nothing to do."""
@@ -75,6 +76,11 @@ class Compiler:
             gc.disable()  # trees are many small objects, none of them garbage
             try:
                 yield
+            except Exception:
+                if self.refused is None:
+                    raise
+                error, self.refused = self.refused, None
+                raise error from None
             finally:
                 active.pop()
                 runtime.set_default_fp(literals)
@@ -88,6 +94,22 @@ class Compiler:
         runtime: Any = impl.get_runtime()
         self.thorough = True
         _set(runtime.prog.config(), self._settings | SAFE)
+
+
+def refuse(error: Exception) -> None:
+    """Stop compiling because of what a user's function does, with this error and not what Taichi makes of it."""
+    if active:
+        active[-1].refused = error
+    raise error
+
+
+def readable(function: Any) -> bool:
+    """Whether Taichi will find the source of a Python function."""
+    try:
+        _wrap_inspect.getsourcelines(function)
+    except (OSError, TypeError):
+        return False
+    return True
 
 
 def inline(function: Any) -> Any:

@@ -107,7 +107,7 @@ class Elastic(Number, Breaking):
 
     def upload(self) -> None:
         """Write new rest values."""
-        if self.scene and self.count:
+        if self.acts:
             self.scene.memory.write(self._on_rest, self.goal)
 
     @ti.func

@@ -18,13 +18,13 @@ constraint are named in `each`, and what depends on where particles were is take
 anew around it (regroup.py).
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import taichi as ti
 
+from .arguments import Knob as Knob
 from .arguments import Noted
 from .compiling import inline
 from .expanding import at
@@ -54,31 +54,11 @@ class Scene:
         return self.memory.real
 
 
-class Knob:
-    """A live setting of a feature: checked when assigned, written to the device before the next frame.
-
-    check: a function (feature, value) -> value that raises for a wrong one.
-    """
-
-    def __init__(self, check: Callable, doc: str):
-        self.check = check
-        self.__doc__ = doc
-
-    def __set_name__(self, owner, name: str) -> None:
-        self.name = name
-
-    def __get__(self, feature, owner=None) -> Any:
-        return self if feature is None else feature.__dict__[self.name]
-
-    def __set__(self, feature, value) -> None:
-        feature.__dict__[self.name] = self.check(feature, value)
-        feature.changed = True
-
-
 class Feature(Noted):
     """Base of all. `arguments` are those that it was made with; `changed` says that a knob waits to be uploaded, `moving`
     that a target is under way."""
 
+    kept_by_world = ("scene", "start", "changed", "moving", "arguments")
     changed = True
     moving = False
     scene: Any = None  # Scene, from bind() on
@@ -184,7 +164,12 @@ class Batch(Feature):
             return np.zeros(0)
         if self.scene is None:
             raise RuntimeError(f"{self!r}.residual: there is none before a world has been stepped with it.")
-        return self.scene.residuals(self)
+        return np.zeros(self.count) if self.drives or not self.acts else self.scene.residuals(self)
+
+    @property
+    def acts(self) -> bool:
+        """Whether it is in a world, and on the device: some of its particles can move, or it drives them."""
+        return self.scene is not None and "_on_members" in vars(self)
 
     @property
     def broken(self) -> np.ndarray:

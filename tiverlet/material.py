@@ -37,7 +37,10 @@ class Table:
 
     def __init__(self, who: str, friction: Any, restitution: Any, touching: Iterable | None):
         self.who, self.friction, self.restitution = who, friction, restitution
-        self.touching = None if touching is None else [self._pair("groups", p) for p in touching]
+        self.touching = None
+        if touching is not None:
+            pairs = checks.rows(who, "groups", touching, "a list of pairs of groups, such as [(0, 1)],")
+            self.touching = [self._pair("groups", p) for p in pairs]
         single = not isinstance(friction, Mapping) and not isinstance(restitution, Mapping)
         self.uniform = single and touching is None
         values = friction.values() if isinstance(friction, Mapping) else [friction]

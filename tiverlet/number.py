@@ -23,7 +23,7 @@ class Number(Batch):
 
     def lay(self, indices) -> None:
         """Keep the particles of each constraint."""
-        self.indices = checks.indices(repr(self), self.index_name, indices, 2**31 - 1, arity=self.arity)
+        self.indices = checks.indices(repr(self), self.index_name, indices, checks.ANY, arity=self.arity)
         self._warn_duplicates()
 
     def fit(self, particles: Particles) -> None:
@@ -37,7 +37,7 @@ class Number(Batch):
     def slopes(self, position: np.ndarray) -> np.ndarray:
         """grad_k f of every constraint, (m, arity, dim), by central differences: each constraint on particles of its own."""
         twin: Any = self.copy()
-        twin.indices = np.arange(self.indices.size).reshape(self.indices.shape)
+        vars(twin)["indices"] = np.arange(self.indices.size).reshape(self.indices.shape)
         x = position[self.indices]
         step = 1e-6 * (float(np.ptp(x, axis=1).max(initial=0.0)) or 1.0)
         out = np.zeros_like(x)

@@ -5,9 +5,11 @@ import taichi as ti
 from numpy.typing import ArrayLike
 
 from . import checks
+from .arguments import meant
 from .compiling import inline
 from .expanding import at
 from .memory import Memory
+from .read_only import read_only, structure
 
 LARGEST = 1e15  # [m] beyond this, squared lengths near 1e38 leave f32; nothing physical is that far
 
@@ -38,14 +40,13 @@ class Particles:
         self.mass = checks.per_item(who, "mass", mass, self.count, above=0.0, infinite=True)
         self.radius = checks.per_item(who, "radius", radius, self.count, least=0.0)
         self.pinned = _pinned(who, pinned, self.count)
-        self.group = np.broadcast_to(np.asarray(group), (self.count,)).copy()
-        if self.group.dtype.kind not in "iu" and self.count:
-            raise TypeError(f"Particles: group has type {self.group.dtype}, but integers are needed.")
+        self.group = _group(who, group, self.count)
         with np.errstate(divide="ignore"):
             self.inv_mass = np.where(self.pinned, 0.0, 1.0 / self.mass)
-        for array in vars(self).values():
+        for name, array in vars(self).items():
             if isinstance(array, np.ndarray):
-                array.flags.writeable = False
+                live = f" To move particles, assign to world.{name}." if name in ("position", "velocity") else ""
+                vars(self)[name] = read_only(array, structure("Particles", name) + live)
         self._fixed = True
 
     @property
@@ -66,6 +67,8 @@ class Particles:
 
     def __setattr__(self, name: str, value) -> None:
         if getattr(self, "_fixed", False):
+            if not hasattr(self, name):
+                raise AttributeError(f"Particles has no {name!r}{meant(name, vars(self))}. All of it is structure.")
             raise AttributeError(
                 f"Particles.{name} is structure, fixed when a world is built. Make new Particles for a new world; "
                 "to move particles assign to world.position or world.velocity."
@@ -91,7 +94,7 @@ def in_range(who: str, name: str, position: np.ndarray) -> None:
 
 
 def _velocity(who: str, velocity, shape: tuple[int, int]) -> np.ndarray:
-    array = np.asarray(velocity)
+    array = checks.plain(who, "velocity", velocity)
     if array.ndim == 0:
         checks.number(who, "velocity", velocity)
         if float(velocity) != 0.0:
@@ -102,8 +105,17 @@ def _velocity(who: str, velocity, shape: tuple[int, int]) -> np.ndarray:
     return checks.points(who, "velocity", velocity, dim=shape[1], count=shape[0])
 
 
+def _group(who: str, group, count: int) -> np.ndarray:
+    array = checks.plain(who, "group", group)
+    if array.shape not in ((), (count,)):
+        raise ValueError(f"{who}: group has shape {array.shape}, but an integer or an array of shape ({count},) is needed.")
+    if array.dtype.kind not in "iu" and count:
+        raise TypeError(f"{who}: group has type {array.dtype}, but integers are needed.")
+    return np.broadcast_to(array, (count,)).copy()
+
+
 def _pinned(who: str, pinned, count: int) -> np.ndarray:
-    array = np.asarray(pinned)
+    array = checks.plain(who, "pinned", pinned)
     if array.dtype == bool:
         if array.shape != (count,):
             raise ValueError(f"{who}: pinned has shape {array.shape}, but a mask of shape ({count},) is needed.")

@@ -16,11 +16,12 @@ BLOCK = 32  # corners that one thread sums up: the order of all sums is fixed by
 
 def rows(who: str, name: str, value: Any, least: int) -> list[np.ndarray]:
     """A sequence of index sequences of any lengths (or a single one), each of at least `least` distinct particles."""
+    value = checks.rows(who, name, value, "a sequence of index sequences")
     if len(value) and np.ndim(value[0]) == 0:
         value = [value]
     out = []
     for k, row in enumerate(value):
-        row = checks.indices(who, f"{name}[{k}]", row, 2**31 - 1)
+        row = checks.indices(who, f"{name}[{k}]", row, checks.ANY)
         if len(row) < least:
             raise ValueError(f"{who}: {name}[{k}] has {len(row)} particles, but at least {least} are needed.")
         twice = np.flatnonzero(np.bincount(np.unique(row, return_inverse=True)[1]) > 1)

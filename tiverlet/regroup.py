@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from . import checks, snapshot
-from .assembly import assemble, check_settings, checked_features
+from .assembly import assemble, check_settings, checked_features, listed
 from .constraints.contact import Contact
 from .feature import Acceleration, Batch, Feature
 from .memory import Memory
@@ -47,7 +47,8 @@ class Handle:
 
 def add(world: Any, particles: Particles | None, features: Iterable[Feature]) -> Handle:
     """See World.add."""
-    late = listed("add", features)
+    world._memory.check()
+    late = listed("World.add", features)
     if particles is not None:
         if not isinstance(particles, Particles):
             raise TypeError(f"World.add: particles = {particles!r} is a {type(particles).__name__}; use tv.Particles(position).")
@@ -65,7 +66,8 @@ def add(world: Any, particles: Particles | None, features: Iterable[Feature]) ->
 
 def remove(world: Any, particles: Any, features: Iterable[Feature]) -> None:
     """See World.remove."""
-    gone = listed("remove", features)
+    world._memory.check()
+    gone = listed("World.remove", features)
     for k, feature in enumerate(gone):
         if not any(feature is f for f in world.features):
             raise ValueError(f"World.remove: features[{k}] = {feature!r} does not act in this world.")
@@ -90,13 +92,6 @@ def chosen(world: Any, who: str, particles: Any) -> np.ndarray:
             raise ValueError(f"{who}: particles has shape {array.shape}, but a mask of shape ({n},) is needed.")
         return np.flatnonzero(array)
     return checks.indices(who, "particles", array, n)
-
-
-def listed(what: str, features: Any) -> tuple[Feature, ...]:
-    """Features as a tuple."""
-    if isinstance(features, Feature) or not isinstance(features, Iterable):
-        raise TypeError(f"World.{what}: features = {features!r} is a {type(features).__name__}; write a list, [...].")
-    return tuple(features)
 
 
 def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tuple[Feature, ...]) -> None:

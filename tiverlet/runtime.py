@@ -1,18 +1,39 @@
 """The door to Taichi: starting it, and asking about it."""
 
 import contextlib
+import functools
 import io
 import os
+import sys
 import threading
 from typing import Any
 
-# Quiet and offline: no banner, no version check over the network. Taichi reads these when it is imported.
-os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
-os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
-os.environ.setdefault("TI_LOG_LEVEL", "error")
+# Quiet and offline: no banner, no version check over the network. Taichi reads these when it is imported; where that was before,
+# it has printed its banner, and it would warn of the level being set twice.
+if "taichi" not in sys.modules:
+    os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+    os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
+    os.environ.setdefault("TI_LOG_LEVEL", "error")
 
 import taichi as ti
 from taichi.lang import impl
+
+
+def _asks_for_start(create: Any) -> Any:
+    """Say how to start Taichi where a field is made before it runs; ti.init, as Taichi says, would round otherwise."""
+
+    @functools.wraps(create)
+    def created(*args, **kwargs):
+        if impl.get_runtime().prog is None:
+            raise RuntimeError(
+                "A field of Taichi was asked for before Taichi runs. Call tv.init() first; else the first tv.World starts it."
+            )
+        return create(*args, **kwargs)
+
+    return created
+
+
+impl.create_field_member = _asks_for_start(impl.create_field_member)
 
 ARCHITECTURES = ("cpu", "cuda", "metal", "vulkan")
 LLVM = ("cpu", "cuda")  # what LLVM compiles for; for the others Taichi writes SPIR-V

@@ -17,13 +17,14 @@ class Tether(Batch):
 
     arity = 1
     each = ("compliance", "damping")
+    exclusive = False  # nothing else may hold its particles
     compliance: np.ndarray
     damping: np.ndarray
 
     def setup(self, indices, compliance, damping) -> None:
         """Keep the arguments of __init__."""
         who = repr(self)
-        rows = checks.indices(who, "indices", indices, 2**31 - 1)
+        rows = checks.indices(who, "indices", indices, checks.ANY)
         if len(np.unique(rows)) < len(rows):
             values, counts = np.unique(rows, return_counts=True)
             raise ValueError(f"{who}: particle {values[counts > 1][0]} is named twice, and can have only one place.")
@@ -73,6 +74,8 @@ class Tether(Batch):
             raise RuntimeError(f"{self!r}.load: there is none before a world has been stepped with it.")
         if self.drives:
             raise RuntimeError(f"{self!r}.load: driven particles are taken along whatever it takes; give compliance to measure.")
+        if not self.acts:
+            return np.zeros((self.count, self.scene.particles.dim))
         scale = 1 / self.scene.hh if self.scene.hh else 0.0
         return scale * self.scene.memory.read(self._on_lam)[: self.count].astype(np.float64)
 

@@ -1,11 +1,13 @@
 """The world: a scene, and its step."""
 
+import os
 import weakref
 from collections.abc import Iterable, Sequence
 from time import perf_counter
 from typing import Any
 
 from . import checks, composition, snapshot
+from .arguments import meant
 from .assembly import Assembly, assemble, check_settings, checked_features, checked_solver
 from .explain import explain
 from .feature import Acceleration, Feature
@@ -213,11 +215,22 @@ class World(Launches):
     ) -> StepReport:  # fmt: skip
         """Step for `seconds` [s] in frames of dt [s]; returns the worst figures of all frames.
 
-        tolerance, budget: of each frame, see step(). recorder: a Recorder that logs each frame. progress: show a bar.
+        tolerance, budget: of each frame, see step(). recorder: a Recorder that logs each frame, or the path of one that is made
+        for this run. progress: show a bar.
         """
         seconds = checks.number("World.run", "seconds", seconds, above=0.0)
         dt = checks.number("World.run", "dt", dt, above=0.0)
         frames: Any = range(max(1, round(seconds / dt)))
+        if isinstance(recorder, (str, os.PathLike)):
+            from .recording import Recorder
+
+            with Recorder(recorder, self) as recorder:
+                return self.run(seconds, dt, recorder, progress, tolerance=tolerance, budget=budget)
+        if recorder is not None and not callable(getattr(recorder, "log", None)):
+            kind = type(recorder).__name__
+            raise TypeError(
+                f"World.run: recorder = {recorder!r} is a {kind}, but a path or a tv.Recorder(path, world) is needed."
+            )
         if progress:
             from rich.progress import track  # noqa: PLC0415
 
@@ -287,11 +300,18 @@ class World(Launches):
 
     def __setattr__(self, name: str, value) -> None:
         if not name.startswith("_") and name not in ("position", "velocity", "substeps", "iterations"):
+            guess = "" if hasattr(self, name) else meant(name, ("position", "velocity", "substeps", "iterations"))
             raise AttributeError(
-                f"World.{name} cannot be set. Live are position, velocity, substeps and iterations, and the knobs of the "
+                f"World.{name} cannot be set{guess}. Live are position, velocity, substeps and iterations, and the knobs of the "
                 "features; everything else is structure, fixed when the world is built."
             )
         object.__setattr__(self, name, value)
+
+    def __reduce_ex__(self, protocol):
+        raise TypeError(
+            "A World holds compiled kernels and memory of the device, so it cannot be copied or pickled. Use world.clone(), or "
+            "write it to a file with tv.Recorder(path, world) and read it back with tv.replay(path).world()."
+        )
 
     def __repr__(self) -> str:
         names = ", ".join(map(repr, self._features))

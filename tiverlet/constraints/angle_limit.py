@@ -77,7 +77,7 @@ class AngleLimit(Turning):
 
     def upload(self) -> None:
         """Write new limits."""
-        if self.scene and self.count:
+        if self.acts:
             self.scene.memory.write(self._on_rest, self.rest)
             self.scene.memory.write(self._on_middle, self.middle)
 

@@ -36,6 +36,7 @@ class Area(Scalar):
 
     def __new__(cls, loops=(), *args, **kwargs):
         """Triangles are simpler than loops, and have kernels of their own."""
+        loops = checks.rows("Area", "loops", loops, "a sequence of index sequences")
         triangles = all(np.ndim(loop) == 1 and len(loop) == 3 for loop in loops)
         return object.__new__(Triangles if triangles else Loops)
 

@@ -1,5 +1,7 @@
 """A box with particles inside."""
 
+import warnings
+
 import numpy as np
 import taichi as ti
 
@@ -55,6 +57,18 @@ class Box(Wall):
         self.dim = particles.dim
         self.widest = float(particles.radius.max(initial=0.0))
         self.lower, self.upper = self.lower, self.upper
+
+    def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Warn of particles that start outside."""
+        x, r = particles.position, particles.radius[:, None]
+        out = np.maximum(self.lower + r - x, x + r - self.upper) * (inv_mass > 0)[:, None]
+        if (out > 1e-6 * particles.size).any():
+            (i, k), number = np.unravel_index(int(np.argmax(out)), out.shape), int((out.max(axis=1) > 0).sum())
+            warnings.warn(
+                f"Box: particle {i} starts {out[i, k]:.3g} m outside along axis {k} ({number} such in all); "
+                f"push_out = {self.push_out:g} m/s brings it in. Move it, or make the box larger.",
+                stacklevel=3,
+            )
 
     def bind(self, scene: Scene) -> None:
         """Corners at the start and the end of a frame."""

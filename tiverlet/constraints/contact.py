@@ -1,6 +1,7 @@
 """Particles that do not overlap."""
 
 import copy
+import warnings
 
 import numpy as np
 import taichi as ti
@@ -66,7 +67,7 @@ class Contact(Splitting):
     """
 
     def __init__(self, friction=0.0, restitution=0.0, *, skin="auto", groups=None, push_out=1.0):
-        if skin != "auto":
+        if not (isinstance(skin, str) and skin == "auto"):
             skin = checks.number("Contact", "skin", skin, above=0.0)
         self.skin = skin
         self.table = Table("Contact", friction, restitution, groups)
@@ -98,6 +99,11 @@ class Contact(Splitting):
         self.table = copy.copy(self.table)  # which is bound to one world
         if self.matters:
             self.check_range(particles.position)
+
+    def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Warn of particles that cannot touch."""
+        if not self.matters and particles.count:
+            warnings.warn(f"{self!r}: all radii are 0, so nothing touches; give tv.Particles a radius.", stacklevel=3)
 
     def admit(self, particles: Particles, first: int) -> None:
         """Refuse positions too far out."""

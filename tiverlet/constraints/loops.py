@@ -9,7 +9,10 @@ from .. import checks
 
 def checked(loops: Iterable) -> list[np.ndarray]:
     """The particles of each body, at least 3, each in one body and once."""
-    out = [checks.indices("Polygons", f"loops[{k}]", loop, 2**31 - 1) for k, loop in enumerate(loops)]
+    loops = checks.rows("Polygons", "loops", loops, "a sequence of index sequences, one for each body,")
+    if len(loops) and np.ndim(loops[0]) == 0:
+        raise TypeError(f"Polygons: loops = {loops!r} is one body; write a list of bodies, [[...]].")
+    out = [checks.indices("Polygons", f"loops[{k}]", loop, checks.ANY) for k, loop in enumerate(loops)]
     seen: dict[int, int] = {}
     for k, loop in enumerate(out):
         if len(loop) < 3:

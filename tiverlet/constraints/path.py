@@ -63,6 +63,8 @@ class Path(Tether):
         """Whether the particles are driven."""
         return self.driven
 
+    exclusive = drives
+
     @property
     def length(self) -> float:
         """Length of the curve [m]."""
@@ -125,13 +127,13 @@ class Path(Tether):
 
     def upload(self) -> None:
         """Take the new speed, or aim at the new arc lengths."""
-        if self.scene and self.count and self.driven:
+        if self.acts and self.driven:
             self.scene.memory.write(self._on_to, self.speed if self._on_moves else self.at)
             self.moving = not self._on_moves
 
     def settle(self) -> None:
         """The next frame starts from where this one went."""
-        if self.scene and self.count:
+        if self.acts:
             self.scene.memory.write(self._on_from, self.scene.memory.read(self._on_to)[: self.count])
 
     @ti.func

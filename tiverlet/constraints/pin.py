@@ -33,6 +33,7 @@ class Pin(Tether):
 
     each = ("compliance", "damping", "target")
     dim = 0
+    exclusive = True
     target = Knob(_targets, "Where the particles are held, (m, dim) [m].")
 
     def __init__(self, indices, target=None, *, compliance=0.0, damping=0.0):
@@ -68,13 +69,13 @@ class Pin(Tether):
 
     def upload(self) -> None:
         """Aim at the new target."""
-        if self.scene and self.count:
+        if self.acts:
             self.scene.memory.write(self._on_to, self.target)
             self.moving = True
 
     def settle(self) -> None:
         """The next frame starts from the target."""
-        if self.scene and self.count:
+        if self.acts:
             self.scene.memory.write(self._on_from, self.scene.memory.read(self._on_to)[: self.count])
 
     @ti.func

@@ -54,6 +54,8 @@ class ShapeMatch(Clusters):
             return np.zeros(0)
         if self.scene is None:
             raise RuntimeError("ShapeMatch.load: there is none before a world has been stepped with it.")
+        if not self.acts:
+            return np.zeros(self.count)
         w = self.scene.inv_mass[self.indices]
         scale = np.divide(1, w * self.scene.hh, out=np.zeros_like(w), where=w * self.scene.hh > 0)
         pull = self.scene.memory.read(self._on_pull).astype(np.float64)

@@ -101,7 +101,7 @@ class Surfaces(Volume, Content):
 
     def lay(self, members) -> None:
         """Find the surfaces, and turn the faces of each alike."""
-        faces = checks.indices("Volume", "cells", members, 2**31 - 1, arity=3)
+        faces = checks.indices("Volume", "cells", members, checks.ANY, arity=3)
         self.faces, self._surface = _oriented(faces)
         self.layout([np.unique(self.faces[self._surface == k]) for k in range(int(self._surface.max(initial=-1)) + 1)])
 

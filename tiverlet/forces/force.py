@@ -4,7 +4,9 @@ import inspect
 
 import numpy as np
 import taichi as ti
+from taichi.lang.expr import Expr
 
+from ..compiling import inline, readable, refuse
 from ..feature import Acceleration, Scene
 from ..particles import Particles
 
@@ -33,7 +35,13 @@ class Force(Acceleration):
                 f"Force: function = {function!r} is not a Taichi function. Put the decorator @ti.func above its def "
                 "(import taichi as ti), in a file: Taichi reads its source."
             )
-        names = list(inspect.signature(function.func.func).parameters)
+        plain = function.func.func
+        if not readable(plain):
+            raise ValueError(
+                f"Force: the source of {plain.__name__} cannot be read, and Taichi compiles the source. Write it in a file or "
+                "in a notebook; what is typed in a console is not kept."
+            )
+        names = list(inspect.signature(plain).parameters)
         if not 1 <= len(names) <= 4:
             raise TypeError(f"Force: function takes {names}, but it must take 1 to 4 of (x, v, t, i), in this order.")
         self.function = function
@@ -46,18 +54,28 @@ class Force(Acceleration):
     def bind(self, scene: Scene) -> None:
         """No field of its own."""
         self.scene = scene
-        self._on_w = scene.state.w
+        self._on_w, self._on_dim = scene.state.w, scene.particles.dim
+
+    @inline
+    def force(self, value):
+        """What the function returned, if it is a vector; as a number it would be added to all components."""
+        dim, name = self._on_dim, self.function.func.func.__name__
+        shape = (tuple(value.get_shape()) if value.is_tensor() else ()) if isinstance(value, Expr) else np.shape(value)
+        if shape != (dim,):
+            what = f"{shape[0]} components" if len(shape) == 1 else f"a matrix of shape {shape}" if shape else "a number"
+            refuse(TypeError(f"Force: {name} returns {what}, but in {dim}D a force has {dim} components [N]: ti.Vector([...])."))
+        return value
 
     @ti.func
     def acceleration(self, i, x, v, t):
         """F / m."""
         out = 0 * x
         if ti.static(self.arity == 1):
-            out = self.function(x)
+            out = self.force(self.function(x))
         elif ti.static(self.arity == 2):
-            out = self.function(x, v)
+            out = self.force(self.function(x, v))
         elif ti.static(self.arity == 3):
-            out = self.function(x, v, t)
+            out = self.force(self.function(x, v, t))
         else:
-            out = self.function(x, v, t, i)
+            out = self.force(self.function(x, v, t, i))
         return self._on_w.of(i) * out

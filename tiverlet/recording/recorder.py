@@ -6,16 +6,14 @@ import warnings
 import weakref
 import zlib
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from .. import checks, snapshot
+from ..world import World
 from .journal import JOURNAL, Journal
 from .sink import Sink
-
-if TYPE_CHECKING:
-    from ..world import World
 
 SEND = 1.0  # [s] after which the points of curves are sent on
 BACKLOG = 32 << 20  # bytes that may wait to be written
@@ -44,9 +42,12 @@ class Recorder:
     written any further; what has been written then can be read.
     """
 
-    def __init__(self, path, world: "World", every: int = 1, budget: int | None = None):
+    def __init__(self, path, world: World, every: int = 1, budget: int | None = None):
         import rerun as rr
 
+        if not isinstance(world, World):
+            hint = "; write tv.Recorder(path, world)" if isinstance(path, World) else ""
+            raise TypeError(f"Recorder: world = {world!r} is a {type(world).__name__}, but a tv.World is needed{hint}.")
         self._rr: Any = rr
         self.world = world
         self.every = checks.integer("Recorder", "every", every, least=1)
@@ -212,11 +213,17 @@ class Recorder:
         self._closing()
         if self._sink.error:
             self._fail()
+        if not self._calls and journal.worst:
+            warnings.warn(
+                f"Recorder: log() was never called, so {self.path} shows only the frame at the start. Call recorder.log() after "
+                "each step, or give world.run(seconds, recorder=recorder).",
+                stacklevel=2,
+            )
         if note:
             warnings.warn(note, stacklevel=2)
 
 
-def about(world: "World", worst=None, frames: int = 0, note: str = "") -> str:
+def about(world: World, worst=None, frames: int = 0, note: str = "") -> str:
     """A page about the scene, and about all frames once there are some."""
     rows = [
         f"# {len(world.particles)} particles in {world.particles.dim}D",

@@ -1,6 +1,5 @@
 """A scene as plain data, and back: particles, features and settings by their arguments, never by code."""
 
-import functools
 import inspect
 import platform
 import textwrap
@@ -12,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import constraints, forces, runtime, solvers
-from ..arguments import Noted
-from ..feature import Feature, Knob
+from ..arguments import Noted, knobs_of
+from ..feature import Feature
 from ..particles import Particles
 
 if TYPE_CHECKING:
@@ -102,19 +101,14 @@ def _key(value: Any) -> Any:
     return tuple(value) if isinstance(value, (list, np.ndarray)) else value
 
 
-@functools.cache
-def _knobs(kind: type) -> tuple[str, ...]:
-    return tuple(name for name in dir(kind) if isinstance(getattr(kind, name, None), Knob))
-
-
 def knobs(feature: Feature) -> dict[str, Any]:
     """The live settings of a feature, as they are."""
-    return {name: vars(feature)[name] for name in _knobs(type(feature)) if name in vars(feature)}
+    return {name: vars(feature)[name] for name in knobs_of(type(feature)) if name in vars(feature)}
 
 
 def turn(feature: Feature, values: Mapping[str, Any]) -> None:
     """Set knobs together: some are checked against each other, so the order would matter."""
-    if wrong := set(values) - set(_knobs(type(feature))):
+    if wrong := set(values) - set(knobs_of(type(feature))):
         raise ValueError(f"replay: {feature!r} has no knob {sorted(wrong)[0]!r}.")
     vars(feature).update(values)
     for name, value in values.items():

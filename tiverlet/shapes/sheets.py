@@ -14,8 +14,9 @@ def cloth(corner, along, across, points: tuple[int, int], *, shear: bool = True,
     """
     base = point("cloth", "corner", corner)
     u, v = (checks.vector("cloth", name, value, len(base)) for name, value in (("along", along), ("across", across)))
-    if len(points) != 2:
-        raise ValueError(f"cloth: points = {points!r}, but two numbers are needed, along and across.")
+    if np.shape(points) != (2,):
+        hint = f": ({points}, {points})" if np.ndim(points) == 0 else ""
+        raise ValueError(f"cloth: points = {points!r}, but two numbers are needed, along and across{hint}.")
     rows, columns = (checks.integer("cloth", f"points[{k}]", n, least=2) for k, n in enumerate(points))
     area = u @ u * (v @ v) - (u @ v) ** 2
     if not area > 1e-12 * (u @ u) * (v @ v):
