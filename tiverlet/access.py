@@ -8,6 +8,7 @@ import numpy as np
 from . import checks, composition, regroup
 from .breaking import BREAKS
 from .feature import Feature
+from .interrupts import whole
 from .memory import Memory
 from .particles import Particles, in_range
 from .queries import Contacts, Search, near_by_all, nearest
@@ -56,14 +57,15 @@ class Access:
         if self._sub.contacts:
             self._sub.contacts[0].check_range(value)
         self._memory.check()
-        for watcher in self._watchers:
-            watcher.assigned("position", value)
-        with self._memory.compiler():
-            self._restart()
-            self._scene.state.put(self._memory, value)
-        self._energy, self._placed = None, 0
-        if self._grid:
-            self._grid.age()
+        with whole:
+            for watcher in self._watchers:
+                watcher.assigned("position", value)
+            with self._memory.compiler():
+                self._restart()
+                self._scene.state.put(self._memory, value)
+            self._energy, self._placed = None, 0
+            if self._grid:
+                self._grid.age()
 
     @property
     def velocity(self) -> np.ndarray:
@@ -71,7 +73,7 @@ class Access:
         if self._order == 2 or self._fresh:
             return self._export(self._sub.velocities, self._h, self._time, int(self._fresh))
         self._memory.check()
-        with self._memory.compiler():
+        with whole, self._memory.compiler():
             out = composition.velocity(self)[: len(self._particles)]
         return read_only(out, assign_whole("World", "velocity"))
 
@@ -79,10 +81,11 @@ class Access:
     def velocity(self, value) -> None:
         value = checks.points("World", "velocity", value, dim=self._particles.dim, count=len(self._particles))
         self._memory.check()
-        for watcher in self._watchers:
-            watcher.assigned("velocity", value)
-        self._memory.write(self._scene.state.d, value)
-        self._fresh, self._energy = True, None
+        with whole:
+            for watcher in self._watchers:
+                watcher.assigned("velocity", value)
+            self._memory.write(self._scene.state.d, value)
+            self._fresh, self._energy = True, None
 
     def _export(self, kernel, *args) -> np.ndarray:
         self._memory.check()
@@ -104,10 +107,11 @@ class Access:
             return np.zeros((0, 2), dtype=np.int64)
         if not self._grid:
             return near_by_all(self.position, points, radius)
-        self._list()
-        with self._memory.compiler():
-            self._search = self._search or Search(self._grid)
-            return self._search.near(points, radius)
+        with whole:
+            self._list()
+            with self._memory.compiler():
+                self._search = self._search or Search(self._grid)
+                return self._search.near(points, radius)
 
     def nearest(self, points) -> tuple[np.ndarray, np.ndarray]:
         """Index of, and distance [m] to, the particle whose center is nearest to each point; of equally near ones the first."""
@@ -126,10 +130,11 @@ class Access:
             none, index = np.zeros(0), np.zeros((0, 2), dtype=np.int64)
             vectors = np.zeros((0, self._particles.dim))
             return Contacts(index, index[:, 0], none, none, vectors, vectors, none)
-        self._list()
         contact = self._sub.contacts[0]
-        if contact.measures and self._sub.launched:
-            self._look()  # which measures; elsewhere it makes the list, too
+        with whole:
+            self._list()
+            if contact.measures and self._sub.launched:
+                self._look()  # which measures; elsewhere it makes the list, too
         return contact.found(self.position, self._h or 1.0)
 
     @property
@@ -222,7 +227,8 @@ class Access:
 
         Raises as World() does; the world is then as before.
         """
-        return regroup.add(self, particles, features)
+        with whole:
+            return regroup.add(self, particles, features)
 
     def remove(self, particles: Any = (), features: Iterable[Feature] = ()) -> None:
         """Remove particles and features, between frames.
@@ -236,7 +242,8 @@ class Access:
 
         Raises ValueError or TypeError for what there is not; the world is then as before.
         """
-        regroup.remove(self, particles, features)
+        with whole:
+            regroup.remove(self, particles, features)
 
     def handle(self, particles: Any) -> Handle:
         """A handle to some particles, by indices or a Boolean mask; it knows their numbers when others are removed."""

@@ -20,7 +20,7 @@ from .constraints.contact import Contact
 from .feature import Acceleration, Batch, Feature, Scene
 from .scalar import Scalar
 from .solvers.solver import Solver
-from .substep import CAME, END, FRESH, ITERATIONS, START, SUBSTEPS, H, Substep, integer
+from .substep import BEGIN, CAME, END, FRESH, ITERATIONS, START, SUBSTEPS, UNTIL, H, Substep, integer
 from .wall import Wall
 
 # The first half of the stages; the one in the middle is what is missing to 1.
@@ -109,15 +109,17 @@ class Composition(Substep):
             h64, whole, t = sheet[H], sheet[H] / self.first, sheet[START]
             fresh, came = integer(sheet, FRESH), integer(sheet, CAME)
             substeps, iterations = integer(sheet, SUBSTEPS), integer(sheet, ITERATIONS)
-            for s in range(substeps):
+            until = integer(sheet, UNTIL)
+            for s in range(integer(sheet, BEGIN), ti.min(substeps, until)):
                 for q in range(self.count):
                     g = self.table[q]
                     starts = fresh if s + q == 0 else 0
                     when = ti.Vector([(s + g[2]) / substeps, (s + g[3]) / substeps])
                     final = ti.cast(s == substeps - 1 and q == self.count - 1, ti.i32)
                     self.stage(g[0] * whole, g[1] * whole, t + (s + g[2]) * whole, when, starts, iterations, final)
-            self.survey.weigh(0, h64, came)
-            self.survey.sum_up(0, h64, sheet[END], came, sheet)
+            if until > substeps:
+                self.survey.weigh(0, h64, came)
+                self.survey.sum_up(0, h64, sheet[END], came, sheet)
 
     @ti.kernel
     def probed(self, h: ti.f64, last: ti.f64, t: ti.f64, end: ti.f64, iterations: ti.i32):

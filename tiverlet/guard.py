@@ -59,7 +59,9 @@ class Guard:
         end = float("inf") if budget is None else perf_counter() + budget
         self.prepare(world.iterations, dt, tolerance, budget)
         n, k = self.substeps, self.iterations
-        kept, tries, best, idle, kind = snapshot.keep(world), 0, float("inf"), 0, "substeps"
+        before, flags = world._undo  # type: ignore[misc]  # of the step; where nothing was uploaded since, it is the state now
+        kept = snapshot.keep(world) if any(map(any, flags)) else replace(before, guard=self.memory)
+        tries, best, idle, kind = 0, float("inf"), 0, "substeps"
         world._begin(dt / n * world._sub.first)
         while True:
             tries, begun = tries + 1, perf_counter()

@@ -8,9 +8,12 @@ import numpy as np
 from .access import Access
 from .calm import EVERY, PASSES
 from .compiling import Quick
+from .interrupts import whole
 from .step_report import StepReport
 from .substep import CAME, END, GIVE, HALT, HANDS, REBOUNDS, H
 from .survey import STARTED, STEPPED, UNSTEPPED
+
+LONG = 10_000_000  # particles and constraints, times passes, in a launch: it takes about a second
 
 
 class Launches(Access):
@@ -19,6 +22,7 @@ class Launches(Access):
     _batches: list[Any]
     _since: int
     _started: bool
+    _undo: Any
 
     def _make(self) -> None:
         """The kernels that are launched in every frame."""
@@ -27,6 +31,7 @@ class Launches(Access):
         self._sums = Quick(self._survey, "measure", compiler, sheet)
         self._sheet, self._given = sheet.data, sheet.data[H:]
         self._plain, self._told = vars(self._sub), self._survey.report  # Taichi looks at attributes in Python whenever we do
+        self._passes = max(1, LONG // (1 + len(self._particles) + sum(b.count for b in self._batches)))  # in a launch
 
     def _renew(self) -> None:
         """Kernels that know of a new field; Taichi compiles them for each Substep anew."""
@@ -35,28 +40,47 @@ class Launches(Access):
         self._make()
 
     def _fused(self, substeps: int, iterations: int, end: float, came: int) -> None:
-        """All substeps and the survey in one launch, resumed where the neighbour list had to grow."""
+        """All substeps and the survey in one launch, resumed where the neighbour list had to grow; a long frame in several."""
         self._plain["team"].muster(self._sheet[HANDS])
         begin = it0 = resumed = 0
+        until, part, some = substeps + 1, iterations, self._passes
+        if substeps * iterations > some:
+            until, part = max(1, some // iterations), min(iterations, some) if self._order == 2 else iterations
         while True:
             GIVE(
                 self._given, 0, self._h, self._time, end, self._tick, self._since, self._fresh, substeps, iterations,
-                begin, it0, resumed, 0, came,
+                begin, it0, resumed, 0, came, until, part,
             )  # fmt: skip
             self._frames()
-            if not self._sheet[HALT]:
+            if self._sheet[HALT]:
+                resumed, begin, it0 = (int(v) for v in self._sheet[HALT:HANDS])
+                self._memory.write(self._sub.halt, 0)
+                self._grow()
+                continue
+            if begin == substeps or (until > substeps and part == iterations):
                 return
-            resumed, begin, it0 = (int(v) for v in self._sheet[HALT:HANDS])
-            self._memory.write(self._sub.halt, 0)
-            self._grow()
+            if part < iterations:  # go on with this substep
+                resumed, begin, it0, part = 1, until - 1, part, min(iterations, part + some)
+            else:
+                resumed, begin, it0, part = 0, until, 0, min(iterations, some) if self._order == 2 else iterations
+                until = min(substeps + 1, until + max(1, some // iterations))
+            self._heed_signals()
+
+    def _heed_signals(self) -> None:
+        """In a long frame: call the handlers of signals that came. What they raise undoes the frame, see World.step."""
+        if self._undo:
+            whole.heed()
 
     def _parallel(self, n: int, iterations: int) -> None:
         """A few launches per substep."""
         h, relaxes = self._h, self._batches or self._grid or self._sub.walls
         for s in range(n):
+            self._heed_signals()
             fresh = int(self._fresh and s == 0)
             stale = self._sub.predicted(h, self._time, self._tick, self._since, fresh, s, n)
             for it in range(iterations if relaxes else 0):
+                if it:
+                    self._heed_signals()
                 if stale:
                     self._list()
                 if self._sub.steps:

@@ -94,6 +94,11 @@ def put_back(world: "World", kept: Kept) -> None:
 def install(world: "World", kept: Kept, flagged: list[list[bool]]) -> None:
     """Give a world that was just built the state of another one of the same scene, knobs and precision, bit for bit."""
     world._upload()
+    undo(world, kept, flagged)
+
+
+def undo(world: "World", kept: Kept, flagged: list[list[bool]]) -> None:
+    """Return to the state before a step that was not finished; what it uploaded is uploaded again in the next one."""
     put_back(world, kept)
     for feature, (changed, moving) in zip(world.features, flagged, strict=True):
         feature.changed, feature.moving = changed, moving

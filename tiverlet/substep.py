@@ -20,11 +20,13 @@ from .team import LEAST
 # it ended: whether, in which substep and before which iteration it stopped to have the list grown; how many threads of a team
 # were at work. Then what it is given: the substep, and the times at the start and the end of the frame [s]; substeps so far, and
 # since the last start; whether it starts; how many substeps and iterations; where it goes on if it stopped (substep, iteration,
-# 1); 0, the number of the first thread; how the state that it leaves came about, see Survey.
+# 1); 0, the number of the first thread; how the state that it leaves came about, see Survey; before which substep, and which
+# iteration of it, the launch ends: a long frame is made in several, between which Python looks at signals.
 FIGURES = 14
 HALT, HANDS = FIGURES, FIGURES + 3
-GIVEN = H, START, END, TICK, SINCE, FRESH, SUBSTEPS, ITERATIONS, BEGIN, PASS, RESUMED, FIRST, CAME = range(HANDS + 1, HANDS + 14)
-SHEET = CAME + 1
+GIVEN = tuple(range(HANDS + 1, HANDS + 16))
+H, START, END, TICK, SINCE, FRESH, SUBSTEPS, ITERATIONS, BEGIN, PASS, RESUMED, FIRST, CAME, UNTIL, PART = GIVEN
+SHEET = PART + 1
 GIVE = Struct(f"{len(GIVEN)}d").pack_into  # in a third of the time of an assignment to an array
 REBOUNDS = 8  # rounds of restitution in a substep, at most
 
@@ -57,7 +59,8 @@ class Substep(Phases):
         tick, since, fresh, came = integer(sheet, TICK), integer(sheet, SINCE), integer(sheet, FRESH), integer(sheet, CAME)
         substeps, iterations = integer(sheet, SUBSTEPS), integer(sheet, ITERATIONS)
         begin, it0, resumed = integer(sheet, BEGIN), integer(sheet, PASS), integer(sheet, RESUMED)
-        for s in range(begin, substeps + 1):
+        until, part = integer(sheet, UNTIL), integer(sheet, PART)
+        for s in range(begin, until):
             h, more = ti.cast(h64, self.real), s < substeps
             when = self.clock(s, substeps)
             starts, again = ti.select(s == 0, fresh, 0), ti.select(s == begin, resumed, 0)
@@ -66,7 +69,7 @@ class Substep(Phases):
                     self.predict(
                         me, h, ti.cast(t + s * h64, self.real), tick + s, starts, when, self.calming(since + s)
                     )  # fmt: skip
-                for it in range(ti.select(again != 0, it0, 0), ti.select(more, iterations, 1)):
+                for it in range(ti.select(again != 0, it0, 0), ti.select(more, part, 1)):
                     if ti.static(self.hashes):
                         if self.halted() == 0 and self.is_stale() != 0:
                             self.grid.build(me)
@@ -83,10 +86,10 @@ class Substep(Phases):
                                     self.rebound(me)
                         self.collect(me, h, when, first, final, ti.cast(final != 0 or it + 1 < iterations, ti.i32))
                 if ti.static(self.concludes):
-                    if more and self.halted() == 0:
+                    if more and part == iterations and self.halted() == 0:
                         self.remember(me, h, tick + s)
                 if ti.static(self.calms):
-                    if more and self.halted() == 0 and self.calming(since + s) != 0:
+                    if more and part == iterations and self.halted() == 0 and self.calming(since + s) != 0:
                         for k in range(PASSES):
                             self.calm(me, k)
                 if not more and self.halted() == 0:

@@ -12,6 +12,7 @@ from .assembly import Assembly, assemble, check_settings, checked_features, chec
 from .explain import explain
 from .feature import Acceleration, Feature
 from .guard import Guard
+from .interrupts import whole
 from .launches import Launches
 from .overlap import overlapping
 from .particles import Particles
@@ -80,6 +81,7 @@ class World(Launches):
         self._energy: float | None = None
         self._last: StepReport | None = None
         self._watchers: list[Any] = []  # recorders: told of what the user assigns, and before and after every step
+        self._undo: tuple | None = None  # the state before a step that takes long, and flags of features
 
     @property
     def _asked(self) -> tuple[Solver | None, str, str, int]:
@@ -109,24 +111,43 @@ class World(Launches):
 
         Raises ValueError for dt, tolerance or budget that is not finite and above 0. With another substep length than before,
         displacements are turned into velocities first and back after (time-corrected Verlet), so the step stays second order.
+        A signal such as Ctrl-C is handled after the frame. One that takes seconds is undone at once if the handler raises.
         """
         self._memory.check()
         dt = checks.number("World.step", "dt", dt, above=0.0)
-        for watcher in self._watchers:
-            watcher.before()
-        clock = perf_counter()
-        self._heed()
-        if self._guard.auto or tolerance is not None or budget is not None:
-            with self._memory.compiler():
-                report = self._guard.advance(self, dt, tolerance, budget)
-        else:
-            self._begin(dt / self._substeps * self._plain["first"])
-            report = self._advance(dt, self._substeps, self._iterations)
-        report.__dict__["seconds"] = perf_counter() - clock  # which is no part of what it says
-        self.__dict__.update(_last=report, _energy=report.energy)  # which is quicker than one after the other
-        for watcher in self._watchers:
-            watcher.after(dt, report)
+        with whole:
+            for watcher in self._watchers:
+                watcher.before()
+            clock = perf_counter()
+            try:
+                guarded = self._guard.auto or tolerance is not None or budget is not None
+                if guarded or self._substeps * self._iterations > self._passes:
+                    self._undo = snapshot.keep(self), snapshot.flags(self)
+                self._heed()
+                if guarded:
+                    with self._memory.compiler():
+                        report = self._guard.advance(self, dt, tolerance, budget)
+                else:
+                    self._begin(dt / self._substeps * self._plain["first"])
+                    report = self._advance(dt, self._substeps, self._iterations)
+            except BaseException:
+                self._broken_off()
+                raise
+            report.__dict__["seconds"] = perf_counter() - clock  # which is no part of what it says
+            # All at once, which is quicker than one after the other.
+            self.__dict__.update(_last=report, _energy=report.energy, _undo=None)
+            for watcher in self._watchers:
+                watcher.after(dt, report)
         return report
+
+    def _broken_off(self) -> None:
+        """A step ended with an exception: undo it, or tell recorders that the state is none that steps lead to."""
+        undo, self._undo = self._undo, None
+        if undo:
+            snapshot.undo(self, *undo)
+            return
+        for watcher in self._watchers:
+            watcher.broken_off()
 
     def _advance(self, dt: float, substeps: int, iterations: int) -> StepReport:
         """One frame from where _begin() left off."""
@@ -237,10 +258,11 @@ class World(Launches):
             frames = track(frames, description=f"{len(self._particles)} particles")
         worst = None
         for _ in frames:
-            report = self.step(dt, tolerance, budget)
-            worst = report if worst is None else worst.worse(report)
-            if recorder is not None:
-                recorder.log()
+            with whole:  # the frame is in the file, too
+                report = self.step(dt, tolerance, budget)
+                worst = report if worst is None else worst.worse(report)
+                if recorder is not None:
+                    recorder.log()
         assert worst
         return worst
 

@@ -2,6 +2,7 @@
 
     scene     particles, features, settings, versions; another one where particles or features came or went. A state follows.
     state     an exact state, to continue from
+    taken     the state after a step that an exception has ended; to be taken as it is, since no whole steps lead to it
     turned    knobs that the user turned, before the next step
     assigned  positions or velocities that the user assigned
     frame     a frame of the picture, and the hash of the state then
@@ -10,6 +11,7 @@
 Each entry also says which steps were made since the one before, and carries a checksum of itself and of all before it.
 """
 
+import contextlib
 import copy
 import hashlib
 import json
@@ -112,11 +114,11 @@ class Journal:
         settings = self.world.settings
         return [settings["substeps"], settings["iterations"], list(self.world._guard.memory)]
 
-    def state(self) -> int:
+    def state(self, kind: str = "state") -> int:
         """Write the exact state; returns the size of the entry [bytes]."""
         kept, world = snapshot.keep(self.world), self.world
         more = {"flags": snapshot.flags(world), "reach": world._scene.hh}
-        return self.put("state", {"clock": kept.clock, **more}, kept.values)
+        return self.put(kind, {"clock": kept.clock, **more}, kept.values)
 
     def before(self) -> None:
         """A step begins: write down what was turned since the last one."""
@@ -141,6 +143,11 @@ class Journal:
             self._steps.append([*step, 1])
         self.worst = report if self.worst is None else self.worst.worse(report)
         self.recent = report if self.recent is None else self.recent.worse(report)
+
+    def broken_off(self) -> None:
+        """A step ended with an exception."""
+        with contextlib.suppress(RuntimeError):  # a world whose fields are gone has no state
+            self.state("taken")
 
     def assigned(self, name: str, value: np.ndarray) -> None:
         """The user assigned positions or velocities."""

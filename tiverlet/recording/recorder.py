@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from .. import checks, snapshot
+from .. import checks, interrupts, snapshot
 from ..world import World
 from .journal import JOURNAL, Journal
 from .sink import Sink
@@ -67,6 +67,7 @@ class Recorder:
     def __exit__(self, *exc) -> None:
         self.close()
 
+    @interrupts.uncut
     def _open(self) -> None:
         from .curves import Curves
         from .drawing import Drawing, bounds, links
@@ -115,6 +116,7 @@ class Recorder:
         """About what the file will have when it is closed [bytes]."""
         return max(self._sink.bytes, self._logged)
 
+    @interrupts.uncut
     def log(self) -> None:
         """Write the present frame, if it is one of `every`."""
         if self._sink.stream is None:
@@ -130,6 +132,7 @@ class Recorder:
         if self._sink.error:
             self._fail()
 
+    @interrupts.uncut
     def flush(self) -> None:
         """Wait until what was logged is in the file, so that it is there whatever happens to the process."""
         self._curves.send()
@@ -188,6 +191,7 @@ class Recorder:
                 self._drawing.event(" ".join(report.notes), "WARN")
         self.frames += 1
 
+    @interrupts.uncut
     def close(self) -> None:
         """Write the summary and finish the file. Calling it twice does nothing."""
         if self._sink.stream is None:

@@ -193,6 +193,9 @@ class Replay:
         if entry.kind == "turned":
             for k, values in self._turned(entry):
                 scene.turn(world.features[k], values)
+        elif entry.kind == "taken":
+            snapshot.install(world, _kept(entry, world), entry.data["flags"])
+            world._scene.hh = entry.data["reach"]
         elif entry.kind == "assigned":
             setattr(world, entry.data["name"], entry.arrays["value"])
         if "now" in entry.data:

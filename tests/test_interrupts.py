@@ -1,0 +1,164 @@
+"""Ctrl-C: a frame is done or not done, wherever the signal comes."""
+
+import os
+import signal
+import sys
+import threading
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+from tiverlet import interrupts, snapshot
+
+
+def frames_of(world, dt=1 / 60):
+    """How many frames it has made."""
+    return round(world.time / dt)
+
+
+def pile(**settings):
+    """Discs that touch, rub and bounce, on a rope that breaks: everything that a substep can have."""
+    x = np.array([[0.3 * k, 0.3 + 0.29 * (k % 2)] for k in range(6)])
+    features = [
+        tv.Gravity(9.81), tv.Contact(friction=0.3, restitution=0.4), tv.Box((-1, 0), (3, 3)),
+        tv.Distance([(k, k + 1) for k in range(5)], break_at=2.0), tv.Pin([0]),
+    ]  # fmt: skip
+    return tv.World(tv.Particles(x, radius=0.16), features, **{"substeps": 4, "iterations": 3, "path": "fused", **settings})
+
+
+@pytest.fixture(scope="module")
+def piled():
+    with pile() as world:
+        yield world
+
+
+@pytest.fixture
+def w(piled):
+    """One world for all tests, since compiling it takes longer than all else."""
+    start = snapshot.keep(piled)
+    yield piled
+    snapshot.put_back(piled, start)
+    piled.substeps, piled.iterations = 4, 3
+    piled._make()
+
+
+def test_a_signal_waits_for_the_end_of_the_frame(w, tmp_path):
+    w.substeps = "auto"
+    pin = w.features[-1]
+    with tv.Recorder(tmp_path / "a.rrd", w) as recorder:
+
+        def everything():
+            pin.target = [[0.01 * frames_of(w), 0.3]]
+            w.position = w.position
+            w.step(1 / 60)
+            recorder.log()
+
+        everything()  # compiles
+        place, came = 0, 0
+        lines = [0]
+
+        def watch(frame, event, arg):
+            if "tiverlet" in frame.f_code.co_filename:
+                lines[0] += event == "line"
+                if lines[0] == place and event == "line":
+                    lines[0] += 1
+                    signal.raise_signal(signal.SIGINT)
+                return watch
+
+        while came == place // 41:  # every 41st line of those that are run, until there are no more
+            place, lines[0] = place + 41, 0
+            try:
+                sys.settrace(watch)
+                everything()
+            except KeyboardInterrupt:
+                came += 1
+            finally:
+                sys.settrace(None)
+        assert came > 10 and lines[0] < place  # none has vanished
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    recording = tv.replay(tmp_path / "a.rrd")
+    assert recording.complete and recording.verify()
+    with recording.world(int(recording.frames[-1])) as again:
+        assert frames_of(again) <= frames_of(w)
+
+
+def in_parts(w, passes, frames):
+    """Hashes of frames made in one launch each, and made in launches of so many passes."""
+    start, out = snapshot.keep(w), []
+    for some in (w._passes, passes):
+        snapshot.put_back(w, start)
+        w._passes = some
+        out.append([(w.step(1 / 60).residual, w.hash()) for _ in range(frames)])
+    return out
+
+
+@pytest.mark.parametrize("passes", [1, 2, 5, 7])
+def test_long_frames_in_several_launches_have_the_same_bits(w, passes):
+    whole, parted = in_parts(w, passes, 12)  # of 12 passes each
+    assert whole == parted
+
+
+def test_long_frames_of_a_team_and_of_high_order():
+    chain = [tv.Gravity(), tv.Distance([(0, 1)])]
+    with (
+        pile(path="parallel") as team,
+        tv.World(tv.Particles([[0, 0], [1, 0]], pinned=[0]), chain, order=4, precision="f64") as precise,
+    ):
+        for some in (team, precise):
+            whole, parted = in_parts(some, 5, 4)
+            assert whole == parted
+
+
+@pytest.mark.parametrize("endless", [{"substeps": 2_000_000_000}, {"iterations": 2_000_000_000}])
+def test_an_endless_frame_is_undone(w, endless):
+    pin = w.features[-1]
+    w.run(0.1)
+    start = snapshot.keep(w)
+    pin.target = [[0.05, 0.35]]
+    w.run(0.1)
+    expected = w.hash()
+    snapshot.put_back(w, start)
+    pin.target = [[0.05, 0.35]]
+    for name, value in endless.items():
+        setattr(w, name, value)
+    w._passes = 10_000  # as in a large scene
+    timer = threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT))
+    timer.start()
+    with pytest.raises(KeyboardInterrupt):
+        w.step(1 / 60)
+    timer.join()
+    w.substeps, w.iterations = 4, 3
+    w.run(0.1)
+    assert w.hash() == expected
+
+
+def test_a_handler_that_raises_nothing_is_called_after_the_frame(w):
+    seen = []
+    before = signal.signal(signal.SIGTERM, lambda *_: seen.append(frames_of(w)))
+    try:
+        with interrupts.whole:
+            signal.raise_signal(signal.SIGTERM)
+            w.step(1 / 60)
+            assert not seen
+        assert seen == [1]
+        thread = threading.Thread(target=w.step, args=(1 / 60,))  # where there is nothing to wait for
+        thread.start(), thread.join()
+        assert frames_of(w) == 2
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def test_a_step_that_fails_is_recorded_as_it_is(w, tmp_path):
+    with tv.Recorder(tmp_path / "a.rrd", w) as recorder:
+        w.run(0.05, recorder=recorder)
+        w.__dict__["_report"] = lambda *_: 1 / 0
+        with pytest.raises(ZeroDivisionError):
+            w.step(1 / 60)
+        del w.__dict__["_report"]
+        w.run(0.05, recorder=recorder)
+        end = w.hash()
+    recording = tv.replay(tmp_path / "a.rrd")
+    assert recording.verify()
+    with recording.world(6) as again:
+        assert again.hash() == end
