@@ -89,7 +89,7 @@ def main(path: str = "article.rrd") -> None:
     scene = build()
     world, worst, first, times, stretch = scene.world, None, None, [], 0.0
     rest = np.linalg.norm(np.diff(world.position[scene.chain], axis=1)[:, 0], axis=1)
-    with tv.Recorder(path, world) as recorder:
+    with tv.Recorder(path, world, overwrite=True) as recorder:
         for _ in track(range(round(SECONDS / DT)), description=f"{len(world.particles)} particles"):
             lead(scene)
             report = world.step(DT)

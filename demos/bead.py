@@ -42,7 +42,7 @@ def main(path: str = "bead.rrd") -> None:
     """Race, and compare with the formulas."""
     world, heights = build()
     arrival, first = np.full(3, np.inf), None
-    with tv.Recorder(path, world) as recorder:
+    with tv.Recorder(path, world, overwrite=True) as recorder:
         for frame in range(240):
             report = world.step(1 / 120)
             first = report.energy if first is None else first

@@ -31,7 +31,7 @@ def build(points: int = 31) -> tuple[tv.World, tv.shapes.Shape]:
 def main(path: str = "cloth.rrd", seconds: float = 3.0) -> None:
     """Fall, record, and measure."""
     world, sheet = build()
-    with tv.Recorder(path, world, every=2) as recorder:
+    with tv.Recorder(path, world, every=2, overwrite=True) as recorder:
         report = world.run(seconds, recorder=recorder, progress=True)
     rest = np.linalg.norm(np.diff(sheet.position[sheet.links], axis=1)[:, 0], axis=1)
     stretch = tv.measure.strain(world, sheet.links, rest)

@@ -24,7 +24,7 @@ def cradle(substeps: tuple[int, int], restitution: float) -> list[float]:
         for n in substeps:
             again(world, n)
             speeds.append(0.0)
-            with tv.Recorder("cradle.rrd", world) as recorder:
+            with tv.Recorder("cradle.rrd", world, overwrite=True) as recorder:
                 for _ in range(60):
                     world.step(1 / 60)
                     recorder.log()

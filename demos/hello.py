@@ -13,7 +13,7 @@ world = tv.World(
     [tv.Gravity(9.81), tv.Distance(rope.links), tv.Box((-2, 0), (2, 3)), tv.Contact()],
     substeps="auto",
 )
-with tv.Recorder("rope.rrd", world) as recorder:
+with tv.Recorder("rope.rrd", world, overwrite=True) as recorder:
     report = world.run(5.0, recorder=recorder)
 print(report)
 print(world.explain())

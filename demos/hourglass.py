@@ -46,7 +46,7 @@ def check(world: tv.World) -> None:
 def main(path: str = "hourglass.rrd", seconds: float = 6.0) -> None:
     """Run, record, and say how it went."""
     world = build()
-    with tv.Recorder(path, world, every=2) as recorder:
+    with tv.Recorder(path, world, every=2, overwrite=True) as recorder:
         report = world.run(seconds, recorder=recorder, progress=True)
     check(world)
     fallen = float((world.position[:, 1] < 0).mean())

@@ -51,7 +51,7 @@ def main(path: str = "machine.rrd", seconds: float = 3.0) -> None:
     """Turn, and compare the stamp and its rail with the formulas."""
     world, rail = build()
     off, force = 0.0, []
-    with tv.Recorder(path, world) as recorder:
+    with tv.Recorder(path, world, overwrite=True) as recorder:
         for _ in range(round(seconds * 60)):
             report = world.step(1 / 60)
             off = max(off, abs(world.position[9, 1] - stamp(world.time)))

@@ -60,7 +60,7 @@ def check(world: tv.World) -> float:
 def main(path: str = "net.rrd") -> None:
     """Run, record, and say what tore when."""
     world, events = build(), []
-    with tv.Recorder(path, world, every=2) as recorder:
+    with tv.Recorder(path, world, every=2, overwrite=True) as recorder:
         for _ in range(360):
             report = world.step(1 / 60)
             recorder.log()

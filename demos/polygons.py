@@ -56,7 +56,7 @@ def main(path: str = "polygons.rrd", seconds: float = 8.0) -> None:
     world = build()
     drum = next(f for f in world.features if isinstance(f, tv.Polygon))
     worst = 0.0
-    with tv.Recorder(path, world, every=2) as recorder:
+    with tv.Recorder(path, world, every=2, overwrite=True) as recorder:
         for _ in range(round(60 * seconds)):
             drum.rotation += SPEED / 60
             report = world.step(1 / 60)

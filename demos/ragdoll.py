@@ -33,7 +33,7 @@ def build() -> tuple[tv.World, tv.AngleLimit, tv.Distance]:
 def main(path: str = "ragdoll.rrd", seconds: float = 5.0) -> None:
     """Fall, record, and look at every joint."""
     world, joints, bones = build()
-    with tv.Recorder(path, world) as recorder:
+    with tv.Recorder(path, world, overwrite=True) as recorder:
         report = world.run(seconds, recorder=recorder, progress=True)
     over = float(np.maximum(joints.violation(world.position), 0).max())
     stretch = float(np.abs(bones.violation(world.position)).max())

@@ -37,7 +37,7 @@ def build() -> tuple[tv.World, tv.Area, list[slice]]:
 def main(path: str = "soft.rrd", seconds: float = 4.0) -> None:
     """Run, record, and check what is to be kept."""
     world, area, parts = build()
-    with tv.Recorder(path, world) as recorder:
+    with tv.Recorder(path, world, overwrite=True) as recorder:
         report = world.run(seconds, recorder=recorder, progress=True)
     lost = float(np.abs(area.rest_of(world.position) / area.rest - 1).max())
     box, start = world.position[parts[6]], world.particles.position[parts[6]]

@@ -28,7 +28,7 @@ def main(path: str = "tidy.rrd") -> None:
     """Fall, toss, tidy up, and count."""
     world, gravity, snap = build()
     n = len(world.particles)
-    with tv.Recorder(path, world) as recorder:
+    with tv.Recorder(path, world, overwrite=True) as recorder:
         world.run(1.0, recorder=recorder)
         world.velocity = 3 * (tv.golden(np.arange(n), dim=2) - [0.5, -0.2])
         gravity.g = (0.0, 0.0)

@@ -1,17 +1,20 @@
 """Files of recordings: what they hold, what becomes of them when they are cut, changed or not finished, and the commands."""
 
 import json
+import os
 import pathlib
 import re
 import resource
 import struct
+import subprocess
+import tempfile
 
 import numpy as np
 import pytest
 
 import tiverlet as tv
 from tiverlet.__main__ import main
-from tiverlet.recording import journal, rrd, viewer
+from tiverlet.recording import journal, recorder, rrd, viewer
 
 from .conftest import python
 
@@ -161,9 +164,11 @@ for k in range(30):
     recorder.log()
     if k == 24:
         recorder.flush()
+other = tv.Recorder({str(tmp_path / "first.rrd")!r}, w)
 os.kill(os.getpid(), signal.SIGKILL)
 """
     assert python(code, check=False).returncode == -9
+    assert list(tv.replay(tmp_path / "first.rrd").frames) == [0]  # something is there at once
     recording = tv.replay(tmp_path / "k.rrd")
     assert not recording.complete and recording.frames[-1] >= 25 and "not closed: it ends with frame" in recording.text
     assert recording.verify()
@@ -174,7 +179,7 @@ def test_a_full_disk_is_an_error_and_loses_nothing_that_was_written(world, tmp_p
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, hard))  # bytes in a file, as if the disk were full
     try:
-        with pytest.raises(OSError, match="writing failed at frame [0-9]+ .File too large.*can be replayed"):
+        with pytest.raises(OSError, match="writing .*full.rrd failed at frame [0-9]+ .File too large.*can be replayed"):
             with tv.Recorder(tmp_path / "full.rrd", w) as recorder:
                 for _ in range(40):
                     w.step(1 / 60)
@@ -186,11 +191,101 @@ def test_a_full_disk_is_an_error_and_loses_nothing_that_was_written(world, tmp_p
     recording = tv.replay(tmp_path / "full.rrd")
     assert not recording.complete and 3 < len(recording.frames) < 20
     assert recording.verify()
-    with pytest.raises(OSError, match="writing failed"):
-        with tv.Recorder("/dev/full", w):
-            pass
+    with pytest.raises(OSError, match="nothing could be written to /dev/full .No space left"):
+        tv.Recorder("/dev/full", w)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))
+    try:
+        with pytest.raises(OSError, match="nothing could be written"):
+            tv.Recorder(tmp_path / "none.rrd", w)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not (tmp_path / "none.rrd").exists() and not w._watchers
     with pytest.raises(IsADirectoryError, match="cannot be written"):
         tv.Recorder(tmp_path, w)
+
+
+def test_nothing_is_overwritten_unasked(falling, world, tmp_path):
+    w = world(tv.Particles(np.eye(2)), [tv.Gravity(1.0)])
+    path, other = tmp_path / "a.rrd", tmp_path / "thesis.txt"
+    path.write_bytes(falling.read_bytes())
+    other.write_text("years of work")
+    for target, what in ((path, "a.rrd exists. Choose"), (other, "thesis.txt exists, and is no recording. Choose")):
+        with pytest.raises(FileExistsError, match=f"{what} another name, or replace it: .*overwrite=True"):
+            tv.Recorder(target, w)
+    with tv.replay(path).world(20) as again, pytest.raises(FileExistsError):
+        tv.Recorder(path, again)
+    with tv.Recorder(tmp_path / "b.rrd", w) as first:
+        with pytest.raises(FileExistsError):
+            tv.Recorder(tmp_path / "b.rrd", w)
+        w.step(0.1)
+        first.log()
+    assert len(tv.replay(tmp_path / "b.rrd").frames) == 2
+    assert path.read_bytes() == falling.read_bytes() and other.read_text() == "years of work"
+    with pytest.raises(ValueError, match="Give at least"):
+        tv.Recorder(path, w, budget=1000, overwrite=True)
+    assert path.read_bytes() == falling.read_bytes()  # it is replaced once there is something instead
+    assert main(["run", "hello", "--out", str(other)]) == 2 and other.read_text() == "years of work"
+    with tv.Recorder(path, w, overwrite=True):
+        assert not tv.replay(path).complete
+        assert list(tv.replay(path).frames) == [0]
+    assert tv.replay(path).complete and not w._watchers
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.rrd", "b.rrd", "thesis.txt"]
+
+
+@pytest.mark.parametrize("how", ["removed", "replaced"])
+def test_a_file_that_is_gone_is_noticed(world, tmp_path, monkeypatch, how):
+    w = world(tv.Particles(np.eye(2)), [tv.Gravity(1.0)])
+    monkeypatch.setattr(recorder, "LOOK", 0.0)
+    recording = tv.Recorder(tmp_path / "a.rrd", w)
+    recording.log()
+    if how == "removed":
+        (tmp_path / "a.rrd").unlink()
+        with pytest.raises(FileNotFoundError, match="at frame 2 .the file was removed or replaced.. What was recorded is lost"):
+            recording.log()
+    else:
+        with tv.Recorder(tmp_path / "a.rrd", w, overwrite=True):
+            with pytest.raises(FileNotFoundError, match="removed or replaced"):
+                recording.close()
+        assert tv.replay(tmp_path / "a.rrd").complete
+    assert not w._watchers
+
+
+def test_what_ends_other_programs_is_an_error(tmp_path):
+    # Without HOME Taichi ends the process; in a forked child it waits for ever at the end; ti.reset destroys the fields.
+    code = f"""
+import os, sys
+assert "HOME" not in os.environ
+import tiverlet as tv
+import taichi as ti
+world = tv.World(tv.Particles([[0.0, 0.0]]), [tv.Gravity()])
+recorder = tv.Recorder({str(tmp_path / "f.rrd")!r}, world)
+pid = os.fork()
+if pid == 0:
+    for call in (recorder.log, recorder.flush, lambda: world.step(0.1), lambda: tv.Recorder("b.rrd", world)):
+        try:
+            call()
+        except RuntimeError as e:
+            assert "fork" in str(e), e
+        else:
+            raise AssertionError(call)
+    recorder.close()
+    sys.exit(7)
+assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 7
+world.step(0.1)
+recorder.log()
+ti.reset()
+try:
+    recorder.log()
+except RuntimeError as e:
+    print(e)
+recorder.close()
+"""
+    home = os.environ.pop("HOME")
+    try:
+        assert "Taichi was started again" in python(code).stdout
+    finally:
+        os.environ["HOME"] = home
+    assert list(tv.replay(tmp_path / "f.rrd").frames) == [0, 1]
 
 
 def test_a_budget_is_kept_and_said(world, tmp_path):
@@ -241,11 +336,27 @@ if __name__ == "__main__":
     assert main(["run", "nobody"]) == 2 and "no demo of that name" in capsys.readouterr().err
 
 
-def test_a_picture_without_a_window(falling, tmp_path):
+def test_names_and_frames_of_pictures(falling, tmp_path, monkeypatch):
+    taken = []
+    monkeypatch.setattr(viewer, "_start", lambda *words, **options: subprocess.Popen(["true"], start_new_session=True))
+    monkeypatch.setattr(viewer, "_settled", lambda process, port, frame, name, view: taken.append((frame, name)))
+    assert viewer.picture(str(falling), str(tmp_path / "100%.png")) == [str(tmp_path / "100%.png")] and taken[0][0] == 20
+    viewer.picture(str(falling), str(tmp_path / "50%_%03d.png"), [0, 4])
+    assert [pathlib.Path(name).name for _, name in taken[1:]] == ["50%_000.png", "50%_004.png"]
+    with pytest.raises(ValueError, match="no frame 5; the nearest is"):
+        viewer.picture(str(falling), str(tmp_path / "a.png"), [5])
+    with pytest.raises(ValueError, match="need a name with %d"):
+        viewer.picture(str(falling), str(tmp_path / "a.png"), [2, 4])
+
+
+def test_a_picture_without_a_window(falling, tmp_path, monkeypatch):
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
     places = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d", "/usr/local/share/vulkan/icd.d")
     if not any(pathlib.Path(place).glob("*.json") for place in places):
         pytest.skip("no Vulkan driver here; apt-get install mesa-vulkan-drivers")
     one, other = viewer.picture(str(falling), str(tmp_path / "%d.png"), [0, 20], scene=True)
+    assert not list((tmp_path / "temporary").iterdir())
     first, last = (viewer.pixels_of(png).astype(int) for png in (one, other))
     assert first.shape == last.shape and first.shape[0] > 300
     assert (np.abs(first - last).max(axis=2) > 60).sum() > 50  # particles have moved, on a background that has not

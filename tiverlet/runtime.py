@@ -1,10 +1,12 @@
 """The door to Taichi: starting it, and asking about it."""
 
 import contextlib
+import ctypes
 import functools
 import io
 import os
 import sys
+import tempfile
 import threading
 from typing import Any
 
@@ -14,6 +16,8 @@ if "taichi" not in sys.modules:
     os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
     os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
     os.environ.setdefault("TI_LOG_LEVEL", "error")
+    if os.name == "posix" and "HOME" not in os.environ:  # or Taichi ends the process
+        os.environ["HOME"] = next(folder for folder in (os.path.expanduser("~"), tempfile.gettempdir()) if os.path.isabs(folder))
 
 import taichi as ti
 from taichi.lang import impl
@@ -166,6 +170,19 @@ def _available(arch: str) -> bool:
         library: Any = ti._lib
         return bool(getattr(library.core, f"with_{arch}")())
     return False
+
+
+def _leave() -> None:
+    """In a forked child: keep Taichi from being ended there, which waits for ever for threads that only the parent has."""
+    runtime = _started.get("runtime")
+    if runtime is not None and runtime is impl.get_runtime() and runtime.prog:
+        hold = ctypes.pythonapi.Py_IncRef
+        hold.argtypes = [ctypes.py_object]
+        hold(runtime.prog)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_leave)
 
 
 def _adopt(wanted: dict | None = None) -> None:

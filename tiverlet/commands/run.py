@@ -23,9 +23,12 @@ def add(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Run it."""
     from ..recording import replay
+    from ..recording.sink import is_recording
 
     path = find(args.script)
     out = args.out or f"{path.stem}.rrd"
+    if os.path.isfile(out) and not is_recording(out):
+        raise ValueError(f"{out} is no recording, and is not replaced. Give another --out, or remove it first.")
     with recording(out) as made:
         status = execute(path, args.arguments)
     if made:
@@ -61,7 +64,7 @@ def find(name: str) -> pathlib.Path:
 
 @contextlib.contextmanager
 def recording(out: str) -> Iterator[list[Any]]:
-    """While this lasts, every Recorder writes to `out`, and a world that is stepped before there is one gets its own."""
+    """While this lasts, the first Recorder writes to `out`, and a world that is stepped before there is one gets its own."""
     import tiverlet
 
     from ..world import World
@@ -71,12 +74,12 @@ def recording(out: str) -> Iterator[list[Any]]:
 
     class Redirected(recorder):
         def __init__(self, path, *args, **kwargs):
-            super().__init__(out, *args, **kwargs)
+            super().__init__(path if made else out, *args, **(kwargs if made else kwargs | {"overwrite": True}))
             made.append(self)
 
     def stepped(world: World, *args, **kwargs):
         if not made:
-            made.append(recorder(out, world))
+            made.append(recorder(out, world, overwrite=True))
         report = step(world, *args, **kwargs)
         if made and type(made[0]) is recorder and made[0].world is world:
             made[0].log()

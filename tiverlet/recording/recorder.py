@@ -1,6 +1,7 @@
 """Writing a simulation to a file that is picture, checkpoint and proof."""
 
 import contextlib
+import errno
 import os
 import warnings
 import weakref
@@ -16,6 +17,7 @@ from .journal import JOURNAL, Journal
 from .sink import Sink
 
 SEND = 1.0  # [s] after which the points of curves are sent on
+LOOK = 0.2  # [s] after which the file is looked for
 BACKLOG = 32 << 20  # bytes that may wait to be written
 SHARE = 10  # an exact state is written when the pictures since the last one weigh so many times as much
 SPARSE = 300  # frames after which one is written in any case
@@ -30,19 +32,20 @@ class Recorder:
             recorder.log()
 
     path: the file; its folder must exist. world: what to record. every: log only each so many frames. budget: bytes that the file
-    may have; when they run short, fewer frames are drawn, and a warning at the end says which.
+    may have; when they run short, fewer frames are drawn, and a warning at the end says which. overwrite: whether a file that is
+    there may be replaced; it stays as it is until the new one has its first frame.
 
     Drawn are positions (f32), links coloured by their strain, walls, contacts of up to 1500 particles, what breaks, and curves.
     Beside that the file holds the scene with all arguments, exact states to continue from, the hash of every frame drawn, every
     step, and what the user turned or assigned in between, also between frames that are not drawn: see tv.replay.
 
-    The file is complete when the block ends. Of a process that is killed, all but about the last fifth of a second is there (of
-    curves, the last second), and can be replayed; what flush() has brought to the file is there in any case.
-    Open it with `rerun rope.rrd`. Raises ValueError and OSError where the file cannot be made, and OSError when it cannot be
-    written any further; what has been written then can be read.
+    The file is complete when the block ends. Of a process that is killed, the first frame and all but about the last fifth of a
+    second is there (of curves, the last second), and can be replayed; what flush() has brought to the file is there in any case.
+    Open it with `rerun rope.rrd`. Raises ValueError and OSError where the file cannot be made, FileExistsError where there is one
+    already, and OSError when it cannot be written any further, or was removed; what has been written then can be read.
     """
 
-    def __init__(self, path, world: World, every: int = 1, budget: int | None = None):
+    def __init__(self, path, world: World, every: int = 1, budget: int | None = None, overwrite: bool = False):
         import rerun as rr
 
         if not isinstance(world, World):
@@ -59,7 +62,7 @@ class Recorder:
         self.frames = self._calls = 0
         self._thinned: list[tuple[int, int]] = []  # from which frame on each so many are drawn
         self._seen: set[str] = set()  # flags
-        self._open()
+        self._open(overwrite)
 
     def __enter__(self) -> "Recorder":
         return self
@@ -68,18 +71,34 @@ class Recorder:
         self.close()
 
     @interrupts.uncut
-    def _open(self) -> None:
-        from .curves import Curves
-        from .drawing import Drawing, bounds, links
-        from .layout import MIRROR, SCENE, blueprint
+    def _open(self, overwrite: bool) -> None:
+        from .drawing import bounds, links
+        from .layout import blueprint
 
-        rr, world = self._rr, self.world
+        world = self.world
         extent = bounds(world)
         layout = blueprint(*extent, bool(links(world)))
         title = os.path.splitext(os.path.basename(self.path))[0]
-        self._sink = Sink(self.path, f"tiverlet_{world.particles.dim}d", layout, title)
+        self._sink = Sink(self.path, f"tiverlet_{world.particles.dim}d", layout, title, overwrite)
         self._closing = weakref.finalize(self, self._sink.close)  # also when the process ends
         self._stream = self._sink.stream
+        try:
+            self._begin(extent)
+        except BaseException:
+            if "_journal" in vars(self):
+                self._journal.close()
+            self._closing()
+            self._sink.discard()
+            raise
+        self._sink.keep()
+
+    def _begin(self, extent: tuple[np.ndarray, np.ndarray]) -> None:
+        """Write what holds for all frames, and the first one."""
+        from .curves import Curves
+        from .drawing import Drawing
+        from .layout import MIRROR, SCENE
+
+        rr, world = self._rr, self.world
         self._drawing = Drawing(world, self._stream, extent)
         flat = world.particles.dim == 2
         self._drawing.static(SCENE, MIRROR if flat else rr.ViewCoordinates.RIGHT_HAND_Y_UP)
@@ -92,13 +111,14 @@ class Recorder:
         self._frame(0)
         self._least = self.bytes + RESERVE
         if self.budget is not None and self.budget < 2 * self._least:
-            self._journal.close()
-            self._closing()
-            os.unlink(self.path)
             raise ValueError(
                 f"Recorder: budget = {self.budget} bytes, but the scene and its first frame take {self._least}. "
                 f"Give at least {2 * self._least}."
             )
+        self.flush()  # so that a process that dies soon leaves something
+        self._looked = perf_counter()
+        if error := self._sink.error:
+            raise _told(error, f"Recorder: nothing could be written to {self.path}")
 
     def _stamp(self, number: int) -> None:
         self._stream.set_time("frame", sequence=number)
@@ -119,33 +139,48 @@ class Recorder:
     @interrupts.uncut
     def log(self) -> None:
         """Write the present frame, if it is one of `every`."""
-        if self._sink.stream is None:
-            raise RuntimeError("Recorder: this recording is closed; make a new Recorder for another file.")
+        self._check()
         self._calls += 1
         if self._calls % self._stride() == 0:
             self._frame(self._calls)
-        if perf_counter() - self._sent > SEND:
+        now = perf_counter()
+        if now - self._sent > SEND:
             self._curves.send()
-            self._sent = perf_counter()
+            self._sent = now
         if self._logged - self._flushed > BACKLOG:
             self.flush()
+        if now - self._looked > LOOK:
+            self._sink.check()
+            self._looked = now
         if self._sink.error:
             self._fail()
 
     @interrupts.uncut
     def flush(self) -> None:
         """Wait until what was logged is in the file, so that it is there whatever happens to the process."""
+        self._check()
         self._curves.send()
         self._sink.flush()
         self._flushed = self._logged
+
+    def _check(self) -> None:
+        """Raise RuntimeError where nothing can be written."""
+        if self._sink.forked():
+            raise RuntimeError(
+                f"Recorder: {self.path} is recorded by the process that this one was forked from. Step and record there, or "
+                'build the world and its Recorder in a process of its own, started by "spawn".'
+            )
+        if self._sink.stream is None:
+            raise RuntimeError("Recorder: this recording is closed; make a new Recorder for another file.")
 
     def _fail(self) -> None:
         error = self._sink.error
         assert error
         self._journal.close()
         self._closing()
-        why = f"Recorder: writing failed at frame {self._calls} ({error.strerror}). What the file holds can be replayed"
-        raise OSError(error.errno, why, self.path) from None
+        gone = isinstance(error, FileNotFoundError)
+        rest = "What was recorded is lost" if gone else "What the file holds can be replayed"
+        raise _told(error, f"Recorder: writing {self.path} failed at frame {self._calls}", f". {rest}") from None
 
     def _stride(self) -> int:
         """One of how many frames is drawn: each time half of what is left of the budget is used, half as many."""
@@ -194,13 +229,13 @@ class Recorder:
     @interrupts.uncut
     def close(self) -> None:
         """Write the summary and finish the file. Calling it twice does nothing."""
-        if self._sink.stream is None:
+        if self._sink.stream is None or self._sink.forked():
             return
         journal, world = self._journal, self.world
         journal.close()
         self._curves.send()
         end = {"frames": self.frames, "time": world.time}
-        with contextlib.suppress(RuntimeError):  # a world that was closed has no state
+        with contextlib.suppress(RuntimeError):  # a world that was closed, or whose Taichi is gone, has no state
             end["hash"] = world.hash()
         journal.put("end", end)
         thinned = [f"from frame {frame} on one of {stride}" for frame, stride in self._thinned if stride < 2**40]
@@ -212,8 +247,10 @@ class Recorder:
                 f"Recorder: to stay within budget = {self.budget} bytes, {self.frames} of {self._calls + 1} frames are drawn: "
                 f"{', '.join(thinned)}. All steps are in the file; for more frames give a larger budget, for even ones every=."
             )
-        text = about(world, journal.worst, self.frames, note)
-        self._drawing.static("about", self._rr.TextDocument(text, media_type="text/markdown"))
+        if "hash" in end:
+            text = about(world, journal.worst, self.frames, note)
+            self._drawing.static("about", self._rr.TextDocument(text, media_type="text/markdown"))
+        self._sink.check()
         self._closing()
         if self._sink.error:
             self._fail()
@@ -225,6 +262,13 @@ class Recorder:
             )
         if note:
             warnings.warn(note, stacklevel=2)
+
+
+def _told(error: Exception, what: str, rest: str = "") -> OSError:
+    """The error of a file, with what it means."""
+    if isinstance(error, OSError):
+        return type(error)(error.errno, f"{what} ({error.strerror}){rest}")
+    return OSError(errno.EIO, f"{what} ({error!r}){rest}")
 
 
 def about(world: World, worst=None, frames: int = 0, note: str = "") -> str:
