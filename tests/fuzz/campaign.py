@@ -1,0 +1,125 @@
+"""Many scenes: structures drawn once and compiled once, happenings drawn and shrunk by hypothesis."""
+
+import os
+import random
+from collections.abc import Iterator
+from time import process_time
+from typing import Any
+
+from hypothesis import HealthCheck, Phase, given, seed, settings
+
+from .scenes import Event, Step, Structure, happenings, script, structures
+from .trials import Find, Refused, Trial
+
+PATIENCE = 1.0  # [s] that a scene may take to be run again
+QUIET: Any = dict(database=None, deadline=None, suppress_health_check=list(HealthCheck), print_blob=False)
+
+
+def drawn(number: int, count: int) -> list[Structure]:
+    """Structures, the same for the same number."""
+    out: list[Structure] = []
+
+    @seed(number)
+    @settings(max_examples=count, phases=[Phase.generate], **QUIET)
+    @given(structures())
+    def collect(structure):
+        out.append(structure)
+
+    collect()
+    return out[:count]
+
+
+class Searcher:
+    """Scenes of one structure."""
+
+    def __init__(self, structure: Structure, kinds: set[str] | None = None):
+        self.structure, self.kinds, self.trial = structure, kinds, None
+        self.scenes = self.frames = self.refused = 0
+        self.found: tuple[Find, list[Event]] | None = None
+
+    def scene(self, events: list[Event]) -> None:
+        """Run one, twice."""
+        self.scenes += 1
+        self.frames += sum(isinstance(e, Step) for e in events)
+        try:
+            self.trial = self.trial or Trial(self.structure)
+            clock = process_time()
+            first = self.trial.run(events)
+            if process_time() - clock < PATIENCE and (again := self.trial.replay(events)) != first:
+                raise Find("bits", f"a scene run again ends with another hash: {first[:12]}, {again[:12]}")
+        except Refused:
+            self.refused += 1
+
+    def says(self) -> str:
+        """What was found, as a script."""
+        find, events = self.found or (None, [])
+        return f"{find}\n\n{script(self.structure, events)}"
+
+    def search(self, number: int, each: int) -> None:
+        """Scenes until one of them is a find, which is made small."""
+
+        @seed(number)
+        @settings(max_examples=each, phases=[Phase.generate, Phase.shrink], report_multiple_bugs=False, **QUIET)
+        @given(happenings(self.structure))
+        def test(events):
+            try:
+                self.scene(events)
+            except Find as find:
+                if self.kinds is None or find.kind in self.kinds:
+                    self.found = (find, events)
+                    raise
+
+        try:
+            test()
+        except Find:
+            pass
+        finally:
+            if self.trial:
+                self.trial.close()
+
+
+def smaller(structure: Structure, events: list[Event], kind: str) -> tuple[Structure, list[Event]]:
+    """Leave out features one by one, as long as what is found stays."""
+    k = len(structure.features) - 1
+    while k >= 0:
+        less = Structure(structure.particles, structure.features[:k] + structure.features[k + 1 :], structure.settings)
+        left = [e for e in events if getattr(e, "of", None) != k]
+        left = [type(e)(e.of - 1, e.name, e.value) if getattr(e, "of", None) is not None and e.of > k else e for e in left]
+        trial = None
+        try:
+            trial = Trial(less)
+            trial.run(left)
+        except Find as find:
+            if find.kind == kind:
+                structure, events = less, left
+        except Refused:
+            pass
+        finally:
+            if trial:
+                trial.close()
+        k -= 1
+    return structure, events
+
+
+def search(number: int, k: int, each: int, kinds: set[str] | None = None) -> Searcher:
+    """Scenes of structure k of a campaign, until one is a find of these kinds (None: any)."""
+    structure = drawn(number * 100_003 + k, 8)[random.Random(k).randrange(8) - 8]
+    searcher = Searcher(structure, kinds)
+    searcher.search(k, each)
+    return searcher
+
+
+def campaign(number: int, begin: int, end: int, each: int, folder: str) -> Iterator[dict[str, Any]]:
+    """Structures begin ... end - 1 of a campaign, as lines of what came of each."""
+    for k in range(begin, end):
+        yield {"begins": k}
+        searcher = search(number, k, each)
+        line = {"structures": 1, "scenes": searcher.scenes, "frames": searcher.frames, "refused": searcher.refused, "finds": []}
+        if searcher.found:
+            find, events = searcher.found
+            small, less = smaller(searcher.structure, events, find.kind)
+            path = os.path.join(folder, f"{number}-{k}-{find.kind.replace(', ', '-').replace(' ', '-')}.py")
+            with open(path, "w") as file:
+                file.write(script(small, less, str(find)))
+            line["finds"].append({"kind": find.kind, "structure": k, "says": str(find), "script": path})
+        yield line

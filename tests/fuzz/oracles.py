@@ -1,0 +1,165 @@
+"""What a scene has to be, by brute force in NumPy, and by the words of the documentation."""
+
+from typing import Any
+
+import numpy as np
+
+from tiverlet.feature import Batch
+from tiverlet.ragged import Ragged
+from tiverlet.scalar import Scalar
+
+from .functions import SDF
+from .scenes import Structure, plain
+
+WALLS = ("Box", "HalfSpace", "Ball", "Capsule", "Polygon", "Mesh", "Sdf")
+PULLS = ("Gravity", "Drag", "Wind", "Attractor", "Force")
+TETHERS = ("Pin", "Path", "Snap")
+PASSIVE = ("Gravity", "Drag", *WALLS, "Distance", "Rope", "Spacer", "Bend", "AngleLimit", "Dihedral", "Constraint",
+           "Area", "Volume", "ShapeMatch", "Snap", "Contact", "Polygons")  # fmt: skip
+EPS = {"f32": 2.0**-23, "f32-compensated": 2.0**-23, "f64": 2.0**-52}
+
+
+def segment(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Distances of points (n, dim) to a segment."""
+    d = b - a
+    t = np.clip((p - a) @ d / max(d @ d, 1e-300), 0, 1)
+    return np.linalg.norm(p - a - t[:, None] * d, axis=1)
+
+
+def turned(p: np.ndarray, wall: Any) -> np.ndarray:
+    """Points in the frame of a wall that is not rotated."""
+    return p - np.asarray(wall.position)
+
+
+def polygon(p: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+    """Signed distance to a closed outline, positive outside."""
+    ends = np.roll(vertices, -1, axis=0)
+    away = np.min([segment(p, a, b) for a, b in zip(vertices, ends, strict=True)], axis=0)
+    inside = np.zeros(len(p), dtype=bool)
+    for a, b in zip(vertices, ends, strict=True):
+        crosses = (a[1] > p[:, 1]) != (b[1] > p[:, 1])
+        at = a[0] + (p[:, 1] - a[1]) * (b[0] - a[0]) / (b[1] - a[1] if b[1] != a[1] else 1.0)
+        inside ^= crosses & (p[:, 0] < at)
+    return np.where(inside, -away, away)
+
+
+def convex(p: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """A bound on the signed distance to a tetrahedron: exact inside and beside faces, too small beside edges."""
+    out = []
+    for k in range(4):
+        a, b, c = corners[[j for j in range(4) if j != k]]
+        n = np.cross(b - a, c - a)
+        n = n / np.linalg.norm(n)
+        n = n if (corners[k] - a) @ n < 0 else -n
+        out.append((p - a) @ n)
+    return np.max(out, axis=0)
+
+
+def gap(wall: Any, p: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """How far particles are from a wall as it stands, negative inside of it, (n,)."""
+    name = type(wall).__name__
+    if name == "Box":
+        return np.minimum((p - wall.lower).min(axis=1), (wall.upper - p).min(axis=1)) - r
+    if name == "HalfSpace":
+        return p @ wall.normal - wall.offset - r
+    if name == "Ball":
+        d = np.linalg.norm(p - wall.center, axis=1)
+        return wall.radius - r - d if wall.inside else d - wall.radius - r
+    if name == "Capsule":
+        return segment(p, wall.a, wall.b) - wall.radius - r
+    p = turned(p, wall)
+    if name == "Sdf":
+        return SDF[plain(wall.function).__name__](p) - wall.radius - r
+    d = polygon(p, wall.vertices) if name == "Polygon" else convex(p, wall.vertices)
+    return (-d if wall.turned_in else d) - wall.radius - r
+
+
+def excluded(features: list[Any], particles: Any) -> set[tuple[int, int]]:
+    """Pairs that may overlap, as constraints say where they are to each other."""
+    out = set()
+    for f in features:
+        if isinstance(f, Batch) and not f.drives and f.count and (particles.inv_mass[f.indices] > 0).any():
+            out |= {(min(a, b), max(a, b)) for a, b in f.partners(particles).tolist()}
+    return out
+
+
+def overlap(contact: Any, features: list[Any], particles: Any, free: np.ndarray, x: np.ndarray) -> tuple[int, float]:
+    """Pairs that overlap, and the worst, in radii of the smaller one."""
+    r, group, out = particles.radius, particles.group, excluded(features, particles)
+    allowed = None if contact.table.touching is None else {tuple(sorted(p)) for p in contact.table.touching}
+    count, worst = 0, 0.0
+    for i in range(len(x)):
+        for j in range(i + 1, len(x)):
+            far = r[i] + r[j]
+            if far == 0 or (r[i] == 0 and r[j] == 0) or (i, j) in out or not (free[i] or free[j]):
+                continue
+            if allowed is not None and tuple(sorted((int(group[i]), int(group[j])))) not in allowed:
+                continue
+            depth = far - np.linalg.norm(x[i] - x[j])
+            if depth > 0:
+                small = min(r[i], r[j]) or max(r[i], r[j])
+                count, worst = count + 1, max(worst, depth / small)
+    return count, worst
+
+
+def rigid(features: list[Any], free: np.ndarray, x: np.ndarray) -> tuple[float, bool]:
+    """The worst violation of rigid constraints that are one number, relative to their size, and whether these are all of them."""
+    worst, whole = 0.0, True
+    for f in features:
+        if not isinstance(f, Batch) or getattr(f, "drives", False) or not f.count:
+            continue
+        if not isinstance(f, Scalar) or isinstance(f, Ragged) or f.collapses or (f.compliance > 0).any():
+            whole = False
+        if not isinstance(f, Scalar) or isinstance(f, Ragged) or f.collapses:
+            continue
+        C = f.violation(x)
+        C = np.maximum(f.side * C, 0) if f.side else np.abs(C)
+        start = f.rest_of(f.start.position)
+        unit = f.unit or (float(np.abs(start).mean()) if np.any(start) else f.start.size)
+        size = np.full(f.count, unit) if f.unit else np.where(f.goal != 0, np.abs(f.goal), unit)
+        some = (f.compliance == 0) & ~f.broken & ~f.idle(free)
+        worst = max(worst, float((C / size)[some].max(initial=0.0)))
+    return worst, whole
+
+
+def passive(structure: Structure) -> bool:
+    """Whether nothing in it brings in energy."""
+    driven = any({"speed", "at"} & set(f.args) for f in structure.features if f.name == "Path")
+    return not driven and all(f.name in (*PASSIVE, "Path", "Pin") for f in structure.features)
+
+
+def closed(structure: Structure) -> bool:
+    """Whether nothing outside of it acts."""
+    mass = structure.particles.args.get("mass", 1.0)
+    held = "pinned" in structure.particles.args or np.isinf(mass).any()
+    return not held and not any(f.name in (*PULLS, *WALLS, *TETHERS) for f in structure.features)
+
+
+def feasible(features: list[Any], particles: Any, free: np.ndarray, x: np.ndarray, eps: float) -> bool:
+    """Whether a start violates nothing that is rigid."""
+    if rigid(features, free, x)[0] > 1e-6 + 1e3 * eps:
+        return False
+    built = bool(np.array_equal(x, particles.position))
+    for f in features:
+        name = type(f).__name__
+        if name in WALLS and (gap(f, x, particles.radius)[free > 0] < -1e-6 * particles.size).any():
+            return False
+        if name == "Contact" and overlap(f, features, particles, free, x)[0]:
+            return False
+        if name == "Polygons":
+            return False
+        if not built and isinstance(f, Batch) and (not isinstance(f, Scalar) or f.collapses) and (f.compliance == 0).any():
+            return False
+        if isinstance(f, Scalar) and f.collapses and (np.abs(f.violation(x)) > 1e-9 * np.abs(f.goal)).any():
+            return False
+    return True
+
+
+def height(features: list[Any], particles: Any, free: np.ndarray, low: np.ndarray, high: np.ndarray) -> float:
+    """The largest difference of the potential of gravity [J] between two corners."""
+    out, m = 0.0, np.where(free > 0, particles.mass, 0.0)
+    for f in features:
+        if type(f).__name__ == "Gravity":
+            g = np.abs(f._vector())
+            out += float(m.sum() * (g @ (high - low)))
+    return out

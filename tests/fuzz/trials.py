@@ -1,0 +1,253 @@
+"""One scene run and judged: what may never happen, whatever the scene."""
+
+import os
+import traceback
+import warnings
+
+import numpy as np
+
+import tiverlet as tv
+from tiverlet import snapshot
+from tiverlet.recording.scene import knobs
+
+from . import oracles
+from .scenes import Event, Set, Step, Structure
+
+HOME = os.path.dirname(os.path.abspath(tv.__file__))
+RISKS = {"tunnelling-risk", "stiff-force", "softened", "turned", "substeps-capped", "stuck", "unconverged"}
+
+
+class Find(AssertionError):
+    """What is wrong, by its kind."""
+
+    def __init__(self, kind: str, says: str):
+        super().__init__(f"{kind}: {says}")
+        self.kind = kind
+
+
+class Refused(Exception):
+    """An error at the door, as there should be."""
+
+
+def door(error: BaseException) -> None:
+    """Errors are ValueError, TypeError or RuntimeError, of our own words, raised in Python by ourselves."""
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    ours = os.path.abspath(last.filename).startswith(HOME)
+    first = str(error).partition(":")[0].partition("(")[0].partition(".")[0]
+    if type(error) in (ValueError, TypeError, RuntimeError) and ours and (hasattr(tv, first) or first == "World"):
+        raise Refused(str(error)) from None
+    where = "".join(traceback.format_tb(error.__traceback__)[-2:])
+    raise Find("error", f"{type(error).__name__}: {str(error)[:300]}\n{where}") from None
+
+
+class Trial:
+    """A world that is compiled once, and many scenes run in it."""
+
+    def __init__(self, structure: Structure):
+        self.structure = structure
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                self.world, self.features = structure.build()
+        except Exception as error:  # noqa: BLE001
+            door(error)
+        self.begin()
+
+    def begin(self) -> None:
+        """Keep the state that scenes start from."""
+        w = self.world
+        self.kept, self.flags = snapshot.keep(w), snapshot.flags(w)
+        self.knobs = [dict(knobs(f)) for f in self.features]
+        self.free = w._scene.inv_mass.copy()
+        self.eps = oracles.EPS[w.precision]
+        self.soft = any(getattr(f, "soft", False) for f in self.features)
+
+    def close(self) -> None:
+        """Free its memory."""
+        self.world.close()
+
+    def reset(self) -> None:
+        """As it was built."""
+        w = self.world
+        for f, values in zip(self.features, self.knobs, strict=True):
+            if any(vars(f)[k] is not v for k, v in values.items()):
+                vars(f).update(values)
+                f.changed = True
+        snapshot.install(w, self.kept, self.flags)
+        w._last = None
+        w.substeps, w.iterations = 20, 1
+
+    def run(self, events: list[Event]) -> str:
+        """Run a scene, judge each frame, and return the hash of how it ended."""
+        self.reset()
+        w, judge = self.world, Judge(self)
+        for event in events:
+            judge.before(event)
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")
+                    out = event.do(w, self.features)
+            except Exception as error:  # noqa: BLE001
+                door(error)
+            if isinstance(event, Step):
+                judge.frame(event, out)
+        return w.hash()
+
+    def replay(self, events: list[Event]) -> str:
+        """The same again, without looking."""
+        self.reset()
+        for event in events:
+            event.do(self.world, self.features)
+        return self.world.hash()
+
+
+class Judge:
+    """What is known of a scene so far."""
+
+    def __init__(self, trial: Trial):
+        self.t, self.w, self.p = trial, trial.world, trial.world.particles
+        self.x = self.w.position
+        self.low, self.high = self.x.min(axis=0, initial=np.inf), self.x.max(axis=0, initial=-np.inf)
+        self.passive = oracles.passive(trial.structure) and len(self.x) > 0
+        self.closed = oracles.closed(trial.structure) and len(self.x) > 0
+        self.energy: float | None = None
+        self.flags: set[str] = set()
+        self.steps = 0
+        self.safe = self.inside()
+
+    def inside(self) -> dict[int, np.ndarray]:
+        """Of each wall, the particles that are not in it."""
+        x = self.w.position
+        out = {}
+        for k, f in enumerate(self.t.features):
+            if type(f).__name__ in oracles.WALLS:
+                out[k] = (oracles.gap(f, x, self.p.radius) >= 0) & (self.t.free > 0)
+        return out
+
+    def before(self, event: Event) -> None:
+        """What an event changes."""
+        if isinstance(event, Set):
+            if event.of is not None or (self.steps and event.name in ("position", "velocity")):
+                self.passive = self.closed = False
+            if event.name == "position":
+                self.safe = {}
+        elif isinstance(event, Step) and self.steps == 0:
+            self.x = self.w.position
+            self.safe = self.inside()
+            self.passive = self.passive and oracles.feasible(self.t.features, self.p, self.t.free, self.x, self.t.eps)
+            if self.closed:
+                self.v = self.w.velocity
+        elif isinstance(event, Step) and not self.safe:
+            self.safe = self.inside()
+
+    def frame(self, event: Step, report: tv.StepReport) -> None:
+        """A frame that was made."""
+        x = self.w.position
+        self.steps += 1
+        self.flags |= report.flags
+        bad = ~np.isfinite(x).all(axis=1)
+        if bad.any() and not {"non-finite"} & report.flags:
+            raise Find("nan", f"particle {int(np.argmax(bad))} is {x[bad][0]}, flags {set(report.flags)}")
+        figures = [report.energy, report.residual, report.overlap, report.tension]
+        if not np.isfinite(figures).all() and not {"non-finite", "out-of-range"} & self.flags:
+            raise Find("nan", f"figures {figures} of finite positions, flags {set(report.flags)}")
+        if {"non-finite", "out-of-range"} & self.flags:
+            self.passive = self.closed = False
+            self.safe = {}
+            return
+        self.low, self.high = (
+            np.minimum(self.low, x.min(axis=0, initial=np.inf)),
+            np.maximum(self.high, x.max(axis=0, initial=-np.inf)),
+        )
+        self.bounded(report)
+        self.figures(report, x)
+        self.walls(x)
+        self.momentum(event, x)
+        self.x = x
+
+    def bounded(self, report: tv.StepReport) -> None:
+        """A passive scene has no more energy than it had, but for a thousandth of the largest difference of potential."""
+        if self.energy is None:
+            self.energy = report.energy - report.energy_change
+            if not np.isfinite(self.energy):
+                self.passive = False
+            x = self.x
+            self.low, self.high = np.minimum(self.low, x.min(axis=0)), np.maximum(self.high, x.max(axis=0))
+        if not self.passive:
+            return
+        t = self.t
+        fall = oracles.height(t.features, self.p, t.free, self.low, self.high)
+        share = 0.5 if t.soft else 1e-3
+        room = max(1e-3 * fall, share * abs(self.energy)) + self.digits(fall)
+        if report.energy > self.energy + room:
+            kind = "energy, flagged" if self.flags & RISKS else "energy"
+            raise Find(kind, f"{self.energy:.6g} -> {report.energy:.6g} J, allowed {room:.3g} more; {set(self.flags)}, {report}")
+
+    def digits(self, fall: float) -> float:
+        """What rounding of the coordinates may make of the energy [J]: of heights, of steps h = dt / substeps, of springs."""
+        t, w = self.t, self.w
+        m = np.where(t.free > 0, self.p.mass, 0.0).sum()
+        reach = float(np.abs([self.low, self.high]).max())
+        digit = 64 * t.eps * reach
+        high = digit * fall / max(float((self.high - self.low).max()), 1e-300)
+        alphas = [f.compliance[f.compliance > 0] for f in t.features if hasattr(f, "compliance")]
+        stiff = sum(float((1 / a).sum()) for a in alphas)
+        h = w._h or 1.0
+        return high + m * (digit / h) ** 2 + digit**2 * stiff
+
+    def figures(self, report: tv.StepReport, x: np.ndarray) -> None:
+        """Residual and overlap by brute force."""
+        t, p = self.t, self.p
+        reach = float(np.abs(x).max(initial=0.0))
+        least = min(p.size, *(v for f in t.features if getattr(f, "joins", False) for v in np.abs(f.goal) if v > 0), 1e300)
+        blur = 64 * t.eps * reach / least
+        if blur < 1e-2:
+            worst, whole = oracles.rigid(t.features, t.free, x)
+            near = max(1e-3 * worst, 1e-6 if t.eps < 1e-10 else 2e-3 if not whole else 1e-4, blur)
+            if whole and abs(report.residual - worst) > near:
+                raise Find("residual", f"reported {report.residual:.6g}, by brute force {worst:.6g}, {report}")
+            if report.residual < worst - near:
+                raise Find("residual", f"reported {report.residual:.6g}, rigid ones by brute force {worst:.6g}, {report}")
+        for f in t.features:
+            if type(f).__name__ == "Contact" and p.radius.any():
+                count, worst = oracles.overlap(f, t.features, p, t.free, x)
+                some = p.radius[p.radius > 0].min()
+                blur = 64 * t.eps * reach / some
+                if blur < 1e-2 and abs(report.overlap - worst) > max(1e-4 * worst, 1e-4 + blur):
+                    raise Find(
+                        "overlap",
+                        f"reported {report.overlap:.6g} ({report.contacts}), by brute force {worst:.6g} ({count}), {report}",
+                    )
+
+    def walls(self, x: np.ndarray) -> None:
+        """Who was outside of a wall is outside still."""
+        holds = len(self.safe) == 1
+        for k, some in self.safe.items():
+            f = self.t.features[k]
+            left = -oracles.gap(f, x, self.p.radius)[some]
+            reach = float(np.abs(x).max()) + float(np.abs(getattr(f, "radius", 0.0)))
+            if len(left) and left.max() > 64 * self.t.eps * reach + 4e-6 * self.p.size * (self.t.eps > 1e-10):
+                i = int(np.flatnonzero(some)[np.argmax(left)])
+                kind = "wall" if holds else "wall, several"
+                raise Find(kind, f"{f!r} lets particle {i} in by {left.max():.3g} m, at {x[i]}, {set(self.flags)}")
+
+    def momentum(self, event: Step, x: np.ndarray) -> None:
+        """Of scenes on which nothing acts."""
+        if not self.closed:
+            return
+        m, v = self.p.mass, self.w.velocity
+        if not np.isfinite(v).all():
+            raise Find("nan", f"velocity {v}, flags {set(self.flags)}")
+        way = (x - self.x) / event.dt
+        speed = max(np.abs(v).max(), np.abs(self.v).max(), np.abs(way).max())
+        size = m.sum() * speed
+        reach = np.abs(x).max() + np.abs(self.x).max()
+        n = np.sqrt(self.w.last.substeps * self.w.last.iterations * self.steps * len(m))
+        near = 64 * self.t.eps * n * size + 1e-300
+        if np.abs(m @ v - m @ self.v).max() > near:
+            raise Find("momentum", f"of velocities {m @ self.v} -> {m @ v}, allowed {near:.3g}, {self.w.last}")
+        blur = 64 * self.t.eps * n * m.sum() * reach / event.dt
+        if np.abs(m @ way - m @ self.v).max() > near + blur:
+            raise Find(
+                "momentum", f"of velocities {m @ self.v}, of positions {m @ way}, allowed {near + blur:.3g}, {self.w.last}"
+            )
