@@ -1,5 +1,7 @@
 """Relaxation up to the law of its stability, and solvers that converge faster than it."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -141,3 +143,26 @@ def test_the_report_compares_at_equal_work():
     rows = [chains.run(chains.chain(20), solver, 20) for solver in (tv.Jacobi(), tv.Direct())]
     assert rows[0]["visits"] == rows[1]["visits"] == 20 * 60 * 20 and rows[1]["solver"] == "Direct()"
     assert rows[1]["residual"] < 1e-3 * rows[0]["residual"] and not rows[1]["flags"]
+
+
+@pytest.mark.parametrize(
+    "solver, advised", [(tv.Jacobi(), tv.ConjugateGradient()), (tv.ConjugateGradient(3), tv.ConjugateGradient(6))]
+)
+def test_constraints_that_are_not_met_are_flagged_with_what_helps(world, solver, advised):
+    # Of a cloth that falls into its two pins the residual goes down with h or faster: the substeps of the note, and its solver.
+    x, pairs = cloth(12)
+    start = tv.Particles(x, mass=1e-3, pinned=[0, 11])
+
+    def worst(solver, substeps):
+        w = world(start, [tv.Gravity(9.81), tv.Distance(pairs)], solver=solver, substeps=substeps, path="fused")
+        return max((w.step(1 / 60) for _ in range(45)), key=lambda r: r.residual)
+
+    found = worst(solver, 8)
+    assert found.residual > 0.1 and "unconverged" in found.flags
+    (note,) = (n for n in found.notes if n.startswith("Constraints are not met:"))
+    assert f"off by {100 * found.residual:.3g} %" in note
+    need = int(re.findall(r"Use about (\d+) substeps", note)[0])
+    assert 8 < need < 30 and note.split(", or solver=tv.")[1].startswith(repr(advised).partition("(")[0])
+    for better in (worst(solver, need), worst(advised, 8)):
+        assert better.residual < 0.11, better
+    assert ("unconverged" in better.flags) == (better.residual > 0.1)

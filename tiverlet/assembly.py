@@ -15,7 +15,7 @@ from .memory import Memory
 from .particles import Particles, Radii, State
 from .scalar import LOST, Scalar
 from .solvers.direct import Direct
-from .solvers.elimination import plan
+from .solvers.elimination import plan_of
 from .solvers.jacobi import Jacobi
 from .solvers.slots import Slots
 from .solvers.solver import Solver
@@ -114,7 +114,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
         feature.bind(scene)
     kind = Substep if scene.order == 2 else composition.Composition
     substep = kind(scene, accelerations, batches, drivers, contact, grid, walls, team)
-    survey = Survey(substep)
+    survey = Survey(substep, solver)
     if grid and contact:
         grid.allocate(int(len(particles) * max(ROOM[scene.radius.uniform][particles.dim - 2], contact.room)) + 64)
     memory.place()
@@ -178,12 +178,7 @@ def by_structure(batches: list[Batch], inv_mass: np.ndarray) -> Solver:
         C = b.violation(b.start.position)
         if (np.where(b.side, np.maximum(b.side * C, 0), np.abs(C)) * b.closeness(b.start.position) > LOST).any():
             return Jacobi()
-    arity = np.repeat([b.arity for b in links], [b.count for b in links])
-    item = np.concatenate([b.indices.ravel() for b in links])
-    owner = np.repeat(np.arange(len(arity)), arity)
-    free = inv_mass[item] > 0
-    found = plan(len(arity), owner[free], item[free], WIDTH)
-    return Direct(WIDTH) if len(found.column) else Jacobi()
+    return Direct(WIDTH) if len(plan_of(links, inv_mass, WIDTH).column) else Jacobi()
 
 
 def checked_solver(solver: Solver | None) -> Solver | None:

@@ -3,6 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Any
 
+UNCONVERGED = 0.1  # residual above which a frame has the flag of that name
+
 
 @dataclass(frozen=True)
 class StepReport:
@@ -21,6 +23,7 @@ class StepReport:
         "tunnelling-risk"   a particle moved by more than its own size in one substep, so it may have passed another
         "stiff-force"       a force changes too fast for the substep (omega h > 2) and makes energy grow
         "softened"          a system was made to give way, because its tension is too large for the substep
+        "unconverged"       the residual is above 0.1: a link is off by a tenth of its length, an angle by a tenth of a radian
         "turned"            a constraint turned by more than 41 degrees in a substep and lost its second order there
         "substeps-capped"   the guard would have taken more substeps, but they are at most 4096, or the budget was spent
         "stuck"             neither more substeps nor more iterations bring the residual or the overlap to the tolerance

@@ -11,7 +11,8 @@ from .feature import FAR
 from .grid import FARTHEST
 from .particles import LARGEST
 from .scalar import TENSEST
-from .step_report import StepReport
+from .solvers.solver import Solver
+from .step_report import UNCONVERGED, StepReport
 from .substep import CAME, END, FIGURES, SHEET, H, Substep, integer
 from .team import LEAST
 
@@ -30,8 +31,10 @@ class Survey:
     the last one.
     """
 
-    def __init__(self, substep: Substep):
+    def __init__(self, substep: Substep, solver: Solver):
         self.sub: Any = substep
+        self.solver = solver
+        self.remedy: str | None = None  # the setting that meets constraints better, known once it is asked for
         self.team = substep.team
         self.n, self.dim, self.state = substep.n, substep.dim, substep.state
         self.batches = substep.batches
@@ -241,6 +244,16 @@ class Survey:
             notes["stiff-force"] = (
                 f"A force changes too fast for the substep: omega h = {np.sqrt(stiff):.3g}, stable below 2. "
                 f"Use at least {need} substeps."
+            )
+        if residual > UNCONVERGED:
+            need = int(np.ceil(substeps * residual / UNCONVERGED))  # of order h^2 under loads, h after impacts
+            if self.remedy is None:
+                scene = self.sub.scene
+                self.remedy = self.solver.remedy(self.batches, scene.slots, scene.inv_mass)
+            other = f", or {self.remedy}" if self.remedy else ""
+            notes["unconverged"] = (
+                f"Constraints are not met: the worst is off by {100 * residual:.3g} % of its size. "
+                f"Use about {need} substeps{other}. Where neither helps, constraints contradict each other."
             )
         report = StepReport.of(
             {

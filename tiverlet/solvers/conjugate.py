@@ -38,6 +38,10 @@ class ConjugateGradient(Solver):
         scalars = [b for b in batches if isinstance(b, Scalar) and b.joins and b.side == 0]
         return Krylov(scene, batches, slots, scalars, self.steps) if scalars else None
 
+    def remedy(self, batches: list[Batch], slots: Slots, inv_mass: np.ndarray) -> str:
+        """More steps."""
+        return f"solver=tv.ConjugateGradient({2 * self.steps})" if slots.system else Solver.remedy(self, batches, slots, inv_mass)
+
     def explain(self, batches: list[Batch], slots: Slots) -> str:
         """What is solved how."""
         told = slots.system.rows if slots.system else 0

@@ -8,7 +8,7 @@ from ..feature import Batch, Scene
 from ..scalar import TENSEST, Scalar
 from .elimination import Plan, plan
 from .slots import Slots
-from .solver import Solver
+from .solver import WIDTH, Solver
 from .system import System
 
 REDUNDANT = 1e-12  # of its diagonal: a pivot this small belongs to a constraint that others imply
@@ -37,7 +37,7 @@ class Direct(Solver):
 
     converges = True
 
-    def __init__(self, width: int = 16):
+    def __init__(self, width: int = WIDTH):
         self.width = checks.integer("Direct", "width", width, least=0)
 
     def system(self, scene: Scene, batches: list[Batch], slots: Slots) -> "Elimination | None":
@@ -64,7 +64,7 @@ class Direct(Solver):
         return f"{self!r}: {parts}{alone}"
 
     def __repr__(self) -> str:
-        return "Direct()" if self.width == 16 else f"Direct(width={self.width})"
+        return "Direct()" if self.width == WIDTH else f"Direct(width={self.width})"
 
 
 class Elimination(System):

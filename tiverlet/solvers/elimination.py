@@ -49,6 +49,15 @@ def components(n: int, owner: np.ndarray, item: np.ndarray) -> np.ndarray:
         label = new
 
 
+def plan_of(links: list, inv_mass: np.ndarray, width: int) -> Plan:
+    """The parts of these batches, see plan(); particles that cannot move couple nothing."""
+    arity = np.repeat([b.arity for b in links], [b.count for b in links])
+    item = np.concatenate([b.indices.ravel() for b in links])
+    owner = np.repeat(np.arange(len(arity)), arity)
+    free = inv_mass[item] > 0
+    return plan(len(arity), owner[free], item[free], width)
+
+
 def plan(count: int, owner: np.ndarray, item: np.ndarray, width: int) -> Plan:
     """The parts of `count` constraints whose elimination never couples more than `width` others, in order of least degree.
 

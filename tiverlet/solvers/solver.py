@@ -6,6 +6,10 @@ import numpy as np
 
 from ..arguments import Noted
 from ..feature import Batch, Scene
+from ..scalar import Scalar
+from .elimination import plan_of
+
+WIDTH = 16  # of the systems that Direct takes
 
 
 class Solver(Noted):
@@ -32,6 +36,14 @@ class Solver(Noted):
     def relaxed_by(self, scene: Scene, batches: list[Batch], split: np.ndarray) -> float:
         """The factor on each correction of what is relaxed by itself."""
         return 1.0
+
+    def remedy(self, batches: list[Batch], slots, inv_mass: np.ndarray) -> str:
+        """The setting that meets constraints better, as the user writes it; "" where only more substeps do."""
+        alone = [b for b in batches if isinstance(b, Scalar) and b.joins and not b.side and (slots.rows(b) < 0).any()]
+        if not alone:
+            return ""
+        rows = len(plan_of(alone, inv_mass, WIDTH).rows)
+        return "solver=tv.Direct()" if rows == sum(b.count for b in alone) else "solver=tv.ConjugateGradient()"
 
     def explain(self, batches: list[Batch], slots) -> str:
         """What is solved how."""
