@@ -180,6 +180,7 @@ def test_walls_are_one_sided_at_any_speed(world):
         assert tv.measure.kinetic_energy(w) <= 0.5 * (speed**2).sum()
 
 
+@pytest.mark.filterwarnings("ignore:Box. particle 0 starts")
 def test_walls_move_and_push(world):
     # A piston: the wall goes where it is sent within a frame and carries what it meets, at its own speed.
     box = tv.Box((0, 0), (10, 10))

@@ -4,6 +4,7 @@ import pathlib
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 import tiverlet as tv
 from tiverlet import substep, survey
@@ -64,6 +65,7 @@ def test_every_solver_has_the_same_bits_on_1_and_8_threads():
     # cloth and ropes that fall on a ball, with hail on them. On one thread phase by phase, as on a GPU.
     code = """
 import numpy as np
+import pytest
 import taichi as ti
 import tiverlet as tv
 k = np.arange(900).reshape(30, 30)
@@ -133,6 +135,7 @@ def test_all_paths_have_the_same_bits(world):
     assert made[0] == made[1] == made[2]
 
 
+@pytest.mark.filterwarnings("ignore:Contact. all radii are 0")
 def test_what_is_absent_has_no_field_and_no_kernel(world):
     # A point in free flight: position, displacement, and the survey. Each feature adds its own fields and nothing else; a mass
     # for each particle is needed where one has another than the rest, as what is pinned has.
@@ -205,6 +208,7 @@ def test_unused_files_change_no_bit(tmp_path):
 import sys
 sys.path.insert(0, {path!r})
 import numpy as np
+import pytest
 import tiverlet as tv
 assert tv.__file__.startswith({path!r})
 i = np.arange(39)

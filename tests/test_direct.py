@@ -202,6 +202,7 @@ def test_direct_checks_its_arguments():
         tv.Direct(-1)
 
 
+@pytest.mark.filterwarnings("ignore:Contact. all radii are 0")
 def test_the_default_suits_the_structure(world):
     # Links like chains, trees and loops are solved directly; cloth, braced bodies, limits of angles, single links and what starts
     # violated are relaxed. explain() says what was chosen, and a solver that the user names is taken as it is.

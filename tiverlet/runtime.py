@@ -12,9 +12,9 @@ from typing import Any
 
 # Quiet and offline: no banner, no version check over the network. Taichi reads these when it is imported; where that was before,
 # it has printed its banner, and it would warn of the level being set twice.
+os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
 if "taichi" not in sys.modules:
-    os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
-    os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
     os.environ.setdefault("TI_LOG_LEVEL", "error")
     if os.name == "posix" and "HOME" not in os.environ:  # or Taichi ends the process
         os.environ["HOME"] = next(folder for folder in (os.path.expanduser("~"), tempfile.gettempdir()) if os.path.isabs(folder))

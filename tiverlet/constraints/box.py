@@ -59,9 +59,10 @@ class Box(Wall):
         self.lower, self.upper = self.lower, self.upper
 
     def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Warn of particles that start outside."""
-        x, r = particles.position, particles.radius[:, None]
-        out = np.maximum(self.lower + r - x, x + r - self.upper) * (inv_mass > 0)[:, None]
+        """Warn of particles whose centers start outside."""
+        x = particles.position
+        out = np.maximum(self.lower - x, x - self.upper)
+        out[inv_mass == 0] = 0
         if (out > 1e-6 * particles.size).any():
             (i, k), number = np.unravel_index(int(np.argmax(out)), out.shape), int((out.max(axis=1) > 0).sum())
             warnings.warn(
