@@ -122,6 +122,20 @@ def test_linear_drag_is_exact_and_wind_carries(world):
     np.testing.assert_allclose(w.position[0], mean * t + (v0 - mean) * (1 - np.exp(-k * t)) / k, atol=1e-11)
 
 
+@pytest.mark.parametrize("precision, limit", [("f32", 1e-6), ("f32-compensated", 1e-6), ("f64", 1e-12)])
+def test_velocities_under_any_drag(world, precision, limit):
+    # v = -g (1 - exp(-k t)) / k, also where exp(k h) leaves f32, and after a change of dt.
+    drag, h = tv.Drag(0.0), 1e-3
+    w = world(tv.Particles([[0.0, 0.0]]), [tv.Gravity(9.81), drag], substeps=1, precision=precision)
+    for z in (1e-6, 1e-3, 0.5, 20, 90, 250, 1e4):
+        w.position, w.velocity, drag.rate = np.zeros((1, 2)), np.zeros((1, 2)), z / h
+        t = 0.0
+        for dt in (h, h, h / 2, h):
+            w.step(dt)
+            t += dt
+            assert w.velocity[0, 1] == pytest.approx(9.81 * np.expm1(-z / h * t) * h / z, rel=limit)
+
+
 def test_knobs_are_live_and_rates_may_change(world):
     drag = tv.Drag(0.0)
     w = world(tv.Particles([[0.0, 0.0]], velocity=(1, 0)), [drag], substeps=5, precision="f64")

@@ -87,6 +87,12 @@ class Scene:
         return out
 
 
+def moments(m: np.ndarray, x: np.ndarray, d: np.ndarray) -> list[float]:
+    """Sum m d and sum m x x d."""
+    turn = [m @ (x[:, a] * d[:, b] - x[:, b] * d[:, a]) for a in range(x.shape[1]) for b in range(a)]
+    return [*(m @ d), *turn]
+
+
 @pytest.mark.parametrize("name", ROWS)
 def test_a_constraint_does_what_all_constraints_do(world, name):
     row = ROWS[name]
@@ -119,7 +125,7 @@ def test_a_constraint_does_what_all_constraints_do(world, name):
 
     # Momentum and angular momentum, sum m x_(n-1) x x_n, of the free blocks; covariance under rotations and translations.
     scene.again(iterations=3)
-    history = []
+    history, seen = [], []
     for _ in range(20):
         w.step(dt)
         s = w._memory.state()
@@ -127,11 +133,12 @@ def test_a_constraint_does_what_all_constraints_do(world, name):
         m = MASS[: scene.arity, None]
         history.append([])
         for x, d in (now[:2], now[2:]):
-            turn = [m[:, 0] @ (x[:, a] * d[:, b] - x[:, b] * d[:, a]) for a in range(scene.dim) for b in range(a)]
-            history[-1] += [*(m * d).sum(axis=0), *turn]
+            history[-1] += moments(m[:, 0], x, d)
+        seen.append([moments(m[:, 0], scene.block(b), scene.block(b, w.velocity) * dt) for b in ("free", "swing")])
         np.testing.assert_allclose(scene.block("turned"), scene.block("off") @ scene.turn.T + 0.5 * row.internal, atol=1e-11)
     if row.internal:
         assert np.ptp(history, axis=0).max() <= 1e-14 * 20
+        np.testing.assert_allclose(np.reshape(seen, np.shape(history)), history, atol=1e-14)  # and that of the velocities
     assert np.isfinite(w.position).all() and (scene.block("stuck") == scene.block("stuck", x0)).all()
 
     # Rigid and soft alike converge with h^2.

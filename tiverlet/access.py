@@ -15,6 +15,7 @@ from .queries import Contacts, Search, near_by_all, nearest
 from .read_only import assign_whole, read_only
 from .regroup import Handle
 from .step_report import StepReport
+from .substep import FREE
 
 
 class Access:
@@ -32,6 +33,10 @@ class Access:
     _time: float
     _tick: int
     _fresh: bool
+    _started: bool
+    _owed: float
+    _parted: np.ndarray | None
+    _drag: list[float] | None
     _placed: int | None
     _handles: Any
     _energy: float | None
@@ -70,8 +75,10 @@ class Access:
     @property
     def velocity(self) -> np.ndarray:
         """Velocities [m/s], (n, dim), a read-only copy in f64; of the order of the world. Assign an array to set them."""
+        if self._parted is not None:
+            return read_only(self._parted.copy(), assign_whole("World", "velocity"))
         if self._order == 2 or self._fresh:
-            return self._export(self._sub.velocities, self._h, self._time, int(self._fresh))
+            return self._export(self._sub.velocities, self._h, self._time, int(self._fresh), *self._shares())
         self._memory.check()
         with whole, self._memory.compiler():
             out = composition.velocity(self)[: len(self._particles)]
@@ -85,7 +92,16 @@ class Access:
             for watcher in self._watchers:
                 watcher.assigned("velocity", value)
             self._memory.write(self._scene.state.d, value)
-            self._fresh, self._energy = True, None
+            self._fresh, self._energy, self._owed, self._parted = True, None, 0.0, None
+
+    def _shares(self) -> tuple[float, float]:
+        """What multipliers of the last substep are to be taken for: h^2 over what an acceleration added to the displacement. A
+        start from velocities without what rigid constraints did in half a substep left that to them, too."""
+        drag = self._drag or FREE
+        if not self._started:
+            return 1 / drag[1], 1 / drag[1]
+        owed = drag[1] * self._owed / self._h
+        return 1 / (drag[2] + owed), 1 / drag[2]
 
     def _export(self, kernel, *args) -> np.ndarray:
         self._memory.check()

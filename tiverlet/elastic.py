@@ -178,6 +178,14 @@ class Elastic(Number, Breaking):
             self.push(c, k, h * h * self._on_w.of(self.member(c, k)) * force * g[k, :])
 
     @ti.func
+    def bond(self, c, firm, soft):
+        """scale w_j lam grad_j C(x_n)."""
+        _, g = self.measure(c, self.corners(c, 0))
+        pull = self._on_lam[c] * ti.select(self.is_rigid(c), firm, soft)
+        for k in ti.static(range(self.arity)):
+            self.push(c, k, self._on_w.of(self.member(c, k)) * pull * g[k, :])
+
+    @ti.func
     def force(self, c, f, f0, w, h):
         """F of kick(), from f now and a substep ago."""
         force = ti.cast(0, self._on_real)

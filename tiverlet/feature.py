@@ -250,6 +250,11 @@ class Batch(Feature):
         """Push what the constraint's spring, if it has one, adds to h^2 a at the present positions; for starts."""
 
     @ti.func
+    def bond(self, c, firm, soft):
+        """Push what the constraint added to h^2 a in the last substep, along its directions at the present positions, about which
+        it has no moment. firm, soft: h^2 over what its multiplier stands for, where it is rigid and where not."""
+
+    @ti.func
     def weigh(self, b, h, hh, first, fresh):
         """Before relax() and kick() sum over block b of a ragged batch. first: -1 before kick()."""
 

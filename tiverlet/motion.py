@@ -129,7 +129,7 @@ class Motion:
                 v = (3 * d - self.earlier[i]) / (2 * h)
             force = h * h * self.accelerate(i, self.state.place(i), v, t, self.pull(t)) + bond
             if ti.static(self.decays):
-                v = (d + self.decay[None][3] * force) * self.decay[None][0] / (self.decay[None][1] * h)
+                v = (self.decay[None][0] * d + self.decay[None][3] * force) / h
             else:
                 v = (d + force / 2) / h
         return v

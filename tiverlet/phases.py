@@ -53,14 +53,14 @@ class Phases(Tiles):
             self.halt = scene.memory.field("halt", None, width=3, kind=ti.i32)
 
     @ti.func
-    def predict(self, me, h, time, tick, fresh, when, calming):
+    def predict(self, me, h, time, tick, fresh, when, calming, final):
         """1 Integrate, and move what walls are made of; 2 put driven particles on their targets."""
         for w in ti.static(self.posed):
             ti.loop_config(serialize=True)
             for _ in range(self.team.one(1, me)):
                 w.pose(when)
         for k in range(self.team.deal(self.pieces * self.each, self.each, me)):
-            self.advance(self.team.turn(k, self.each, me), h, time, tick, fresh, calming)
+            self.advance(self.team.turn(k, self.each, me), h, time, tick, fresh, calming, final)
         self.team.wait()
         self.team.watch(me)
         for f in ti.static(self.drivers):
@@ -142,7 +142,7 @@ class Phases(Tiles):
         for c in ti.static(self.contacts):
             if ti.static(len(self.batches) > 0):
                 for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
-                    self.slots.gather(i, first, final)
+                    self.slots.gather(i)
                 self.team.wait()
             if ti.static(c.measures):
                 for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
@@ -160,7 +160,11 @@ class Phases(Tiles):
                     low, high = block(b, begin, end)
                     if c.busy(low) != 0:
                         for i in range(low, high):
-                            c.relax(i, first, fresh)
+                            c.relax(i, first, fresh, final)
+                    elif final != 0:
+                        if ti.static(c.rubs):
+                            for i in range(low, high):
+                                c.sum_up(i, 0 * self.state.d[i], first)
             self.team.wait()
 
     @ti.func

@@ -220,6 +220,13 @@ class Content(Scalar, Ragged):
         self._on_change[c], self._on_astray[c] = h * h * self.force(c, f, f0, w, h), 1
 
     @ti.func
+    def bond(self, c, firm, soft):
+        """As in Scalar."""
+        pull = self._on_lam[c] * ti.select(self.is_rigid(c), firm, soft)
+        for e in range(self._on_starts[c], self._on_starts[c + 1]):
+            self.give(e, self._on_w.of(self._on_members[e]) * pull * self.slope(e, 0))
+
+    @ti.func
     def miss(self, c, h, hh, when, fresh):
         """The violation that is left, relative to the rest value."""
         f, f0, w, W, turn, extent, move = self.total(c)

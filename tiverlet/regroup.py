@@ -13,6 +13,8 @@ from .memory import Memory
 from .particles import Particles
 from .substep import decay
 
+NOTHING = 2.0**-20  # of a velocity: less than this of it is in the next displacement
+
 
 class Handle:
     """Some particles of a world, whatever happens to others: NumPy, and whatever takes indices, takes it for an index array.
@@ -105,7 +107,9 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
     went = [f for f in before if f not in features]
     starts = {id(f.start): f.start.regrouped(some, added) for f in before}
     starts = [None if f in came else starts[id(f.start)] for f in features]
-    parts = None
+    parts, seen = None, None
+    if not world._fresh and (world._parted is not None or any(_loses(f, number, features) for f in before)):
+        seen = world.velocity
     try:
         turned = any(_drives(f, number) for f in came + went)
         if turned:
@@ -129,6 +133,7 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
         raise
     memories, particles = world._memories, world._particles.regrouped(some, added)
     contact, reach = next((c for c in world._sub.contacts if c in features), None), world._scene.hh
+    world._parted = None
     world._install(particles, features, parts)
     world._scene.hh = reach
     world._memory.restore(state)
@@ -153,6 +158,8 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
         world._placed = n
     if m and not world._fresh:
         _launch(world, n)
+    if seen is not None and not world._fresh:  # what went has left its part in the velocities of what stays
+        world._parted = seen[some] if added is None else np.concatenate([seen[some], added.velocity])
     for watcher in world._watchers:
         watcher.regrouped()
 
@@ -162,6 +169,11 @@ def _drives(feature: Feature, number: np.ndarray) -> bool:
     if isinstance(feature, Batch):
         return feature.soft and bool(feature.spared(number)[0].any()) if feature.scene else feature.soft
     return isinstance(feature, Acceleration)
+
+
+def _loses(feature: Feature, number: np.ndarray, features: tuple[Feature, ...]) -> bool:
+    """Whether constraints go."""
+    return isinstance(feature, Batch) and (feature not in features or not feature.spared(number)[0].all())
 
 
 def _carried(
@@ -209,8 +221,8 @@ def _give_contacts(world: Any, contact: Contact, old: dict, number: np.ndarray, 
 def _launch(world: Any, first: int) -> None:
     """Give particles from `first` on the displacements that their velocities need, between two substeps.
 
-    v = s (d / h + what forces add in half a substep), with s = 1, or with drag exp(-z) / phi1: from any d, what it lacks of v
-    says what d lacks.
+    v = share d / h + what forces add, see decay(): from any d, what it lacks of v says what d lacks. Where drag leaves nothing of
+    a velocity in a substep, d does not matter.
     """
     h, memory, state = world._h, world._memory, world._scene.state
     want = np.where(world._scene.inv_mass[first:, None] > 0, world._particles.velocity[first:], 0.0)
@@ -219,8 +231,8 @@ def _launch(world: Any, first: int) -> None:
     for field, rows in zip(fields, values, strict=True):
         rows[first:] = h * want
         memory.write(field, rows)
-    fade, phi, *_ = decay(sum(f.rate for f in world._sub.drags), h)
-    d = h * want + phi / fade * h * (want - world.velocity[first:])
+    share = max(decay(sum(f.rate for f in world._sub.drags), h)[0], NOTHING)
+    d = h * want + h / share * (want - world.velocity[first:])
     d[world._scene.inv_mass[first:] == 0] = 0.0
     values[0][first:] = d
     for rows in values[1:]:

@@ -75,6 +75,20 @@ def solved(H, r):
 
 
 @ti.func
+def spin(S, X):
+    """How a body turns, as a matrix, whose parts move by y: S = sum m r r^T, X = sum m r y^T, about its centre."""
+    gap, out, size = axial(X.transpose()), 0 * S, S.trace()
+    if size > 0:
+        if ti.static(S.n == 2):
+            out[1, 0] = gap[0] / size
+            out[0, 1] = -out[1, 0]
+        else:
+            x, _ = solved(diagonal(ti.static(1 + 2.0**-46) * size, S) - S, gap)  # about a line of particles anything will do
+            out = ti.Matrix([[0 * size, -x[2], x[1]], [x[2], 0 * size, -x[0]], [-x[1], x[0], 0 * size]])
+    return out
+
+
+@ti.func
 def newton(M, gap, least):
     """A rotation vector that closes the gap of axial(M) for M = R K; along the gap where there is no curvature to go by."""
     size, step = M.norm(), 0 * gap

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 HASHED = ("_time", "_tick", "_since", "_h", "_fresh")  # of the clock; the rest follows from the same past
 CARRIED = ("Contact.push", "Contact.slip", "Contact.slack")  # by pairs, for the next substep
 TOLD = "Contact.given"  # by pairs, of the last substep, for reports
-CLOCK = (*HASHED, "_frame", "_drag", "_started", "_placed", "_energy")
+CLOCK = (*HASHED, "_frame", "_drag", "_started", "_owed", "_parted", "_placed", "_energy")
 
 
 @dataclass(frozen=True)

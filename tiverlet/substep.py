@@ -66,9 +66,8 @@ class Substep(Phases):
             starts, again = ti.select(s == 0, fresh, 0), ti.select(s == begin, resumed, 0)
             if self.team.works(me) and self.halted() == 0:
                 if more and again == 0:
-                    self.predict(
-                        me, h, ti.cast(t + s * h64, self.real), tick + s, starts, when, self.calming(since + s)
-                    )  # fmt: skip
+                    time, final = ti.cast(t + s * h64, self.real), ti.cast(s == substeps - 1, ti.i32)
+                    self.predict(me, h, time, tick + s, starts, when, self.calming(since + s), final)
                 for it in range(ti.select(again != 0, it0, 0), ti.select(more, part, 1)):
                     if ti.static(self.hashes):
                         if self.halted() == 0 and self.is_stale() != 0:
@@ -109,8 +108,8 @@ class Substep(Phases):
     ) -> ti.i32:  # fmt: skip
         """Phases 1 and 2 of substep s; returns whether the neighbour list is stale."""
         h = ti.cast(h64, self.real)
-        when, calming = self.clock(s, substeps), self.calming(since + s)
-        self.predict(0, h, ti.cast(t + s * h64, self.real), tick + s, fresh, when, calming)
+        when, calming, final = self.clock(s, substeps), self.calming(since + s), ti.cast(s == substeps - 1, ti.i32)
+        self.predict(0, h, ti.cast(t + s * h64, self.real), tick + s, fresh, when, calming, final)
         return self.is_stale()
 
     @ti.kernel
@@ -207,13 +206,20 @@ class Substep(Phases):
             self.state.d[i] = self.velocity_after(i, h, ti.cast(t, self.real), bond)
 
     @ti.kernel
-    def velocities(self, h64: ti.f64, t: ti.f64, fresh: ti.i32, out: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
-        """Velocities as the user sees them."""
+    def velocities(self, h64: ti.f64, t: ti.f64, fresh: ti.i32, firm64: ti.f64, soft64: ti.f64, out: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
+        """Velocities as the user sees them. firm, soft: see Batch.bond.
+
+        With the multipliers of the last substep along the directions at its end they are second order, and have the momentum and
+        the angular momentum of the motion, sum m x_n x (x_n - x_(n-1)) / h and what forces from outside add in h / 2.
+        """
+        for f in ti.static(self.batches):
+            for c in range(f.count):
+                f.bond(c, ti.cast(firm64, self.real), ti.cast(soft64, self.real))
         for i in range(self.n):
             v = self.state.d[i]
             if fresh == 0:
-                h, time = ti.cast(h64, self.real), ti.cast(t, self.real)
-                v = self.velocity_after(i, h, time, self.felt(i, h, time))
+                h, time, firm = ti.cast(h64, self.real), ti.cast(t, self.real), ti.cast(firm64, self.real)
+                v = self.velocity_after(i, h, time, self.felt(i, h, time, firm))
             for k in ti.static(range(self.dim)):
                 out[i, k] = v[k]
 
@@ -221,15 +227,21 @@ class Substep(Phases):
 def decay(rate: float, h: float) -> list[float]:
     """What drag makes of a substep, for z = rate h.
 
-    exp(-z), phi1 = (1 - exp(-z)) / z, phi2 = (z - 1 + exp(-z)) / z^2, psi2 = (exp(z) - 1 - z) / z^2, 1 - exp(-z).
+    share = z / (exp(z) - 1), phi1 = (1 - exp(-z)) / z, phi2 = (z - 1 + exp(-z)) / z^2, rest = (1 - share) / z, 1 - exp(-z).
+    The velocity at its end is (share d + rest h^2 a) / h; no exp(z) is left in it, which leaves f32 at z = 88.
     """
     z = rate * h
     if z < 1e-3:  # series: the closed forms cancel
+        share = 1 - z / 2 + z * z / 12
         phi1 = 1 - z / 2 + z * z / 6 - z**3 / 24
         phi2 = 1 / 2 - z / 6 + z * z / 24 - z**3 / 120
-        psi2 = 1 / 2 + z / 6 + z * z / 24 + z**3 / 120
+        rest = 1 / 2 - z / 12 + z**3 / 720
     else:
+        share = -z * np.exp(-z) / np.expm1(-z)
         phi1 = -np.expm1(-z) / z
         phi2 = (z + np.expm1(-z)) / z**2
-        psi2 = (np.expm1(min(z, 700.0)) - z) / z**2
-    return [float(np.exp(-z)), float(phi1), float(phi2), float(psi2), float(-np.expm1(-z))]
+        rest = (1 - share) / z
+    return [float(share), float(phi1), float(phi2), float(rest), float(-np.expm1(-z))]
+
+
+FREE = decay(0.0, 1.0)  # what no drag makes of a substep

@@ -130,6 +130,8 @@ class Survey:
                     touching, worst = c.overlaps(i)
                     figures[2] = ti.max(figures[2], worst)
                     figures[4] += touching
+                    if begin == 0:
+                        c.push_bond(i)
         for f in ti.static(self.batches):
             part = (f.count + self.blocks - 1) // self.blocks
             for c in range(b * part, ti.min((b + 1) * part, f.count)):

@@ -138,6 +138,14 @@ class Tether(Batch):
         self.push(c, 0, move)
 
     @ti.func
+    def bond(self, c, firm, soft):
+        """As in Scalar, for each axis."""
+        scale = firm
+        if ti.static(self._on_soft):
+            scale = ti.select(self._on_alpha[c] > 0, soft, firm)
+        self.push(c, 0, scale * self._on_w.of(self.member(c, 0)) * self._on_lam[c])
+
+    @ti.func
     def miss(self, c, h, hh, when, fresh):
         """What is left, relative to the size of the scene."""
         _, _, size = self.solve(c, h, hh, when, 0, fresh)

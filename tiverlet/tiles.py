@@ -27,7 +27,7 @@ class Tiles(Motion):
         self.slots, self.grid, self.walls, self.radius = scene.slots, grid, walls, scene.radius
         self.batches: list[Batch] = [b for b in batches if b.count]
         self.contacts = [contact] if contact else []
-        if walls or contact:
+        if walls:
             self.thrust = scene.memory.field("thrust", self.n, width=self.dim, state=True)
 
     @ti.func
@@ -46,9 +46,14 @@ class Tiles(Motion):
         return first, ti.min(first + self.tile, (piece + 1) * self.team.piece, self.n)
 
     @ti.func
-    def advance(self, tile, h, t, tick, fresh, calming):
+    def advance(self, tile, h, t, tick, fresh, calming, final):
         """Integrate a tile of particles. Short loops, so that each is done for several particles at once."""
         first, end = self.within(tile)
+        for c in ti.static(self.contacts):
+            if final != 0:
+                scale = ti.select(fresh != 0, h, ti.cast(1, self.real))
+                for i in range(first, end):
+                    c.set_out(i, scale)
         if ti.static(self.state.starts):
             for i in range(first, end):
                 self.state.x0[i] = self.state.x[i]
@@ -81,20 +86,20 @@ class Tiles(Motion):
         begin, end = self.within(tile)
         if ti.static(len(self.batches) > 0 and len(self.contacts) == 0):
             for i in range(begin, end):
-                self.slots.gather(i, first, final)
-        if ti.static(len(self.walls) > 0 or len(self.contacts) > 0):
-            if final != 0:
-                for i in range(begin, end):
-                    if first != 0:
-                        self.thrust[i] = -self.state.d[i]
-                    else:
-                        self.thrust[i] = self.thrust[i] - self.state.d[i]
+                self.slots.gather(i)
         for c in ti.static(self.contacts):
             for b in range(blocks(begin, end)):
                 low, high = block(b, begin, end)
                 if c.busy(low) != 0:
                     for i in range(low, high):
                         c.gather(i, first)
+        if ti.static(len(self.walls) > 0):
+            if final != 0:
+                for i in range(begin, end):
+                    if first != 0:
+                        self.thrust[i] = -self.state.d[i]
+                    else:
+                        self.thrust[i] = self.thrust[i] - self.state.d[i]
         if ti.static(len(self.walls) > 0 and self.n < FEW):
             for i in range(begin, end):
                 self.confine(i, h, when)
@@ -114,7 +119,7 @@ class Tiles(Motion):
                 for i in range(begin, end):
                     stale |= self.grid.outrun(i)
                 c.heed(stale, 0)
-        if ti.static(len(self.walls) > 0 or len(self.contacts) > 0):
+        if ti.static(len(self.walls) > 0):
             if final != 0:
                 for i in range(begin, end):
                     self.thrust[i] = self.thrust[i] + self.state.d[i]
@@ -136,17 +141,19 @@ class Tiles(Motion):
                         moving = (self.state.d[i] != before).any()
 
     @ti.func
-    def felt(self, i, h, t):
-        """h^2 times what constraints, contacts and walls did to particle i in the last substep, for its velocity.
+    def felt(self, i, h, t, firm):
+        """h^2 times what constraints (from Slots), contacts and walls accelerated particle i by in the last substep.
 
-        Contacts and walls count as far as they balance the rest: a body at rest has velocity 0, but one that has just bounced is
-        not credited with half of the blow.
+        Walls count as far as they balance the rest: a body at rest has velocity 0, but one that has just bounced is not credited
+        with half of the blow.
         """
         bond = 0 * self.state.d[i]
         if ti.static(len(self.batches) > 0):
-            bond = self.slots.pull[i]
-        if ti.static(len(self.walls) > 0 or len(self.contacts) > 0):
-            push = self.thrust[i]
+            bond = self.slots.total_of(i)
+        for c in ti.static(self.contacts):
+            bond += firm * c.bond(i)
+        if ti.static(len(self.walls) > 0):
+            push = firm * self.thrust[i]
             v = self.state.d[i] / h
             limit = (h * h * self.accelerate(i, self.state.place(i), v, t, self.pull(t)) + bond).norm()
             size = push.norm()

@@ -18,6 +18,8 @@ class Touch(Feature):
     _on_state: Any
     _on_radius: Any
     _on_push: Any
+    _on_bond: Any
+    _on_before: Any
     _on_given: Any
     _on_bounces: bool
     _on_eases, _on_store = False, None
@@ -55,6 +57,37 @@ class Touch(Feature):
             else:
                 overlap, n = far, self.part(i, j, r)
         return overlap, n
+
+    @ti.func
+    def steady(self, came, push):
+        """How much of a push is a force, which acts before and after, and not a blow, which is over.
+
+        A blow is no more than what stops a pair that came together by `came` in the substep before. It is the same for both of a
+        pair, which keeps momentum.
+        """
+        return ti.max(1 - ti.select(push > 0, ti.max(came, 0) / push, ti.zero(push)) ** 2, 0)
+
+    @ti.func
+    def set_out(self, i, scale):
+        """At the start of the last substep of a frame: keep the displacement of particle i, `scale` times what is kept there."""
+        self._on_before[i] = scale * self._on_state.d[i]
+
+    @ti.func
+    def sum_up(self, i, bond, first):
+        """Keep what forces of a pass moved particle i by in the last substep of a frame, for its velocity."""
+        if first != 0:
+            self._on_bond[i] = bond
+        else:
+            self._on_bond[i] = self._on_bond[i] + bond
+
+    @ti.func
+    def push_bond(self, i):
+        """At the end of a frame: what pushes that are forces moved particle i by, where that is not known from the passes."""
+
+    @ti.func
+    def bond(self, i):
+        """What forces moved particle i by in the last substep of a frame."""
+        return self._on_bond[i]
 
     @ti.func
     def meet(self, i, j, far, shared):

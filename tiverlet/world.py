@@ -19,10 +19,8 @@ from .particles import Particles
 from .regroup import Handle
 from .solvers.solver import Solver
 from .step_report import StepReport
-from .substep import decay
+from .substep import FREE, decay
 from .survey import STARTED, STEPPED
-
-FREE = decay(0.0, 1.0)  # what no drag makes of a substep
 
 
 class World(Launches):
@@ -76,6 +74,8 @@ class World(Launches):
         self._since = 0  # substeps since the last start
         self._frame = (0.0, 0.0, 0)  # when frames of the present length began, their length, their number
         self._fresh, self._started = True, False  # d holds velocities; the last substep was the first after a start
+        self._owed = 0.0  # [s] of the kick by rigid constraints that the velocities at the last start lacked
+        self._parted: Any = None  # velocities, until the next step, where constraints were removed that have a part in them
         self._placed: int | None = 0  # the first of the particles that the user placed and that were not looked at yet
         self._drag: list[float] | None = None
         self._energy: float | None = None
@@ -164,7 +164,7 @@ class World(Launches):
             self._fused(done, iterations, end, STARTED if started else STEPPED)
         self.__dict__.update(
             _tick=(self._tick + substeps) % 2**31, _since=(self._since + substeps) % 2**31,
-            _started=started, _fresh=False, _frame=frame, _time=end,
+            _started=started, _fresh=False, _parted=None, _frame=frame, _time=end,
         )  # fmt: skip
         if sub["launched"]:
             self._look()
@@ -226,9 +226,10 @@ class World(Launches):
         if not self._fresh:
             if self._order == 2:
                 self._sub.to_velocity(self._h, self._time)
+                self._owed = (self._drag or FREE)[3] * self._h
             else:
                 self._memory.write(self._scene.state.d, composition.velocity(self))
-            self._fresh = True
+            self._fresh, self._parted = True, None
 
     def run(
         self, seconds: float, dt: float = 1 / 60, recorder=None, progress: bool = False, *, tolerance: float | None = None,

@@ -135,6 +135,10 @@ class Contact(Splitting):
         self._on_radius = scene.radius
         self._on_move = scene.memory.field("Contact.move", n, width=dim)
         self._on_split = scene.memory.field("Contact.split_mass", n, state=True)
+        self._on_press = scene.memory.field("Contact.press", n, width=dim, state=True)
+        self._on_before = scene.memory.field("Contact.before", n, width=dim, state=True)
+        if self.rubs:
+            self._on_bond = scene.memory.field("Contact.bond", n, width=dim, state=True)
         self._on_block = min(BLOCK, team.piece)
         self._on_skips = n >= FEW and not self.bounces  # in relax() what bounces forgets the last blow
         if self._on_skips:
@@ -180,10 +184,10 @@ class Contact(Splitting):
                 self._on_fast[None] = 1
 
     @ti.func
-    def relax(self, i, first, fresh):
+    def relax(self, i, first, fresh, final):
         """What the pairs of particle i want of it."""
         total, w = ti.Vector.zero(self.scene.real, self._on_state.dim), self._on_state.w.of(i)
-        lift = total
+        lift, bond = total, total
         if ti.static(self._on_bounces):
             if first != 0:
                 self._on_struck[i] = self._on_split[i]
@@ -227,10 +231,44 @@ class Contact(Splitting):
                     if ti.static(self._on_rubs):
                         want -= self.rub(i, j, n, part * shared + given, self._on_slip.field[e]) / shared
                     total += w * want
+                    if ti.static(self._on_rubs):
+                        if final != 0:
+                            came = -(self._on_before[i] - self._on_before[j]).dot(n)
+                            bond += self.steady(came, part * alone) * w * (want - part * n)
                     self._on_push.field[e] = push
         self._on_move[i] = total
+        if ti.static(self._on_rubs):
+            if final != 0:
+                self.sum_up(i, bond, first)
         if ti.static(self._on_bounces):
             self._on_lift[i] = lift
+
+    @ti.func
+    def push_bond(self, i):
+        """Along the normals at the present places, where pushes have no moment. Friction is known from the passes."""
+        total, w = 0 * self._on_press[i], self._on_state.w.of(i)
+        if self._on_split[i] > 0:
+            for word in range(self._on_grid.words(i)):
+                bits = ti.select(word == 0, self._on_grid.touching[i], self._on_grid.whole(i, word))
+                while bits != 0:
+                    e = self._on_grid.first[i] + word * WORD + lowest(bits)
+                    bits &= bits - ti.u32(1)
+                    j, push = self._on_grid.near[e], self._on_push.field[e]
+                    r = self._on_state.apart(i, j)
+                    length = r.norm()
+                    if push > 0 and length > 0:
+                        n = r / length
+                        came = -(self._on_before[i] - self._on_before[j]).dot(n)
+                        total += self.steady(came, push * (w + self._on_state.w.of(j))) * w * push * n
+        self._on_press[i] = total
+
+    @ti.func
+    def bond(self, i):
+        """Pushes, and friction."""
+        total = self._on_press[i]
+        if ti.static(self._on_rubs):
+            total += self._on_bond[i]
+        return total
 
     @ti.func
     def bounce(self, i, j, n, overlap, slack, last, first):

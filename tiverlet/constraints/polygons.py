@@ -91,6 +91,8 @@ class Polygons(Rim):
         self._on_eases = True
         self._on_move = add("Contact.move", n, width=2)
         self._on_active = add("Contact.active", n, kind=ti.i32)
+        self._on_bond = add("Contact.bond", n, width=2, state=True)
+        self._on_before = add("Contact.before", n, width=2)
         self._on_fast = add("Contact.fast", None, kind=ti.i32)
         if self.bounces:
             self._on_struck = add("Contact.struck", n, kind=ti.i32)
@@ -162,6 +164,11 @@ class Polygons(Rim):
         return count[v] * self._on_w.of(v) + at_a + at_b
 
     @ti.func
+    def alone(self, v, a, b, t):
+        """The weight of a contact that is the only one."""
+        return self._on_w.of(v) + (1 - t) * (1 - t) * self._on_w.of(a) + t * t * self._on_w.of(b)
+
+    @ti.func
     def count(self, begin, end):
         """How many contacts some particles are in."""
         for i in range(begin, end):
@@ -175,9 +182,9 @@ class Polygons(Rim):
             self._on_active[i] = active
 
     @ti.func
-    def relax(self, i, first, fresh):
+    def relax(self, i, first, fresh, final):
         """What the contacts of particle i want of it."""
-        total, lifts = 0 * self._on_state.x[i], 0 * self._on_state.x[i]
+        total, lifts, bond = 0 * self._on_state.x[i], 0 * self._on_state.x[i], 0 * self._on_state.x[i]
         for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
             if first != 0:
                 self._on_given.field[e] = 0
@@ -189,7 +196,7 @@ class Polygons(Rim):
                     met = self._on_met.field[at]
                     overlap, n = met[0], ti.Vector([met[2], met[3]])
                     if overlap > 0:
-                        d, shared = self.relative(v, a, b, t), self.split(self._on_active, v, a, b, t)
+                        d, shared = self.relative(self._on_state.d, v, a, b, t), self.split(self._on_active, v, a, b, t)
                         share, kick = part * self._on_w.of(i) / shared, 0 * overlap
                         back = overlap  # what is taken back of the position and of the displacement
                         if ti.static(self._on_bounces):
@@ -207,7 +214,12 @@ class Polygons(Rim):
                         if ti.static(self._on_rubs):
                             want -= self.held(v, a, n, overlap + kick, self._on_slip.field[at] + d)
                         total += share * want
+                        if final != 0:
+                            came = -self.relative(self._on_before, v, a, b, t).dot(n)
+                            bond += self.steady(came, overlap * self.alone(v, a, b, t) / shared) * share * want
         self._on_move[i] = total
+        if final != 0:
+            self.sum_up(i, bond, first)
         if ti.static(self._on_bounces):
             if first != 0:
                 self._on_lift[i] = lifts
@@ -257,7 +269,7 @@ class Polygons(Rim):
                         size = aim.norm()
                         if size > 0:
                             n = aim / size
-                            lack = size - self.relative(v, a, b, t).dot(n)
+                            lack = size - self.relative(self._on_state.d, v, a, b, t).dot(n)
                             if lack > 0:
                                 shared = self.split(self._on_struck, v, a, b, t)
                                 self._on_hit[None] = 1
@@ -283,7 +295,7 @@ class Polygons(Rim):
                     met = self._on_met.field[at]
                     if met[0] > 0:
                         n = ti.Vector([met[2], met[3]])
-                        slip = self.held(v, a, n, met[0], self._on_slip.field[e] + self.relative(v, a, b, t))
+                        slip = self.held(v, a, n, met[0], self._on_slip.field[e] + self.relative(self._on_state.d, v, a, b, t))
                 self._on_slip.field[e] = slip
 
     @ti.func

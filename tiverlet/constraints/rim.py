@@ -89,7 +89,7 @@ class Rim(Contact):
                     out -= self._on_less[v]
                 if not came:
                     if ti.static(moved):
-                        out = ti.min(out, self.push_out * self._on_h[None] - self.relative(v, a, b, t).dot(n))
+                        out = ti.min(out, self.push_out * self._on_h[None] - self.relative(self._on_state.d, v, a, b, t).dot(n))
                         back = self.inward(v)
                     if back.dot(n) >= 0 and self.inside(v, a):
                         came = self.nearest(v, a, shared, height, back)
@@ -220,9 +220,9 @@ class Rim(Contact):
         return at, v, a, b, t, part
 
     @ti.func
-    def relative(self, v, a, b, t):
+    def relative(self, d: ti.template(), v, a, b, t):  # type: ignore[valid-type]
         """The displacement of v relative to the point t of the edge from a to b."""
-        return self._on_state.d[v] - (1 - t) * self._on_state.d[a] - t * self._on_state.d[b]
+        return d[v] - (1 - t) * d[a] - t * d[b]
 
     def found(self, x: np.ndarray, h: float) -> Contacts:
         """Vertices and edges, and pairs of discs, by what look() found last; also those that were pushed apart since."""

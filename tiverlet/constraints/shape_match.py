@@ -95,6 +95,35 @@ class ShapeMatch(Clusters):
             self.keep(self._on_pose, c, R)
 
     @ti.func
+    def bond(self, c, firm, soft):
+        """What moved each corner, less its moment about the present places: as what turns the cluster, of least sum m move^2.
+
+        Moves have no moment about the places at the start. Where something cannot move, forces from outside have one.
+        """
+        begin, end, i0 = self._on_starts[c], self._on_starts[c + 1], self.hub(c)
+        scale = firm
+        if ti.static(self._on_soft):
+            scale = ti.select(self._on_alpha[c] > 0, soft, firm)
+        total, mean, pull, held = ti.cast(0, ti.f64), 0 * self._on_place[c], 0 * self._on_place[c], False
+        S = mean.outer_product(mean)
+        X = 0 * S
+        for e in range(begin, end):
+            held = held or self._on_w.of(self._on_members[e]) == 0
+            m, r = self.weight(e, c), self.arm(e, i0, 0)
+            total += m
+            mean += m * r
+            pull += m * self._on_pull[e]
+            S += m * r.outer_product(r)
+            X += m * r.outer_product(ti.cast(self._on_pull[e], ti.f64))
+        mean, pull = mean / total, pull / total
+        spin = rotation.spin(S - total * mean.outer_product(mean), X - total * mean.outer_product(pull))
+        for e in range(begin, end):
+            move = ti.cast(self._on_pull[e], ti.f64)
+            if not held:
+                move -= spin @ (self.arm(e, i0, 0) - mean)
+            self.give(e, ti.cast(scale * move, self._on_real))
+
+    @ti.func
     def off(self, e, c):
         """C_i at the present places."""
         return self.arm(e, self.hub(c), 0) - self._on_place[c] - self.kept(self._on_pose, c) @ self._on_shape[e]

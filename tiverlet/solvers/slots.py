@@ -35,7 +35,6 @@ class Slots:
         self.state = state
         self.move = memory.field("slots.move", self.total, width=state.dim)
         self.begin = memory.field("slots.begin", n + 1, kind=ti.i32, values=np.concatenate([[0], np.cumsum(degree)]))
-        self.pull = memory.field("slots.pull", n, width=state.dim, state=True)
         self.accelerates = solver.accelerates
         if self.accelerates:
             self.pace = memory.field("slots.pace", None, width=3, kind=ti.f64)
@@ -112,13 +111,7 @@ class Slots:
         return total
 
     @ti.func
-    def gather(self, i, first, final):
-        """Move particle i by what the constraints want. `pull` keeps the sum of a frame's last substep."""
+    def gather(self, i):
+        """Move particle i by what the constraints want."""
         if self.begin[i + 1] > self.begin[i]:
-            total = self.wanted(i)
-            self.state.shift(i, total)
-            if final != 0:
-                if first != 0:
-                    self.pull[i] = total
-                else:
-                    self.pull[i] = self.pull[i] + total
+            self.state.shift(i, self.wanted(i))
