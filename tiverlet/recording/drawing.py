@@ -118,7 +118,7 @@ class Drawing:
     def _contact(self) -> None:
         """Where particles touch: between the two."""
         world = self._world
-        middle = world.contacts.point if world.last is not None else np.zeros((0, world.particles.dim))
+        middle = world.contacts.point if world._h else np.zeros((0, world.particles.dim))
         if not len(middle) and not self._touched:
             return
         self._touched = bool(len(middle))

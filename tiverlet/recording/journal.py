@@ -73,10 +73,16 @@ def checksum(before: str, text: str, blob: bytes) -> str:
     return hashlib.sha256(b"\n".join([before.encode(), text.encode(), blob])).hexdigest()
 
 
+def said(report: StepReport | None) -> dict[str, Any]:
+    """The flags of a report, some of which do not follow from the steps alone: a Guard knows what it tried in vain."""
+    return {"flags": sorted(report.flags), "notes": list(report.notes)} if report and report.flags else {}
+
+
 class Journal:
     """Watches a world and writes entries."""
 
-    def __init__(self, world: "World", write: Write):
+    def __init__(self, world: "World", write: Write, told: dict[str, Any]):
+        self._told = told  # what is in the picture and follows from nothing else
         self.world, self.frame, self.bytes = world, 0, 0
         self.worst: StepReport | None = None  # of the whole recording
         self.recent: StepReport | None = None  # since the last frame
@@ -92,7 +98,7 @@ class Journal:
         """Write the scene and its state: at the begin, and when the user has added or removed something."""
         data, arrays = scene.describe(self.world)
         self._known = [copy.deepcopy(scene.knobs(f)) for f in self.world.features]
-        self.put("scene", {"format": FORMAT, **data}, arrays)
+        self.put("scene", {"format": FORMAT, **data, **self._told}, arrays)
         self.size = self.state()
         self.scenes += 1
         self.stirred = set(range(len(self.world.features)))  # all are to be drawn
@@ -108,6 +114,13 @@ class Journal:
         self._serial, self._steps = self._serial + 1, []
         self.bytes += len(text) + len(blob)
         return len(text) + len(blob)
+
+    def frame_drawn(self, data: dict[str, Any]) -> None:
+        """A frame was drawn."""
+        took = {"seconds": self.recent.seconds} if self.recent else {}
+        self.put("frame", {**data, **took, **said(self.recent)})
+        self.recent = None
+        self.stirred.clear()
 
     def _now(self) -> list:
         """What the user has set for the next step, and what the guard remembers."""

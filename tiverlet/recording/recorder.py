@@ -13,7 +13,8 @@ import numpy as np
 
 from .. import checks, interrupts, snapshot
 from ..world import World
-from .journal import JOURNAL, Journal
+from .journal import JOURNAL, Journal, said
+from .picture import Picture, layout
 from .sink import Sink
 
 SEND = 1.0  # [s] after which the points of curves are sent on
@@ -61,7 +62,6 @@ class Recorder:
             raise ValueError(f"Recorder: the folder {folder} does not exist. Make it first: os.makedirs({folder!r}).")
         self.frames = self._calls = 0
         self._thinned: list[tuple[int, int]] = []  # from which frame on each so many are drawn
-        self._seen: set[str] = set()  # flags
         self._open(overwrite)
 
     def __enter__(self) -> "Recorder":
@@ -72,18 +72,13 @@ class Recorder:
 
     @interrupts.uncut
     def _open(self, overwrite: bool) -> None:
-        from .drawing import bounds, links
-        from .layout import blueprint
-
         world = self.world
-        extent = bounds(world)
-        layout = blueprint(*extent, bool(links(world)))
         title = os.path.splitext(os.path.basename(self.path))[0]
-        self._sink = Sink(self.path, f"tiverlet_{world.particles.dim}d", layout, title, overwrite)
+        self._sink = Sink(self.path, f"tiverlet_{world.particles.dim}d", layout(world), title, overwrite)
         self._closing = weakref.finalize(self, self._sink.close)  # also when the process ends
         self._stream = self._sink.stream
         try:
-            self._begin(extent)
+            self._begin(title)
         except BaseException:
             if "_journal" in vars(self):
                 self._journal.close()
@@ -92,21 +87,13 @@ class Recorder:
             raise
         self._sink.keep()
 
-    def _begin(self, extent: tuple[np.ndarray, np.ndarray]) -> None:
+    def _begin(self, title: str) -> None:
         """Write what holds for all frames, and the first one."""
-        from .curves import Curves
-        from .drawing import Drawing
-        from .layout import MIRROR, SCENE
-
-        rr, world = self._rr, self.world
-        self._drawing = Drawing(world, self._stream, extent)
-        flat = world.particles.dim == 2
-        self._drawing.static(SCENE, MIRROR if flat else rr.ViewCoordinates.RIGHT_HAND_Y_UP)
-        self._curves = Curves(world, self._stream)
-        self._drawing.static("about", rr.TextDocument(about(world), media_type="text/markdown"))
+        world, explained = self.world, self.world.explain()
+        self._picture = Picture(world, self._stream, explained)
         self._sent, self._flushed = perf_counter(), 0
-        self._stamp(0)
-        self._journal = Journal(world, self._write)
+        self._picture.stamp(0)
+        self._journal = Journal(world, self._write, {"title": title, "explained": explained})
         self._note_state(self._journal.size)
         self._frame(0)
         self._least = self.bytes + RESERVE
@@ -120,16 +107,12 @@ class Recorder:
         if error := self._sink.error:
             raise _told(error, f"Recorder: nothing could be written to {self.path}")
 
-    def _stamp(self, number: int) -> None:
-        self._stream.set_time("frame", sequence=number)
-        self._stream.set_time("time", duration=self.world.time)
-
     def _write(self, text: str, blob: np.ndarray, checksum: str) -> None:
         self._stream.log(JOURNAL, self._rr.AnyValues(text=text, blob=blob, checksum=checksum), strict=True)
 
     @property
     def _logged(self) -> int:
-        return self._drawing.bytes + self._journal.bytes + 1500 * self.frames
+        return self._picture.drawing.bytes + self._journal.bytes + 1500 * self.frames
 
     @property
     def bytes(self) -> int:
@@ -145,7 +128,7 @@ class Recorder:
             self._frame(self._calls)
         now = perf_counter()
         if now - self._sent > SEND:
-            self._curves.send()
+            self._picture.curves.send()
             self._sent = now
         if self._logged - self._flushed > BACKLOG:
             self.flush()
@@ -159,7 +142,7 @@ class Recorder:
     def flush(self) -> None:
         """Wait until what was logged is in the file, so that it is there whatever happens to the process."""
         self._check()
-        self._curves.send()
+        self._picture.curves.send()
         self._sink.flush()
         self._flushed = self._logged
 
@@ -200,30 +183,19 @@ class Recorder:
     def _note_state(self, size: int) -> None:
         """An exact state of that size was written, to continue from: when the next one is due."""
         self._due = SHARE * size
-        self._drawn, self._last_state = self._drawing.bytes, self._calls
+        self._drawn, self._last_state = self._picture.drawing.bytes, self._calls
 
     def _frame(self, number: int) -> None:
-        world, journal = self.world, self._journal
+        world, journal, picture = self.world, self._journal, self._picture
         journal.frame = number
-        self._stamp(number)
-        if number and (self._drawing.bytes - self._drawn > self._due or number - self._last_state >= SPARSE):
+        picture.stamp(number)
+        if number and (picture.drawing.bytes - self._drawn > self._due or number - self._last_state >= SPARSE):
             self._note_state(journal.state())
-        if journal.scenes > self._drawing.scenes:
-            self._curves.weigh(world)
-            self._drawing.begin()
         now = snapshot.keep(world, pairs=False)
-        n = len(world.particles)
-        x = now.position(n)
+        x = now.position(len(world.particles))
         x32 = x.astype(np.float32)
-        report, journal.recent = journal.recent, None
-        journal.put("frame", {"time": world.time, "hash": now.digest(), "crc": zlib.crc32(x32.tobytes())})
-        self._drawing.frame(x, x32, journal.stirred, bool(report and report.broken))
-        journal.stirred.clear()
-        if report:
-            self._curves.add(number, report, now)
-            if report.flags - self._seen:
-                self._seen |= report.flags
-                self._drawing.event(" ".join(report.notes), "WARN")
+        picture.frame(number, now, x, x32, journal.recent, journal.scenes, journal.stirred)
+        journal.frame_drawn({"time": world.time, "hash": now.digest(), "crc": zlib.crc32(x32.tobytes())})
         self.frames += 1
 
     @interrupts.uncut
@@ -233,11 +205,10 @@ class Recorder:
             return
         journal, world = self._journal, self.world
         journal.close()
-        self._curves.send()
-        end = {"frames": self.frames, "time": world.time}
+        self._picture.curves.send()
+        end: dict[str, Any] = {"frames": self.frames, "time": world.time}
         with contextlib.suppress(RuntimeError):  # a world that was closed, or whose Taichi is gone, has no state
             end["hash"] = world.hash()
-        journal.put("end", end)
         thinned = [f"from frame {frame} on one of {stride}" for frame, stride in self._thinned if stride < 2**40]
         if self._thinned and self._thinned[-1][1] >= 2**40:
             thinned.append(f"from frame {self._thinned[-1][0]} on none")
@@ -248,8 +219,8 @@ class Recorder:
                 f"{', '.join(thinned)}. All steps are in the file; for more frames give a larger budget, for even ones every=."
             )
         if "hash" in end:
-            text = about(world, journal.worst, self.frames, note)
-            self._drawing.static("about", self._rr.TextDocument(text, media_type="text/markdown"))
+            self._picture.end(journal.worst, self.frames, note)
+        journal.put("end", {**end, "note": note, **said(journal.worst)})
         self._sink.check()
         self._closing()
         if self._sink.error:
@@ -269,22 +240,3 @@ def _told(error: Exception, what: str, rest: str = "") -> OSError:
     if isinstance(error, OSError):
         return type(error)(error.errno, f"{what} ({error.strerror}){rest}")
     return OSError(errno.EIO, f"{what} ({error!r}){rest}")
-
-
-def about(world: World, worst=None, frames: int = 0, note: str = "") -> str:
-    """A page about the scene, and about all frames once there are some."""
-    rows = [
-        f"# {len(world.particles)} particles in {world.particles.dim}D",
-        "",
-        "```",
-        world.explain(),
-        "```",
-    ]
-    if worst is not None:
-        rows[1:1] = [
-            "", f"{frames} frames, {world.time:.4g} s simulated.", "", *([note, ""] if note else []),
-            "| worst of all frames | |", "|---|---|", f"| constraint violation | {worst.residual:.2e} |",
-            f"| overlap | {worst.overlap:.2e} radii |", f"| contacts | {worst.contacts} |", f"| broken | {worst.broken} |",
-            f"| flags | {', '.join(sorted(worst.flags)) or 'none'} |", *(f"\n{note}" for note in worst.notes),
-        ]  # fmt: skip
-    return "\n".join(rows)

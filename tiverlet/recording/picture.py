@@ -1,0 +1,92 @@
+"""What the viewer shows of a world, as rows of a rerun stream.
+
+All of it follows from the world, its reports and what the journal says, so that it can be drawn again and compared.
+"""
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..snapshot import Kept
+from ..step_report import StepReport
+
+if TYPE_CHECKING:
+    from ..world import World
+
+
+class Picture:
+    """The scene, its figures as curves, events, and a page about it. explained: what world.explain() says."""
+
+    def __init__(self, world: "World", stream: Any, explained: str):
+        import rerun as rr
+
+        from .curves import Curves
+        from .drawing import Drawing, bounds
+        from .layout import MIRROR, SCENE
+
+        self.world, self._stream, self._explained = world, stream, explained
+        self.drawing = Drawing(world, stream, bounds(world))
+        self.drawing.static(SCENE, MIRROR if world.particles.dim == 2 else rr.ViewCoordinates.RIGHT_HAND_Y_UP)
+        self.curves = Curves(world, stream)
+        self._about(None, 0, "")
+        self._seen: set[str] = set()  # flags
+
+    def _about(self, worst: StepReport | None, frames: int, note: str) -> None:
+        import rerun as rr
+
+        text = about(self.world, self._explained, worst, frames, note)
+        self.drawing.static("about", rr.TextDocument(text, media_type="text/markdown"))
+
+    def stamp(self, number: int) -> None:
+        """What is logged from now on belongs to this frame."""
+        self._stream.set_time("frame", sequence=number)
+        self._stream.set_time("time", duration=self.world.time)
+
+    def frame(
+        self, number: int, now: Kept, x: np.ndarray, x32: np.ndarray, report: StepReport | None, scenes: int,
+        stirred: Iterable[int],
+    ) -> None:  # fmt: skip
+        """Draw a frame. now: its state. x, x32: positions, (n, dim), and rounded to f32. report: the worst of the steps since the
+        last one. scenes: how many there were. stirred: features that were turned since the last frame.
+        """
+        if scenes > self.drawing.scenes:
+            self.curves.weigh(self.world)
+            self.drawing.begin()
+        self.drawing.frame(x, x32, stirred, bool(report and report.broken))
+        if report:
+            self.curves.add(number, report, now)
+            if report.flags - self._seen:
+                self._seen |= report.flags
+                self.drawing.event(" ".join(report.notes), "WARN")
+
+    def end(self, worst: StepReport | None, frames: int, note: str) -> None:
+        """The page about all frames."""
+        self._about(worst, frames, note)
+
+
+def layout(world: "World") -> Any:
+    """How it opens in the viewer."""
+    from .drawing import bounds, links
+    from .layout import blueprint
+
+    return blueprint(*bounds(world), bool(links(world)))
+
+
+def about(world: "World", explained: str, worst: StepReport | None = None, frames: int = 0, note: str = "") -> str:
+    """A page about the scene, and about all frames once there are some."""
+    rows = [
+        f"# {len(world.particles)} particles in {world.particles.dim}D",
+        "",
+        "```",
+        explained,
+        "```",
+    ]
+    if worst is not None:
+        rows[1:1] = [
+            "", f"{frames} frames, {world.time:.4g} s simulated.", "", *([note, ""] if note else []),
+            "| worst of all frames | |", "|---|---|", f"| constraint violation | {worst.residual:.2e} |",
+            f"| overlap | {worst.overlap:.2e} radii |", f"| contacts | {worst.contacts} |", f"| broken | {worst.broken} |",
+            f"| flags | {', '.join(sorted(worst.flags)) or 'none'} |", *(f"\n{note}" for note in worst.notes),
+        ]  # fmt: skip
+    return "\n".join(rows)
