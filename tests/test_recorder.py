@@ -1,12 +1,15 @@
 """Recordings: what is read back is what the world was."""
 
 import warnings
+from itertools import pairwise
 
 import numpy as np
 import pytest
 import rerun as rr
 
 import tiverlet as tv
+from tiverlet.recording.lines import Lines, Sheet, trails
+from tiverlet.recording.strain import LEVELS, SCALE, levels
 
 
 def read(path, entity: str, column: str):
@@ -48,11 +51,17 @@ def test_every_frame_reads_back(world, tmp_path, dim):
     assert sorted(frames) == list(range(13))
     for k, position in enumerate(seen):
         np.testing.assert_array_equal(np.array(frames[k], dtype=np.float32), position.astype(np.float32))
-    strips = read(path, "/world/scene/links/1", f"LineStrips{kind}:strips")
+    strips = read(path, "/world/scene/particles", f"LineStrips{kind}:strips")
+    hues = read(path, "/world/scene/particles", f"LineStrips{kind}:colors")
     for k, position in enumerate(seen):
-        np.testing.assert_array_equal(np.array(strips[k], np.float32), position.astype(np.float32)[links])
+        x = position.astype(np.float32)
+        drawn = [(a, b, hue) for strip, hue in zip(strips[k], hues[k], strict=True) for a, b in pairwise(strip)]
+        np.testing.assert_array_equal(np.array([d[:2] for d in drawn], np.float32), x[links])  # a rope: in its order
+        strain = np.linalg.norm(np.diff(position[links], axis=1)[:, 0], axis=1) / w.features[1].rest - 1
+        assert [d[2] for d in drawn] == SCALE[levels(strain)].tolist()
     radii = read(path, "/world/scene/particles", f"Points{kind}:radii")
     assert list(radii) == [None] and radii[None][0] < 0 and radii[None][1] == np.float32(0.02)
+    assert len(strips[12]) < 29 or len(set(hues[12])) > 1  # neighbours of one colour are one strip
     hues = np.array(read(path, "/world/scene/particles", f"Points{kind}:colors")[None], dtype=np.uint32) >> 8  # RGBA
     red, green, blue = tv.golden_colors(30).astype(np.uint32).T
     np.testing.assert_array_equal(hues[1:], (red << 16 | green << 8 | blue)[1:])
@@ -100,3 +109,61 @@ def test_a_path_is_recorded_to_and_a_recorder_that_logs_nothing_says_so(world, t
         w.run(0.1)
     w.run(0.1, recorder=tmp_path / "b.rrd")
     assert len(tv.replay(tmp_path / "b.rrd").frames) == 7 and tv.replay(tmp_path / "b.rrd").world(6).hash() == w.hash()
+
+
+@pytest.mark.parametrize("count, links", [(2, 1), (7, 12), (30, 29), (40, 200)])
+def test_each_link_is_in_one_strip(count, links):
+    rng = np.random.default_rng(count)
+    pairs = np.stack([rng.integers(0, count, links), rng.integers(0, count, links)], axis=1)
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]  # some are there twice
+    particles, link = trails(pairs)
+    assert sorted(link[link >= 0].tolist()) == list(range(len(pairs))) and link[-1] == -1
+    for k in np.flatnonzero(link >= 0):
+        assert sorted(particles[k : k + 2]) == sorted(pairs[link[k]])
+    level = rng.integers(-1, 3, len(pairs))
+    at, ends, hues = Lines(pairs).strips(level)
+    drawn = [(*sorted(p), h) for a, b, h in zip(ends, ends[1:], hues, strict=False) for p in pairwise(at[a:b].tolist())]
+    assert sorted(drawn) == sorted((*sorted(p), SCALE[v]) for p, v in zip(pairs.tolist(), level, strict=True) if v >= 0)
+
+
+def test_a_rope_is_one_strip_and_a_sheet_is_one_mesh():
+    rope = tv.shapes.rope((0, 0), (1, 0), 40)
+    particles, link = trails(rope.links)
+    assert particles.tolist() == list(range(40)) and link.tolist() == [*range(39), -1]
+
+    sheet = tv.shapes.cloth((0, 0, 0), (1, 0, 0), (0, 0, 1), (6, 5))
+    pairs = np.concatenate([sheet.links, sheet.braces])
+    mesh = Sheet(pairs, sheet.position)
+    assert mesh.used.all()  # threads, diagonals, and what lies on two threads
+    corners = sheet.position[mesh.triangles.astype(int)]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    assert len(area) == 2 * 5 * 4 and area.sum() == pytest.approx(1.0)  # no cell is left out, and none is there twice
+    for triangle in mesh.spots[mesh.triangles.astype(int)]:
+        assert len({*map(tuple, triangle.tolist())}) == 3  # three corners of the texture
+    level = np.full(len(pairs), LEVELS)
+    level[0] += 3  # longer, and one beside it a little shorter
+    level[1] -= 1
+    hues = mesh.colors(level)
+    assert (hues[pairs[0]] == SCALE[LEVELS + 3]).all() and set(hues) == {SCALE[LEVELS + 3], SCALE[LEVELS - 1], SCALE[LEVELS]}
+
+    tetrahedron = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float)
+    mesh = Sheet(np.stack(np.triu_indices(4, 1), axis=1), tetrahedron)
+    assert not len(mesh.triangles) and not mesh.used.any()  # six links, but not flat
+
+
+def test_bytes_of_positions_take_most_of_the_file(world, tmp_path):
+    # Beside n * dim * 4 bytes of a frame there are 0.4 of that, 500 for the journal and curves, and what does not grow: 90 kB.
+    rng = np.random.default_rng(1)
+    sheet = tv.shapes.cloth((0, 1, 0), (1, 0, 0), (0, 0, 1), (16, 16))
+    cloth = tv.Particles(sheet.position, velocity=rng.normal(0, 0.1, (256, 3)))
+    rope = tv.Particles(tv.shapes.rope((0, 0), (1, 0), 200).position, velocity=rng.normal(0, 0.1, (200, 2)))
+    for p, features in (
+        (cloth, [tv.Distance(sheet.links), tv.Distance(sheet.braces, compliance=1e-2)]),
+        (rope, [tv.Distance(tv.shapes.rope((0, 0), (1, 0), 200).links)]),
+    ):
+        w = world(p, [tv.Gravity(1.0), *features], substeps=2)
+        path = tmp_path / f"{p.dim}.rrd"
+        with tv.Recorder(path, w) as recorder:
+            w.run(2.0, recorder=recorder)
+        raw = 121 * len(p) * p.dim * 4
+        assert path.stat().st_size < 1.4 * raw + 90_000 + 500 * 121, (path.stat().st_size / raw, p.dim)

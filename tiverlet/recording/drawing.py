@@ -13,14 +13,17 @@ from ..tools import golden_colors
 from ..wall import Wall
 from .journal import PARTICLES
 from .layout import LEGEND, SCENE, WIDE
-from .strain import colors, legend
+from .lines import Lines, Sheet
+from .strain import legend, levels
 
 if TYPE_CHECKING:
     from ..world import World
 
 POINT = -2.5  # a particle without radius is drawn as a dot of so many pixels (negative: screen units)
-MANY = 5000  # links of a kind that are drawn; of more, an even selection, since lines take most of the file
+MANY = 5000  # links that are drawn as lines; of more, an even selection
+SHEET = 100_000  # links up to which it is asked whether they are a sheet
 FEW = 1500  # particles up to which contacts are drawn; finding them would take too much of the frame beyond
+TOUCH = 4  # one contact is drawn for so many particles, those that push most
 
 
 class Drawing:
@@ -34,6 +37,7 @@ class Drawing:
         flat = world.particles.dim == 2
         self._points: Any = rr.Points2D if flat else rr.Points3D
         self._strips: Any = rr.LineStrips2D if flat else rr.LineStrips3D
+        self._flat = flat
         point = pyarrow.list_(pyarrow.field("item", pyarrow.float32(), nullable=False), world.particles.dim)
         self._strip = pyarrow.list_(pyarrow.field("item", point, nullable=False))  # of rerun's lines
         self.bytes = 0
@@ -41,12 +45,12 @@ class Drawing:
         self.scenes = 0  # that were begun
         self._touched = self._torn = False
 
-    def static(self, entity: str, what: Any) -> None:
+    def static(self, entity: str, *what: Any) -> None:
         """Log what holds for all frames."""
-        self._stream.log(entity, what, static=True, strict=True)
+        self._stream.log(entity, *what, static=True, strict=True)
 
-    def _log(self, entity: str, what: Any) -> None:
-        self._stream.log(entity, what, strict=True)
+    def _log(self, entity: str, *what: Any) -> None:
+        self._stream.log(entity, *what, strict=True)
 
     def begin(self) -> None:
         """What does not change until particles or features come or go; then all is drawn anew, under another name."""
@@ -56,16 +60,15 @@ class Drawing:
             self._log(SCENE, self._rr.Clear(recursive=True))
         self.scenes += 1
         self._contacts = len(p) <= FEW and bool(world._sub.contacts)
-        self._links = [(k, f, slice(None, None, -(-f.count // MANY))) for k, f in links(world)]
         self._broken = {k: f.broken for k, f in enumerate(world.features) if isinstance(f, Batch) and f.breaks}
         hues = golden_colors(len(p))
         hues[p.inv_mass == 0] = (140, 140, 150)
-        self.static(
-            f"{self._root}/{PARTICLES}", self._points.from_fields(radii=np.where(p.radius > 0, p.radius, POINT), colors=hues)
-        )
-        for k, _, _ in self._links:
-            self.static(f"{self._root}/links/{k}", self._strips.from_fields(radii=[-1.2]))
-        if self._links:
+        self._join()
+        what = [self._points.from_fields(radii=np.where(p.radius > 0, p.radius, POINT), colors=hues)]
+        what += [self._sheet.mesh(self._rr)] if self._sheet else []
+        what += [self._strips.from_fields(radii=[-1.2])] if self._lines else []
+        self.static(f"{self._root}/{PARTICLES}", *what)
+        if len(self._pairs):
             hues, labels = legend()
             at = np.stack([WIDE * np.arange(len(hues)), np.zeros(len(hues))], axis=1)
             ends = np.stack([at - [0.45 * WIDE, 0.4], at + [0.45 * WIDE, -0.4]], axis=1)
@@ -74,14 +77,38 @@ class Drawing:
                 f"{LEGEND}/labels", self._rr.Points2D(at + [0, 0.5], colors=hues, labels=labels, radii=[0], show_labels=True)
             )
 
+    def _join(self) -> None:
+        """All links together: as a sheet what is one, and the others as lines."""
+        world = self._world
+        found = links(world)
+        none = np.zeros((0, 2), dtype=np.int64)
+        self._pairs = np.concatenate([none, *(f.indices for _, f in found)])
+        self._rest = np.concatenate([[], *(f.rest if isinstance(f, Link) else np.full(f.count, np.nan) for _, f in found)])
+        self._whole, at = [], 0  # of features whose links break: where they are, and the number of the feature
+        for k, f in found:
+            self._whole += [(slice(at, at + f.count), k)] if k in self._broken else []
+            at += f.count
+        self._sheet = None
+        rest = np.ones(len(self._pairs), dtype=bool)  # of links that are not in it
+        if not self._flat and not self._whole and 0 < len(self._pairs) <= SHEET:
+            start = found[0][1].start.position
+            sheet = Sheet(self._pairs, start) if len(start) == len(world.particles) else None
+            if sheet and len(sheet.triangles):
+                self._sheet, rest = sheet, ~sheet.used
+        some = np.flatnonzero(rest)
+        some = some[:: -(-len(some) // MANY) or 1]
+        self._some, self._lines = some, Lines(self._pairs[some]) if len(some) else None
+
     def frame(self, x: np.ndarray, x32: np.ndarray, turned: Iterable[int], torn: bool) -> None:
         """Draw a frame. x: (n, dim), and rounded to f32. turned: features that are not as they were in the last one. torn: if
         something broke since then.
         """
-        self._log(f"{self._root}/{PARTICLES}", self._points.from_fields(positions=x32))
+        # All in one row: then LZ4 finds the points of lines and sheets among those of the particles.
+        row = [self._points.from_fields(positions=x32)]
         self.bytes += x32.nbytes
-        for link in self._links:
-            self._link(*link, x)
+        if len(self._pairs):
+            row += self._link(x, x32)
+        self._log(f"{self._root}/{PARTICLES}", *row)
         for k in turned:
             self._wall(k)
         if self._contacts:
@@ -90,21 +117,26 @@ class Drawing:
             self._breaks(x)
             self._torn = torn
 
-    def _link(self, k: int, f: Any, some: slice, x: np.ndarray) -> None:
-        """Links as line strips; the strips go to rerun in its own layout, which is ten times as fast."""
-        rows, rest = f.indices[some], f.rest[some] if isinstance(f, Link) else np.full(len(f.indices[some]), np.nan)
-        if k in self._broken:
-            whole = ~self._broken[k][some]
-            rows, rest = rows[whole], rest[whole]
-        ends = x[rows]
-        pa = self._pa
-        points = pa.FixedSizeListArray.from_arrays(pa.array(ends.astype(np.float32).ravel()), type=self._strip.value_type)
-        strips = pa.ListArray.from_arrays(pa.array(np.arange(0, 2 * len(rows) + 1, 2, dtype=np.int32)), points, type=self._strip)
-        r = ends[:, 0] - ends[:, 1]
+    def _link(self, x: np.ndarray, x32: np.ndarray) -> list[Any]:
+        """Links, coloured by their strain; strips go to rerun in its own layout, which is ten times as fast."""
+        r = x[self._pairs[:, 0]] - x[self._pairs[:, 1]]
         with np.errstate(divide="ignore", invalid="ignore"):
-            shades = colors(np.sqrt(np.einsum("ij,ij->i", r, r)) / rest - 1)
-        self._log(f"{self._root}/links/{k}", self._strips.from_fields(strips=strips, colors=shades))
-        self.bytes += shades.nbytes + 4 * ends.size
+            level = levels(np.sqrt(np.einsum("ij,ij->i", r, r)) / self._rest - 1)
+        for some, k in self._whole:
+            level[some][self._broken[k]] = -1
+        row = []
+        if self._sheet:
+            shades = self._sheet.colors(level)
+            row.append(self._rr.Mesh3D.from_fields(vertex_positions=x32, vertex_colors=shades))
+            self.bytes += shades.nbytes // 2
+        if self._lines:
+            particles, ends, shades = self._lines.strips(level[self._some])
+            pa = self._pa
+            points = pa.FixedSizeListArray.from_arrays(pa.array(x32[particles].ravel()), type=self._strip.value_type)
+            strips = pa.ListArray.from_arrays(pa.array(ends.astype(np.int32)), points, type=self._strip)
+            row.append(self._strips.from_fields(strips=strips, colors=shades))
+            self.bytes += shades.nbytes + x32[:1].nbytes * len(particles) // 3
+        return row
 
     def _wall(self, k: int) -> None:
         """A wall or a path, where it is now."""
@@ -118,7 +150,11 @@ class Drawing:
     def _contact(self) -> None:
         """Where particles touch: between the two."""
         world = self._world
-        middle = world.contacts.point if world._h else np.zeros((0, world.particles.dim))
+        middle = np.zeros((0, world.particles.dim))
+        if world._h:
+            found = world.contacts
+            most = np.argsort(-found.impulse, kind="stable")[: -(-len(world.particles) // TOUCH)]
+            middle = found.point[np.sort(most)]
         if not len(middle) and not self._touched:
             return
         self._touched = bool(len(middle))

@@ -15,6 +15,7 @@ PIECE = 1 << 20  # bytes that are read at a time
 HEADER = 12  # bytes of the file before its first message
 HEAD = struct.Struct("<QQ")  # of a message: its kind, and the bytes that follow
 END, CHUNK = 0, 2  # kinds: the last message, and one with data
+BATCH = 120_000  # bytes that are sent together: LZ4 looks back by 64 kB
 LEVEL = 9  # of LZ4: finds the points of lines among those of the particles, at 60 MB/s
 PAYLOAD = b"\x2a"  # field 5 of a message with data, its bytes
 COMPRESSION, SIZE = 2, 3  # its fields with the kind of compression, and how many bytes there are without it
@@ -38,7 +39,8 @@ class Sink:
 
         self.path, self.bytes = path, 0
         self.error: Exception | None = None
-        self.stream: Any = rr.RecordingStream(application, recording_id=uuid.uuid4())
+        batches = rr.ChunkBatcherConfig(flush_num_bytes=BATCH)
+        self.stream: Any = rr.RecordingStream(application, recording_id=uuid.uuid4(), batcher_config=batches)
         if not self.stream.is_enabled():
             raise RuntimeError("Recorder: rerun is switched off by RERUN in the environment; unset it to record.")
         self.stream.set_log_time_enabled(False)
