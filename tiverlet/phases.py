@@ -130,6 +130,9 @@ class Phases(Tiles):
     @ti.func
     def take(self, me, first):
         """What systems found goes to the multipliers."""
+        for system in ti.static(self.systems):
+            if ti.static(system.steps > 0):
+                system.close(me)
         for f in ti.static(self.told):
             for c in range(self.team.low(f.count, me), self.team.high(f.count, me)):
                 f.take(c, first)

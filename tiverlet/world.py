@@ -207,6 +207,8 @@ class World(Launches):
                 self._restart()
             if self._fresh:
                 self._since = 0
+            if self._placed is not None and self._sub.slots and self._sub.slots.system:
+                self._sub.slots.system.forget()
             self._set(h, drag)
             if self._energy is None:
                 self._look()

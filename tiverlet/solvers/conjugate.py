@@ -8,8 +8,12 @@ from ..feature import Batch, Scene
 from ..scalar import TENSEST, Scalar
 from .slots import Slots
 from .solver import Solver
+from .spectrum import largest
 from .system import System
 
+POWER = 30  # rounds of power iteration for lambda_max
+GROWTH, HIGHEST = 1.1, 1.0  # of the floor, by which it grows, and up to where, a link gives way as much as by itself
+CONVERGED = 1e-2  # of r . z at the start of an iteration: what is left at its end
 BLOCKS = 64  # partial sums: their number is fixed, so the total has the same bits on any number of threads
 
 
@@ -22,8 +26,15 @@ class ConjugateGradient(Solver):
     but for what the constraints turn in a substep. The error falls as ((sqrt(kappa) - 1) / (sqrt(kappa) + 1))^steps: some forty
     steps for a cloth of 30 x 30. Sums are over a fixed number of blocks, in f64: the bits are those of any number of threads.
 
-    Made for constraints that can all be met. Where they contradict each other (a row of links drawn straight between two pins),
-    it stops at the tension that the substep can stand ("softened") and may bring in energy; Jacobi and Chebyshev do not.
+    Steps that end before they have converged do something else in every substep, as a spring would whose stiffness jumps, and
+    that brings in energy; where constraints contradict each other (a row of links drawn straight between two pins) they never
+    converge. So once r . z is not down to a hundredth at the end of an iteration, the diagonal gets a floor,
+
+        alpha'_j + sigma W_j,   sigma = lambda_max / steps^2
+
+    with W_j the diagonal of A = G w G^T and lambda_max the largest eigenvalue of W^-1 A: the condition number is then at most
+    steps^2 + 1, for which so many steps suffice, and a link gives way as one of compliance sigma W h^2 would. The floor stays
+    until particles are placed anew, and grows where it is still too low, or where the tension is near what the substep can stand.
 
     steps: of conjugate gradients in an iteration. Ropes, spacers and what is not one number are relaxed as by Jacobi beside it.
     """
@@ -73,11 +84,18 @@ class Krylov(System):
         self.gradient = scene.memory.field("system.gradient", slots.total, width=self.dim)
         self.pull = scene.memory.field("system.pull", self.n, width=self.dim)
         self.part, self.worst = self.reals("part", BLOCKS), self.reals("worst", BLOCKS)
-        self.sums = scene.memory.field("system.sums", None, width=3, kind=ti.f64)  # r.z, the coming weight, what is taken back
+        # r . z, the coming weight, what is taken back; r . z at the start, and the worst tension since
+        self.sums = scene.memory.field("system.sums", None, width=5, kind=ti.f64)
+        self.least = 1.2 * largest(scene, scalars, self.blocks * scene.inv_mass, POWER) / steps**2
+        self.floor = scene.memory.field("system.floor", None, kind=ti.f64, state=True)
 
     def vector(self, name: str):
         """A real number for each row."""
         return self.memory.field(f"system.{name}", self.rows)
+
+    def forget(self) -> None:
+        """Steps may converge from the new places."""
+        self.memory.write(self.floor, 0.0)
 
     @ti.func
     def tell(self, r, violation, A, alpha, lam, W, lever):
@@ -86,7 +104,7 @@ class Krylov(System):
         zero = 0 * violation
         self.step[r] = 0
         self.rest[r] = ti.select(W > 0, -violation / A, zero)
-        self.soft[r] = ti.select(W > 0, alpha / A, zero)
+        self.soft[r] = ti.select(W > 0, alpha / A + ti.cast(self.floor[None], self.real) * W, zero)
         self.scaled[r] = ti.select(W > 0, 1 / (W + self.soft[r]), zero)
         self.ahead[r] = self.scaled[r] * self.rest[r]
 
@@ -121,7 +139,17 @@ class Krylov(System):
         self.team.wait()
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, me)):
-            self.sums[None][0] = self.summed()
+            now = self.summed()
+            self.sums[None] = ti.Vector([now, 0, 0, now, 0], ti.f64)
+        self.team.wait()
+
+    @ti.func
+    def close(self, me):
+        """Raise the floor where the steps have not converged, or have come to a tension that is hard to stand."""
+        ti.loop_config(serialize=True)
+        for _ in range(self.team.one(1, me)):
+            if self.sums[None][0] > CONVERGED * self.sums[None][3] or self.sums[None][4] > TENSEST / 2:
+                self.floor[None] = ti.max(self.least, ti.min(GROWTH * self.floor[None], HIGHEST))
         self.team.wait()
 
     @ti.func
@@ -176,7 +204,8 @@ class Krylov(System):
             back = ti.select(worst > TENSEST, self.sums[None][1], 0 * now)
             if worst > TENSEST:
                 now = 0
-            self.sums[None] = ti.Vector([now, ti.select(before > 0, now / before, 0 * now), back], ti.f64)
+            first, worst = self.sums[None][3], ti.max(worst, self.sums[None][4])
+            self.sums[None] = ti.Vector([now, ti.select(before > 0, now / before, 0 * now), back, first, worst], ti.f64)
         self.team.wait()
         for r in range(self.team.low(self.rows, me), self.team.high(self.rows, me)):
             if self.sums[None][2] != 0:

@@ -9,7 +9,7 @@ from ..tools import golden
 ROUNDS = 300  # of power iteration; it converges from below, and the margin of 1.2 to 4/3 covers what is missing
 
 
-def largest(scene: Scene, scalars: list[Scalar], split: np.ndarray) -> float:
+def largest(scene: Scene, scalars: list[Scalar], split: np.ndarray, rounds: int = ROUNDS) -> float:
     """lambda_max of D^-1 A for the scene as it starts, A = G w G^T and D its diagonal in mass-split weights."""
     w, n, dim = scene.inv_mass, len(scene.inv_mass), scene.particles.dim
     slopes = [b.slopes(b.start.position) for b in scalars]
@@ -20,7 +20,7 @@ def largest(scene: Scene, scalars: list[Scalar], split: np.ndarray) -> float:
     scale = np.divide(1, np.sqrt(D), out=np.zeros(len(D)), where=D > 0)
     x = np.asarray(golden(np.arange(len(D)))) - 0.5
     value = 0.0
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         pull = G * (scale * x)[row][:, None]
         move = np.stack([w * np.bincount(who, pull[:, a], minlength=n) for a in range(dim)], axis=1)
         y = scale * np.bincount(row, (G * move[who]).sum(axis=1))

@@ -71,6 +71,9 @@ class System:
         """The number of constraints that are relaxed by themselves, of those with a particle that can move."""
         return sum(int((~b.idle(self.inv_mass) & (self.row(b) < 0)).sum()) for b in batches)
 
+    def forget(self) -> None:
+        """Particles were placed anew: what was found out on the way to where they were says nothing."""
+
     @ti.func
     def tell(self, r, violation, A, alpha, lam, W, lever):
         """What constraint r is about in this pass, but for what its corners tell. lever: see Scalar."""
