@@ -8,6 +8,7 @@ import tiverlet as tv
 
 from .conftest import case
 from .outlines import CUBE, CUBE_FACES, SQUARE
+from .test_walls import keeps
 
 
 @ti.func
@@ -21,6 +22,16 @@ def boxes(dim: int, **options) -> dict:
     """The square or cube with half sides of 1, in all ways to say it."""
     facets = tv.Polygon(SQUARE, **options) if dim == 2 else tv.Mesh(CUBE, CUBE_FACES, **options)
     return {"facets": facets, "sdf": tv.Sdf(box_distance, **options)}
+
+
+@ti.func
+def round_room(p):
+    """Distance from a round wall, from inside."""
+    return 1 - p.norm()
+
+
+def test_nothing_gets_out_of_a_function(world):
+    keeps(world, [tv.Sdf(round_room, friction=0.3, restitution=0.8)], lambda x, w: 1 - np.linalg.norm(x, axis=1), lambda s: {})
 
 
 MU, BOUNCE = 0.4, 0.5

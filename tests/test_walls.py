@@ -67,6 +67,88 @@ def test_no_particle_is_ever_inside(world, name, dim):
             assert report.energy <= energy + 9.81 * len(x) * 3
 
 
+SLOPE = np.array([[1.0, 0.3], [-1.0, 0.3]]) / np.hypot(1.0, 0.3)
+
+
+# Walls that take turns, or a particle back into themselves, as functions of friction and restitution; how far outside of them a
+# point is; and how they move with a time s.
+TIGHT = {
+    "box": (
+        lambda **k: [tv.Box((-1.0, -1.0), (1.0, 1.0), **k)],
+        lambda x, w: np.minimum(x - w.lower, w.upper - x).min(axis=1),
+        lambda s: {"lower": (-1 + 0.3 * np.sin(s), -1 + 0.2 * np.sin(2 * s)), "upper": (1 - 0.2 * np.sin(3 * s), 1.0)},
+    ),
+    "corner": (
+        lambda **k: [tv.HalfSpace((0.0, 1.0), -0.5, **k), tv.HalfSpace((1.0, 0.0), -0.5, **k)],
+        lambda x, w: np.minimum(x[:, 1] - w.offset, x[:, 0] + 0.5),
+        lambda s: {"offset": -0.5 + 0.4 * np.sin(s)},
+    ),
+    "wedge": (  # of 33 degrees
+        lambda **k: [tv.HalfSpace(n, -0.5, **k) for n in SLOPE],
+        lambda x, w: (x @ SLOPE.T).min(axis=1) + 0.5,
+        lambda s: {},
+    ),
+    "bowl": (
+        lambda **k: [tv.Ball((0.0, 0.0), 1.0, True, **k)],
+        lambda x, w: 1 - np.linalg.norm(x - w.center, axis=1),
+        lambda s: {"center": (0.5 * np.sin(s), 0.5 * np.sin(2 * s))},
+    ),
+    "ball": (
+        lambda **k: [tv.Ball((0.0, 0.0), 0.4, **k)],
+        lambda x, w: np.linalg.norm(x - w.center, axis=1) - 0.4,
+        lambda s: {"center": (0.5 * np.sin(s), 0.5 * np.sin(2 * s))},
+    ),
+    "rod": (  # which turns
+        lambda **k: [tv.Capsule((-0.8, 0.0), (0.8, 0.0), 0.02, **k)],
+        lambda x, w: np.linalg.norm(x - np.clip(x @ w.b / (w.b @ w.b), -1, 1)[:, None] * w.b, axis=1) - 0.02,
+        lambda s: {"a": (-0.8 * np.cos(s), -0.8 * np.sin(s)), "b": (0.8 * np.cos(s), 0.8 * np.sin(s))},
+    ),
+    "hollow": (
+        lambda **k: [tv.Polygon(SQUARE, True, **k)],
+        lambda x, w: 1 - np.abs(x @ np.array([[c := np.cos(w.rotation), -(s := np.sin(w.rotation))], [s, c]])).max(axis=1),
+        lambda s: {"rotation": 0.7 * s},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", TIGHT)
+def test_nothing_gets_out_whatever_takes_it_there(world, name):
+    make, outside, moves = TIGHT[name]
+    keeps(world, make(friction=0.3, restitution=1.0 if name in ("box", "bowl") else 0.8), outside, moves)
+
+
+def keeps(world, walls, outside, moves):
+    """Rows 80 and 81: v h = 0.02 ... 100 half widths, friction, bounces, rods, links that draw particles to anchors on either
+    side, 1 ... 8 iterations, standing and moving walls. Nobody is outside after a substep, and what is free gains no energy."""
+    rng, r, m, h = np.random.default_rng(4), 0.05, 30, 1 / 60
+    x = rng.uniform(-0.9, 0.9, (2000, 2))
+    x = x[outside(x, walls[0]) > r + 0.01][: 3 * m]
+    x = np.concatenate([x, rng.uniform(-2.5, 2.5, (m, 2))])
+    free, rods, drawn = slice(0, m), np.arange(m, 2 * m).reshape(-1, 2), np.arange(2 * m, 3 * m)
+    ties = tv.Distance(np.stack([drawn, drawn + m], axis=1), rng.uniform(0.05, 1, m), compliance=1e-5)
+    start = tv.Particles(x, radius=r, pinned=drawn + m)
+    w = world(start, [tv.Distance(rods), ties, *walls], precision="f64", substeps=1, solver=tv.Jacobi())
+    for iterations in (1, 3, 8):
+        w.iterations = iterations
+        for speed in (0.02, 0.2, 1.0, 20.0, 100.0):
+            v = rng.normal(size=x.shape) * speed / h
+            w.position, w.velocity = x, v
+            most = (v[free] ** 2).sum(axis=1)
+            for _ in range(8):
+                w.step(h)
+                assert outside(w.position[: 3 * m], walls[0]).min() >= r - 1e-12, (iterations, speed)
+                assert ((w.velocity[free] ** 2).sum(axis=1) <= most * (1 + 1e-9)).all(), (iterations, speed)
+        for k in range(30 if moves(0.0) else 0):
+            for knob, value in moves(0.2 * (k + 1)).items():
+                setattr(walls[0], knob, value)
+            w.step(h)
+            assert outside(w.position[: 3 * m], walls[0]).min() >= r - 1e-12, iterations
+        for knob, value in moves(0.0).items():
+            setattr(walls[0], knob, value)
+        w.position = 9.0 * x  # out of the way of a wall that comes back
+        w.step(h)
+
+
 def test_nothing_passes_a_thin_rod(world):
     # Row 46: a rod of 1 mm, points at v h = 0.1 ... 1000 mm; all end on the side that they came from.
     n = 200

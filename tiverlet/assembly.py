@@ -98,8 +98,9 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     if contact or walls:
         scene.radius = Radii(memory, particles.radius)
     surfaces = [*walls, *([contact] if contact else [])]
-    starts = any(f.rubs for f in surfaces) or any(w.sweeps for w in walls)
-    state.remember(memory, starts, any(f.bounces for f in surfaces), bool(contact and walls))
+    rubs, bounces = any(f.rubs for f in surfaces), any(f.bounces for f in surfaces)
+    starts = rubs or any(w.sweeps for w in walls) or (bounces and bool(walls))
+    state.remember(memory, starts, bounces, bool(contact and walls))
     solver = solver or (by_structure(batches, scene.inv_mass) if scene.order == 2 else Direct())
     if batches:
         scene.slots = Slots(scene, batches, solver)

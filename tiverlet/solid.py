@@ -11,7 +11,7 @@ from .feature import Knob, Scene
 from .particles import Particles
 from .wall import Track, Wall
 
-ROUNDS = 8  # touches of one particle in one substep; then it stays where it is known to be free
+TOUCHES = 8  # of one particle in one substep; then it stays where it is known to be free
 
 
 def _position(solid: "Solid", value):
@@ -38,10 +38,12 @@ class Solid(Wall):
 
     A particle is followed in the wall's frame, along the straight line from where it was at the start of the substep: strike()
     finds the first touch, press() deals with it, and the rest of the way is followed in turn. So nothing passes, at any speed of
-    either, and corners need no special case. Where a particle is still on its way in after ROUNDS touches (in a wedge), it stays.
+    either, and corners need no special case. Where a particle is still on its way in after TOUCHES of them (in a wedge), it stays
+    at the last one.
     """
 
     sweeps = poses = True
+    guesses = False  # strike() may miss a touch, so that ends of ways are looked at: a place is free or astray()
     dim = 0
     radius = 0.0  # what the shape is rounded by [m]
     _on_close = 0.0  # what rounding amounts to in the wall's frame [m]
@@ -142,7 +144,7 @@ class Solid(Wall):
         return ti.cast(2, self._on_real), 0 * far, 0 * e
 
     @ti.func
-    def confine(self, i, radius, h, when):
+    def confine(self, i, radius, h, when, turn):
         """Touch by touch along the way.
 
         The wall moves by what its point under the start of the particle moves, so what sticks rides along and does not creep.
@@ -154,22 +156,42 @@ class Solid(Wall):
         close = ti.max(self._on_state.digits(i), ti.cast(self._on_close, self._on_real))
         if ti.static(self._on_state.befores):
             # What has bounced in this substep is not where its displacement says.
-            lift = self._on_state.place(i) - start - self._on_state.d[i]
-            if lift.norm() > 4 * close:
+            high, lift = self.lifted(i)
+            if high:
                 e += self.inward(1, lift)
-        a, going = first, True
-        for k in range(ROUNDS + 1):
+        a, going, touched = first, True, False
+        for k in range(TOUCHES + 1):
             if going:
                 s, depth, n = self.strike(a, e, far, close, self.push_out * h)
                 if s > 1:
                     going = False
-                elif k < ROUNDS:
-                    shift = self.press(i, depth, self.outward(1, n), moved, h)
+                elif k < TOUCHES:
+                    touched = True
+                    sunk = ti.select(s > 0, ti.min(depth, 0), depth + e.dot(n))
+                    shift = self.press(i, depth, sunk, self.outward(1, n), moved, h, turn)
                     a += s * e
                     e += self.inward(1, shift) - s * e
-                else:
-                    self._on_state.d[i] = moved + self.outward(1, a - first)
-                    self._on_state.restart(i)
+        if ti.static(self.guesses):
+            if touched and not self.astray(first, far - 8 * close, close):
+                going = going or self.astray(a + e, far, close)
+                if going and self.astray(a, far, close):
+                    a = first
+        if going:
+            # There with no more speed than it had.
+            gone = self.outward(1, a - first)
+            d = self._on_state.d[i]
+            size, speed = gone.norm(), (d - moved).norm()
+            self._on_state.d[i] = moved + gone
+            self._on_state.restart(i)
+            if size > speed:
+                self._on_state.d[i] = moved + gone * (speed / size)
+            if ti.static(self._on_state.befores):
+                self._on_state.before[i] = self._on_state.before[i] + (self._on_state.d[i] - d)
+
+    @ti.func
+    def astray(self, q, far, close):
+        """Whether a particle with its center at q, in the wall's frame, is inside of the wall."""
+        return False
 
 
 def rotation_matrix(rotation) -> np.ndarray:

@@ -7,10 +7,9 @@ from .compiling import FEW
 from .feature import Acceleration, Batch, Scene
 from .motion import Motion
 from .team import Team, block, blocks
-from .wall import Wall
+from .wall import AGAIN, FIRST, GENTLY, ROUNDS, SWEEPS, Wall
 
 TILE = 256  # particles that a thread takes at a time, through several loops: their state stays in its cache
-SWEEPS = 8  # rounds over the walls, for particles that several of them push
 
 
 class Tiles(Motion):
@@ -27,6 +26,7 @@ class Tiles(Motion):
         self.slots, self.grid, self.walls, self.radius = scene.slots, grid, walls, scene.radius
         self.batches: list[Batch] = [b for b in batches if b.count]
         self.contacts = [contact] if contact else []
+        self.rough = any(w.rubs or w.bounces for w in walls)
         if walls:
             self.thrust = scene.memory.field("thrust", self.n, width=self.dim, state=True)
 
@@ -126,19 +126,37 @@ class Tiles(Motion):
 
     @ti.func
     def confine(self, i, h, when):
-        """The walls, which have the last word; several take turns until they agree, or for SWEEPS rounds in a sharp corner."""
+        """The walls, which have the last word; they take turns until they agree, see Wall."""
         if self.state.w.of(i) > 0:
-            if ti.static(len(self.walls) == 1):
+            if ti.static(len(self.walls) == 1 and not self.walls[0].repeats):
                 for f in ti.static(self.walls):
-                    f.confine(i, self.radius.of(i), h, when)
+                    f.confine(i, self.radius.of(i), h, when, FIRST)
             else:
-                moving = True
-                for _ in range(SWEEPS):
+                moving, turn = True, FIRST
+                for k in range(SWEEPS + ROUNDS + 1):
                     if moving:
-                        before = self.state.d[i]
+                        if k == SWEEPS + ROUNDS:
+                            self.stay(i)
+                        x, d = self.state.x[i], self.state.d[i]
                         for f in ti.static(self.walls):
-                            f.confine(i, self.radius.of(i), h, when)
-                        moving = (self.state.d[i] != before).any()
+                            f.confine(i, self.radius.of(i), h, when, turn)
+                        settled = (self.state.d[i] == d).all() and (self.state.x[i] == x).all()
+                        # With friction or bounces a round may come back to where it began, and not be free there.
+                        moving = not (settled and (turn == GENTLY or ti.static(not self.rough)))
+                        turn = FIRST if ti.static(len(self.walls) > 1) else AGAIN
+                        if settled or k + 1 >= SWEEPS:
+                            turn = GENTLY
+
+    @ti.func
+    def stay(self, i):
+        """Put particle i back to where it was at the start of the substep, at rest."""
+        if ti.static(self.state.starts):
+            if ti.static(self.state.befores):
+                self.state.before[i] = self.state.before[i] - self.state.d[i]
+            self.state.d[i] = ti.zero(self.state.d[i])
+            self.state.restart(i)
+        else:
+            self.state.shift(i, -self.state.d[i])
 
     @ti.func
     def felt(self, i, h, t, firm):

@@ -10,6 +10,10 @@ from .feature import Feature, Scene
 from .material import friction_of, restitution_of
 from .memory import Memory
 
+SWEEPS = 8  # rounds over the walls, for particles that several of them push
+ROUNDS = 32  # more of them, without friction and bounces
+# How a wall confines: as it comes; only what is further out than rounding; of that, without friction and bounces.
+FIRST, AGAIN, GENTLY = range(3)
 TOUCH = 2.0**-20  # of the size of a wall: a start that is no deeper inside than this counts as on the surface
 
 
@@ -17,7 +21,13 @@ class Wall(Feature):
     """Each particle by itself is kept on one side, with the last word in every iteration.
 
     A wall's confine() finds how deep a particle is, and calls press(). One-sided: what entered in this substep is taken back
-    whole, at any speed. Depth from before (a bad start) is left at `push_out` [m/s], and gives no more velocity than that.
+    whole, at any speed, whether it flew in or constraints, contacts, friction or a bounce off another wall took it there. Depth
+    from before (a bad start) is left at `push_out` [m/s], and gives no more velocity than that.
+
+    Where one correction may lead into a wall again (several walls, a box in whose corners particles bounce), corrections take
+    turns until none changes anything: SWEEPS rounds as they come, then ROUNDS without friction and bounces, which are projections
+    of the displacement and give no energy. What is still not free then, in a wedge, stays where it was at the start of the
+    substep. Walls that move towards each other may leave no room at all: then the last of them in the list has its way.
 
     friction: Coulomb, a number or (static, dynamic). The tangential displacement relative to the wall is taken back, up to
     friction times the normal displacement that the wall gave, so neither coefficient depends on h. What sticks goes back to
@@ -29,6 +39,7 @@ class Wall(Feature):
     push_out = 1.0
     static, dynamic, restitution = 0.0, 0.0, 0.0
     sweeps = False  # needs the exact position at the start of the substep
+    repeats = False  # one confine() may leave a particle that rubs or bounces where it has to be confined again
     poses = False  # has a pose(when) to be worked out once for each substep, before any confine()
 
     def surface(self, friction: Any, restitution: Any, push_out: float) -> None:
@@ -64,13 +75,32 @@ class Wall(Feature):
         return 1
 
     @ti.func
-    def confine(self, i, radius, h, when):
-        """Move particle i out of the wall, with self.press."""
+    def confine(self, i, radius, h, when, turn):
+        """Move particle i out of the wall, with self.press. turn: FIRST, AGAIN or GENTLY."""
 
     @ti.func
-    def press(self, i, depth, n, moved, h):
+    def lifted(self, i):
+        """Whether particle i is not where its displacement says, because it has bounced in this substep; and by how much."""
+        lift = 0 * self._on_state.d[i]
+        if ti.static(self._on_state.befores):
+            lift = self._on_state.place(i) - self._on_state.begin(i) - self._on_state.d[i]
+        return lift.norm() > 4 * self._on_state.digits(i), lift
+
+    @ti.func
+    def way(self, i, moved):
+        """From where particle i was at the start of the substep to where it is, as seen from a wall that moved by `moved`."""
+        out = self._on_state.d[i] - moved
+        if ti.static(self._on_state.befores):
+            high, lift = self.lifted(i)
+            if high:
+                out += lift
+        return out
+
+    @ti.func
+    def press(self, i, depth, sunk, n, moved, h, turn):
         """Take particle i out of a wall that it entered by `depth` [m], along the normal n; the wall itself moved by `moved`.
 
+        sunk: how deep it was at the start of the substep, 0 or less outside [m]. turn: FIRST, AGAIN or GENTLY.
         What comes as close as the last digits of the position can tell touches: it does not sink, or slip, by these digits.
         Returns how the position was shifted.
         """
@@ -80,31 +110,38 @@ class Wall(Feature):
         close = self._on_state.digits(i)
         if depth > -close:
             depth = ti.max(depth, ti.min(-leaving, close))
-        if depth > 0:
-            move = ti.min(depth, ti.max(self.push_out * h - leaving, 0))
-            after = leaving + move  # normal displacement after the substep
+        if depth > ti.select(turn == FIRST, 0, close):
+            move = ti.max(depth - ti.max(sunk - self.push_out * h, 0), 0)
+            # Normal displacement after the substep; what has bounced may be moved further than that is to tell.
+            after = ti.min(leaving + move, ti.max(ti.abs(leaving), self.push_out * h))
             rise = 0 * depth
             if ti.static(self._on_bounces):
+                # Where the last bounce has put it back on a straight way, that way began at a height of `gap`.
                 gap = -depth - leaving
-                if gap >= 0 and leaving < 0:
+                if gap >= 0 and leaving < 0 and turn != GENTLY:
                     rise, after = self.bounce(gap, leaving, (self._on_state.before[i] - moved).dot(n), after)
-                    if rise > 0:
-                        self._on_state.before[i] = self._on_state.before[i] + (after - leaving) * n
             change = (after - leaving) * n
             if ti.static(self._on_state.leans):
                 self._on_state.lean[i] = self._on_state.lean[i] + change
             shift = (move + rise) * n
             stuck = False
             if ti.static(self._on_rubs):
-                slip = d - leaving * n
-                size, given = slip.norm(), after - leaving
-                if size > self.static * given:
-                    slip *= self.dynamic * given / size
-                else:
-                    stuck = rise == 0
-                change -= slip
-                shift -= slip
+                if turn != GENTLY:
+                    slip = d - leaving * n
+                    size, given = slip.norm(), after - leaving
+                    if size > self.static * given:
+                        slip *= self.dynamic * given / size
+                    else:
+                        high, _lift = self.lifted(i)
+                        stuck = rise == 0 and not high
+                    change -= slip
+                    shift -= slip
             self._on_state.d[i] = self._on_state.d[i] + change
+            if ti.static(self._on_state.befores):
+                blow = change  # which is no acceleration
+                if rise == 0:
+                    blow -= (after - leaving) * n
+                self._on_state.before[i] = self._on_state.before[i] + blow
             if ti.static(self._on_rubs):
                 if stuck:
                     self._on_state.restart(i)

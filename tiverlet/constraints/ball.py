@@ -18,6 +18,7 @@ class Ball(Wall):
     keep particles in. friction, restitution, push_out: see Wall.
 
     What passes through in one substep is caught on the way in: the moment when it met the surface is solved for, as for pairs.
+    Nothing passes at any speed, nor can anything draw it through.
     """
 
     dim = 0
@@ -37,6 +38,11 @@ class Ball(Wall):
         if self.inside and wide.any():
             i = int(np.argmax(wide))
             raise ValueError(f"Ball: particle {i} of radius {particles.radius[i]:g} m does not fit inside {self.radius:g} m.")
+
+    @property
+    def repeats(self) -> bool:
+        """Inside, the way along the surface leads out, and a bounce may lead to the other end."""
+        return self.inside and (self.rubs or self.bounces)
 
     def bind(self, scene: Scene) -> None:
         """The center at the start and the end of a frame."""
@@ -66,15 +72,16 @@ class Ball(Wall):
         return np.array(circles), 0.0
 
     @ti.func
-    def confine(self, i, radius, h, when):
+    def confine(self, i, radius, h, when, turn):
         """The surface where it was met, or where it is nearest."""
         center, moved = self._on_center.at(when[1]), self._on_center.step(when)
         r = self._on_state.place(i) - center
         far = ti.cast(self.radius, self._on_real)
         depth, n = self.nearest(r, far, radius)
+        d = self.way(i, moved)
+        start = r - d
+        sunk, _n = self.nearest(start, far, radius)
         if ti.static(not self.inside):
-            d = self._on_state.d[i] - moved
-            start = r - d
             far += radius
             c, b, a = start.dot(start) - far * far, start.dot(d), d.dot(d)
             root = b * b - a * c
@@ -83,7 +90,7 @@ class Ball(Wall):
                 if s < 1:
                     n = (start + s * d).normalized()
                     depth = (s - 1) * d.dot(n)
-        self.press(i, depth, n, moved, h)
+        self.press(i, depth, sunk, n, moved, h, turn)
 
     @ti.func
     def nearest(self, r, far, radius):

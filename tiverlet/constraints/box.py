@@ -38,7 +38,7 @@ class Box(Wall):
     there during the next frame (to or from an open side they jump). friction, restitution, push_out:
     see Wall.
 
-    One-sided: a particle cannot leave at any speed.
+    One-sided: a particle cannot leave at any speed, nor can anything draw it out.
     """
 
     dim = 0
@@ -70,6 +70,11 @@ class Box(Wall):
                 f"push_out = {self.push_out:g} m/s brings it in. Move it, or make the box larger.",
                 stacklevel=3,
             )
+
+    @property
+    def repeats(self) -> bool:
+        """In a corner friction on one side may lead into another, and a bounce may lead to the other end."""
+        return self.rubs or self.bounces
 
     def bind(self, scene: Scene) -> None:
         """Corners at the start and the end of a frame."""
@@ -120,7 +125,7 @@ class Box(Wall):
         return out
 
     @ti.func
-    def confine(self, i, radius, h, when):
+    def confine(self, i, radius, h, when, turn):
         """Two planes per axis, lower ones first."""
         if self.near(i, radius) != 0:
             for side in range(ti.static(2 * self.dim)):
@@ -131,4 +136,4 @@ class Box(Wall):
                         n[k], moved[k], depth = 1, shift, wall + radius - x[k]
                     elif side == k + self.dim:
                         n[k], moved[k], depth = -1, shift, x[k] + radius - wall
-                self.press(i, depth, n, moved, h)
+                self.press(i, depth, depth + self.way(i, moved).dot(n), n, moved, h, turn)

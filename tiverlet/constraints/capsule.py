@@ -23,8 +23,8 @@ class Capsule(Wall):
     a, b: (dim,) [m], live: the ends move to what is assigned during the next frame. radius: R [m], above 0. friction,
     restitution, push_out: see Wall.
 
-    What passes through in one substep is caught on the way in, however thin the rod: the path is followed to where it meets the
-    surface (sphere tracing, Hart 1996).
+    What passes through in one substep is caught on the way in, however thin the rod: the path, as seen from the rod, is followed
+    to where it meets the surface (sphere tracing, Hart 1996). Nothing can be drawn through either.
     """
 
     dim = 0
@@ -77,17 +77,30 @@ class Capsule(Wall):
         return t, length, n
 
     @ti.func
-    def confine(self, i, radius, h, when):
+    def along(self, x, a, b, when):
+        """Where a point at x, at the start of the substep, would be if the rod took it along as it turns: beside the same place
+        on the axis, which ends between a and b, and as far from it."""
+        t, length, n = self.nearest(x, self._on_a.at(when[0]), self._on_b.at(when[0]))
+        axis = b - a
+        if 0 < t < 1:
+            n -= axis * (n.dot(axis) / axis.dot(axis))
+        return a * (1 - t) + b * t + n * (length / ti.max(n.norm(), TOUCH))
+
+    @ti.func
+    def confine(self, i, radius, h, when, turn):
         """The surface where it was met, or where it is nearest."""
         a, b = self._on_a.at(when[1]), self._on_b.at(when[1])
         x, far = self._on_state.place(i), ti.cast(self.radius, self._on_real) + radius
         t, length, n = self.nearest(x, a, b)
         depth = far - length
         moved = self._on_a.step(when) * (1 - t) + self._on_b.step(when) * t
-        d = self._on_state.d[i] - moved
+        d = self.way(i, moved)
+        if (self._on_a.step(when) != self._on_b.step(when)).any():
+            d = x - self.along(x - self.way(i, 0 * x), a, b, when)
         way = d.norm()
         _t, gap, _n = self.nearest(x - d, a, b)  # not twice the same name: Taichi would assign a vector to a number
         gap -= far
+        sunk = -gap
         # It was outside, or touched, and may have come in: walk along the path, never further than the surface is away.
         if gap > -TOUCH * far and gap < way:
             s = ti.max(gap, 0) / way
@@ -99,4 +112,4 @@ class Capsule(Wall):
             if s < 1:
                 _t, _gap, n = self.nearest(x - (1 - s) * d, a, b)
                 depth = (s - 1) * d.dot(n)
-        self.press(i, depth, n, moved, h)
+        self.press(i, depth, sunk, n, moved, h, turn)

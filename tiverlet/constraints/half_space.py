@@ -17,7 +17,7 @@ class HalfSpace(Wall):
     normal: (dim,), any length above 0; offset: [m] along the unit normal, from the origin. offset is live: assign to it between
     frames, and the plane moves there during the next frame. friction, restitution, push_out: see Wall.
 
-    One-sided: a particle cannot pass at any speed.
+    One-sided: a particle cannot pass at any speed, nor can anything draw it through.
     """
 
     offset = Knob(lambda f, v: checks.number("HalfSpace", "offset", v), "Of the plane along its normal [m].")
@@ -63,11 +63,12 @@ class HalfSpace(Wall):
         return np.stack([foot - reach * across, foot + reach * across], axis=1), 0.0
 
     @ti.func
-    def confine(self, i, radius, h, when):
+    def confine(self, i, radius, h, when, turn):
         """One plane."""
         n, offset = self._on_normal[None], self._on_offset[None]
         before, now = (
             offset[0] * (1 - when[0]) + offset[1] * when[0],
             offset[0] * (1 - when[1]) + offset[1] * when[1],
         )
-        self.press(i, now + radius - n.dot(self._on_state.place(i)), n, (now - before) * n, h)
+        depth, moved = now + radius - n.dot(self._on_state.place(i)), (now - before) * n
+        self.press(i, depth, depth + self.way(i, moved).dot(n), n, moved, h, turn)

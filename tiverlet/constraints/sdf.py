@@ -41,6 +41,8 @@ class Sdf(Solid):
     checked where particles start and around, and ValueError names the place.
     """
 
+    guesses = True
+
     def __init__(
         self, function, gradient=None, *, radius=0.0, position=0.0, rotation=0.0, friction=0.0, restitution=0.0, push_out=1.0
     ):  # fmt: skip
@@ -111,6 +113,11 @@ class Sdf(Solid):
                 local = (grid.reshape(-1, self.dim) - self.position) @ rotation_matrix(self.rotation)
                 out.append(contour(grid, self._on_probe.value(local).reshape(129, 129) - self.radius))
         return np.concatenate(out), 0.0
+
+    @ti.func
+    def astray(self, q, far, close):
+        """By more than rounding."""
+        return self.function(q) < far - close
 
     @ti.func
     def normal(self, q):

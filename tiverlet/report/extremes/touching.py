@@ -2,10 +2,11 @@
 
 import numpy as np
 
-from ...constraints import Box, Capsule, Contact, HalfSpace
+from ...constraints import Ball, Box, Capsule, Contact, Distance, HalfSpace
 from ...forces import Drag, Gravity
 from ...measure import kinetic_energy
 from ...particles import Particles
+from ...solvers import Jacobi
 from .row import Finding, contacts_of, finite, pairs_of, rerun, row, same_pairs, warned, world
 
 
@@ -114,6 +115,51 @@ def _fast() -> Finding:
             w.step(1 / 60)
             deepest = max(deepest, float(np.abs(w.position).max() - 0.9), float(-0.4 - (w.position @ slope).min()))
     return Finding(f"deepest {deepest:.0e} m, in the corner of both", {"inside": deepest <= 1e-3})
+
+
+ROOMS = {
+    "box": (lambda **k: [Box((-1, -1), (1, 1), **k)], lambda x: 1 - np.abs(x).max(axis=1)),
+    "corner": (lambda **k: [HalfSpace((1, 0), -1, **k), HalfSpace((0, 1), -1, **k)], lambda x: 1 + x.min(axis=1)),
+    "ball": (lambda **k: [Ball((0, 0), 1, inside=True, **k)], lambda x: 1 - np.linalg.norm(x, axis=1)),
+}
+
+
+def _kept_in(features, pinned, holds: dict[str, bool], **settings) -> float:
+    """Throw 40 particles about in every room, at v h = 0.1 ... 100 half widths; how far outside one was at worst."""
+    rng, worst = np.random.default_rng(0), 0.0
+    x = np.concatenate([rng.uniform(-0.6, 0.6, (40, 2)), rng.uniform(-3, 3, (len(pinned), 2))])
+    aim = rng.normal(size=x.shape)
+    aim /= np.linalg.norm(aim, axis=1)[:, None]
+    for name, (make, inside) in ROOMS.items():
+        for friction, restitution in ((0.5, 0.0), (0.4, 1.0)):
+            made = [*features(), *make(friction=friction, restitution=restitution)]
+            with world(Particles(x, radius=0.1, pinned=pinned), made, substeps=1, **settings) as w:
+                deepest = 0.0
+                for iterations in (1, 2, 8):
+                    w.iterations = iterations
+                    for ratio in (0.1, 1.0, 10.0, 100.0):
+                        w.position, w.velocity = x, 60 * ratio * aim
+                        for _ in range(10):
+                            w.step(1 / 60)
+                            deepest = max(deepest, 0.1 - float(inside(w.position[:40]).min()))
+            worst = max(worst, deepest)
+            holds[f"{name}, friction {friction:g}, restitution {restitution:g}: {deepest:.1e} m"] = deepest <= 1e-12
+    return worst
+
+
+@row(80, "v h = 0.1 ... 100 half widths in a Box, a corner of two HalfSpaces, inside a Ball", "inside after every substep")
+def _thrown() -> Finding:
+    holds: dict[str, bool] = {}
+    worst = _kept_in(lambda: [], [], holds)
+    return Finding(f"{worst:.0e} m outside", holds)
+
+
+@row(81, "links that pull through a wall, 1 ... 8 iterations, restitution 0 ... 1", "inside after every substep")
+def _drawn() -> Finding:
+    holds: dict[str, bool] = {}
+    pairs = np.stack([np.arange(20), np.arange(40, 60)], axis=1)
+    worst = _kept_in(lambda: [Distance(pairs, 0.1, compliance=1e-5)], np.arange(40, 60), holds, solver=Jacobi())
+    return Finding(f"{worst:.0e} m outside", holds)
 
 
 @row(46, "a rod of 1 mm, v h from 0.1 to 1000 mm", "nothing passes")
