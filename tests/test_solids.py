@@ -228,7 +228,7 @@ def test_solids_have_the_same_bits_on_both_paths(world, kind):
         wall = boxes(3, friction=0.4, restitution=0.3)[kind]
         wall.position = (0.1, 0.0, 0.0)
         w = world(
-            tv.Particles(x, velocity=v, radius=0.08), [tv.Gravity(9.81), wall, tv.Box([-3] * 3, [3] * 3)], path=path, substeps=6
+            tv.Particles(x, velocity=v, radius=0.08), [tv.Gravity(9.81), wall, tv.Box([-3] * 3, [3, 5, 3])], path=path, substeps=6
         )
         for k in range(30):
             wall.rotation = (0.02 * k, 0.0, 0.05 * k)
