@@ -14,7 +14,7 @@ import pytest
 
 import tiverlet as tv
 from tiverlet.__main__ import main
-from tiverlet.recording import journal, recorder, rrd, viewer
+from tiverlet.recording import journal, messages, recorder, rrd, viewer
 
 from .conftest import python
 
@@ -293,13 +293,44 @@ def test_a_budget_is_kept_and_said(world, tmp_path):
     with pytest.raises(ValueError, match="Give at least"):
         tv.Recorder(tmp_path / "a.rrd", w, budget=1000)
     assert not (tmp_path / "a.rrd").exists()
-    with pytest.warns(UserWarning, match=r"of 401 frames are drawn: from frame [0-9]+ on one of 2, .*All steps are in the file"):
-        with tv.Recorder(tmp_path / "b.rrd", w, budget=500_000) as recorder:
-            w.run(400 / 60, recorder=recorder)
-    assert (tmp_path / "b.rrd").stat().st_size < 500_000
-    recording = tv.replay(tmp_path / "b.rrd")
-    assert 60 < len(recording.frames) < 300 and recording.frames[-1] > 120
-    assert recording.verify()
+    sizes = []
+    with pytest.warns(UserWarning, match=r"budget = 500000 bytes, the picture has one of [48] frames. All steps are in the file"):
+        with tv.Recorder(tmp_path / "b.rrd", w, budget=500_000) as recording:
+            for _ in range(400):
+                w.step(1 / 60)
+                recording.log()
+                sizes.append((tmp_path / "b.rrd").stat().st_size)
+    assert max(sizes) < 500_000 and (tmp_path / "b.rrd").stat().st_size < 500_000
+    recording = tv.replay(tmp_path / "b.rrd")  # the whole run is there
+    assert {*range(0, 401, 8)} <= {*recording.frames.tolist()} and len(recording.frames) < 110
+    assert recording.verify() and recording.complete
+    frames, values = recording.curves["energy"]
+    assert {*range(8, 401, 8)} <= {*frames.tolist()} and len(frames) < 110 and np.isfinite(values).all()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["b.rrd"]
+
+    # What the user does in each step is in the file, too: where not even that fits, the recording ends, and says so.
+    gravity = w.features[0]
+    with pytest.warns(UserWarning, match="do not fit in it after frame [0-9]+, where the recording ends"):
+        with tv.Recorder(tmp_path / "c.rrd", w, budget=320_000) as recording:
+            for k in range(1500):
+                gravity.g = 9.0 + 0.001 * k
+                w.step(1 / 60)
+                recording.log()
+    assert (tmp_path / "c.rrd").stat().st_size < 320_000
+    recording = tv.replay(tmp_path / "c.rrd")
+    assert recording.complete and recording.verify() and 50 < recording.frames[-1] < 1500
+
+
+@pytest.mark.parametrize("stride", [2, 4, 8])
+def test_frames_are_taken_out_so_that_the_rest_shows_the_same(stride):
+    # What is seen in a frame that is kept is the last row up to it: the same before and after.
+    for frames in ([], [0], list(range(41)), [0, 3, 5, 6, 17], [7], [0, 8, 9, 16, 39, 40]):
+        gone = messages.droppable(np.array(frames, dtype=np.int64), stride)
+        rest = [frame for frame, drop in zip(frames, gone, strict=True) if not drop]
+        for kept in range(0, 41, stride):
+            seen = [max([k for k in rows if k <= kept], default=None) for rows in (frames, rest)]
+            assert seen[0] == seen[1]
+        assert len(rest) <= 40 // stride + 3 or len(frames) < 10
 
 
 def test_command_line(falling, tmp_path, monkeypatch, capsys):

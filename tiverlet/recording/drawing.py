@@ -27,7 +27,7 @@ TOUCH = 4  # one contact is drawn for so many particles, those that push most
 
 
 class Drawing:
-    """The picture of a world in a rerun stream. `bytes` is about what was logged."""
+    """The picture of a world in a rerun stream. `bytes` is about what was logged, uncompressed."""
 
     def __init__(self, world: "World", stream: Any, extent: tuple[np.ndarray, np.ndarray]):
         import pyarrow
@@ -128,14 +128,14 @@ class Drawing:
         if self._sheet:
             shades = self._sheet.colors(level)
             row.append(self._rr.Mesh3D.from_fields(vertex_positions=x32, vertex_colors=shades))
-            self.bytes += shades.nbytes // 2
+            self.bytes += shades.nbytes + x32.nbytes
         if self._lines:
             particles, ends, shades = self._lines.strips(level[self._some])
             pa = self._pa
             points = pa.FixedSizeListArray.from_arrays(pa.array(x32[particles].ravel()), type=self._strip.value_type)
             strips = pa.ListArray.from_arrays(pa.array(ends.astype(np.int32)), points, type=self._strip)
             row.append(self._strips.from_fields(strips=strips, colors=shades))
-            self.bytes += shades.nbytes + x32[:1].nbytes * len(particles) // 3
+            self.bytes += shades.nbytes + ends.nbytes + x32[:1].nbytes * len(particles)
         return row
 
     def _wall(self, k: int) -> None:

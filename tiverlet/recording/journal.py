@@ -6,6 +6,7 @@
     turned    knobs that the user turned, before the next step
     assigned  positions or velocities that the user assigned
     frame     a frame of the picture, and the hash of the state then
+    thinned   of all frames before, only one of `stride` is still in the picture
     end       the recording was closed
 
 Each entry also says which steps were made since the one before, and carries a checksum of itself and of all before it.

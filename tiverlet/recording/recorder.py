@@ -20,7 +20,7 @@ from .sink import Sink
 SEND = 1.0  # [s] after which the points of curves are sent on
 LOOK = 0.2  # [s] after which the file is looked for
 BACKLOG = 32 << 20  # bytes that may wait to be written
-SHARE = 10  # an exact state is written when the pictures since the last one weigh so many times as much
+SHARE = 20  # an exact state is written when the pictures since the last one weigh so many times as much, uncompressed
 SPARSE = 300  # frames after which one is written in any case
 RESERVE = 40_000  # bytes of a budget for the layout and the summary
 
@@ -33,8 +33,9 @@ class Recorder:
             recorder.log()
 
     path: the file; its folder must exist. world: what to record. every: log only each so many frames. budget: bytes that the file
-    may have; when they run short, fewer frames are drawn, and a warning at the end says which. overwrite: whether a file that is
-    there may be replaced; it stays as it is until the new one has its first frame.
+    may have. When they run short, every other frame is taken out of the picture of the whole run, again and again, and a warning
+    at the end says so; all steps stay in the file. overwrite: whether a file that is there may be replaced; it stays as it is
+    until the new one has its first frame.
 
     Drawn are positions (f32), links coloured by their strain, walls, contacts of up to 1500 particles, what breaks, and curves.
     Beside that the file holds the scene with all arguments, exact states to continue from, the hash of every frame drawn, every
@@ -61,7 +62,10 @@ class Recorder:
         if not os.path.isdir(folder):
             raise ValueError(f"Recorder: the folder {folder} does not exist. Make it first: os.makedirs({folder!r}).")
         self.frames = self._calls = 0
-        self._thinned: list[tuple[int, int]] = []  # from which frame on each so many are drawn
+        self._stride = self.every  # one of how many frames is drawn
+        self._each = 0  # bytes of a frame, about
+        self._note = ""  # what the budget has left out
+        self._full = self._closed = False  # whether the budget has ended the recording; whether close() was called
         self._open(overwrite)
 
     def __enter__(self) -> "Recorder":
@@ -96,16 +100,16 @@ class Recorder:
         self._journal = Journal(world, self._write, {"title": title, "explained": explained})
         self._note_state(self._journal.size)
         self._frame(0)
-        self._least = self.bytes + RESERVE
-        if self.budget is not None and self.budget < 2 * self._least:
-            raise ValueError(
-                f"Recorder: budget = {self.budget} bytes, but the scene and its first frame take {self._least}. "
-                f"Give at least {2 * self._least}."
-            )
         self.flush()  # so that a process that dies soon leaves something
         self._looked = perf_counter()
         if error := self._sink.error:
             raise _told(error, f"Recorder: nothing could be written to {self.path}")
+        least = self._sink.bytes + RESERVE
+        if self.budget is not None and self.budget < 2 * least:
+            raise ValueError(
+                f"Recorder: budget = {self.budget} bytes, but the scene and its first frame take {least}. "
+                f"Give at least {2 * least}."
+            )
 
     def _write(self, text: str, blob: np.ndarray, checksum: str) -> None:
         self._stream.log(JOURNAL, self._rr.AnyValues(text=text, blob=blob, checksum=checksum), strict=True)
@@ -117,15 +121,23 @@ class Recorder:
     @property
     def bytes(self) -> int:
         """About what the file will have when it is closed [bytes]."""
-        return max(self._sink.bytes, self._logged)
+        return self._sink.bytes + self._logged - self._flushed
 
     @interrupts.uncut
     def log(self) -> None:
         """Write the present frame, if it is one of `every`."""
+        if self._full:
+            return
         self._check()
         self._calls += 1
-        if self._calls % self._stride() == 0:
+        if self.budget is not None and self._left() < self._each:
+            self._thin()
+        if self._full:
+            return
+        if self._calls % self._stride == 0:
+            before = self._logged
             self._frame(self._calls)
+            self._each = max(self._each, self._logged - before)
         now = perf_counter()
         if now - self._sent > SEND:
             self._picture.curves.send()
@@ -141,6 +153,8 @@ class Recorder:
     @interrupts.uncut
     def flush(self) -> None:
         """Wait until what was logged is in the file, so that it is there whatever happens to the process."""
+        if self._full:
+            return
         self._check()
         self._picture.curves.send()
         self._sink.flush()
@@ -159,26 +173,40 @@ class Recorder:
     def _fail(self) -> None:
         error = self._sink.error
         assert error
+        self._closed = True
         self._journal.close()
         self._closing()
         gone = isinstance(error, FileNotFoundError)
         rest = "What was recorded is lost" if gone else "What the file holds can be replayed"
         raise _told(error, f"Recorder: writing {self.path} failed at frame {self._calls}", f". {rest}") from None
 
-    def _stride(self) -> int:
-        """One of how many frames is drawn: each time half of what is left of the budget is used, half as many."""
-        if self.budget is None:
-            return self.every
-        room, left, halvings = self.budget - self._least, self.budget - self.bytes - RESERVE, 0
-        each = (self.bytes - self._least) / max(1, self.frames - 1) if self.frames > 1 else 0
-        while left < room / 2 and halvings < 40:
-            room, halvings = room / 2, halvings + 1
-        if left < 2 * each:
-            halvings = 40
-        stride = self.every * 2**halvings
-        if halvings and (not self._thinned or self._thinned[-1][1] < stride):
-            self._thinned.append((self._calls, stride))
-        return max([self.every, *(s for _, s in self._thinned)])
+    def _left(self) -> int:
+        """What is left of the budget [bytes], after all that waits to be written, and the end."""
+        assert self.budget is not None
+        return self.budget - self.bytes - RESERVE
+
+    def _thin(self) -> None:
+        """Make room for more frames: keep the picture of every other one, until a quarter of the budget is free.
+
+        Where there is nothing more to take out, the recording ends here.
+        """
+        assert self.budget is not None
+        self.flush()
+        room = self._each
+        while self._left() < room and not self._sink.error:
+            self._stride, room = 2 * self._stride, max(self._each, self.budget // 4)
+            self._journal.put("thinned", {"stride": self._stride})
+            self.flush()
+            self._note = (
+                f"Recorder: to stay within budget = {self.budget} bytes, the picture has one of {self._stride} frames. All "
+                "steps are in the file; for more frames give a larger budget."
+            )
+            if self._calls < 2 * self._stride or not self._sink.thin(self._stride):
+                break
+        if self._left() < self._each:
+            self._full = True
+            self._note += f" They do not fit in it after frame {self._calls}, where the recording ends."
+            self._finish()
 
     def _note_state(self, size: int) -> None:
         """An exact state of that size was written, to continue from: when the next one is due."""
@@ -189,7 +217,9 @@ class Recorder:
         world, journal, picture = self.world, self._journal, self._picture
         journal.frame = number
         picture.stamp(number)
-        if number and (picture.drawing.bytes - self._drawn > self._due or number - self._last_state >= SPARSE):
+        if number and (
+            picture.drawing.bytes - self._drawn > self._due or number - self._last_state >= SPARSE * self._stride // self.every
+        ):
             self._note_state(journal.state())
         now = snapshot.keep(world, pairs=False)
         x = now.position(len(world.particles))
@@ -201,38 +231,34 @@ class Recorder:
     @interrupts.uncut
     def close(self) -> None:
         """Write the summary and finish the file. Calling it twice does nothing."""
-        if self._sink.stream is None or self._sink.forked():
+        if self._closed or self._sink.forked():
             return
+        self._closed = True
+        if not self._full:
+            self._finish()
+        if not self._calls and self._journal.worst:
+            warnings.warn(
+                f"Recorder: log() was never called, so {self.path} shows only the frame at the start. Call recorder.log() after "
+                "each step, or give world.run(seconds, recorder=recorder).",
+                stacklevel=2,
+            )
+        if self._note:
+            warnings.warn(self._note, stacklevel=2)
+
+    def _finish(self) -> None:
         journal, world = self._journal, self.world
         journal.close()
         self._picture.curves.send()
         end: dict[str, Any] = {"frames": self.frames, "time": world.time}
         with contextlib.suppress(RuntimeError):  # a world that was closed, or whose Taichi is gone, has no state
             end["hash"] = world.hash()
-        thinned = [f"from frame {frame} on one of {stride}" for frame, stride in self._thinned if stride < 2**40]
-        if self._thinned and self._thinned[-1][1] >= 2**40:
-            thinned.append(f"from frame {self._thinned[-1][0]} on none")
-        note = ""
-        if thinned:
-            note = (
-                f"Recorder: to stay within budget = {self.budget} bytes, {self.frames} of {self._calls + 1} frames are drawn: "
-                f"{', '.join(thinned)}. All steps are in the file; for more frames give a larger budget, for even ones every=."
-            )
         if "hash" in end:
-            self._picture.end(journal.worst, self.frames, note)
-        journal.put("end", {**end, "note": note, **said(journal.worst)})
+            self._picture.end(journal.worst, self.frames, self._note)
+        journal.put("end", {**end, "note": self._note, **said(journal.worst)})
         self._sink.check()
         self._closing()
         if self._sink.error:
             self._fail()
-        if not self._calls and journal.worst:
-            warnings.warn(
-                f"Recorder: log() was never called, so {self.path} shows only the frame at the start. Call recorder.log() after "
-                "each step, or give world.run(seconds, recorder=recorder).",
-                stacklevel=2,
-            )
-        if note:
-            warnings.warn(note, stacklevel=2)
 
 
 def _told(error: Exception, what: str, rest: str = "") -> OSError:

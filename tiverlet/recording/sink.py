@@ -1,26 +1,20 @@
 """The way of a recording to its file."""
 
 import errno
+import hashlib
 import os
 import select
 import stat
-import struct
 import threading
 import uuid
 from time import monotonic, sleep
 from typing import Any
 
+from .messages import BATCH, CHUNK, END, HEAD, HEADER, smaller, split, thinned
+
 WAIT = 10.0  # [s] that a flush may take
 PIECE = 1 << 20  # bytes that are read at a time
-HEADER = 12  # bytes of the file before its first message
-HEAD = struct.Struct("<QQ")  # of a message: its kind, and the bytes that follow
-END, CHUNK = 0, 2  # kinds: the last message, and one with data
-BATCH = 120_000  # bytes that are sent together: LZ4 looks back by 64 kB
-LEVEL = 9  # of LZ4: finds the points of lines among those of the particles, at 60 MB/s
-PAYLOAD = b"\x2a"  # field 5 of a message with data, its bytes
-COMPRESSION, SIZE = 2, 3  # its fields with the kind of compression, and how many bytes there are without it
-LZ4 = 2
-NOISE = 0.97  # what rerun's faster LZ4 leaves of noise: there is nothing to be found there
+SEAL = b"\x7a\x20"  # in the last message, which rerun does not read: a field of 32 bytes, SHA-256 of all before that message
 
 
 class Sink:
@@ -45,6 +39,7 @@ class Sink:
             raise RuntimeError("Recorder: rerun is switched off by RERUN in the environment; unset it to record.")
         self.stream.set_log_time_enabled(False)
         self._pid = os.getpid()
+        self._sum = hashlib.sha256()  # of all bytes
         self._new: str | None = None  # the name until keep(), where another file has that of the recording
         try:
             self._file = self._create(overwrite)
@@ -52,9 +47,7 @@ class Sink:
             if isinstance(e, FileExistsError):
                 raise
             raise type(e)(e.errno, f"Recorder: {path} cannot be written ({e.strerror}); choose another place") from None
-        found = os.fstat(self._file.fileno())
-        self._regular = stat.S_ISREG(found.st_mode)
-        self._same = (found.st_dev, found.st_ino)
+        self._look()
         self._copy: threading.Thread | None = None
         self._rest, self._past, self._ended = bytearray(), HEADER, False  # what was read of a message; bytes to pass on
         self._busy = threading.Lock()
@@ -81,10 +74,19 @@ class Sink:
             raise FileExistsError(errno.EEXIST, f"{what}name, or replace it: Recorder(path, world, overwrite=True)")
         if not os.path.isdir("/dev/fd"):
             return open(self.path, "wb", buffering=0)
-        folder, name = os.path.split(os.path.realpath(self.path))
-        self._new = os.path.join(folder, f".{name}.{uuid.uuid4().hex[:8]}")
         os.close(os.open(self.path, os.O_WRONLY))  # may it be written?
+        self._new = self._beside()
         return open(self._new, "xb", buffering=0)
+
+    def _beside(self) -> str:
+        """A name for a file that will replace the one of the recording."""
+        folder, name = os.path.split(os.path.realpath(self.path))
+        return os.path.join(folder, f".{name}.{uuid.uuid4().hex[:8]}")
+
+    def _look(self) -> None:
+        found = os.fstat(self._file.fileno())
+        self._regular = stat.S_ISREG(found.st_mode)
+        self._same = (found.st_dev, found.st_ino)
 
     def keep(self) -> None:
         """Give the file its name."""
@@ -137,7 +139,8 @@ class Sink:
                 break
             kind, length = HEAD.unpack_from(self._rest, at)
             if kind == END:
-                self._put(HEAD.pack(END, 0))
+                seal = SEAL + self._sum.digest()
+                self._put(HEAD.pack(END, len(seal)) + seal)
                 self._ended = True
             elif len(self._rest) - at - HEAD.size < length:
                 break
@@ -152,7 +155,39 @@ class Sink:
         left = memoryview(data)
         while left:
             left = left[self._file.write(left) :]
+        self._sum.update(data)
         self.bytes += len(data)
+
+    def thin(self, stride: int) -> bool:
+        """Keep the picture of one of `stride` frames: write the file anew, and put it in the place of the old one.
+
+        To be called after flush(). Returns whether that can be done here.
+        """
+        if not self._copy or not self._regular or self.error:
+            return False
+        with self._busy:
+            old = os.path.realpath(self.path) if self._new is None else self._new
+            with open(old, "rb") as file:
+                data = file.read()
+            new, before, taken = self._beside(), (self._file, self._sum, self.bytes), False
+            try:
+                self._file, self._sum, self.bytes = open(new, "xb", buffering=0), hashlib.sha256(), 0
+                os.chmod(new, stat.S_IMODE(os.fstat(before[0].fileno()).st_mode))
+                self._put(data[:HEADER])
+                for kind, message in thinned(split(data), stride):
+                    self._put(HEAD.pack(kind, len(message)) + message)
+                os.replace(new, old)
+                taken = True
+            except OSError:  # there is no room for both
+                os.unlink(new)
+            finally:
+                if not taken:
+                    self._file.close()
+                    self._file, self._sum, self.bytes = before
+            if taken:
+                before[0].close()
+            self._look()
+        return taken
 
     def forked(self) -> bool:
         """Whether this is a child of the process that records: rerun does not work there, and nothing is copied."""
@@ -192,46 +227,3 @@ def is_recording(path: str) -> bool:
     """Whether a file begins as recordings do; so does an empty one."""
     with open(path, "rb") as file:
         return file.read(4) in (b"RRF2", b"")
-
-
-def smaller(message: bytes) -> bytes:
-    """A message with data, compressed better than rerun does it in its hurry; as it is where there is nothing to gain."""
-    import pyarrow as pa
-
-    at, values, begin = 0, {}, None
-    while at < len(message):
-        start = at
-        key, at = _varint(message, at)
-        number, at = _varint(message, at)
-        if key & 7 == 2:
-            if message[start : start + 1] == PAYLOAD:
-                begin, body = start, (at, at + number)
-            at += number
-        elif key & 7:
-            raise ValueError("a message of rerun is not as expected")
-        values[key >> 3] = number
-    if begin is None or values.get(COMPRESSION) != LZ4 or body[1] - body[0] > NOISE * values[SIZE]:
-        return message
-    plain = pa.decompress(message[slice(*body)], values[SIZE], codec="lz4_raw")
-    packed = pa.Codec("lz4_raw", compression_level=LEVEL).compress(plain).to_pybytes()
-    if len(packed) >= body[1] - body[0]:
-        return message
-    return b"".join([message[:begin], PAYLOAD, _as_varint(len(packed)), packed, message[body[1] :]])
-
-
-def _varint(data: bytes, at: int) -> tuple[int, int]:
-    """A number of seven bits to a byte, and where the next begins."""
-    number = shift = 0
-    while True:
-        byte = data[at]
-        number, shift, at = number | (byte & 127) << shift, shift + 7, at + 1
-        if byte < 128:
-            return number, at
-
-
-def _as_varint(number: int) -> bytes:
-    out = bytearray()
-    while number > 127:
-        out.append(number & 127 | 128)
-        number >>= 7
-    return bytes([*out, number])

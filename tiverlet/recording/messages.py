@@ -1,0 +1,167 @@
+"""The messages of an .rrd file, as far as it takes to write one: rows of data go through here on their way to the file."""
+
+import struct
+from collections import defaultdict
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+HEADER = 12  # bytes of a file before its first message
+HEAD = struct.Struct("<QQ")  # of a message: its kind, and the bytes that follow
+END, CHUNK = 0, 2  # kinds: the last message, and one with rows of an entity
+COMPRESSION, SIZE, PAYLOAD = 2, 3, 5  # fields of the latter: how its bytes are compressed, how many they are without it, and they
+LZ4 = 2
+BATCH = 120_000  # bytes that are sent together: LZ4 looks back by 64 kB
+LEVEL = 9  # of LZ4: finds the points of lines among those of the particles, at 60 MB/s
+NOISE = 0.97  # what rerun's faster LZ4 leaves of noise: there is nothing to be found there
+PARTS = ("particles", "contacts", "breaks")  # of the scene that are drawn in each frame, or in the one after, too
+
+
+class Chunk:
+    """A message with rows of an entity."""
+
+    def __init__(self, message: bytes):
+        self._message, self._fields, at = message, {}, 0
+        while at < len(message):
+            start = at
+            key, at = _varint(message, at)
+            number, at = _varint(message, at)
+            if key & 7 not in (0, 2):
+                raise ValueError("a message of rerun is not as expected")
+            begin, at = at, at + (number if key & 7 == 2 else 0)
+            self._fields[key >> 3] = (start, begin, at, number)
+
+    def __len__(self) -> int:
+        return len(self._message)
+
+    def noise(self) -> bool:
+        """Whether it can be compressed no better."""
+        packed, plain = self._number(PAYLOAD), self._number(SIZE)
+        return self._number(COMPRESSION) != LZ4 or packed > NOISE * plain
+
+    def _number(self, field: int) -> int:
+        return self._fields[field][3] if field in self._fields else 0
+
+    def rows(self) -> Any:
+        """As a pyarrow.RecordBatch."""
+        import pyarrow as pa
+
+        _, begin, end, _ = self._fields[PAYLOAD]
+        data = self._message[begin:end]
+        if self._number(COMPRESSION) == LZ4:
+            data = pa.decompress(data, self._number(SIZE), codec="lz4_raw")
+        return pa.ipc.open_stream(data).read_next_batch()
+
+    def holding(self, rows: Any) -> bytes:
+        """The message with other rows, compressed well. pyarrow pads them less than rerun does."""
+        import pyarrow as pa
+
+        out = pa.BufferOutputStream()
+        with pa.ipc.new_stream(out, rows.schema) as stream:
+            stream.write_batch(rows)
+        plain = out.getvalue()
+        packed = pa.Codec("lz4_raw", compression_level=LEVEL).compress(plain).to_pybytes()
+        parts = []
+        for field, (start, _, end, _) in self._fields.items():
+            new = {
+                COMPRESSION: bytes([COMPRESSION << 3, LZ4]),
+                SIZE: bytes([SIZE << 3]) + _as_varint(len(plain)),
+                PAYLOAD: bytes([PAYLOAD << 3 | 2]) + _as_varint(len(packed)) + packed,
+            }
+            parts.append(new.get(field, self._message[start:end]))
+        return b"".join(parts)
+
+
+def smaller(message: bytes) -> bytes:
+    """A message with rows, compressed better than rerun does it in its hurry; as it is where there is nothing to gain."""
+    chunk = Chunk(message)
+    if chunk.noise():
+        return message
+    new = chunk.holding(chunk.rows())
+    return new if len(new) < len(message) else message
+
+
+def droppable(frames: np.ndarray, stride: int) -> np.ndarray:
+    """Which rows of an entity may go when one of `stride` frames is kept. frames: of its rows, ascending.
+
+    Rows of the frames that are kept stay, and the last row before one that has none of its own: what it shows goes on.
+    """
+    following = np.append(frames[1:], np.iinfo(np.int64).max)
+    return (frames % stride != 0) & (following <= -(-frames // stride) * stride)
+
+
+def thins(entity: str) -> bool:
+    """Whether an entity is among those that lose rows."""
+    return entity.startswith("/figures") or (entity.startswith("/world/") and entity.rpartition("/")[2] in PARTS)
+
+
+def thinned(messages: list[tuple[int, bytes]], stride: int) -> Iterator[tuple[int, bytes]]:
+    """Messages (kind, bytes) with the picture of one of `stride` frames; all others as they are."""
+    found, frames = [], defaultdict(list)
+    for kind, message in messages:
+        entity = ""
+        if kind == CHUNK:
+            rows = Chunk(message).rows()
+            name = rows.schema.metadata[b"rerun:entity_path"].decode()
+            if thins(name) and "frame" in rows.schema.names:
+                entity = name
+                frames[entity].append(rows.column("frame").to_numpy())
+        found.append(entity)
+    gone = {}
+    for entity, numbers in frames.items():
+        numbers = np.unique(np.concatenate(numbers))
+        gone[entity] = numbers[droppable(numbers, stride)]
+    waiting: dict[tuple, list] = defaultdict(list)  # rows that go together: a message of a single one takes 1 kB
+    for (kind, message), entity in zip(messages, found, strict=True):
+        if not entity:
+            yield kind, message
+            continue
+        chunk = Chunk(message)
+        rows = chunk.rows()
+        rows = rows.take(np.flatnonzero(~np.isin(rows.column("frame").to_numpy(), gone[entity])))
+        together = waiting[entity, tuple(zip(rows.schema.names, rows.schema.types, strict=True))]
+        if rows.num_rows:
+            together.append((chunk, rows))
+        if sum(rows.nbytes for _, rows in together) > BATCH:
+            yield CHUNK, _joined(together)
+            together.clear()
+    for together in waiting.values():
+        if together:
+            yield CHUNK, _joined(together)
+
+
+def _joined(parts: list[tuple[Chunk, Any]]) -> bytes:
+    import pyarrow as pa
+
+    chunk, first = parts[0]
+    table = pa.Table.from_batches([rows.replace_schema_metadata(first.schema.metadata) for _, rows in parts], first.schema)
+    return chunk.holding(table.combine_chunks().to_batches()[0])
+
+
+def split(data: bytes) -> list[tuple[int, bytes]]:
+    """The messages of a file, each with its kind."""
+    out, at = [], HEADER
+    while at + HEAD.size <= len(data):
+        kind, length = HEAD.unpack_from(data, at)
+        out.append((kind, data[at + HEAD.size : at + HEAD.size + length]))
+        at += HEAD.size + length
+    return out
+
+
+def _varint(data: bytes, at: int) -> tuple[int, int]:
+    """A number of seven bits to a byte, and where the next begins."""
+    number = shift = 0
+    while True:
+        byte = data[at]
+        number, shift, at = number | (byte & 127) << shift, shift + 7, at + 1
+        if byte < 128:
+            return number, at
+
+
+def _as_varint(number: int) -> bytes:
+    out = bytearray()
+    while number > 127:
+        out.append(number & 127 | 128)
+        number >>= 7
+    return bytes([*out, number])
