@@ -256,3 +256,35 @@ def test_ropes_that_touch_are_solved_and_come_to_rest(world):
         assert w.last.overlap < 0.1 and w.position[:, 1].min() > 0.0149
     assert np.median(stretched) < 0.05 and max(stretched) < fastest / 1200 / length
     assert np.median(kinetic) < 1e-6 and max(kinetic) < 1e-3 and np.median(left) < 5e-3
+
+
+@pytest.mark.parametrize("link", [tv.Distance, tv.Rope])
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+def test_straight_ropes_between_pins_stay_where_they_are(world, link, precision):
+    # Rows 71 and 72. No tension along a straight rope bears its weight, and any number is a solution to first order. Energy may
+    # not exceed what there was by more than 1e-3 of m g L, and no speed that of a free fall through L. The sag that is left is
+    # that of the tension that a substep can stand, (omega h)^2 = 4 w T h^2 / l <= 1: N^2 g h^2 / 2, and twice as much in passing.
+    # One of the ropes leans, and one is a tenth too short for its pins.
+    counts, ends = (3, 5, 40, 40, 20), [(1.0, 0.0)] * 3 + [(0.7, 0.7), (1.0, 0.0)]
+    x = np.vstack([np.linspace((0, y), np.add((0, y), end), n) for y, (n, end) in enumerate(zip(counts, ends, strict=True))])
+    first = np.cumsum([0, *counts])
+    pairs = np.vstack([links(n - 1, k) for n, k in zip(counts, first, strict=False)])
+    rest = np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1) * np.where(pairs[:, 0] >= first[-2], 0.9, 1.0)
+    pinned = np.concatenate([first[:-1], first[1:] - 1])
+    w = world(
+        tv.Particles(x, mass=0.01, pinned=pinned), [tv.Gravity(9.81), link(pairs, rest)], precision=precision, solver=tv.Direct()
+    )  # fmt: skip
+    free = np.setdiff1d(np.arange(len(x)), pinned)
+    start, supply = 0.01 * 9.81 * x[free, 1].sum(), 0.01 * 9.81 * len(free)
+    for substeps, seconds in ((2, 1.0), (20, 1.0), (200, 0.2)):
+        w.substeps, fastest, h = substeps, 0.0, 1 / 60 / substeps
+        w.position, w.velocity = x, np.zeros_like(x)
+        for _ in range(round(60 * seconds)):
+            report = w.step(1 / 60)
+            assert report.energy <= start + 1e-3 * supply, substeps
+            fastest = max(fastest, np.abs(w.velocity).max())
+        assert fastest < np.sqrt(2 * 9.81), substeps
+        assert "softened" in report.flags
+        if substeps != 2:
+            assert "straight rope" in " ".join(report.notes)
+            assert np.abs(w.position - x).max() < 40**2 * 9.81 * h**2 + 1e-6

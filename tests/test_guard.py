@@ -60,7 +60,7 @@ def test_undoing_a_frame_leaves_no_trace(world):
     used = []
     for frame in range(40):
         for pin in pins:
-            pin.target = [x[0] + 0.02 * frame]
+            pin.target = [x[0] + 0.02 * frame + 0.02 * max(0, frame - 20) ** 2]
         report = a.step(1 / 60)
         b.substeps, b.iterations = report.substeps, report.iterations
         used.append((report.tries, report.substeps))
@@ -108,7 +108,7 @@ def test_too_much_for_the_budget_is_said(world):
     w = world(tv.Particles(rope.position, pinned=[0]), [tv.Gravity(9.81), tv.Distance(rope.links)], solver=tv.Jacobi())
     for _ in range(20):
         report = w.step(1 / 60, tolerance=1e-9, budget=1e-9)
-        assert report.flags == {"substeps-capped"} and report.tries == 1 and "budget" in report.notes[-1]
+        assert report.flags - {"unconverged"} == {"substeps-capped"} and report.tries == 1 and "budget" in report.notes[-1]
     rich = [w.step(1 / 60, budget=0.05) for _ in range(10)]
     assert max(r.substeps for r in rich) > 64  # all that fits: a substep of 40 links takes some microseconds
 

@@ -5,6 +5,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING
 
 from . import checks, snapshot
+from .scalar import TENSEST
 from .step_report import StepReport
 
 if TYPE_CHECKING:
@@ -15,11 +16,15 @@ MOST = 4096  # substeps of a frame
 PASSES = 64  # iterations of a substep
 RESIDUAL, OVERLAP = 1e-2, 0.1  # what is good where the user asks for nothing else
 TENSION = 2.0  # (omega h)^2: half the limit of stability
-RISKS = {"tunnelling-risk", "stiff-force", "softened", "non-finite"}
+RISKS = {"tunnelling-risk", "stiff-force", "non-finite"}
 GAIN = 1.4  # by which twice the effort has to lower the figures; of second order they fall by 4, of first order by 2
 IDLE = {"substeps": 2, "iterations": 1}  # doublings without a gain that are enough
 ROOM = 6.0  # by which the figures have to be better than asked before less is tried
 PATIENCE = 64  # frames, at most, until it is tried again
+
+Figures = tuple[float, ...]  # residual, overlap and tension, relative to what is asked
+NOTHING: Figures = (1.0, 1.0, 1.0)
+WORST: Figures = (float("inf"),) * 3
 
 
 class Guard:
@@ -28,7 +33,8 @@ class Guard:
     A frame is undone, and made again with twice the substeps, when in one of them a constraint turned by more than 26 degrees
     (cos < 0.9, where SHAKE's direction is no longer good), a residual above 1e-2 or an overlap above a tenth of a radius was
     left, a tension made particles vibrate with (omega h)^2 > 2, or when it has a flag that shorter substeps remove. Where twice
-    the substeps bring no gain, twice the iterations are tried; where they bring none either, the flag is "stuck".
+    the substeps bring no gain, twice the iterations are tried; where they bring none either, the flag is "stuck": the frame is
+    the one with the least effort of those that are as good, and what stays wrong is asked for no more in the next frames.
     When all figures, which are of the order of h^2, leave room for it, the next frame is tried with half the effort. Each time
     that fails, twice as many frames pass before the next try, up to 64.
 
@@ -40,17 +46,19 @@ class Guard:
         self.substeps, self.iterations = START, 1  # of the next frame
         self.dt = 0.0  # of the last one
         self.wait, self.patience = 0, 1  # frames until less is tried, and after the next failure
-        self.stuck = 1.0  # the figure that no effort improved
+        self.stuck = NOTHING  # the figures that no effort improved
         self.cost = 0.0  # measured seconds of an iteration
 
     @property
     def memory(self) -> tuple:
         """What the next frames depend on."""
-        return self.substeps, self.iterations, self.dt, self.wait, self.patience, self.stuck
+        stuck = NOTHING[:1] if self.stuck == NOTHING else self.stuck
+        return self.substeps, self.iterations, self.dt, self.wait, self.patience, *stuck
 
     @memory.setter
     def memory(self, value: tuple) -> None:
-        self.substeps, self.iterations, self.dt, self.wait, self.patience, self.stuck = value
+        self.substeps, self.iterations, self.dt, self.wait, self.patience, *stuck = value
+        self.stuck = tuple(stuck) if len(stuck) > 1 else NOTHING
 
     def advance(self, world: "World", dt: float, tolerance: float | None, budget: float | None) -> StepReport:
         """One frame, made again until it is good, nothing helps, or there can be no more."""
@@ -58,29 +66,39 @@ class Guard:
         budget = None if budget is None else checks.number("World.step", "budget", budget, above=0.0)
         end = float("inf") if budget is None else perf_counter() + budget
         self.prepare(world.iterations, dt, tolerance, budget)
-        n, k = self.substeps, self.iterations
+        n, k, stuck = self.substeps, self.iterations, self.stuck
         before, flags = world._undo  # type: ignore[misc]  # of the step; where nothing was uploaded since, it is the state now
         kept = snapshot.keep(world) if any(map(any, flags)) else replace(before, guard=self.memory)
-        tries, best, idle, kind = 0, float("inf"), 0, "substeps"
+        tries, best, idle, kind = 0, WORST, 0, "substeps"
+        known: dict[tuple[int, int], Figures] = {}  # of the tries without a risk
         world._begin(dt / n * world._sub.first)
         while True:
             tries, begun = tries + 1, perf_counter()
             report = world._advance(dt, n, k)
             took = perf_counter() - begun
             self.learn(took / (n * k))
-            figure, risks = judge(report, tolerance)
+            figures, risks = judge(report, tolerance)
+            wrong = [f > max(1.0, s) for f, s in zip(figures, stuck, strict=True)]
             if risks:
-                best, idle, kind = float("inf"), 0, "substeps"
-            elif figure <= self.stuck:
-                verdict = "good" if figure <= 1 else "stuck"
+                best, idle, kind = WORST, 0, "substeps"
+            elif (n, k) in known or not any(wrong):
+                verdict = "stuck" if max(figures) > 1 else "good"
                 break
             else:
-                idle = 0 if figure * GAIN <= best else idle + 1
-                best = min(best, figure)
+                known[n, k] = figures
+                gains = any(f * GAIN <= b for f, b, w in zip(figures, best, wrong, strict=True) if w)
+                idle = 0 if gains else idle + 1
+                best = tuple(map(min, figures, best))
                 if idle >= IDLE[kind]:
                     if kind == "iterations" or k >= PASSES:
                         verdict = "stuck"
-                        break
+                        stuck = tuple(max(s, GAIN * f) if w else s for s, f, w in zip(stuck, figures, wrong, strict=True))
+                        n, k, last = *cheapest(known, stuck), (n, k)
+                        if (n, k) == last:
+                            break
+                        snapshot.put_back(world, kept)
+                        world._begin(dt / n * world._sub.first)
+                        continue
                     kind, idle = "iterations", 0
             if n >= MOST or perf_counter() + 2 * took > end:
                 verdict = "substeps-capped"
@@ -88,12 +106,9 @@ class Guard:
             n, k = (min(2 * n, MOST), k) if kind == "substeps" else (n, 2 * k)
             snapshot.put_back(world, kept)
             world._begin(dt / n * world._sub.first)
-        if verdict == "stuck":
-            self.stuck = max(self.stuck, GAIN * figure)  # and the next frames do not try in vain
-        else:
-            self.substeps, self.iterations = n, k
-        self.look_ahead(world.iterations, report, figure, verdict, tries)
-        return told(report, figure, risks, verdict, tries)
+        self.substeps, self.iterations, self.stuck = n, k, stuck  # and the next frames do not try in vain
+        self.look_ahead(world.iterations, report, max(figures), verdict, tries)
+        return told(report, max(figures), risks, verdict, tries)
 
     def prepare(self, iterations: int, dt: float, tolerance: float | None, budget: float | None) -> None:
         """The effort to begin with."""
@@ -108,7 +123,7 @@ class Guard:
         elif self.wait:
             self.wait -= 1
             if not self.wait:
-                self.stuck = 1.0
+                self.stuck = NOTHING
 
     def learn(self, cost: float) -> None:
         """Keep the cost of an iteration: lower ones at once, for the first frame compiles; higher ones by and by."""
@@ -128,17 +143,25 @@ class Guard:
             self.patience = 1
 
 
-def judge(report: StepReport, tolerance: float | None) -> tuple[float, set[str]]:
-    """How the worst figure compares with what is asked (1: just met), and what shorter substeps have to remove."""
+def judge(report: StepReport, tolerance: float | None) -> tuple[Figures, set[str]]:
+    """How residual, overlap and tension compare with what is asked (1: just met), and what shorter substeps have to remove."""
     risks = set(report.flags & RISKS)
     if report.turn:
         risks.add("turned")
+    if report.tension > TENSEST:
+        risks.add("softened")
     ratios = (
         report.residual / (tolerance or RESIDUAL),
         report.overlap / (tolerance or OVERLAP),
         report.tension / TENSION,
     )
-    return max(r if r == r else float("inf") for r in ratios), risks  # NaN is the worst of all
+    return tuple(r if r == r else float("inf") for r in ratios), risks  # NaN is the worst of all
+
+
+def cheapest(known: dict[tuple[int, int], Figures], stuck: Figures) -> tuple[int, int]:
+    """The least effort with which all figures are as good as they have to be, or as they were with the most."""
+    enough = [max(1.0, s) for s in stuck]
+    return next(effort for effort, figures in known.items() if all(f <= e for f, e in zip(figures, enough, strict=True)))
 
 
 def told(report: StepReport, figure: float, risks: set[str], verdict: str, tries: int) -> StepReport:
@@ -147,7 +170,8 @@ def told(report: StepReport, figure: float, risks: set[str], verdict: str, tries
         return replace(report, tries=tries)
     wrong = sorted(risks) or [f"a figure is {figure:.3g} times what is asked"]
     why = {
-        "stuck": "Nothing helps: constraints contradict each other, or particles still part that began in one place.",
+        "stuck": "Nothing helps: constraints contradict each other, a load has no direction to be carried in (that of a straight "
+        "rope between two pins; give it slack or compliance), or particles still part that began in one place.",
         "substeps-capped": f"More than {report.substeps} substeps are needed, but the budget is spent or there can be no more.",
     }[verdict]
     note = f"The frame is not as good as asked: {', '.join(wrong)}. {why}"

@@ -164,6 +164,14 @@ class State:
         r = at(self.x, i) - at(self.x, j)
         return r + (at(self.low, i) - at(self.low, j)) if self.compensated else r
 
+    @ti.func
+    def between(self, i, j):
+        """x_i - x_j in f64."""
+        r = ti.cast(self.x[i], ti.f64) - ti.cast(self.x[j], ti.f64)
+        if ti.static(self.compensated):
+            r += ti.cast(self.low[i], ti.f64) - ti.cast(self.low[j], ti.f64)
+        return r
+
     @inline
     def place(self, i):
         """x_i as one number per axis."""

@@ -28,6 +28,7 @@ class Scalar(Elastic):
     With drag, alpha' = alpha / (phi h^2) with the factor phi that the exact solution gives every other acceleration.
     """
 
+    precise = False  # whether exactly() measures to all the digits that positions have
     collapses = 0  # the power of a length that f is, where gradients vanish with the size of the body; else 0
 
     @property
@@ -141,10 +142,11 @@ class Scalar(Elastic):
                     if first != 0:
                         last = 0
                     most = TENSEST / self.lever(c, W / 2)  # split by two in a chain
-                    step = ti.max(-most, ti.min(most, lam + self._on_slots.hurried(last, step))) - lam
+                    wanted = lam + self._on_slots.hurried(last, step)
+                    step = ti.max(-most, ti.min(most, wanted)) - lam
                     self._on_step[c] = step
-                    if ti.abs(lam + step) == most:
-                        ti.atomic_max(self._on_slots.tension[None], ti.cast(TENSEST, ti.f64))
+                    if ti.abs(wanted) >= most:
+                        ti.atomic_max(self._on_slots.tension[None], ti.cast(TENSEST * ti.abs(wanted) / most, ti.f64))
                     new = lam + step
                 self._on_lam[c] = new
         for k in ti.static(range(self.arity)):

@@ -235,11 +235,16 @@ class Survey:
             )
         if turned == FAR:
             notes["turned"] = "A constraint turned by more than 41 degrees in one substep and is damped there; use more substeps."
-        if tension >= TENSEST:
+        if tension > TENSEST:
             need = int(np.ceil(substeps * np.sqrt(tension / STIFF)))
             notes["softened"] = (
                 f"A tension makes particles vibrate too fast for the substep: omega h >= {np.sqrt(tension):.3g}, stable below 2. "
                 f"Its constraints give way instead. Use about {need} substeps."
+            )
+        elif tension == TENSEST:
+            notes["softened"] = (
+                "A load has hardly a direction to be carried in, as that of a straight rope between two pins: its constraints "
+                "give way and sag with h^2. Give them slack or compliance, or use more substeps."
             )
         if stiff > STIFF:
             need = int(np.ceil(substeps * np.sqrt(stiff / STIFF))) + 1

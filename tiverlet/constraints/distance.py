@@ -15,6 +15,7 @@ class Link(Scalar):
     """
 
     arity = 2
+    precise = True
     rest = Knob(lambda f, v: checks.per_item(repr(f), f.rest_name, v, f.count, least=0.0), "Rest length [m].")
 
     def rest_of(self, position: np.ndarray) -> np.ndarray:
@@ -32,6 +33,12 @@ class Link(Scalar):
         if length > 0:
             n = r / length
         return length, ti.Matrix.rows([n, -n])
+
+    @ti.func
+    def exactly(self, c):
+        """C in f64, which the difference of two lengths in f32 is not."""
+        r = self._on_state.between(self.member(c, 0), self.member(c, 1))
+        return ti.sqrt(r.dot(r)) - ti.cast(self._on_rest[c], ti.f64)  # type: ignore[reportOptionalCall]
 
 
 class Distance(Link):

@@ -12,7 +12,20 @@ from .solver import WIDTH, Solver
 from .system import System
 
 REDUNDANT = 1e-12  # of its diagonal: a pivot this small belongs to a constraint that others imply
+ODD = 1e-6  # of its violation: what others leave of such a constraint without contradicting it
+SMALL = 2e-3  # of what the heaviest of its particles adds to it: with a pivot below, a load is hardly borne to first order
+AGREE = 0.25  # of the tension: how far the two ends of a substep may differ about it there
+CALM = 2.0  # (omega h)^2 that is allowed there: half the limit of stability
 ROUNDS = 8  # of finding out which ropes pull, and how soft a system has to be
+
+# (omega h)^2 to which a tension gives way with directions at the end of the substep. There the move is a step down the gradient
+# of a convex energy, sum lam |r|; as long as this is at most 1, it brings in no more than lam times what the links shorten.
+BACKWARD = 1.0
+FLOOR = 2e-12  # of its diagonal: how much it gives way in any case, so that no pivot vanishes
+
+# What a system is solved for: with directions at the start of the substep, in f32 first with violations to f32; with those at its
+# end, to compare; then as before if they agree, else at the end as softly as it has to be.
+ROUGH, FORWARD, AGAIN, COMPARE, GIVE_WAY, DONE = range(6)
 
 
 class Direct(Solver):
@@ -33,6 +46,11 @@ class Direct(Solver):
     Ropes, spacers and limits take part: which of them act is found by switching off those whose multiplier has the wrong sign
     and on those that are violated, until nothing changes. A constraint that others imply (a double link) is left to them.
     The elimination is in f64 in every world, for its pivots span the mass ratio.
+
+    A load that cannot be borne to first order (a straight rope between two pins) has no tension to speak of with directions at
+    the start of the step: any number, which brings in energy. Such a system, and one with (omega h)^2 > 4 across a tension, is
+    solved with directions at the end, and made softer until (omega h)^2 <= 1: it gives way and loses energy, and "softened" says
+    so. It is known by a pivot that is a small part of its diagonal while both ends of the substep disagree about the tension.
     """
 
     converges = True
@@ -51,7 +69,7 @@ class Direct(Solver):
         owner = np.repeat(np.arange(len(arity)), arity)
         free = (slot >= 0) & ~np.concatenate([b.sprung(scene) for b in scalars])[owner]
         found = plan(len(arity), owner[free], item[free], self.width)
-        return Elimination(scene, batches, slots, scalars, found, slot[free]) if found.parts else None
+        return Elimination(scene, batches, slots, scalars, found, slot[free], item[free]) if found.parts else None
 
     def explain(self, batches: list[Batch], slots: Slots) -> str:
         """What is solved how."""
@@ -70,7 +88,10 @@ class Direct(Solver):
 class Elimination(System):
     """The systems of one world on the device. Row r is a constraint, at its place in the elimination."""
 
-    def __init__(self, scene: Scene, batches: list[Batch], slots: Slots, scalars: list[Scalar], found: Plan, slot: np.ndarray):
+    def __init__(
+        self, scene: Scene, batches: list[Batch], slots: Slots, scalars: list[Scalar], found: Plan, slot: np.ndarray,
+        item: np.ndarray,
+    ):  # fmt: skip
         super().__init__(scene, batches, slots, scalars, found.rows)
         self.plan, self.parts, self.entries = found, found.parts, len(found.column)
         product = found.product.copy()
@@ -83,6 +104,19 @@ class Elimination(System):
         self.update_begin, self.product = ints("update_begin", found.update_begin), ints("product", product, 3)
         self.gradient = scene.memory.field("system.gradient", slots.total, width=self.dim)
         self.value, self.weight = reals("value", self.rows + 2 * self.entries), reals("weight")
+        who = np.zeros(slots.total, dtype=np.int64)
+        who[slot] = item
+        self.who, self.w, self.close = ints("who", who), scene.state.w, reals("close")
+        self.digit = float(np.finfo(np.float32 if scene.real == ti.f32 else np.float64).eps)
+        parts = [scene.inv_mass[b.indices] * (b.slopes(b.start.position) ** 2).sum(axis=2) for b in scalars]
+        least = np.concatenate([np.where(p > 0, p, np.inf).min(axis=1, initial=np.inf) for p in parts])[found.rows]
+        small = np.where(np.isfinite(least), SMALL * least, 0.0)
+        self.small = scene.memory.field("system.small", self.rows, kind=ti.f64, values=small)
+        self.precise = [(k, b) for k, b in enumerate(scalars) if b.precise and scene.real == ti.f32]
+        if self.precise:
+            batch = np.repeat(np.arange(len(scalars)), [b.count for b in scalars])[found.rows]
+            number = np.concatenate([np.arange(b.count) for b in scalars])[found.rows]
+            self.batch, self.number = ints("batch", batch), ints("number", number)
         if self.one_sided:
             self.side, self.active, self.left = ints("side", side), ints("active", 0 * side), reals("left")
 
@@ -90,6 +124,8 @@ class Elimination(System):
     def tell(self, r, violation, A, alpha, lam, W, lever):
         """What constraint r is about in this pass, but for what its corners tell. lever: see Scalar."""
         System.tell(self, r, violation, A, alpha, lam, W, lever)
+        if W > 0:
+            self.close[r] = lever / (2 * W)
         if ti.static(self.one_sided):
             acts = self.side[r] == 0 or self.side[r] * violation > 0 or lam != 0
             self.active[r] = ti.cast(acts and W > 0, ti.i32)
@@ -111,7 +147,7 @@ class Elimination(System):
         return out
 
     @ti.func
-    def assemble(self, begin, end, soft):
+    def assemble(self, begin, end, soft, backward):
         """The matrix, with `soft` added to its diagonal, and the right side of the rows that act; others get the multiplier 0."""
         for r in range(begin, end):
             self.value[r] = 0
@@ -122,7 +158,7 @@ class Elimination(System):
             if self.acts(r):
                 for q in range(self.product_begin[r], self.product_begin[r + 1]):
                     at = self.product[q]
-                    self.value[at[0]] = self.value[at[0]] + self.scale[r] * self.coupling(at)
+                    self.value[at[0]] = self.value[at[0]] + self.scale[r] * self.coupling(at, backward)
                 self.value[r] = self.value[r] + (self.alpha[r] + soft)
                 self.step[r] = -self.violation[r]
             else:
@@ -131,24 +167,53 @@ class Elimination(System):
             self.weight[r] = self.value[r]
 
     @ti.func
-    def coupling(self, at):
-        """grad C_j . w . grad C_k of one particle."""
+    def coupling(self, at, backward):
+        """grad C_j . w . grad C_k of one particle. backward: with the gradient at the end of the substep for both."""
+        move = self.move[at[2]]
+        if backward != 0:
+            move = self.move_back(at[2])
         out = ti.cast(0, ti.f64)
         for k in ti.static(range(self.dim)):
-            out += ti.cast(self.gradient[at[1]][k], ti.f64) * ti.cast(self.move[at[2]][k], ti.f64)
+            out += ti.cast(self.gradient[at[1]][k], ti.f64) * ti.cast(move[k], ti.f64)
         return out
 
     @ti.func
+    def move_back(self, s):
+        """What a multiplier of 1 moves the corner of slot s along the gradient at the end of the substep."""
+        i = self.who[s]
+        move = self.gradient[s] * self.w.of(i)
+        if ti.static(self.shares):
+            move /= self.share[i]
+        return move
+
+    @ti.func
+    def turn_back(self, begin, end):
+        """Rows move corners along their gradients at the end of the substep."""
+        for r in range(begin, end):
+            for q in range(self.product_begin[r], self.product_begin[r + 1]):
+                s = self.product[q][1]
+                if s == self.product[q][2]:
+                    self.move[s] = self.move_back(s)
+
+    @ti.func
     def eliminate(self, begin, end):
-        """Each row from those that it is coupled to, then back."""
+        """Each row from those that it is coupled to, then back. Returns whether a pivot was small.
+
+        A constraint that others imply is left to them; but where it contradicts them, by more than its digits, it counts.
+        """
+        hard = 0
         for r in range(begin, end):
             first, last, pivot, step = self.entry_begin[r], self.entry_begin[r + 1], self.value[r], self.step[r]
             if ti.abs(pivot) <= REDUNDANT * self.weight[r]:
+                if (ti.abs(step) - ODD * ti.abs(self.violation[r])) * self.close[r] > 8 * self.digit:
+                    hard = 1
                 self.value[r] = 1
                 self.step[r] = 0
                 for e in range(first, last):
                     self.value[self.rows + e] = 0
             else:
+                if pivot <= self.small[r]:
+                    hard = 1
                 u = self.update_begin[r]
                 for e in range(first, last):
                     part, later = self.value[self.rows + self.entries + e] / pivot, self.column[e]
@@ -163,9 +228,10 @@ class Elimination(System):
             for e in range(self.entry_begin[r], self.entry_begin[r + 1]):
                 rest -= self.value[self.rows + e] * self.step[self.column[e]]
             self.step[r] = rest / self.value[r]
+        return hard
 
     @ti.func
-    def switch(self, begin, end):
+    def switch(self, begin, end, backward):
         """Rows off that would push where they can only pull, rows on that are violated; returns whether any changed."""
         for r in range(begin, end):
             self.left[r] = 0
@@ -173,7 +239,7 @@ class Elimination(System):
         for r in range(begin, end):
             for q in range(self.product_begin[r], self.product_begin[r + 1]):
                 at = self.product[q]
-                self.left[r] = self.left[r] + self.scale[r] * self.coupling(at) * self.step[self.row_of[at[2]]]
+                self.left[r] = self.left[r] + self.scale[r] * self.coupling(at, backward) * self.step[self.row_of[at[2]]]
             if self.side[r] != 0 and self.scale[r] != 0:
                 new = self.lam[r] + self.step[r]
                 left = self.violation[r] + self.left[r] + self.alpha[r] * self.step[r]
@@ -184,44 +250,109 @@ class Elimination(System):
         return changed
 
     @ti.func
-    def find(self, begin, end, soft):
-        """The step of every multiplier, of those that act."""
+    def find(self, begin, end, soft, backward):
+        """The step of every multiplier, of those that act. Returns what eliminate() does."""
+        hard = 0
         if ti.static(self.one_sided):
             k = 0
             while k < ROUNDS:
-                self.assemble(begin, end, soft)
-                self.eliminate(begin, end)
-                k = ti.select(self.switch(begin, end) != 0, k + 1, ROUNDS)
+                self.assemble(begin, end, soft, backward)
+                hard = self.eliminate(begin, end)
+                k = ti.select(self.switch(begin, end, backward) != 0, k + 1, ROUNDS)
             for r in range(begin, end):
                 if self.side[r] * (self.lam[r] + self.step[r]) > 0:
                     self.step[r] = -self.lam[r]
         else:
-            self.assemble(begin, end, soft)
-            self.eliminate(begin, end)
+            self.assemble(begin, end, soft, backward)
+            hard = self.eliminate(begin, end)
+        return hard
 
     @ti.func
-    def tensest(self, begin, end):
-        """The largest (omega h)^2 of a transverse vibration under the multipliers found, and the stiffness behind it."""
-        worst, size, steps = ti.cast(0, ti.f64), ti.cast(0, ti.f64), ti.cast(0, ti.f64)
+    def longer(self, r):
+        """The length of constraint r, relative to that at rest: a longer one vibrates less."""
+        out = ti.cast(1, ti.f64)
+        if self.scale[r] != 0:
+            out += ti.max(self.violation[r], 0 * out) * self.close[r] / self.scale[r]
+        return out
+
+    @ti.func
+    def tensest(self, begin, end, backward):
+        """(omega h)^2 of a transverse vibration under the multipliers found: the largest, and the sum; the stiffness behind it,
+        and the largest diagonal."""
+        worst, total = ti.cast(0, ti.f64), ti.cast(0, ti.f64)
+        size, steps, most = ti.cast(0, ti.f64), ti.cast(0, ti.f64), ti.cast(0, ti.f64)
         for r in range(begin, end):
-            step = self.step[r]
-            worst = ti.max(worst, self.lever[r] * ti.abs(self.lam[r] + step))
+            step, lever = self.step[r], self.lever[r]
+            if backward != 0:
+                lever /= self.longer(r)
+            worst = ti.max(worst, lever * ti.abs(self.lam[r] + step))
+            total += lever * (self.lam[r] + step)
             size += ti.abs(self.violation[r])
             steps += ti.abs(step)
-        return worst, ti.select(steps > 0, size / steps, 0 * size)
+            most = ti.max(most, self.weight[r])
+        return worst, total, ti.select(steps > 0, size / steps, 0 * size), most
+
+    @ti.func
+    def measure_again(self, begin, end):
+        """In f32: violations to all the digits that positions have. Those of a taut rope are of second order in its slopes."""
+        for r in range(begin, end):
+            for k, b in ti.static(self.precise):
+                if self.batch[r] == k and self.alpha[r] == 0 and self.scale[r] != 0:
+                    self.violation[r] = b.exactly(self.number[r])
+
+    @ti.func
+    def cut(self, begin, end):
+        """No multiplier beyond what its tension may be."""
+        for r in range(begin, end):
+            if self.lever[r] > 0:
+                most = BACKWARD * self.longer(r) / self.lever[r]
+                self.step[r] = ti.max(-most, ti.min(most, self.lam[r] + self.step[r])) - self.lam[r]
 
     @ti.func
     def solve(self, b):
         """System b: the step of every multiplier in it.
 
-        A tension makes particles vibrate across. Where the substep is too long for that, the system gives way until it is not.
+        A tension makes particles vibrate across. Where the substep is too long for that, or no tension is right, see Direct, the
+        system is solved with directions at the end of the substep, and gives way until its tension is small enough: one over the
+        tension grows linearly with the softness, where one load cannot be borne.
         """
         begin, end = self.part_begin[b], self.part_begin[b + 1]
-        soft, k = ti.cast(0, ti.f64), 0
-        while k < ROUNDS:
-            self.find(begin, end, soft)
-            tension, stiffness = self.tensest(begin, end)
-            if k == 0:
-                ti.atomic_max(self.tension[None], tension)
-            soft = ti.max(2 * soft, soft + stiffness * (tension / TENSEST - 1))
-            k = ti.select(tension > TENSEST, k + 1, ROUNDS)
+        zero = ti.cast(0, ti.f64)
+        soft, least, inverse, ahead, sum_ahead = zero, zero, zero, zero, zero
+        stage, k, bound = FORWARD, 0, True
+        if ti.static(len(self.precise) > 0):
+            stage = ROUGH
+        while stage != DONE:
+            hard = self.find(begin, end, soft, ti.cast(stage >= COMPARE, ti.i32))
+            tension, total, stiffness, most = self.tensest(begin, end, ti.cast(stage >= COMPARE, ti.i32))
+            if stage <= AGAIN:
+                if (hard == 0 and tension <= TENSEST) or stage == AGAIN:
+                    ti.atomic_max(self.tension[None], tension)
+                    stage = DONE
+                elif stage == ROUGH:
+                    self.measure_again(begin, end)
+                    stage = FORWARD
+                else:
+                    ahead, sum_ahead, bound, stage = tension, total, hard == 0, COMPARE
+            elif stage == COMPARE:
+                same = ti.abs(tension - ahead) <= AGREE * tension and ti.abs(total - sum_ahead) <= AGREE * ti.abs(total)
+                if same and tension <= CALM:
+                    stage = AGAIN
+                else:
+                    # What more substeps do not help has the figure of what is just unstable.
+                    ti.atomic_max(self.tension[None], ti.select(bound, ahead, ti.min(tension, TENSEST)))
+                    soft, stage = FLOOR * most, GIVE_WAY
+            else:
+                k += 1
+                if k == ROUNDS or (tension <= BACKWARD and (k == 1 or k > 3 or tension > 0.8 * BACKWARD)):
+                    self.turn_back(begin, end)
+                    self.cut(begin, end)
+                    stage = DONE
+                else:
+                    new = soft + stiffness * (tension / BACKWARD - 1)
+                    if k > 1 and 1 / tension > inverse:
+                        new = least + (soft - least) * (1.1 / BACKWARD - inverse) / (1 / tension - inverse)
+                    if tension > BACKWARD:
+                        least, inverse = soft, 1 / tension
+                        new = ti.max(new, 1.1 * soft)
+                    soft = new
