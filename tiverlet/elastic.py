@@ -203,14 +203,22 @@ class Elastic(Number, Breaking):
         return force
 
     @ti.func
-    def energy(self, c, back):
-        """C^2 / (2 alpha) at x - back d."""
+    def energy(self, c, back, hh, miss):
+        """Elastic energy [J] at x - back d: F C / 2, which is C^2 / (2 alpha) once solved.
+
+        What a solver leaves of the violation bears no load: the spring is as soft as it was solved, F = C / (alpha + what that
+        adds), and 1 / alpha would count energy that nobody supplied. hh: F = -lam / hh; 0 where there was no substep yet.
+        """
         out = ti.cast(0, ti.f64)
         if ti.static(self._on_soft):
             alpha = self._on_alpha[c]
             if alpha > 0 and self.holds(c):
                 C = self.bounded(self.near(self.value(c, back), self._on_rest[c]) - self._on_rest[c])
-                out = C * C / (2 * alpha)
+                out = ti.cast(C, ti.f64) * C / (2 * alpha)
+                if ti.static(not self._on_sprung):
+                    if hh > 0 and miss > 0:
+                        borne = ti.abs(self._on_lam[c]) * alpha / hh
+                        out *= borne / (borne + miss * self.extent(c))
         return out
 
     @ti.func

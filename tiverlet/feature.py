@@ -268,6 +268,6 @@ class Batch(Feature):
         return 0.0
 
     @ti.func
-    def energy(self, c, back):
-        """Elastic energy [J] of constraint c at x - back d."""
+    def energy(self, c, back, hh, miss):
+        """Elastic energy [J] of constraint c at x - back d. hh: as in relax(), 0 where there was no substep yet. miss: miss()."""
         return 0.0

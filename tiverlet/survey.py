@@ -135,9 +135,12 @@ class Survey:
         for f in ti.static(self.batches):
             part = (f.count + self.blocks - 1) // self.blocks
             for c in range(b * part, ti.min((b + 1) * part, f.count)):
-                figures[0] += f.energy(c, back)
+                hh, miss = 0 * h, 0 * h
                 if begin == 0:
-                    figures[1] = ti.max(figures[1], ti.cast(f.miss(c, h, self.sub.reach(h, fresh), when, fresh), ti.f64))
+                    hh = self.sub.reach(h, fresh)
+                    miss = f.miss(c, h, hh, when, fresh)
+                    figures[1] = ti.max(figures[1], ti.cast(miss, ti.f64))
+                figures[0] += f.energy(c, back, hh, miss)
         return figures, low, high
 
     @ti.func

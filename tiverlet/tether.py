@@ -152,7 +152,7 @@ class Tether(Batch):
         return size / self._on_size
 
     @ti.func
-    def energy(self, c, back):
+    def energy(self, c, back, hh, miss):
         """|C|^2 / (2 alpha)."""
         out = ti.cast(0, ti.f64)
         if ti.static(self._on_soft):

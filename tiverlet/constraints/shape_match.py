@@ -215,7 +215,7 @@ class ShapeMatch(Clusters):
         return ti.cast(worst / self._on_size[c], self._on_real)
 
     @ti.func
-    def energy(self, c, back):
+    def energy(self, c, back, hh, miss):
         """Sum of m |C|^2 / (2 alpha M) at x - back d, about the best fit there."""
         out = ti.cast(0, ti.f64)
         if ti.static(self._on_soft):
