@@ -260,3 +260,29 @@ def test_what_a_failed_frame_left_behind_is_gone(world):
         w.run(0.2)
         ends.append(w.hash())
     assert ends[0] == ends[1] and w.last.contacts > 100
+
+
+def test_the_skin_changes_no_bits_of_what_links_move(world):
+    # Row 83: skins of 0.01 ... 2 contact distances, on every path. Soft links throw discs together, apart and together again, in
+    # one substep further than the narrow skins reach.
+    n, rng = 60, np.random.default_rng(3)
+    x, v = rng.uniform(-2, 2, (n, 2)), rng.normal(size=(n, 2)) * 4
+    links = np.arange(n).reshape(-1, 2)
+    start, rest = tv.Particles(x, velocity=v, radius=0.1), rng.uniform(0.2, 1.5, len(links))
+    hashes = set()
+    for skin, path in ((0.002, "fused"), (0.05, "launched"), (0.4, "fused")):
+        contact = tv.Contact(skin=skin, friction=0.2)
+        features = [tv.Gravity(9.81), tv.Distance(links, rest, compliance=1e-4), contact, tv.Box((-2.2, -2.2), (2.2, 2.2))]
+        w = world(start, features, substeps=4, iterations=2, solver=tv.Jacobi(), path=path)
+        for _ in range(25):
+            w.step(1 / 60)
+        hashes.add(w.hash())
+    assert len(hashes) == 1
+
+
+def test_what_a_link_draws_through_another_disc_is_flagged(world):
+    # Row 82: in one substep from 0 to 2.3, through one that is pinned at 1.15. A link that is as long as it should be draws nothing.
+    for rest, flagged in ((0.7, True), (3.0, False)):
+        start = tv.Particles([[0.0, 0], [3.0, 0], [1.15, 0.0]], radius=0.3, pinned=[1, 2])
+        w = world(start, [tv.Distance([[0, 1]], rest), tv.Contact()], substeps=1)
+        assert ("tunnelling-risk" in w.step(1 / 60).flags) == flagged

@@ -1,7 +1,9 @@
 """Neighbours: how the list of near pairs is built.
 
-It holds, for each particle, all others closer than the sum of radii plus a skin, sorted by index. It stays valid until
-something has moved by half the skin, and no sum over it depends on when it was built, on the hash, or on the skin.
+It holds, for each particle, all others closer than the sum of radii plus a skin, sorted by index, and those with which it has
+something to carry along, wherever they are: what touched in the last substep may do so in the next, although a list was built
+in between. It stays valid until something has moved by half the skin, and no sum over it depends on when it was built, on the
+hash, or on the skin.
 """
 
 from collections.abc import Sequence
@@ -180,6 +182,17 @@ class Grid(Pairs):
                                     self.near[self.first[j] + raised(self.number, j, 1, self.serial)] = i
                             self.near[start + at] = j
                             used += 1
+        for old in range(self.old_first[i], self.old_first[i] + self.old_number[i]):
+            j = self.aside[old]
+            if self.listed(i, j, self.state.apart(i, j)) == 0:
+                if ti.static(what == APPEND):
+                    self.near[start + ti.min(used, self.capacity)] = j
+                elif ti.static(what == FILL):
+                    at = used
+                    if ti.static(self.several):
+                        at = raised(self.number, i, 1, self.serial)
+                    self.near[start + at] = j
+                used += 1
         return used
 
     @ti.func

@@ -60,7 +60,7 @@ class Launches(Access):
             if begin == substeps or (until > substeps and part == iterations):
                 return
             if part < iterations:  # go on with this substep
-                resumed, begin, it0, part = 1, until - 1, part, min(iterations, part + some)
+                resumed, begin, it0, part = 1, until - 1, part * self._sub.halves, min(iterations, part + some)
             else:
                 resumed, begin, it0, part = 0, until, 0, min(iterations, some) if self._order == 2 else iterations
                 until = min(substeps + 1, until + max(1, some // iterations))
@@ -90,6 +90,10 @@ class Launches(Access):
                     state = self._sub.collected(h, s, n, it, fresh)
                 else:
                     state = self._sub.relaxed(h, s, n, it, fresh)
+                if self._sub.halves == 2:
+                    if state & 1:
+                        self._list()
+                    state = self._sub.met(h, s, n, it, fresh)
                 if self._sub.bounces:
                     rounds = REBOUNDS if it == 0 and state & 2 else 0
                     while rounds and self._sub.rebounded():

@@ -43,6 +43,7 @@ class Phases(Tiles):
         self.ragged = [b for b in self.batches if b.blocks]
         self.drivers = drivers
         self.hashes = bool(grid)
+        self.halves = 2 if self.batches and self.contacts else 1  # of a pass, each with a list that is good
         self.breakers: list[Any] = [b for b in self.batches if b.breaks]
         self.concludes = any(c.rubs or c.bounces for c in self.contacts) or bool(self.breakers)
         self.bounces = any(c.bounces for c in self.contacts)
@@ -140,13 +141,19 @@ class Phases(Tiles):
             self.team.wait()
 
     @ti.func
-    def meet(self, me, first, fresh, final):
-        """3c Contacts: which there are, and what they want."""
-        for c in ti.static(self.contacts):
-            if ti.static(len(self.batches) > 0):
+    def draw(self, me):
+        """3c Where there are contacts, particles gather the moves of constraints first, which the list has to hear of, too."""
+        if ti.static(self.halves == 2):
+            for c in ti.static(self.contacts):
                 for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
                     self.slots.gather(i)
+                    c.heed(self.grid.outrun(i), c.overshoots(i))
                 self.team.wait()
+
+    @ti.func
+    def meet(self, me, first, fresh, final):
+        """3d Contacts: which there are, and what they want."""
+        for c in ti.static(self.contacts):
             if ti.static(c.measures):
                 for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
                     c.measure(i)
@@ -172,7 +179,7 @@ class Phases(Tiles):
 
     @ti.func
     def rebound(self, me):
-        """3d One round of restitution, in the first pass; hit tells whether another one is needed."""
+        """3e One round of restitution, in the first pass; hit tells whether another one is needed."""
         for c in ti.static(self.contacts):
             if ti.static(c.bounces):
                 self.team.wait()
@@ -189,7 +196,7 @@ class Phases(Tiles):
 
     @ti.func
     def collect(self, me, h, when, first, final, looks):
-        """3e Particles gather their moves; walls. looks: 0 if predict() is next, which asks for the list, too."""
+        """3f Particles gather their moves; walls. looks: 0 if predict() is next, which asks for the list, too."""
         if ti.static(len(self.batches) > 0 or len(self.contacts) > 0 or len(self.walls) > 0):
             for k in range(self.team.deal(self.pieces * self.each, self.each, me)):
                 self.move(self.team.turn(k, self.each, me), h, when, first, final, looks)

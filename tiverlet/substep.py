@@ -19,8 +19,8 @@ from .team import LEAST
 # The sheet of a frame, one array, since a launch takes 0.25 us more for each. First what the frame came to, see Survey; then how
 # it ended: whether, in which substep and before which iteration it stopped to have the list grown; how many threads of a team
 # were at work. Then what it is given: the substep, and the times at the start and the end of the frame [s]; substeps so far, and
-# since the last start; whether it starts; how many substeps and iterations; where it goes on if it stopped (substep, iteration,
-# 1); 0, the number of the first thread; how the state that it leaves came about, see Survey; before which substep, and which
+# since the last start; whether it starts; how many substeps and iterations; where it goes on if it stopped (substep, pass or
+# half of it, 1); 0, the number of the first thread; how the state that it leaves came about, see Survey; before which substep, and which
 # iteration of it, the launch ends: a long frame is made in several, between which Python looks at signals.
 FIGURES = 14
 HALT, HANDS = FIGURES, FIGURES + 3
@@ -68,22 +68,26 @@ class Substep(Phases):
                 if more and again == 0:
                     time, final = ti.cast(t + s * h64, self.real), ti.cast(s == substeps - 1, ti.i32)
                     self.predict(me, h, time, tick + s, starts, when, self.calming(since + s), final)
-                for it in range(ti.select(again != 0, it0, 0), ti.select(more, part, 1)):
+                for q in range(ti.select(again != 0, it0, 0), ti.select(more, part * self.halves, 1)):
+                    it = q // self.halves
                     if ti.static(self.hashes):
                         if self.halted() == 0 and self.is_stale() != 0:
                             self.grid.build(me)
                             if self.grid.need[None] > self.grid.capacity:
-                                self.halt[None] = [1, s, it]  # all write the same
+                                self.halt[None] = [1, s, q]  # all write the same
                     if more and self.halted() == 0:
                         first, final = ti.cast(it == 0, ti.i32), ti.cast(s == substeps - 1, ti.i32)
-                        self.tell(me, h, when, first, starts)
-                        self.settle(me, first)
-                        self.meet(me, first, starts, final)
-                        if ti.static(self.bounces):
-                            for _ in range(REBOUNDS):
-                                if it == 0 and self.struck() != 0:
-                                    self.rebound(me)
-                        self.collect(me, h, when, first, final, ti.cast(final != 0 or it + 1 < iterations, ti.i32))
+                        if q % self.halves == 0:
+                            self.tell(me, h, when, first, starts)
+                            self.settle(me, first)
+                            self.draw(me)
+                        if q % self.halves == self.halves - 1:
+                            self.meet(me, first, starts, final)
+                            if ti.static(self.bounces):
+                                for _ in range(REBOUNDS):
+                                    if it == 0 and self.struck() != 0:
+                                        self.rebound(me)
+                            self.collect(me, h, when, first, final, ti.cast(final != 0 or it + 1 < iterations, ti.i32))
                 if ti.static(self.concludes):
                     if more and part == iterations and self.halted() == 0:
                         self.remember(me, h, tick + s)
@@ -114,14 +118,29 @@ class Substep(Phases):
 
     @ti.kernel
     def relaxed(self, h64: ti.f64, s: ti.i32, substeps: ti.i32, it: ti.i32, fresh: ti.i32) -> ti.i32:
-        """One pass of phase 3, or what comes before bounces; returns whether the list is stale, and 2 more if a pair bounces."""
+        """One pass of phase 3, or the half of it before contacts where there are constraints, too, or what comes before bounces;
+        returns whether the list is stale, and 2 more if a pair bounces."""
         h, when = ti.cast(h64, self.real), self.clock(s, substeps)
-        first, final = ti.cast(it == 0, ti.i32), ti.cast(s == substeps - 1, ti.i32)
+        first = ti.cast(it == 0, ti.i32)
         self.tell(0, h, when, first, fresh)
         self.settle(0, first)
+        self.draw(0)
+        if ti.static(self.halves == 1):
+            self.go_on(h, when, first, fresh, ti.cast(s == substeps - 1, ti.i32))
+        return self.is_stale() + 2 * self.struck()
+
+    @ti.func
+    def go_on(self, h, when, first, fresh, final):
+        """The rest of a pass, or what of it comes before bounces."""
         self.meet(0, first, fresh, final)
         if ti.static(not self.bounces):
             self.collect(0, h, when, first, final, 1)
+
+    @ti.kernel
+    def met(self, h64: ti.f64, s: ti.i32, substeps: ti.i32, it: ti.i32, fresh: ti.i32) -> ti.i32:
+        """The other half; returns what relaxed() does."""
+        first, final = ti.cast(it == 0, ti.i32), ti.cast(s == substeps - 1, ti.i32)
+        self.go_on(ti.cast(h64, self.real), self.clock(s, substeps), first, fresh, final)
         return self.is_stale() + 2 * self.struck()
 
     @ti.kernel
@@ -139,13 +158,12 @@ class Substep(Phases):
 
     @ti.kernel
     def collected(self, h64: ti.f64, s: ti.i32, substeps: ti.i32, it: ti.i32, fresh: ti.i32) -> ti.i32:
-        """The end of the pass, or what comes before bounces; returns what relaxed() does."""
-        h, when = ti.cast(h64, self.real), self.clock(s, substeps)
-        first, final = ti.cast(it == 0, ti.i32), ti.cast(s == substeps - 1, ti.i32)
+        """The end of the pass, or of its half; returns what relaxed() does."""
+        first = ti.cast(it == 0, ti.i32)
         self.take(0, first)
-        self.meet(0, first, fresh, final)
-        if ti.static(not self.bounces):
-            self.collect(0, h, when, first, final, 1)
+        self.draw(0)
+        if ti.static(self.halves == 1):
+            self.go_on(ti.cast(h64, self.real), self.clock(s, substeps), first, fresh, ti.cast(s == substeps - 1, ti.i32))
         return self.is_stale() + 2 * self.struck()
 
     @ti.kernel

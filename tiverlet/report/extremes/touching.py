@@ -202,6 +202,30 @@ def _deep() -> Finding:
         )
 
 
+@row(82, "a link draws a disc through a pinned one", "flagged; not where the link is as long as it should be")
+def _drawn_through() -> Finding:
+    holds = {}
+    for rest in (0.7, 3.0):
+        start = Particles([[0.0, 0], [3.0, 0], [1.15, 0.0]], radius=0.3, pinned=[1, 2])
+        with world(start, [Distance([[0, 1]], rest), Contact()], substeps=1) as w:
+            told, moved = "tunnelling-risk" in w.step(1 / 60).flags, float(w.position[0, 0])
+            holds[f"to {moved:.2f} m: {'flagged' if told else 'not flagged'}"] = told == (moved > 0.3)
+    return Finding(", ".join(holds), holds)
+
+
+@row(83, "skins of 0.01 ... 2 contact distances, discs with soft links", "the same bits")
+def _skins() -> Finding:
+    n, rng = 60, np.random.default_rng(3)
+    start = Particles(rng.uniform(-2, 2, (n, 2)), velocity=rng.normal(size=(n, 2)) * 4, radius=0.1)
+    rest, made = rng.uniform(0.2, 1.5, n // 2), []
+    for skin in (0.002, 0.05, 0.4):
+        features = [Gravity(9.81), Distance(np.arange(n).reshape(-1, 2), rest, compliance=1e-4), Contact(skin=skin)]
+        with world(start, [*features, Box((-2.2, -2.2), (2.2, 2.2))], substeps=4) as w:
+            w.run(1.0)
+            made.append((w.hash(), w.last.overlap))
+    return Finding(f"overlap {made[0][1]:.2g} each", {"the same": len({bits for bits, _ in made}) == 1})
+
+
 @row(67, "particles outside every wall", "they still collide")
 def _outside() -> Finding:
     start = Particles([[-50.0, 0], [-50.5, 0.0]], velocity=[[-1, 0], [1, 0]], radius=0.2)
