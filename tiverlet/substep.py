@@ -19,9 +19,9 @@ from .team import LEAST
 # The sheet of a frame, one array, since a launch takes 0.25 us more for each. First what the frame came to, see Survey; then how
 # it ended: whether, in which substep and before which iteration it stopped to have the list grown; how many threads of a team
 # were at work. Then what it is given: the substep, and the times at the start and the end of the frame [s]; substeps so far, and
-# since the last start; whether it starts; how many substeps and iterations; where it goes on if it stopped (substep, pass or
-# half of it, 1); 0, the number of the first thread; how the state that it leaves came about, see Survey; before which substep, and which
-# iteration of it, the launch ends: a long frame is made in several, between which Python looks at signals.
+# since the last start; whether it starts; how many substeps and iterations; where it goes on if it stopped (substep, pass or half
+# of it, 1); 0, the number of the first thread; how the state that it leaves came about, see Survey; before which substep, and
+# which iteration of it, the launch ends: a long frame is made in several, between which Python looks at signals.
 FIGURES = 14
 HALT, HANDS = FIGURES, FIGURES + 3
 GIVEN = tuple(range(HANDS + 1, HANDS + 16))

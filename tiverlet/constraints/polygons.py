@@ -226,6 +226,15 @@ class Polygons(Rim):
                 self._on_struck[i] = self._on_active[i]
 
     @ti.func
+    def push_bond(self, i):
+        """Nothing is left for the end of a frame: all of it is known from the passes."""
+
+    @ti.func
+    def bond(self, i):
+        """Pushes, and friction."""
+        return self._on_bond[i]
+
+    @ti.func
     def gather(self, i, first):
         """Move particle i as its contacts want; what bounced goes where it is at the end of the substep."""
         if self._on_w.of(i) > 0:
