@@ -66,7 +66,7 @@ class Contact(Splitting):
     1; otherwise it bounces again, or is let go on its way out.
     """
 
-    def __init__(self, friction=0.0, restitution=0.0, *, skin="auto", groups=None, push_out=1.0):
+    def __init__(self, friction=0.0, restitution=0.0, *, skin: float | str = "auto", groups=None, push_out=1.0):
         if not (isinstance(skin, str) and skin == "auto"):
             skin = checks.number("Contact", "skin", skin, above=0.0)
         self.skin = skin
