@@ -29,7 +29,7 @@ ROOT = pathlib.Path(tv.__file__).parent
 def test_every_known_answer_is_a_case_or_said_to_be_left_out():
     named = {name.partition(":")[0] for name in CASES} | set(LEFT_OUT)
     assert set(entries()) <= named
-    assert len(CASES) >= 25 and sorted(ROWS) == list(range(1, 71))
+    assert len(CASES) >= 25 and set(range(1, 71)) <= set(ROWS)
     assert [c.name for c in chosen("D07_massratio_1000")] == [n for n in CASES if n.startswith("D07_massratio_1000")]
     with pytest.raises(ValueError, match="'D99' fits no case. Near it: D0"):
         chosen(["D99"])
