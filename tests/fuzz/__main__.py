@@ -19,11 +19,12 @@ def main() -> int:
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--batch", type=int, default=20, help="structures of a process")
     parser.add_argument("--folder", default="fuzz-finds", help="for scripts")
+    parser.add_argument("--kinds", default="", help="of finds to look for, separated by commas; all by default")
     parser.add_argument("--part", default="", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.part:
         begin, end = map(int, args.part.split(":"))
-        for line in campaign(args.seed, begin, end, args.each, args.folder):
+        for line in campaign(args.seed, begin, end, args.each, args.folder, set(args.kinds.split(",")) if args.kinds else None):
             print(json.dumps(line), flush=True)
         return 0
     os.makedirs(args.folder, exist_ok=True)
@@ -38,7 +39,7 @@ def parent(args) -> int:
 
     def start(begin, end):
         command = [sys.executable, "-m", "tests.fuzz", "--part", f"{begin}:{end}", "--seed", str(args.seed)]
-        command += ["--each", str(args.each), "--folder", args.folder]
+        command += ["--each", str(args.each), "--folder", args.folder, "--kinds", args.kinds]
         running[subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)] = (begin, end)
 
     while todo or running:

@@ -8,10 +8,12 @@ from typing import Any
 
 from hypothesis import HealthCheck, Phase, given, seed, settings
 
-from .scenes import Event, Step, Structure, happenings, script, structures
+from . import twins
+from .scenes import Event, Set, Step, Structure, happenings, script, structures
 from .trials import Find, Refused, Trial
 
 PATIENCE = 1.0  # [s] that a scene may take to be run again
+ENOUGH = 15.0  # [s] for all scenes of a structure
 QUIET: Any = dict(database=None, deadline=None, suppress_health_check=list(HealthCheck), print_blob=False)
 
 
@@ -35,20 +37,27 @@ class Searcher:
     def __init__(self, structure: Structure, kinds: set[str] | None = None):
         self.structure, self.kinds, self.trial = structure, kinds, None
         self.scenes = self.frames = self.refused = 0
+        self.spent = 0.0
+        self.last: list[Event] = []  # of the scenes that were not refused
         self.found: tuple[Find, list[Event]] | None = None
 
     def scene(self, events: list[Event]) -> None:
-        """Run one, twice."""
+        """Run one, twice; none once others of the structure have taken long."""
+        if self.spent > ENOUGH and not self.found:
+            return
         self.scenes += 1
+        clock = process_time()
         self.frames += sum(isinstance(e, Step) for e in events)
         try:
             self.trial = self.trial or Trial(self.structure)
-            clock = process_time()
             first = self.trial.run(events)
             if process_time() - clock < PATIENCE and (again := self.trial.replay(events)) != first:
                 raise Find("bits", f"a scene run again ends with another hash: {first[:12]}, {again[:12]}")
+            self.last = events
         except Refused:
             self.refused += 1
+        finally:
+            self.spent += process_time() - clock
 
     def says(self) -> str:
         """What was found, as a script."""
@@ -71,11 +80,24 @@ class Searcher:
 
         try:
             test()
+            if self.trial and self.last:
+                self.others(number)
         except Find:
             pass
         finally:
             if self.trial:
                 self.trial.close()
+
+    def others(self, number: int) -> None:
+        """The last scene again by other ways, which are compiled anew: one of them for each structure."""
+        events = [Set(None, e.name, 3) if isinstance(e, Set) and e.name == "substeps" else e for e in self.last]
+        way = twins.WAYS[number % len(twins.WAYS)]
+        try:
+            way(self.trial, events)
+        except Find as find:
+            if self.kinds is None or find.kind in self.kinds:
+                self.found = (find, events)
+                raise
 
 
 def smaller(structure: Structure, events: list[Event], kind: str) -> tuple[Structure, list[Event]]:
@@ -109,15 +131,15 @@ def search(number: int, k: int, each: int, kinds: set[str] | None = None) -> Sea
     return searcher
 
 
-def campaign(number: int, begin: int, end: int, each: int, folder: str) -> Iterator[dict[str, Any]]:
+def campaign(number: int, begin: int, end: int, each: int, folder: str, kinds: set[str] | None) -> Iterator[dict[str, Any]]:
     """Structures begin ... end - 1 of a campaign, as lines of what came of each."""
     for k in range(begin, end):
         yield {"begins": k}
-        searcher = search(number, k, each)
+        searcher = search(number, k, each, kinds)
         line = {"structures": 1, "scenes": searcher.scenes, "frames": searcher.frames, "refused": searcher.refused, "finds": []}
         if searcher.found:
             find, events = searcher.found
-            small, less = smaller(searcher.structure, events, find.kind)
+            small, less = (searcher.structure, events) if find.kind == "twin" else smaller(searcher.structure, events, find.kind)
             path = os.path.join(folder, f"{number}-{k}-{find.kind.replace(', ', '-').replace(' ', '-')}.py")
             with open(path, "w") as file:
                 file.write(script(small, less, str(find)))

@@ -554,7 +554,7 @@ def happenings(draw, structure: Structure, regroup: bool = False) -> list[Event]
     start = pick(draw, "built", "built", "built", "jitter", "random", "point", "row", "flat", "away", "shrunk", "swapped")
     if start != "built":
         out.append(Set(None, "position", placed(start, x, draw(seeds))))
-    speed = pick(draw, 0.0, 0.0, 1.0, 10.0, 1e3, 1e-3)
+    speed = pick(draw, 0.0, 0.0, 1.0, 10.0, 100.0, 1e-3)
     if speed:
         rng = np.random.default_rng(draw(seeds))
         out.append(Set(None, "velocity", speed * scale(x) * rng.standard_normal(x.shape)))

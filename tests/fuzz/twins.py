@@ -1,0 +1,138 @@
+"""The same scene by other ways has the same bits: other paths, clones, recordings, and what comes and goes beside it."""
+
+import os
+import tempfile
+import warnings
+from typing import Any
+
+import numpy as np
+
+import tiverlet as tv
+
+from . import functions
+from .scenes import Call, Event, Step, Structure, plain
+from .trials import Find, Refused, Trial, door, quiet
+
+
+def quietly(events: list[Event], world: tv.World, features: list[Any], log=None) -> None:
+    """Run events."""
+    try:
+        with warnings.catch_warnings():
+            quiet()
+            for event in events:
+                event.do(world, features)
+                if log and isinstance(event, Step):
+                    log()
+    except Exception as error:  # noqa: BLE001
+        door(error)
+
+
+def same(what: str, a: str, b: str) -> None:
+    """Refuse other bits."""
+    if a != b:
+        raise Find("twin", f"{what} has other bits: {a[:12]}, {b[:12]}")
+
+
+def by_path(trial: Trial, events: list[Event]) -> None:
+    """Fused, or launched as on a GPU."""
+    settings = trial.structure.settings
+    if settings.get("order", 2) > 2:
+        return
+    path = "launched" if settings["path"] == "fused" else "fused"
+    other = Trial(Structure(trial.structure.particles, trial.structure.features, settings | {"path": path}))
+    try:
+        same(f'path="{path}"', trial.replay(events), other.replay(events))
+    finally:
+        other.close()
+
+
+def by_clone(trial: Trial, events: list[Event]) -> None:
+    """A clone goes on alike."""
+    half = len(events) // 2 + 1
+    trial.replay(events[:half])
+    try:
+        twin = trial.world.clone()
+    except Exception as error:  # noqa: BLE001
+        door(error)
+    with twin:
+        same("a clone", trial.world.hash(), twin.hash())
+        quietly(events[half:], trial.world, trial.features)
+        quietly(events[half:], twin, list(twin.features))
+        same("a clone after some frames", trial.world.hash(), twin.hash())
+
+
+def by_recording(trial: Trial, events: list[Event]) -> None:
+    """A recording computed anew comes out as it was recorded."""
+    trial.reset()
+    own = [
+        v
+        for f in trial.structure.features
+        for v in f.args.values()
+        if getattr(functions, getattr(plain(v), "__name__", ""), None)
+    ]
+    with tempfile.TemporaryDirectory() as folder:
+        path = os.path.join(folder, "scene.rrd")
+        try:
+            with warnings.catch_warnings():
+                quiet()
+                with tv.Recorder(path, trial.world) as recorder:
+                    quietly(events, trial.world, trial.features, recorder.log)
+                verdict = tv.replay(path, given=own).verify()
+        except Exception as error:  # noqa: BLE001
+            door(error)
+    if not verdict:
+        raise Find("twin", f"a recording: {verdict}")
+
+
+def by_company(trial: Trial, events: list[Event]) -> None:
+    """A particle that comes and goes far away changes nothing."""
+    structure = trial.structure
+    other, n, radius = Trial(structure), len(structure.position), float(trial.world.particles.radius.max())
+    try:
+        steps = [e for e in events if isinstance(e, Step)][:3]
+        for world in (trial, other):
+            world.reset()
+        far = structure.position.max(axis=0) + 50 * max(trial.world.particles.size, 1e-3)
+        for k in range(4):
+            if k == 1:
+                other.world.add(Call("Particles", {"position": far[None], "radius": radius}).make())
+            if k == 3:
+                other.world.remove([n])
+            for world in (trial, other):
+                quietly(steps[:1], world.world, world.features)
+            a, b = trial.world.position, other.world.position[:n]
+            if not np.array_equal(a, b, equal_nan=True):
+                i = int(np.argmax((a != b).any(axis=1)))
+                raise Find("twin", f"a particle far away ({far}) moves particle {i} by {np.abs(a - b).max():.3g} m in frame {k}")
+    except (Find, Refused):
+        raise
+    except Exception as error:  # noqa: BLE001
+        door(error)
+    finally:
+        other.close()
+
+
+def by_questions(trial: Trial, events: list[Event]) -> None:
+    """Who is near, nearest, or in contact, by comparing all."""
+    trial.replay(events)
+    w, x = trial.world, trial.world.position
+    if not np.isfinite(x).all():
+        return
+    size = w.particles.size
+    points = x.mean(axis=0) + size * (tv.golden(np.arange(5), dim=x.shape[1]) - 0.5)
+    apart = np.linalg.norm(points[:, None] - x[None], axis=2)
+    radius = float(np.median(apart))
+    blur = 1e-5 * (np.abs(x).max() + radius)
+    try:
+        near, (index, distance) = w.near(points, radius), w.nearest(points)
+        w.explain(), w.contacts, repr(w)
+    except Exception as error:  # noqa: BLE001
+        door(error)
+    got = np.zeros(apart.shape, dtype=bool)
+    got[near[:, 0], near[:, 1]] = True
+    wrong = (got != (apart <= radius)) & (np.abs(apart - radius) > blur)
+    if wrong.any() or np.abs(distance - apart.min(axis=1)).max() > blur:
+        raise Find("twin", f"near {near.tolist()}, nearest {index.tolist()} of {points.tolist()} within {radius}")
+
+
+WAYS = (by_path, by_clone, by_recording, by_company, by_questions)
