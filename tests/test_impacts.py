@@ -326,3 +326,17 @@ def test_bounces_survive_a_new_list_between_two_passes(world):
         w.run(0.5)
         hashes.add(w.hash())
     assert len(hashes) == 1
+
+
+@pytest.mark.parametrize("e", [0.5, 1.0])
+def test_what_is_driven_strikes(world, e):
+    # A racket at V meets a ball at rest, which leaves at (1 + e) V: the racket is as good as infinitely heavy.
+    V, pin, beads = 2.0, tv.Pin([0]), tv.Path([2], [[0.0, 5], [5, 5]], smooth=False, speed=2.0)
+    x = [[0.0, 0], [0.7, 0], [0.0, 5], [0.7, 5]]
+    w = world(
+        tv.Particles(x, radius=0.3, mass=[1, 2, 1, 3]), [pin, beads, tv.Contact(restitution=e)], precision="f64", substeps=4
+    )
+    for k in range(12):
+        pin.target = [[V * (k + 1) / 60, 0.0]]
+        w.step(1 / 60)
+    np.testing.assert_allclose(w.velocity[[1, 3], 0], (1 + e) * V, rtol=1e-12)

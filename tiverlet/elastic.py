@@ -158,6 +158,9 @@ class Elastic(Number, Breaking):
                     self._on_last[c] = f0
                 else:
                     B = self._on_history[c]
+            elif first != 0:  # it has no direction now, and may get one in a later pass
+                self._on_history[c] = 0
+                self._on_last[c] = f0
         return A * C + B + alpha * lam, A, alpha, lam, W
 
     @ti.func

@@ -67,6 +67,8 @@ class Phases(Tiles):
         for f in ti.static(self.drivers):
             for c in range(self.team.low(f.count, me), self.team.high(f.count, me)):
                 f.drive(c, h, when[1])
+                if ti.static(self.state.befores):  # at the velocity with which it is driven, others meet it
+                    self.state.before[f.member(c, 0)] = self.state.d[f.member(c, 0)]
                 for k in ti.static(self.contacts):
                     k.heed(self.grid.outrun(f.member(c, 0)), k.overshoots(f.member(c, 0)))
             self.team.wait()

@@ -111,7 +111,7 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
     if not world._fresh and (world._parted is not None or any(_loses(f, number, features) for f in before)):
         seen = world.velocity
     try:
-        turned = any(_drives(f, number) for f in came + went)
+        turned = world._force_waits or any(_drives(f, number) for f in came + went)
         if turned:
             with world._memory.compiler():
                 world._restart()

@@ -182,11 +182,21 @@ class World(Launches):
         """Bring the knobs to the device; where a force has changed, start anew while the device still has what it was."""
         for feature in self._features:
             if feature.changed or feature.moving:
+                self._settle_forces()
                 with self._memory.compiler():
-                    if any(f.changed and isinstance(f, Acceleration) for f in self._features):
-                        self._restart()
                     self._upload()
                 return
+
+    @property
+    def _force_waits(self) -> bool:
+        """Whether a force has changed and the device still has what it was."""
+        return any(f.changed and isinstance(f, Acceleration) for f in self._features)
+
+    def _settle_forces(self) -> None:
+        """Where a force has changed, take velocities by what it was: before that is overwritten, or left behind by a copy."""
+        if self._force_waits:
+            with self._memory.compiler():
+                self._restart()
 
     def _upload(self) -> None:
         """Write what was changed in Python since the last frame."""
@@ -295,6 +305,7 @@ class World(Launches):
         if unknown := set(changes) - set(settings):
             raise TypeError(f"World.clone: {sorted(unknown)[0]} cannot be changed; one of {', '.join(settings)} can.")
         self._memory.check()
+        self._settle_forces()
         copies = tuple(f.copy() for f in self._features)
         new = World._of(self._particles, copies, [f.start for f in self._features], **{**settings, **changes})
         snapshot.transfer(self, new)

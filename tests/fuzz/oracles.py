@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from tiverlet.constraints.bend import Angle
 from tiverlet.feature import Batch
 from tiverlet.ragged import Ragged
 from tiverlet.scalar import Scalar
@@ -102,6 +103,18 @@ def overlap(contact: Any, features: list[Any], particles: Any, free: np.ndarray,
     return count, worst
 
 
+def shapeless(f: Any, x: np.ndarray) -> np.ndarray:
+    """Of constraints on angles, those between corners that have none: nothing acts on them."""
+    if not isinstance(f, Angle):
+        return np.zeros(f.count, dtype=bool)
+    q = x[f.indices]
+    legs = np.diff(q, axis=1) if f.arity == 3 else q[:, 1:] - q[:, :1]
+    if f.arity == 4:  # an edge, and the heights of two wings over it
+        e = legs[:, :1] / np.maximum(np.linalg.norm(legs[:, :1], axis=2, keepdims=True), 1e-300)
+        legs[:, 1:] -= e * (legs[:, 1:] * e).sum(axis=2, keepdims=True)
+    return np.linalg.norm(legs, axis=2).min(axis=1, initial=np.inf) < 1e-6 * f.start.size
+
+
 def rigid(features: list[Any], free: np.ndarray, x: np.ndarray) -> tuple[float, bool]:
     """The worst violation of rigid constraints that are one number, relative to their size, and whether these are all of them."""
     worst, whole = 0.0, True
@@ -117,7 +130,7 @@ def rigid(features: list[Any], free: np.ndarray, x: np.ndarray) -> tuple[float, 
         start = f.rest_of(f.start.position)
         unit = f.unit or (float(np.abs(start).mean()) if np.any(start) else f.start.size)
         size = np.full(f.count, unit) if f.unit else np.where(f.goal != 0, np.abs(f.goal), unit)
-        some = (f.compliance == 0) & ~f.broken & ~f.idle(free)
+        some = (f.compliance == 0) & ~f.broken & ~f.idle(free) & ~shapeless(f, x)
         worst = max(worst, float((C / size)[some].max(initial=0.0)))
     return worst, whole
 

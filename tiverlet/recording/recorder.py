@@ -94,6 +94,7 @@ class Recorder:
     def _begin(self, title: str) -> None:
         """Write what holds for all frames, and the first one."""
         world, explained = self.world, self.world.explain()
+        world._settle_forces()
         self._picture = Picture(world, self._stream, explained)
         self._sent, self._flushed = perf_counter(), 0
         self._picture.stamp(0)
@@ -217,9 +218,9 @@ class Recorder:
         world, journal, picture = self.world, self._journal, self._picture
         journal.frame = number
         picture.stamp(number)
-        if number and (
-            picture.drawing.bytes - self._drawn > self._due or number - self._last_state >= SPARSE * self._stride // self.every
-        ):
+        sparse = number - self._last_state >= SPARSE * self._stride // self.every
+        due = picture.drawing.bytes - self._drawn > self._due or sparse
+        if number and due and not world._force_waits:  # a state does not hold the force that it came about under
             self._note_state(journal.state())
         now = snapshot.keep(world, pairs=False)
         x = now.position(len(world.particles))
