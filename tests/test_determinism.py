@@ -150,7 +150,7 @@ def test_what_is_absent_has_no_field_and_no_kernel(world):
         "HalfSpace": ([tv.HalfSpace((0, 1), -1)], {"HalfSpace", "thrust"}),
         "Polygon": ([tv.Polygon([[1, 1], [2, 1], [1, 2]])], {"Polygon", "thrust", "position_at_start"}),
         "Pin": ([tv.Pin([0])], {"Pin", "inv_mass"}),
-        "Distance": ([tv.Distance([[0, 1]], 0.1)], {"Distance", "slots"}),
+        "Distance": ([tv.Distance([[0, 1]], 0.1)], {"Distance", "slots", "position_low", "displacement_low"}),
         "empty Distance": ([tv.Distance(np.zeros((0, 2), int))], set()),
         "Contact of points": ([tv.Contact()], set()),
     }

@@ -204,13 +204,11 @@ def test_direct_checks_its_arguments():
 
 @pytest.mark.filterwarnings("ignore:Contact. all radii are 0")
 def test_the_default_suits_the_structure(world):
-    # Links like chains, trees and loops are solved directly, stiff cloth by conjugate gradients; soft cloth, small braced bodies,
-    # limits of angles, single links and what starts violated are relaxed. explain() says what was chosen, and a solver that the
-    # user names is taken as it is.
+    # Links like chains, trees and loops are solved directly; cloth, braced bodies, limits of angles, single links and what starts
+    # violated are relaxed. explain() says what was chosen, and a solver that the user names is taken as it is.
     flat = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1], [2, 1]])
     x, chain = flat[[0, 1, 2, 4]], links(3)
     braced = [(i, j) for i in range(4) for j in range(i)]
-    sheet = tv.shapes.cloth((0, 0, 0), (1, 0, 0), (0, 0, 1), (11, 11))
     for position, features, solver in (
         (x, [tv.Distance(chain)], "Direct"),
         (x, [tv.Rope(chain), tv.Contact(), tv.Gravity()], "Direct"),
@@ -222,22 +220,20 @@ def test_the_default_suits_the_structure(world):
         (x, [tv.Distance(chain, [1.0, 1.0, 3.0])], "Jacobi"),
         (x, [tv.Rope(chain, 5.0)], "Direct"),
         (x, [], "Jacobi"),
-        (sheet.position, [tv.Distance(sheet.links), tv.Dihedral(sheet.quads, compliance=1.0)], "ConjugateGradient"),
-        (sheet.position, [tv.Distance(sheet.links), tv.Dihedral(sheet.quads)], "Jacobi"),
-        (sheet.position, [tv.Distance(sheet.links, compliance=1e-3)], "Jacobi"),
     ):
         w = world(tv.Particles(position), features)
         assert type(w._solver).__name__ == solver, features
-        assert not features or f"Solved by {solver}" in w.explain() and "; chosen because links " in w.explain()
+        assert f"Solved by {solver}" in w.explain() or not features
     w = world(tv.Particles(x), [tv.Distance(chain)], solver=tv.Jacobi())
-    assert "Solved by Jacobi" in w.explain() and "chosen" not in w.explain()
+    assert "Solved by Jacobi" in w.explain()
 
 
 def test_ropes_that_touch_are_solved_and_come_to_rest(world):
     # Elimination and contacts take turns in f32: ropes fall into a box, keep their length, and lie still. Before they touch the
     # walls, what they do to each other leaves their momentum: m g t per particle. Thrown a little harder they pile up another
     # way; about one pile in four goes on trembling, with some 1e-4 m g r. A blow at v moves an end of a link
-    # by v h at most before the link is solved again. All fall less than 0.7 m; half of the throws stretch links by less than 5 %.
+    # by v h at most before the link is solved again. All fall less than 0.7 m; half of the throws stretch links by less than 5 %
+    # (in f32 and f64 seven of eight do).
     x = np.vstack([tv.shapes.rope((-0.3, 0.3 + 0.06 * k), (0.3, 0.33 + 0.06 * k), points=20).position for k in range(6)])
     pairs = np.vstack([links(19, 20 * k) for k in range(6)])
     speed = np.zeros_like(x)
@@ -252,7 +248,7 @@ def test_ropes_that_touch_are_solved_and_come_to_rest(world):
     np.testing.assert_allclose(momentum, falling, atol=1e-6 * np.abs(falling).max())
     fastest, length = np.hypot(3 * 1.04, np.sqrt(2 * 9.81 * 0.7)), np.linalg.norm(x[1] - x[0])
     kinetic, left, stretched = [], [], []
-    for harder in (0.0, 0.03, 0.06, 0.09, 0.12):
+    for harder in 0.03 * np.arange(9):
         w.position, w.velocity = x, speed * (1 + harder / 3)
         worst = w.run(4.1)
         kinetic.append(0.5 * (w.velocity**2).sum() / len(x) / (9.81 * 0.015))

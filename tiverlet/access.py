@@ -91,7 +91,7 @@ class Access:
         with whole:
             for watcher in self._watchers:
                 watcher.assigned("velocity", value)
-            self._memory.write(self._scene.state.d, value)
+            self._scene.state.start(self._memory, value)
             self._fresh, self._energy, self._owed, self._parted = True, None, 0.0, None
 
     def _shares(self) -> tuple[float, float]:

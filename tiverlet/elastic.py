@@ -142,7 +142,7 @@ class Elastic(Number, Breaking):
         if ti.static(self._on_sprung):
             if not self.is_rigid(c):
                 W = 0
-        C, A = f - self._on_rest[c], ti.cast(1, self._on_real)
+        C, A = self.excess(c, f, self._on_rest[c]), ti.cast(1, self._on_real)
         B, alpha = ti.cast(0, self._on_real), ti.cast(0, self._on_real)
         lam = self._on_lam[c]
         if first != 0:

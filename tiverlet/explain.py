@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from . import runtime
-from .assembly import reason
 from .feature import Acceleration, Batch
 from .shapes.shape import morton
 from .wall import Wall
@@ -38,8 +37,7 @@ def explain(world: "World") -> str:
         size = sum(world.fields[name] for name in names)
         lines.append(f"    {owner:10s} {size:>9d} bytes: {', '.join(n.partition('.')[2] or n for n in names)}")
     if sub.batches:
-        why = "" if world._wanted[0] else f"; chosen because {reason(world._solver)}"
-        lines.append(f"Solved by {world._solver.explain(sub.batches, sub.slots)}{why}")
+        lines.append(f"Solved by {world._solver.explain(sub.batches, sub.slots)}")
         lines.append(f"Constraint corners that can move: {sub.slots.total} of {sum(b.indices.size for b in sub.batches)}")
     if _scattered(p.position):
         lines.append(
@@ -106,6 +104,6 @@ def _absent(world: "World") -> list[str]:
         (not sub.breakers, "loads compared and breaks counted: no constraint has break_at"),
         (sub.radius is None or sub.radius.uniform, "field of radii: all are equal or none is needed"),
         (sub.state.w.uniform, "field of masses: all are equal"),
-        (world.precision != "f32-compensated", "low words of positions: precision is not f32-compensated"),
+        (not sub.state.sums, "low words: precision is not f32-compensated, and no chain is solved to rounding"),
     ]
     return [text for missing, text in rows if missing] or ["nothing"]

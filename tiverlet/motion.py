@@ -22,7 +22,7 @@ class Motion:
         self.uses_velocity = any(f.uses_velocity for f in accelerations)
         self.drags = [f for f in accelerations if f.decays]
         self.decays = bool(self.drags)
-        self.dithers = scene.real == ti.f32
+        self.dithers = scene.real == ti.f32 and not scene.state.carries
         if self.uses_velocity:
             self.earlier = scene.memory.field("displacement_before", self.n, width=self.dim, state=True)
         if self.decays:
@@ -80,22 +80,30 @@ class Motion:
         live, x, d = self.state.w.of(i) > 0, self.state.x[i], self.state.d[i]
         v = self.velocity_before(i, h, fresh)
         a = self.accelerate(i, self.state.place(i), v, t, pull)
-        before = ti.select(fresh != 0, h * v - h * h / 2 * a, d)
+        before, low = ti.select(fresh != 0, h * v - h * h / 2 * a, d), ti.zero(d)
+        if ti.static(self.state.carries):
+            low = self.state.d_low[i]
         if ti.static(self.decays or len(self.accelerations) > 0):
             kick = reach * a
             if ti.static(self.decays):
                 # d' = exp(-z) d + phi1 h^2 a, as a small change of d, which f32 holds to more digits.
                 kick -= ti.select(fresh != 0, ti.zero(d), self.decay[None][4] * d)
             d *= share
-            d += self.dithered(d, kick, tick, DITHER[0])
+            if ti.static(self.state.carries):
+                d, low = self.state.sum(d, low, kick)
+            else:
+                d += self.dithered(d, kick, tick, DITHER[0])
         else:
             d *= share
         step = d
-        if ti.static(not self.state.compensated):
+        if ti.static(not self.state.sums):
             step = self.dithered(x, d, tick, DITHER[1])
         if live:
             self.state.d[i] = d
-            if ti.static(self.state.compensated):
+            if ti.static(self.state.carries):
+                self.state.d_low[i] = low
+                self.state.x[i], self.state.low[i] = self.state.sum(x, self.state.low[i] + low, d)
+            elif ti.static(self.state.compensated):
                 self.state.advance(i, d)
             else:
                 self.state.x[i] = x + step

@@ -85,6 +85,11 @@ class Number(Batch):
         return f
 
     @ti.func
+    def excess(self, c, f, rest):
+        """f - rest."""
+        return f - rest
+
+    @ti.func
     def distinct(self, f, f0):
         """Whether the direction is clear enough at f and f0, now and at the start, for a turn of 41 degrees to mean something."""
         return True

@@ -130,7 +130,9 @@ class State:
 
     Displacement form (numerics: "summed" Verlet): every correction goes to x and to d alike, so that x - d is the
     start of the substep and d / h the velocity half a substep ago, without the cancellation of x_n - x_(n-1).
-    With `compensated`, the sum in x carries its rounding error along in `low` (two-sum, Knuth).
+    With `compensated`, x has a second word, `low`. With `carries`, what rounding takes from the sums in x and d is carried along
+    in `low` and `d_low` (two-sum, Knuth): in f32, where rounding is the error that is left, the larger the shorter substeps are.
+    So `low` is there with either of them, but what only reads x does without where it is not `compensated`.
     """
 
     def __init__(self, memory: Memory, particles: Particles, inv_mass: np.ndarray, compensated: bool):
@@ -138,25 +140,41 @@ class State:
         self.compensated = compensated
         self.real, self.double = memory.real, memory.real == ti.f64
         self.count, self.dim = n, dim
-        self.starts = self.befores = self.leans = False
+        self.starts = self.befores = self.leans = self.carries = False
         self.x = memory.field("position", n, width=dim, values=particles.position, state=True)
         self.d = memory.field("displacement", n, width=dim, values=particles.velocity, state=True)
         self.w = Shared(memory, "inv_mass", inv_mass)
+        self.sums = compensated  # x in two words
         if compensated:
-            high = particles.position.astype(np.float32)
-            low = particles.position - high
-            self.low = memory.field("position_low", n, width=dim, values=low, state=True)
+            self._add_low(memory, particles)
+
+    def _add_low(self, memory: Memory, particles: Particles) -> None:
+        low = particles.position - particles.position.astype(np.float32)
+        self.low = memory.field("position_low", self.count, width=self.dim, values=low, state=True)
+
+    def carry(self, memory: Memory, particles: Particles) -> None:
+        """Declare the low words of displacements, and of positions where there are none."""
+        self.d_low = memory.field("displacement_low", self.count, width=self.dim, state=True)
+        if not self.sums:
+            self._add_low(memory, particles)
+        self.carries = self.sums = True
 
     def get(self, memory: Memory) -> np.ndarray:
         """A copy of the positions, low words added in f64."""
         out = memory.read(self.x).astype(np.float64, copy=False)
-        return (out + memory.read(self.low) if self.compensated else out)[: self.count]
+        return (out + memory.read(self.low) if self.sums else out)[: self.count]
 
     def put(self, memory: Memory, position: np.ndarray) -> None:
         """Overwrite the positions."""
         memory.write(self.x, position)
-        if self.compensated:
+        if self.sums:
             memory.write(self.low, position - position.astype(np.float32))
+
+    def start(self, memory: Memory, velocity: np.ndarray) -> None:
+        """Overwrite the displacements with velocities, which they are at a start."""
+        memory.write(self.d, velocity)
+        if self.carries:
+            memory.write(self.d_low, np.zeros_like(velocity))
 
     @inline
     def apart(self, i, j):
@@ -168,7 +186,7 @@ class State:
     def between(self, i, j):
         """x_i - x_j in f64."""
         r = ti.cast(self.x[i], ti.f64) - ti.cast(self.x[j], ti.f64)
-        if ti.static(self.compensated):
+        if ti.static(self.sums):
             r += ti.cast(self.low[i], ti.f64) - ti.cast(self.low[j], ti.f64)
         return r
 
@@ -193,7 +211,7 @@ class State:
             self.lean = memory.field("lean", self.count, width=self.dim)
         if start:
             self.x0 = memory.field("position_at_start", self.count, width=self.dim)
-            if self.compensated:
+            if self.sums:
                 self.low0 = memory.field("position_low_at_start", self.count, width=self.dim)
         if before:
             self.before = memory.field("displacement_at_start", self.count, width=self.dim)
@@ -211,27 +229,38 @@ class State:
     def restart(self, i):
         """x = start + d in one sum: a particle whose d has come to nothing is where it was, to the bit."""
         self.x[i] = self.x0[i]
-        if ti.static(self.compensated):
+        if ti.static(self.sums):
             self.low[i] = self.low0[i]
         self.advance(i, self.d[i])
 
     @ti.func
+    def sum(self, a, low, b):
+        """a + low + b in two words. Where it `carries`, what rounding takes is found in half of the time (Dekker); for |b| > |a|
+        some of it may be missed, which is no worse than without."""
+        s = a + b
+        part = s - a
+        if ti.static(self.carries):
+            low += b - part
+        else:
+            low += (a - (s - part)) + (b - part)
+        t = s + low
+        return t, low - (t - s)
+
+    @ti.func
     def advance(self, i, d):
         """x_i += d."""
-        x = self.x[i]
-        s = x + d
-        if ti.static(self.compensated):
-            b = s - x
-            low = self.low[i] + ((x - (s - b)) + (d - b))
-            t = s + low
-            self.low[i] = low - (t - s)
-            s = t
-        self.x[i] = s
+        if ti.static(self.sums):
+            self.x[i], self.low[i] = self.sum(self.x[i], self.low[i], d)
+        else:
+            self.x[i] = self.x[i] + d
 
     @ti.func
     def shift(self, i, move):
         """A correction: the same move to x_i and to d_i, so that x - d stays the start of the substep."""
-        self.d[i] = self.d[i] + move
+        if ti.static(self.carries):
+            self.d[i], self.d_low[i] = self.sum(self.d[i], self.d_low[i], move)
+        else:
+            self.d[i] = self.d[i] + move
         self.advance(i, move)
 
 

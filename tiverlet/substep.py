@@ -222,6 +222,8 @@ class Substep(Phases):
             if ti.static(self.springs):
                 bond = self.slots.total_of(i)
             self.state.d[i] = self.velocity_after(i, h, ti.cast(t, self.real), bond)
+            if ti.static(self.state.carries):
+                self.state.d_low[i] = ti.zero(self.state.d[i])
 
     @ti.kernel
     def velocities(self, h64: ti.f64, t: ti.f64, fresh: ti.i32, firm64: ti.f64, soft64: ti.f64, out: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]

@@ -57,7 +57,7 @@ class Tiles(Motion):
         if ti.static(self.state.starts):
             for i in range(first, end):
                 self.state.x0[i] = self.state.x[i]
-                if ti.static(self.state.compensated):
+                if ti.static(self.state.sums):
                     self.state.low0[i] = self.state.low[i]
         if ti.static(self.state.leans):
             if calming != 0:

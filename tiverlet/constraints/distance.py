@@ -24,6 +24,17 @@ class Link(Scalar):
         return np.linalg.norm(position[i] - position[j], axis=1)
 
     @ti.func
+    def excess(self, c, f, rest):
+        """|r| - rest = (r^2 - rest^2) / (|r| + rest): to all digits of the low words, where there are any."""
+        C = f - rest
+        if ti.static(self._on_state.carries):
+            if f + rest > 0:
+                r = self._on_state.between(self.member(c, 0), self.member(c, 1))
+                goal = ti.cast(rest, ti.f64)
+                C = ti.cast(r.dot(r) - goal * goal, self._on_real) / (f + rest)
+        return C
+
+    @ti.func
     def measure(self, c, q):
         """|r| and +- r / |r|, with r = x_0 - x_1."""
         r = q[0, :] - q[1, :]

@@ -6,6 +6,7 @@ import numpy as np
 import taichi as ti
 
 from ..feature import BENT, FAR, Batch, Scene
+from ..scalar import Scalar
 
 
 class Slots:
@@ -47,6 +48,9 @@ class Slots:
             self.broken = memory.field("slots.broken", None, kind=ti.i32)
         self.system: Any = solver.system(scene, batches, self)
         self.whole = bool(self.system)
+        # Whether a substep fulfils constraints to rounding, which is then the error that is left.
+        scalars = [b for b in batches if isinstance(b, Scalar) and b.joins]
+        self.exact = bool(scalars) and (not self.system.steps if self.system else bool(degree.max(initial=0) <= 1))
         blocks = self.system.blocks if self.system else degree
         self.split = memory.field("slots.split_mass", n, values=blocks * inv_mass)
         self.relaxation = solver.relaxed_by(scene, batches, blocks * inv_mass)
