@@ -84,20 +84,24 @@ class Drawing:
         none = np.zeros((0, 2), dtype=np.int64)
         self._pairs = np.concatenate([none, *(f.indices for _, f in found)])
         self._rest = np.concatenate([[], *(f.rest if isinstance(f, Link) else np.full(f.count, np.nan) for _, f in found)])
-        self._whole, at = [], 0  # of features whose links break: where they are, and the number of the feature
-        for k, f in found:
-            self._whole += [(slice(at, at + f.count), k)] if k in self._broken else []
-            at += f.count
+        number, row = (np.concatenate([[], *each]).astype(np.int64) for each in (
+            [np.full(f.count, k) for k, f in found], [np.arange(f.count) for _, f in found]
+        ))  # fmt: skip  # of the feature, and of the link in it
         self._sheet = None
         rest = np.ones(len(self._pairs), dtype=bool)  # of links that are not in it
-        if not self._flat and not self._whole and 0 < len(self._pairs) <= SHEET:
+        if not self._flat and not any(k in self._broken for k, _ in found) and 0 < len(self._pairs) <= SHEET:
             start = found[0][1].start.position
             sheet = Sheet(self._pairs, start) if len(start) == len(world.particles) else None
             if sheet and len(sheet.triangles):
                 self._sheet, rest = sheet, ~sheet.used
         some = np.flatnonzero(rest)
         some = some[:: -(-len(some) // MANY) or 1]
-        self._some, self._lines = some, Lines(self._pairs[some]) if len(some) else None
+        self._lines = Lines(self._pairs[some]) if len(some) else None
+        if not self._sheet:
+            self._pairs, self._rest, number, row = (each[some] for each in (self._pairs, self._rest, number, row))
+            some = np.arange(len(some))
+        self._some = some
+        self._tears = [(k, np.flatnonzero(number == k), row[number == k]) for k, _ in found if k in self._broken]
 
     def frame(self, x: np.ndarray, x32: np.ndarray, turned: Iterable[int], torn: bool) -> None:
         """Draw a frame. x: (n, dim), and rounded to f32. turned: features that are not as they were in the last one. torn: if
@@ -122,8 +126,8 @@ class Drawing:
         r = x[self._pairs[:, 0]] - x[self._pairs[:, 1]]
         with np.errstate(divide="ignore", invalid="ignore"):
             level = levels(np.sqrt(np.einsum("ij,ij->i", r, r)) / self._rest - 1)
-        for some, k in self._whole:
-            level[some][self._broken[k]] = -1
+        for k, mine, rows in self._tears:
+            level[mine[self._broken[k][rows]]] = -1
         row = []
         if self._sheet:
             shades = self._sheet.colors(level)
