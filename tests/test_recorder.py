@@ -8,6 +8,7 @@ import pytest
 import rerun as rr
 
 import tiverlet as tv
+from tiverlet.recording import messages
 from tiverlet.recording.lines import Lines, Sheet, trails
 from tiverlet.recording.strain import LEVELS, SCALE, levels
 
@@ -152,7 +153,7 @@ def test_a_rope_is_one_strip_and_a_sheet_is_one_mesh():
 
 
 def test_bytes_of_positions_take_most_of_the_file(world, tmp_path):
-    # Beside n * dim * 4 bytes of a frame there are 0.4 of that, 500 for the journal and curves, and what does not grow: 90 kB.
+    # Positions take n * dim * 4 bytes of a frame; lines, meshes and colours 0.4 of that. A message of rows takes 1.5 kB, a row 100.
     rng = np.random.default_rng(1)
     sheet = tv.shapes.cloth((0, 1, 0), (1, 0, 0), (0, 0, 1), (16, 16))
     cloth = tv.Particles(sheet.position, velocity=rng.normal(0, 0.1, (256, 3)))
@@ -165,5 +166,7 @@ def test_bytes_of_positions_take_most_of_the_file(world, tmp_path):
         path = tmp_path / f"{p.dim}.rrd"
         with tv.Recorder(path, w) as recorder:
             w.run(2.0, recorder=recorder)
+        of = [message for kind, message in messages.split(path.read_bytes()) if kind == messages.CHUNK]
+        of = [m for m in of if messages.Chunk(m).rows().schema.metadata[b"rerun:entity_path"] == b"/world/scene/particles"]
         raw = 121 * len(p) * p.dim * 4
-        assert path.stat().st_size < 1.4 * raw + 90_000 + 500 * 121, (path.stat().st_size / raw, p.dim)
+        assert raw < sum(map(len, of)) < 1.4 * raw + 1500 * len(of) + 100 * 121
