@@ -153,7 +153,7 @@ def test_a_rope_is_one_strip_and_a_sheet_is_one_mesh():
 
 
 def test_bytes_of_positions_take_most_of_the_file(world, tmp_path):
-    # Positions take n * dim * 4 bytes of a frame; lines, meshes and colours 0.4 of that. A message of rows takes 1.5 kB, a row 100.
+    # Positions take n * dim * 4 bytes of a frame; lines, meshes and colours 0.4 of that; a message of rows 1.5 kB, a row 100.
     rng = np.random.default_rng(1)
     sheet = tv.shapes.cloth((0, 1, 0), (1, 0, 0), (0, 0, 1), (16, 16))
     cloth = tv.Particles(sheet.position, velocity=rng.normal(0, 0.1, (256, 3)))
