@@ -25,7 +25,7 @@ def build(points: int = 31) -> tuple[tv.World, tv.shapes.Shape]:
         tv.Ball(CENTER, RADIUS, friction=0.2),
         tv.HalfSpace((0, 1, 0), friction=0.5),
     ]
-    return tv.World(tv.Particles(sheet.position, mass=0.3 / points**2, radius=0.012), features, substeps=40), sheet
+    return tv.World(tv.Particles(sheet.position, mass=0.3 / points**2, radius=0.012), features, substeps=20), sheet
 
 
 def main(path: str = "cloth.rrd", seconds: float = 3.0) -> None:

@@ -27,7 +27,7 @@ def build() -> tuple[tv.World, tv.AngleLimit, tv.Distance]:
         tv.Polygon(stairs, friction=0.5), tv.Box((0.0, -0.6), (stairs[-3][0], 5.0)),
     ]  # fmt: skip
     start = tv.Particles(body.position, mass=1.0 + 20 * body.radius, radius=body.radius, velocity=(1.2, 0), group=group)
-    return tv.World(start, features, substeps=30, iterations=2), joints, bones
+    return tv.World(start, features, substeps=30, iterations=2, solver=tv.ConjugateGradient(5)), joints, bones
 
 
 def main(path: str = "ragdoll.rrd", seconds: float = 5.0) -> None:
