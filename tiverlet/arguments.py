@@ -9,32 +9,43 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from taichi.lang import impl
 
-from .read_only import assign_whole, read_only, structure
+from .expanding import at
+from .read_only import assign_whole, handed_out, structure
 
 
 class Knob:
     """A live setting: checked when assigned, written to the device before the next frame.
 
     check: a function (feature, value) -> value that raises for a wrong one.
+    force: it changes a force, so that displacements are turned into velocities first, see World._restart().
+    compiled: kernels have its value in them, so that another one has the world built anew, see Feature.outgrown.
+    device: the attribute that is its field, for kernels, which read the setting by the same name; None where they do not.
     """
 
-    def __init__(self, check: Callable, doc: str):
-        self.check = check
+    def __init__(self, check: Callable, doc: str, *, force: bool = False, compiled: bool = False, device: str | None = None):
+        self.check, self.force, self.compiled, self.device = check, force, compiled, device
         self.__doc__ = doc
 
     def __set_name__(self, owner, name: str) -> None:
         self.name = name
 
     def __get__(self, feature, owner=None) -> Any:
-        return self if feature is None else feature.__dict__[self.name]
+        if feature is None:
+            return self
+        if self.device and impl.inside_kernel() and self.device in feature.__dict__:
+            return at(feature.__dict__[self.device], None)
+        if self.name not in feature.__dict__:
+            raise AttributeError(f"{feature!r} has no {self.name}.")
+        return feature.__dict__[self.name]
 
     def __set__(self, feature, value) -> None:
         value = self.check(feature, value)
-        if isinstance(value, np.ndarray):
-            value = read_only(value, assign_whole(type(feature).__name__, self.name))
-        feature.__dict__[self.name] = value
+        feature.__dict__[self.name] = handed_out(value, assign_whole(type(feature).__name__, self.name))
         feature.changed = True
+        if self.force:
+            feature.new_force = True
 
 
 class Noted:
@@ -56,8 +67,7 @@ class Noted:
         if not name.startswith("_") and name not in self.kept_by_world and not isinstance(getattr(type(self), name, None), Knob):
             if sys._getframe(1).f_locals.get("self") is not self:
                 raise AttributeError(self._refused(name))
-            if isinstance(value, np.ndarray):
-                value = read_only(value, structure(type(self).__name__, name))
+            value = handed_out(value, structure(type(self).__name__, name))
         object.__setattr__(self, name, value)
 
     def __delattr__(self, name: str) -> None:
@@ -66,7 +76,7 @@ class Noted:
     def _refused(self, name: str) -> str:
         live, given = knobs_of(type(self)), [*inspect.signature(type(self)).parameters]
         can = f"Live are {', '.join(live)}" if live else "Nothing of it is live"
-        if name in given or hasattr(self, name):
+        if name in given or inspect.getattr_static(self, name, None) is not None:
             return (
                 f"{self!r}.{name} cannot be set: it is fixed when {type(self).__name__} is made. {can}. For another {name} make "
                 f"a new {type(self).__name__}; in a world, world.remove(features=[old]) and world.add(features=[new])."

@@ -114,6 +114,8 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
         feature.scene = scene  # also of those that do nothing, because all of their particles are held
     for feature in [*accelerations, *drivers, *batches, *walls]:
         feature.bind(scene)
+    for feature in features:
+        vars(feature)["_on_built"] = feature.compiled() if not isinstance(feature, Batch) or feature.acts else None
     kind = Substep if scene.order == 2 else composition.Composition
     substep = kind(scene, accelerations, batches, drivers, contact, grid, walls, team)
     survey = Survey(substep, solver)

@@ -6,7 +6,7 @@ import numpy as np
 import taichi as ti
 
 from . import checks
-from .feature import Batch, Scene
+from .feature import Batch, Knob, Scene
 
 BREAKS = 2**30  # substeps after which the number of one comes again
 
@@ -18,14 +18,13 @@ class Breaking(Batch):
     masses that are split between constraints, which is safe, if slower than need be, until the world is built anew.
     """
 
-    break_at: np.ndarray | None = None
+    break_at = Knob(lambda f, v: f._strength(v), "Load beyond which a constraint breaks, (m,); None for never.")
     _on_lam: Any
 
-    def strengthen(self, break_at) -> None:
-        """Keep the argument of __init__."""
-        if break_at is not None:
-            self.break_at = checks.per_item(repr(self), "break_at", break_at, self.count, above=0.0, infinite=True)
-            self.break_at.flags.writeable = False
+    def _strength(self, value):
+        if value is None:
+            return None
+        return checks.per_item(repr(self), "break_at", value, self.count, above=0.0, infinite=True)
 
     def bind_strength(self, scene: Scene) -> None:
         """Declare what breaking needs, if anything can break."""
@@ -36,7 +35,12 @@ class Breaking(Batch):
     @property
     def breaks(self) -> bool:
         """Whether a load can break constraints of the batch."""
-        return self.break_at is not None
+        return self.break_at is not None or "_on_strength" in vars(self)
+
+    def upload_strength(self) -> None:
+        """Write new ones."""
+        if self.breaks:
+            self.scene.memory.write(self._on_strength, np.full(self.count, np.inf) if self.break_at is None else self.break_at)
 
     @property
     def load(self) -> np.ndarray:

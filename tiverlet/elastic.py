@@ -9,7 +9,7 @@ import taichi as ti
 from . import checks
 from .breaking import Breaking
 from .compliance import law, stiff
-from .feature import Scene
+from .feature import Knob, Scene
 from .number import Number
 from .particles import Particles
 
@@ -23,8 +23,9 @@ class Elastic(Number, Breaking):
 
     side = 0  # 0: C = 0;  1: C <= 0, pulls when f > rest;  -1: C >= 0, pushes when f < rest
     rest: Any  # a Knob in each constraint: (m,) array
-    compliance: np.ndarray
-    damping: np.ndarray
+    compliance = Knob(lambda f, v: checks.per_item(repr(f), "compliance", v, f.count, least=0.0), "Of springs.", force=True)
+    damping = Knob(lambda f, v: checks.per_item(repr(f), "damping", v, f.count, least=0.0), "Of the dashpot.", force=True)
+    compiled_for = ("soft", "damped", "breaks", "_strictly")
 
     each = ("rest", "compliance", "damping", "break_at")
     rest_name = "rest"
@@ -33,13 +34,8 @@ class Elastic(Number, Breaking):
     def setup(self, indices, rest, compliance, damping, break_at=None) -> None:
         """Keep the arguments of __init__; what depends on the particles is checked in prepare()."""
         self.lay(indices)
-        m = self.count
-        self.strengthen(break_at)
         self._rest_given = rest
-        self.compliance = checks.per_item(repr(self), "compliance", compliance, m, least=0.0)
-        self.damping = checks.per_item(repr(self), "damping", damping, m, least=0.0)
-        for array in (self.indices, self.compliance, self.damping):
-            array.flags.writeable = False
+        self.break_at, self.compliance, self.damping = break_at, compliance, damping
 
     @property
     def goal(self) -> np.ndarray:
@@ -78,8 +74,18 @@ class Elastic(Number, Breaking):
 
     @property
     def soft(self) -> bool:
-        """Whether any constraint of the batch has compliance."""
-        return bool((self.compliance > 0).any())
+        """Whether any constraint of the batch has compliance, or had when kernels were compiled."""
+        return bool((self.compliance > 0).any()) or vars(self).get("_on_soft", False)
+
+    @property
+    def damped(self) -> bool:
+        """Whether any has a dashpot."""
+        return self.soft and bool((self.damping > 0).any()) or vars(self).get("_on_damped", False)
+
+    @property
+    def _strictly(self) -> bytes | None:
+        """The compliances, where a world of higher order is made for these."""
+        return self.compliance.tobytes() if self.scene and self.scene.order > 2 else None
 
     def sprung(self, scene: Scene) -> np.ndarray:
         """Which constraints act as forces, (m,): soft ones in substeps of an order above 2. See composition.py."""
@@ -90,7 +96,7 @@ class Elastic(Number, Breaking):
         super().bind(scene)
         self._on_soft = self.soft
         self._on_sprung = bool(self.sprung(scene).any())
-        self._on_damped = self.soft and bool((self.damping > 0).any())
+        self._on_damped = self.damped
         start = self.rest_of(self.start.position) if self.count else np.zeros(0)
         self._on_scale = self.unit or (float(np.abs(start).mean()) if np.any(start) else self.start.size)
         name, m, add = repr(self), self.count, scene.memory.field
@@ -106,9 +112,18 @@ class Elastic(Number, Breaking):
         self.changed = False
 
     def upload(self) -> None:
-        """Write new rest values."""
+        """Write new rest values, stiffnesses and strengths."""
         if self.acts:
             self.scene.memory.write(self._on_rest, self.goal)
+            self.upload_springs()
+
+    def upload_springs(self) -> None:
+        """Write new stiffnesses and strengths."""
+        if self._on_soft:
+            self.scene.memory.write(self._on_alpha, self.compliance)
+        if self._on_damped:
+            self.scene.memory.write(self._on_damping, self.damping)
+        self.upload_strength()
 
     @ti.func
     def dashpot(self, c):

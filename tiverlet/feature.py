@@ -25,11 +25,12 @@ import numpy as np
 import taichi as ti
 
 from .arguments import Knob as Knob
-from .arguments import Noted
+from .arguments import Noted, knobs_of
 from .compiling import inline
 from .expanding import at
 from .memory import Memory
 from .particles import Particles, State
+from .read_only import handed_out
 
 BENT, FAR = 1, 2  # how far a constraint turned in a substep: by more than 26 degrees, by more than 41
 
@@ -55,12 +56,13 @@ class Scene:
 
 
 class Feature(Noted):
-    """Base of all. `arguments` are those that it was made with; `changed` says that a knob waits to be uploaded, `moving`
-    that a target is under way."""
+    """Base of all. `arguments` are those that it was made with; `changed` says that a knob waits to be uploaded, `new_force`
+    that it changes a force, `moving` that a target is under way."""
 
-    kept_by_world = ("scene", "start", "changed", "moving", "arguments")
+    kept_by_world = ("scene", "start", "changed", "moving", "new_force", "arguments")
+    compiled_for: tuple[str, ...] = ()  # properties that decide what its kernels consist of
     changed = True
-    moving = False
+    moving = new_force = False
     scene: Any = None  # Scene, from bind() on
     start: Any = None  # Particles, as they were when it came: what it takes from them is what it took then, when bound again too
 
@@ -82,6 +84,20 @@ class Feature(Noted):
     def settle(self) -> None:
         """End a motion: what was the target of the last frame is where the next one starts. Called when `moving`."""
 
+    def compiled(self) -> dict[str, Any]:
+        """What its kernels have in them: the values of knobs that are compiled, and what they are compiled for."""
+        knobs = [name for name in knobs_of(type(self)) if getattr(type(self), name).compiled]
+        return {name: getattr(self, name) for name in (*knobs, *self.compiled_for)}
+
+    @property
+    def outgrown(self) -> bool:
+        """Whether knobs ask for what its kernels do not have, so that the world has to be built anew around it.
+
+        What once was compiled stays when a knob no longer needs it: friction of 0 where there was some costs no compiling.
+        """
+        built = vars(self).get("_on_built")
+        return built is not None and built != self.compiled()
+
     def copy(self) -> "Feature":
         """The same feature, unbound: same arrays and knobs, ready for another world."""
         new = object.__new__(type(self))
@@ -91,7 +107,7 @@ class Feature(Noted):
 
     def release(self) -> None:
         """Forget the world that it acted in."""
-        for name in ["scene", "start", "changed", "moving", *(k for k in vars(self) if k.startswith("_on_"))]:
+        for name in ["scene", "start", "changed", "moving", "new_force", *(k for k in vars(self) if k.startswith("_on_"))]:
             self.__dict__.pop(name, None)
 
     def spared(self, number: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -193,8 +209,8 @@ class Batch(Feature):
         some = self.spared(number)[0]
         self.select(some, number)
         for name in self.each:
-            if isinstance(self.__dict__.get(name), np.ndarray):
-                self.__dict__[name] = self.__dict__[name][some]
+            if isinstance(rows := self.__dict__.get(name), np.ndarray):
+                self.__dict__[name] = handed_out(rows[some], getattr(rows, "advice", ""))
         now = {self.index_name: self.listing} | {name: self.__dict__[name] for name in self.each if name in self.__dict__}
         self.arguments = {k: v if v is None or np.isscalar(v) else now.get(k, v) for k, v in self.arguments.items()}
 

@@ -29,7 +29,7 @@ def restitution_of(who: str, name: str, value: Any) -> float:
 
 
 class Table:
-    """For each pair of groups: static friction, dynamic friction, restitution, and whether they touch.
+    """For each pair of groups: static friction, dynamic friction, restitution, whether they touch; one row where `uniform`.
 
     friction, restitution: one value for all, or a mapping from pairs of groups to values, with 0 for pairs that are not in it.
     touching: None for all, or the pairs of groups that touch.
@@ -70,20 +70,27 @@ class Table:
 
     def bind(self, scene: Scene) -> None:
         """Declare the table and the groups, where they differ; one value for all is a constant of the kernel."""
-        self._on_real = scene.real
-        rank, self._on_rows = self.rows(scene.particles.group)
+        rank, rows = self.rows(scene.particles.group)
         self.groups = int(rank.max(initial=0)) + 1
-        if not self.uniform:
+        if self.uniform:
+            rows = rows[:1]
+        else:
             self._on_rank = scene.memory.field("Contact.group", len(rank), kind=ti.i32, values=rank)
-            self._on_table = scene.memory.field("Contact.table", len(self._on_rows), width=4, values=self._on_rows)
+        if self.rubs or self.bounces or not self.uniform:
+            self._on_table = scene.memory.field("Contact.table", len(rows), width=4, values=rows)
+
+    def upload(self, scene: Scene, other: "Table") -> None:
+        """Write the values of another table, for the same kernels."""
+        if "_on_table" in vars(self):
+            scene.memory.write(self._on_table, other.rows(scene.particles.group)[1][: 1 if self.uniform else None])
 
     @ti.func
     def of(self, i, j):
         """Static friction, dynamic friction and restitution of particles i and j, and 1 if they touch."""
-        row = ti.Vector([ti.cast(v, self._on_real) for v in ti.static(self._on_rows[0].tolist())])
+        row = 0
         if ti.static(not self.uniform):
-            row = self._on_table[self._on_rank[i] * self.groups + self._on_rank[j]]
-        return row
+            row = self._on_rank[i] * self.groups + self._on_rank[j]
+        return self._on_table[row]
 
     def _pair(self, name: str, pair: Any) -> tuple[int, int]:
         if not (isinstance(pair, (tuple, list)) and len(pair) == 2 and all(isinstance(k, (int, np.integer)) for k in pair)):

@@ -1,4 +1,7 @@
-"""Arrays that are handed out: they can be read like any other, and say what to do when they are written to."""
+"""Arrays and mappings that are handed out: they can be read like any other, and say what to do when they are written to."""
+
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -51,10 +54,41 @@ def read_only(array: np.ndarray, advice: str) -> ReadOnly:
     return out
 
 
+class ReadOnlyMapping(Mapping):
+    """A mapping that nobody can write to."""
+
+    def __init__(self, values: Mapping, advice: str):
+        self._values, self._advice = dict(values), advice
+
+    def __getitem__(self, key):
+        return self._values[key]
+
+    def __iter__(self):
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def __setitem__(self, key, value) -> None:
+        raise TypeError(self._advice)
+
+    def __repr__(self) -> str:
+        return repr(self._values)
+
+
+def handed_out(value: Any, advice: str) -> Any:
+    """The same, read-only if it is an array or a mapping."""
+    if isinstance(value, np.ndarray):
+        return read_only(value, advice)
+    if isinstance(value, Mapping):
+        return ReadOnlyMapping(value, advice)
+    return value
+
+
 def assign_whole(owner: str, name: str) -> str:
     """Advice for an array that is live as a whole."""
     return (
-        f"{owner}.{name} is read-only, because a world does not notice when numbers in it change. Assign the whole array: "
+        f"{owner}.{name} is read-only, because a world does not notice when a part of it changes. Assign the whole: "
         f"new = {owner.lower()}.{name}.copy(); new[...] = ...; {owner.lower()}.{name} = new."
     )
 

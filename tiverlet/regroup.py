@@ -145,6 +145,7 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
     for f in features:
         if f not in came:
             f.changed, f.moving = attributes[f].get("changed", True), attributes[f].get("moving", False)
+            f.new_force = attributes[f].get("new_force", False)
     for memory in memories:
         memory.destroy()
     for one in list(world._handles):
@@ -215,7 +216,8 @@ def _give_contacts(world: Any, contact: Contact, old: dict, number: np.ndarray, 
     grid, pairs = world._grid, number[old["Contact.pairs"]]
     assert grid
     both = (pairs >= 0).all(axis=1)
-    grid.restore(pairs[both], {piece.name: old[f"Contact.{piece.name}"][both] for piece in grid.lasting})
+    nothing = {p.name: np.zeros((len(pairs), p.width) if p.width else len(pairs)) for p in grid.lasting}  # of what came just now
+    grid.restore(pairs[both], {name: old.get(f"Contact.{name}", none)[both] for name, none in nothing.items()})
 
 
 def _launch(world: Any, first: int) -> None:

@@ -45,7 +45,9 @@ class Solid(Wall):
     sweeps = poses = True
     guesses = False  # strike() may miss a touch, so that ends of ways are looked at: a place is free or astray()
     dim = 0
-    radius = 0.0  # what the shape is rounded by [m]
+    radius: Any = Knob(
+        lambda f, v: checks.number(repr(f), "radius", v, least=0.0), "It is rounded by so much [m].", compiled=True
+    )
     _on_close = 0.0  # what rounding amounts to in the wall's frame [m]
     position = Knob(_position, "Where the origin of the wall's frame is [m].")
     rotation = Knob(_rotation, "Angle (2D) or rotation vector (3D) [rad].")
@@ -73,6 +75,7 @@ class Solid(Wall):
 
     def upload(self) -> None:
         """Move and turn to the new place."""
+        Wall.upload(self)
         self._on_position.aim(self.position)
         self._on_rotation.aim(np.atleast_1d(self.rotation))
         self.moving = True

@@ -5,7 +5,7 @@ import taichi as ti
 
 from . import checks
 from .compliance import law, stiff
-from .feature import Batch, Scene
+from .feature import Batch, Knob, Scene
 from .particles import Particles
 
 
@@ -18,8 +18,9 @@ class Tether(Batch):
     arity = 1
     each = ("compliance", "damping")
     exclusive = False  # nothing else may hold its particles
-    compliance: np.ndarray
-    damping: np.ndarray
+    compliance = Knob(lambda f, v: f._compliance(v), "Inverse stiffness [m/N].", force=True)
+    damping = Knob(lambda f, v: checks.per_item(repr(f), "damping", v, f.count, least=0.0), "Of the dashpot [N s/m].", force=True)
+    compiled_for = ("soft",)
 
     def setup(self, indices, compliance, damping) -> None:
         """Keep the arguments of __init__."""
@@ -29,10 +30,10 @@ class Tether(Batch):
             values, counts = np.unique(rows, return_counts=True)
             raise ValueError(f"{who}: particle {values[counts > 1][0]} is named twice, and can have only one place.")
         self.indices = rows[:, None]
-        self.compliance = checks.per_item(who, "compliance", compliance, len(rows), least=0.0)
-        self.damping = checks.per_item(who, "damping", damping, len(rows), least=0.0)
-        for array in (self.indices, self.compliance, self.damping):
-            array.flags.writeable = False
+        self.compliance, self.damping = compliance, damping
+
+    def _compliance(self, value) -> np.ndarray:
+        return checks.per_item(repr(self), "compliance", value, self.count, least=0.0)
 
     @property
     def listing(self) -> np.ndarray:
@@ -41,8 +42,14 @@ class Tether(Batch):
 
     @property
     def soft(self) -> bool:
-        """Whether any of them is a spring."""
-        return bool((self.compliance > 0).any())
+        """Whether any of them is a spring, or was when kernels were compiled."""
+        return bool(np.any(self.compliance > 0)) or vars(self).get("_on_soft", False)
+
+    def upload(self) -> None:
+        """Write new stiffnesses."""
+        if self.acts and not self.drives and self._on_soft:
+            self.scene.memory.write(self._on_alpha, self.compliance)
+            self.scene.memory.write(self._on_damping, self.damping)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check that the particles exist."""

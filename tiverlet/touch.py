@@ -13,7 +13,7 @@ from .queries import Contacts
 class Touch(Feature):
     """The geometry of pairs. Particles that the user put into each other may be smaller than they are, for a while."""
 
-    push_out: float
+    push_out: Any
     _on_grid: Any
     _on_state: Any
     _on_radius: Any

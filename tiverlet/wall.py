@@ -6,7 +6,8 @@ import numpy as np
 import taichi as ti
 
 from . import checks
-from .feature import Feature, Scene
+from .expanding import at
+from .feature import Feature, Knob, Scene
 from .material import friction_of, restitution_of
 from .memory import Memory
 
@@ -36,27 +37,37 @@ class Wall(Feature):
     leaves at restitution times its velocity then, and is placed where it would be at the end of the substep.
     """
 
-    push_out = 1.0
-    static, dynamic, restitution = 0.0, 0.0, 0.0
+    friction = Knob(lambda f, v: _friction(f, v), "A number, or (static, dynamic).")
+    restitution = Knob(lambda f, v: restitution_of(repr(f), "restitution", v), "0 to 1.", device="_on_restitution")
+    push_out = Knob(lambda f, v: checks.number(repr(f), "push_out", v, least=0.0), "[m/s].", compiled=True)
+    compiled_for = ("rubs", "bounces")
     sweeps = False  # needs the exact position at the start of the substep
     repeats = False  # one confine() may leave a particle that rubs or bounces where it has to be confined again
     poses = False  # has a pose(when) to be worked out once for each substep, before any confine()
 
     def surface(self, friction: Any, restitution: Any, push_out: float) -> None:
         """Check and keep the arguments that all walls have."""
-        self.static, self.dynamic = friction_of(repr(self), "friction", friction)
-        self.restitution = restitution_of(repr(self), "restitution", restitution)
-        self.push_out = checks.number(repr(self), "push_out", push_out, least=0.0)
+        self.friction, self.restitution, self.push_out = friction, restitution, push_out
+
+    @property
+    def static(self) -> Any:
+        """The coefficient of static friction, for kernels."""
+        return at(at(self._on_friction, None), 0)
+
+    @property
+    def dynamic(self) -> Any:
+        """The coefficient of dynamic friction, for kernels."""
+        return at(at(self._on_friction, None), 1)
 
     @property
     def rubs(self) -> bool:
-        """Whether there is friction."""
-        return self.static > 0
+        """Whether there is friction, or was when kernels were compiled."""
+        return friction_of(repr(self), "friction", self.friction)[0] > 0 or "_on_friction" in vars(self)
 
     @property
     def bounces(self) -> bool:
-        """Whether there is restitution."""
-        return self.restitution > 0
+        """Whether there is restitution, or was when kernels were compiled."""
+        return self.restitution > 0 or "_on_restitution" in vars(self)
 
     def bind(self, scene: Scene) -> None:
         """Keep the state at hand."""
@@ -64,6 +75,19 @@ class Wall(Feature):
         self._on_state = scene.state
         self._on_real = scene.real
         self._on_rubs, self._on_bounces = self.rubs, self.bounces
+        if self._on_rubs:
+            both = friction_of(repr(self), "friction", self.friction)
+            self._on_friction = scene.memory.field(f"{self!r}.friction", None, width=2, values=both)
+        if self._on_bounces:
+            self._on_restitution = scene.memory.field(f"{self!r}.restitution", None, values=self.restitution)
+
+    def upload(self) -> None:
+        """Write friction and restitution."""
+        write = self.scene.memory.write
+        if self._on_rubs:
+            write(self._on_friction, friction_of(repr(self), "friction", self.friction))
+        if self._on_bounces:
+            write(self._on_restitution, self.restitution)
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
         """For pictures of a scene between two corners: line strips (m, k, dim), and half their width [m], 0 for a thin line."""
@@ -168,6 +192,11 @@ class Wall(Feature):
                 rise = height
                 after = out + k * (1 - s) - k / 2
         return rise, after
+
+
+def _friction(wall: Wall, value: Any) -> Any:
+    friction_of(repr(wall), "friction", value)
+    return tuple(float(v) for v in value) if isinstance(value, (tuple, list)) else float(value)
 
 
 class Track:

@@ -6,7 +6,9 @@ from collections.abc import Iterable, Sequence
 from time import perf_counter
 from typing import Any
 
-from . import checks, composition, snapshot
+import numpy as np
+
+from . import checks, composition, regroup, snapshot
 from .arguments import meant
 from .assembly import Assembly, assemble, check_settings, checked_features, checked_solver
 from .explain import explain
@@ -182,7 +184,7 @@ class World(Launches):
         """Bring the knobs to the device; where a force has changed, start anew while the device still has what it was."""
         for feature in self._features:
             if feature.changed or feature.moving:
-                self._settle_forces()
+                self._adapt()
                 with self._memory.compiler():
                     self._upload()
                 return
@@ -190,13 +192,20 @@ class World(Launches):
     @property
     def _force_waits(self) -> bool:
         """Whether a force has changed and the device still has what it was."""
-        return any(f.changed and isinstance(f, Acceleration) for f in self._features)
+        return any(f.changed and (f.new_force or isinstance(f, Acceleration)) for f in self._features)
 
     def _settle_forces(self) -> None:
         """Where a force has changed, take velocities by what it was: before that is overwritten, or left behind by a copy."""
         if self._force_waits:
             with self._memory.compiler():
                 self._restart()
+
+    def _adapt(self) -> None:
+        """Settle forces; where knobs ask for what the kernels do not have, build the world anew."""
+        self._settle_forces()
+        if any(f.changed and f.outgrown for f in self._features):
+            check_settings(self._precision, self._wanted[1], self._order, self._features)
+            regroup.rebuild(self, np.ones(len(self._particles), dtype=bool), None, self._features)
 
     def _upload(self) -> None:
         """Write what was changed in Python since the last frame."""
@@ -205,7 +214,7 @@ class World(Launches):
                 feature.moving = False
                 feature.settle()
             if feature.changed:
-                feature.changed = False
+                feature.changed = feature.new_force = False
                 feature.upload()
 
     def _begin(self, h: float) -> None:
@@ -305,7 +314,7 @@ class World(Launches):
         if unknown := set(changes) - set(settings):
             raise TypeError(f"World.clone: {sorted(unknown)[0]} cannot be changed; one of {', '.join(settings)} can.")
         self._memory.check()
-        self._settle_forces()
+        self._adapt()
         copies = tuple(f.copy() for f in self._features)
         new = World._of(self._particles, copies, [f.start for f in self._features], **{**settings, **changes})
         snapshot.transfer(self, new)

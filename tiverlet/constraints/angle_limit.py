@@ -80,6 +80,7 @@ class AngleLimit(Turning):
         if self.acts:
             self.scene.memory.write(self._on_rest, self.rest)
             self.scene.memory.write(self._on_middle, self.middle)
+            self.upload_springs()
 
     near, distinct = Scalar.near, Scalar.distinct  # a distance from the middle has one value, and acts on one side of straight
 

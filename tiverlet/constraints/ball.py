@@ -14,8 +14,9 @@ class Ball(Wall):
 
     C(x) = |x - center| - (R + r) >= 0 outside, R - r - |x - center| >= 0 inside; grad C = +- (x - center) / |x - center|.
 
-    center: (dim,) [m], live: assign to it between frames, and the ball moves there during the next frame. radius: R [m]. inside:
-    keep particles in. friction, restitution, push_out: see Wall.
+    center: (dim,) [m], live: assign to it between frames, and the ball moves there during the next frame. radius: R [m], live: it
+    changes at once, and what is inside then goes out at push_out. inside: keep particles in. friction, restitution, push_out: see
+    Wall.
 
     What passes through in one substep is caught on the way in: the moment when it met the surface is solved for, as for pairs.
     Nothing passes at any speed, nor can anything draw it through.
@@ -24,10 +25,13 @@ class Ball(Wall):
     dim = 0
     center = Knob(lambda f, v: checks.vector("Ball", "center", v, f.dim or len(np.atleast_1d(v))), "Middle of the ball [m].")
 
+    radius = Knob(lambda f, v: f._size(v), "Of the ball [m].", device="_on_size")
+    widest = 0.0  # radius of a particle [m]
+
     def __init__(self, center, radius, inside=False, *, friction=0.0, restitution=0.0, push_out=1.0):
         self.center = center
-        self.radius = checks.number("Ball", "radius", radius, above=0.0)
         self.inside = bool(inside)
+        self.radius = radius
         self.surface(friction, restitution, push_out)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
@@ -38,6 +42,13 @@ class Ball(Wall):
         if self.inside and wide.any():
             i = int(np.argmax(wide))
             raise ValueError(f"Ball: particle {i} of radius {particles.radius[i]:g} m does not fit inside {self.radius:g} m.")
+        self.widest = float(particles.radius.max(initial=0.0))
+
+    def _size(self, value) -> float:
+        value = checks.number("Ball", "radius", value, above=0.0)
+        if self.inside and value <= self.widest:
+            raise ValueError(f"Ball: radius = {value:g}, but a particle of radius {self.widest:g} m does not fit inside.")
+        return value
 
     @property
     def repeats(self) -> bool:
@@ -48,10 +59,13 @@ class Ball(Wall):
         """The center at the start and the end of a frame."""
         Wall.bind(self, scene)
         self._on_center = Track(scene.memory, "Ball.center", self.center)
+        self._on_size = scene.memory.field("Ball.radius", None, values=self.radius)
         self.changed = False
 
     def upload(self) -> None:
         """Move to the new center."""
+        Wall.upload(self)
+        self.scene.memory.write(self._on_size, self.radius)
         self._on_center.aim(self.center)
         self.moving = True
 

@@ -86,6 +86,7 @@ class Box(Wall):
 
     def upload(self) -> None:
         """Move from the last corners to the new ones."""
+        Wall.upload(self)
         old, new = self.scene.memory.read(self._on_sides)[:, 1], np.concatenate([self.lower, self.upper])
         jump = np.isinf(old) | np.isinf(new)
         self.scene.memory.write(self._on_sides, np.stack([np.where(jump, new, old), new], axis=1))

@@ -20,8 +20,8 @@ class Capsule(Wall):
 
     C(x) = |x - q| - (R + r) >= 0 with q the nearest point of the segment; grad C = (x - q) / |x - q|.
 
-    a, b: (dim,) [m], live: the ends move to what is assigned during the next frame. radius: R [m], above 0. friction,
-    restitution, push_out: see Wall.
+    a, b: (dim,) [m], live: the ends move to what is assigned during the next frame. radius: R [m], above 0,
+    live: it changes at once. friction, restitution, push_out: see Wall.
 
     What passes through in one substep is caught on the way in, however thin the rod: the path, as seen from the rod, is followed
     to where it meets the surface (sphere tracing, Hart 1996). Nothing can be drawn through either.
@@ -29,10 +29,11 @@ class Capsule(Wall):
 
     dim = 0
     a, b = _end("a"), _end("b")
+    radius = Knob(lambda f, v: checks.number("Capsule", "radius", v, above=0.0), "Of the rod [m].", device="_on_size")
 
     def __init__(self, a, b, radius, *, friction=0.0, restitution=0.0, push_out=1.0):
         self.a, self.b = a, b
-        self.radius = checks.number("Capsule", "radius", radius, above=0.0)
+        self.radius = radius
         self.surface(friction, restitution, push_out)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
@@ -43,11 +44,14 @@ class Capsule(Wall):
     def bind(self, scene: Scene) -> None:
         """The ends at the start and the end of a frame."""
         Wall.bind(self, scene)
+        self._on_size = scene.memory.field("Capsule.radius", None, values=self.radius)
         self._on_a, self._on_b = Track(scene.memory, "Capsule.a", self.a), Track(scene.memory, "Capsule.b", self.b)
         self.changed = False
 
     def upload(self) -> None:
         """Move to the new ends."""
+        Wall.upload(self)
+        self.scene.memory.write(self._on_size, self.radius)
         self._on_a.aim(self.a)
         self._on_b.aim(self.b)
         self.moving = True

@@ -6,7 +6,7 @@ import taichi as ti
 from .. import checks, rotation
 from ..breaking import Breaking
 from ..compliance import law, stiff
-from ..feature import Scene
+from ..feature import Knob, Scene
 from ..particles import Particles
 from ..ragged import Ragged, rows
 
@@ -18,33 +18,51 @@ class Clusters(Ragged, Breaking):
 
     each = ("compliance", "damping", "creep", "yield_strain", "break_at")
     index_name = "clusters"
-    compliance: np.ndarray
-    damping: np.ndarray
-    creep: np.ndarray
-    yield_strain: np.ndarray
+    compliance = Knob(lambda f, v: f._setting("compliance", v), "Inverse stiffness [m/N], (m,).", force=True)
+    damping = Knob(lambda f, v: f._setting("damping", v), "Of the dashpots [N s/m], (m,).", force=True)
+    creep = Knob(lambda f, v: f._setting("creep", v), "Rate of flow [1/s], (m,).")
+    yield_strain = Knob(lambda f, v: f._setting("yield_strain", v), "Strain without flow, (m,).")
+    compiled_for = ("soft", "transcends", "breaks")
 
     def setup(self, clusters, rest, compliance, damping, creep, yield_strain, break_at) -> None:
         """Keep the arguments of __init__; what depends on the particles is checked in prepare()."""
         self.layout(rows(repr(self), "clusters", clusters, 1))
         self._rest = None if rest is None else checks.points(repr(self), "rest", rest)
-        for name, value in (("compliance", compliance), ("damping", damping), ("creep", creep), ("yield_strain", yield_strain)):
-            array = checks.per_item(repr(self), name, value, self.count, least=0.0)
-            array.flags.writeable = False
-            setattr(self, name, array)
-        self.strengthen(break_at)
-        if ((self.creep > 0) & (self.compliance == 0)).any():
-            k = int(np.argmax((self.creep > 0) & (self.compliance == 0)))
-            raise ValueError(f"{self!r}: creep[{k}] = {self.creep[k]:g}, but a rigid cluster does not flow; give it compliance.")
+        self.compliance, self.damping, self.creep, self.yield_strain = compliance, damping, creep, yield_strain
+        self.break_at = break_at
+
+    def _setting(self, name: str, value) -> np.ndarray:
+        value = checks.per_item(repr(self), name, value, self.count, least=0.0)
+        now = {"compliance": 1.0, "creep": 0.0} | vars(self) | {name: value}
+        rigid = (now["creep"] > 0) & (now["compliance"] == 0) & np.ones(self.count, dtype=bool)
+        if rigid.any():
+            k = int(np.argmax(rigid))
+            raise ValueError(
+                f"{self!r}: creep[{k}] = {now['creep'][k]:g}, but a rigid cluster does not flow; give it compliance."
+            )
+        return value
+
+    def upload(self) -> None:
+        """Write new stiffnesses, rates and strengths."""
+        if self.acts:
+            write = self.scene.memory.write
+            if self._on_soft:
+                write(self._on_alpha, self.compliance)
+                write(self._on_damping, self.damping)
+            if self._on_plastic:
+                write(self._on_creep, self.creep)
+                write(self._on_yield, self.yield_strain * self._radius)
+            self.upload_strength()
 
     @property
     def soft(self) -> bool:
         """Whether any cluster has compliance."""
-        return bool((self.compliance > 0).any())
+        return bool((self.compliance > 0).any()) or vars(self).get("_on_soft", False)
 
     @property
     def transcends(self) -> bool:
         """Whether any cluster flows, at an exponential rate."""
-        return bool((self.creep > 0).any())
+        return bool((self.creep > 0).any()) or vars(self).get("_on_plastic", False)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Settle the shapes at rest, each about its center."""
@@ -78,7 +96,7 @@ class Clusters(Ragged, Breaking):
         """Shapes, rotations, sums; for soft clusters multipliers and the memory of the averaged constraint."""
         super().bind(scene)
         name, dim, m, add = repr(self), scene.state.dim, self.count, scene.memory.field
-        self._on_soft, self._on_plastic = self.soft, bool((self.creep > 0).any())
+        self._on_soft, self._on_plastic = self.soft, self.transcends
         w = scene.inv_mass[self.indices]
         mass = np.bincount(self.owner, weights=np.divide(1, w, where=w > 0, out=np.zeros_like(w)), minlength=m)
         self._on_mass = add(f"{name}.mass", m, values=mass)

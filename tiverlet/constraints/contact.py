@@ -1,7 +1,7 @@
 """Particles that do not overlap."""
 
-import copy
 import warnings
+from typing import Any
 
 import numpy as np
 import taichi as ti
@@ -9,7 +9,7 @@ import taichi as ti
 from .. import checks
 from ..calm import Calm
 from ..compiling import FEW
-from ..feature import Batch, Scene
+from ..feature import Batch, Knob, Scene
 from ..grid import FARTHEST, Grid
 from ..material import Table
 from ..pairs import WORD, Luggage, lowest
@@ -67,26 +67,55 @@ class Contact(Splitting):
     """
 
     def __init__(self, friction=0.0, restitution=0.0, *, skin: float | str = "auto", groups=None, push_out=1.0):
-        if not (isinstance(skin, str) and skin == "auto"):
-            skin = checks.number("Contact", "skin", skin, above=0.0)
-        self.skin = skin
-        self.table = Table("Contact", friction, restitution, groups)
-        self.push_out = checks.number("Contact", "push_out", push_out, least=0.0)
+        self.groups, self.restitution, self.friction = groups, restitution, friction
+        self.skin, self.push_out = skin, push_out
 
+    friction = Knob(lambda f, v: f._surface("friction", v), "Of all pairs, or by pairs of groups.")
+    restitution = Knob(lambda f, v: f._surface("restitution", v), "Of all pairs, or by pairs of groups.")
+    groups: Any = Knob(lambda f, v: f._surface("groups", v), "The pairs of groups that touch; None for all.", compiled=True)
+    skin = Knob(lambda f, v: _skin(v), "How far beyond touching pairs are listed [m].", compiled=True)
+    push_out = Knob(lambda f, v: checks.number("Contact", "push_out", v, least=0.0), "[m/s].", compiled=True)
+    compiled_for = ("rubs", "bounces", "uniform")
+    table: Table  # bound to one world
     matters = True
     room = 0  # entries of the list for each particle, at first, if that is more than discs have
     measures = False  # looks at all contacts once in each pass, before they are counted
     calms = True  # knows which of them bear a load, see calm.py
 
+    def _surface(self, name: str, value):
+        """Check what pairs are like, with what was said so far."""
+        if name == "groups" and value is not None:
+            value = checks.rows("Contact", name, value, "a list of pairs of groups, such as [(0, 1)],")
+        elif isinstance(value, list):
+            value = tuple(value)
+        given = {"friction": 0.0, "restitution": 0.0, "groups": None} | vars(self) | {name: value}
+        Table("Contact", given["friction"], given["restitution"], given["groups"])
+        return value
+
+    @property
+    def wanted(self) -> Table:
+        """What pairs are to be like."""
+        return Table("Contact", self.friction, self.restitution, self.groups)
+
+    @property
+    def uniform(self) -> bool:
+        """Whether all pairs are alike."""
+        return self.wanted.uniform
+
     @property
     def rubs(self) -> bool:
-        """Whether any pair has friction."""
-        return self.table.rubs
+        """Whether any pair has friction, or had when kernels were compiled."""
+        return self.wanted.rubs or vars(self).get("_on_rubs", False)
 
     @property
     def bounces(self) -> bool:
-        """Whether any pair has restitution."""
-        return self.table.bounces
+        """Whether any pair has restitution, or had when kernels were compiled."""
+        return self.wanted.bounces or vars(self).get("_on_bounces", False)
+
+    def upload(self) -> None:
+        """Write friction and restitution."""
+        if self.scene:
+            self.table.upload(self.scene, self.wanted)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Choose the skin, and refuse positions too far out for cells to be told apart."""
@@ -96,7 +125,7 @@ class Contact(Splitting):
         self._on_size = auto if self.skin == "auto" else float(self.skin)
         self._on_finest = float(radius.min(initial=np.inf))
         self.matters = len(some) > 0
-        self.table = copy.copy(self.table)  # which is bound to one world
+        self.table = self.wanted
         if self.matters:
             self.check_range(particles.position)
 
@@ -369,6 +398,10 @@ class Contact(Splitting):
                         overlap, _n = self.touch(i, j, self.far(i, j))
                         if overlap <= 0:
                             self._on_slack.field[e] = 0
+
+
+def _skin(value):
+    return value if isinstance(value, str) and value == "auto" else checks.number("Contact", "skin", value, above=0.0)
 
 
 @ti.func

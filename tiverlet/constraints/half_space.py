@@ -46,6 +46,7 @@ class HalfSpace(Wall):
 
     def upload(self) -> None:
         """Move from the last offset to the new one."""
+        Wall.upload(self)
         memory = self.scene.memory
         memory.write(self._on_offset, [memory.read(self._on_offset)[0, 1], self.offset])
         self.moving = True

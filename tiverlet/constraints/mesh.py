@@ -32,7 +32,7 @@ class Mesh(Facets):
         vertices = checks.points("Mesh", "vertices", vertices, dim=3)
         faces = checks.indices("Mesh", "faces", faces, len(vertices), arity=3).astype(int)
         self.closed, self.turned_in = bool(closed), bool(inside)
-        self.radius = checks.number("Mesh", "radius", radius, least=0.0)
+        self.radius = radius
         if self.turned_in and not self.closed:
             raise ValueError("Mesh: inside = True needs an inside; a sheet (closed = False) has none.")
         if not len(faces):

@@ -32,12 +32,13 @@ class Path(Tether):
     """
 
     each = ("compliance", "damping", "speed", "at")
-    speed = Knob(lambda f, v: checks.per_item("Path", "speed", v, f.count), "Along the curve [m/s], (m,).")
-    at = Knob(lambda f, v: checks.per_item("Path", "at", v, f.count), "Arc length at the end of the next frame [m].")
+    speed = Knob(lambda f, v: f._drive("speed", v), "Along the curve [m/s], (m,).")
+    at = Knob(lambda f, v: f._drive("at", v), "Arc length at the end of the next frame [m].")
 
     def __init__(
         self, indices, points, *, closed=False, smooth=True, speed=None, at=None, compliance=0.0, damping=0.0
     ):  # fmt: skip
+        self.driver = "speed" if speed is not None else "at" if at is not None else ""
         self.setup(indices, compliance, damping)
         self.points = checks.points("Path", "points", points)
         self.points.flags.writeable = False
@@ -48,11 +49,8 @@ class Path(Tether):
             k = int(np.argmin(steps))
             raise ValueError(f"Path: points[{k}] and the next are the same, {tuple(map(float, self.points[k]))}; leave one out.")
         self.curve = Curve(self.points, bool(closed), bool(smooth))
-        self.driven = speed is not None or at is not None
         if speed is not None and at is not None:
             raise ValueError("Path: speed and at exclude each other; give one of them, or none for free particles.")
-        if self.driven and self.soft:
-            raise ValueError("Path: driven particles take no compliance; they go along whatever pulls at them.")
         if speed is not None:
             self.speed = speed
         if at is not None:
@@ -61,7 +59,19 @@ class Path(Tether):
     @property
     def drives(self) -> bool:
         """Whether the particles are driven."""
-        return self.driven
+        return bool(self.driver)
+
+    def _drive(self, name: str, value) -> np.ndarray:
+        if name != self.driver:
+            how = f"driven by {self.driver}" if self.driver else "free to slide"
+            raise ValueError(f"Path: {name} cannot be set: these particles are {how}. Make a Path with {name}=... for them.")
+        return checks.per_item("Path", name, value, self.count)
+
+    def _compliance(self, value) -> np.ndarray:
+        value = super()._compliance(value)
+        if self.drives and (value > 0).any():
+            raise ValueError("Path: driven particles take no compliance; they go along whatever pulls at them.")
+        return value
 
     exclusive = drives
 
@@ -80,14 +90,14 @@ class Path(Tether):
         checks.points("Path", "points", self.points, dim=particles.dim)
         rows = self.indices[:, 0]
         self._start = self.curve.nearest(particles.position[rows])
-        if self.driven:
+        if self.drives:
             inv_mass[rows] = 0.0
 
     def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Warn of particles that are not on the curve."""
         x = particles.position[self.indices[:, 0]]
         off = np.linalg.norm(x - self.curve.at(self._start), axis=1)
-        if not self.driven and not self.soft and (off > 1e-2 * self.length).any():
+        if not self.drives and not self.soft and (off > 1e-2 * self.length).any():
             k = int(np.argmax(off))
             at = tuple(round(float(v), 6) for v in self.curve.at(self._start[k]))
             warnings.warn(
@@ -117,7 +127,7 @@ class Path(Tether):
         self._on_piece = add("Path.piece", m, kind=ti.i32, values=piece, state=True)
         self._on_rest = add("Path.rest", m, values=rest, state=True)
         self._on_least = self.start.size * (2.0**-22 if scene.real == ti.f32 else 2.0**-44)
-        if self.driven:
+        if self.drives:
             self._on_moves = "speed" in self.__dict__
             self._on_begin = add("Path.begin", self._on_pieces + 1, kind=ti.f64, values=c.starts)
             self._on_from = add("Path.from", m, kind=ti.f64, values=self._start, state=True)
@@ -127,7 +137,8 @@ class Path(Tether):
 
     def upload(self) -> None:
         """Take the new speed, or aim at the new arc lengths."""
-        if self.acts and self.driven:
+        super().upload()
+        if self.acts and self.drives:
             self.scene.memory.write(self._on_to, self.speed if self._on_moves else self.at)
             self.moving = not self._on_moves
 

@@ -38,11 +38,21 @@ class Pin(Tether):
 
     def __init__(self, indices, target=None, *, compliance=0.0, damping=0.0):
         self.setup(indices, compliance, damping)
-        if self.soft and not (self.compliance > 0).all():
-            i = int(np.argmin(self.compliance > 0))
-            raise ValueError(f"Pin: compliance[{i}] = 0 among positive ones. Use two Pins, one driven and one drawn.")
         if target is not None:
             self.target = target
+
+    def _compliance(self, value) -> np.ndarray:
+        value = super()._compliance(value)
+        if (value > 0).any() and not (value > 0).all():
+            i = int(np.argmin(value > 0))
+            raise ValueError(f"Pin: compliance[{i}] = 0 among positive ones. Use two Pins, one driven and one drawn.")
+        if "compliance" in vars(self) and (value > 0).any() != self.soft:
+            now = "drawn by springs" if self.soft else "driven"
+            raise ValueError(
+                f"Pin: compliance cannot go {'to 0' if self.soft else 'from 0'}, because these particles are {now}. Make a "
+                "new Pin and exchange it: world.remove(features=[old]), world.add(features=[new])."
+            )
+        return value
 
     @property
     def drives(self) -> bool:
@@ -69,6 +79,7 @@ class Pin(Tether):
 
     def upload(self) -> None:
         """Aim at the new target."""
+        super().upload()
         if self.acts:
             self.scene.memory.write(self._on_to, self.target)
             self.moving = True

@@ -31,7 +31,7 @@ class Polygon(Facets):
     ):  # fmt: skip
         vertices = checks.points("Polygon", "vertices", vertices, dim=2)
         self.closed, self.turned_in = bool(closed), bool(inside)
-        self.radius = checks.number("Polygon", "radius", radius, least=0.0)
+        self.radius = radius
         if self.turned_in and not self.closed:
             raise ValueError("Polygon: inside = True needs an inside; an open line (closed = False) has none.")
         if self.closed and len(vertices) > 1 and (vertices[0] == vertices[-1]).all():

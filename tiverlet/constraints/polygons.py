@@ -1,6 +1,5 @@
 """Bodies made of loops of particles that do not overlap (2D)."""
 
-import copy
 from collections.abc import Iterable
 from dataclasses import replace
 from types import SimpleNamespace
@@ -45,6 +44,7 @@ class Polygons(Rim):
 
     measures, calms = True, False
     room = 64  # the particles of near bodies
+    groups: Any = None  # all touch
     _on_store: Any = None
 
     def __init__(self, loops: Iterable, friction=0.0, restitution=0.0, *, skin="auto", push_out=1.0):
@@ -67,7 +67,7 @@ class Polygons(Rim):
         self._on_reach = float(length[loops].min(initial=np.inf)) / 4
         self._on_size = 0.15 * median(self._on_cover) if self.skin == "auto" else float(self.skin)
         self._on_finest = float(self._on_cover.min(initial=np.inf))
-        self.table = copy.copy(self.table)  # which is bound to one world
+        self.table = self.wanted
         self.matters = n > 0 and bool(self.loops or (particles.radius > 0).any())
         if self.matters:
             self.check_range(x)

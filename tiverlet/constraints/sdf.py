@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from .. import checks, runtime
+from .. import runtime
 from ..compiling import Compiler
 from ..feature import Scene
 from ..particles import Particles
@@ -48,7 +48,7 @@ class Sdf(Solid):
     ):  # fmt: skip
         self.function: Any = _taken("function", function)
         self.gradient: Any = gradient and _taken("gradient", gradient)
-        self.radius = checks.number("Sdf", "radius", radius, least=0.0)
+        self.radius = radius
         self.place(position, rotation)
         self.surface(friction, restitution, push_out)
 

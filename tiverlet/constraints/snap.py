@@ -24,10 +24,14 @@ class Snap(Tether):
 
     def __init__(self, indices, spacing, origin=0.0, *, compliance, damping=0.0):
         self.setup(indices, compliance, damping)
-        if (self.compliance == 0).any():
-            i = int(np.argmin(self.compliance))
-            raise ValueError(f"Snap: compliance[{i}] = 0, but a rigid grid leaves nothing free; use Pin, or a small compliance.")
         self.spacing, self.origin = spacing, origin
+
+    def _compliance(self, value) -> np.ndarray:
+        value = super()._compliance(value)
+        if (value == 0).any():
+            i = int(np.argmin(value))
+            raise ValueError(f"Snap: compliance[{i}] = 0, but a rigid grid leaves nothing free; use Pin, or a small compliance.")
+        return value
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Settle the grid."""

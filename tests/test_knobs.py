@@ -1,0 +1,374 @@
+"""Settings that look live are live, and all others refuse: for every exported force, constraint and wall at once.
+
+One world in 3D and one in 2D hold all of them, each with particles of its own to show its effect on. A setting is live if a world
+goes on, after the assignment, as one that was built with the new value.
+"""
+
+import inspect
+
+import numpy as np
+import pytest
+import taichi as ti
+
+import tiverlet as tv
+from tiverlet import constraints, forces
+from tiverlet.arguments import knobs_of
+
+from .conftest import order
+
+DT = 1 / 60
+LINK = np.array([[0.0, 0.3, 0.1], [0.5, -0.1, 0.3]])
+PATH = np.array([[-0.4, 0.3, 0.1], [0.1, -0.2, 0.0], [0.6, 0.4, 0.3]])
+WINGS = np.array([[0.0, -0.1, 0.0], [0.9, 0.1, 0.1], [0.3, 0.8, 0.2], [0.5, -0.6, 0.4]])
+SPRING, SPRINGS = {"compliance": 1e-2, "damping": 1.0, "break_at": 1e6}, {"compliance": 3e-2, "damping": 3.0, "break_at": 1e5}
+SOFT, SOFTER, RIGID = ({"compliance": a, "damping": b} for a, b in ((1e-2, 1.0), (1e-3, 3.0), (0.0, 0.0)))
+SURFACE = {"friction": 0.5, "restitution": 0.5, "push_out": 1.0}
+SURFACES = {"friction": (0.2, 0.1), "restitution": 0.9, "push_out": 3.0}
+BLOCK = np.array([6.0, 0.0, 0.0])  # from the particles of one to those of the next
+LOCAL = ("center", "a", "b", "position", "target")  # settings that are places, given from the block
+
+
+@ti.func
+def mound(p):
+    return ti.math.length(p) - 1.0
+
+
+@ti.func
+def pull(x):
+    return -0.3 * x
+
+
+def size(x):
+    return x.norm()
+
+
+SQUARE, LOOP = np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]]), np.array([[0.0, 0], [0.5, 0], [0.5, 0.5], [0, 0.5]])
+SHELL = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
+TIPS = np.array([[1.0, 1, 1], [-1, -1, 1], [-1, 1, -1], [1, -1, -1]]) * 1.5
+CURVE = [(0.0, 0.0, 0.0), (1.0, 0.5, 0.0), (2.0, 0.0, 0.5)]
+DISCS = [[0, 0, 0], [0.38, 0.1, 0], [0.3, -0.5, 0]]
+ANGLE, AREA, GROUPS = {"rest": 0.3}, {"rest": 0.2, "pressure": 1.0}, [(0, 0), (0, 1)]
+TURN = {"position": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0)}
+
+# By name: how it is made of the numbers of its particles and the place of its block, where its particles are in it, and its
+# settings, old and new. What acts on all particles comes with those that show it.
+ROWS3 = {
+    "Gravity": (lambda i, x, **k: tv.Gravity(**k), PATH, {"g": (0.0, -1.0, 0.0)}, {"g": 3.0}),
+    "Drag": (lambda i, x, **k: tv.Drag(**k), PATH, {"rate": 0.1}, {"rate": 1.0}),
+    "Wind": (lambda i, x, **k: tv.Wind(**k), PATH, {"velocity": (1, 0, 0), "rate": 0.2}, {"velocity": (0, 2, 0), "rate": 1.0}),
+    "Attractor": (
+        lambda i, x, **k: tv.Attractor(**k), PATH, {"center": (0, 1, 0), "strength": 3.0}, {"center": (1, 0, 2), "strength": -3.0}
+    ),
+    "Force": (lambda i, x: tv.Force(pull), PATH, {}, {}),
+    "Distance": (lambda i, x, **k: tv.Distance([i], **k), LINK, ANGLE | SPRING, {"rest": 0.7} | SPRINGS),
+    "Rope": (lambda i, x, rest, **k: tv.Rope([i], rest, **k), LINK, ANGLE | SPRING, {"rest": 0.2} | SPRINGS),
+    "Spacer": (lambda i, x, rest, **k: tv.Spacer([i], rest, **k), LINK, {"rest": 1.0} | SPRING, {"rest": 1.2} | SPRINGS),
+    "Bend": (lambda i, x, **k: tv.Bend([i], **k), PATH, ANGLE | SPRING, {"rest": 0.7} | SPRINGS),
+    "AngleLimit": (
+        lambda i, x, **k: tv.AngleLimit([i], **k), PATH, {"lower": 0.1, "upper": 0.3} | SPRING,
+        {"lower": 0.2, "upper": 0.5} | SPRINGS
+    ),
+    "Dihedral": (lambda i, x, **k: tv.Dihedral([i], **k), WINGS, ANGLE | SPRING, {"rest": 0.7} | SPRINGS),
+    "Area": (lambda i, x, **k: tv.Area([i], **k), PATH, AREA | SPRING, {"rest": 0.4, "pressure": 1.3} | SPRINGS),
+    "Volume": (lambda i, x, **k: tv.Volume([i], **k), WINGS, AREA | SPRING, {"rest": 0.4, "pressure": 1.3} | SPRINGS),
+    "Volume, surface": (
+        lambda i, x, **k: tv.Volume(i[SHELL], **k), WINGS, AREA | SPRING,
+        {"rest": 0.4, "pressure": 1.3} | SPRINGS,
+    ),
+    "Constraint": (
+        lambda i, x, **k: tv.Constraint(size, i, origin=x, **k), LINK[1:], {"rest": 1.0} | SPRING,
+        {"rest": 1.5} | SPRINGS,
+    ),
+    "ShapeMatch": (
+        lambda i, x, **k: tv.ShapeMatch([i], **k), WINGS,
+        {"creep": 1e-9, "yield_strain": 9.0} | SPRING, {"creep": 5.0, "yield_strain": 1e-3} | SPRINGS,
+    ),
+    "Pin": (
+        lambda i, x, **k: tv.Pin(i, **k), [[0, 0, 0]], {"target": (0.0, 0, 0), "compliance": 1e-2, "damping": 1.0},
+        {"target": (0.3, 0.1, 0), "compliance": 1e-3, "damping": 3.0},
+    ),
+    "Pin, driven": (
+        lambda i, x, **k: tv.Pin(i, **k), [[0, 0, 0]], {"target": (0.0, 0, 0)} | RIGID,
+        {"target": (0.3, 0.1, 0)} | RIGID,
+    ),
+    "Snap": (
+        lambda i, x, **k: tv.Snap(i, 0.3, **k), [[0, 0.1, 0]], SOFT, SOFTER
+    ),
+    "Path": (
+        lambda i, x, **k: tv.Path(i, x + CURVE, **k), [[0.5, 0.5, 0]], SOFT, SOFTER,
+    ),
+    "Path, at": (lambda i, x, **k: tv.Path(i, x + CURVE, **k), [[0.5, 0.3, 0]], {"at": 0.5} | RIGID, {"at": 0.7} | RIGID),
+    "Path, speed": (
+        lambda i, x, **k: tv.Path(i, x + CURVE, **k), [[0.5, 0.3, 0]], {"speed": 0.5} | RIGID,
+        {"speed": -0.7} | RIGID,
+    ),
+    "Contact": (
+        lambda i, x, **k: tv.Contact(**k), DISCS,
+        {"friction": {(0, 1): 0.5}, "restitution": {(0, 1): 0.5}, "skin": "auto", "groups": GROUPS, "push_out": 1.0},
+        {"friction": {(0, 0): 0.1, (0, 1): (0.3, 0.2)}, "restitution": {(0, 1): 0.9}, "skin": 0.2, "groups": [(0, 1)],
+        "push_out": 2.0},
+    ),
+    "Box": (
+        lambda i, x, **k: tv.Box(**k), [[1, 8.78, 0], [1, 8.85, 1]],
+        {"lower": (-5.0, -2.5, -3.0), "upper": (300, 9.0, 3)} | SURFACE,
+        {"lower": (-4.0, -2.5, -3.0), "upper": (300, 8.9, 3)} | SURFACES,
+    ),
+    "HalfSpace": (
+        lambda i, x, **k: tv.HalfSpace((0, 1, 0), **k), [[0, -1.85, 0], [1, -1.95, 0]], {"offset": -2.0} | SURFACE,
+        {"offset": -1.95} | SURFACES,
+    ),
+    "Ball": (
+        lambda i, x, **k: tv.Ball(**k), [[0, 1.12, 0], [0.9, 0, 0]], {"center": (0, 0, 0), "radius": 1.0} | SURFACE,
+        {"center": (0.02, 0.02, 0), "radius": 1.02} | SURFACES,
+    ),
+    "Capsule": (
+        lambda i, x, **k: tv.Capsule(**k), [[0, 0.62, 0], [0.5, -0.5, 0]],
+        {"a": (-1, 0, 0), "b": (1, 0, 0), "radius": 0.5} | SURFACE,
+        {"a": (-1, 0.02, 0), "b": (1, 0.03, 0), "radius": 0.52} | SURFACES,
+    ),
+    "Mesh": (
+        lambda i, x, **k: tv.Mesh(TIPS, SHELL, **k), [[-0.57, -0.57, -0.57], [-0.33, -0.33, -0.33]],
+        TURN | {"radius": 0.01} | SURFACE,
+        {"position": (0, 0, 0.02), "rotation": (0, 0.02, 0.02), "radius": 0.03} | SURFACES,
+    ),
+    "Sdf": (
+        lambda i, x, **k: tv.Sdf(mound, **k), [[0, 1.12, 0], [0.9, 0, 0]], TURN | {"radius": 0.01} | SURFACE,
+        {"position": (0.02, 0.02, 0), "rotation": (0, 0, 0.2), "radius": 0.03} | SURFACES,
+    ),
+}  # fmt: skip
+ROWS2 = {
+    "Polygon": (
+        lambda i, x, **k: tv.Polygon(SQUARE, **k), [[0, 1.12], [0.2, -0.95]],
+        {"radius": 0.01, "position": (0, 0), "rotation": 0.0} | SURFACE,
+        {"radius": 0.02, "position": (0, 0.03), "rotation": 0.05} | SURFACES,
+    ),
+    "Area, loops": (lambda i, x, **k: tv.Area([i], **k), LOOP, AREA | SPRING, {"rest": 0.4, "pressure": 1.3} | SPRINGS),
+    "Polygons": (
+        lambda i, x, **k: tv.Polygons([i[:4], i[4:]], **k), np.concatenate([LOOP, LOOP + [0.1, 0.72]]),
+        {"friction": 0.5, "restitution": 0.5, "skin": "auto", "push_out": 1.0},
+        {"friction": 0.1, "restitution": 0.2, "skin": 0.2, "push_out": 2.0},
+    ),
+}  # fmt: skip
+ELSEWHERE = {
+    ("ShapeMatch", "creep"),
+    ("ShapeMatch", "yield_strain"),
+    ("AngleLimit", "lower"),
+    ("Box", "lower"),
+}  # nothing is there
+
+
+class Scene:
+    """One world of all rows."""
+
+    def __init__(self, world, rows, new: bool, **settings):
+        self.rows, dim = rows, np.shape(next(iter(rows.values()))[1])[1]
+        points = [np.asarray(p, dtype=float) + k * BLOCK[:dim] for k, (_, p, _, _) in enumerate(rows.values())]
+        ends = np.cumsum([len(p) for p in points])
+        self.indices = dict(zip(rows, np.split(np.arange(ends[-1]), ends[:-1]), strict=True))
+        self.place = {name: k * BLOCK[:dim] for k, name in enumerate(rows)}
+        self.x = np.concatenate(points)
+        self.v = np.random.default_rng(2).normal(size=self.x.shape) * 0.7
+        walls = [name for name in rows if issubclass(getattr(tv, name.split(",")[0]), tv.wall.Wall)]
+        for name in walls:  # they come in, with a slant
+            self.v[self.indices[name]] = 4.0
+            self.v[self.indices[name], 1:] = np.array([-3.0, 1.0])[: self.x.shape[1] - 1] * (-1 if name == "Box" else 1)
+        if "Polygons" in rows:  # the upper body falls on the lower one
+            self.v[self.indices["Polygons"]] = np.repeat([[0.0, 0.0], [2.0, -2.0]], 4, axis=0)
+        if "Contact" in rows:
+            self.v[self.indices["Contact"]] = [[3.0, 0, 0], [-3.0, 1, 0], [0.0, 4.0, 1]]
+        radius = np.full(len(self.x), 0.1)
+        radius[self.indices.get("Contact", [])] = 0.18
+        self.features = {
+            name: make(self.indices[name], self.place[name], **self.values(name, new)) for name, (make, *_) in rows.items()
+        }
+        group = np.arange(len(self.x)) % 2
+        start = tv.Particles(self.x, velocity=self.v, radius=radius, mass=1 + group, group=group)
+        self.world = world(start, list(self.features.values()), substeps=5, precision="f64", **settings)
+
+    def values(self, name: str, new: bool) -> dict:
+        """Settings, old or new."""
+        local = name != "Attractor"
+        return {k: np.add(v, self.place[name]) if k in LOCAL and local else v for k, v in self.rows[name][2 + new].items()}
+
+    def assign(self, new: bool, names=None) -> None:
+        """Set all of them."""
+        for name in names or self.rows:
+            for setting, value in self.values(name, new).items():
+                setattr(self.features[name], setting, value)
+
+    def go(self, frames: int = 4) -> np.ndarray:
+        """Let targets be reached, and what pairs remember be forgotten; then run from the start."""
+        apart = self.x.copy()
+        for name in ("Contact", "Polygons"):
+            apart[self.indices.get(name, []), 1] += np.arange(len(self.indices.get(name, []))) / 2
+        self.world.position, self.world.velocity = apart, 0 * self.v
+        self.world.step(DT)
+        self.world.position, self.world.velocity = self.x, self.v
+        out = [self.world.step(DT) and self.world.position for _ in range(frames)]
+        return np.concatenate(out, axis=1)
+
+
+GROUPED = {
+    "forces": ["Gravity", "Drag", "Wind", "Attractor"],
+    "links": ["Distance", "Bend", "AngleLimit"],
+    "bodies": ["Area", "ShapeMatch"],
+    "tethers": ["Pin", "Pin, driven", "Snap", "Path", "Path, at", "Path, speed"],
+    "contact": ["Contact"],
+    "walls": ["Box", "HalfSpace", "Ball", "Capsule"],
+    "solid": ["Mesh"],
+}
+LIKE = {  # settings that the same code writes for the same code to read; these would only take long to compile
+    "Rope": tv.Distance, "Spacer": tv.Distance, "Constraint": tv.Distance, "Dihedral": tv.Bend, "Volume": tv.Area, "Sdf": tv.Mesh,
+    "Polygon": tv.Mesh, "Polygons": tv.Contact,
+}  # fmt: skip
+
+
+def test_the_rows_have_every_feature():
+    shown = {name.split(",")[0] for names in GROUPED.values() for name in names}
+    assert shown | {*LIKE, "Force"} == {*constraints.__all__, *forces.__all__} == {name.split(",")[0] for name in (ROWS3 | ROWS2)}
+    for name, like in LIKE.items():
+        kind = getattr(tv, name)
+        assert {*knobs_of(kind)} == {*knobs_of(like)} - (
+            {"groups"} if kind is tv.Polygons else set()
+        ) and kind.upload is like.upload
+    assert knobs_of(tv.Force) == ()
+
+
+@pytest.mark.parametrize("group", GROUPED)
+def test_every_setting_is_live(world, group):
+    rows = {name: ROWS3[name] for name in GROUPED[group]}
+    scene = Scene(world, rows, False)
+    memory, before = scene.world._memory, scene.go()
+    fields = scene.world.fields
+    some = np.ones(len(before), dtype=bool)
+    some[scene.indices.get("Path, speed", [])] = False  # which goes on from where it is
+
+    # Each one by itself changes the motion of its particles, compiles nothing, and leaves no trace when it is set back.
+    for name, (_, _, old, new) in rows.items():
+        feature = scene.features[name]
+        assert old.keys() == new.keys() == {k for k in knobs_of(type(feature)) if hasattr(feature, k)}, name
+        for setting in old:
+            if inspect.getattr_static(type(feature), setting).compiled or setting == "break_at" or old[setting] == new[setting]:
+                continue
+            setattr(feature, setting, scene.values(name, True)[setting])
+            moved = np.abs(scene.go() - before)
+            assert moved[scene.indices[name]].max() > 1e-7 or (name, setting) in ELSEWHERE, (name, setting)
+            moved[~some | np.isin(np.arange(len(moved)), scene.indices[name])] = 0
+            assert group == "forces" or name in ("Box", "HalfSpace") or moved.max() < 1e-12, (name, setting)
+            setattr(feature, setting, scene.values(name, False)[setting])
+    np.testing.assert_allclose(scene.go()[some], before[some], atol=1e-9)
+    assert scene.world._memory is memory and scene.world.fields == fields
+
+    # All of them together: as a world that was built so. What is compiled is compiled anew.
+    scene.assign(True)
+    other = Scene(world, rows, True)
+    np.testing.assert_allclose(scene.go()[some], other.go()[some], atol=1e-9)
+    assert np.abs(scene.go() - before).max() > 1e-3
+    compiles = any(inspect.getattr_static(type(f), k).compiled for f in scene.features.values() for k in knobs_of(type(f)))
+    assert (scene.world._memory is memory) != compiles
+    for name, feature in scene.features.items():
+        if "break_at" in rows[name][2]:
+            feature.break_at = 1e-9
+    scene.world.step(DT)
+    assert all(f.broken.all() for name, f in scene.features.items() if "break_at" in rows[name][2])
+
+
+def test_what_is_not_live_refuses_and_says_what_is(world):
+    # Every argument and every other public attribute; what is misspelt is named; arrays cannot be written to in place.
+    made = {name: Scene(lambda *a, **k: None, {name: row}, False).features[name] for name, row in (ROWS3 | ROWS2).items()}
+    for name, feature in made.items():
+        kind, live = type(feature), knobs_of(type(feature))
+        inner = {k for k in dir(feature) if not k.startswith("_") and not callable(getattr(kind, k, None))}
+        names = {*inspect.signature(kind).parameters, *inner} - {*live, *kind.kept_by_world}
+        assert names, name
+        for attribute in names:
+            with pytest.raises(AttributeError, match=f"{live[0]}" if live else "Nothing of it is live"):
+                setattr(feature, attribute, 1.0)
+        with pytest.raises(AttributeError, match=f"did you mean '{live[0]}'" if live else "Nothing of it is live"):
+            setattr(feature, f"{live[0]}s" if live else "functions", 1.0)
+        for attribute in inner | set(live):
+            value = vars(feature).get(attribute)
+            if isinstance(value, np.ndarray):
+                with pytest.raises(ValueError, match="Assign the whole" if attribute in live else "it is structure"):
+                    value[...] = 0
+    with pytest.raises(TypeError, match="Assign the whole"):
+        made["Contact"].friction[(0, 0)] = 1.0
+    with pytest.raises(AttributeError, match="did you mean 'center'"):
+        made["Ball"].centre = (0, 0, 0)
+    with pytest.raises(ValueError, match="these particles are driven by speed"):
+        made["Path, speed"].at = 1.0
+    with pytest.raises(ValueError, match="Pin: compliance cannot go from 0"):
+        made["Pin, driven"].compliance = 1.0
+    with pytest.raises(AttributeError, match="Nothing of it is live"):
+        tv.Jacobi().relaxation = 1.1
+    pin = made["Pin"]
+    pin.target += 1.0  # which assigns the whole
+    assert (pin.target == np.asarray(pin.arguments["target"]) + 1).all() and isinstance(pin.target.copy(), np.ndarray)
+    w = world(tv.Particles([[0.0, 1.0]]))
+    with pytest.raises(ValueError, match="Assign the whole: new = world.position.copy"):
+        w.position[0] = 1.0
+    with pytest.raises(AttributeError, match="did you mean 'substeps'"):
+        w.substep = 3
+
+
+def falling(world, features, **settings):
+    """Two linked discs that fall on a floor, and two that meet."""
+    x = np.array([[0.0, 0.3], [0.9, 0.3], [4.0, 0.3], [4.9, 0.4]])
+    speed = [[2.0, -2], [0, -2], [3, -2], [0, -2]]
+    return world(tv.Particles(x, velocity=speed, radius=0.25), [tv.Gravity(), *features], precision="f64", **settings)
+
+
+def test_what_was_absent_is_compiled_when_it_is_first_asked_for(world):
+    # From smooth to rough: as a world that was built so; then a clone, which goes on alike.
+    surfaces, rough = ([tv.HalfSpace((0, 1), **k), tv.Contact(**k)] for k in ({}, {"friction": 0.3, "restitution": 0.5}))
+    w, other = falling(world, surfaces), falling(world, rough)
+    start, handle = (w.position, w.velocity), w.handle([3])
+    w.run(0.1)
+    for surface in surfaces:
+        surface.friction, surface.restitution = 0.3, 0.5
+    twin = w.clone()
+    for one in (w, twin):
+        one.run(0.1)
+    assert twin.hash() == w.hash() and handle.indices.tolist() == [3]
+    twin.close()
+    for one in (w, other):
+        one.position, one.velocity = start[0] + [0, 3], 0 * start[1]
+        one.step(DT)  # in which pairs forget
+        one.position, one.velocity = start
+        one.run(0.2)
+    np.testing.assert_allclose(w.position, other.position, atol=1e-9)
+
+
+def test_what_is_turned_stays_in_edited_worlds_and_in_recordings(world, tmp_path):
+    link, floor = tv.Distance([[0, 1]]), tv.HalfSpace((0, 1), friction=0.5)
+    w = falling(world, [link, floor])
+    w.run(0.05)
+    with tv.Recorder(tmp_path / "a.rrd", w) as recorder:
+        link.compliance, link.break_at, floor.friction = 1e-2, 1e9, (0.4, 0.2)  # which compiles
+        w.run(0.05, recorder=recorder)
+        memory = w._memory
+        link.compliance, link.break_at, link.damping = 1e-3, None, 0.0
+        w.run(0.05, recorder=recorder)
+        assert w._memory is memory and np.isfinite(link.residual).all() and link.load[0] != 0
+    replay = tv.replay(tmp_path / "a.rrd")
+    assert replay.verify() and replay.world(6).hash() == w.hash()
+    w.remove(w.add(tv.Particles([[9.0, 9.0]]), [tv.Drag(0.1)]))
+    assert link.compliance[0] == 1e-3 and floor.friction == (0.4, 0.2)
+    w.step(DT)
+
+
+def test_a_force_that_changes_starts_from_velocities(world):
+    # m x'' = -(x - x0) / a(t), a from 1e-2 to 1e-3 at t1 = 0.25 s: the exact solution goes on from x1 and v1. Second order.
+    def run(substeps):
+        spring = tv.Distance([[0, 1]], rest=1.0, compliance=1e-2)
+        w = world(tv.Particles([[0.0, 0], [1.1, 0]], pinned=[0]), [spring], substeps=substeps, precision="f64")
+        w.run(0.25, dt=0.05)
+        spring.compliance = 1e-3
+        w.run(0.25, dt=0.05)
+        return w.position[1, 0] - 1
+
+    one, two = np.sqrt(1 / 1e-2), np.sqrt(1 / 1e-3)
+    x, v = 0.1 * np.cos(one * 0.25), -0.1 * one * np.sin(one * 0.25)
+    want = x * np.cos(two * 0.25) + v / two * np.sin(two * 0.25)
+    errors = [abs(run(n) - want) for n in (20, 40, 80)]
+    assert errors[-1] < 1e-4 and 1.9 <= order(errors) <= 2.1
