@@ -204,11 +204,13 @@ def test_direct_checks_its_arguments():
 
 @pytest.mark.filterwarnings("ignore:Contact. all radii are 0")
 def test_the_default_suits_the_structure(world):
-    # Links like chains, trees and loops are solved directly; cloth, braced bodies, limits of angles, single links and what starts
-    # violated are relaxed. explain() says what was chosen, and a solver that the user names is taken as it is.
+    # Links like chains, trees and loops are solved directly, stiff cloth by conjugate gradients; soft cloth, small braced bodies,
+    # limits of angles, single links and what starts violated are relaxed. explain() says what was chosen, and a solver that the
+    # user names is taken as it is.
     flat = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1], [2, 1]])
     x, chain = flat[[0, 1, 2, 4]], links(3)
     braced = [(i, j) for i in range(4) for j in range(i)]
+    sheet = tv.shapes.cloth((0, 0, 0), (1, 0, 0), (0, 0, 1), (11, 11))
     for position, features, solver in (
         (x, [tv.Distance(chain)], "Direct"),
         (x, [tv.Rope(chain), tv.Contact(), tv.Gravity()], "Direct"),
@@ -220,12 +222,15 @@ def test_the_default_suits_the_structure(world):
         (x, [tv.Distance(chain, [1.0, 1.0, 3.0])], "Jacobi"),
         (x, [tv.Rope(chain, 5.0)], "Direct"),
         (x, [], "Jacobi"),
+        (sheet.position, [tv.Distance(sheet.links), tv.Dihedral(sheet.quads, compliance=1.0)], "ConjugateGradient"),
+        (sheet.position, [tv.Distance(sheet.links), tv.Dihedral(sheet.quads)], "Jacobi"),
+        (sheet.position, [tv.Distance(sheet.links, compliance=1e-3)], "Jacobi"),
     ):
         w = world(tv.Particles(position), features)
         assert type(w._solver).__name__ == solver, features
-        assert f"Solved by {solver}" in w.explain() or not features
+        assert not features or f"Solved by {solver}" in w.explain() and "; chosen because links " in w.explain()
     w = world(tv.Particles(x), [tv.Distance(chain)], solver=tv.Jacobi())
-    assert "Solved by Jacobi" in w.explain()
+    assert "Solved by Jacobi" in w.explain() and "chosen" not in w.explain()
 
 
 def test_ropes_that_touch_are_solved_and_come_to_rest(world):

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from . import runtime
+from .assembly import reason
 from .feature import Acceleration, Batch
 from .shapes.shape import morton
 from .wall import Wall
@@ -37,7 +38,8 @@ def explain(world: "World") -> str:
         size = sum(world.fields[name] for name in names)
         lines.append(f"    {owner:10s} {size:>9d} bytes: {', '.join(n.partition('.')[2] or n for n in names)}")
     if sub.batches:
-        lines.append(f"Solved by {world._solver.explain(sub.batches, sub.slots)}")
+        why = "" if world._wanted[0] else f"; chosen because {reason(world._solver)}"
+        lines.append(f"Solved by {world._solver.explain(sub.batches, sub.slots)}{why}")
         lines.append(f"Constraint corners that can move: {sub.slots.total} of {sum(b.indices.size for b in sub.batches)}")
     if _scattered(p.position):
         lines.append(
