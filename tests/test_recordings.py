@@ -14,9 +14,10 @@ import pytest
 
 import tiverlet as tv
 from tiverlet.__main__ import main
-from tiverlet.recording import journal, messages, recorder, rrd, viewer
+from tiverlet.recording import journal, messages, reader, recorder, viewer
 
 from .conftest import python
+from .forging import Forgery
 
 
 @pytest.fixture(scope="module")
@@ -36,24 +37,8 @@ def falling(tmp_path_factory):
 
 
 def rewrite(path, to, change, seal=True):
-    """Copy a recording with entries changed by change(number, text) -> text; sealed with new checksums, or not."""
-    import rerun as rr
-
-    stream = rr.RecordingStream("tiverlet_3d")
-    stream.save(to)
-    with rrd.chunks(str(path)) as (chunks, _):
-        rows = [
-            row for c in chunks if c.entity_path == f"/{journal.JOURNAL}"
-            for row in zip(*(rrd.rows(c, name) for name in ("text", "blob", "checksum")), strict=True)
-        ]  # fmt: skip
-        stream.send_chunks([c for c in chunks if c.entity_path != f"/{journal.JOURNAL}"])
-    mark = ""
-    for text, blob, old in rows:
-        text = change(text)
-        mark = journal.checksum(mark, text, blob.tobytes()) if seal else old
-        stream.log(journal.JOURNAL, rr.AnyValues(text=text, blob=blob, checksum=mark))
-    stream.disconnect()
-    return to
+    """Copy a recording with entries changed by change(text) -> text; with new checksums, or not."""
+    return Forgery(path).journal(lambda entry: json.loads(change(json.dumps(entry))), seal).save(to)
 
 
 def test_what_was_recorded_reads_back(falling, tmp_path):
@@ -94,7 +79,7 @@ def test_damage_is_named(falling, tmp_path):
         tv.replay(path)
 
     # Cut in the middle of every message: what comes before it is read, and it is said where that ends.
-    ends, at = [], rrd.HEADER
+    ends, at = [], reader.HEADER
     while at < len(whole) and (kind := struct.unpack_from("<QQ", whole, at))[0]:
         at += 16 + kind[1]
         ends.append(at)
@@ -107,9 +92,22 @@ def test_damage_is_named(falling, tmp_path):
             assert "cut short before anything" in str(e) and not seen
             continue
         seen.add(len(part.frames))
-        assert not part.complete and "not closed: it " in part.text
+        assert not part.complete and "not complete (the file is cut short" in part.text
     assert seen and max(seen) == 11
-    assert part.verify()
+    verdict = part.verify()
+    assert not verdict and (verdict.kind, verdict.frames) == ("incomplete", 11) and "the first 11 frames hold" in str(verdict)
+
+    # An entry of the journal that is not there; and a length that is wrong.
+    forged = Forgery(falling)
+    (k,) = forged.chunks(journal.JOURNAL)[6:7]
+    forged.only(k, [])
+    missing = tv.replay(forged.save(tmp_path / "c.rrd")).verify()
+    assert missing.kind == "incomplete" and 0 < missing.frames < 11 and missing.of >= 10
+    assert f"the first {missing.frames} of {missing.of} frames hold" in str(missing)
+    at = ends[len(ends) // 2]
+    path.write_bytes(whole[:at] + struct.pack("<QQ", 2, 1 << 60) + whole[at + 16 :])
+    wrong = tv.replay(path)
+    assert not wrong.complete and "a length is wrong" in wrong.text and wrong.verify().kind == "incomplete"
 
 
 def test_tampering_is_found(falling, tmp_path):
@@ -136,17 +134,17 @@ def test_tampering_is_found(falling, tmp_path):
     with pytest.raises(RuntimeError, match="frame 12 .* not as it was: taichi 0.7.4 then, 1.7.4 now"):
         tv.replay(rewrite(falling, tmp_path / "d.rrd", elsewhere)).world(12)
 
-    # One coordinate of the picture: its bytes are in the file as they are, since LZ4 finds nothing to save in them.
-    whole, x = bytearray(falling.read_bytes()), tv.replay(falling).position(8)
-    at = whole.find(x[1].tobytes())
-    if at >= 0:
-        whole[at] ^= 1
-        (tmp_path / "e.rrd").write_bytes(whole)
-        recording = tv.replay(tmp_path / "e.rrd")
-        with pytest.raises(ValueError, match="picture of frame 8"):
-            recording.position(8)
-        verdict = recording.verify()
-        assert not verdict and (verdict.frame, verdict.particle) == (8, 1) and "picture" in str(verdict)
+    # One coordinate of the picture.
+    forged = Forgery(falling)
+    k, row = forged.rows("world/scene/particles", "Points3D:positions")[4]
+    x = forged.messages[k][2].column("Points3D:positions").to_pylist()
+    x[row][1][0] = np.nextafter(np.float32(x[row][1][0]), np.float32(9))
+    forged.set(k, Points3D__positions=x)
+    recording = tv.replay(forged.save(tmp_path / "e.rrd"))
+    with pytest.raises(ValueError, match="picture of frame 8"):
+        recording.position(8)
+    verdict = recording.verify()
+    assert (verdict.kind, verdict.frame, verdict.particle) == ("changed", 8, 1) and "picture" in str(verdict)
 
 
 def test_a_killed_process_leaves_what_was_flushed(tmp_path):
@@ -170,8 +168,9 @@ os.kill(os.getpid(), signal.SIGKILL)
     assert python(code, check=False).returncode == -9
     assert list(tv.replay(tmp_path / "first.rrd").frames) == [0]  # something is there at once
     recording = tv.replay(tmp_path / "k.rrd")
-    assert not recording.complete and recording.frames[-1] >= 25 and "not closed: it ends with frame" in recording.text
-    assert recording.verify()
+    assert not recording.complete and recording.frames[-1] >= 25 and "it ends with frame" in recording.text
+    verdict = recording.verify()
+    assert (verdict.kind, bool(verdict)) == ("incomplete", False) and verdict.frames >= 26
 
 
 def test_a_full_disk_is_an_error_and_loses_nothing_that_was_written(world, tmp_path):
@@ -190,7 +189,7 @@ def test_a_full_disk_is_an_error_and_loses_nothing_that_was_written(world, tmp_p
     assert not w._watchers
     recording = tv.replay(tmp_path / "full.rrd")
     assert not recording.complete and 3 < len(recording.frames) < 20
-    assert recording.verify()
+    assert recording.verify().kind == "incomplete" and recording.verify().frames > 3
     with pytest.raises(OSError, match="nothing could be written to /dev/full .No space left"):
         tv.Recorder("/dev/full", w)
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))

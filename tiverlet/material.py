@@ -28,6 +28,9 @@ def restitution_of(who: str, name: str, value: Any) -> float:
     return checks.number(who, name, value, least=0.0, most=1.0)
 
 
+MOST = 1000  # groups of particles that are told apart
+
+
 class Table:
     """For each pair of groups: static friction, dynamic friction, restitution, whether they touch; one row where `uniform`.
 
@@ -50,9 +53,14 @@ class Table:
 
     def rows(self, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The rank of each particle's group, (n,), and the table, (ranks * ranks, 4)."""
-        names, rank, _ = distinct(group)
-        at = {int(name): k for k, name in enumerate(names)}
-        m = len(names)
+        named = {k for given in (self.friction, self.restitution) if isinstance(given, Mapping) for pair in given for k in pair}
+        named |= {k for pair in self.touching or () for k in pair}
+        names, which, _ = distinct(group)
+        at = {int(name): k for k, name in enumerate(name for name in names if name in named)}
+        m = len(at) + (len(at) < len(names))  # all others are one
+        if m > MOST:
+            raise ValueError(f"{self.who}: {len(at)} groups of particles are named, but there can be {MOST}.")
+        rank = np.array([at.get(int(name), len(at)) for name in names], dtype=np.int64)[which]
         table = np.zeros((m, m, 4))
         table[..., 3] = self.touching is None
         for a, b in self.touching or []:

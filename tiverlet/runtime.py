@@ -136,6 +136,18 @@ def fast_math() -> bool:
     return bool(_config().fast_math)
 
 
+def default_fp() -> str:
+    """The type of plain numbers in the user's own functions: "f32" or "f64"."""
+    return str(_config().default_fp)
+
+
+def compiler() -> str:
+    """What makes machine code of kernels: Taichi, of which commit, and what it was built with."""
+    library: Any = ti._lib
+    core = library.core
+    return f"Taichi {core.get_version_string()} ({core.get_commit_hash()[:8]}), LLVM {core.get_llvm_target_support()}"
+
+
 def wanted() -> dict[str, Any]:
     """What init() was asked for; nothing when the user started Taichi."""
     return _started.get("wanted") or {}

@@ -97,6 +97,36 @@ def install(world: "World", kept: Kept, flagged: list[list[bool]]) -> None:
     undo(world, kept, flagged)
 
 
+def check(world: "World", kept: Kept, flagged: list[list[bool]]) -> None:
+    """Raise ValueError unless a state that came from elsewhere fits the world; above all what kernels take for indices."""
+    present = keep(world)
+    late = {"Contact.shrunk"}  # a field that is made when it is needed
+    if set(present.values) - late != set(kept.values) - late or set(present.clock) != set(kept.clock):
+        raise ValueError("The state is not one of this scene: it has other fields.")
+    pieces = {f"Contact.{piece.name}" for piece in world._grid.lasting} if world._grid else set()
+    most = {"Contact.pairs": len(world.particles)}
+    for f in world.features:
+        if hasattr(f, "_on_pieces"):  # of a Path
+            most |= {name: f._on_pieces for name in kept.values if name.startswith("Path.piece")}  # type: ignore[attr-defined]
+    for name, value in kept.values.items():
+        ours, free = present.values.get(name), name in pieces or name in ("Contact.pairs", "Contact.shrunk")
+        shape = ours is None or ours.shape[free:] == value.shape[free:]
+        if not shape or (ours is not None and ours.dtype.kind != value.dtype.kind):
+            raise ValueError(f"The state is not one of this scene: {name} has shape {value.shape} of {value.dtype}.")
+        if name in most and value.size and not (value.min() >= 0 and value.max() < most[name]):
+            raise ValueError(f"The state is not one of this scene: {name} has {value.min()} to {value.max()}, of {most[name]}.")
+    if len({len(value) for name, value in kept.values.items() if name in pieces or name == "Contact.pairs"}) > 1:
+        raise ValueError("The state is not one of this scene: pairs in contact carry other numbers of values.")
+    clock = kept.clock
+    right = [type(clock[name]) is int and 0 <= clock[name] < 2**31 for name in ("_tick", "_since")]
+    right += [type(v) is bool for v in (clock["_fresh"], clock["_started"], *(b for pair in flagged for b in pair))]
+    right += [type(v) in (int, float) for v in (clock["_time"], clock["_h"], *clock["_frame"], clock["_energy"] or 0)]
+    right += [clock["_placed"] is None or 0 <= clock["_placed"] <= len(world.particles), len(flagged) == len(world.features)]
+    right += [clock["_drag"] is None or [type(v) for v in clock["_drag"]] == [float] * 5, len(clock["_frame"]) == 3]
+    if not all(right):
+        raise ValueError("The state is not one of this scene: its clock is none.")
+
+
 def undo(world: "World", kept: Kept, flagged: list[list[bool]]) -> None:
     """Return to the state before a step that was not finished; what it uploaded is uploaded again in the next one."""
     put_back(world, kept)

@@ -8,11 +8,16 @@ from typing import Any
 ABOUT = "view, verify, picture or export a recording"
 
 
+STATUS = {"intact": 0, "changed": 1, "incomplete": 3}  # 2: it cannot be read
+
+
 def add(parser: argparse.ArgumentParser) -> None:
     """The file, and what to do with it."""
     parser.add_argument("file", help="an .rrd file that a Recorder has written")
     what = parser.add_mutually_exclusive_group()
-    what.add_argument("--verify", action="store_true", help="compute all frames again, and compare; exit status 1 if one differs")
+    what.add_argument(
+        "--verify", action="store_true", help="compute all again and compare; exit status 1: changed, 3: incomplete"
+    )
     what.add_argument("--web", action="store_true", help="serve the viewer to browsers, on 127.0.0.1 only")
     what.add_argument("--png", metavar="OUT.png", help="save a picture, without a window; needs a Vulkan driver, in software too")
     what.add_argument("--export", choices=("npz", "csv"), help="write positions (npz: and curves) beside the file")
@@ -25,15 +30,22 @@ def add(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Do it."""
     from ..recording import replay
+    from ..recording.journal import Changed
 
-    recording = replay(args.file)
+    try:
+        recording = replay(args.file)
+    except Changed as e:
+        if not args.verify:
+            raise
+        print(e)
+        return STATUS["changed"]
     print(recording.text)
     if args.verify:
         if args.given:
             recording = replay(args.file, functions(args.given, recording.scene["needs"]))
         verdict = recording.verify()
         print(verdict)
-        return 0 if verdict else 1
+        return STATUS[verdict.kind]
     if args.export:
         out = f"{os.path.splitext(args.file)[0]}.{args.export}"
         recording.export(out)
@@ -54,6 +66,18 @@ def main(args: argparse.Namespace) -> int:
 
 
 def functions(script: str, names: dict[str, str]) -> dict[str, Any]:
-    """What of these names a script defines. The script is run, up to its `if __name__ == "__main__":`."""
+    """What of these names a script defines. The script is run, up to its `if __name__ == "__main__":`.
+
+    Only functions for kernels: what else there is in a script is not for a file to choose from.
+    """
+    from ..recording.scene import plain
+
     found = runpy.run_path(script, run_name="given")
-    return {name: found[name.partition(" #")[0]] for name in names if name.partition(" #")[0] in found}
+    out = {name: found[name.partition(" #")[0]] for name in names if name.partition(" #")[0] in found}
+    for name, thing in out.items():
+        if not getattr(thing, "_is_taichi_function", False):
+            raise ValueError(
+                f"--given {script}: {plain(name)} is a {type(thing).__name__}, but only functions with @ti.func are taken from "
+                "a script. Give others in Python: tv.replay(path, given=[...])."
+            )
+    return out

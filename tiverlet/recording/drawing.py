@@ -33,7 +33,7 @@ class Drawing:
         import pyarrow
         import rerun as rr
 
-        self._rr, self._pa, self._world, self._stream = rr, pyarrow, world, stream
+        self._rr, self._pa, self.world, self._stream = rr, pyarrow, world, stream
         flat = world.particles.dim == 2
         self._points: Any = rr.Points2D if flat else rr.Points3D
         self._strips: Any = rr.LineStrips2D if flat else rr.LineStrips3D
@@ -54,7 +54,7 @@ class Drawing:
 
     def begin(self) -> None:
         """What does not change until particles or features come or go; then all is drawn anew, under another name."""
-        world, p = self._world, self._world.particles
+        world, p = self.world, self.world.particles
         self._root = f"{SCENE}/scene{self.scenes}" if self.scenes else SCENE
         if self.scenes:
             self._log(SCENE, self._rr.Clear(recursive=True))
@@ -79,7 +79,7 @@ class Drawing:
 
     def _join(self) -> None:
         """All links together: as a sheet what is one, and the others as lines."""
-        world = self._world
+        world = self.world
         found = links(world)
         none = np.zeros((0, 2), dtype=np.int64)
         self._pairs = np.concatenate([none, *(f.indices for _, f in found)])
@@ -144,7 +144,7 @@ class Drawing:
 
     def _wall(self, k: int) -> None:
         """A wall or a path, where it is now."""
-        wall = self._world.features[k]
+        wall = self.world.features[k]
         if isinstance(wall, (Wall, Path)):
             strips, thickness = wall.outline(*self._extent)
             radius = thickness if thickness else -1.5  # half the width in the scene, or pixels
@@ -153,7 +153,7 @@ class Drawing:
 
     def _contact(self) -> None:
         """Where particles touch: between the two."""
-        world = self._world
+        world = self.world
         middle = np.zeros((0, world.particles.dim))
         if world._h:
             found = world.contacts
@@ -169,7 +169,7 @@ class Drawing:
         """A mark where something broke since the last frame, and a line in the list of events."""
         marks = [np.zeros((0, x.shape[1]))]
         for k, before in self._broken.items():
-            f = self._world.features[k]
+            f = self.world.features[k]
             now = f.broken  # type: ignore[attr-defined]
             new = np.flatnonzero(now & ~before)
             self._broken[k] = now

@@ -16,6 +16,7 @@ import contextlib
 import copy
 import hashlib
 import json
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -29,10 +30,20 @@ from . import rrd, scene
 if TYPE_CHECKING:
     from ..world import World
 
-FORMAT = 1
+FORMAT = 2
+GUARD = {"stuck", "substeps-capped"}  # flags that do not follow from the steps: the Guard knows what it tried in vain
 JOURNAL = "tiverlet/journal"
+SCENE = "world/scene"
 PARTICLES = "particles"  # the end of the entities that have the positions of frames
 Write = Callable[[str, np.ndarray, str], None]
+
+
+class Changed(ValueError):
+    """A recording was changed after it was written. frames: how many were good before the place."""
+
+    def __init__(self, text: str, frames: int = 0):
+        super().__init__(text)
+        self.frames = frames
 
 
 @dataclass
@@ -60,10 +71,12 @@ class Entry:
         """The entry that pack() was given."""
         parts, arrays, at = json.loads(text), {}, 0
         for name, kind, shape in parts["arrays"]:
-            dtype = np.dtype(kind)
+            dtype = np.dtype(str(kind))
             if dtype.kind not in "biuf":
                 raise ValueError(f"array {name!r} has the type {kind}")
-            count = int(np.prod(shape, dtype=np.int64))
+            count = math.prod(shape)
+            if len(shape) > 3 or any(type(k) is not int or k < 0 for k in shape) or count * dtype.itemsize > len(blob) - at:
+                raise ValueError(f"array {name!r} has the shape {shape}, but {len(blob) - at} bytes are left")
             arrays[name] = np.frombuffer(blob, dtype, count, at).reshape(shape).astype(dtype.newbyteorder("="))
             at += arrays[name].nbytes
         return Entry(parts["kind"], parts["frame"], parts["data"], arrays, parts["steps"])
@@ -75,8 +88,8 @@ def checksum(before: str, text: str, blob: bytes) -> str:
 
 
 def said(report: StepReport | None) -> dict[str, Any]:
-    """The flags of a report, some of which do not follow from the steps alone: a Guard knows what it tried in vain."""
-    return {"flags": sorted(report.flags), "notes": list(report.notes)} if report and report.flags else {}
+    """The flags of a report, if some do not follow from the steps alone."""
+    return {"flags": sorted(report.flags), "notes": list(report.notes)} if report and report.flags & GUARD else {}
 
 
 class Journal:
@@ -173,36 +186,58 @@ class Journal:
             self.world._watchers.remove(self)
 
 
-def read(path: str, chunks: list[Any], whole: bool) -> tuple[list[Entry], str]:
-    """The entries in order, checked, and what is to be said about them."""
-    packed = []
-    for chunk in chunks:
-        if chunk.entity_path == f"/{JOURNAL}":
-            packed += zip(*(rrd.rows(chunk, name) for name in ("text", "blob", "checksum")), strict=True)
-    rows = sorted(((json.loads(text)["serial"], text, blob, mark) for text, blob, mark in packed), key=lambda row: row[0])
+def read(path: str, contents: rrd.Contents) -> tuple[list[Entry], str, int | None]:
+    """The entries in order, checked; why they end where they do, if something is missing; and how many frames follow it.
+
+    Raises ValueError for what is no recording, or of another format, and Changed where a checksum is wrong.
+    """
+    rows = []
+    for number, (ident, text, blob, mark) in enumerate(contents.journal()):
+        try:
+            serial = json.loads(text)["serial"]
+        except (ValueError, KeyError, TypeError, RecursionError):
+            raise Changed(f"replay: {path} was changed after it was recorded: entry {number} of its journal is none.") from None
+        rows.append((serial, ident, text, blob, mark))
     if not rows:
-        why = "is not a recording of tiverlet; `rerun` shows it" if whole else "was cut short before anything was flushed"
+        why = (
+            "is not a recording of tiverlet; `rerun` shows it" if contents.whole else "was cut short before anything was flushed"
+        )
         raise ValueError(f"replay: {path} {why}.")
-    first = json.loads(rows[0][1])
-    if first["kind"] == "scene" and first["data"]["format"] != FORMAT:
+    rows.sort(key=lambda row: row[:2])
+    _check_format(path, rows[0][2])
+    entries, mark, frames = [], "", 0
+    for k, (serial, _, text, blob, wanted) in enumerate(rows):
+        if serial > k:
+            later = sum(_kind(text) == "frame" for _, _, text, *_ in rows[k:])
+            return entries, f"entry {k} of the journal is missing", later
+        mark = checksum(mark, text.decode(errors="replace"), blob)
+        if serial < k or mark.encode() != wanted:
+            what = f"entry {k}, {_kind(text)!r} of frame {json.loads(text).get('frame')}"
+            raise Changed(f"replay: {path} was changed after it was recorded: {what}.", frames)
+        entries.append(Entry.unpack(text.decode(), blob))
+        frames += entries[-1].kind == "frame"
+    ids = [row[1] for row in rows]
+    if ids != sorted(ids) or len(set(ids)) < len(ids):
+        raise Changed(f"replay: {path} was changed after it was recorded: entries of the journal were written in another order.")
+    if entries[-1].kind == "scene":  # its state was not flushed
+        entries.pop()
+    if not entries:
+        raise ValueError(f"replay: {path} was cut short before anything was flushed.")
+    kinds = [entry.kind for entry in entries]
+    if kinds[:2] != ["scene", "state"][: len(kinds)] or "end" in kinds[:-1]:
+        raise ValueError(f"replay: {path} is damaged, or was not written by a Recorder: its entries are {', '.join(kinds[:5])}.")
+    return entries, "", None
+
+
+def _kind(text: bytes) -> str:
+    return json.loads(text).get("kind")
+
+
+def _check_format(path: str, text: bytes) -> None:
+    first = json.loads(text)
+    if first.get("kind") == "scene" and first["data"]["format"] != FORMAT:
         theirs, version = first["data"]["format"], first["data"]["environment"]["tiverlet"]
         raise ValueError(
             f"replay: {path} is in format {theirs}, of tiverlet {version}, but this version reads format {FORMAT}. "
             "The picture opens with `rerun`; for the rest use that version."
         )
-    entries, mark = [], ""
-    for k, (serial, text, blob, wanted) in enumerate(rows):
-        if serial != k:
-            return entries, f" Entry {k} of the journal is missing, so it is read up to there."
-        mark = checksum(mark, text, blob.tobytes())
-        entry = Entry.unpack(text, blob.tobytes())
-        if mark != wanted:
-            raise ValueError(
-                f"replay: {path} was changed after it was recorded: entry {k}, {entry.kind!r} of frame {entry.frame}."
-            )
-        entries.append(entry)
-    if entries[-1].kind == "scene":  # its state was not flushed
-        entries.pop()
-    if not entries:
-        raise ValueError(f"replay: {path} was cut short before anything was flushed.")
-    return entries, ""

@@ -55,13 +55,22 @@ def blueprint(low: np.ndarray, high: np.ndarray, links: bool) -> rrb.Blueprint:
         visual_bounds=rrb.VisualBounds2D(x_range=[-0.6 * WIDE, 6.6 * WIDE], y_range=[-1.3, 1.5]),
     )  # fmt: skip
     side = rrb.Vertical(*curves[:-2], rrb.Horizontal(*curves[-2:]), rrb.Tabs(*pages), row_shares=[1, 1, 1, 1, 1.6])
-    view.id = SCENE_VIEW
     left = rrb.Vertical(view, scale, row_shares=[10, 1.2]) if links else view
+    whole = rrb.Horizontal(left, side, column_shares=[7, 3])
+    _name(whole, "layout")
+    view.id = SCENE_VIEW
     return rrb.Blueprint(
-        rrb.Horizontal(left, side, column_shares=[7, 3]),
+        whole,
         rrb.TimePanel(state="collapsed", timeline="frame"),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
         auto_views=False,
         auto_layout=False,
     )
+
+
+def _name(part: rrb.Container | rrb.View, name: str) -> None:
+    """Give all parts ids that are the same in every recording, so that layouts can be compared."""
+    part.id = uuid.uuid5(SCENE_VIEW, name)
+    for k, inner in enumerate(part.contents if isinstance(part, rrb.Container) else ()):
+        _name(inner, f"{name}/{k}")

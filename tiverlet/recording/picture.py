@@ -16,16 +16,18 @@ if TYPE_CHECKING:
 
 
 class Picture:
-    """The scene, its figures as curves, events, and a page about it. explained: what world.explain() says."""
+    """The scene, its figures as curves, events, and a page about it. explained: what world.explain() says. environment: what it
+    was recorded with, see scene.environment().
+    """
 
-    def __init__(self, world: "World", stream: Any, explained: str):
+    def __init__(self, world: "World", stream: Any, explained: str, environment: dict[str, Any]):
         import rerun as rr
 
         from .curves import Curves
         from .drawing import Drawing, bounds
         from .layout import MIRROR, SCENE
 
-        self.world, self._stream, self._explained = world, stream, explained
+        self.world, self._stream, self._explained, self._environment = world, stream, explained, environment
         self.drawing = Drawing(world, stream, bounds(world))
         self.drawing.static(SCENE, MIRROR if world.particles.dim == 2 else rr.ViewCoordinates.RIGHT_HAND_Y_UP)
         self.curves = Curves(world, stream)
@@ -35,8 +37,12 @@ class Picture:
     def _about(self, worst: StepReport | None, frames: int, note: str) -> None:
         import rerun as rr
 
-        text = about(self.world, self._explained, worst, frames, note)
+        text = about(self.world, self._explained, self._environment, worst, frames, note)
         self.drawing.static("about", rr.TextDocument(text, media_type="text/markdown"))
+
+    def follow(self, world: "World") -> None:
+        """Draw another world from now on, which is the same to the viewer."""
+        self.world = self.drawing.world = world
 
     def stamp(self, number: int) -> None:
         """What is logged from now on belongs to this frame."""
@@ -73,7 +79,9 @@ def layout(world: "World") -> Any:
     return blueprint(*bounds(world), bool(links(world)))
 
 
-def about(world: "World", explained: str, worst: StepReport | None = None, frames: int = 0, note: str = "") -> str:
+def about(
+    world: "World", explained: str, environment: dict[str, Any], worst: StepReport | None = None, frames: int = 0, note: str = ""
+) -> str:
     """A page about the scene, and about all frames once there are some."""
     rows = [
         f"# {len(world.particles)} particles in {world.particles.dim}D",
@@ -81,6 +89,8 @@ def about(world: "World", explained: str, worst: StepReport | None = None, frame
         "```",
         explained,
         "```",
+        "",
+        f"Recorded with {', '.join(f'{name} {value}' for name, value in environment.items())}.",
     ]
     if worst is not None:
         rows[1:1] = [

@@ -15,6 +15,7 @@ from .. import checks, interrupts, snapshot
 from ..world import World
 from .journal import JOURNAL, Journal, said
 from .picture import Picture, layout
+from .scene import environment
 from .sink import Sink
 
 SEND = 1.0  # [s] after which the points of curves are sent on
@@ -95,7 +96,7 @@ class Recorder:
         """Write what holds for all frames, and the first one."""
         world, explained = self.world, self.world.explain()
         world._settle_forces()
-        self._picture = Picture(world, self._stream, explained)
+        self._picture = Picture(world, self._stream, explained, environment())
         self._sent, self._flushed = perf_counter(), 0
         self._picture.stamp(0)
         self._journal = Journal(world, self._write, {"title": title, "explained": explained})

@@ -1,5 +1,6 @@
 """Reading a recording back: its picture, a world that goes on from any frame, and the proof that both are true."""
 
+import functools
 import os
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
@@ -8,9 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .. import snapshot
+from .. import checks, snapshot
 from . import journal, rrd, scene
 from .journal import Entry
+from .redraw import Redraw, compare
+from .scene import plain
 
 if TYPE_CHECKING:
     from ..world import World
@@ -18,22 +21,38 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What verify() found; true if every frame came out as recorded.
+    """What verify() found; true if the recording is whole and every frame came out as recorded.
 
-    frames: how many were compared. frame: the first that differs. particle: the first particle that does, where it shows; it may
-    show only later. text: a sentence that says so.
+    kind: "intact"; "changed", where something is not what the steps lead to; or "incomplete", where nothing was changed, but not
+    all is there. frames: how many hold, of how many that are known. frame: the first that differs. particle: the first particle
+    that does, where it shows; it may show only later. text: a sentence that says so.
     """
 
+    kind: str
     frames: int
+    of: int
     frame: int | None = None
     particle: int | None = None
     text: str = field(default="", repr=False)
 
     def __bool__(self) -> bool:
-        return self.frame is None
+        return self.kind == "intact"
 
     def __str__(self) -> str:
         return self.text
+
+
+def _clear(function):
+    """Let what a damaged file makes Python say become one clear error."""
+
+    @functools.wraps(function)
+    def guarded(self, *args, **kwargs):
+        try:
+            return function(self, *args, **kwargs)
+        except (KeyError, IndexError, TypeError, AttributeError, OverflowError, RecursionError, AssertionError) as e:
+            raise ValueError(f"replay: {self.path} is damaged, or was not written by a Recorder: {e!r}.") from e
+
+    return guarded
 
 
 class Replay:
@@ -41,35 +60,30 @@ class Replay:
 
     def __init__(self, path: str, given: Mapping[str, Any]):
         self.path, self._given = path, given
-        with rrd.chunks(path) as (chunks, whole):
-            self._entries, trouble = journal.read(path, chunks, whole)
-            first, empty = self._entries[0], False
-            dim = first.arrays["position"].shape[1]
-            drawn = rrd.by_frame(chunks, journal.PARTICLES, f"Points{dim}D:positions")
-            self.curves = rrd.curves(chunks)
-        for e in self._entries:
-            empty = not len(e.arrays["position"]) if e.kind == "scene" else empty  # rerun leaves out what is empty everywhere
-            if e.kind == "frame" and empty:
-                drawn[e.frame] = np.zeros(0, dtype=np.float32)
-        self._drawn = {k: x.reshape(-1, dim) for k, x in drawn.items()}
+        self._contents = contents = rrd.read(path)
+        self._entries, gap, self._later = journal.read(path, contents)
+        first = self._entries[0]
+        self._drawn, self.curves = _pictures(contents, self._entries), _curves(contents)
         self.scene: dict[str, Any] = first.data
         shown = [e for e in self._entries if e.kind == "frame" and e.frame in self._drawn]
         self._frames = {e.frame: e for e in shown}
         self.frames = np.array([e.frame for e in shown], dtype=np.int64)
-        self.times = np.array([e.data["time"] for e in shown])
-        self.complete = whole and self._entries[-1].kind == "end"
-        self.text = self._say(trouble)
+        self.times = np.array([e.data["time"] for e in shown], dtype=np.float64)
+        ends = self._entries[-1].kind == "end"
+        self._gap = gap or contents.why or ("" if ends else "the recording was not closed")  # why it is not complete
+        self.complete = not self._gap
+        self.text = self._say()
 
-    def _say(self, trouble: str) -> str:
-        s = self.scene["environment"]
+    def _say(self) -> str:
+        s = {name: plain(str(value)) for name, value in self.scene["environment"].items()}
         out = f"{self.path}: {len(self.frames)} frames"
         if len(self.frames):
             out += f" (0 ... {self.frames[-1]}), {self.times[-1]:.6g} s"
         out += f", recorded with tiverlet {s['tiverlet']} and Taichi {s['taichi']} on {s['arch']} ({s['machine']}, {s['system']})"
         if not self.complete:
             last = f"it ends with frame {self.frames[-1]}" if len(self.frames) else "it has no frame"
-            out += f". The recording was not closed: {last}"
-        return f"{out}.{trouble}"
+            out += f". It is not complete ({plain(self._gap)}): {last}"
+        return f"{out}."
 
     def __repr__(self) -> str:
         return f"Replay({self.path!r}, {len(self.frames)} frames{'' if self.complete else ', not complete'})"
@@ -82,11 +96,14 @@ class Replay:
 
     def position(self, frame: int) -> np.ndarray:
         """Positions [m] as they are drawn, (n, dim), in f32. world(frame).position has all digits."""
-        entry, x = self._entry(frame), self._drawn[frame]
+        entry, number = self._entry(frame), self._drawn[frame]
+        dim = self._entries[0].arrays["position"].shape[1]
+        x = np.zeros((0, dim), dtype=np.float32) if number < 0 else self._contents.values(number).reshape(-1, dim)
         if zlib.crc32(x.tobytes()) != entry.data["crc"]:
             raise ValueError(f"replay: the picture of frame {frame} in {self.path} is not what was recorded. See .verify().")
         return x
 
+    @_clear
     def world(self, frame: int) -> "World":
         """A world in the exact state of a frame, to go on with: computed from the nearest state before, and compared.
 
@@ -106,53 +123,94 @@ class Replay:
                 world.close()
             raise
 
+    @_clear
     def verify(self) -> Verdict:
-        """Compute everything again from the first frame on, and compare hashes, states and pictures.
+        """Compute and draw everything again from the first frame on, and compare hashes, states and every row of the picture.
 
+        What the user turned, assigned, added or removed is taken as the journal says, and so are the state at the start, the
+        environment, what explain() said, and times of computing; the page about the scene and the curves have to say the same.
         In a world with contacts, what pairs carry along is part of the hash of states and of the end, but not of that of frames,
         where it shows in the next one.
         """
-        count, wrong, world = 0, None, None
+        contents = rrd.read(self.path, rows=True)
+        if [row[3] for row in contents.journal()] != [row[3] for row in self._contents.journal()]:
+            raise ValueError(f"replay: {self.path} has changed since it was read; read it again.")
+        redraw = Redraw(self.scene)
+        redraw.scene(len(self.scene["features"]))
+        wrong, world = None, None
+        known = sum(e.kind == "frame" for e in self._entries) + (self._later or 0)
         try:
             for world, entry in self._run(1, len(self._entries) - 1):
-                off = None
+                off, why, same = None, None, True
+                redraw.watch(world)
                 if entry.kind == "frame":
-                    count += 1
                     now = snapshot.keep(world, pairs=False)
-                    same = now.digest() == entry.data["hash"]
-                    off = _differing(now.position(len(world.particles)).astype(np.float32), self._drawn.get(entry.frame))
+                    same = now.digest() == entry.data["hash"] and world.time == entry.data["time"]
+                    x = now.position(len(world.particles))
+                    x32 = x.astype(np.float32)
+                    off = _differing(x32, self._shown(entry.frame, x32.shape))
                     if same and off is not None:
-                        return Verdict(count, entry.frame, off, self._judge(entry.frame, entry.frame, off, picture=True))
+                        why = f"the picture of frame {entry.frame} shows particle {off} where it was not; the state is as it was."
+                        return self._changed(redraw.frames, known, entry.frame, off, why)
+                    if zlib.crc32(x32.tobytes()) != entry.data["crc"]:
+                        same = False
+                    why = redraw.frame(entry, now, x, x32)
                 elif entry.kind == "state":
                     now, then = snapshot.keep(world), _kept(entry, world)
                     same = now.digest() == then.digest()
                     changed = (k for k, v in now.values.items() if k in then.values and len(v) == len(world.particles))
                     found = (_differing(now.values[k], then.values[k]) for k in changed)
                     off = next((i for i in found if i is not None), None)
-                else:
+                elif entry.kind == "scene":
+                    redraw.scene(len(world.features))
+                elif entry.kind == "thinned":
+                    redraw.thinned(entry)
+                elif entry.kind == "turned":
+                    redraw.turned(entry.data["features"])
+                elif entry.kind == "end":
                     same = "hash" not in entry.data or world.hash() == entry.data["hash"]
+                    why = redraw.end(entry)
+                if same and wrong is None and why:
+                    return self._changed(redraw.frames, known, entry.frame, None, f"frame {entry.frame}: {why}.")
                 if not same and wrong is None:
                     wrong = entry.frame
                 if off is not None:
                     break
+            redraw.send()
         finally:
             if world:
                 world.close()
-        if wrong is None:
-            return Verdict(count, text=f"{self.path}: all {count} frames come out as recorded, bit for bit.")
-        return Verdict(count, wrong, off, self._judge(wrong, entry.frame, off))
+        if wrong is not None:
+            before = sum(frame < wrong for frame in self._frames)
+            return self._changed(before, known, wrong, off, self._judge(wrong, entry.frame, off))
+        dim = self._entries[0].arrays["position"].shape[1]
+        result = compare(contents, redraw, f"tiverlet_{dim}d", self.complete)
+        if isinstance(result, tuple):
+            frame, what = result
+            where = "" if frame is None else f"frame {frame}: "
+            return self._changed(sum(k < frame for k in self._frames) if frame else 0, known, frame, None, f"{where}{what}.")
+        if not contents.sealed:
+            return self._changed(result, known, None, None, f"{contents.why}, though its frames hold.")
+        if self.complete:
+            return Verdict("intact", result, known, text=f"{self.path}: all {result} frames come out as recorded, bit for bit.")
+        hold = f"the first {result} of {known} frames hold" if result < known else f"the first {result} frames hold"
+        return Verdict("incomplete", result, known, text=f"{self.path}: {hold}; the rest is not there ({plain(self._gap)}).")
 
-    def _judge(self, frame: int, seen: int, particle: int | None, picture: bool = False) -> str:
-        if picture:
-            return (
-                f"{self.path}: the picture of frame {frame} shows particle {particle} where it was not; the state is as recorded."
-            )
+    def _shown(self, frame: int, shape: tuple) -> np.ndarray | None:
+        number = self._drawn.get(frame, -1)
+        x = None if number < 0 else self._contents.values(number)
+        return x if x is None or x.size != np.prod(shape) else x.reshape(shape)
+
+    def _changed(self, frames: int, known: int, frame: int | None, particle: int | None, why: str) -> Verdict:
+        return Verdict("changed", frames, known, frame, particle, f"{self.path}: {plain(why)}")
+
+    def _judge(self, frame: int, seen: int, particle: int | None) -> str:
         where = "" if particle is None else f", first particle {particle}" + (f" (seen in frame {seen})" if seen != frame else "")
-        return f"{self.path}: frame {frame} does not come out as recorded{where}. {self._why()}"
+        return f"frame {frame} does not come out as recorded{where}. {self._why()}"
 
     def _why(self) -> str:
         then, now = self.scene["environment"], scene.environment()
-        other = [f"{name} {then[name]} then, {now[name]} now" for name in now if name in then and then[name] != now[name]]
+        other = [plain(f"{name} {then[name]} then, {now[name]} now") for name in now if name in then and then[name] != now[name]]
         if other:
             return f"What is not as it was: {', '.join(other)}."
         return "Versions and machine are those of the recording, so the file was changed, or a function of the scene was."
@@ -186,7 +244,7 @@ class Replay:
         """Make the steps of an entry, and then what it says."""
         settings = world.settings
         for dt, substeps, iterations, count in entry.steps:
-            world.substeps, world.iterations = substeps, iterations
+            world.substeps, world.iterations = checks.integer("replay", "substeps", substeps, least=1), iterations
             for _ in range(count):
                 world.step(dt)
         world.substeps, world.iterations = settings["substeps"], settings["iterations"]
@@ -197,13 +255,15 @@ class Replay:
             snapshot.install(world, _kept(entry, world), entry.data["flags"])
             world._scene.hh = entry.data["reach"]
         elif entry.kind == "assigned":
+            if entry.data["name"] not in ("position", "velocity"):
+                raise ValueError(f"replay: {self.path} says that {plain(entry.data['name'])!r} was assigned.")
             setattr(world, entry.data["name"], entry.arrays["value"])
         if "now" in entry.data:
             _settle(world, entry.data["now"])
 
     def _turned(self, entry: Entry) -> list[scene.Turned]:
         return [
-            (int(k), {name: scene.decode(v, entry.arrays, self._given) for name, v in values.items()})
+            (int(k), {name: scene.decode(v, entry.arrays) for name, v in values.items()})
             for k, values in entry.data["features"].items()
         ]
 
@@ -244,13 +304,16 @@ def replay(path, given: Iterable[Any] | Mapping[str, Any] = ()) -> Replay:
     whether the recording was closed; one that was cut short by a crash has all that was flushed. .text: what the file is, and
     where it ends.
 
+    A file may come from anyone: another process reads it, with limits on memory and time, and what it finds is checked before it
+    is used.
+
     Raises FileNotFoundError, and ValueError for what is no recording of tiverlet, was written in another format, or was changed
     after it was written, naming the place.
     """
     names = given if isinstance(given, Mapping) else {thing.__name__: thing for thing in given}
     try:
         return Replay(os.fspath(path), dict(names))
-    except (KeyError, IndexError, TypeError) as e:
+    except (KeyError, IndexError, TypeError, AttributeError, OverflowError, RecursionError) as e:
         raise ValueError(f"replay: {path} is damaged, or was not written by a Recorder: {e!r}.") from e
 
 
@@ -260,7 +323,42 @@ def _settle(world: "World", settings: list) -> None:
 
 
 def _kept(entry: Entry, world: "World") -> snapshot.Kept:
-    return snapshot.Kept(entry.arrays, entry.data["clock"], world._guard.memory)
+    kept = snapshot.Kept(entry.arrays, entry.data["clock"], world._guard.memory)
+    snapshot.check(world, kept, entry.data["flags"])
+    return kept
+
+
+def _pictures(contents: rrd.Contents, entries: list[Entry]) -> dict[int, int]:
+    """Of each frame the number of the row that has its positions, as the viewer finds it; -1 where there are no particles."""
+    rows: dict[tuple[str, int], tuple[bytes, int]] = {}
+    for k, (entity, frame, ident, *_) in enumerate(contents.numbers.tolist()):
+        key = (contents.entities[entity], frame)
+        rows[key] = max(rows.get(key, (b"", 0)), (ident, k))
+    scenes, out, empty = 0, {}, False
+    for e in entries:
+        if e.kind == "scene":
+            scenes, empty = scenes + 1, not len(e.arrays["position"])
+        elif e.kind == "frame":
+            root = journal.SCENE if scenes == 1 else f"{journal.SCENE}/scene{scenes - 1}"
+            if empty:  # rerun leaves out what is empty everywhere
+                out[e.frame] = -1
+            elif (key := (f"{root}/{journal.PARTICLES}", e.frame)) in rows:
+                out[e.frame] = rows[key][1]
+    return out
+
+
+def _curves(contents: rrd.Contents) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Frames and values of each figure."""
+    found: dict[str, dict[int, int]] = {}
+    for k, (entity, frame, *_) in enumerate(contents.numbers.tolist()):
+        name = contents.entities[entity]
+        if name.startswith("figures/"):
+            found.setdefault(name[len("figures/") :], {})[frame] = k
+    out = {}
+    for name, rows in sorted(found.items()):
+        frames = sorted(rows)
+        out[name] = np.array(frames), np.concatenate([contents.values(rows[frame]) for frame in frames])
+    return out
 
 
 def _differing(now: np.ndarray, then: np.ndarray | None) -> int | None:

@@ -14,6 +14,7 @@ from .. import constraints, forces, runtime, solvers
 from ..arguments import Noted, knobs_of
 from ..feature import Feature
 from ..particles import Particles
+from ..solvers.solver import Solver
 
 if TYPE_CHECKING:
     from ..world import World
@@ -24,7 +25,14 @@ PUBLIC = {
     if isinstance(kind, type) and issubclass(kind, Noted)
 }  # fmt: skip
 Turned = tuple[int, dict[str, Any]]  # the number of a feature, and its knobs
+TAKES = {"Force": ("function",), "Constraint": ("function", "gradient"), "Sdf": ("function", "gradient")}  # functions
+MOST = 10_000  # steps of a solver in a substep
 LONG = 8  # numbers in a list from which it is kept as an array
+
+
+def plain(text: str) -> str:
+    """Text of a file without what a terminal would take for a command."""
+    return "".join(c if c.isprintable() or c == "\n" else "?" for c in text)
 
 
 class Needs:
@@ -83,18 +91,18 @@ def _array(parts: list) -> np.ndarray | None:
     return array if array.dtype.kind in "iuf" else None
 
 
-def decode(data: Any, arrays: Mapping[str, np.ndarray], given: Mapping[str, Any]) -> Any:
-    """The value that encode() was given."""
+def decode(data: Any, arrays: Mapping[str, np.ndarray]) -> Any:
+    """The value that encode() was given, of plain data."""
     if isinstance(data, list):
-        return [decode(part, arrays, given) for part in data]
+        return [decode(part, arrays) for part in data]
     if not isinstance(data, dict):
         return data
     ((kind, inner),) = data.items()
     if kind == "array":
         return arrays[inner]
     if kind == "map":
-        return {_key(decode(k, arrays, given)): decode(v, arrays, given) for k, v in inner}
-    return given[inner]
+        return {_key(decode(k, arrays)): decode(v, arrays) for k, v in inner}
+    raise ValueError(f"replay: something of the user's stands where a scene has only data: {kind!r}.")
 
 
 def _key(value: Any) -> Any:
@@ -154,6 +162,7 @@ def environment() -> dict[str, Any]:
         "tiverlet": version("tiverlet"), "taichi": ".".join(map(str, ti.__version__)), "numpy": np.__version__,
         "python": platform.python_version(), "machine": platform.machine(), "system": platform.system(),
         "arch": runtime.architecture(), "threads": runtime.threads(), "fast_math": runtime.fast_math(),
+        "default_fp": runtime.default_fp(), "compiler": runtime.compiler(),
         "seed": wanted.get("seed"), "debug": wanted.get("debug"),
     }  # fmt: skip
 
@@ -167,29 +176,49 @@ def rebuild(scene: dict[str, Any], arrays: Mapping[str, np.ndarray], given: Mapp
         raise ValueError(
             f"replay: the scene uses {', '.join(missing)}, which the recording keeps only to be read. Give "
             f"{'it' if len(missing) == 1 else 'them'} again: tv.replay(path, given=[{', '.join(missing)}]). As recorded:\n\n"
-            + "\n".join(scene["needs"][name] for name in missing)
+            + "\n".join(plain(scene["needs"][name]) for name in missing)
         )
     for name, text in scene["needs"].items():
         if text and source(given[name]) not in ("", text):
             warnings.warn(f"replay: {name} reads otherwise than when it was recorded; the bits may differ.", stacklevel=4)
 
-    def make(thing: dict[str, Any]) -> Any:
-        kind = thing["class"]
-        kind = given[kind["given"]] if isinstance(kind, dict) else PUBLIC[kind]
-        return kind(**{name: decode(value, arrays, given) for name, value in thing["arguments"].items()})
+    def make(thing: dict[str, Any], base: type) -> Any:
+        name = thing["class"]
+        own = isinstance(name, dict)
+        kind = given[name["given"]] if own else PUBLIC.get(name)
+        if not (isinstance(kind, type) and issubclass(kind, base)):
+            raise ValueError(f"replay: the scene has {name!r}, which is no {base.__name__.lower()} of this version of tiverlet.")
+        arguments = {}
+        for argument, value in thing["arguments"].items():
+            if isinstance(value, dict) and "given" in value:
+                if not (own or argument in TAKES.get(name, ())):
+                    raise ValueError(f"replay: {kind.__name__} takes no function for {argument!r}.")
+                arguments[argument] = given[value["given"]]
+                if not (getattr(arguments[argument], "_is_taichi_function", False) or inspect.isfunction(arguments[argument])):
+                    raise TypeError(
+                        f"replay: given {value['given']} is {arguments[argument]!r}, but the scene has a function there."
+                    )
+            else:
+                arguments[argument] = decode(value, arrays)
+        if base is Solver and any(isinstance(v, int) and v > MOST for v in arguments.values()):
+            raise ValueError(f"replay: the scene has {kind.__name__}({arguments}), of more than {MOST} steps.")
+        try:
+            return kind(**arguments)
+        except TypeError as e:
+            raise ValueError(f"replay: the scene has a {kind.__name__} that this version of tiverlet cannot make: {e}") from e
 
-    p = {name: decode(value, arrays, given) for name, value in scene["particles"].items()}
+    p = {name: decode(value, arrays) for name, value in scene["particles"].items()}
     particles = Particles(p.pop("position"), **p)
     everyone = np.ones(len(particles), dtype=bool)
     features, starts = [], []
     for data in scene["features"]:
-        start = decode(data["start"], arrays, given) if "start" in data else None
+        start = decode(data["start"], arrays) if "start" in data else None
         starts.append(None if start is None else particles.regrouped(everyone, position=start))
-        feature = make(data)
-        turn(feature, {name: decode(value, arrays, given) for name, value in data["knobs"].items()})
+        feature = make(data, Feature)
+        turn(feature, {name: decode(value, arrays) for name, value in data["knobs"].items()})
         features.append(feature)
     for k, values in turned:
         turn(features[k], values)
     settings = dict(scene["settings"])
-    settings["solver"] = make(settings["solver"])
+    settings["solver"] = make(settings["solver"], Solver)
     return World._of(particles, tuple(features), starts, **settings)

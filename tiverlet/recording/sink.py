@@ -11,10 +11,10 @@ from time import monotonic, sleep
 from typing import Any
 
 from .messages import BATCH, CHUNK, END, HEAD, HEADER, smaller, split, thinned
+from .reader import SEAL
 
 WAIT = 10.0  # [s] that a flush may take
 PIECE = 1 << 20  # bytes that are read at a time
-SEAL = b"\x7a\x20"  # in the last message, which rerun does not read: a field of 32 bytes, SHA-256 of all before that message
 
 
 class Sink:

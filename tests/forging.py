@@ -1,0 +1,326 @@
+"""Recordings that are forged for tests: taken apart, changed row by row, and written with checksums that are right again."""
+
+import hashlib
+import json
+import struct
+
+import numpy as np
+import pyarrow as pa
+
+from tiverlet.recording import journal, reader
+
+NEVER = "7fffffffffffffffffffffffffffffff"  # an id that is higher than all others
+
+
+def varint(n):
+    """A number as protobuf has it."""
+    out = bytearray()
+    while n > 127:
+        out.append(n & 127 | 128)
+        n >>= 7
+    return bytes([*out, n])
+
+
+def packed(fields):
+    """A record of protobuf."""
+    out = b""
+    for number, value in sorted(fields.items()):
+        if isinstance(value, int):
+            out += varint(number << 3) + varint(value)
+        else:
+            out += varint(number << 3 | 2) + varint(len(value)) + value
+    return out
+
+
+class Forgery:
+    """A recording as a list of messages: (kind, bytes), or (2, fields, batch) where there are rows."""
+
+    def __init__(self, path):
+        data = path.read_bytes()
+        self.head, self.messages, at = data[: reader.HEADER], [], reader.HEADER
+        while at < len(data):
+            kind, length = struct.unpack_from("<QQ", data, at)
+            body, at = data[at + 16 : at + 16 + length], at + 16 + length
+            if kind == 2:
+                fields = reader.record(body, "1 2 3 4 5 6 7")
+                raw = fields[5] if fields[2] == 1 else pa.Codec("lz4_raw").decompress(fields[5], decompressed_size=fields[3])
+                self.messages.append((2, fields, pa.ipc.open_stream(raw).read_next_batch()))
+            elif kind:
+                self.messages.append((kind, body))
+
+    def save(self, to, seal=True):
+        """Write it; returns the path."""
+        out = self.head
+        for kind, body, *batch in self.messages:
+            if batch:
+                sink = pa.BufferOutputStream()
+                with pa.ipc.new_stream(sink, batch[0].schema) as stream:
+                    stream.write_batch(batch[0])
+                raw = sink.getvalue().to_pybytes()
+                body = packed({**body, 2: 2, 3: len(raw), 5: pa.Codec("lz4_raw").compress(raw).to_pybytes()})
+            out += struct.pack("<QQ", kind, len(body)) + body
+        if seal:
+            out += struct.pack("<QQ", 0, 34) + reader.SEAL + hashlib.sha256(out).digest()
+        to.write_bytes(out)
+        return to
+
+    def chunks(self, entity="", static=None):
+        """The numbers of messages with rows of entities whose paths begin so."""
+        out = []
+        for k, message in enumerate(self.messages):
+            if message[0] == 2:
+                path = message[2].schema.metadata[b"rerun:entity_path"].decode().lstrip("/")
+                if path.startswith(entity) and static in (None, bool(message[1].get(7))):
+                    out.append(k)
+        return out
+
+    def rows(self, entity, column):
+        """Where rows of the entity with this column are: (number of the message, row)."""
+        out = []
+        for k in self.chunks(entity, static=False):
+            batch = self.messages[k][2]
+            if column in batch.schema.names:
+                out += [(k, row) for row in range(batch.num_rows) if batch.column(column)[row].is_valid]
+        return out
+
+    def set(self, k, **columns):
+        """Replace columns, given by name with __ for :; None drops one."""
+        _, fields, batch = self.messages[k]
+        for name, values in columns.items():
+            at = batch.schema.get_field_index(name.replace("__", ":"))
+            if values is None:
+                batch = batch.remove_column(at)
+            else:
+                field = batch.schema.field(at)
+                if not isinstance(values, pa.Array):
+                    values = pa.array(values, type=field.type)
+                batch = batch.set_column(at, field, values)
+        self.messages[k] = (2, fields, batch)
+
+    def scale(self, k, row, column, factor):
+        """Multiply the numbers of a cell."""
+        batch = self.messages[k][2]
+        values = batch.column(column).to_pylist()
+        values[row] = (np.array(values[row]) * factor).tolist()
+        self.set(k, **{column.replace(":", "__"): values})
+
+    def only(self, k, rows):
+        """Keep these rows of a message; none drops it."""
+        _, fields, batch = self.messages[k]
+        if len(rows):
+            self.messages[k] = (2, fields, batch.take(pa.array(rows)))
+        else:
+            del self.messages[k]
+
+    def copy(self, k, rows, before=0, entity=None, static=False, ident=NEVER):
+        """Put copies of rows into the file, with other ids, before message `before`; returns the number of the new message."""
+        _, fields, batch = self.messages[k]
+        batch = batch.take(pa.array(rows))
+        at = batch.schema.get_field_index("rerun.controls.RowId")
+        ids = [(int(ident, 16) + n).to_bytes(16, "big") for n in range(len(rows))]
+        batch = batch.set_column(at, batch.schema.field(at), pa.array(ids, type=batch.schema.field(at).type))
+        if entity:
+            batch = batch.replace_schema_metadata({**batch.schema.metadata, b"rerun:entity_path": f"/{entity}".encode()})
+        if static:
+            batch = batch.drop_columns([name for name in ("frame", "time") if name in batch.schema.names])
+            fields = {**fields, 7: 1}
+        place = max(before, 1 + max(n for n, m in enumerate(self.messages) if m[0] == 1))
+        self.messages.insert(place, (2, fields, batch))
+        return place
+
+    def journal(self, change, seal=True):
+        """Put every entry through change(entry) -> entry, or None to drop it; with checksums that are right again, or not."""
+        mark, serial, empty = "", 0, []
+        for k in self.chunks(journal.JOURNAL):
+            batch = self.messages[k][2]
+            rows, blobs = batch.column("text").to_pylist(), batch.column("blob")
+            texts, marks, kept = [], [], []
+            for row, (text,) in enumerate(rows):
+                entry = change(json.loads(text))
+                if entry is None:
+                    continue
+                entry["serial"], serial = serial, serial + 1
+                texts.append([json.dumps(entry)])
+                blob = blobs[row].values.to_numpy().tobytes() if blobs[row].is_valid else b""
+                mark = journal.checksum(mark, texts[-1][0], blob)
+                marks.append([mark if seal else batch.column("checksum")[row].as_py()[0]])
+                kept.append(row)
+            if kept:
+                self.only(k, kept)
+                self.set(k, text=texts, checksum=marks)
+            else:
+                empty.append(k)
+        for k in reversed(empty):
+            self.only(k, [])
+        return self
+
+
+def later(frame):
+    """Rows of a frame with higher ids, which stand before all others: the viewer draws them."""
+    return lambda f, p: f.scale(f.copy(*_at(f, p, frame)), 0, p["positions"], 1.5)
+
+
+def _at(f, p, frame):
+    k, row = f.rows(p["particles"], p["positions"])[frame]
+    return k, [row]
+
+
+def _static(f, p):
+    f.scale(f.copy(*_at(f, p, 3), static=True), 0, p["positions"], 2.0)
+
+
+def _another_frame(f, p):
+    f.set(f.copy(*_at(f, p, -1)), frame=[999])
+
+
+def _column(name):
+    """Drop a column of the particles from one frame on."""
+
+    def drop(f, p):
+        k, _ = f.rows(p["particles"], p[name])[4]
+        f.set(k, **{p[name].replace(":", "__"): None})
+
+    return drop
+
+
+def _drop(f, p):
+    k, row = f.rows(p["particles"], p["positions"])[4]
+    f.only(k, [n for n in range(f.messages[k][2].num_rows) if n != row])
+
+
+def _scaled(entity, column, at, factor):
+    return lambda f, p: f.scale(*f.rows(entity, column)[at], column, factor)
+
+
+def _times(f, p):
+    for k in f.chunks(static=False):
+        batch = f.messages[k][2]
+        if "time" in batch.schema.names:
+            f.set(k, time=pa.array(10 * batch.column("time").cast(pa.int64()).to_numpy(), type=batch.schema.field("time").type))
+
+
+def _frames(f, p):
+    k, row = f.rows(p["particles"], p["positions"])[2]
+    numbers = f.messages[k][2].column("frame").to_pylist()
+    f.set(k, frame=[number + 1 for number in numbers])
+
+
+def _cell(entity, column, change):
+    """Change what an entity has in a static or other column."""
+
+    def changed(f, p):
+        k = next(k for k in f.chunks(entity) if column in f.messages[k][2].schema.names)
+        f.set(k, **{column.replace(":", "__"): [change(row) for row in f.messages[k][2].column(column).to_pylist()]})
+
+    return changed
+
+
+def _told(kind, change):
+    """Change the data of entries of the journal."""
+
+    def changed(f, p):
+        def entry(e):
+            if e["kind"] == kind:
+                change(e["data"])
+            return e
+
+        f.journal(entry)
+
+    return changed
+
+
+def _gone(kind):
+    return lambda f, p: f.journal(lambda e: None if e["kind"] == kind else e)
+
+
+def _metadata(key, value):
+    def changed(f, p):
+        k, _ = f.rows(p["particles"], p["positions"])[0]
+        _, fields, batch = f.messages[k]
+        at = batch.schema.get_field_index(p["positions"])
+        field = batch.schema.field(at)
+        field = field.with_metadata({**field.metadata, key: value})
+        f.messages[k] = (2, fields, batch.set_column(at, field, batch.column(at)))
+
+    return changed
+
+
+def _reordered(f, p):
+    one, other = (f.rows(p["particles"], p["positions"])[n] for n in (1, 5))
+    ids = [f.messages[k][2].column("rerun.controls.RowId").to_pylist() for k, _ in (one, other)]
+    ids[0][one[1]], ids[1][other[1]] = ids[1][other[1]], ids[0][one[1]]
+    for (k, _), column in zip((one, other), ids, strict=True):
+        f.set(k, **{"rerun.controls.RowId": column})
+
+
+def _twice(f, p):
+    k, row = f.rows(p["particles"], p["positions"])[3]
+    f.messages.append(f.messages[k])
+
+
+def _layout(f, p):
+    f.messages = [m for m in f.messages if m[0] != 3]
+
+
+def _view(f, p):
+    k = next(k for k in f.chunks("view/") if f.messages[k][2].schema.metadata[b"rerun:entity_path"].endswith(b"ViewContents"))
+    f.only(k, [])
+
+
+def _application(f, p):
+    for k, message in enumerate(f.messages):
+        f.messages[k] = (message[0], *(_renamed(part) for part in message[1:]))
+
+
+def _renamed(part):
+    swap = (b"tiverlet_", b"tiverless")
+    if isinstance(part, bytes):
+        return part.replace(*swap)
+    return {**part, 1: part[1].replace(*swap)} if isinstance(part, dict) else part
+
+
+FORGERIES = {
+    "a later row that stands earlier": later(4),
+    "a later row of the first frame": later(0),
+    "static positions over all frames": _static,
+    "a frame more": _another_frame,
+    "an entity more": lambda f, p: f.copy(*_at(f, p, 2), entity="world/scene/more"),
+    "an entity more beside the scene": lambda f, p: f.copy(*_at(f, p, 2), entity="world/more", static=True),
+    "a layer over the layout": lambda f, p: f.copy(*_at(f, p, 2), entity="figures/energy/more"),
+    "a row dropped": _drop,
+    "a chunk of rows dropped": lambda f, p: f.only(f.rows(p["particles"], p["positions"])[-1][0], []),
+    "positions dropped": _column("positions"),
+    "links dropped": _column("links"),
+    "links moved": lambda f, p: f.scale(*f.rows(p["particles"], p["links"])[2], p["links"], 1.01),
+    "a wall moved": lambda f, p: f.scale(*f.rows("world/scene/walls", p["links"])[0], p["links"], 1.1),
+    "a wall dropped": lambda f, p: f.only(f.rows("world/scene/walls", p["links"])[0][0], []),
+    "times times ten": _times,
+    "frames later by one": _frames,
+    "colours of particles": _cell("world/scene/particles", "Points2D:colors", lambda row: row[::-1]),
+    "radii of particles": _cell("world/scene/particles", "Points2D:radii", lambda row: [2 * r for r in row]),
+    "the page about it": _cell("about", "TextDocument:text", lambda row: [row[0].replace("particles", "planets")]),
+    "its name": _cell("__properties", "RecordingInfo:name", lambda row: row and ["another"]),
+    "the mirror": _cell("world/scene", "Transform3D:scale", lambda row: [[1.0, 1.0, 1.0]]),
+    "the type of a column": _metadata(b"rerun:component_type", b"rerun.components.Color"),
+    "rows in another order": _reordered,
+    "rows twice": _twice,
+    "no layout": _layout,
+    "a view less": _view,
+    "another application": _application,
+    "the environment": _told("scene", lambda d: d["environment"].update(taichi="1.7.5")),
+    "the number of threads": _told("scene", lambda d: d["environment"].update(threads=64)),
+    "the number of frames": _told("end", lambda d: d.update(frames=d["frames"] + 1)),
+    "the time at the end": _told("end", lambda d: d.update(time=2 * d["time"])),
+    "the hash at the end": _told("end", lambda d: d.update(hash="0" * 64)),
+    "the time of frames": _told("frame", lambda d: d.update(time=10 * d["time"])),
+    "hashes of frames": _told("frame", lambda d: d.update(hash="0" * 64)),
+    "checksums of pictures": _told("frame", lambda d: d.update(crc=d["crc"] ^ 1)),
+    "how long frames took": _told("frame", lambda d: d.update(seconds=d.get("seconds", 0) / 10)),
+    "flags": _told("frame", lambda d: d.update(flags=["stiff-force"], notes=["stiff-force: none"])),
+    "what was compiled": _told("scene", lambda d: d.update(explained="nothing")),
+    "knobs": _told("turned", lambda d: d["features"].get("0", {}).update(g=3.0)),
+    "nothing turned": _gone("turned"),
+    "no end": _gone("end"),
+    "a feature that there is not": _told("scene", lambda d: d["features"][0].update({"class": "Levity"})),
+    "an argument that there is not": _told("scene", lambda d: d["features"][0]["arguments"].update(anti=True)),
+}

@@ -1,0 +1,272 @@
+"""Drawing a recording again, to compare it row by row with what the viewer shows of the file."""
+
+import hashlib
+from collections import Counter, defaultdict
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .. import checks
+from ..step_report import StepReport
+from . import reader
+from .journal import GUARD, JOURNAL, PARTICLES, Entry
+from .messages import droppable, thins
+from .picture import Picture, layout
+from .rrd import Contents
+
+if TYPE_CHECKING:
+    from ..snapshot import Kept
+    from ..world import World
+
+NOTHING = hashlib.blake2b(digest_size=16).digest()  # of a row without components: the time at which the file was begun
+Row = tuple[str, bool, int, int, bytes]  # entity, whether it is static, frame, time [ns], digest of its components
+
+
+class Rows:
+    """Takes the place of a rerun stream, and keeps the rows."""
+
+    def __init__(self):
+        self.rows: list[Row] = []
+        self._frame = self._time = 0
+
+    def set_time(self, timeline: str, *, sequence: int = 0, duration: float = 0.0) -> None:
+        """As rerun's."""
+        if timeline == "frame":
+            self._frame = sequence
+        elif timeline == "time":
+            self._time = _nanoseconds(duration)
+
+    def log(self, entity: str, *what: Any, static: bool = False, strict: bool | None = None) -> None:
+        """As rerun's."""
+        parts = {part.component_descriptor(): part.as_arrow_array() for one in what for part in one.as_component_batches()}
+        frame, time = (-1, 0) if static else (self._frame, self._time)
+        self.rows.append((entity.lstrip("/"), static, frame, time, _digest(parts)))
+
+    def send_columns(self, entity: str, indexes: Any, columns: Any, strict: bool | None = None) -> None:
+        """As rerun's."""
+        times = {index.timeline_name(): index.as_arrow_array().cast("int64").to_pylist() for index in indexes}
+        lists = {column.component_descriptor(): column.as_arrow_array() for column in columns}
+        for k, (frame, time) in enumerate(zip(times["frame"], times["time"], strict=True)):
+            self.rows.append((entity, False, frame, time, _digest({name: a[k].values for name, a in lists.items()})))
+
+
+def _nanoseconds(seconds: float) -> int:
+    return round(1e9 * float(seconds))
+
+
+def _digest(parts: dict[Any, Any]) -> bytes:
+    into = hashlib.blake2b(digest_size=16)
+    for name in sorted(parts, key=lambda name: name.component):
+        into.update(f"{name.component} {name.archetype} {name.component_type} ".encode())
+        reader.feed(into, parts[name])
+    return into.digest()
+
+
+class Redraw:
+    """Draws what the journal says, of worlds that are computed again. trouble: what the journal says and is not so."""
+
+    def __init__(self, told: dict[str, Any]):
+        self._told, self._rows, self._stirred, self.scenes = told, Rows(), set[int](), 0
+        self._picture: Picture | None = None
+        self._world: Any = None
+        self._recent: StepReport | None = None
+        self._worst: StepReport | None = None
+        self.layout: list[Row] = []
+        self.frames = 0
+        self.ended = False
+        self.stride, self.thin = 1, -1  # of frames up to this one, one of so many may be all that is in the picture
+
+    @property
+    def rows(self) -> list[Row]:
+        """All rows, in the order in which they are logged."""
+        return self._rows.rows
+
+    def watch(self, world: "World") -> None:
+        """From now on this is the world."""
+        if world is self._world:
+            return
+        import rerun as rr
+
+        self._world = world
+        world._watchers.append(self)
+        if self._picture:
+            self._picture.follow(world)
+            return
+        self._rows.log("__properties", rr.archetypes.RecordingInfo(name=self._told["title"]), static=True)
+        self._picture = Picture(world, self._rows, self._told["explained"], self._told["environment"])
+        views = Rows()
+        layout(world)._log_to_stream(views)
+        self.layout = views.rows
+
+    def before(self) -> None:
+        """A step begins."""
+
+    def after(self, dt: float, report: StepReport) -> None:
+        """A step was made."""
+        self._recent = report if self._recent is None else self._recent.worse(report)
+        self._worst = report if self._worst is None else self._worst.worse(report)
+
+    def assigned(self, name: str, value: np.ndarray) -> None:
+        """Positions or velocities were assigned."""
+
+    def broken_off(self) -> None:
+        """A step has failed."""
+
+    def scene(self, features: int) -> None:
+        """There is a new scene."""
+        self.scenes += 1
+        self._stirred = set(range(features))
+
+    def turned(self, features: dict[str, Any]) -> None:
+        """Knobs were turned."""
+        self._stirred.update(map(int, features))
+
+    def thinned(self, entry: Entry) -> None:
+        """Frames were taken out of the picture."""
+        self.stride, self.thin = checks.integer("replay", "stride", entry.data["stride"], least=1), entry.frame
+
+    def _thinned(self, found: list[Row]) -> list[Row]:
+        """What was drawn, without what is not in the file and may be missing."""
+        there = Counter(found)
+        frames: dict[str, list[int]] = defaultdict(list)
+        for entity, static, frame, *_ in self.rows:
+            if not static and thins(f"/{entity}"):
+                frames[entity].append(frame)
+        gone = {entity: np.unique(numbers) for entity, numbers in frames.items()}
+        may = {entity: set(numbers[droppable(numbers, self.stride)].tolist()) for entity, numbers in gone.items()}
+        out = []
+        for row in self.rows:
+            if there[row] > 0:
+                there[row] -= 1
+            elif row[2] <= self.thin and row[2] in may.get(row[0], ()):
+                continue
+            out.append(row)
+        return out
+
+    def expected(self, found: list[Row]) -> list[Row]:
+        """The rows that have to be in the file."""
+        return self.rows if self.stride == 1 else self._thinned(found)
+
+    def frame(self, entry: Entry, now: "Kept", x: np.ndarray, x32: np.ndarray) -> str | None:
+        """Draw a frame; what is wrong with what the journal says of it, if anything."""
+        assert self._picture
+        report = self._recent
+        if report:
+            report, wrong = _amended(report, entry.data)
+            if wrong:
+                return wrong
+            report = replace(report, seconds=entry.data["seconds"])
+        self._picture.stamp(entry.frame)
+        self._picture.frame(entry.frame, now, x, x32, report, self.scenes, self._stirred)
+        self._recent, self._stirred = None, set()
+        self.frames += 1
+        return None
+
+    def end(self, entry: Entry) -> str | None:
+        """The last entry."""
+        assert self._picture
+        self.ended = True
+        self._picture.curves.send()
+        if entry.data["frames"] != self.frames:
+            return f"the journal has {self.frames} frames, but says at its end that there are {entry.data['frames']}"
+        if entry.data["time"] != self._world.time:
+            return f"the end says {entry.data['time']} s, but it is {self._world.time} s"
+        worst, wrong = (self._worst, None) if self._worst is None else _amended(self._worst, entry.data)
+        if wrong:
+            return wrong
+        if "hash" in entry.data:
+            self._picture.end(worst, self.frames, entry.data["note"])
+        return None
+
+    def send(self) -> None:
+        """What was collected of curves, where there is no end."""
+        if self._picture:
+            self._picture.curves.send()
+
+
+def _amended(report: StepReport, told: dict[str, Any]) -> tuple[StepReport, str | None]:
+    """A report with the flags that were told, which may be more."""
+    if "flags" not in told:
+        return report, None
+    flags, notes = set(told["flags"]), tuple(told["notes"])
+    if not report.flags <= flags or flags - report.flags - GUARD or not set(report.notes) <= set(notes):
+        return report, f"flags are {sorted(report.flags)}, but the journal says {sorted(flags)}"
+    if any(not note.startswith("The frame is not as good") for note in set(notes) - set(report.notes)):
+        return report, "the journal has notes that no report has"
+    return replace(report, flags=frozenset(flags), notes=notes), None
+
+
+def compare(contents: Contents, redraw: Redraw, application: str, complete: bool) -> tuple[int | None, str] | int:
+    """The first difference between a file and what was drawn again: the frame, if it is of one, and what it is.
+
+    Where there is none, the number of frames that are there whole. The viewer takes of rows at the same time the one with the
+    highest id, and static ones before all; so the rows of each entity have to be the same in the order of their ids, and those of
+    all together, but for curves, which are sent from time to time. Of a recording that is not complete rows may be missing at the
+    end of each entity.
+    """
+    if contents.trouble:
+        return None, contents.trouble[0]
+    kinds = sorted({(kind, name) for kind, name, _ in contents.stores})
+    if kinds != [(1, application), (2, application)] or len(set(contents.stores)) != 2:
+        return None, f"it has other stores than a recording of {application}"
+    (blueprint,) = {store[2] for store in contents.stores if store[0] == 2}
+    if contents.shown != [(blueprint, 0, 1)]:
+        return None, "it opens with another layout"
+    rows = np.sort(contents.rows, order="f5")  # by id
+    if len(np.unique(rows["f5"])) != len(rows):
+        return None, "two rows have the same id"
+    names = contents.entities
+    last = None if complete else max((row[2] for row in redraw.rows), default=-1)  # nothing is known of later frames
+    found: list[Row] = []
+    views: list[tuple[str, bytes]] = []
+    for store, static, entity, frame, time, _, digest in rows.tolist():
+        digest = digest.ljust(16, b"\0")
+        if store == 2:
+            views.append((names[entity], digest))
+        elif names[entity] == "about" and not redraw.ended and any(row[0] == "about" for row in found):
+            continue  # the page about all frames has come into the file, but not the entry that it follows from
+        elif names[entity] != JOURNAL and digest != NOTHING and (last is None or frame <= last):
+            found.append((names[entity], bool(static), frame, time, digest))
+    if sorted(views) != sorted((entity, digest) for entity, *_, digest in redraw.layout):
+        return None, "the layout is not that of the recording"
+    return _first(found, redraw.expected(found), complete)
+
+
+def _first(found: list[Row], drawn: list[Row], complete: bool) -> tuple[int | None, str] | int:
+    by: dict[str, tuple[list[Row], list[Row]]] = {}
+    for k, rows in enumerate((found, drawn)):
+        for row in rows:
+            by.setdefault(row[0], ([], []))[k].append(row)
+    differences: list[tuple[int, str]] = []
+    least: list[int] = []  # frames from which on something is missing at the end of an entity
+    for entity, (there, wanted) in by.items():
+        for one, other in zip(there, wanted, strict=False):
+            if one != other:
+                differences.append((max(min(one[2], other[2]), -1), f"{entity} is not what was recorded"))
+                break
+        else:
+            if len(there) > len(wanted):
+                differences.append((there[len(wanted)][2], f"{entity} has rows that were not recorded"))
+            elif len(there) < len(wanted):
+                missing = wanted[len(there)]
+                if complete or missing[1]:
+                    if not (missing[1] and not complete):
+                        differences.append((missing[2], f"{entity} is missing"))
+                elif not entity.startswith("figures/"):
+                    least.append(missing[2])
+    if differences:
+        frame, what = min(differences)
+        return (None if frame < 0 else frame), what
+    counts = {entity: len(there) for entity, (there, _) in by.items()}
+    order = []
+    for row in drawn:
+        if counts.get(row[0], 0) > 0:
+            counts[row[0]] -= 1
+            order.append(row)
+    plain = [[row for row in rows if not row[0].startswith("figures/")] for rows in (found, order)]
+    for one, other in zip(*plain, strict=True):
+        if one != other:
+            return (other[2] if other[2] >= 0 else None), f"{one[0]} stands before {other[0]}, in another order than recorded"
+    frames = {row[2] for row in drawn if row[0].endswith(f"/{PARTICLES}") and not row[1]}
+    return sum(frame < min(least) for frame in frames) if least else len(frames)
