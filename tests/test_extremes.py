@@ -19,7 +19,7 @@ MOTION = (2, 4, 6, 7, 11, 15, 17, 18, 22, 29, 37, 45, 48, 50, 51, 52, 55, 61, 62
 
 @pytest.mark.parametrize("number", DOORS + MOTION)
 def test_rows_pass(number):
-    # All 70 take a minute: python -m tiverlet stress.
+    # All of them take minutes: python -m tiverlet stress.
     result = certify(number)
     if ARCH not in tv.runtime.LLVM and any(ARCH in why for why in result.failing):  # refused because of the architecture
         pytest.skip(str(result.failing))

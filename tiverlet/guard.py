@@ -23,6 +23,7 @@ ROOM = 6.0  # by which the figures have to be better than asked before less is t
 PATIENCE = 64  # frames, at most, until it is tried again
 
 Figures = tuple[float, ...]  # residual, overlap and tension, relative to what is asked
+TENSE = 2  # the place of the tension among them
 NOTHING: Figures = (1.0, 1.0, 1.0)
 WORST: Figures = (float("inf"),) * 3
 
@@ -159,9 +160,14 @@ def judge(report: StepReport, tolerance: float | None) -> tuple[Figures, set[str
 
 
 def cheapest(known: dict[tuple[int, int], Figures], stuck: Figures) -> tuple[int, int]:
-    """The least effort with which all figures are as good as they have to be, or as they were with the most."""
+    """The least effort with which all figures are as good as they have to be, or as they were with the most.
+
+    Where a load has hardly a direction, the most substeps: the sag that bears it falls with h^2, and would spring back if they
+    were not enough later.
+    """
     enough = [max(1.0, s) for s in stuck]
-    return next(effort for effort, figures in known.items() if all(f <= e for f, e in zip(figures, enough, strict=True)))
+    fit = [effort for effort, figures in known.items() if all(f <= e for f, e in zip(figures, enough, strict=True))]
+    return next(e for e in fit if stuck[TENSE] <= 1 or e[0] == max(fit)[0])
 
 
 def told(report: StepReport, figure: float, risks: set[str], verdict: str, tries: int) -> StepReport:

@@ -29,6 +29,7 @@ class Scalar(Elastic):
     """
 
     precise = False  # whether exactly() measures to all the digits that positions have
+    cusp = False  # whether f = 0 is where gradients end: no direction at the start of the step means anything for rest = 0
     collapses = 0  # the power of a length that f is, where gradients vanish with the size of the body; else 0
 
     @property
@@ -76,6 +77,8 @@ class Scalar(Elastic):
             there += split * n[k, :].dot(n[k, :])
         turn = self._on_slots.turn(both, ti.sqrt(here * there))
         lost = turn == FAR
+        if ti.static(self.cusp):
+            lost = lost or (self._on_rest[c] == 0 and self.is_rigid(c))
         if ti.static(self._on_firm):
             if self.is_rigid(c):
                 lost = lost or ti.abs(self.bounded(f0 - self._on_rest[c])) * self._on_close[c] > LOST

@@ -18,6 +18,7 @@ from .interrupts import whole
 from .launches import Launches
 from .overlap import overlapping
 from .particles import Particles
+from .projection import SHORTER, project
 from .regroup import Handle
 from .solvers.solver import Solver
 from .step_report import StepReport
@@ -225,7 +226,10 @@ class World(Launches):
             return
         with self._memory.compiler():
             if h != self._h or drag != self._drag:
+                ratio = 1.0 if self._fresh or self._order > 2 else h / self._h
                 self._restart()
+                if ratio < SHORTER:
+                    project(self, ratio)
             if self._fresh:
                 self._since = 0
             if self._placed is not None and self._sub.slots and self._sub.slots.system:

@@ -15,7 +15,7 @@ class Link(Scalar):
     """
 
     arity = 2
-    precise = True
+    precise = cusp = True
     rest = Knob(lambda f, v: checks.per_item(repr(f), f.rest_name, v, f.count, least=0.0), "Rest length [m].")
 
     def rest_of(self, position: np.ndarray) -> np.ndarray:

@@ -100,7 +100,7 @@ def certify(number: int) -> Result:
 def stress(
     world: "World | None" = None, *, rows: Iterable[int] | None = None, executor: Any = None, progress: bool = False, **more
 ):  # fmt: skip
-    """Try what is stiff and extreme: the 70 rows of the matrix, or the scene of a world of the user's.
+    """Try what is stiff and extreme: the rows of the matrix, or the scene of a world of the user's.
 
     world: None for the matrix; else its scene is perturbed, see tv.report.perturbed, which takes the further arguments.
     rows: numbers; None for all. executor: with submit(), as in concurrent.futures, in whose workers rows are tried ("spawn").

@@ -197,23 +197,23 @@ class Elimination(System):
 
     @ti.func
     def eliminate(self, begin, end):
-        """Each row from those that it is coupled to, then back. Returns whether a pivot was small.
+        """Each row from those that it is coupled to, then back. Returns 1 where a pivot was small, 2 for a contradiction.
 
-        A constraint that others imply is left to them; but where it contradicts them, by more than its digits, it counts.
+        A constraint that others imply is left to them; it contradicts them where it is off by more than its digits.
         """
         hard = 0
         for r in range(begin, end):
             first, last, pivot, step = self.entry_begin[r], self.entry_begin[r + 1], self.value[r], self.step[r]
             if ti.abs(pivot) <= REDUNDANT * self.weight[r]:
                 if (ti.abs(step) - ODD * ti.abs(self.violation[r])) * self.close[r] > 8 * self.digit:
-                    hard = 1
+                    hard = 2
                 self.value[r] = 1
                 self.step[r] = 0
                 for e in range(first, last):
                     self.value[self.rows + e] = 0
             else:
                 if pivot <= self.small[r]:
-                    hard = 1
+                    hard = ti.max(hard, 1)
                 u = self.update_begin[r]
                 for e in range(first, last):
                     part, later = self.value[self.rows + self.entries + e] / pivot, self.column[e]
@@ -257,7 +257,8 @@ class Elimination(System):
             k = 0
             while k < ROUNDS:
                 self.assemble(begin, end, soft, backward)
-                hard = self.eliminate(begin, end)
+                found = self.eliminate(begin, end)
+                hard = ti.max(found, ti.select(hard == 2, 2, 0))  # one that contradicts gets no multiplier, and is switched off
                 k = ti.select(self.switch(begin, end, backward) != 0, k + 1, ROUNDS)
             for r in range(begin, end):
                 if self.side[r] * (self.lam[r] + self.step[r]) > 0:
@@ -332,6 +333,9 @@ class Elimination(System):
                 elif stage == ROUGH:
                     self.measure_again(begin, end)
                     stage = FORWARD
+                elif hard == 2:
+                    ti.atomic_max(self.tension[None], ti.cast(TENSEST, ti.f64))
+                    soft, stage = FLOOR * most, GIVE_WAY
                 else:
                     ahead, sum_ahead, bound, stage = tension, total, hard == 0, COMPARE
             elif stage == COMPARE:

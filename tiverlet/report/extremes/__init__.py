@@ -3,7 +3,7 @@
 A new row is one function with the decorator @row in a file here.
 """
 
-from . import bodily, doors, linked, motion, networks, sheets, touching  # noqa: F401  (they register their rows)
+from . import bodily, doors, linked, motion, networks, sheets, taut, touching  # noqa: F401  (they register their rows)
 from .row import ROWS, Finding, NotAvailable, Row
 
 __all__ = ["ROWS", "Finding", "NotAvailable", "Row"]
