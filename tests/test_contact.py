@@ -286,3 +286,16 @@ def test_what_a_link_draws_through_another_disc_is_flagged(world):
         start = tv.Particles([[0.0, 0], [3.0, 0], [1.15, 0.0]], radius=0.3, pinned=[1, 2])
         w = world(start, [tv.Distance([[0, 1]], rest), tv.Contact()], substeps=1)
         assert ("tunnelling-risk" in w.step(1 / 60).flags) == flagged
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_discs_in_the_same_place_have_the_normal_along_which_they_part(world, dim):
+    w = world(
+        tv.Particles(np.zeros((3, dim)) + [[0.0] * dim, [0.0] * dim, [5.0] * dim], radius=0.1), [tv.Contact()], precision="f64"
+    )
+    found = w.contacts
+    np.testing.assert_array_equal(found.pairs, [[0, 1]])
+    np.testing.assert_allclose(np.linalg.norm(found.normal, axis=1), 1.0, rtol=1e-12)
+    w.step(1 / 60)
+    apart = w.position[0] - w.position[1]
+    np.testing.assert_allclose(apart / np.linalg.norm(apart), found.normal[0], atol=1e-9)

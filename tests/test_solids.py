@@ -30,6 +30,30 @@ def round_room(p):
     return 1 - p.norm()
 
 
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+def test_what_is_far_away_changes_no_bits(world, precision):
+    # Row 85: discs rest in a round room, beads slide down a wire and discs pile up, with another particle at 1e2 m, and with
+    # one that comes on the way, at 1e5 m.
+    ends = []
+    for far in (1e2, None):
+        start = tv.Particles(FEW if far is None else [*FEW, (far, far)], radius=0.05, pinned=[] if far is None else [len(FEW)])
+        wire = tv.Path([4, 5], [[2.0, 0.0], [2.5, -1.0], [3.0, -0.5], [4.0, -1.5]])
+        w = world(
+            start, [tv.Gravity(9.81), tv.Sdf(round_room), wire, tv.Contact(), tv.Box((-1, -9), (9e9, 9e9))], precision=precision
+        )
+        w.run(0.5)
+        if far is None:
+            w.add(tv.Particles([[1e5, 1e5]], radius=0.05, pinned=[0]))
+        w.run(0.5)
+        ends.append(w.position[: len(FEW)])
+    for end in ends[1:]:
+        np.testing.assert_array_equal(end, ends[0])
+    assert (1 - np.linalg.norm(ends[0][:4], axis=1)).min() == pytest.approx(0.05, abs=1e-5)
+
+
+FEW = [(-0.5, 0.2), (0.0, 0.1), (0.5, 0.3), (0.1, 0.4), (2.017036, -0.207938), (2.5, -1.0)]
+
+
 def test_nothing_gets_out_of_a_function(world):
     keeps(world, [tv.Sdf(round_room, friction=0.3, restitution=0.8)], lambda x, w: 1 - np.linalg.norm(x, axis=1), lambda s: {})
 

@@ -156,7 +156,7 @@ class Solid(Wall):
         first = self.inward(0, start - self._on_place[0])
         moved = self._on_place[2] + self.outward(2, first)
         e = self.inward(1, self._on_state.d[i] - moved)
-        close = ti.max(self._on_state.digits(i), ti.cast(self._on_close, self._on_real))
+        close = ti.max(self._on_state.digits(i), self.rounding(first))
         if ti.static(self._on_state.befores):
             # What has bounced in this substep is not where its displacement says.
             high, lift = self.lifted(i)
@@ -190,6 +190,11 @@ class Solid(Wall):
                 self._on_state.d[i] = moved + gone * (speed / size)
             if ti.static(self._on_state.befores):
                 self._on_state.before[i] = self._on_state.before[i] + (self._on_state.d[i] - d)
+
+    @ti.func
+    def rounding(self, q):
+        """What it amounts to around a point q of the wall's frame [m]."""
+        return ti.cast(self._on_close, self._on_real)
 
     @ti.func
     def astray(self, q, far, close):

@@ -208,6 +208,27 @@ class Touch(Feature):
         overlap = r[pairs].sum(axis=1) - length
         some = (overlap > 0) | (push > 0)
         pairs, overlap, j = pairs[some], overlap[some], pairs[some, 1]
-        normal = d[some] / np.where(length > 0, length, 1.0)[some, None]
+        far, d, length = r[pairs].sum(axis=1), d[some], length[some]
+        same = length**2 <= far**2 * 2.0**-80
+        normal = d / np.where(same, 1.0, length)[:, None]
+        normal[same] = parting(pairs[same], d.shape[1])
         point = x[j] + (r[j] - overlap / 2)[:, None] * normal
         return Contacts(pairs, j, np.zeros(len(j)), overlap, normal, point, push[some] / h)
+
+
+def parting(pairs: np.ndarray, dim: int) -> np.ndarray:
+    """What Touch.part() returns for pairs i < j, (m, dim)."""
+
+    def fraction(bits: np.ndarray) -> np.ndarray:
+        return (2.0 * (bits >> np.uint32(9)) + 1 - 2**23) * 2.0**-23
+
+    low, high = pairs.astype(np.uint32).T
+    mixed = (low * np.uint32(2654435769)) ^ ((high + np.uint32(1)) * np.uint32(2246822519))
+    bits = mixed * np.uint32(2654435769)
+    t, side = fraction(bits << np.uint32(1)), 1 - 2.0 * (bits >> np.uint32(31))
+    n = np.stack([1 - t * t, 2 * t, 0 * t], axis=1)[:, :dim] * (side / (1 + t * t))[:, None]
+    if dim == 3:
+        z = fraction(mixed * np.uint32(3242174889))
+        n *= np.sqrt(1 - z * z)[:, None]
+        n[:, 2] = z
+    return n

@@ -126,7 +126,7 @@ class Path(Tether):
         piece, rest = c.split(self._start)
         self._on_piece = add("Path.piece", m, kind=ti.i32, values=piece, state=True)
         self._on_rest = add("Path.rest", m, values=rest, state=True)
-        self._on_least = self.start.size * (2.0**-22 if scene.real == ti.f32 else 2.0**-44)
+        self._on_least = float(np.ptp(self.points, axis=0).max()) * (2.0**-22 if scene.real == ti.f32 else 2.0**-44)
         if self.drives:
             self._on_moves = "speed" in self.__dict__
             self._on_begin = add("Path.begin", self._on_pieces + 1, kind=ti.f64, values=c.starts)

@@ -94,11 +94,10 @@ class Sdf(Solid):
     def bind(self, scene: Scene) -> None:
         """No field of its own."""
         Solid.bind(self, scene)
-        single, size = scene.real == ti.f32, self.start.size
-        grain = float(scene.particles.radius.max(initial=0.0)) + self.radius or size / 100
-        self._on_close = size * (2.0**-21 if single else 2.0**-50)
+        single = scene.real == ti.f32
+        self._on_digits = 2.0**-21 if single else 2.0**-50
         self._on_slight = 2.0**-20 if single else 2.0**-48
-        self._on_step = grain * (2.0**-6 if single else 2.0**-16)
+        self._on_step = 2.0**-6 if single else 2.0**-16
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
         """Where the surface meets the plane of a 2D scene, or the three planes through the middle of a 3D one."""
@@ -120,9 +119,14 @@ class Sdf(Solid):
         return self.function(q) < far - close
 
     @ti.func
-    def normal(self, q):
+    def rounding(self, q):
+        """That of a function that is made of coordinates as large as those of q."""
+        return q.norm() * ti.cast(self._on_digits, self._on_real)
+
+    @ti.func
+    def normal(self, q, far):
         """The direction of the gradient; +x where there is none."""
-        g = self.slope(q)
+        g = self.slope(q, far)
         size, n = g.norm(), 0 * q
         n[0] = 1
         if size > 0:
@@ -130,13 +134,14 @@ class Sdf(Solid):
         return n
 
     @ti.func
-    def slope(self, q):
-        """The gradient, the user's or by central differences."""
+    def slope(self, q, far):
+        """The gradient, the user's or by central differences; these know of what touches at a distance `far` and of where it is,
+        and of nothing else in the scene."""
         out = 0 * q
         if ti.static(bool(self.gradient)):
             out = self.gradient(q)
         else:
-            step = ti.cast(self._on_step, self._on_real)
+            step = ti.max(far, q.norm() / 100) * ti.cast(self._on_step, self._on_real)
             for k in range(self.dim):
                 ahead, behind = q, q
                 for a in ti.static(range(self.dim)):
@@ -169,7 +174,7 @@ class Sdf(Solid):
                 if k == 0 and gap > way + close:
                     going = False
                 elif k == 0 or gap <= fine or ends or k == MARCH:
-                    n = self.normal(q)
+                    n = self.normal(q, far)
                     slope = e.dot(n)
                     toward = slope < -ti.cast(self._on_slight, self._on_real) * way
                     if k == 0:

@@ -1,8 +1,9 @@
 """Rows about contacts, cells and walls: no contact is lost, nothing explodes, nothing passes a wall."""
 
 import numpy as np
+import taichi as ti
 
-from ...constraints import Ball, Box, Capsule, Contact, Distance, HalfSpace
+from ...constraints import Ball, Box, Capsule, Contact, Distance, HalfSpace, Path, Sdf
 from ...forces import Drag, Gravity
 from ...measure import kinetic_energy
 from ...particles import Particles
@@ -245,3 +246,23 @@ def _belt() -> Finding:
             w.step(1 / 60)
         error = abs(w.position[0, 0] - (1.5 - 0.5 / (0.4 * 9.81)))
         return Finding(f"{error:.0e} m off", {"way": error <= 2e-3, "speed": abs(w.velocity[0, 0] - 1) < 1e-9})
+
+
+@row(85, "another particle at 1e2 ... 1e5 m, in f32: discs in a round room, beads on a wire", "the same bits for the rest")
+def _far() -> Finding:
+    x = [(-0.5, 0.2), (0.0, 0.1), (0.5, 0.3), (0.1, 0.4), (2.017036, -0.207938), (2.5, -1.0)]
+    made = []
+    for far in (1e2, 1e5):
+        wire = Path([4, 5], [[2.0, 0.0], [2.5, -1.0], [3.0, -0.5], [4.0, -1.5]])
+        start = Particles([*x, (far, far)], radius=0.05, pinned=[len(x)])
+        with world(start, [Gravity(9.81), Sdf(_round_room), wire, Contact()], precision="f32") as w:
+            w.run(1.0)
+            made.append(w.position[: len(x)])
+    gap = float((0.95 - np.linalg.norm(made[1][:4], axis=1)).min())
+    return Finding(f"{abs(gap):.0e} m above the ground", {"the same": np.array_equal(*made), "on the ground": abs(gap) < 1e-5})
+
+
+@ti.func
+def _round_room(p):
+    """Distance from a round wall, from inside."""
+    return 1 - p.norm()
