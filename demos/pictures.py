@@ -35,7 +35,9 @@ def scene(folder: str, demo: str, frame: int, begin: float, end: float) -> Image
     """One frame of one demo, without the empty background around it, from one part of its height to another."""
     out, png = f"{folder}/{demo}.rrd", f"{folder}/{demo}.png"
     with run.recording(out):
-        run.execute(run.find(demo), [])
+        status = run.execute(run.find(demo), [])
+    if status:
+        raise SystemExit(f"demos/{demo}.py ended with {status}: its check fails, and there is no picture of it.")
     viewer.picture(out, png, [frame], scene=True)
     pixels = viewer.pixels_of(png)
     drawn = (np.abs(pixels.astype(int) - pixels[-1, -1]) > 40).any(axis=2)

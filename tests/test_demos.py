@@ -71,3 +71,13 @@ def test_pay_finds_that_features_only_add(printed):
 def test_demos_check_themselves(printed, name, arguments, words):
     # Each raises SystemExit where its check fails.
     assert words in printed(name, **arguments)
+
+
+def test_a_demo_that_fails_gives_no_picture(tmp_path, monkeypatch):
+    spec = importlib.util.spec_from_file_location("pictures", ROOT / "demos" / "pictures.py")
+    assert spec and spec.loader
+    pictures = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(pictures)
+    monkeypatch.setattr(pictures.run, "execute", lambda path, arguments: 1)
+    with pytest.raises(SystemExit, match="cloth.py ended with 1"):
+        pictures.scene(str(tmp_path), "cloth", 1, 0.0, 1.0)
