@@ -1,5 +1,6 @@
 """The reports: what they measure, what they say of it, and that a defect in the engine does not get past them."""
 
+import io
 import json
 import multiprocessing
 import os
@@ -13,6 +14,7 @@ import dask
 import distributed
 import numpy as np
 import pytest
+from rich.console import Console
 
 import tiverlet as tv
 from tiverlet.__main__ import main
@@ -20,6 +22,7 @@ from tiverlet.report import CASES, baselines, errors, points
 from tiverlet.report.cases import LEFT_OUT, chosen, entries
 from tiverlet.report.certificate import certify
 from tiverlet.report.extremes import ROWS, Finding, Row
+from tiverlet.report.smaller_steps import curve, table
 
 from .conftest import figures, python
 
@@ -251,3 +254,14 @@ raise SystemExit(0 if good else 7)
 """
     done = python(code, check=False, PYTHONPATH=str(tmp_path))
     assert done.returncode == 7, done.stdout + done.stderr
+
+
+def test_smaller_steps_fit_eighty_columns():
+    # Order 2 until rounding is what is left, some 3e-7: a quarter of the steps, nearly 16 times the error.
+    found = curve(CASES["D01_double_pendulum"], "f32", 2, (10, 40))
+    assert 14 < found["10"] / found["40"] < 17 and found["40"] < 3e-6
+    rows = {"f32-comp.": found, "f64, order 8": found | dict.fromkeys(("20", "80", "320", "1280", "5120", "auto"), 1e-12)}
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(table(CASES["D01_double_pendulum"], rows))
+    lines = console.export_text().splitlines()
+    assert "f64, order 8" in lines[-2] and lines[-2].count("1.0e-12") == 6

@@ -3,7 +3,7 @@
 import numpy as np
 import taichi as ti
 
-from ...constraints import Box, Contact, Distance, HalfSpace
+from ...constraints import Box, Contact, Distance, HalfSpace, ShapeMatch
 from ...forces import Drag, Force, Gravity
 from ...measure import angular_momentum
 from ...particles import Particles
@@ -200,3 +200,52 @@ def _floor() -> Finding:
             ok = finite(w)
     error = float(np.abs(made[0] - made[1]).max())
     return Finding(f"{error:.1e} m", {"within the floor": ok and error <= 2e-4})
+
+
+@row(
+    84,
+    "drag, rate h = 1e-6 ... 1e4",
+    "the velocity is that of the closed form to 1e-6, in every precision, also after another dt",
+)
+def _dragged() -> Finding:
+    h, holds, worst = 1e-3, {}, 0.0
+    for precision in ("f32", "f32-compensated", "f64"):
+        drag = Drag(0.0)
+        with world(Particles([[0.0, 0.0]]), [Gravity(9.81), drag], substeps=1, precision=precision) as w:
+            error = 0.0
+            for z in 10.0 ** np.arange(-6, 5) * 2.5:
+                w.position, w.velocity, drag.rate = np.zeros((1, 2)), np.zeros((1, 2)), z / h
+                for dt, t in ((h, 1), (h, 2), (h / 2, 2.5), (h, 3.5)):
+                    w.step(dt)
+                    error = max(error, abs(w.velocity[0, 1] / (9.81 * np.expm1(-z * t) * h / z) - 1))
+            holds[precision], worst = bool(error <= 1e-6), max(worst, float(error))
+    return Finding(f"{worst:.0e}", holds)
+
+
+def _whole(x: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Momentum and angular momentum of particles of 1 kg."""
+    spin = [x[:, j] @ v[:, k] - x[:, k] @ v[:, j] for j in range(x.shape[1]) for k in range(j)]
+    return np.r_[v.sum(axis=0), spin]
+
+
+@row(86, "velocities of linked, touching, spinning groups", "momentum and angular momentum of the motion, to 1e-12")
+def _momenta() -> Finding:
+    rod = Particles([[0.5, 0], [-0.5, 0]], velocity=[[0, 18.5], [0, -18.5]])
+    pushed = Particles([[0.0, 0], [0.5, 0], [1.2, 0.1]], velocity=[[1.0, 0], [1, 0], [0, 0]], radius=0.3)
+    body = Particles([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], velocity=[[0.0, 1, 2], [3, 0, 0], [0, 0, 2], [0, 1, 0]])
+    groups = {
+        "rod at 37 rad/s": (rod, [Distance([[0, 1]])]),
+        "pair that pushes a third disc": (pushed, [Distance([[0, 1]]), Contact()]),
+        "rigid body": (body, [ShapeMatch([np.arange(4)])]),
+        "soft body": (body, [ShapeMatch([np.arange(4)], compliance=1e-3)]),
+    }
+    holds = {}
+    for name, (start, features) in groups.items():
+        with world(start, features, substeps=1) as w:
+            error, at = 0.0, start.position
+            for _ in range(400):
+                w.step(7e-4)
+                seen, done = (_whole(w.position, v) for v in (w.velocity, (w.position - at) / 7e-4))
+                error, at = max(error, np.abs(seen - done).max() / np.abs(done).max()), w.position
+            holds[f"{name} {error:.0e}"] = bool(error <= 1e-12)
+    return Finding(", ".join(holds), holds)
