@@ -99,6 +99,7 @@ def test_a_report_can_be_read_by_people_and_machines(report, tmp_path):
     assert len(data["points"]) == len(report.points) and not data["failures"] and data["machine"]
     table, text = report.markdown(), str(report)
     assert table.count("\n| ") == 2 and "D01" in text and "article on S04" in text
+    assert max(map(len, text.splitlines())) <= 80 and re.search(r"^D01_double_pendulum +20 .* ok *$", text, re.M)
     assert len(report.markdown(every=True).split("\n")) > len(report.points)
     report.record(tmp_path / "curves.rrd")
     assert (tmp_path / "curves.rrd").stat().st_size > 1000

@@ -54,9 +54,12 @@ class Summary:
 class ErrorReport:
     """Points of error against run time. print() shows a table; see .markdown(), .json(), .plot(path), .record(path).
 
+    every_column: whether print() shows all columns, which take 200 characters, and not those that fit 80.
     points: all that were measured. missing: curves that were not. omissions: what was left out on purpose. failures: cases that
     are not what they must be, with the reasons; empty for a good report.
     """
+
+    every_column = False
 
     def __init__(self, cases: list[str], points: list[Point], missing: list[Missing], omissions: list[str], machine: str):
         self.cases, self.points, self.missing, self.machine = cases, points, missing, machine
@@ -141,19 +144,41 @@ class ErrorReport:
         return out | {m.task: (f"missing: {m.why}",) for m in self.missing}
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        table = Table(title=f"Error against run time ({self.machine})")
-        for k, head in enumerate(HEADS):
-            table.add_column(head, justify="left" if k < 2 or head == HEADS[-1] else "right", no_wrap=0 < k < len(HEADS) - 1)
-        for s in self.summaries:
-            table.add_row(*cells(s), style="red" if s.failures else "")
-        yield table
-        for m in self.missing:
-            yield f"missing: {m.task}: {m.why}"
+        yield f"[bold]Error against run time[/] ({self.machine})"
+        yield self._wide() if self.every_column else self._narrow()
+        for case, why in self.failures.items():
+            yield f"[red]{case}: {'; '.join(why)}[/]"
+        if not self.every_column and self.summaries:
+            yield (
+                "[dim]error with n substeps of a frame; its order in the substep; run time per simulated second; the error of "
+                "XPBD at the same run time over ours. All columns: --wide, .markdown()[/]"
+            )
         for line in self.omissions:
             yield f"left out: {line}"
 
+    def _narrow(self) -> Table:
+        """What matters, in 80 columns."""
+        table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False, header_style="bold")
+        for k, head in enumerate(SHORT):
+            table.add_column(head, justify="right" if 0 < k < len(SHORT) - 1 else "left", no_wrap=k > 0, overflow="fold")
+        for s in self.summaries:
+            verdict, unit = "[red]FAIL[/]" if s.failures else "[green]ok[/]", "rel." if s.unit == "relative" else s.unit
+            error, faster = f"{s.error:.1e} {unit[:4]:4}", times(s.in_time and s.in_time[:1])
+            table.add_row(s.case, str(s.substeps), error, ordered(s)[:4], f"{1e3 * s.seconds:.1f}", faster, verdict)
+        return table
+
+    def _wide(self) -> Table:
+        """Everything."""
+        table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
+        for k, head in enumerate(HEADS):
+            last = head == HEADS[-1]
+            table.add_column(head, justify="left" if k < 2 or last else "right", no_wrap=not last)
+        for s in self.summaries:
+            table.add_row(*cells(s), style="red" if s.failures else "")
+        return table
+
     def __str__(self) -> str:
-        return output.text(self, 160)
+        return output.text(self, 200 if self.every_column else 80)
 
     def markdown(self, every: bool = False) -> str:
         """The table as Markdown; every: also one table of all points for each case."""
@@ -194,6 +219,7 @@ class ErrorReport:
         record(self, path)
 
 
+SHORT = ("case", "n", "error", "order", "ms/s", "XPBD", "")  # on a screen
 HEADS = (
     "case", "solver", "substeps", "error", "order", "ms per s", "XPBD / ours", "at equal work", "article / ours", "f32 error",
     "energy drift", "momentum drift", "verdict",
@@ -261,8 +287,8 @@ def ordered(s: Summary) -> str:
     return f"{s.order:.2f}" if s.shown_by == s.method else f"{s.order:.2f} ({s.shown_by})"
 
 
-def times(ratios: tuple[float, float] | None) -> str:
-    """The median of a factor and the least, with two digits."""
+def times(ratios: tuple[float, ...] | None) -> str:
+    """The median of a factor, and the least if it is given, with two digits."""
     if ratios is None:
         return ""
     return " / ".join(f"{r:.0f}" if 10 <= r < 1e4 else f"{r:.2g}" for r in ratios)
