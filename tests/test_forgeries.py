@@ -2,14 +2,24 @@
 
 import json
 import os
+import re
+import signal
+import subprocess
+import sys
 import tempfile
+import time
+import urllib.error
+import urllib.request
 
+import numpy as np
 import pytest
 
 import tiverlet as tv
-from tiverlet.recording import reader, rrd, scene
+from tiverlet import material
+from tiverlet.__main__ import main
+from tiverlet.recording import reader, rrd, scene, viewer
 
-from . import recordings_campaign
+from . import forging, recordings_campaign
 from .forging import FORGERIES, Forgery
 
 PLACES = recordings_campaign.PLACES
@@ -69,3 +79,113 @@ def test_what_was_not_forged_is_intact(original, quick, tmp_path):
     assert tv.replay(Forgery(original).save(tmp_path / "b.rrd")).verify()
     open_ended = tv.replay(Forgery(original).save(tmp_path / "c.rrd", seal=False)).verify()
     assert open_ended.kind == "incomplete" and open_ended.frames == open_ended.of
+
+
+def test_a_file_calls_nothing_in_a_script(original, tmp_path, monkeypatch, capsys):
+    victim = tmp_path / "victim"
+    victim.write_text("precious")
+    (tmp_path / "mine.py").write_text("from pathlib import Path\nfrom subprocess import run\n")
+
+    def chosen(name, arguments):
+        def change(e):
+            if e["kind"] == "scene":
+                e["data"]["needs"] = {name: ""}
+                e["data"]["features"][0].update({"class": {"given": name}, "arguments": arguments})
+            return e
+
+        return Forgery(original).journal(change).save(tmp_path / "a.rrd")
+
+    def argument(e):
+        if e["kind"] == "scene":
+            e["data"]["needs"] = {"run": ""}
+            e["data"]["features"][0]["arguments"]["acceleration"] = {"given": "run"}
+        return e
+
+    monkeypatch.chdir(tmp_path)
+    chosen("run", {"args": ["rm", str(victim)]})
+    assert (
+        main(["replay", "a.rrd", "--verify", "--given", "mine.py"]) == 2
+        and "only functions with @ti.func" in capsys.readouterr().err
+    )
+    for function in (subprocess.run, os.remove):
+        path = chosen(function.__name__, {"args": ["rm", str(victim)]})
+        with pytest.raises(ValueError, match="no feature of this version"):
+            tv.replay(path, [function]).world(0)
+    with pytest.raises(ValueError, match="takes no function"):
+        tv.replay(Forgery(original).journal(argument).save(tmp_path / "b.rrd"), [subprocess.run]).verify()
+    assert victim.read_text() == "precious"
+
+
+def test_what_a_file_asks_for_is_bounded(original, tmp_path):
+    def told(change):
+        def entry(e):
+            change(e)
+            return e
+
+        return Forgery(original).journal(entry).save(tmp_path / "a.rrd")
+
+    def shape(e):
+        if e["arrays"]:
+            e["arrays"][0][2] = [10**9, 10]
+
+    def count(e):
+        if e["kind"] == "assigned" or e["kind"] == "turned":
+            e.update(kind="assigned", data={"name": "_memory"}, arrays=[])
+
+    for change in (shape, count, lambda e: e.update(steps=[[1 / 60, "auto", 1, 1]]), lambda e: e.update(frame=[[[]]])):
+        with pytest.raises(ValueError, match="^replay: |^The state|shape"):
+            tv.replay(told(change)).verify()
+
+    # Rows that say that they unpack to 70 GB, and data that is more than there may be.
+    forged = Forgery(original)
+    _, fields, _ = forged.messages[forged.chunks("world/scene/particles")[0]]
+    out = reader.Found(os.open(os.devnull, os.O_WRONLY), 1000)
+    taker = reader.Reader(out, False)
+    taker.stores.append(reader.store_of(fields[1]))
+    with pytest.raises(reader.Damaged, match="unpack to"):
+        taker.chunk(forging.packed({**fields, 2: 2, 3: 1 << 36, 5: b"x" * 5000}))
+    with pytest.raises(reader.Damaged, match="MB"):
+        out.put(b"x" * 1001)
+    out.close()
+
+    # A table for each pair of groups of as many groups as there are particles.
+    n = 20_000
+    table = material.Table("Contact", {(0, 1): 0.3}, 0.0, None).rows(np.arange(n))[1]
+    assert len(table) == 9
+    with pytest.raises(ValueError, match="groups of particles"):
+        material.Table("Contact", {(k, k): 0.3 for k in range(n)}, 0.0, None).rows(np.arange(n))
+
+
+def test_the_page_for_browsers_talks_to_this_machine_only_and_ends_when_told(original):
+    port = viewer._free_port()
+    words = [sys.executable, "-m", "tiverlet", "replay", str(original), "--web", "--port", str(port)]
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+    assert process.stdout
+    try:
+        process.stdout.readline()
+        data = int(re.findall("3A([0-9]+)%2Fproxy", process.stdout.readline())[0])
+        for _ in range(100):
+            try:
+                with urllib.request.urlopen(f"http://127.0.0.1:{port}/") as answer:
+                    policy = answer.headers["Content-Security-Policy"]
+                    assert b"<html" in answer.read().lower()
+                break
+            except OSError:
+                time.sleep(0.2)
+        assert set(re.findall("https?://[^ ;]*", policy)) == {f"http://127.0.0.1:{data}"} and "default-src 'self'" in policy
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(urllib.request.Request(f"http://127.0.0.1:{port}/", headers={"Host": f"evil.example:{port}"}))
+    finally:
+        process.send_signal(signal.SIGTERM)
+        process.wait(20)
+        process.stdout.close()
+    assert process.returncode == 128 + signal.SIGTERM
+    assert not [p for p in os.listdir("/proc") if p.isdigit() and str(original).encode() in _command(p)]
+
+
+def _command(number):
+    try:
+        with open(f"/proc/{number}/cmdline", "rb") as file:
+            return file.read()
+    except OSError:
+        return b""

@@ -1,6 +1,7 @@
 """The rerun viewer, from the command line: a window, a page for the browser, or a picture without either."""
 
 import contextlib
+import http.server
 import os
 import re
 import shutil
@@ -9,7 +10,11 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+import urllib.request
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -35,6 +40,24 @@ def _folder() -> tempfile.TemporaryDirectory:
     return tempfile.TemporaryDirectory(prefix="tiverlet-", ignore_cleanup_errors=True)
 
 
+@contextlib.contextmanager
+def _told_to_end() -> Iterator[None]:
+    """SIGTERM, or a terminal that closes, ends the block with SystemExit, so that what was started in it is ended, too."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def leave(number: int, frame: Any) -> None:
+        raise SystemExit(128 + number)
+
+    before = [(number, signal.signal(number, leave)) for number in (signal.SIGTERM, signal.SIGHUP)]
+    try:
+        yield
+    finally:
+        for number, handler in before:
+            signal.signal(number, handler)
+
+
 def _wait(process: subprocess.Popen) -> int:
     try:
         return process.wait()
@@ -45,23 +68,74 @@ def _wait(process: subprocess.Popen) -> int:
 
 
 def _end(process: subprocess.Popen) -> None:
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGTERM)
-    process.wait()
+    for number in (signal.SIGTERM, signal.SIGKILL):
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, number)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(5)
 
 
 def show(path: str) -> int:
     """Open the viewer's window, and wait until it is closed; returns its exit status."""
-    with _folder() as folder:
+    with _told_to_end(), _folder() as folder:
         return _wait(_start(folder, "--port", str(_free_port()), path))
 
 
 def serve(path: str, port: int) -> int:
-    """Serve a recording to browsers on this machine, until interrupted."""
-    data = _free_port()
-    print(f"http://{LOCAL}:{port}/?url=rerun%2Bhttp%3A%2F%2F{LOCAL}%3A{data}%2Fproxy   (Ctrl-C ends it)", flush=True)
-    with _folder() as folder:
-        return _wait(_start(folder, "--serve-web", "--port", str(data), "--web-viewer-port", str(port), path))
+    """Serve a recording to browsers on this machine, until interrupted.
+
+    rerun's page asks other hosts for news, fonts and examples. It comes through here, with a header by which the browser lets it
+    talk to this machine only.
+    """
+    data, page = _free_port(), _free_port()
+    with _told_to_end(), _folder() as folder, _Pages((LOCAL, port), page, data) as pages:
+        process = _start(folder, "--serve-web", "--port", str(data), "--web-viewer-port", str(page), path)
+        threading.Thread(target=pages.serve_forever, daemon=True).start()
+        print(f"http://{LOCAL}:{port}/?url=rerun%2Bhttp%3A%2F%2F{LOCAL}%3A{data}%2Fproxy   (Ctrl-C ends it)", flush=True)
+        return _wait(process)
+
+
+class _Pages(http.server.ThreadingHTTPServer):
+    """Hands on the pages of rerun's server at port `page`; they may talk to it and to port `data`, and to nobody else."""
+
+    daemon_threads = True
+
+    def __init__(self, address: tuple[str, int], page: int, data: int):
+        super().__init__(address, _Page)
+        self.source = f"http://{LOCAL}:{page}"
+        here = "'self' data: blob:"
+        self.policy = (
+            f"default-src {here} 'unsafe-inline' 'unsafe-eval'; connect-src {here} http://{LOCAL}:{data}; "
+            "form-action 'none'; frame-ancestors 'none'; base-uri 'none'"
+        )
+
+
+class _Page(http.server.BaseHTTPRequestHandler):
+    server: _Pages  # type: ignore[assignment]
+
+    def do_GET(self) -> None:
+        """One page."""
+        name = (self.headers.get("Host") or "").rpartition(":")[0]
+        if name not in (LOCAL, "localhost"):  # a page from elsewhere, whose name was made to mean this machine
+            self.send_error(403)
+            return
+        try:
+            with urllib.request.urlopen(self.server.source + self.path, timeout=PATIENCE) as answer:
+                body, kind = answer.read(), answer.headers.get("Content-Type", "application/octet-stream")
+        except OSError:
+            self.send_error(502, "rerun does not answer (yet)")
+            return
+        self.send_response(200)
+        for key, value in {
+            "Content-Type": kind, "Content-Length": str(len(body)), "Content-Security-Policy": self.server.policy,
+            "Referrer-Policy": "no-referrer",
+        }.items():  # fmt: skip
+            self.send_header(key, value)
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, *args) -> None:
+        """Say nothing."""
 
 
 def picture(path: str, png: str, frames: list[int] | None = None, scene: bool = False) -> list[str]:
