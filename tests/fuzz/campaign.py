@@ -7,6 +7,7 @@ from time import process_time
 from typing import Any
 
 from hypothesis import HealthCheck, Phase, given, seed, settings
+from hypothesis.errors import Flaky, FlakyFailure
 
 from . import twins
 from .scenes import Event, Set, Step, Structure, happenings, script, structures
@@ -82,7 +83,7 @@ class Searcher:
             test()
             if self.trial and self.last:
                 self.others(number)
-        except Find:
+        except (Find, Flaky, FlakyFailure):  # flaky: what is found does not come again, as where bits differ
             pass
         finally:
             if self.trial:
