@@ -95,6 +95,8 @@ class Searcher:
         way = twins.WAYS[number % len(twins.WAYS)]
         try:
             way(self.trial, events)
+        except Refused:
+            self.refused += 1
         except Find as find:
             if self.kinds is None or find.kind in self.kinds:
                 self.found = (find, events)

@@ -119,6 +119,7 @@ class Judge:
         self.energy: float | None = None
         self.flags: set[str] = set()
         self.steps = 0
+        self.watched = True
         self.safe = self.inside()
 
     def inside(self) -> dict[int, np.ndarray]:
@@ -135,6 +136,8 @@ class Judge:
         if isinstance(event, Set):
             if event.of is not None or (self.steps and event.name in ("position", "velocity")):
                 self.passive = self.closed = False
+                if len(self.safe) > 1:  # which may be moved so that no place is left between them
+                    self.watched = False
             if event.name == "position":
                 self.safe = {}
         elif isinstance(event, Step) and self.steps == 0:
@@ -229,7 +232,7 @@ class Judge:
     def walls(self, x: np.ndarray) -> None:
         """Who was outside of a wall is outside still."""
         holds = len(self.safe) == 1
-        for k, some in self.safe.items():
+        for k, some in self.safe.items() if self.watched else ():
             f = self.t.features[k]
             left = -oracles.gap(f, x, self.p.radius)[some]
             reach = float(np.abs(x).max()) + float(np.abs(getattr(f, "radius", 0.0)))
