@@ -8,7 +8,7 @@ import numpy as np
 
 import tiverlet as tv
 from tiverlet import snapshot
-from tiverlet.recording.scene import knobs
+from tiverlet.recording.scene import knobs, turn
 
 from . import oracles
 from .scenes import Event, Set, Step, Structure
@@ -77,8 +77,7 @@ class Trial:
         w = self.world
         for f, values in zip(self.features, self.knobs, strict=True):
             if any(vars(f)[k] is not v for k, v in values.items()):
-                vars(f).update(values)
-                f.changed = True
+                turn(f, values)
         snapshot.install(w, self.kept, self.flags)
         w._last = None
         w.substeps, w.iterations = 20, 1
