@@ -30,4 +30,8 @@ FINDS: dict[str, tuple[Structure, list[Event]]] = {
         ),
         [Set(None, "substeps", 4), Set(None, "iterations", 2), FRAME, Set(1, "target", PAIRED[[1]] + 0.05), FRAME],
     ),
+    "a rest length turned for the first time": (
+        of([[0.0, 0], [1, 0]], Call("Distance", {"pairs": [[0, 1]], "compliance": 1e-3}), Call("Gravity", {"g": 9.81})),
+        [Set(None, "substeps", 4), FRAME, FRAME, Set(0, "rest", 0.9), FRAME],
+    ),
 }  # fmt: skip
