@@ -189,3 +189,15 @@ def _command(number):
             return file.read()
     except OSError:
         return b""
+
+
+def test_names_of_a_file_do_not_leave_the_folder(original, quick, tmp_path):
+    forged = Forgery(original)
+    forged.copy(*_first(forged, "figures/energy"), entity="figures/../../../stray")
+    with pytest.raises(ValueError, match="a curve with the name '../../../stray'"):
+        tv.replay(forged.save(tmp_path / "a.rrd")).export(str(tmp_path / "a.npz"))
+
+
+def _first(forged, entity):
+    k, row = forged.rows(entity, "Scalars:scalars")[0]
+    return k, [row]

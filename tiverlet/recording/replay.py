@@ -2,6 +2,7 @@
 
 import functools
 import os
+import re
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -276,6 +277,8 @@ class Replay:
                 raise ValueError("replay: the particles are not the same in all frames, so they are no array; export to .csv.")
             more: dict[str, Any] = {name: p[name] for name in ("mass", "radius")}
             for name, (frames, values) in self.curves.items():
+                if not re.fullmatch(r"\w+(/\w+)*", name):  # they become names of files in the archive
+                    raise ValueError(f"replay: {self.path} has a curve with the name {plain(name)!r}; see .verify().")
                 more |= {f"{name} frame": frames, f"{name} value": values}
             np.savez_compressed(path, position=np.array(x), frame=self.frames, time=self.times, **more)
         elif kind == ".csv":
