@@ -223,3 +223,18 @@ def test_bad_loops_are_named():
     ):
         with pytest.raises(ValueError, match=words):
             make()
+
+
+def test_discs_beside_wide_bodies_list_what_they_may_touch(world):
+    # Two discs are near by their own radii, however long the edges of bodies elsewhere are.
+    discs = np.stack(np.divmod(np.arange(100), 10), axis=1) * 0.25 + [0.0, 1.5]
+    body = [[0.0, 0.0], [2.0, 0.0], [1.0, 1.0]]
+    start = tv.Particles([*body, *discs], radius=np.r_[np.zeros(3), np.full(100, 0.1)])
+    contact = tv.Polygons([[0, 1, 2]])
+    w = world(start, [contact])
+    w._list()
+    pairs, _ = w._grid.entries()
+    both = pairs[(pairs >= 3).all(axis=1)]
+    apart = np.linalg.norm(start.position[both[:, 0]] - start.position[both[:, 1]], axis=1)
+    assert (apart < 0.2 + w._grid.skin).all()
+    assert len(pairs) > len(both)

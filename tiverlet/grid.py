@@ -198,7 +198,7 @@ class Grid(Pairs):
     @ti.func
     def listed(self, i, j, r):
         """1 if a pair, apart by r, belongs on the list: near, not both immovable, not linked."""
-        far = self.radius.of(i) + self.radius.of(j) + ti.cast(self.skin, self.real)
+        far = self.table.reach(self.radius, i, j) + ti.cast(self.skin, self.real)
         yes = ti.cast(r.dot(r) < far * far, ti.i32) & ti.cast(i != j, ti.i32)
         if ti.static(self.still):
             if yes != 0:

@@ -7,6 +7,7 @@ import numpy as np
 import taichi as ti
 
 from . import checks
+from .compiling import inline
 from .feature import Scene
 from .tools import distinct
 
@@ -99,6 +100,11 @@ class Table:
         if ti.static(not self.uniform):
             row = self._on_rank[i] * self.groups + self._on_rank[j]
         return self._on_table[row]
+
+    @inline
+    def reach(self, radius, i, j):
+        """How far from each other particles i and j may touch."""
+        return radius.of(i) + radius.of(j)
 
     def _pair(self, name: str, pair: Any) -> tuple[int, int]:
         if not (isinstance(pair, (tuple, list)) and len(pair) == 2 and all(isinstance(k, (int, np.integer)) for k in pair)):

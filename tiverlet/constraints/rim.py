@@ -252,6 +252,15 @@ class Apart:
     def __init__(self, rim: Rim):
         self.table: Table = rim.table
         self.loop = rim._on_loop
+        self.radius = rim._on_radius
+
+    @ti.func
+    def reach(self, radius: ti.template(), i, j):  # type: ignore[valid-type]
+        """Two discs touch by their own radii, whatever the edges elsewhere are; `radius` has half an edge in it."""
+        far = radius.of(i) + radius.of(j)
+        if self.loop[i][2] < 0 and self.loop[j][2] < 0:
+            far = self.radius.of(i) + self.radius.of(j)
+        return far
 
     @ti.func
     def of(self, i, j):
