@@ -77,15 +77,15 @@ class Table:
                     table[at[a], at[b], columns] = table[at[b], at[a], columns] = parse(self.who, f"value of {pair}", value)
         return rank, table.reshape(m * m, 4)
 
-    def bind(self, scene: Scene) -> None:
-        """Declare the table and the groups, where they differ; one value for all is a constant of the kernel."""
+    def bind(self, scene: Scene, asked: bool = False) -> None:
+        """Declare the table and the groups, where they differ. asked: of() is asked even where all rows are 0."""
         rank, rows = self.rows(scene.particles.group)
         self.groups = int(rank.max(initial=0)) + 1
         if self.uniform:
             rows = rows[:1]
         else:
             self._on_rank = scene.memory.field("Contact.group", len(rank), kind=ti.i32, values=rank)
-        if self.rubs or self.bounces or not self.uniform:
+        if self.rubs or self.bounces or not self.uniform or asked:
             self._on_table = scene.memory.field("Contact.table", len(rows), width=4, values=rows)
 
     def upload(self, scene: Scene, other: "Table") -> None:

@@ -103,7 +103,7 @@ class Polygons(Rim):
         self._on_limit = add("Polygons.longest_edge", n, values=STRETCH * self._on_length)
         self._on_less = add("Polygons.allowed", n, state=True)
         self._on_h = add("Polygons.substep", None)
-        self.table.bind(scene)
+        self.table.bind(scene, asked=True)
         cover: Any = SimpleNamespace(count=n, dim=2, position=p.position, radius=self._on_cover, group=p.group)
         reach = replace(scene, particles=cover, radius=Radii(scene.memory, self._on_cover))
         pairs = [f.partners(f.start) for f in batches]
