@@ -93,7 +93,8 @@ def changed(forged, rng):
         column, row = rng.choice(columns), rng.randrange(batch.num_rows)
         if column in ("blueprint", "log_time") or column.endswith("start_time"):
             continue
-        cells = batch.column(column).to_pylist()
+        values = batch.column(column)
+        cells = (values.cast("int64") if str(values.type) == "duration[ns]" else values).to_pylist()
         if isinstance(cells[row], int):
             cells[row] += rng.choice((-1, 1, 1000))
         elif not mutate(cells[row], rng):
