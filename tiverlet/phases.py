@@ -176,7 +176,7 @@ class Phases(Tiles):
                     elif final != 0:
                         if ti.static(c.rubs):
                             for i in range(low, high):
-                                c.sum_up(i, 0 * self.state.d[i], first)
+                                c.sum_up(i, ti.Vector.zero(self.real, self.dim), first)
             self.team.wait()
 
     @ti.func
