@@ -53,7 +53,7 @@ class Ball(Wall):
     @property
     def repeats(self) -> bool:
         """Inside, the way along the surface leads out, and a bounce may lead to the other end."""
-        return self.inside and (self.rubs or self.bounces)
+        return self.inside and (self._on_rubs or self._on_bounces)
 
     def bind(self, scene: Scene) -> None:
         """The center at the start and the end of a frame."""

@@ -74,7 +74,7 @@ class Box(Wall):
     @property
     def repeats(self) -> bool:
         """In a corner friction on one side may lead into another, and a bounce may lead to the other end."""
-        return self.rubs or self.bounces
+        return self._on_rubs or self._on_bounces
 
     def bind(self, scene: Scene) -> None:
         """Corners at the start and the end of a frame."""

@@ -214,7 +214,8 @@ class Reader:
             values = [c.values if c is not None and c.is_valid else None for c in cells]
             text, blob, mark = (self._bytes(v) for v in values)
             at = self.found.put(text)
-            self.found.put(blob), self.found.put(mark)
+            self.found.put(blob)
+            self.found.put(mark)
             self.journal.append((row, at, len(text), len(blob), len(mark)))
 
     def _bytes(self, array) -> bytes:
@@ -276,7 +277,8 @@ def messages(file, size: int, take) -> tuple[int, str | None]:
             if data[:2] != SEAL or data[2:] != whole.digest():
                 return at, BROKEN
             return size, None
-        whole.update(head), whole.update(data)
+        whole.update(head)
+        whole.update(data)
         try:
             if kind not in (1, 2, 3):
                 raise Damaged(f"there is a message of kind {kind}")
