@@ -12,13 +12,14 @@
 Each entry also says which steps were made since the one before, and carries a checksum of itself and of all before it.
 """
 
+import base64
 import contextlib
 import copy
 import hashlib
 import json
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,7 +31,7 @@ from . import rrd, scene
 if TYPE_CHECKING:
     from ..world import World
 
-FORMAT = 2
+FORMAT = 3
 GUARD = {"stuck", "substeps-capped"}  # flags that do not follow from the steps: the Guard knows what it tried in vain
 JOURNAL = "tiverlet/journal"
 SCENE = "world/scene"
@@ -84,7 +85,12 @@ class Entry:
 
 def checksum(before: str, text: str, blob: bytes) -> str:
     """Of an entry and all before it."""
-    return hashlib.sha256(b"\n".join([before.encode(), text.encode(), blob])).hexdigest()
+    return brief(hashlib.sha256(b"\n".join([before.encode(), text.encode(), blob])).hexdigest())
+
+
+def brief(digest: str) -> str:
+    """The first 128 bits of a digest in 20 characters: LZ4 cannot make digits of noise any shorter; each takes a byte."""
+    return base64.b85encode(bytes.fromhex(digest)[:16]).decode()
 
 
 def said(report: StepReport | None) -> dict[str, Any]:
@@ -128,6 +134,12 @@ class Journal:
         self._serial, self._steps = self._serial + 1, []
         self.bytes += len(text) + len(blob)
         return len(text) + len(blob)
+
+    def rounded(self) -> StepReport | None:
+        """The worst report since the last frame, with as many digits of its seconds as mean something."""
+        if self.recent:
+            self.recent = replace(self.recent, seconds=float(f"{self.recent.seconds:.3g}"))
+        return self.recent
 
     def frame_drawn(self, data: dict[str, Any]) -> None:
         """A frame was drawn."""

@@ -97,14 +97,17 @@ def thins(entity: str) -> bool:
 
 
 def thinned(messages: list[tuple[int, bytes]], stride: int) -> Iterator[tuple[int, bytes]]:
-    """Messages (kind, bytes) with the picture of one of `stride` frames; all others as they are."""
+    """Messages (kind, bytes) with the picture of one of `stride` frames; all others as they are.
+
+    stride = 1: nothing is left out, but the rows of each entity stand together.
+    """
     found, frames = [], defaultdict(list)
     for kind, message in messages:
         entity = ""
         if kind == CHUNK:
             rows = Chunk(message).rows()
             name = rows.schema.metadata[b"rerun:entity_path"].decode()
-            if thins(name) and "frame" in rows.schema.names:
+            if "frame" in rows.schema.names and (thins(name) or stride == 1):
                 entity = name
                 frames[entity].append(rows.column("frame").to_numpy())
         found.append(entity)
@@ -121,11 +124,11 @@ def thinned(messages: list[tuple[int, bytes]], stride: int) -> Iterator[tuple[in
         rows = chunk.rows()
         rows = rows.take(np.flatnonzero(~np.isin(rows.column("frame").to_numpy(), gone[entity])))
         together = waiting[entity, tuple(zip(rows.schema.names, rows.schema.types, strict=True))]
-        if rows.num_rows:
-            together.append((chunk, rows))
-        if sum(rows.nbytes for _, rows in together) > BATCH:
+        if together and sum(rows.nbytes for _, rows in together) + rows.nbytes > BATCH:
             yield CHUNK, _joined(together)
             together.clear()
+        if rows.num_rows:
+            together.append((chunk, rows))
     for together in waiting.values():
         if together:
             yield CHUNK, _joined(together)

@@ -13,7 +13,7 @@ import numpy as np
 
 from .. import checks, interrupts, snapshot
 from ..world import World
-from .journal import JOURNAL, Journal, said
+from .journal import JOURNAL, Journal, brief, said
 from .picture import Picture, layout
 from .scene import environment
 from .sink import Sink
@@ -23,6 +23,7 @@ LOOK = 0.2  # [s] after which the file is looked for
 BACKLOG = 32 << 20  # bytes that may wait to be written
 SHARE = 20  # an exact state is written when the pictures since the last one weigh so many times as much, uncompressed
 SPARSE = 300  # frames after which one is written in any case
+SMALL = 2 << 20  # bytes of a file that is written anew when it is closed: rows take less when they stand together
 RESERVE = 40_000  # bytes of a budget for the layout and the summary
 
 
@@ -226,8 +227,8 @@ class Recorder:
         now = snapshot.keep(world, pairs=False)
         x = now.position(len(world.particles))
         x32 = x.astype(np.float32)
-        picture.frame(number, now, x, x32, journal.recent, journal.scenes, journal.stirred)
-        journal.frame_drawn({"time": world.time, "hash": now.digest(), "crc": zlib.crc32(x32.tobytes())})
+        picture.frame(number, now, x, x32, journal.rounded(), journal.scenes, journal.stirred)
+        journal.frame_drawn({"time": world.time, "hash": brief(now.digest()), "crc": zlib.crc32(x32.tobytes())})
         self.frames += 1
 
     @interrupts.uncut
@@ -257,7 +258,10 @@ class Recorder:
         if "hash" in end:
             self._picture.end(journal.worst, self.frames, self._note)
         journal.put("end", {**end, "note": self._note, **said(journal.worst)})
+        self._sink.flush()
         self._sink.check()
+        if self._sink.bytes < SMALL:
+            self._sink.thin(1)
         self._closing()
         if self._sink.error:
             self._fail()
