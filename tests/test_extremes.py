@@ -50,8 +50,8 @@ class Chains:
         self.world = world(start, [tv.Gravity(9.81), self.links], precision="f64", **settings)
 
     def energies(self, before=None, h=0.0):
-        """Of each chain [J], and m g L, what gravity can supply in a swing. before: where it was h [s] ago; then the energy is that
-        of the motion since, half way."""
+        """Of each chain [J], and m g L, what gravity can supply in a swing. before: where it was h [s] ago; then the energy is
+        that of the motion since, half way."""
         w = self.world
         velocity = w.velocity if before is None else (w.position - before) / h
         height = w.position[:, 1] if before is None else (w.position + before)[:, 1] / 2
