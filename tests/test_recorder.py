@@ -66,9 +66,9 @@ def test_every_frame_reads_back(world, tmp_path, dim):
     hues = np.array(read(path, "/world/scene/particles", f"Points{kind}:colors")[None], dtype=np.uint32) >> 8  # RGBA
     red, green, blue = tv.golden_colors(30).astype(np.uint32).T
     np.testing.assert_array_equal(hues[1:], (red << 16 | green << 8 | blue)[1:])
-    for name in ("energy", "residual", "overlap", "substeps"):
-        curve = read(path, f"/figures/{name}", "Scalars:scalars")
-        assert [curve[k + 1][0] for k in range(12)] == [getattr(report, name) for report in reports]
+    for end, names in {"energy": ["energy"], "violation": ["residual", "overlap"], "substeps": ["substeps"]}.items():
+        curve = read(path, f"/figures/{end}", "Scalars:scalars")
+        assert [curve[k + 1] for k in range(12)] == [[getattr(report, name) for name in names] for report in reports]
     curve = read(path, "/figures/milliseconds", "Scalars:scalars")  # of the first frame: compiling
     assert [curve[k + 1][0] for k in range(1, 12)] == pytest.approx([report.seconds * 1e3 for report in reports[1:]], rel=5e-3)
     # y is up: the views of rerun in 2D have it down, and a mirror above the data turns it; in 3D it is said.

@@ -6,6 +6,8 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from .curves import CURVES
+
 SCENE_VIEW = uuid.uuid5(uuid.NAMESPACE_DNS, "scene.tiverlet")  # the view of the scene, to be found in any recording
 SCENE = "world/scene"  # the view looks at "world", so that a mirror at "world/scene" shows
 LEGEND = "legend/strain"
@@ -14,16 +16,6 @@ WIDE = 5.0  # steps of the legend are so far apart, with a height of 1
 # The viewer's 2D views have y pointing down, with no option. A mirror above the data, and below the
 # origin of the view, turns it up without touching the data.
 MIRROR = rr.Transform3D(scale=[1.0, -1.0, 1.0])
-# Views of curves, by title: for each curve the end of its path, its label and its colour.
-CURVES = {
-    "Worst violation": {"residual": ("of constraints", [230, 120, 60]), "overlap": ("overlap [radii]", [90, 160, 230])},
-    "Energy [J]": {"energy": ("energy", [120, 200, 120])},
-    "Momentum [kg m/s]": {
-        "momentum/x": ("x", [235, 110, 100]), "momentum/y": ("y", [130, 200, 110]), "momentum/z": ("z", [110, 150, 240]),
-    },
-    "Substeps": {"substeps": ("substeps", [150, 160, 175])},
-    "Time per frame [ms]": {"milliseconds": ("ms", [190, 140, 220])},
-}  # fmt: skip
 
 
 def blueprint(low: np.ndarray, high: np.ndarray, links: bool) -> rrb.Blueprint:
@@ -43,11 +35,11 @@ def blueprint(low: np.ndarray, high: np.ndarray, links: bool) -> rrb.Blueprint:
     curves = [
         rrb.TimeSeriesView(
             origin="figures",
-            contents=[f"figures/{name}" for name in names],
+            contents=[f"figures/{end}"],
             name=title,
             plot_legend=rrb.PlotLegend(corner="RightTop", visible=len(names) > 1),
         )
-        for title, names in CURVES.items()
+        for title, (end, names) in CURVES.items()
     ]
     pages = [rrb.TextDocumentView(origin="about", name="About"), rrb.TextLogView(origin="events", name="Events")]
     scale = rrb.Spatial2DView(

@@ -12,6 +12,7 @@ import numpy as np
 
 from .. import checks, snapshot
 from . import journal, rrd, scene
+from .curves import CURVES
 from .journal import Entry
 from .redraw import Redraw, compare
 from .scene import plain
@@ -357,11 +358,13 @@ def _curves(contents: rrd.Contents) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         name = contents.entities[entity]
         if name.startswith("figures/"):
             found.setdefault(name[len("figures/") :], {})[frame] = k
-    out = {}
-    for name, rows in sorted(found.items()):
+    out, known = {}, {end: list(curves) for end, curves in CURVES.values()}
+    for end, rows in found.items():
         frames = sorted(rows)
-        out[name] = np.array(frames), np.concatenate([contents.values(rows[frame]) for frame in frames])
-    return out
+        values = np.array([contents.values(rows[frame]) for frame in frames])
+        for name, column in zip(known.get(end, [end]), values.reshape(len(frames), -1).T, strict=False):
+            out[name] = np.array(frames), column
+    return dict(sorted(out.items()))
 
 
 def _differing(now: np.ndarray, then: np.ndarray | None) -> int | None:
