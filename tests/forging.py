@@ -136,11 +136,12 @@ class Forgery:
             rows, blobs = batch.column("text").to_pylist(), batch.column("blob")
             texts, marks, kept = [], [], []
             for row, (text,) in enumerate(rows):
-                entry = change(json.loads(text))
-                if entry is None:
+                lines = [entry for line in text.split("\n") if (entry := change(json.loads(line))) is not None]
+                if not lines:
                     continue
-                entry["serial"], serial = serial, serial + 1
-                texts.append([json.dumps(entry)])
+                for entry in lines:
+                    entry["serial"], serial = serial, serial + 1
+                texts.append(["\n".join(map(json.dumps, lines))])
                 blob = blobs[row].values.to_numpy().tobytes() if blobs[row].is_valid else b""
                 mark = journal.checksum(mark, texts[-1][0], blob)
                 marks.append([mark if seal else batch.column("checksum")[row].as_py()[0]])

@@ -9,7 +9,8 @@
     thinned   of all frames before, only one of `stride` is still in the picture
     end       the recording was closed
 
-Each entry also says which steps were made since the one before, and carries a checksum of itself and of all before it.
+Each entry also says which steps were made since the one before. Each row of the file is an entry, or, once it was closed, one or
+more of frames, line by line; and carries a checksum of itself and of all before it.
 """
 
 import base64
@@ -206,28 +207,31 @@ def read(path: str, contents: rrd.Contents) -> tuple[list[Entry], str, int | Non
     rows = []
     for number, (ident, text, blob, mark) in enumerate(contents.journal()):
         try:
-            serial = json.loads(text)["serial"]
+            serials = [json.loads(line)["serial"] for line in text.split(b"\n")]
+            if serials != [*range(serials[0], serials[0] + len(serials))] or (len(serials) > 1 and blob):
+                raise ValueError
         except (ValueError, KeyError, TypeError, RecursionError):
             raise Changed(f"replay: {path} was changed after it was recorded: entry {number} of its journal is none.") from None
-        rows.append((serial, ident, text, blob, mark))
+        rows.append((serials[0], ident, text, blob, mark))
     if not rows:
         why = (
             "is not a recording of tiverlet; `rerun` shows it" if contents.whole else "was cut short before anything was flushed"
         )
         raise ValueError(f"replay: {path} {why}.")
     rows.sort(key=lambda row: row[:2])
-    _check_format(path, rows[0][2])
+    _check_format(path, rows[0][2].split(b"\n")[0])
     entries, mark, frames = [], "", 0
-    for k, (serial, _, text, blob, wanted) in enumerate(rows):
+    for n, (serial, _, text, blob, wanted) in enumerate(rows):
+        k, lines = len(entries), text.split(b"\n")
         if serial > k:
-            later = sum(_kind(text) == "frame" for _, _, text, *_ in rows[k:])
+            later = sum(_kind(line) == "frame" for row in rows[n:] for line in row[2].split(b"\n"))
             return entries, f"entry {k} of the journal is missing", later
         mark = checksum(mark, text.decode(errors="replace"), blob)
         if serial < k or mark.encode() != wanted:
-            what = f"entry {k}, {_kind(text)!r} of frame {json.loads(text).get('frame')}"
+            what = f"entry {k}, {_kind(lines[0])!r} of frame {json.loads(lines[0]).get('frame')}"
             raise Changed(f"replay: {path} was changed after it was recorded: {what}.", frames)
-        entries.append(Entry.unpack(text.decode(), blob))
-        frames += entries[-1].kind == "frame"
+        entries += [Entry.unpack(line.decode(), blob) for line in lines]
+        frames += sum(entry.kind == "frame" for entry in entries[k:])
     ids = [row[1] for row in rows]
     if ids != sorted(ids) or len(set(ids)) < len(ids):
         raise Changed(f"replay: {path} was changed after it was recorded: entries of the journal were written in another order.")
@@ -241,7 +245,12 @@ def read(path: str, contents: rrd.Contents) -> tuple[list[Entry], str, int | Non
     return entries, "", None
 
 
-def _kind(text: bytes) -> str:
+def is_frame(text: str) -> bool:
+    """Whether an entry is that of a frame."""
+    return _kind(text) == "frame"
+
+
+def _kind(text: bytes | str) -> str:
     return json.loads(text).get("kind")
 
 

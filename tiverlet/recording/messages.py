@@ -2,10 +2,12 @@
 
 import struct
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
+
+from . import journal
 
 HEADER = 12  # bytes of a file before its first message
 HEAD = struct.Struct("<QQ")  # of a message: its kind, and the bytes that follow
@@ -15,6 +17,7 @@ LZ4 = 2
 BATCH = 120_000  # bytes that are sent together: LZ4 looks back by 64 kB
 LEVEL = 9  # of LZ4: finds the points of lines among those of the particles, at 60 MB/s
 NOISE = 0.9  # what rerun's faster LZ4 leaves of noise: there is 1 % more to be found there, for 2 ms per 100 kB
+PACKED = 64  # entries of a journal in one row
 WRITTEN = "log_time"  # of rows of the layout: when they were written, which nothing looks at
 PARTS = ("particles", "contacts", "breaks")  # of the scene that are drawn in each frame, or in the one after, too
 
@@ -58,6 +61,9 @@ class Chunk:
         """The message with other rows, compressed well. pyarrow pads them less than rerun does."""
         import pyarrow as pa
 
+        ids = rows.schema.field(0)  # rerun takes them for ids by their kind, and needs no name of their type beside it
+        told = {key: value for key, value in (ids.metadata or {}).items() if not key.startswith(b"ARROW:extension")}
+        rows = rows.set_column(0, ids.with_metadata(told), rows.column(0))
         out = pa.BufferOutputStream()
         with pa.ipc.new_stream(out, rows.schema) as stream:
             stream.write_batch(rows)
@@ -101,7 +107,7 @@ def thins(entity: str) -> bool:
 def thinned(messages: list[tuple[int, bytes]], stride: int) -> Iterator[tuple[int, bytes]]:
     """Messages (kind, bytes) with the picture of one of `stride` frames; all others as they are.
 
-    stride = 1: nothing is left out, but the rows of each entity stand together.
+    stride = 1: nothing is left out, but the rows of each entity stand together, and so do entries of the journal.
     """
     found, frames = [], defaultdict(list)
     for kind, message in messages:
@@ -117,6 +123,7 @@ def thinned(messages: list[tuple[int, bytes]], stride: int) -> Iterator[tuple[in
     for entity, numbers in frames.items():
         numbers = np.unique(np.concatenate(numbers))
         gone[entity] = numbers[droppable(numbers, stride)]
+    entries = []
     waiting: dict[tuple, list] = defaultdict(list)  # rows that go together: a message of a single one takes 1 kB
     for (kind, message), entity in zip(messages, found, strict=True):
         if not entity:
@@ -124,6 +131,9 @@ def thinned(messages: list[tuple[int, bytes]], stride: int) -> Iterator[tuple[in
             continue
         chunk = Chunk(message)
         rows = chunk.rows()
+        if entity == f"/{journal.JOURNAL}" and (not entries or entries[0][1].schema.equals(rows.schema)):
+            entries.append((chunk, rows))
+            continue
         rows = rows.take(np.flatnonzero(~np.isin(rows.column("frame").to_numpy(), gone[entity])))
         together = waiting[entity, tuple(zip(rows.schema.names, rows.schema.types, strict=True))]
         if together and sum(rows.nbytes for _, rows in together) + rows.nbytes > BATCH:
@@ -131,17 +141,43 @@ def thinned(messages: list[tuple[int, bytes]], stride: int) -> Iterator[tuple[in
             together.clear()
         if rows.num_rows:
             together.append((chunk, rows))
+    if entries:
+        yield CHUNK, _joined(entries, _packed)
     for together in waiting.values():
         if together:
             yield CHUNK, _joined(together)
 
 
-def _joined(parts: list[tuple[Chunk, Any]]) -> bytes:
+def _packed(rows: Any) -> Any:
+    """Rows of a journal with entries of frames that follow each other in one: a row takes 60 bytes beside its text."""
+    import pyarrow as pa
+
+    texts = [text for (text,) in rows.column("text").to_pylist()]
+    blobs = [bytes(blob or ()) for blob in rows.column("blob").to_pylist()]
+    firsts, together, marks = [], [], []
+    for k, text in enumerate(texts):
+        alike = k and all(not blobs[j] and journal.is_frame(texts[j]) for j in (k - 1, k))
+        if alike and k - firsts[-1] < PACKED:
+            together[-1].append(text)
+        else:
+            firsts.append(k)
+            together.append([text])
+    together = ["\n".join(lines) for lines in together]
+    for k, text in zip(firsts, together, strict=True):
+        marks.append(journal.checksum(marks[-1] if marks else "", text, blobs[k]))
+    rows = rows.take(firsts)
+    for name, values in (("text", together), ("checksum", marks)):
+        at = rows.schema.get_field_index(name)
+        rows = rows.set_column(at, rows.schema.field(at), pa.array([[v] for v in values], rows.schema.field(at).type))
+    return rows
+
+
+def _joined(parts: list[tuple[Chunk, Any]], change: Callable[[Any], Any] = lambda rows: rows) -> bytes:
     import pyarrow as pa
 
     chunk, first = parts[0]
     table = pa.Table.from_batches([rows.replace_schema_metadata(first.schema.metadata) for _, rows in parts], first.schema)
-    return chunk.holding(table.combine_chunks().to_batches()[0])
+    return chunk.holding(change(table.combine_chunks().to_batches()[0]))
 
 
 def split(data: bytes) -> list[tuple[int, bytes]]:
