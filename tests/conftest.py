@@ -12,8 +12,9 @@ import taichi as ti
 from taichi.lang import ops
 
 import tiverlet as tv
-from tiverlet import reading, team
-from tiverlet.report.cases import entries, known
+from tiverlet.device import thread_team
+from tiverlet.device.patches import source_cache
+from tiverlet.report.accuracy.cases import entries, known
 
 # Taichi keeps kernels that it has compiled, by their content, and finds them when a worker comes by the same tests in the same
 # order: a second run takes half of the time or less. All of them are about as large as what it keeps by default, 100 MB.
@@ -43,9 +44,9 @@ def taichi():
         return assign(to, value)
 
     ops.assign = checked
-    home, reading.HOME = reading.HOME, reading.HOME + OURS
+    home, source_cache.HOME = source_cache.HOME, source_cache.HOME + OURS
     yield
-    ops.assign, reading.HOME = assign, home
+    ops.assign, source_cache.HOME = assign, home
 
 
 @pytest.fixture
@@ -56,7 +57,7 @@ def world():
     def build(*args, **kwargs):
         launched = kwargs.get("path") == "launched"
         try:
-            with team.launching() if launched else contextlib.nullcontext():
+            with thread_team.launching() if launched else contextlib.nullcontext():
                 made.append(tv.World(*args, **(kwargs | {"path": "parallel"} if launched else kwargs)))
         except ValueError as e:
             if ARCH not in tv.runtime.LLVM and ARCH in str(e):  # refused because of the architecture

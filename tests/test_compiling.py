@@ -8,7 +8,7 @@ import tempfile
 import numpy as np
 
 import tiverlet as tv
-from tiverlet import reading
+from tiverlet.device.patches import source_cache
 
 from .conftest import python
 
@@ -118,7 +118,7 @@ def test_functions_are_cut_out_of_their_files_as_python_does_it():
     made = [f.func.func for o in owners for f in vars(o).values() if hasattr(getattr(f, "func", None), "func")]
     assert len(made) > 300
     for function in made:
-        lines, first = reading._cut_out(function.__code__)
+        lines, first = source_cache._cut_out(function.__code__)
         want = inspect.getsourcelines(function)
         assert ("".join(lines).rstrip(), first) == ("".join(want[0]).rstrip(), want[1]), function
 
@@ -127,4 +127,4 @@ def test_compiling_leaves_nothing_behind(world):
     # Trees of functions know what they were compiled with, worlds among them; and Python goes on to collect garbage.
     w = world(tv.Particles([[0.0, 1.0], [1.0, 1.0]], radius=0.1), [tv.Gravity(9.81), tv.Contact()])
     w.run(0.1)
-    assert not reading._read and not reading.active and gc.isenabled()
+    assert not source_cache._read and not source_cache.active and gc.isenabled()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
-from tiverlet import snapshot
+from tiverlet.step import checkpoint
 
 from .test_links import net
 
@@ -166,9 +166,9 @@ def test_splitting_a_run_changes_nothing(world):
     x, v, m, pairs, rest, alpha, damping = net(2, seed=2)
     links = tv.Distance(pairs, rest, compliance=alpha, damping=damping)
     w = world(tv.Particles(x, velocity=v, mass=m, radius=radii(x, pairs, 0.5)), [tv.Gravity(9.81), links, tv.Contact()])
-    start, hashes = snapshot.keep(w), []
+    start, hashes = checkpoint.keep(w), []
     for parts in ((30,), (7, 23)):
-        snapshot.put_back(w, start)
+        checkpoint.put_back(w, start)
         for frames in parts:
             w.run(frames / 60)
         hashes.append(w.hash())

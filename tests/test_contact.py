@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
-from tiverlet import snapshot
+from tiverlet.step import checkpoint
 
 from .test_pairs import roomy
 
@@ -250,13 +250,13 @@ def test_what_a_failed_frame_left_behind_is_gone(world):
     x = 0.21 * k + 0.01 * np.sin(7.0 * k[:, ::-1]) + 0.2
     w = world(tv.Particles(x, radius=0.1), [tv.Gravity(9.81), tv.Box((0, 0), (2.4, 9)), tv.Contact(friction=0.3)])
     w.run(0.5)
-    kept = snapshot.keep(w)
+    kept = checkpoint.keep(w)
     ends = []
     for failed in (False, True):
         if failed:
             for piece in w._grid.luggage:
                 piece.field.fill(np.nan)
-        snapshot.put_back(w, kept)
+        checkpoint.put_back(w, kept)
         w.run(0.2)
         ends.append(w.hash())
     assert ends[0] == ends[1] and w.last.contacts > 100

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
-from tiverlet import substep, survey
+from tiverlet.device.runtime import cores
 from tiverlet.report.speed import counting
-from tiverlet.runtime import cores
+from tiverlet.step import diagnostics, step
 
 from .conftest import python
 
@@ -23,7 +23,7 @@ def test_what_a_gpu_sums_up_is_the_same(world, monkeypatch):
     links = np.arange(600).reshape(300, 2)
     reports = []
     for architecture in ("cpu", "cuda"):
-        monkeypatch.setattr(survey, "runtime", SimpleNamespace(architecture=lambda a=architecture: a))
+        monkeypatch.setattr(diagnostics, "runtime", SimpleNamespace(architecture=lambda a=architecture: a))
         features = [tv.Gravity(9.81), tv.Distance(links, compliance=1e-3), tv.Contact(), tv.Box((-4, -4), (4, 4))]
         w = world(tv.Particles(x, radius=0.1), features, substeps=4, path="launched")
         assert w._survey.blocks == (64 if architecture == "cpu" else 64**2)
@@ -104,7 +104,7 @@ def test_a_large_pile_has_the_same_bits_on_all_paths_and_where_a_team_breaks_up(
         w = world(tv.Particles(x, radius=0.5), features, path=path, substeps=3)
         if patience:
             w._sub.team.patience = patience
-        alone = [w.step(1 / 60) and w._sheet[substep.HANDS] == 1 for _ in range(40)]
+        alone = [w.step(1 / 60) and w._sheet[step.HANDS] == 1 for _ in range(40)]
         assert not patience or w._sub.team.size == 1 or all(alone)
         assert w.last.contacts > 1000
         made.append(w.hash())

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
-from tiverlet import snapshot
+from tiverlet.step import checkpoint
 
 from .chains import links
 from .prototype import Prototype
@@ -191,7 +191,7 @@ def test_direct_has_the_same_bits_on_both_paths(world):
         made.append(w)
     assert made[0].hash() == made[1].hash()
     made[0].run(0.1)
-    snapshot.transfer(made[1], made[0])  # as clones do
+    checkpoint.transfer(made[1], made[0])  # as clones do
     for w in made:
         w.run(0.1)
     assert made[0].hash() == made[1].hash()

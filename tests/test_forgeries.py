@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
-from tiverlet import material
 from tiverlet.__main__ import main
+from tiverlet.features import material
 from tiverlet.recording import reader, rrd, scene, viewer
 
 from . import forging, recordings_campaign

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tiverlet.report import granular
+from tiverlet.report.accuracy import granular
 
 
 def test_gas_of_discs():

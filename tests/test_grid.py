@@ -5,10 +5,10 @@ import pytest
 import taichi as ti
 
 import tiverlet as tv
-from tiverlet.memory import Memory
-from tiverlet.sorting import LONG, sort
-from tiverlet.sums import MOST, RADIX, Sums
-from tiverlet.team import Team
+from tiverlet.device.memory import Memory
+from tiverlet.device.prefix_sum import MOST, RADIX, Sums
+from tiverlet.device.sorting import LONG, sort
+from tiverlet.device.thread_team import Team
 
 from .conftest import ARCH
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
-from tiverlet import snapshot
+from tiverlet.step import checkpoint
 
 from .conftest import case, rerun
 
@@ -306,7 +306,7 @@ def test_friction_and_restitution_have_the_same_bits_on_both_paths(world):
         worlds.append(w)
     assert hashes[0] == hashes[1]
     worlds[0].run(0.1)
-    snapshot.transfer(worlds[1], worlds[0])
+    checkpoint.transfer(worlds[1], worlds[0])
     np.testing.assert_array_equal(worlds[0].contacts.impulse, worlds[1].contacts.impulse)
     for w in worlds:
         w.run(0.2)

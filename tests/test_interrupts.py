@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
-from tiverlet import interrupts, snapshot
+from tiverlet.device import interrupts
+from tiverlet.step import checkpoint
 
 
 def frames_of(world, dt=1 / 60):
@@ -36,9 +37,9 @@ def piled():
 @pytest.fixture
 def w(piled):
     """One world for all tests, since compiling it takes longer than all else."""
-    start = snapshot.keep(piled)
+    start = checkpoint.keep(piled)
     yield piled
-    snapshot.put_back(piled, start)
+    checkpoint.put_back(piled, start)
     piled.substeps, piled.iterations = 4, 3
     piled._make()
 
@@ -85,9 +86,9 @@ def test_a_signal_waits_for_the_end_of_the_frame(w, tmp_path):
 
 def in_parts(w, passes, frames):
     """Hashes of frames made in one launch each, and made in launches of so many passes."""
-    start, out = snapshot.keep(w), []
+    start, out = checkpoint.keep(w), []
     for some in (w._passes, passes):
-        snapshot.put_back(w, start)
+        checkpoint.put_back(w, start)
         w._passes = some
         out.append([(w.step(1 / 60).residual, w.hash()) for _ in range(frames)])
     return out
@@ -114,11 +115,11 @@ def test_long_frames_of_a_team_and_of_high_order():
 def test_an_endless_frame_is_undone(w, endless):
     pin = w.features[-1]
     w.run(0.1)
-    start = snapshot.keep(w)
+    start = checkpoint.keep(w)
     pin.target = [[0.05, 0.35]]
     w.run(0.1)
     expected = w.hash()
-    snapshot.put_back(w, start)
+    checkpoint.put_back(w, start)
     pin.target = [[0.05, 0.35]]
     for name, value in endless.items():
         setattr(w, name, value)

@@ -12,7 +12,7 @@ import taichi as ti
 
 import tiverlet as tv
 from tiverlet import constraints, forces
-from tiverlet.arguments import knobs_of
+from tiverlet.features.arguments import knobs_of
 
 from .conftest import order
 

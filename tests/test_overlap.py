@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 import tiverlet as tv
-from tiverlet.overlap import overlapping
+from tiverlet.contact.initial_overlap import overlapping
 
 
 def test_overlap_is_what_comparing_all_pairs_finds():

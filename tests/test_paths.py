@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
-from tiverlet.curve import Curve
+from tiverlet.constraints.core.curve import Curve
 
 from .conftest import case, order, rerun, rms
 

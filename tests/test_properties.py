@@ -10,7 +10,7 @@ import pytest
 
 import tiverlet as tv
 from tiverlet import constraints
-from tiverlet.wall import Wall
+from tiverlet.colliders.collider import Wall
 
 from .conftest import order, rms
 from .rows import OTHERS, ROWS, Row

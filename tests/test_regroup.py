@@ -5,8 +5,8 @@ import pytest
 import taichi as ti
 
 import tiverlet as tv
-from tiverlet import snapshot
-from tiverlet.feature import Batch
+from tiverlet.features.feature import Batch
+from tiverlet.step import checkpoint
 
 
 def half(x: float):
@@ -64,10 +64,10 @@ def test_what_stays_goes_on_to_the_bit(world):
     lead()
     w.step(1 / 60)
     lead()
-    kept, knobs = snapshot.keep(w), (rope.rest, hand.target, hand.moving)
+    kept, knobs = checkpoint.keep(w), (rope.rest, hand.target, hand.moving)
     before = w.run(0.4)
     without = look()
-    snapshot.put_back(w, kept)
+    checkpoint.put_back(w, kept)
     rope.rest, hand.target, hand.moving = knobs
     x, v = w.position, w.velocity
     new = w.add(tv.Particles([[50.0, 5.0], [50.3, 5.0]], velocity=(0.0, 1.0), radius=0.1, mass=2.0))

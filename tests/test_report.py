@@ -18,11 +18,12 @@ from rich.console import Console
 
 import tiverlet as tv
 from tiverlet.__main__ import main
-from tiverlet.report import CASES, baselines, errors, points
-from tiverlet.report.cases import LEFT_OUT, chosen, entries
-from tiverlet.report.certificate import certify
-from tiverlet.report.extremes import ROWS, Finding, Row
-from tiverlet.report.smaller_steps import curve, table
+from tiverlet.report import CASES
+from tiverlet.report.accuracy import baselines, errors, points
+from tiverlet.report.accuracy.cases import LEFT_OUT, chosen, entries
+from tiverlet.report.accuracy.smaller_steps import curve, table
+from tiverlet.report.stress.certificate import certify
+from tiverlet.report.stress.rows import ROWS, Finding, Row
 
 from .conftest import figures, python
 
@@ -216,7 +217,7 @@ PLANTS = {
         "stress(rows=[30])",
         [
             (
-                "grid.py",
+                "neighbour_search.py",
                 "< far * far, ti.i32) & ti.cast(i != j, ti.i32)",
                 "< far * far, ti.i32) & ti.cast((i + j) % 100 != 7, ti.i32)",
             )
@@ -226,7 +227,7 @@ PLANTS = {
         "stress(rows=[11])",
         [
             (
-                "motion.py",
+                "integrator.py",
                 "self.state.x[i] = x + step",
                 "self.state.x[i] = x + d; self.state.d[i] = self.state.x[i] - x",
             )

@@ -5,10 +5,11 @@ import pytest
 import taichi as ti
 
 import tiverlet as tv
-from tiverlet import assembly, runtime
-from tiverlet import memory as fields
-from tiverlet.memory import Memory
-from tiverlet.transfer import chain
+from tiverlet.device import memory as fields
+from tiverlet.device import runtime
+from tiverlet.device.host_copy import chain
+from tiverlet.device.memory import Memory
+from tiverlet.step import build
 
 from .conftest import python
 
@@ -110,8 +111,8 @@ def test_what_spirv_lacks_is_refused(monkeypatch):
     with pytest.raises(ValueError, match='"f32-compensated" needs exact rounding, which Taichi does not have on vulkan'):
         tv.World(tv.Particles(x), precision="f32-compensated")
     for feature in (tv.ShapeMatch([k]), tv.Distance([k[:2]])):
-        assembly.check_architecture("f64", (feature,))
-    assembly.check_architecture("f32", asked)
+        build.check_architecture("f64", (feature,))
+    build.check_architecture("f32", asked)
 
 
 def test_import_is_quiet_and_starts_nothing():

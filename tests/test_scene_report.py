@@ -7,8 +7,8 @@ import pytest
 import taichi as ti
 
 import tiverlet as tv
-from tiverlet import snapshot
-from tiverlet.report import perturbed
+from tiverlet.report.stress import robustness
+from tiverlet.step import checkpoint
 
 from .conftest import rms
 
@@ -29,12 +29,12 @@ def test_a_world_reports_on_itself(world):
     assert found.paste == f"world = tv.World(particles, features, {best.paste})" and "substeps=" in best.paste
     # What it says of an error is so: against a reference that is a hundred times finer.
     clone = w.clone(precision="f64", solver=tv.Direct(), substeps=1000)
-    start = snapshot.keep(clone)
+    start = checkpoint.keep(clone)
     clone.run(0.3)
     fine = clone.position
     for s in found.settings:
         if (s.solver, s.precision) == ("Direct()", "f64"):
-            snapshot.put_back(clone, start)
+            checkpoint.put_back(clone, start)
             clone.substeps = s.substeps
             clone.run(0.3)
             assert rms(clone.position, fine) == pytest.approx(s.error, abs=found.reference_error + 1e-2 * s.error)
@@ -63,7 +63,7 @@ def test_reports_keep_the_order_of_a_world(world):
     found = w.report(0.2, substeps=(2, 5, 10))
     assert found.order == pytest.approx(4, abs=0.1) and {s.precision for s in found.settings} == {"f64"}
     assert found.paste.endswith('precision="f64", order=4)')
-    with perturbed.scene_of(w, 1 / 60).build(w) as copy:
+    with robustness.scene_of(w, 1 / 60).build(w) as copy:
         assert copy.order == 4
 
 

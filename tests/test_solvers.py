@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
-from tiverlet.report import chains
+from tiverlet.report.accuracy import chains
 from tiverlet.solvers.spectrum import largest
 
 

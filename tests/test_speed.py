@@ -9,7 +9,7 @@ import pytest
 import tiverlet as tv
 from tiverlet.__main__ import main
 from tiverlet.report import speed
-from tiverlet.report.speed import SCENES, SpeedReport, counting, measure, peers, scenes, stripped, yardstick
+from tiverlet.report.speed import SCENES, SpeedReport, c_baseline, counting, measure, peers, scenes, stripped
 
 
 @pytest.fixture(scope="module")
@@ -50,10 +50,10 @@ def test_yardstick_starts_where_the_scene_does(tmp_path):
     assert x.min() >= 0.5 and np.ptp(x, axis=0).max() < 1.1 * 31 + 0.05
     jitter = x - 0.5 - 1.1 * np.stack([np.arange(1000) % 32, np.arange(1000) // 32], axis=1)
     assert jitter.min() >= 0 and jitter.max() < 0.05 + 1e-12 and abs(jitter.mean() - 0.025) < 1e-3
-    program, how = yardstick.build(tmp_path)
+    program, how = c_baseline.build(tmp_path)
     if program is None:
         pytest.skip(how)
-    with yardstick.Yardstick(program, 1000, 8, 1) as talker:
+    with c_baseline.Yardstick(program, 1000, 8, 1) as talker:
         assert talker.ask("quality")["overlap"] == 0
         assert talker.ask("run 2") > 0
 
@@ -61,7 +61,7 @@ def test_yardstick_starts_where_the_scene_does(tmp_path):
 def test_yardstick_is_left_out_without_a_compiler(monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("CC", raising=False)
-    program, why = yardstick.build(tmp_path)
+    program, why = c_baseline.build(tmp_path)
     assert program is None and "no C compiler" in why
     session = measure.Session("cpu", [1], True)
     session.folder = str(tmp_path)

@@ -3,8 +3,8 @@
 import numpy as np
 import taichi as ti
 
-from tiverlet.memory import Memory
-from tiverlet.team import Team
+from tiverlet.device.memory import Memory
+from tiverlet.device.thread_team import Team
 
 DEALS = ((1, 1), (7, 1), (16, 4), (23, 4), (64, 8))  # so many things, so many at a time
 

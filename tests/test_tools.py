@@ -5,7 +5,7 @@ import pytest
 import taichi as ti
 
 import tiverlet as tv
-from tiverlet.angle import cos_sin
+from tiverlet.colliders.angle import cos_sin
 from tiverlet.tools import distinct, median
 
 

@@ -2,37 +2,16 @@
 
 from typing import Any
 
-from . import runtime  # first: it sets what Taichi reads when it is imported  # isort: skip
-from . import compiling  # noqa: F401  # next: what comes after it is imported in half the time  # isort: skip
+from .device import runtime  # first: it sets what Taichi reads when it is imported  # isort: skip
+from .device.patches import compiler  # noqa: F401  # next: what comes after it is imported in half the time  # isort: skip
 from . import measure, shapes
-from .constraints import (
-    AngleLimit,
-    Area,
-    Ball,
-    Bend,
-    Box,
-    Capsule,
-    Constraint,
-    Contact,
-    Dihedral,
-    Distance,
-    HalfSpace,
-    Mesh,
-    Path,
-    Pin,
-    Polygon,
-    Polygons,
-    Rope,
-    Sdf,
-    ShapeMatch,
-    Snap,
-    Spacer,
-    Volume,
-)
+from .colliders import Ball, Box, Capsule, HalfSpace, Mesh, Polygon, Sdf
+from .constraints import AngleLimit, Area, Bend, Constraint, Dihedral, Distance, Path, Pin, Rope, ShapeMatch, Snap, Spacer, Volume
+from .contact import Contact, Polygons
+from .device.runtime import init
 from .forces import Attractor, Drag, Force, Gravity, Wind
 from .particles import Particles
 from .recording import Recorder, replay
-from .runtime import init
 from .solvers import Chebyshev, ConjugateGradient, Direct, Jacobi
 from .step_report import StepReport
 from .tools import approach, clamp, golden, golden_colors, golden_index, mix, smoothstep

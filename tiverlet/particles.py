@@ -1,15 +1,15 @@
 """Particles: what the user gives (plain arrays), and the state that a world keeps of them on the device."""
 
 import numpy as np
-import taichi as ti
 from numpy.typing import ArrayLike
 
 from . import checks
-from .arguments import meant
-from .compiling import inline
-from .expanding import at
-from .memory import Memory
-from .read_only import read_only, structure
+from .device import ti
+from .device.memory import Memory
+from .device.patches.compiler import inline
+from .device.patches.syntax_cache import at
+from .features.arguments import meant
+from .features.read_only import read_only, structure
 
 LARGEST = 1e15  # [m] beyond this, squared lengths near 1e38 leave f32; nothing physical is that far
 

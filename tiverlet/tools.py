@@ -5,8 +5,9 @@ import functools
 from collections.abc import Callable
 
 import numpy as np
-import taichi as ti
 from taichi.lang import impl
+
+from .device import ti
 
 # x**(d + 1) = x + 1 has one positive root, the golden ratio of dimension d (Roberts 2018, the R_d sequence). Its
 # inverse powers are the steps along each axis. As odd 32-bit integers, i * step mod 2**32 visits every value once,

@@ -8,22 +8,23 @@ from typing import Any
 
 import numpy as np
 
-from . import checks, composition, regroup, snapshot
-from .arguments import meant
-from .assembly import Assembly, assemble, check_settings, checked_features, checked_solver
-from .explain import explain
-from .feature import Acceleration, Feature
-from .guard import Guard
-from .interrupts import whole
-from .launches import Launches
-from .overlap import overlapping
+from . import checks
+from .contact.initial_overlap import overlapping
+from .device.interrupts import whole
+from .features.arguments import meant
+from .features.feature import Acceleration, Feature
 from .particles import Particles
-from .projection import SHORTER, project
-from .regroup import Handle
 from .solvers.solver import Solver
+from .step import checkpoint, edit_scene, high_order
+from .step.adaptive import Guard
+from .step.build import Assembly, assemble, check_settings, checked_features, checked_solver
+from .step.diagnostics import STARTED, STEPPED
+from .step.edit_scene import Handle
+from .step.explain import explain
+from .step.projection import SHORTER, project
+from .step.runner import Launches
+from .step.step import FREE, decay
 from .step_report import StepReport
-from .substep import FREE, decay
-from .survey import STARTED, STEPPED
 
 
 class World(Launches):
@@ -41,7 +42,7 @@ class World(Launches):
     path: "auto", "fused" (one launch per frame, one thread) or "parallel" (one launch, a team of CPU threads; several launches on
     a GPU); the bits are the same.
     order: of the error in the substep: 2, or 4, 6 or 8 in f64 for motion without contacts, walls, damping and limits, where
-    every rigid constraint is solved directly. A substep is then made of 5, 9 or 15 stages, see composition.py.
+    every rigid constraint is solved directly. A substep is then made of 5, 9 or 15 stages, see high_order.py.
 
     Raises ValueError or TypeError, naming the argument, the index and the value, before anything is compiled.
     """
@@ -127,7 +128,7 @@ class World(Launches):
             try:
                 guarded = self._guard.auto or tolerance is not None or budget is not None
                 if guarded or self._substeps * self._iterations > self._passes:
-                    self._undo = snapshot.keep(self), snapshot.flags(self)
+                    self._undo = checkpoint.keep(self), checkpoint.flags(self)
                 self._heed()
                 if guarded:
                     with self._memory.compiler():
@@ -149,7 +150,7 @@ class World(Launches):
         """A step ended with an exception: undo it, or tell recorders that the state is none that steps lead to."""
         undo, self._undo = self._undo, None
         if undo:
-            snapshot.undo(self, *undo)
+            checkpoint.undo(self, *undo)
             return
         for watcher in self._watchers:
             watcher.broken_off()
@@ -207,7 +208,7 @@ class World(Launches):
         self._settle_forces()
         if any(f.changed and f.outgrown for f in self._features):
             check_settings(self._precision, self._wanted[1], self._order, self._features)
-            regroup.rebuild(self, np.ones(len(self._particles), dtype=bool), None, self._features)
+            edit_scene.rebuild(self, np.ones(len(self._particles), dtype=bool), None, self._features)
 
     def _upload(self) -> None:
         """Write what was changed in Python since the last frame."""
@@ -255,7 +256,7 @@ class World(Launches):
                 self._sub.to_velocity(self._h, self._time)
                 self._owed = (self._drag or FREE)[3] * self._h
             else:
-                self._memory.write(self._scene.state.d, composition.velocity(self))
+                self._memory.write(self._scene.state.d, high_order.velocity(self))
             self._fresh, self._parted = True, None
 
     def run(
@@ -298,7 +299,7 @@ class World(Launches):
 
     def hash(self) -> str:
         """SHA-256 of the exact state: equal if and only if two worlds of the same scene will go on alike, bit for bit."""
-        return snapshot.keep(self).digest()
+        return checkpoint.keep(self).digest()
 
     def explain(self) -> str:
         """What was compiled and what was left out, with fields, bytes and launches."""
@@ -322,7 +323,7 @@ class World(Launches):
         self._adapt()
         copies = tuple(f.copy() for f in self._features)
         new = World._of(self._particles, copies, [f.start for f in self._features], **{**settings, **changes})
-        snapshot.transfer(self, new)
+        checkpoint.transfer(self, new)
         return new
 
     def report(self, seconds: float, tolerance: float | None = None, **options):
@@ -332,7 +333,7 @@ class World(Launches):
         frame; substeps: those to try; progress: show a bar. Clones run; this world is not touched. Knobs keep their present
         values. There is no known answer: the reference is the finest run, and how far that is off is estimated and said.
         """
-        from .report.scene import scene_report
+        from .report.accuracy.scene import scene_report
 
         return scene_report(self, seconds, tolerance, **options)
 

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 
 from tiverlet.constraints.bend import Angle
-from tiverlet.feature import Batch
-from tiverlet.ragged import Ragged
-from tiverlet.scalar import Scalar
+from tiverlet.constraints.core.scalar import Scalar
+from tiverlet.constraints.core.variable_size import Ragged
+from tiverlet.features.feature import Batch
 
 from .functions import SDF
 from .scenes import Structure, plain

@@ -7,8 +7,8 @@ import warnings
 import numpy as np
 
 import tiverlet as tv
-from tiverlet import snapshot
 from tiverlet.recording.scene import knobs, turn
+from tiverlet.step import checkpoint
 
 from . import oracles
 from .scenes import Event, Set, Step, Structure
@@ -62,7 +62,7 @@ class Trial:
     def begin(self) -> None:
         """Keep the state that scenes start from."""
         w = self.world
-        self.kept, self.flags = snapshot.keep(w), snapshot.flags(w)
+        self.kept, self.flags = checkpoint.keep(w), checkpoint.flags(w)
         self.knobs = [dict(knobs(f)) for f in self.features]
         self.free = w._scene.inv_mass.copy()
         self.eps = oracles.EPS[w.precision]
@@ -78,7 +78,7 @@ class Trial:
         for f, values in zip(self.features, self.knobs, strict=True):
             if any(vars(f)[k] is not v for k, v in values.items()):
                 turn(f, values)
-        snapshot.install(w, self.kept, self.flags)
+        checkpoint.install(w, self.kept, self.flags)
         w._last = None
         w.substeps, w.iterations = 20, 1
 

@@ -14,8 +14,8 @@ def main(args: argparse.Namespace) -> int:
     import platform
     from importlib import metadata
 
-    from .. import runtime
-    from ..report.sweep import machine
+    from ..device import runtime
+    from ..report.accuracy.sweep import machine
 
     print(f"machine        {machine()}")
     for package in ("tiverlet", "taichi", "numpy", "rerun-sdk", "rich", "matplotlib"):

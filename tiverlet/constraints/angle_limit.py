@@ -1,13 +1,13 @@
 """Limbs and hinges: corners that turn only so far."""
 
 import numpy as np
-import taichi as ti
 
 from .. import checks
-from ..feature import Knob, Scene
+from ..device import ti
+from ..features.feature import Knob, Scene
 from ..particles import Particles
-from ..scalar import Scalar
 from .bend import TURN, Turning
+from .core.scalar import Scalar
 
 
 class AngleLimit(Turning):

@@ -1,13 +1,13 @@
 """Areas of triangles and of closed loops."""
 
 import numpy as np
-import taichi as ti
 
 from .. import checks
-from ..feature import Knob
+from ..device import ti
+from ..features.feature import Knob
 from ..particles import Particles
-from ..ragged import Content, rows
-from ..scalar import Scalar
+from .core.scalar import Scalar
+from .core.variable_size import Content, rows
 
 
 class Area(Scalar):

@@ -1,11 +1,11 @@
 """Angles between links."""
 
 import numpy as np
-import taichi as ti
 
 from .. import checks
-from ..feature import Knob, Scene
-from ..scalar import Scalar
+from ..device import ti
+from ..features.feature import Knob, Scene
+from .core.scalar import Scalar
 
 TURN = 2 * np.pi
 SHORT = 1e-24  # [m^2] squared length below which a link has no direction, in f32 and far below any in use

@@ -4,14 +4,14 @@ import inspect
 from typing import Any
 
 import numpy as np
-import taichi as ti
 
 from .. import checks
-from ..differences import Slopes
-from ..feature import Knob
+from ..device import ti
+from ..features.feature import Knob
 from ..particles import Particles
-from ..scalar import Scalar
 from ..tools import golden
+from .core.finite_differences import Slopes
+from .core.scalar import Scalar
 
 WRONG = 1e-4  # relative difference between a gradient and differences of the function that is not rounding
 

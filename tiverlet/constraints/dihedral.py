@@ -1,8 +1,8 @@
 """Angles between triangles."""
 
 import numpy as np
-import taichi as ti
 
+from ..device import ti
 from .bend import SHORT, Angle
 
 

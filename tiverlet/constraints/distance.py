@@ -1,11 +1,11 @@
 """Links of given length."""
 
 import numpy as np
-import taichi as ti
 
 from .. import checks
-from ..feature import Knob
-from ..scalar import Scalar
+from ..device import ti
+from ..features.feature import Knob
+from .core.scalar import Scalar
 
 
 class Link(Scalar):

@@ -3,13 +3,13 @@
 import warnings
 
 import numpy as np
-import taichi as ti
 
 from .. import checks
-from ..curve import Curve
-from ..feature import FAR, Knob, Scene
+from ..device import ti
+from ..features.feature import FAR, Knob, Scene
 from ..particles import Particles
-from ..tether import Tether
+from .core.anchored import Tether
+from .core.curve import Curve
 
 WALK = 64  # steps along the pieces of a path, at most, that a search takes
 

@@ -1,12 +1,12 @@
 """Particles held at targets."""
 
 import numpy as np
-import taichi as ti
 
 from .. import checks
-from ..feature import Knob, Scene
+from ..device import ti
+from ..features.feature import Knob, Scene
 from ..particles import Particles, in_range
-from ..tether import Tether
+from .core.anchored import Tether
 
 
 def _targets(pin: "Pin", target):

@@ -1,11 +1,11 @@
 """Clusters of particles that keep their shape."""
 
 import numpy as np
-import taichi as ti
 
-from .. import rotation
-from ..compliance import stiff
-from .clusters import Clusters
+from ..device import ti
+from .core import rotation
+from .core.clusters import Clusters
+from .core.compliance import stiff
 
 LEAST = 2.0**-46  # relative changes of a rotation that are rounding
 

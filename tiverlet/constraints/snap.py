@@ -1,12 +1,12 @@
 """A tidy grid."""
 
 import numpy as np
-import taichi as ti
 
 from .. import checks
-from ..feature import Scene
+from ..device import ti
+from ..features.feature import Scene
 from ..particles import Particles
-from ..tether import Tether
+from .core.anchored import Tether
 
 
 class Snap(Tether):

@@ -1,13 +1,13 @@
 """Volumes of tetrahedra and of closed meshes."""
 
 import numpy as np
-import taichi as ti
 
 from .. import checks
-from ..feature import Knob, Scene
+from ..device import ti
+from ..features.feature import Knob, Scene
 from ..particles import Particles
-from ..ragged import Content
-from ..scalar import Scalar
+from .core.scalar import Scalar
+from .core.variable_size import Content
 
 LARGEST = 1e9  # [m] the square of a volume's gradient, a length to the fourth, has to stay below 3e38
 

@@ -1,7 +1,7 @@
 """Linear drag."""
 
 from .. import checks
-from ..feature import Acceleration, Knob
+from ..features.feature import Acceleration, Knob
 
 
 class Drag(Acceleration):

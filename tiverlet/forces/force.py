@@ -3,11 +3,11 @@
 import inspect
 
 import numpy as np
-import taichi as ti
 from taichi.lang.expr import Expr
 
-from ..compiling import inline, readable, refuse
-from ..feature import Acceleration, Scene
+from ..device import ti
+from ..device.patches.compiler import inline, readable, refuse
+from ..features.feature import Acceleration, Scene
 from ..particles import Particles
 
 

@@ -1,10 +1,10 @@
 """Wind: drag relative to moving air."""
 
 import numpy as np
-import taichi as ti
 
 from .. import checks
-from ..feature import Acceleration, Knob, Scene
+from ..device import ti
+from ..features.feature import Acceleration, Knob, Scene
 from ..particles import Particles
 
 

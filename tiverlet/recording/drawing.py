@@ -5,12 +5,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..constraints import Box, Path
+from ..colliders import Box
+from ..colliders.collider import Wall
+from ..colliders.facets import Facets
+from ..constraints import Path
 from ..constraints.distance import Link
-from ..facets import Facets
-from ..feature import Batch
+from ..features.feature import Batch
 from ..tools import golden_colors
-from ..wall import Wall
 from .journal import PARTICLES
 from .layout import LEGEND, SCENE, WIDE
 from .lines import Lines, Sheet

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .. import snapshot
+from ..step import checkpoint
 from ..step_report import StepReport
 from . import rrd, scene
 
@@ -156,8 +156,8 @@ class Journal:
 
     def state(self, kind: str = "state") -> int:
         """Write the exact state; returns the size of the entry [bytes]."""
-        kept, world = snapshot.keep(self.world), self.world
-        more = {"flags": snapshot.flags(world), "reach": world._scene.hh}
+        kept, world = checkpoint.keep(self.world), self.world
+        more = {"flags": checkpoint.flags(world), "reach": world._scene.hh}
         return self.put(kind, {"clock": kept.clock, **more}, kept.values)
 
     def before(self) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..snapshot import Kept
+from ..step.checkpoint import Kept
 from ..step_report import StepReport
 
 if TYPE_CHECKING:

@@ -11,7 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from .. import checks, interrupts, snapshot
+from .. import checks
+from ..device import interrupts
+from ..step import checkpoint
 from ..world import World
 from .journal import JOURNAL, Journal, brief, said
 from .picture import Picture, layout
@@ -224,7 +226,7 @@ class Recorder:
         due = picture.drawing.bytes - self._drawn > self._due or sparse
         if number and due and not world._force_waits:  # a state does not hold the force that it came about under
             self._note_state(journal.state())
-        now = snapshot.keep(world, pairs=False)
+        now = checkpoint.keep(world, pairs=False)
         x = now.position(len(world.particles))
         x32 = x.astype(np.float32)
         picture.frame(number, now, x, x32, journal.rounded(), journal.scenes, journal.stirred)

@@ -16,7 +16,7 @@ from .picture import Picture, layout
 from .rrd import Contents
 
 if TYPE_CHECKING:
-    from ..snapshot import Kept
+    from ..step.checkpoint import Kept
     from ..world import World
 
 NOTHING = hashlib.blake2b(digest_size=16).digest()  # of a row without components: the time at which the file was begun

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .. import checks, snapshot
+from .. import checks
+from ..step import checkpoint
 from . import journal, rrd, scene
 from .curves import CURVES
 from .journal import Entry
@@ -116,7 +117,7 @@ class Replay:
         world = None
         try:
             for world, entry in self._run(start, goal):
-                if entry.kind == "frame" and journal.brief(snapshot.keep(world, pairs=False).digest()) != entry.data["hash"]:
+                if entry.kind == "frame" and journal.brief(checkpoint.keep(world, pairs=False).digest()) != entry.data["hash"]:
                     raise RuntimeError(f"replay: frame {entry.frame} of {self.path} does not come out as recorded. {self._why()}")
             assert world
             return world
@@ -146,7 +147,7 @@ class Replay:
                 off, why, same = None, None, True
                 redraw.watch(world)
                 if entry.kind == "frame":
-                    now = snapshot.keep(world, pairs=False)
+                    now = checkpoint.keep(world, pairs=False)
                     same = journal.brief(now.digest()) == entry.data["hash"] and world.time == entry.data["time"]
                     x = now.position(len(world.particles))
                     x32 = x.astype(np.float32)
@@ -158,7 +159,7 @@ class Replay:
                         same = False
                     why = redraw.frame(entry, now, x, x32)
                 elif entry.kind == "state":
-                    now, then = snapshot.keep(world), _kept(entry, world)
+                    now, then = checkpoint.keep(world), _kept(entry, world)
                     same = now.digest() == then.digest()
                     changed = (k for k, v in now.values.items() if k in then.values and len(v) == len(world.particles))
                     found = (_differing(now.values[k], then.values[k]) for k in changed)
@@ -224,7 +225,7 @@ class Replay:
         before = [turned for e in self._entries[base:start] if e.kind == "turned" for turned in self._turned(e)]
         world = scene.rebuild(source.data, source.arrays, self._given, before)
         _settle(world, [e.data["now"] for e in self._entries[: start + 1] if "now" in e.data][-1])
-        snapshot.install(world, _kept(state, world), state.data["flags"])
+        checkpoint.install(world, _kept(state, world), state.data["flags"])
         world._scene.hh = state.data["reach"]
         return world
 
@@ -254,7 +255,7 @@ class Replay:
             for k, values in self._turned(entry):
                 scene.turn(world.features[k], values)
         elif entry.kind == "taken":
-            snapshot.install(world, _kept(entry, world), entry.data["flags"])
+            checkpoint.install(world, _kept(entry, world), entry.data["flags"])
             world._scene.hh = entry.data["reach"]
         elif entry.kind == "assigned":
             if entry.data["name"] not in ("position", "velocity"):
@@ -326,9 +327,9 @@ def _settle(world: "World", settings: list) -> None:
     world.substeps, world.iterations, world._guard.memory = *settings[:2], tuple(settings[2])
 
 
-def _kept(entry: Entry, world: "World") -> snapshot.Kept:
-    kept = snapshot.Kept(entry.arrays, entry.data["clock"], world._guard.memory)
-    snapshot.check(world, kept, entry.data["flags"])
+def _kept(entry: Entry, world: "World") -> checkpoint.Kept:
+    kept = checkpoint.Kept(entry.arrays, entry.data["clock"], world._guard.memory)
+    checkpoint.check(world, kept, entry.data["flags"])
     return kept
 
 

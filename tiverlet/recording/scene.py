@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .. import constraints, forces, runtime, solvers
-from ..arguments import Noted, knobs_of
-from ..feature import Feature
+from .. import constraints, forces, solvers
+from ..device import runtime
+from ..features.arguments import Noted, knobs_of
+from ..features.feature import Feature
 from ..particles import Particles
 from ..solvers.solver import Solver
 
@@ -155,7 +156,7 @@ def describe(world: "World") -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 def environment() -> dict[str, Any]:
     """What the bits may depend on besides the scene, and who started Taichi how."""
-    import taichi as ti
+    from ..device import ti
 
     wanted = runtime.wanted()
     return {

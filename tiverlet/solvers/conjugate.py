@@ -1,11 +1,11 @@
 """Preconditioned conjugate gradients on the constraints of a scene: cloth and nets that converge."""
 
 import numpy as np
-import taichi as ti
 
 from .. import checks
-from ..feature import Batch, Scene
-from ..scalar import TENSEST, Scalar
+from ..constraints.core.scalar import TENSEST, Scalar
+from ..device import ti
+from ..features.feature import Batch, Scene
 from .slots import Slots
 from .solver import Solver
 from .spectrum import largest

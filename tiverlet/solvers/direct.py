@@ -1,11 +1,11 @@
 """Chains, trees and loops by elimination: exact for any length, any mass ratio and any compliance."""
 
 import numpy as np
-import taichi as ti
 
 from .. import checks
-from ..feature import Batch, Scene
-from ..scalar import TENSEST, Scalar
+from ..constraints.core.scalar import TENSEST, Scalar
+from ..device import ti
+from ..features.feature import Batch, Scene
 from .elimination import Plan, plan
 from .slots import Slots
 from .solver import WIDTH, Solver

@@ -3,8 +3,8 @@
 import numpy as np
 
 from .. import checks
-from ..feature import Batch, Scene
-from ..scalar import Scalar
+from ..constraints.core.scalar import Scalar
+from ..features.feature import Batch, Scene
 from .solver import Solver
 from .spectrum import largest
 

@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from ..arguments import Noted
-from ..feature import Batch, Scene
-from ..scalar import Scalar
+from ..constraints.core.scalar import Scalar
+from ..features.arguments import Noted
+from ..features.feature import Batch, Scene
 from .elimination import plan_of
 
 WIDTH = 16  # of the systems that Direct takes

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from ..feature import Scene
-from ..scalar import Scalar
+from ..constraints.core.scalar import Scalar
+from ..features.feature import Scene
 from ..tools import golden
 
 ROUNDS = 300  # of power iteration; it converges from below, and the margin of 1.2 to 4/3 covers what is missing

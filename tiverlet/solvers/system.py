@@ -3,10 +3,10 @@
 from typing import Any
 
 import numpy as np
-import taichi as ti
 
-from ..feature import Batch, Scene
-from ..scalar import Scalar
+from ..constraints.core.scalar import Scalar
+from ..device import ti
+from ..features.feature import Batch, Scene
 from .slots import Slots
 
 

@@ -79,7 +79,7 @@ def main(job: dict[str, Any], imported: float) -> None:
 
 def copied(size: int = 1 << 28) -> float:
     """Bytes per second that are read and written in a copy of a field of so many bytes; the best of five."""
-    import taichi as ti
+    from ...device import ti
 
     source, target, best = ti.field(ti.f32, size // 4), ti.field(ti.f32, size // 4), float("inf")
     for _ in range(6):  # the first one compiles

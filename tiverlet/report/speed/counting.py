@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from time import perf_counter
 from typing import Any
 
-import taichi as ti
 from taichi.lang import common_ops, impl, kernel_impl
 from taichi.lang.ast.ast_transformer import ASTTransformer
 
-from ...compiling import Quick
-from ...team import launching
+from ...device import ti
+from ...device.patches.compiler import Quick
+from ...device.thread_team import launching
 
 DT = 1 / 60  # [s] of a frame
 ATOMIC = (ti.atomic_add, ti.atomic_sub, ti.atomic_max, ti.atomic_min)

@@ -13,9 +13,9 @@ import numpy as np
 from rich.progress import Progress
 
 from ... import checks
-from ..sweep import machine, said
+from ..accuracy.sweep import machine, said
+from . import c_baseline, processes, stripped
 from . import peers as others
-from . import processes, stripped, yardstick
 from .result import Absent, Peer, Run, SpeedReport
 from .scenes import SCENES
 
@@ -86,7 +86,7 @@ class Session:
 
     def compile(self) -> None:
         """Compile the yardstick, or say why not."""
-        self.program, how = yardstick.build(self.folder)
+        self.program, how = c_baseline.build(self.folder)
         self.notes.append(f"pile.c: {how}." if self.program else f"Left out: the yardstick pile.c, since {how}.")
 
     @contextmanager
@@ -136,7 +136,7 @@ class Session:
                 warm = ours.ask()
                 both = [ours]
                 if self.program and name == "pile":
-                    both.append(stack.enter_context(yardstick.Yardstick(self.program, n, scene.substeps, threads)))
+                    both.append(stack.enter_context(c_baseline.Yardstick(self.program, n, scene.substeps, threads)))
                 times = self.turns(both, n, scene.substeps)
                 if not same:
                     qualities = [processes.quality(talker, frames) for talker in both]

@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from ...constraints import Box, Distance
+from ...colliders import Box
+from ...constraints import Distance
 from .counting import DT
 from .processes import Talker, paths
 from .scenes import SCENES

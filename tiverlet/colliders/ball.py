@@ -1,0 +1,119 @@
+"""A ball with particles outside, or inside."""
+
+import numpy as np
+
+from .. import checks
+from ..device import ti
+from ..features.feature import Knob, Scene
+from ..particles import Particles
+from .collider import TOUCH, Track, Wall
+
+
+class Ball(Wall):
+    """Particles stay outside of a disc or ball, or inside.
+
+    C(x) = |x - center| - (R + r) >= 0 outside, R - r - |x - center| >= 0 inside; grad C = +- (x - center) / |x - center|.
+
+    center: (dim,) [m], live: assign to it between frames, and the ball moves there during the next frame. radius: R [m], live: it
+    changes at once, and what is inside then goes out at push_out. inside: keep particles in. friction, restitution, push_out: see
+    Wall.
+
+    What passes through in one substep is caught on the way in: the moment when it met the surface is solved for, as for pairs.
+    Nothing passes at any speed, nor can anything draw it through.
+    """
+
+    dim = 0
+    center = Knob(lambda f, v: checks.vector("Ball", "center", v, f.dim or len(np.atleast_1d(v))), "Middle of the ball [m].")
+
+    radius = Knob(lambda f, v: f._size(v), "Of the ball [m].", device="_on_size")
+    widest = 0.0  # radius of a particle [m]
+
+    def __init__(self, center, radius, inside=False, *, friction=0.0, restitution=0.0, push_out=1.0):
+        self.center = center
+        self.inside = bool(inside)
+        self.radius = radius
+        self.surface(friction, restitution, push_out)
+
+    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Check the dimension, and that particles fit in."""
+        self.dim = particles.dim
+        self.center = self.center
+        wide = particles.radius >= self.radius
+        if self.inside and wide.any():
+            i = int(np.argmax(wide))
+            raise ValueError(f"Ball: particle {i} of radius {particles.radius[i]:g} m does not fit inside {self.radius:g} m.")
+        self.widest = float(particles.radius.max(initial=0.0))
+
+    def _size(self, value) -> float:
+        value = checks.number("Ball", "radius", value, above=0.0)
+        if self.inside and value <= self.widest:
+            raise ValueError(f"Ball: radius = {value:g}, but a particle of radius {self.widest:g} m does not fit inside.")
+        return value
+
+    @property
+    def repeats(self) -> bool:
+        """Inside, the way along the surface leads out, and a bounce may lead to the other end."""
+        return self.inside and (self._on_rubs or self._on_bounces)
+
+    def bind(self, scene: Scene) -> None:
+        """The center at the start and the end of a frame."""
+        Wall.bind(self, scene)
+        self._on_center = Track(scene.memory, "Ball.center", self.center)
+        self._on_size = scene.memory.field("Ball.radius", None, values=self.radius)
+        self.changed = False
+
+    def upload(self) -> None:
+        """Move to the new center."""
+        Wall.upload(self)
+        self.scene.memory.write(self._on_size, self.radius)
+        self._on_center.aim(self.center)
+        self.moving = True
+
+    def settle(self) -> None:
+        """Stay."""
+        self._on_center.settle()
+
+    def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
+        """A circle in 2D, three in 3D."""
+        turn = np.linspace(0, 2 * np.pi, 65)
+        circles = []
+        for a in range(self.dim):
+            for b in range(a):
+                circle = np.tile(self.center, (len(turn), 1))
+                circle[:, a] += self.radius * np.cos(turn)
+                circle[:, b] += self.radius * np.sin(turn)
+                circles.append(circle)
+        return np.array(circles), 0.0
+
+    @ti.func
+    def confine(self, i, radius, h, when, turn):
+        """The surface where it was met, or where it is nearest."""
+        center, moved = self._on_center.at(when[1]), self._on_center.step(when)
+        r = self._on_state.place(i) - center
+        far = ti.cast(self.radius, self._on_real)
+        depth, n = self.nearest(r, far, radius)
+        d = self.way(i, moved)
+        start = r - d
+        sunk, _n = self.nearest(start, far, radius)
+        if ti.static(not self.inside):
+            far += radius
+            c, b, a = start.dot(start) - far * far, start.dot(d), d.dot(d)
+            root = b * b - a * c
+            if c > -TOUCH * far * far and b < 0 and root > 0:
+                s = ti.max(c, 0) / (ti.sqrt(root) - b)
+                if s < 1:
+                    n = (start + s * d).normalized()
+                    depth = (s - 1) * d.dot(n)
+        self.press(i, depth, sunk, n, moved, h, turn)
+
+    @ti.func
+    def nearest(self, r, far, radius):
+        """Depth in the surface and its normal at r from the middle; a particle right there goes along +x."""
+        length, n = r.norm(), 0 * r
+        n[0] = 1
+        if length > 0:
+            n = r / length
+        depth = far + radius - length
+        if ti.static(self.inside):
+            depth, n = length + radius - far, -n
+        return depth, n

@@ -1,0 +1,140 @@
+"""A box with particles inside."""
+
+import warnings
+
+import numpy as np
+
+from .. import checks
+from ..device import ti
+from ..features.feature import Knob, Scene
+from ..particles import Particles
+from .collider import Wall
+
+
+def _corner(name: str):
+    def check(box: "Box", value):
+        value = checks.vector("Box", name, value, box.dim or len(np.atleast_1d(value)), infinite=True)
+        other = box.__dict__.get("upper" if name == "lower" else "lower")
+        if other is not None and len(other) == len(value):
+            lower, upper = (value, other) if name == "lower" else (other, value)
+            narrow = upper - lower < 2 * box.widest
+            if (narrow | (upper <= lower)).any():
+                k = int(np.argmax(narrow | (upper <= lower)))
+                raise ValueError(
+                    f"Box: along axis {k} it goes from {lower[k]:g} to {upper[k]:g} m, which does not hold a particle of "
+                    f"radius {box.widest:g} m. Make upper - lower at least {2 * box.widest:g} m and above 0."
+                )
+        return value
+
+    return check
+
+
+class Box(Wall):
+    """Particles stay inside: lower + radius <= x <= upper - radius along every axis.
+
+    C(x) = x_k - lower_k - radius >= 0 and upper_k - x_k - radius >= 0, with unit gradients along axis k.
+
+    lower, upper: (dim,) [m]; -inf and inf leave a side open. Live: assign to .lower or .upper between frames, and the walls move
+    there during the next frame (to or from an open side they jump). friction, restitution, push_out:
+    see Wall.
+
+    One-sided: a particle cannot leave at any speed, nor can anything draw it out.
+    """
+
+    dim = 0
+    poses = True
+    widest = 0.0
+    lower = Knob(_corner("lower"), "Lower corner [m].")
+    upper = Knob(_corner("upper"), "Upper corner [m].")
+
+    def __init__(self, lower, upper, *, friction=0.0, restitution=0.0, push_out=1.0):
+        self.lower = lower
+        self.upper = upper
+        self.surface(friction, restitution, push_out)
+
+    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Check the corners against the dimension and the widest particle."""
+        self.dim = particles.dim
+        self.widest = float(particles.radius.max(initial=0.0))
+        self.lower, self.upper = self.lower, self.upper
+
+    def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Warn of particles whose centers start outside."""
+        x = particles.position
+        out = np.maximum(self.lower - x, x - self.upper)
+        out[inv_mass == 0] = 0
+        if (out > 1e-6 * particles.size).any():
+            (i, k), number = np.unravel_index(int(np.argmax(out)), out.shape), int((out.max(axis=1) > 0).sum())
+            warnings.warn(
+                f"Box: particle {i} starts {out[i, k]:.3g} m outside along axis {k} ({number} such in all); "
+                f"push_out = {self.push_out:g} m/s brings it in. Move it, or make the box larger.",
+                stacklevel=3,
+            )
+
+    @property
+    def repeats(self) -> bool:
+        """In a corner friction on one side may lead into another, and a bounce may lead to the other end."""
+        return self._on_rubs or self._on_bounces
+
+    def bind(self, scene: Scene) -> None:
+        """Corners at the start and the end of a frame."""
+        Wall.bind(self, scene)
+        sides = np.concatenate([self.lower, self.upper])
+        self._on_sides = scene.memory.field("Box.sides", len(sides), width=2, values=np.stack([sides, sides], 1), state=True)
+        self._on_now = scene.memory.field("Box.sides_now", len(sides), width=2)  # the plane, and how far it goes in the substep
+        self.changed = False
+
+    def upload(self) -> None:
+        """Move from the last corners to the new ones."""
+        Wall.upload(self)
+        old, new = self.scene.memory.read(self._on_sides)[:, 1], np.concatenate([self.lower, self.upper])
+        jump = np.isinf(old) | np.isinf(new)
+        self.scene.memory.write(self._on_sides, np.stack([np.where(jump, new, old), new], axis=1))
+        self.moving = True
+
+    def settle(self) -> None:
+        """Stay."""
+        sides = self.scene.memory.read(self._on_sides)[:, 1]
+        self.scene.memory.write(self._on_sides, np.stack([sides, sides], axis=1))
+
+    def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
+        """The edges, if all sides are closed."""
+        if not (np.isfinite(self.lower).all() and np.isfinite(self.upper).all()):
+            return Wall.outline(self, low, high)
+        bits = np.array([[(c >> k) & 1 for k in range(self.dim)] for c in range(2**self.dim)])
+        corners = np.where(bits, self.upper, self.lower)
+        edges = [(a, b) for a in range(len(bits)) for b in range(a) if np.abs(bits[a] - bits[b]).sum() == 1]
+        return corners[np.array(edges)], 0.0
+
+    @ti.func
+    def pose(self, when):
+        """Where the planes are; what stands is where it stands, to the bit, and at infinity too."""
+        for side in range(ti.static(2 * self.dim)):
+            a, b = self._on_sides[side][0], self._on_sides[side][1]
+            at, shift = b, ti.zero(b)
+            if a != b:
+                at, shift = a * (1 - when[1]) + b * when[1], (b - a) * (when[1] - when[0])
+            self._on_now[side] = ti.Vector([at, shift])
+
+    @ti.func
+    def near(self, i, radius):
+        """1 if there may be something to press()."""
+        out, x, close = 0, self._on_state.place(i), self._on_state.digits(i)
+        for k in ti.static(range(self.dim)):
+            out |= ti.cast(self._on_now[k][0] + radius - x[k] > -close, ti.i32)
+            out |= ti.cast(x[k] + radius - self._on_now[k + self.dim][0] > -close, ti.i32)
+        return out
+
+    @ti.func
+    def confine(self, i, radius, h, when, turn):
+        """Two planes per axis, lower ones first."""
+        if self.near(i, radius) != 0:
+            for side in range(ti.static(2 * self.dim)):
+                wall, shift, x = self._on_now[side][0], self._on_now[side][1], self._on_state.place(i)
+                n, moved, depth = ti.zero(x), ti.zero(x), ti.zero(wall)
+                for k in ti.static(range(self.dim)):
+                    if side == k:
+                        n[k], moved[k], depth = 1, shift, wall + radius - x[k]
+                    elif side == k + self.dim:
+                        n[k], moved[k], depth = -1, shift, x[k] + radius - wall
+                self.press(i, depth, depth + self.way(i, moved).dot(n), n, moved, h, turn)

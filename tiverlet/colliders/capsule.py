@@ -1,0 +1,119 @@
+"""A rod with round ends."""
+
+import numpy as np
+
+from .. import checks
+from ..device import ti
+from ..features.feature import Knob, Scene
+from ..particles import Particles
+from .collider import TOUCH, Track, Wall
+
+MARCH = 32  # steps along a path; what only grazes is then within 1e-6 of its way
+
+
+def _end(name: str) -> Knob:
+    return Knob(lambda f, v: checks.vector("Capsule", name, v, f.dim or len(np.atleast_1d(v))), "End of the axis [m].")
+
+
+class Capsule(Wall):
+    """Particles stay outside of all points within `radius` of the segment from a to b: a rod, a peg, a thin wall.
+
+    C(x) = |x - q| - (R + r) >= 0 with q the nearest point of the segment; grad C = (x - q) / |x - q|.
+
+    a, b: (dim,) [m], live: the ends move to what is assigned during the next frame. radius: R [m], above 0,
+    live: it changes at once. friction, restitution, push_out: see Wall.
+
+    What passes through in one substep is caught on the way in, however thin the rod: the path, as seen from the rod, is followed
+    to where it meets the surface (sphere tracing, Hart 1996). Nothing can be drawn through either.
+    """
+
+    dim = 0
+    a, b = _end("a"), _end("b")
+    radius = Knob(lambda f, v: checks.number("Capsule", "radius", v, above=0.0), "Of the rod [m].", device="_on_size")
+
+    def __init__(self, a, b, radius, *, friction=0.0, restitution=0.0, push_out=1.0):
+        self.a, self.b = a, b
+        self.radius = radius
+        self.surface(friction, restitution, push_out)
+
+    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Check the dimension."""
+        self.dim = particles.dim
+        self.a, self.b = self.a, self.b
+
+    def bind(self, scene: Scene) -> None:
+        """The ends at the start and the end of a frame."""
+        Wall.bind(self, scene)
+        self._on_size = scene.memory.field("Capsule.radius", None, values=self.radius)
+        self._on_a, self._on_b = Track(scene.memory, "Capsule.a", self.a), Track(scene.memory, "Capsule.b", self.b)
+        self.changed = False
+
+    def upload(self) -> None:
+        """Move to the new ends."""
+        Wall.upload(self)
+        self.scene.memory.write(self._on_size, self.radius)
+        self._on_a.aim(self.a)
+        self._on_b.aim(self.b)
+        self.moving = True
+
+    def settle(self) -> None:
+        """Stay."""
+        self._on_a.settle()
+        self._on_b.settle()
+
+    def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
+        """The axis, as thick as the rod."""
+        return np.array([[self.a, self.b]]), self.radius
+
+    @ti.func
+    def nearest(self, x, a, b):
+        """Where on the axis, from 0 at a to 1 at b, the point nearest to x is, the distance to it, and the direction from it."""
+        axis = b - a
+        size = axis.dot(axis)
+        t = 0 * size
+        if size > 0:
+            t = ti.min(ti.max((x - a).dot(axis) / size, 0), 1)
+        r = x - a * (1 - t) - b * t
+        length, n = r.norm(), 0 * r
+        n[0] = 1
+        if length > 0:
+            n = r / length
+        return t, length, n
+
+    @ti.func
+    def along(self, x, a, b, when):
+        """Where a point at x, at the start of the substep, would be if the rod took it along as it turns: beside the same place
+        on the axis, which ends between a and b, and as far from it."""
+        t, length, n = self.nearest(x, self._on_a.at(when[0]), self._on_b.at(when[0]))
+        axis = b - a
+        if 0 < t < 1:
+            n -= axis * (n.dot(axis) / axis.dot(axis))
+        return a * (1 - t) + b * t + n * (length / ti.max(n.norm(), TOUCH))
+
+    @ti.func
+    def confine(self, i, radius, h, when, turn):
+        """The surface where it was met, or where it is nearest."""
+        a, b = self._on_a.at(when[1]), self._on_b.at(when[1])
+        x, far = self._on_state.place(i), ti.cast(self.radius, self._on_real) + radius
+        t, length, n = self.nearest(x, a, b)
+        depth = far - length
+        moved = self._on_a.step(when) * (1 - t) + self._on_b.step(when) * t
+        d = self.way(i, moved)
+        if (self._on_a.step(when) != self._on_b.step(when)).any():
+            d = x - self.along(x - self.way(i, 0 * x), a, b, when)
+        way = d.norm()
+        _t, gap, _n = self.nearest(x - d, a, b)  # not twice the same name: Taichi would assign a vector to a number
+        gap -= far
+        sunk = -gap
+        # It was outside, or touched, and may have come in: walk along the path, never further than the surface is away.
+        if gap > -TOUCH * far and gap < way:
+            s = ti.max(gap, 0) / way
+            for k in range(MARCH):
+                if s < 1:
+                    _t, gap, _n = self.nearest(x - (1 - s) * d, a, b)
+                    s += ti.max(gap - far, 0) / way
+            depth = 0 * depth
+            if s < 1:
+                _t, _gap, n = self.nearest(x - (1 - s) * d, a, b)
+                depth = (s - 1) * d.dot(n)
+        self.press(i, depth, sunk, n, moved, h, turn)

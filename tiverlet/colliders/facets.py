@@ -1,0 +1,212 @@
+"""Walls made of facets: segments in 2D, triangles in 3D."""
+
+import numpy as np
+
+from ..device import ti
+from ..features.feature import Scene
+from ..particles import Particles
+from .collider import TOUCH
+from .facet_grid import Buckets
+from .moving import Solid
+
+NEWTON = 16  # steps to the moment of a touch; only what grazes needs more than 3
+
+
+class Facets(Solid):
+    """A wall made of facets: corners (m, dim, dim) [m], and the outward normal of each by the order of its corners.
+
+    C(x) = dist(x, facets) - (R + r) >= 0 with R the rounding, grad C the direction from the nearest point.
+
+    The distance to one facet is convex along a straight way, so Newton's method from its start goes to the moment of the touch
+    without ever overshooting. A facet that is touched at a corner or an edge counts only where no neighbour is nearer, which is
+    seen from the directions (`wings`) in which the neighbours go on; so nothing catches on the seams of a flat surface.
+
+    Subclasses set, in the wall's frame: corners, features (m, k) the numbers of the corners (and in 3D, from column 3, of the
+    edges 01, 12, 20), wings as (feature, direction) pairs, facing (features, dim) the mean normals there.
+    """
+
+    closed = True
+    corners: np.ndarray
+    features: np.ndarray
+    wings: tuple[np.ndarray, np.ndarray]
+    facing: np.ndarray
+
+    @property
+    def normals(self) -> np.ndarray:
+        """Unit normals of the facets."""
+        c = self.corners
+        if c.shape[1] == 2:
+            u = c[:, 1] - c[:, 0]
+            n = np.stack([u[:, 1], -u[:, 0]], axis=1)
+        else:
+            n = np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0])
+        return n / np.linalg.norm(n, axis=1)[:, None]
+
+    def check_thickness(self, particles: Particles) -> None:
+        """Refuse points that meet a wall without thickness: a point on it would have no side."""
+        points = particles.radius + self.radius == 0
+        if not self.closed and points.any():
+            raise ValueError(
+                f"{self!r}: particle {int(np.argmax(points))} has radius 0, and so has the open wall, so nothing tells on which "
+                "side of it the particle is. Give one of them a radius."
+            )
+
+    def bind(self, scene: Scene) -> None:
+        """The facets, and for each cell of space those within reach."""
+        Solid.bind(self, scene)
+        name, add, dim = repr(self), scene.memory.field, self.dim
+        size = float(np.abs(self.corners).max())
+        self._on_close = size * (2.0**-21 if scene.real == ti.f32 else 2.0**-50)
+        self._on_touch = TOUCH * size
+        self._on_tilt, self._on_slight = (2.0**-18, 2.0**-20) if scene.real == ti.f32 else (2.0**-40, 2.0**-48)
+        buckets = Buckets(self.corners, float(scene.particles.radius.max(initial=0.0)) + self.radius, self.closed)
+        self._on_reach, self._on_cell, self._on_shape = buckets.reach, buckets.cell, buckets.shape.tolist()
+        self._on_low, self._on_high = self.corners.min(axis=(0, 1)).tolist(), self.corners.max(axis=(0, 1)).tolist()
+        self._on_pieces = 4 * int(buckets.shape.sum()) + 64
+        self._on_all = len(buckets.begin) - 2  # the last bucket holds all facets, for what starts deep inside
+        self._on_beyond = self.closed and self.turned_in
+        order = np.argsort(self.wings[0], kind="stable")
+        begin = np.searchsorted(self.wings[0][order], np.arange(len(self.facing) + 1))
+        self._on_corner = add(f"{name}.corner", len(self.corners) * dim, width=dim, values=self.corners.reshape(-1, dim))
+        self._on_normal = add(f"{name}.normal", len(self.corners), width=dim, values=self.normals)
+        self._on_feature = add(f"{name}.feature", self.features.size, kind=ti.i32, values=self.features.ravel())
+        self._on_facing = add(f"{name}.facing", len(self.facing), width=dim, values=self.facing)
+        self._on_wing = add(f"{name}.wing", len(order), width=dim, values=self.wings[1][order])
+        self._on_wing_begin = add(f"{name}.wing_begin", len(begin), kind=ti.i32, values=begin)
+        self._on_bucket = add(f"{name}.bucket", len(buckets.bucket), kind=ti.i32, values=buckets.bucket)
+        self._on_begin = add(f"{name}.begin", len(buckets.begin), kind=ti.i32, values=buckets.begin)
+        self._on_list = add(f"{name}.list", len(buckets.list), kind=ti.i32, values=buckets.list)
+
+    turned_in = False  # particles are kept inside: the solid is all around
+
+    @ti.func
+    def corner(self, f, k):
+        """Corner k of facet f."""
+        return self._on_corner[f * self.dim + k]
+
+    @ti.func
+    def nearest(self, f, q):
+        """Distance from q to facet f, the direction from the nearest point to q, and the feature that has it (-1: none)."""
+        n = self._on_normal[f]
+        r, at, over = q - self.corner(f, 0), -1, True
+        least = r.dot(r)
+        for k in range(ti.static(1 if self.dim == 2 else 3)):
+            a = self.corner(f, k)
+            u, v = self.corner(f, (k + 1) % self.dim) - a, q - a
+            t, uu = v.dot(u), u.dot(u)
+            if ti.static(self.dim == 2):
+                over = 0 < t < uu
+            elif v.dot(n.cross(u)) < 0:
+                over = False
+            v -= ti.min(ti.max(t / uu, 0), 1) * u
+            if k == 0 or v.dot(v) < least:
+                least, r, at = v.dot(v), v, self.dim + k
+                if t <= 0:
+                    at = k
+                elif t >= uu:
+                    at = (k + 1) % self.dim
+        if over:
+            r, at = q - self.corner(f, 0), -1
+        height = r.dot(n)
+        distance = ti.abs(height)
+        if at >= 0:
+            distance = r.norm()
+            at = self._on_feature[f * ti.static(self.features.shape[1]) + at]
+            if distance > 0:
+                n = r / distance
+        elif height < 0:
+            n = -n
+        return distance, n, at
+
+    @ti.func
+    def around(self, q):
+        """Where the list of the facets around q begins and ends, and how far from q there are no others."""
+        low, high = self.constant(self._on_low), self.constant(self._on_high)
+        reach, size = ti.cast(self._on_reach, self._on_real), ti.cast(self._on_cell, self._on_real)
+        off = ti.max(low - q, q - high)
+        clear = off[0]
+        for k in ti.static(range(1, self.dim)):
+            clear = ti.max(clear, off[k])
+        bucket = -1
+        if clear < reach:
+            cell = ti.floor((q - low + reach) / size, ti.i32)
+            where = 0
+            for k in ti.static(range(self.dim - 1, -1, -1)):
+                where = where * self._on_shape[k] + ti.min(ti.max(cell[k], 0), self._on_shape[k] - 1)
+            bucket = self._on_bucket[where]
+            clear = reach
+            if bucket < 0:
+                clear += (-1 - bucket) * size
+        elif ti.static(self._on_beyond):
+            bucket = self._on_all
+        begin, end = 0, 0
+        if bucket >= 0:
+            begin, end = self._on_begin[bucket], self._on_begin[bucket + 1]
+        return begin, end, clear
+
+    @ti.func
+    def constant(self, values: ti.template()):  # type: ignore[valid-type]
+        """A vector of numbers that are known when the kernel is compiled."""
+        return ti.Vector([ti.cast(v, self._on_real) for v in ti.static(values)])
+
+    @ti.func
+    def strike(self, a, e, far, close, limit):
+        """The first touch of any facet on the way. Where the start is inside of a closed shape, the nearest facet lets it out."""
+        way, s, piece = e.norm(), 0 * far, 0
+        best, depth, normal = 0 * far + 2, 0 * far, 0 * e
+        least, outside, exit = far + way + 1, 0 * far + 1, 0 * e
+        while s < 1 and s < best and piece < self._on_pieces:
+            begin, end, clear = self.around(a + s * e)
+            for place in range(begin, end):
+                f, t, going = self._on_list[place], 0 * far, True
+                for k in range(NEWTON):
+                    if going:
+                        distance, n, at = self.nearest(f, a + t * e)
+                        out = self._on_normal[f]
+                        if at >= 0:
+                            out = self._on_facing[at]
+                        side = n.dot(out)
+                        if ti.static(self.closed):
+                            if k == 0 and piece == 0 and distance < least:
+                                least, outside, exit = distance, side, -n
+                            if distance <= self._on_touch:
+                                # On the surface itself, each facet that is touched there has its own direction.
+                                distance, n, at = ti.select(side < 0, -distance, distance), self._on_normal[f], -1
+                        gap, slope = distance - far, e.dot(n)
+                        if gap <= close or k == NEWTON - 1:
+                            going = False
+                            below = -(gap + (1 - t) * slope)
+                            toward = slope < -ti.cast(self._on_slight, self._on_real) * way
+                            hit = toward and t > 0 and below > 0
+                            if t == 0:
+                                if toward:
+                                    below = ti.max(below, ti.min(-slope, close))
+                                behind = ti.static(self.closed) and side < 0 and at < 0 and distance > 0
+                                hit = not behind and (toward or ti.min(below, limit - slope) > 2 * close)
+                            if hit and (t < best or (t == best and below > depth)):
+                                if self.alone(at, n):
+                                    best, depth, normal = t, below, n
+                        elif slope < 0:
+                            t -= gap / slope
+                            going = t <= 1
+                        else:
+                            going = False
+            s += (clear - far) / way
+            piece += 1
+        if ti.static(self.closed):
+            if outside < 0 and least > self._on_touch:
+                below = far + least - e.dot(exit)
+                best = 0 * far + 2
+                if ti.min(below, limit - e.dot(exit)) > 2 * close:
+                    best, depth, normal = 0 * far, below, exit
+        return best, depth, normal
+
+    @ti.func
+    def alone(self, at, n):
+        """Whether no neighbour of a feature is nearer in the direction n."""
+        out = True
+        if at >= 0:
+            for k in range(self._on_wing_begin[at], self._on_wing_begin[at + 1]):
+                if n.dot(self._on_wing[k]) > self._on_tilt:
+                    out = False
+        return out

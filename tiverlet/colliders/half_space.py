@@ -1,0 +1,75 @@
+"""A plane with particles on one side."""
+
+import numpy as np
+
+from .. import checks
+from ..device import ti
+from ..features.feature import Knob, Scene
+from ..particles import Particles
+from .collider import Wall
+
+
+class HalfSpace(Wall):
+    """Particles stay on the side of a plane to which the normal points: a floor, a slope.
+
+    C(x) = n . x - offset - radius >= 0, grad C = n.
+
+    normal: (dim,), any length above 0; offset: [m] along the unit normal, from the origin. offset is live: assign to it between
+    frames, and the plane moves there during the next frame. friction, restitution, push_out: see Wall.
+
+    One-sided: a particle cannot pass at any speed, nor can anything draw it through.
+    """
+
+    offset = Knob(lambda f, v: checks.number("HalfSpace", "offset", v), "Of the plane along its normal [m].")
+
+    def __init__(self, normal, offset=0.0, *, friction=0.0, restitution=0.0, push_out=1.0):
+        normal = np.asarray(normal, dtype=np.float64)
+        normal = checks.vector("HalfSpace", "normal", normal, normal.size)
+        length = float(np.linalg.norm(normal))
+        if length == 0:
+            raise ValueError("HalfSpace: normal = 0 has no direction; (0, 1) is a floor.")
+        self.normal = normal / length
+        self.normal.flags.writeable = False
+        self.offset = offset
+        self.surface(friction, restitution, push_out)
+
+    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Check the normal's length."""
+        checks.vector("HalfSpace", "normal", self.normal, particles.dim)
+
+    def bind(self, scene: Scene) -> None:
+        """Normal, and the offsets at the start and the end of a frame."""
+        Wall.bind(self, scene)
+        self._on_normal = scene.memory.field("HalfSpace.normal", None, width=len(self.normal), values=self.normal)
+        self._on_offset = scene.memory.field("HalfSpace.offset", None, width=2, values=[self.offset] * 2, state=True)
+        self.changed = False
+
+    def upload(self) -> None:
+        """Move from the last offset to the new one."""
+        Wall.upload(self)
+        memory = self.scene.memory
+        memory.write(self._on_offset, [memory.read(self._on_offset)[0, 1], self.offset])
+        self.moving = True
+
+    def settle(self) -> None:
+        """Stay."""
+        memory = self.scene.memory
+        memory.write(self._on_offset, memory.read(self._on_offset)[0, 1])
+
+    def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
+        """Lines across the scene: one in 2D, two at right angles in 3D."""
+        middle, reach = (low + high) / 2, float(np.linalg.norm(high - low)) or 1.0
+        foot = middle - (self.normal @ middle - self.offset) * self.normal
+        across = np.linalg.svd(self.normal[None])[2][1:]  # an orthonormal basis of the plane
+        return np.stack([foot - reach * across, foot + reach * across], axis=1), 0.0
+
+    @ti.func
+    def confine(self, i, radius, h, when, turn):
+        """One plane."""
+        n, offset = self._on_normal[None], self._on_offset[None]
+        before, now = (
+            offset[0] * (1 - when[0]) + offset[1] * when[0],
+            offset[0] * (1 - when[1]) + offset[1] * when[1],
+        )
+        depth, moved = now + radius - n.dot(self._on_state.place(i)), (now - before) * n
+        self.press(i, depth, depth + self.way(i, moved).dot(n), n, moved, h, turn)

@@ -1,0 +1,144 @@
+"""A wall along a triangle mesh."""
+
+import numpy as np
+
+from .. import checks
+from ..particles import Particles
+from .facets import Facets
+
+FLAT = 0.999  # cosine between faces whose common edge is not drawn
+
+
+class Mesh(Facets):
+    """Particles stay outside of a closed triangle mesh, or inside; or on their own side of an open sheet (3D).
+
+    C(x) = dist(x, faces) - (R + r) >= 0, grad C the direction from the nearest point of the mesh (see Facets).
+
+    vertices: (m, 3) [m]. faces: (k, 3) vertices of each triangle, either way round: they are turned alike here, and outwards.
+    inside: keep particles in. closed: False for a sheet, a thin wall with two sides. radius: R [m], what the faces are thickened
+    by; a sheet that points (particles of radius 0) meet needs some. position, rotation: where the vertices are put (see Solid);
+    live. friction, restitution, push_out: see Wall.
+
+    Nothing passes, at any speed of the particle or of the wall. The cost for a particle grows with the faces around it, not with
+    those of the mesh. Raises ValueError for faces of no area, and for a closed mesh with an edge that does not have two faces.
+    """
+
+    dim = 3
+
+    def __init__(
+        self, vertices, faces, inside=False, *, closed=True, radius=0.0, position=0.0, rotation=0.0, friction=0.0,
+        restitution=0.0, push_out=1.0,
+    ):  # fmt: skip
+        vertices = checks.points("Mesh", "vertices", vertices, dim=3)
+        faces = checks.indices("Mesh", "faces", faces, len(vertices), arity=3).astype(int)
+        self.closed, self.turned_in = bool(closed), bool(inside)
+        self.radius = radius
+        if self.turned_in and not self.closed:
+            raise ValueError("Mesh: inside = True needs an inside; a sheet (closed = False) has none.")
+        if not len(faces):
+            raise ValueError("Mesh: faces is empty; a wall needs at least one.")
+        corners = vertices[faces]
+        u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        longest = np.linalg.norm([u, v, v - u], axis=2).max(axis=0)
+        flat = np.linalg.norm(np.cross(u, v), axis=1) <= 1e-9 * longest * np.maximum(longest, np.abs(vertices).max())
+        if flat.any():
+            k = int(np.argmax(flat))
+            raise ValueError(f"Mesh: faces[{k}] = {tuple(faces[k].tolist())} has no area; leave it out.")
+        if self.closed:
+            faces = self._outward(vertices, faces)
+        self.vertices, self.faces = vertices, faces
+        for array in (vertices, faces):
+            array.flags.writeable = False
+        self.place(position, rotation)
+        self.surface(friction, restitution, push_out)
+        self._join()
+
+    def _outward(self, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+        """The faces with their corners in the order that makes normals point away from the solid."""
+        halves = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+        owner = np.repeat(np.arange(len(faces)), 3)
+        edges, which, number = np.unique(np.sort(halves, axis=1), axis=0, return_inverse=True, return_counts=True)
+        if (number != 2).any():
+            e = int(np.argmax(number != 2))
+            k = int(owner[np.argmax(which.ravel() == e)])
+            what = "one face only" if number[e] == 1 else f"{number[e]} faces"
+            raise ValueError(
+                f"Mesh: the edge {tuple(edges[e].tolist())} of faces[{k}] belongs to {what}, but each edge of a closed mesh has "
+                "two. Merge vertices that are in the same place, close the hole, or use closed = False for a thin sheet."
+            )
+        order = np.argsort(which.ravel(), kind="stable").reshape(-1, 2)
+        first, second = owner[order].T
+        same = (halves[order[:, 0]] == halves[order[:, 1]]).all(axis=1)  # both run along it the same way: one is turned
+        if same.any():
+            faces = np.where(_turned(len(faces), first, second, same)[:, None], faces[:, ::-1], faces)
+        c = vertices[faces] - vertices.mean(axis=0)
+        volume = float(np.einsum("ij,ij->i", c[:, 0], np.cross(c[:, 1], c[:, 2])).sum()) / 6
+        if abs(volume) <= 1e-12 * np.abs(c).max() ** 3:
+            raise ValueError(f"Mesh: faces enclose a volume of {volume:g} m^3; closed = False makes a sheet of them.")
+        return faces[:, ::-1] if (volume < 0) != self.turned_in else faces
+
+    def _join(self) -> None:
+        """Corners and edges, the ways in which the faces go on from them, and the mean normals there."""
+        faces, m = self.faces, len(self.vertices)
+        self.corners = c = self.vertices[faces]
+        normal = self.normals
+        pairs = faces[:, [[0, 1], [1, 2], [2, 0]]]
+        self.edges, which = np.unique(np.sort(pairs.reshape(-1, 2), axis=1), axis=0, return_inverse=True)
+        edge = which.reshape(-1, 3)
+        self.features = np.concatenate([faces, m + edge], axis=1)
+        along = self.vertices[self.edges[:, 1]] - self.vertices[self.edges[:, 0]]
+        along /= np.linalg.norm(along, axis=1)[:, None]
+        # From an edge, the face goes on at right angles to it; from a corner, along its edges.
+        opposite = c[:, [2, 0, 1]] - c
+        across = opposite - (opposite * along[edge]).sum(axis=2)[:, :, None] * along[edge]
+        across /= np.linalg.norm(across, axis=2)[:, :, None]
+        self.wings = (
+            np.concatenate([m + edge.ravel(), self.edges[:, 0], self.edges[:, 1]]),
+            np.concatenate([across.reshape(-1, 3), along, -along]),
+        )
+        # The sum of normals weighted by angles tells inside from outside at a corner (Baerentzen and Aanaes 2005).
+        sides = c[:, [1, 2, 0]] - c
+        sides /= np.linalg.norm(sides, axis=2)[:, :, None]
+        angle = np.arccos(np.clip(-(sides * sides[:, [2, 0, 1]]).sum(axis=2), -1, 1))
+        facing = np.zeros((m + len(self.edges), 3))
+        np.add.at(facing, faces, angle[:, :, None] * normal[:, None])
+        np.add.at(facing, m + edge, np.repeat(normal[:, None], 3, axis=1))
+        self.creases = np.linalg.norm(facing[m:], axis=1) < 2 * np.sqrt((1 + FLAT) / 2)
+        size = np.linalg.norm(facing, axis=1)
+        weak = np.flatnonzero(size[self.features].ravel() < 1e-9)
+        facing[self.features.ravel()[weak]] = np.repeat(normal, 6, axis=0)[weak]  # a knife's edge: either side will do
+        self.facing = facing / np.maximum(np.linalg.norm(facing, axis=1), 1e-9)[:, None]
+
+    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Check the dimension, and that particles and sheet are not both without thickness."""
+        Facets.prepare(self, particles, inv_mass)
+        self.check_thickness(particles)
+
+    def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
+        """The edges where the mesh bends."""
+        return self.placed(self.vertices[self.edges[self.creases]]), self.radius
+
+
+def _turned(count: int, first: np.ndarray, second: np.ndarray, same: np.ndarray) -> np.ndarray:
+    """Which faces to turn so that all neighbours agree, given pairs of neighbours and whether exactly one of them is turned."""
+    a, b, differ = np.concatenate([first, second]), np.concatenate([second, first]), np.concatenate([same, same])
+    order = np.argsort(a, kind="stable")
+    b, differ = b[order], differ[order]
+    begin = np.searchsorted(a[order], np.arange(count + 1))
+    turned = np.full(count, -1)
+    for seed in range(count):
+        if turned[seed] >= 0:
+            continue
+        turned[seed], queue = 0, [seed]
+        while queue:
+            f = queue.pop()
+            for k in range(begin[f], begin[f + 1]):
+                want = turned[f] ^ int(differ[k])
+                if turned[b[k]] < 0:
+                    turned[b[k]] = want
+                    queue.append(int(b[k]))
+                elif turned[b[k]] != want:
+                    raise ValueError(
+                        f"Mesh: the faces around faces[{f}] have no outside; a Moebius strip or a Klein bottle has none."
+                    )
+    return turned == 1

@@ -1,0 +1,119 @@
+"""A wall along a polygon."""
+
+import numpy as np
+
+from .. import checks
+from ..particles import Particles
+from .facets import Facets
+
+BLOCK = 1 << 20  # pairs of edges that are compared together
+
+
+class Polygon(Facets):
+    """Particles stay outside of a polygon, or inside; or on their own side of an open line (2D).
+
+    C(x) = dist(x, outline) - (R + r) >= 0, grad C the direction from the nearest point of the outline (see Facets).
+
+    vertices: (m, 2) [m], in order, either way round; concave outlines are fine. inside: keep particles in. closed: False for a
+    line from the first vertex to the last, a thin wall with two sides. radius: R [m], what the outline is thickened by; a line
+    that points (particles of radius 0) meet needs some. position, rotation: where the vertices are put (see Solid); live.
+    friction, restitution, push_out: see Wall.
+
+    Nothing passes, at any speed of the particle or of the wall. Raises ValueError for edges of no length, and for a closed
+    outline that has no area or meets itself.
+    """
+
+    dim = 2
+
+    def __init__(
+        self, vertices, inside=False, *, closed=True, radius=0.0, position=0.0, rotation=0.0, friction=0.0, restitution=0.0,
+        push_out=1.0,
+    ):  # fmt: skip
+        vertices = checks.points("Polygon", "vertices", vertices, dim=2)
+        self.closed, self.turned_in = bool(closed), bool(inside)
+        self.radius = radius
+        if self.turned_in and not self.closed:
+            raise ValueError("Polygon: inside = True needs an inside; an open line (closed = False) has none.")
+        if self.closed and len(vertices) > 1 and (vertices[0] == vertices[-1]).all():
+            vertices = vertices[:-1]  # written as a loop that ends where it began
+        if len(vertices) < (3 if self.closed else 2):
+            raise ValueError(f"Polygon: vertices has shape {vertices.shape}, but at least {3 if self.closed else 2} are needed.")
+        m = len(vertices) if self.closed else len(vertices) - 1
+        i, j = np.arange(m), (np.arange(m) + 1) % len(vertices)
+        size = np.abs(vertices).max()
+        short = np.linalg.norm(vertices[j] - vertices[i], axis=1) <= 1e-9 * size
+        if short.any():
+            k = int(np.argmax(short))
+            raise ValueError(f"Polygon: vertices[{i[k]}] and vertices[{j[k]}] are the same point; leave one out.")
+        if self.closed:
+            _check_simple(vertices, i, j)
+            v = vertices - vertices.mean(axis=0)
+            area = float((v[i, 0] * v[j, 1] - v[j, 0] * v[i, 1]).sum()) / 2
+            if abs(area) <= 1e-12 * size**2:
+                raise ValueError(f"Polygon: vertices enclose an area of {area:g} m^2; closed = False makes a line of them.")
+            if (area < 0) != self.turned_in:
+                i, j = j, i
+        self.vertices = vertices
+        self.vertices.flags.writeable = False
+        self.place(position, rotation)
+        self.surface(friction, restitution, push_out)
+        along = vertices[j] - vertices[i]
+        along /= np.linalg.norm(along, axis=1)[:, None]
+        self.corners, self.features = vertices[np.stack([i, j], axis=1)], np.stack([i, j], axis=1)
+        self.wings = np.concatenate([i, j]), np.concatenate([along, -along])
+        facing = np.zeros_like(vertices)
+        normal = self.normals
+        np.add.at(facing, i, normal)
+        np.add.at(facing, j, normal)
+        facing[i] = np.where(np.linalg.norm(facing[i], axis=1)[:, None] > 1e-9, facing[i], normal)
+        self.facing = facing / np.maximum(np.linalg.norm(facing, axis=1)[:, None], 1e-9)
+
+    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Check the dimension, and that particles and line are not both without thickness."""
+        Facets.prepare(self, particles, inv_mass)
+        self.check_thickness(particles)
+
+    def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
+        """The polygon."""
+        loop = np.concatenate([self.vertices, self.vertices[:1]]) if self.closed else self.vertices
+        return self.placed(loop)[None], self.radius
+
+
+def _check_simple(vertices: np.ndarray, i: np.ndarray, j: np.ndarray) -> None:
+    """Raise for the first two edges that cross or touch, other than neighbours where they join."""
+    a, b, m = vertices[i], vertices[j], len(vertices)
+    low, high = np.minimum(a, b), np.maximum(a, b)
+    order = np.argsort(low[:, 0], kind="stable")
+    # Edges that begin, along x, before another one ends.
+    ends = np.searchsorted(low[order, 0], high[order, 0], side="right")
+    number = ends - np.arange(m) - 1
+    for group in np.split(np.arange(m), np.flatnonzero(np.diff(np.cumsum(number) // BLOCK)) + 1):
+        p = np.repeat(group, number[group])
+        q = p + 1 + np.arange(len(p)) - np.repeat(np.cumsum(number[group]) - number[group], number[group])
+        p, q = np.minimum(order[p], order[q]), np.maximum(order[p], order[q])
+        near = (low[p, 1] <= high[q, 1]) & (low[q, 1] <= high[p, 1])
+        p, q = p[near], q[near]
+        wrong = _meet(a[p], b[p], a[q], b[q])
+        joined = (q - p == 1) | ((p == 0) & (q == m - 1))
+        # Neighbours meet in their joint, and only there unless one folds back onto the other.
+        shared = np.where((q - p == 1)[:, None], a[q], a[p])
+        one, two = np.where((shared == a[p]).all(1)[:, None], b[p], a[p]), np.where((shared == a[q]).all(1)[:, None], b[q], a[q])
+        u, v = one - shared, two - shared
+        folded = (np.abs(_cross(u, v)) <= 1e-12 * np.linalg.norm(u, axis=1) * np.linalg.norm(v, axis=1)) & ((u * v).sum(1) > 0)
+        wrong = np.where(joined, folded, wrong)
+        if wrong.any():
+            k = int(np.argmax(wrong))
+            e, f = (f"{int(n)}-{int((n + 1) % m)}" for n in (p[k], q[k]))
+            raise ValueError(f"Polygon: the edges {e} and {f} of vertices meet, so it has no clear inside; take them apart.")
+
+
+def _cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    return u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
+
+
+def _meet(a, b, c, d) -> np.ndarray:
+    """Whether segments a-b and c-d have a point in common."""
+    s, t = np.sign(_cross(b - a, c - a)), np.sign(_cross(b - a, d - a))
+    u, v = np.sign(_cross(d - c, a - c)), np.sign(_cross(d - c, b - c))
+    flat = (s == 0) & (t == 0)  # all four on one line: then their boxes, which overlap, tell
+    return ((s != t) & (u != v)) | flat

@@ -1,0 +1,283 @@
+"""A wall given by a function."""
+
+import inspect
+from typing import Any
+
+import numpy as np
+
+from ..device import runtime, ti
+from ..device.patches.compiler import Compiler
+from ..features.feature import Scene
+from ..particles import Particles
+from ..tools import golden
+from .moving import Solid, rotation_matrix
+
+MARCH = 64  # steps along a way; what has not come to its end by then stays where it is
+FINE = 1 / 64  # of a way: closer than that, the surface is taken for its tangent plane
+SAMPLES = 4096  # places where the function is looked at before it is used
+STEEP, FLAT = 1.1, 0.9  # bounds of the gradient that pass for 1
+
+
+class Sdf(Solid):
+    """Particles stay where a function is positive: outside of any shape that can be written down.
+
+    C(x) = function(x) - (R + r) >= 0, grad C = grad function.
+
+    function: a ti.func that takes a position [m] and returns the signed distance to the surface [m], negative inside of the
+    solid. Its literals have the world's precision. gradient: a ti.func of the position that returns the gradient; None for
+    central differences. radius: R [m], what the shape is thickened by. position, rotation: where the shape is put (see Solid);
+    live. friction, restitution, push_out: see Wall.
+
+        @ti.func
+        def torus(p):
+            return ti.math.length(ti.Vector([ti.math.length(p.xz) - 1.0, p.y])) - 0.3
+
+        world = tv.World(particles, [tv.Sdf(torus)])
+
+    The way of a particle is followed by steps as long as the function says, never shorter than 1/64 of it (sphere tracing, Hart
+    1996): nothing passes that is thicker than that with the particle's diameter added. A function that changes faster than
+    distance would break this, and one that changes more slowly at the surface would keep particles too far away: the gradient is
+    checked where particles start and around, and ValueError names the place.
+    """
+
+    guesses = True
+
+    def __init__(
+        self, function, gradient=None, *, radius=0.0, position=0.0, rotation=0.0, friction=0.0, restitution=0.0, push_out=1.0
+    ):  # fmt: skip
+        self.function: Any = _taken("function", function)
+        self.gradient: Any = gradient and _taken("gradient", gradient)
+        self.radius = radius
+        self.place(position, rotation)
+        self.surface(friction, restitution, push_out)
+
+    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Check the dimension, and refuse a function that is not finite, or not a distance, around the particles."""
+        Solid.prepare(self, particles, inv_mass)
+        runtime.ensure_started()
+        self._on_probe = _Probe(self)
+        x = particles.position
+        if not len(x):
+            return
+        low, high = x.min(axis=0), x.max(axis=0)
+        reach = float((high - low).max()) or float(particles.radius.max()) or 1.0
+        around = low - reach / 2 + golden(np.arange(SAMPLES), dim=self.dim) * (high - low + reach)
+        points = (np.concatenate([x[:SAMPLES], around]) - self.position) @ rotation_matrix(self.rotation)
+        value, slope = self._on_probe.value(points), self._on_probe.slope(points, 1e-6 * reach)
+        size = np.linalg.norm(slope, axis=1)
+        bad = ~np.isfinite(value) | ~np.isfinite(size)
+        if bad.any():
+            k = int(np.argmax(bad))
+            raise ValueError(f"Sdf: function is {value[k]} at {_at(points[k])} and around; it must be finite everywhere.")
+        if size.max() > STEEP:
+            k = int(np.argmax(size))
+            raise ValueError(
+                f"Sdf: function has a gradient of size {size[k]:.3g} at {_at(points[k])}, but a distance has at most 1. Divide "
+                "the function by the largest size of its gradient, or particles would pass through."
+            )
+        near = np.abs(value) < reach / 16
+        if near.any() and np.median(size[near]) < FLAT:
+            k = int(np.flatnonzero(near)[np.argmin(size[near])])
+            raise ValueError(
+                f"Sdf: function has a gradient of size {size[k]:.3g} at {_at(points[k])}, near its surface, but a distance has 1 "
+                "there. Divide the function by the size of its gradient at the surface, or particles would stay too far away."
+            )
+        if self.gradient:
+            off = np.linalg.norm(self._on_probe.gradient(points) - slope, axis=1)
+            if not (np.median(off) < 1 - FLAT):
+                k = int(np.argmax(off))
+                raise ValueError(
+                    f"Sdf: gradient is off by {off[k]:.3g} at {_at(points[k])}, compared with differences of function."
+                )
+
+    def bind(self, scene: Scene) -> None:
+        """No field of its own."""
+        Solid.bind(self, scene)
+        single = scene.real == ti.f32
+        self._on_digits = 2.0**-21 if single else 2.0**-50
+        self._on_slight = 2.0**-20 if single else 2.0**-48
+        self._on_step = 2.0**-6 if single else 2.0**-16
+
+    def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
+        """Where the surface meets the plane of a 2D scene, or the three planes through the middle of a 3D one."""
+        middle, half = (low + high) / 2, float((high - low).max()) * 0.6 or 1.0
+        line = np.linspace(-half, half, 129)
+        out = []
+        for a in range(self.dim):
+            for b in range(a):
+                grid = np.tile(middle, (129, 129, 1))
+                grid[..., a] += line[:, None]
+                grid[..., b] += line[None, :]
+                local = (grid.reshape(-1, self.dim) - self.position) @ rotation_matrix(self.rotation)
+                out.append(contour(grid, self._on_probe.value(local).reshape(129, 129) - self.radius))
+        return np.concatenate(out), 0.0
+
+    @ti.func
+    def astray(self, q, far, close):
+        """By more than rounding."""
+        return self.function(q) < far - close
+
+    @ti.func
+    def rounding(self, q):
+        """That of a function that is made of coordinates as large as those of q."""
+        return q.norm() * ti.cast(self._on_digits, self._on_real)
+
+    @ti.func
+    def normal(self, q, far):
+        """The direction of the gradient; +x where there is none."""
+        g = self.slope(q, far)
+        size, n = g.norm(), 0 * q
+        n[0] = 1
+        if size > 0:
+            n = g / size
+        return n
+
+    @ti.func
+    def slope(self, q, far):
+        """The gradient, the user's or by central differences; these know of what touches at a distance `far` and of where it is,
+        and of nothing else in the scene."""
+        out = 0 * q
+        if ti.static(bool(self.gradient)):
+            out = self.gradient(q)
+        else:
+            step = ti.max(far, q.norm() / 100) * ti.cast(self._on_step, self._on_real)
+            for k in range(self.dim):
+                ahead, behind = q, q
+                for a in ti.static(range(self.dim)):
+                    if a == k:
+                        ahead[a] += step
+                        behind[a] -= step
+                change = (self.function(ahead) - self.function(behind)) / (2 * step)
+                for a in ti.static(range(self.dim)):
+                    if a == k:
+                        out[a] = change
+        return out
+
+    @ti.func
+    def strike(self, a, e, far, close, limit):
+        """The first touch on the way.
+
+        What starts close to the surface is first held above the tangent plane there. Then the way is followed at FINE * 4 of its
+        length above that plane, so that steps do not shrink to nothing; at last its end is looked at: in a hollow, it is below.
+        """
+        way = e.norm()
+        best, depth, normal = 0 * far + 2, 0 * far, 0 * e
+        fine, lift, s, going = way * FINE + close, 0 * e, 0 * far, True
+        for k in range(MARCH + 2):
+            if going:
+                ends = s >= 1
+                q = a + s * e + lift
+                if ends:
+                    q = a + e
+                gap = self.function(q) - far
+                if k == 0 and gap > way + close:
+                    going = False
+                elif k == 0 or gap <= fine or ends or k == MARCH:
+                    n = self.normal(q, far)
+                    slope = e.dot(n)
+                    toward = slope < -ti.cast(self._on_slight, self._on_real) * way
+                    if k == 0:
+                        below = -(gap + slope)
+                        if gap <= 4 * fine:
+                            if toward and gap <= close:
+                                below = ti.max(below, ti.min(-slope, close))
+                            pushed = gap < 0 and ti.min(below, limit - slope) > 2 * close
+                            if (toward and below > 0) or pushed:
+                                best, depth, normal, going = ti.max(gap, 0) / ti.max(-slope, way * FINE + close), below, n, False
+                                best = ti.min(best, 1)
+                            lift = (4 * fine - gap) * n
+                    elif ends:
+                        going = False
+                        if ti.min(-gap, limit - slope) > 2 * close:
+                            best, depth, normal = 0 * far, -gap, n
+                    else:
+                        below = -(gap - lift.dot(n) + (1 - s) * slope)
+                        if toward and below > 0:
+                            best, depth, normal, going = s, below, n, False
+                        elif k == MARCH:
+                            best, depth, normal, going = s, (1 - s) * way, -e / way, False
+                s += ti.max(gap, fine) / way
+        return best, depth, normal
+
+
+@ti.data_oriented
+class _Probe:
+    """The function at many places, in Python and f64."""
+
+    def __init__(self, wall: Sdf):
+        self.compiler = Compiler(ti.f64)
+        self.wall: Any = wall
+        self.dim = wall.dim
+
+    def value(self, points: np.ndarray) -> np.ndarray:
+        """The function at points (n, dim) of the wall's frame, (n,)."""
+        out = np.zeros(len(points))
+        with self.compiler():
+            self._value(np.ascontiguousarray(points, dtype=np.float64), out)
+        return out
+
+    def slope(self, points: np.ndarray, step: float) -> np.ndarray:
+        """Its central differences, (n, dim)."""
+        moves = np.concatenate([np.eye(self.dim), -np.eye(self.dim)]) * step
+        ahead, behind = np.split(self.value((points + moves[:, None]).reshape(-1, self.dim)).reshape(2 * self.dim, -1), 2)
+        return (ahead - behind).T / (2 * step)
+
+    def gradient(self, points: np.ndarray) -> np.ndarray:
+        """The user's gradient, (n, dim)."""
+        out = np.zeros(points.shape)
+        with self.compiler():
+            self._gradient(np.ascontiguousarray(points, dtype=np.float64), out)
+        return out
+
+    @ti.func
+    def _point(self, points: ti.template(), i):  # type: ignore[valid-type]
+        return ti.Vector([points[i, k] for k in ti.static(range(self.dim))])
+
+    @ti.kernel
+    def _value(self, points: ti.types.ndarray(ti.f64, 2), out: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
+        for i in range(points.shape[0]):
+            out[i] = self.wall.function(self._point(points, i))
+
+    @ti.kernel
+    def _gradient(self, points: ti.types.ndarray(ti.f64, 2), out: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
+        for i in range(points.shape[0]):
+            g = self.wall.gradient(self._point(points, i))
+            for k in ti.static(range(self.dim)):
+                out[i, k] = g[k]
+
+
+def contour(grid: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """Segments (m, 2, dim) of the line value = 0 on a grid of places (r, c, dim): in each half of a cell, at most one."""
+    low, high = slice(0, -1), slice(1, None)
+    corners = [(low, low), (high, low), (high, high), (low, high)]
+    out = []
+    for triangle in ((0, 1, 2), (0, 2, 3)):
+        x = np.stack([grid[corners[k]].reshape(-1, grid.shape[2]) for k in triangle], axis=1)
+        f = np.stack([value[corners[k]].ravel() for k in triangle], axis=1)
+        cut = (f > 0).any(axis=1) & (f <= 0).any(axis=1)
+        x, f = x[cut], f[cut]
+        odd = np.argmax((f > 0) == ((f > 0).sum(axis=1) == 1)[:, None], axis=1)  # the corner that is alone on its side
+        rows, ends = np.arange(len(f)), []
+        for step in (1, 2):
+            other = (odd + step) % 3
+            weight = f[rows, odd] / (f[rows, odd] - f[rows, other])
+            ends.append(x[rows, odd] + weight[:, None] * (x[rows, other] - x[rows, odd]))
+        out.append(np.stack(ends, axis=1))
+    return np.concatenate(out)
+
+
+def _taken(name: str, function):
+    """A ti.func of one argument."""
+    if not getattr(function, "_is_taichi_function", False):
+        raise TypeError(
+            f"Sdf: {name} = {function!r} is not a Taichi function. Put the decorator @ti.func above its def "
+            "(import taichi as ti), in a file: Taichi reads its source."
+        )
+    names = list(inspect.signature(function.func.func).parameters)
+    if len(names) != 1:
+        raise TypeError(f"Sdf: {name} takes {names}, but it must take one position.")
+    return function
+
+
+def _at(point: np.ndarray) -> str:
+    return "(" + ", ".join(f"{v:.4g}" for v in point) + ")"

@@ -1,0 +1,170 @@
+"""Particles drawn to a place, each by itself: what pins, paths and grids share."""
+
+import numpy as np
+
+from ... import checks
+from ...device import ti
+from ...features.feature import Batch, Knob, Scene
+from ...particles import Particles
+from .compliance import law, stiff
+
+
+class Tether(Batch):
+    """One particle each, with the vector C(x) = x - place, from soft to rigid: give offsets() and present().
+
+    The formula of Scalar for each axis alike; the gradients are unit vectors.
+    """
+
+    arity = 1
+    each = ("compliance", "damping")
+    exclusive = False  # nothing else may hold its particles
+    compliance = Knob(lambda f, v: f._compliance(v), "Inverse stiffness [m/N].", force=True)
+    damping = Knob(lambda f, v: checks.per_item(repr(f), "damping", v, f.count, least=0.0), "Of the dashpot [N s/m].", force=True)
+    compiled_for = ("soft",)
+
+    def setup(self, indices, compliance, damping) -> None:
+        """Keep the arguments of __init__."""
+        who = repr(self)
+        rows = checks.indices(who, "indices", indices, checks.ANY)
+        if len(np.unique(rows)) < len(rows):
+            values, counts = np.unique(rows, return_counts=True)
+            raise ValueError(f"{who}: particle {values[counts > 1][0]} is named twice, and can have only one place.")
+        self.indices = rows[:, None]
+        self.compliance, self.damping = compliance, damping
+
+    def _compliance(self, value) -> np.ndarray:
+        return checks.per_item(repr(self), "compliance", value, self.count, least=0.0)
+
+    @property
+    def listing(self) -> np.ndarray:
+        """One particle each."""
+        return self.indices[:, 0]
+
+    @property
+    def soft(self) -> bool:
+        """Whether any of them is a spring, or was when kernels were compiled."""
+        return bool(np.any(self.compliance > 0)) or vars(self).get("_on_soft", False)
+
+    def upload(self) -> None:
+        """Write new stiffnesses."""
+        if self.acts and not self.drives and self._on_soft:
+            self.scene.memory.write(self._on_alpha, self.compliance)
+            self.scene.memory.write(self._on_damping, self.damping)
+
+    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Check that the particles exist."""
+        checks.indices(repr(self), "indices", self.indices[:, 0], particles.count)
+
+    def begin(self, position: np.ndarray) -> np.ndarray:
+        """C at the start, (m, dim)."""
+        return np.zeros((self.count, position.shape[1]))
+
+    def bind(self, scene: Scene) -> None:
+        """For what is not driven its multiplier, and for springs their memory."""
+        super().bind(scene)
+        self._on_size, self._on_real, self._on_soft = self.start.size, scene.real, self.soft
+        if not self.drives:
+            name, m, dim, add = repr(self), self.count, scene.particles.dim, scene.memory.field
+            self._on_lam = add(f"{name}.multiplier", m, width=dim, state=True)
+            if self.soft:
+                self._on_alpha = add(f"{name}.compliance", m, values=self.compliance)
+                self._on_damping = add(f"{name}.damping", m, values=self.damping)
+                self._on_last = add(f"{name}.last", m, width=dim, values=self.begin(self.start.position), state=True)
+                self._on_history = add(f"{name}.history", m, width=dim)
+
+    @property
+    def load(self) -> np.ndarray:
+        """The force on each particle during the last substep [N], (m, dim)."""
+        if not self.count:
+            return np.zeros((0, 0 if self.start is None else self.start.dim))
+        if self.scene is None:
+            raise RuntimeError(f"{self!r}.load: there is none before a world has been stepped with it.")
+        if self.drives:
+            raise RuntimeError(f"{self!r}.load: driven particles are taken along whatever it takes; give compliance to measure.")
+        if not self.acts:
+            return np.zeros((self.count, self.scene.particles.dim))
+        scale = 1 / self.scene.hh if self.scene.hh else 0.0
+        return scale * self.scene.memory.read(self._on_lam)[: self.count].astype(np.float64)
+
+    @ti.func
+    def offsets(self, c, when, first, fresh):
+        """C at the end and at the start of the substep."""
+        zero = 0 * self._on_state.d[0]
+        return zero, zero
+
+    @ti.func
+    def present(self, c, back):
+        """C at x - back d."""
+        return 0 * self._on_state.d[0]
+
+    @ti.func
+    def change(self, c):
+        """How far C changed in the last substep, by the motion of the particle."""
+        return self._on_state.d[self.member(c, 0)]
+
+    @ti.func
+    def solve(self, c, h, hh, when, first, fresh):
+        """Multiplier before and after, and the size of the violation that this removes."""
+        w = self._on_w.of(self.member(c, 0))
+        C, C0 = self.offsets(c, when, first, fresh)
+        lam, B = self._on_lam[c], 0 * C
+        if first != 0:
+            lam = 0 * lam
+        new, size = lam, 0 * w
+        if w > 0:
+            alpha, A = 0 * w, 1 + 0 * w
+            if ti.static(self._on_soft):
+                alpha = self._on_alpha[c] / hh
+                A, now, last = law(self._on_alpha[c], self._on_damping[c], h, w, fresh)
+                if first != 0:
+                    self._on_history[c] = now * C0 + last * self._on_last[c]
+                    self._on_last[c] = C0
+                B = self._on_history[c]
+            K = A * self._on_slots.split[self.member(c, 0)] + alpha
+            new = lam - self._on_slots.relaxation * (A * C + B + alpha * lam) / K
+            size = (new - lam).norm() * K / self._on_slots.relaxation
+        return lam, new, size
+
+    @ti.func
+    def relax(self, c, h, hh, when, first, fresh):
+        """Draw the particle to its place."""
+        lam, new, size = self.solve(c, h, hh, when, first, fresh)
+        self._on_lam[c] = new
+        self.push(c, 0, self._on_w.of(self.member(c, 0)) * (new - lam))
+
+    @ti.func
+    def kick(self, c, h):
+        """As in Scalar, for each axis."""
+        move = 0 * self._on_state.d[0]
+        if ti.static(self._on_soft):
+            w, alpha = self._on_w.of(self.member(c, 0)), self._on_alpha[c]
+            if w > 0 and alpha > 0:
+                C = self.present(c, 0)
+                rate = self.change(c) / h
+                move = -h * h * w * (1 - stiff(alpha, h, w)) * (C / alpha + self._on_damping[c] * rate)
+        self.push(c, 0, move)
+
+    @ti.func
+    def bond(self, c, firm, soft):
+        """As in Scalar, for each axis."""
+        scale = firm
+        if ti.static(self._on_soft):
+            scale = ti.select(self._on_alpha[c] > 0, soft, firm)
+        self.push(c, 0, scale * self._on_w.of(self.member(c, 0)) * self._on_lam[c])
+
+    @ti.func
+    def miss(self, c, h, hh, when, fresh):
+        """What is left, relative to the size of the scene."""
+        _, _, size = self.solve(c, h, hh, when, 0, fresh)
+        return size / self._on_size
+
+    @ti.func
+    def energy(self, c, back, hh, miss):
+        """|C|^2 / (2 alpha)."""
+        out = ti.cast(0, ti.f64)
+        if ti.static(self._on_soft):
+            alpha = self._on_alpha[c]
+            if alpha > 0:
+                C = self.present(c, back)
+                out = ti.cast(C.dot(C) / (2 * alpha), ti.f64)
+        return out

@@ -1,0 +1,124 @@
+"""A function of a few corners and its gradient, on the device and on the host."""
+
+from typing import Any
+
+import numpy as np
+
+from ...device import runtime, ti
+from ...device.patches.compiler import Compiler
+
+STEP = 2.0**-20  # of central differences, relative to the distance between corners
+
+
+@ti.data_oriented
+class Slopes:
+    """function(x_0, x_1, ...) of `arity` corners in `dim` dimensions, and its gradient: given, or by central differences.
+
+    function, gradient: a Taichi function, and whether it takes the number of the constraint after the corners.
+    fixed: 1 if the function does not change when all corners move together; the gradient of the first is then what the others
+    lack to a sum of 0. size: of the step where all corners coincide, in units of STEP [m].
+    """
+
+    def __init__(self, function: tuple, gradient: tuple | None, arity: int, dim: int, fixed: int, size: float):
+        self.compiler = Compiler(ti.f64)
+        self.function, self.counts = function
+        self.given: Any = gradient[0] if gradient else None
+        self.gradient_counts = bool(gradient and gradient[1])
+        self.analytic = gradient is not None
+        self.arity, self.dim, self.fixed, self.size = arity, dim, fixed, size
+        self.unknowns = [(k, a) for k in range(fixed, arity) for a in range(dim)]
+        self.number = [[(k - fixed) * dim + a + 1 if k >= fixed else -1 for a in range(dim)] for k in range(arity)]
+
+    def __call__(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Values (m,), gradients and differences (m, arity, dim) at corners q (m, arity, dim), in f64."""
+        runtime.ensure_started()
+        m = len(q)
+        f, g, d = np.zeros(m), np.zeros((m, self.arity, self.dim)), np.zeros((m, self.arity, self.dim))
+        with self.compiler():
+            self.evaluate(np.ascontiguousarray(q), f, g, d)
+        return f, g if self.analytic else d, d
+
+    @ti.kernel
+    def evaluate(
+        self, points: ti.types.ndarray(ti.f64, 3), f: ti.types.ndarray(ti.f64, 1), g: ti.types.ndarray(ti.f64, 3),
+        d: ti.types.ndarray(ti.f64, 3),
+    ):  # fmt: skip
+        """The function, its gradient as constraints use it, and by differences."""
+        for c in range(points.shape[0]):
+            q = ti.Matrix.zero(ti.f64, self.arity, self.dim)
+            for k, a in ti.static(ti.ndrange(self.arity, self.dim)):
+                q[k, a] = points[c, k, a]
+            value, slope = self.differentiate(c, q)
+            f[c] = value
+            for k, a in ti.static(ti.ndrange(self.arity, self.dim)):
+                d[c, k, a] = slope[k, a]
+            if ti.static(self.analytic):
+                given = self.slope(c, q)
+                for k, a in ti.static(ti.ndrange(self.arity, self.dim)):
+                    g[c, k, a] = given[k, a]
+
+    @ti.func
+    def value(self, c, q, j, step):
+        """function at q, moved by `step` along the unknown number (j + 1) / 2, forward for odd j and back for even."""
+        # Vectors, not a matrix: Taichi 1.7.4 ends in control_flow_graph.cpp on some that are assigned whole and by elements.
+        sign = ti.select(j % 2 == 1, step, -step)
+        corners = [
+            ti.Vector([q[k, a] + sign * ti.cast((j + 1) // 2 == self.number[k][a], ti.f64) for a in ti.static(range(self.dim))])
+            for k in ti.static(range(self.arity))
+        ]
+        out = 0 * step
+        if ti.static(self.counts):
+            out = self.function(*corners, c)
+        else:
+            out = self.function(*corners)
+        return out
+
+    @ti.func
+    def slope(self, c, q):
+        """The gradient that was given."""
+        corners = [q[k, :] for k in ti.static(range(self.arity))]
+        if ti.static(self.gradient_counts):
+            return self.rows(self.given(*corners, c))
+        else:
+            return self.rows(self.given(*corners))
+
+    @ti.func
+    def rows(self, vectors: ti.template()):  # type: ignore[valid-type]
+        """One vector, or a tuple of them, as a matrix."""
+        g = ti.Matrix.zero(ti.f64, self.arity, self.dim)
+        for k, a in ti.static(ti.ndrange(self.arity, self.dim)):
+            if ti.static(self.arity == 1):
+                g[k, a] = vectors[a]
+            else:
+                g[k, a] = vectors[k][a]
+        return g
+
+    @ti.func
+    def differentiate(self, c, q):
+        """function and central differences of it at q. One loop, not unrolled, holds the only copy of the function."""
+        size = 0 * q[0, 0]
+        for k, a in ti.static(ti.ndrange(self.arity, self.dim)):
+            size = ti.max(size, ti.abs(q[k, a]))
+        if size == 0:
+            size += self.size
+        step, f = STEP * size, 0 * size
+        g = ti.Matrix.zero(ti.f64, self.arity, self.dim)
+        for j in range(ti.static(2 * len(self.unknowns) + 1)):
+            v = self.value(c, q, j, step)
+            if j == 0:
+                f = v
+            for k, a in ti.static(self.unknowns):
+                if (j + 1) // 2 == ti.static(self.number[k][a]):
+                    g[k, a] += ti.select(j % 2 == 1, v - f, f - v) / (2 * step)
+        if ti.static(self.fixed):
+            for k, a in ti.static(self.unknowns):
+                g[0, a] -= g[k, a]
+        return f, g
+
+    @ti.func
+    def both(self, c, q):
+        """The function and its gradient."""
+        if ti.static(self.analytic):
+            return self.value(c, q, 0, 0 * q[0, 0]), self.slope(c, q)
+        else:
+            return self.differentiate(c, q)

@@ -1,0 +1,195 @@
+"""Rotations of clusters, in 2D and 3D: the best fit without reflection, and the turn of a body in a step.
+
+Kept as (cos, sin) in 2D and as a quaternion (w, x, y, z) in 3D. K = sum mu q s^T holds a shape q against places s.
+"""
+
+import numpy as np
+
+from ...device import ti
+
+STEPS = 16  # of Newton's iteration at most; from the rotation of the last substep it takes two or three
+
+
+def identity(dim: int) -> np.ndarray:
+    """No rotation, as it is kept."""
+    return np.eye(1, 2 if dim == 2 else 4)[0]
+
+
+@ti.func
+def matrix(r):
+    """The matrix of a kept rotation."""
+    if ti.static(r.n == 2):
+        return ti.Matrix([[r[0], -r[1]], [r[1], r[0]]])
+    else:
+        w, x, y, z = r[0], r[1], r[2], r[3]
+        return ti.Matrix([
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ])  # fmt: skip
+
+
+@ti.func
+def after(a, b):
+    """Rotation b, then a; normalized."""
+    c = 0 * a
+    if ti.static(a.n == 2):
+        c = ti.Vector([a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]])
+    else:
+        u, v = ti.Vector([a[1], a[2], a[3]]), ti.Vector([b[1], b[2], b[3]])
+        w = a[0] * b[0] - u.dot(v)
+        t = a[0] * v + b[0] * u + u.cross(v)
+        c = ti.Vector([w, t[0], t[1], t[2]])
+    return c / c.norm()
+
+
+@ti.func
+def axial(B):
+    """sum s x y of B = sum y s^T: one number in 2D, three in 3D."""
+    if ti.static(B.n == 2):
+        return ti.Vector([B[1, 0] - B[0, 1]])
+    else:
+        return ti.Vector([B[2, 1] - B[1, 2], B[0, 2] - B[2, 0], B[1, 0] - B[0, 1]])
+
+
+@ti.func
+def quaternion(step):
+    """A rotation by about |step|, about it; not normalized."""
+    return ti.Vector([1 + 0 * step[0], step[0] / 2, step[1] / 2, step[2] / 2])
+
+
+@ti.func
+def diagonal(value, like):
+    """`value` times the unit matrix."""
+    out = 0 * like
+    for k in ti.static(range(like.n)):
+        out[k, k] = value
+    return out
+
+
+@ti.func
+def solved(H, r):
+    """The solution of H x = r by cofactors, and det H."""
+    a, b, c = H[0, :], H[1, :], H[2, :]
+    det = a.dot(b.cross(c))
+    return (b.cross(c) * r[0] + c.cross(a) * r[1] + a.cross(b) * r[2]) / det, det
+
+
+@ti.func
+def spin(S, X):
+    """How a body turns, as a matrix, whose parts move by y: S = sum m r r^T, X = sum m r y^T, about its centre."""
+    gap, out, size = axial(X.transpose()), 0 * S, S.trace()
+    if size > 0:
+        if ti.static(S.n == 2):
+            out[1, 0] = gap[0] / size
+            out[0, 1] = -out[1, 0]
+        else:
+            x, _ = solved(diagonal(ti.static(1 + 2.0**-46) * size, S) - S, gap)  # about a line of particles anything will do
+            out = ti.Matrix([[0 * size, -x[2], x[1]], [x[2], 0 * size, -x[0]], [-x[1], x[0], 0 * size]])
+    return out
+
+
+@ti.func
+def newton(M, gap, least):
+    """A rotation vector that closes the gap of axial(M) for M = R K; along the gap where there is no curvature to go by."""
+    size, step = M.norm(), 0 * gap
+    if size > 0:
+        step = gap / size
+        H = diagonal(M.trace(), M) - M
+        if H[0, 0] > 0 and H[0, 0] * H[1, 1] > H[0, 1] * H[1, 0]:
+            x, det = solved(H, gap)
+            if det > 1e-6 * size * size * size:
+                step = x
+    length = step.norm()
+    if length > 0.5:
+        step *= 0.5 / length
+    return step, length > least
+
+
+@ti.func
+def fit(K, kept, least):
+    """The rotation R that comes closest, sum mu |s - R q|^2 least, among rotations without reflection.
+
+    In 2D it has a closed form. In 3D Newton's iteration from `kept` climbs tr(R K) over the quaternions, by the gradient where it
+    is not concave (Mueller et al. 2016 use the gradient throughout). Where the fit does not determine the rotation (points on a
+    line, in one place, or mirrored with equal axes) it stays as near to `kept` as it can.
+    least: the relative size below which a number is rounding.
+    """
+    r = kept
+    if ti.static(kept.n == 2):
+        best = ti.Vector([K[0, 0] + K[1, 1], K[0, 1] - K[1, 0]])
+        size = best.norm()
+        if size > least * K.norm():
+            r = best / size
+    else:
+        going = True
+        for _ in range(STEPS):
+            if going:
+                B = matrix(r) @ K
+                step, going = newton(B, -axial(B), least)
+                r = after(quaternion(step), r)
+    return r
+
+
+@ti.func
+def turn(K, X, U, body, stiff, soft, kept, least, deforms: ti.template()):  # type: ignore[valid-type]
+    """Rotations of a body at the start and at the end of a step, at most 90 degrees apart, and the cosine of that angle.
+
+    At the start, with K = sum mu q s^T, it is the fit R. At the end it is D R, with
+        axial((stiff + soft D^T) X - (stiff D + soft) R K + U) = 0,   X = sum mu p s^T of the predicted places p.
+    Stiff, this says that what moves places p to D R q has no moment about the places s at the start; then it is one step of a
+    free rigid body (Moser and Veselov 1991), and nothing is lost. Soft, deformations are turned back into the frame at the
+    start first, and U is what else pulls (body: given in the frame of the body). deforms: whether anything is soft.
+    """
+    start, end, cosine, pull = kept, kept, 1 + 0 * stiff, axial(U)
+    if ti.static(kept.n == 2):
+        # sin(angle) a + cos(angle) b = c
+        start = fit(K, kept, least)
+        S = matrix(start) @ K
+        if body:
+            pull = axial(matrix(start) @ U)
+        a, b = stiff * S.trace() + soft * X.trace(), stiff * axial(S)[0] - soft * axial(X)[0]
+        c = stiff * axial(X)[0] - soft * axial(S)[0] + pull[0]
+        size = ti.sqrt(a * a + b * b)
+        if size > 0:
+            sine = ti.min(ti.max(c / size, -1), 1)
+            cosine = ti.sqrt(1 - sine * sine)
+            D = ti.Vector([(a * cosine + b * sine) / size, (a * sine - b * cosine) / size])
+            end, cosine = after(D, start), D[0]
+    else:
+        stage, S = 0, K  # 0: the fit; 1: the turn; 2: done
+        for k in range(2 * STEPS):
+            if stage < 2:
+                B = matrix(end) @ K
+                M, gap = B, -axial(B)
+                if stage == 1:
+                    gap = stiff * (axial(X) + gap)
+                    if ti.static(deforms):
+                        Y = matrix(after(start, turned_back(end))) @ X
+                        gap += soft * (axial(Y) - axial(S)) + pull
+                        M = stiff * B + soft * Y
+                step, going = newton(M, gap, least)
+                end = after(quaternion(step), end)
+                if stage == 0 and (not going or k == STEPS - 1):
+                    stage, start, S = 1, end, matrix(end) @ K
+                    if ti.static(deforms):
+                        if body:
+                            pull = axial(matrix(end) @ U)
+                elif not going:
+                    stage = 2
+        D = after(end, turned_back(start))
+        if D[0] < 0:
+            D = -D
+        cosine = 2 * D[0] * D[0] - 1
+        if cosine < 0:  # more than 90 degrees
+            u = ti.Vector([D[1], D[2], D[3]])
+            half = ti.sqrt(0.5 + 0 * cosine)
+            u *= half / u.norm()
+            end = after(ti.Vector([half, u[0], u[1], u[2]]), start)
+    return start, end, cosine
+
+
+@ti.func
+def turned_back(r):
+    """The inverse of a quaternion."""
+    return ti.Vector([r[0], -r[1], -r[2], -r[3]])

@@ -1,0 +1,271 @@
+"""Where vertices are to the edges of bodies made of loops of particles (2D)."""
+
+from typing import Any
+
+import numpy as np
+
+from ..device import ti
+from ..features.material import Table
+from ..neighbours.queries import Contacts
+from .contact import Contact
+
+SLACK = 1 / 512  # of an edge: as much further it goes at its ends, so that bodies of the same width stand on each other
+CLOSE = 1e-4  # edges whose distances differ by less are equally near: the first of them counts
+TINY = 1e-30
+VERTEX, START, END = range(3)  # what a particle is in a contact with one that it is listed with
+
+
+class Rim(Contact):
+    """The geometry of Polygons: which vertex is beside, over or inside of which edge, and who takes part in that contact."""
+
+    _on_w: Any
+    _on_loop: Any
+    _on_met: Any
+    _on_back: Any
+    _on_h: Any
+    _on_less: Any
+    _on_ends: Any
+
+    @ti.func
+    def after(self, i):
+        """The next particle around the body of particle i; -1 if it has none."""
+        return self._on_loop[i][0]
+
+    @ti.func
+    def before(self, i):
+        """The one before."""
+        return self._on_loop[i][1]
+
+    @ti.func
+    def corner(self, v, a):
+        """1 if v is in front of the corner a, beside none of its edges; -1 if it is behind an inner one; 0 if beside an edge.
+
+        A particle without edges is a corner all around.
+        """
+        out = 1
+        if self.after(a) >= 0:
+            r, u, w = self._on_state.apart(v, a), self._on_state.apart(self.after(a), a), self._on_state.apart(self.before(a), a)
+            if r.dot(u) > 0 or r.dot(w) > 0:
+                out = 0
+            elif u.cross(w) < 0:
+                out = -1
+        return out
+
+    @ti.func
+    def edge(self, v, a, front, moved: ti.template()):  # type: ignore[valid-type]
+        """How far v overlaps the edge from a to the next, negative where it does not, the normal, and where on the edge.
+
+        What was in front at the start of the substep came in over this edge if it crossed it between its ends. What was behind
+        already goes out over the nearest one that faces its own body, at push_out. moved: as in look().
+        """
+        b = self.after(a)
+        r, u = self._on_state.apart(v, a), self._on_state.apart(b, a)
+        uu, t = u.dot(u), 0 * r[0]
+        overlap, n = t - 1, 0 * r
+        if uu > 0:
+            length = ti.sqrt(uu)
+            t, n = r.dot(u) / uu, ti.Vector([u[1], -u[0]]) / length
+            height, cross, came, shared = r.dot(n), t, True, a
+            if height < 0:
+                came = height >= -SLACK * length
+                if ti.static(moved):
+                    d = self._on_state.d[a]
+                    r0, u0 = r - (self._on_state.d[v] - d), u - (self._on_state.d[b] - d)
+                    height0, t0 = r0.dot(ti.Vector([u0[1], -u0[0]])) / length, r0.dot(u0) / ti.max(u0.dot(u0), uu * SLACK)
+                    came = height0 >= -SLACK * length
+                    if height0 > 0:
+                        cross = t0 + height0 / (height0 - height) * (t - t0)
+            beside = -SLACK <= cross <= 1 + SLACK
+            if not came and t < 0:
+                beside = front < 0
+                if beside:  # the nearest way out is over an inner corner
+                    height, shared = -r.norm(), self.before(a)
+                    n = r / ti.min(height, -uu * TINY)
+            t = ti.min(ti.max(t, 0), 1)
+            far = self._on_radius.of(v) + (1 - t) * self._on_radius.of(a) + t * self._on_radius.of(b)
+            if beside and height < far and height >= -length / 2:
+                out, back = far - height, 0 * r
+                if ti.static(moved):
+                    out -= self._on_less[v]
+                if not came:
+                    if ti.static(moved):
+                        out = ti.min(out, self.push_out * self._on_h[None] - self.relative(self._on_state.d, v, a, b, t).dot(n))
+                        back = self.inward(v)
+                    if back.dot(n) >= 0 and self.inside(v, a):
+                        came = self.nearest(v, a, shared, height, back)
+                if came:
+                    overlap = out
+        return overlap, n, t
+
+    @ti.func
+    def inside(self, v, a):
+        """Whether v is inside of the body of a: a ray from it along +x crosses the loop an odd number of times.
+
+        What is behind one edge may be in front of the next, where they meet at less than 90 degrees.
+        """
+        out, k, r = False, a, self._on_state.apart(a, v)
+        going = True
+        while going:
+            k = self.after(k)
+            s = self._on_state.apart(k, v)
+            up = s[1] > 0
+            if (r[1] > 0) != up and (r.cross(s) > 0) == up:
+                out = not out
+            r, going = s, k != a
+        return out
+
+    @ti.func
+    def inward(self, v):
+        """The way from an outer corner v into its own body; 0 where there is none."""
+        out = 0 * self._on_state.x[v]
+        if self.after(v) >= 0:
+            u, w = self._on_state.apart(self.after(v), v), self._on_state.apart(self.before(v), v)
+            if u.cross(w) > 0:
+                out = u * w.norm() + w * u.norm()
+        return out
+
+    @ti.func
+    def nearest(self, v, a, shared, height, back):
+        """Whether no edge of the body of a but those from a and `shared` is nearer to v, which is at `height` below 0 over them.
+
+        Edges that face away from the body of v, which lies in the direction `back`, are no way out for it.
+        """
+        out = True
+        for e in range(self._on_grid.first[v], self._on_grid.first[v] + self._on_grid.number[v]):
+            j = self._on_grid.near[e]
+            if j != a and j != shared and self._on_loop[j][2] == self._on_loop[a][2]:
+                r, u = self._on_state.apart(v, j), self._on_state.apart(self.after(j), j)
+                uu, faces = u.dot(u), u[1] * back[0] - u[0] * back[1] >= 0
+                if uu > 0:
+                    r -= ti.min(ti.max(r.dot(u) / uu, 0), 1) * u
+                rest = -height - r.norm()
+                if faces and (rest > -CLOSE * height or (rest >= CLOSE * height and j < a)):
+                    out = False
+        return out
+
+    @ti.func
+    def look(self, i, moved: ti.template()):  # type: ignore[valid-type]
+        """Find the contacts that particle i is the vertex of, or the first of two discs: at most one with each near particle.
+
+        moved: in a substep, by how particles moved in it, and without the overlap that is allowed. Otherwise by where they are
+        and the nearest edges: before the first substep after a start, d is the velocity.
+        """
+        for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
+            j = self._on_grid.near[e]
+            overlap, n, t = 0 * self._on_w.of(i) - 1, 0 * self._on_state.x[i], 0 * self._on_w.of(i)
+            front = self.corner(i, j)
+            if self.after(j) >= 0:
+                overlap, n, t = self.edge(i, j, front, moved)
+            if overlap <= 0 and i < j and front > 0:
+                overlap, n = self.touch(i, j, self._on_radius.of(i) + self._on_radius.of(j))
+                if ti.static(moved):
+                    overlap -= self._on_less[i]
+                if overlap > 0:
+                    t = 0 * t - 1
+                    if self.corner(j, i) <= 0:
+                        overlap = -overlap
+            self._on_met.field[e] = ti.Vector([overlap, t, n[0], n[1]])
+            back = ti.Vector([self.find(j, i), -1])
+            if self.before(i) >= 0:
+                back[1] = self.find(j, self.before(i))
+            self._on_back.field[e] = ti.cast(back, self.scene.real)
+
+    @ti.func
+    def find(self, v, a):
+        """Where a is in the list of v, counted from its begin; -1 if it is not."""
+        low, end = self._on_grid.first[v], self._on_grid.first[v] + self._on_grid.number[v]
+        high = end
+        while low < high:
+            middle = (low + high) // 2
+            if self._on_grid.near[middle] < a:
+                low = middle + 1
+            else:
+                high = middle
+        out = -1
+        if low < end:
+            if self._on_grid.near[low] == a:
+                out = low - self._on_grid.first[v]
+        return out
+
+    @ti.func
+    def meeting(self, i, e, role):
+        """The contact in which particle i, with the one at entry e of its list, is in a role.
+
+        Returns the entry that keeps it (-1: there is none), its particles v, a, b, where on the edge, and the part of its move
+        that is that of i: 1, -(1 - t) or -t. Two discs are an edge of which only the start is touched.
+        """
+        j = self._on_grid.near[e]
+        at, v, a = e, i, j
+        if role != VERTEX:
+            back = self._on_back.field[e]
+            v, a, at = j, i, ti.cast(back[0], ti.i32)
+            if role == END:
+                a, at = self.before(i), ti.cast(back[1], ti.i32)
+            if at >= 0:
+                at += self._on_grid.first[j]
+        b, t, part = a, 0 * self._on_w.of(i), 0 * self._on_w.of(i) + 1
+        if at >= 0:
+            t = self._on_met.field[at][1]
+            if t >= 0:
+                b = self.after(a)
+            elif role == END:
+                at = -1
+            t = ti.max(t, 0)
+            if b < 0:
+                at = -1
+            if role == START:
+                part = t - 1
+            elif role == END:
+                part = -t
+        return at, v, a, b, t, part
+
+    @ti.func
+    def relative(self, d: ti.template(), v, a, b, t):  # type: ignore[valid-type]
+        """The displacement of v relative to the point t of the edge from a to b."""
+        return d[v] - (1 - t) * d[a] - t * d[b]
+
+    def found(self, x: np.ndarray, h: float) -> Contacts:
+        """Vertices and edges, and pairs of discs, by what look() found last; also those that were pushed apart since."""
+        grid, r = self._on_grid, self.scene.particles.radius
+        pairs, at = grid.entries()
+        met, push = grid.read(self._on_met, at), grid.read(self._on_given, at)
+        some = (met[:, 0] > 0) | (push > 0)
+        pairs, met, push = pairs[some], met[some], push[some]
+        (i, j), overlap, t, n = pairs.T, met[:, 0], met[:, 1], met[:, 2:]
+        parted, no_way = overlap <= 0, (n == 0).all(axis=1)
+        discs = (t < 0) | (no_way & (r[i] + r[j] > 0))
+        ends, t = np.where(discs, j, self._on_ends[j, 0]), np.where(discs, 0.0, t)
+        edge, apart = x[ends] - x[j], x[i] - (1 - t)[:, None] * x[j] - t[:, None] * x[ends]
+        straight = np.where(discs[:, None], apart, np.stack([edge[:, 1], -edge[:, 0]], axis=1))
+        n = np.where(no_way[:, None], straight / np.linalg.norm(straight, axis=1)[:, None], n)
+        far = (1 - t) * r[j] + t * r[ends]
+        overlap = np.where(parted, r[i] + far - (apart * n).sum(axis=1), overlap)
+        point = x[i] - apart + (far - overlap / 2)[:, None] * n
+        return Contacts(pairs, ends, t, overlap, n, point, push / h)
+
+
+class Apart:
+    """What the grid asks which pairs may touch: those of different bodies, as far as their groups do."""
+
+    uniform = False
+
+    def __init__(self, rim: Rim):
+        self.table: Table = rim.table
+        self.loop = rim._on_loop
+        self.radius = rim._on_radius
+
+    @ti.func
+    def reach(self, radius: ti.template(), i, j):  # type: ignore[valid-type]
+        """Two discs touch by their own radii, whatever the edges elsewhere are; `radius` has half an edge in it."""
+        far = radius.of(i) + radius.of(j)
+        if self.loop[i][2] < 0 and self.loop[j][2] < 0:
+            far = self.radius.of(i) + self.radius.of(j)
+        return far
+
+    @ti.func
+    def of(self, i, j):
+        """The row of the table, with 0 at its end for two particles of one body."""
+        row = self.table.of(i, j)
+        if self.loop[i][2] >= 0 and self.loop[i][2] == self.loop[j][2]:
+            row[3] = 0
+        return row

@@ -1,0 +1,112 @@
+"""Quiet piles: what takes the sound out of loaded contacts."""
+
+from typing import Any
+
+import numpy as np
+
+from ..device import ti
+from ..neighbours.neighbour_list import WORD, lowest
+
+EVERY = 32  # substeps from one projection to the next
+PASSES = 32
+CONDITION = 400.0  # modes with an eigenvalue of at least 1 / CONDITION keep 1 / T(PASSES) = 8 % of their velocity
+
+
+class Calm:
+    """Pairs that bear a load move neither towards nor away from each other.
+
+    With one pass per substep loaded contacts are springs, and sound in them decays by a third of its eigenvalue L per substep,
+    which for the longest wave in a column of N is (pi / 4 N)^2. So every EVERY substeps displacements are projected onto those
+    that keep the lengths of loaded pairs, (d_i - d_j) . n = 0, by PASSES Jacobi passes with Chebyshev's acceleration: the slow
+    modes lose PASSES^2 L of their velocity, not PASSES L. The polynomial is within -1 ... 1 on all eigenvalues 0 ... 1, so no
+    energy is made; moves come in pairs, so momentum is conserved. Particles that lean on a wall do not move into it or off it.
+
+    It is what inelastic rigid discs do: there is no sound in them. Pairs that bounce (restitution) are left out.
+    """
+
+    def __init__(self, contact: Any, pieces: int):
+        scene = contact.scene
+        self.contact, self.grid, self.state = contact, contact._on_grid, scene.state
+        self.change = contact._on_move  # is free at the end of a substep
+        # So is what is put aside while lists are built: here for the loaded pairs of each particle, how many they are, and for
+        # those who have any, piece by piece.
+        self.number, self.loaded = self.grid.old_number, self.grid.old_first
+        self.count = scene.memory.field("Contact.loaded", pieces, kind=ti.i32)
+        self.factors = scene.memory.field("Contact.chebyshev", PASSES, values=chebyshev(PASSES, CONDITION))
+
+    @ti.func
+    def bears(self, i, e):
+        """Whether entry e in the list of particle i is a pair that bears a load."""
+        out = self.contact._on_push.field[e] > 0
+        if ti.static(self.contact._on_bounces):
+            if self.contact._on_struck[i] > 0:
+                out = out and self.contact._on_blow.field[e] == 0
+        return out
+
+    @ti.func
+    def find(self, i):
+        """Put aside the loaded pairs of particle i, each with what all passes multiply by; returns how many there are."""
+        first, w = self.grid.first[i], self.state.w.of(i)
+        at = first
+        if self.contact._on_split[i] > 0:
+            for word in range(self.grid.words(i)):
+                # Not touches(): the pair may have parted in this pass, and both of it have to agree.
+                bits = ti.select(word == 0, self.grid.touching[i], self.grid.whole(i, word))
+                while bits != 0:
+                    e = first + word * WORD + lowest(bits)
+                    bits &= bits - ti.u32(1)
+                    if self.bears(i, e):
+                        j = self.grid.near[e]
+                        r = self.state.apart(i, j)
+                        rr = r.dot(r)
+                        if rr > 0:
+                            shared = self.contact._on_split[i] + self.contact._on_split[j]
+                            self.grid.aside[at] = j
+                            self.contact._on_push.aside[at] = w / (rr * shared)
+                            at += 1
+        return at - first
+
+    @ti.func
+    def open(self, piece, begin, end):
+        """The loaded pairs of a piece of the particles. They move in no pass, so what depends on positions is worked out once."""
+        count = 0
+        for i in range(begin, end):
+            number = self.find(i)
+            self.number[i] = number
+            if number > 0:
+                self.loaded[begin + count] = i
+                count += 1
+        self.count[piece] = count
+
+    @ti.func
+    def want(self, i, k):
+        """Pass k for particle i: what changes d. change' = (factor - 1) change + factor 2 / (1 + 1 / CONDITION) want."""
+        want, first = 0 * self.state.d[i], self.grid.first[i]
+        for e in range(first, first + self.number[i]):
+            j = self.grid.aside[e]
+            r = self.state.apart(i, j)
+            want -= self.contact._on_push.aside[e] * (self.state.d[i] - self.state.d[j]).dot(r) * r
+        if ti.static(self.state.leans):
+            lean = self.state.lean[i]
+            size = lean.dot(lean)
+            if size > 0:
+                want -= want.dot(lean) / size * lean
+        factor = self.factors[k]
+        want *= factor * ti.static(2 / (1 + 1 / CONDITION))
+        if k > 0:
+            want += (factor - 1) * self.change[i]
+        self.change[i] = want
+
+    @ti.func
+    def move(self, i):
+        """Change d."""
+        self.state.d[i] = self.state.d[i] + self.change[i]
+
+
+def chebyshev(passes: int, condition: float) -> np.ndarray:
+    """The factors of a semi-iteration for eigenvalues 1 / condition ... 1 (Golub and Varga 1961)."""
+    rho = (condition - 1) / (condition + 1)
+    out = [1.0, 2 / (2 - rho * rho)]
+    while len(out) < passes:
+        out.append(4 / (4 - rho * rho * out[-1]))
+    return np.array(out[:passes])

@@ -1,0 +1,171 @@
+"""How kernels are compiled: in a third of the time that Taichi takes by itself, to the same bits.
+
+Most of that time goes into Taichi's analysis of control flow and, in small worlds, its simplifier; LLVM does both again. They are
+left out while a kernel of ours compiles, and only then: what the user compiles in the same process is compiled as ever. A kernel
+with the user's functions in it keeps them, because they can hide what LLVM ends the process for: a vector assigned to a variable
+that is a number, where nobody reads it (`_, gap, _ = nearest(x)`). How functions are read is in source_cache.py,
+and how they become statements in syntax_cache.py.
+
+Everything here knows the inside of Taichi 1.7.4; with another one, kernels are compiled as Taichi does.
+"""
+
+import contextlib
+import gc
+import threading
+from collections.abc import Callable, Iterator
+from functools import partial
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from taichi.lang import _wrap_inspect, impl
+
+from .source_cache import active, forget, patched
+
+HOSTS = ("Arch.x64", "Arch.arm64")  # whose kernels LLVM makes as fast without it; measured on x64
+# No variables for what loops read and write at one address: Taichi does not see that another address may be the same place, such
+# as field[k] for field[0].
+SAFE = {"cache_loop_invariant_global_vars": False}
+LEAN = SAFE | {"cfg_optimization": False}  # and no analysis of control flow
+# In small worlds no simplifying either: compiling takes two thirds of the time. Frames with contacts take a tenth more where they
+# take more than the launch, because the address of the fields is looked up again after every store. What Taichi would simplify to
+# other bits (LLVM does not), a power of 1/2 to a root, is to be written so.
+BRIEF = {"advanced_optimization": False}
+FEW = 1000  # particles from which it pays
+_INSIDE = contextlib.nullcontext()
+_lock = threading.RLock()  # the type of literals is one for all threads
+
+
+class Compiler:
+    """How the kernels of one world are compiled, while it is called as a context.
+
+    real: the type of their literals. Taichi rounds the literal 0.1 to its default type even next to f64 operands; a world of
+    precision "f64" (and the user's own functions in it) must not lose half of the digits that way. particles: how many they are
+    for. Kernels compile at their first launch.
+    """
+
+    def __init__(self, real, particles: int = FEW):
+        self.real = real
+        self.lean = LEAN | BRIEF if particles < FEW else LEAN
+        self.thorough = not patched  # once and for all, since what Taichi fails to compile may be tried again
+        self.config: Any = None  # of Taichi, while kernels compile
+        self._settings: dict[str, Any] = {}  # that Taichi was started with
+        self._thread = 0
+        self.refused: Exception | None = None  # what is wrong with a function that is being compiled, see refuse()
+
+    def __call__(self) -> contextlib.AbstractContextManager[None]:
+        """The context; inside itself it has nothing to do."""
+        if active and active[-1] is self and self._thread == threading.get_ident():
+            return _INSIDE
+        return self._entered()
+
+    @contextlib.contextmanager
+    def _entered(self) -> Iterator[None]:
+        runtime: Any = impl.get_runtime()
+        with _lock:
+            config, literals = runtime.prog.config(), runtime.default_fp
+            self.config = config
+            before = {name: getattr(config, name) for name in LEAN | BRIEF}
+            self._settings = active[0]._settings if active else before
+            runtime.set_default_fp(self.real)
+            _set(config, self.lean if str(config.arch) in HOSTS and not self.thorough else SAFE)
+            active.append(self)
+            forget()
+            self._thread = threading.get_ident()
+            collects = gc.isenabled()
+            gc.disable()  # trees are many small objects, none of them garbage
+            try:
+                yield
+            except Exception:
+                if self.refused is None:
+                    raise
+                error, self.refused = self.refused, None
+                raise error from None
+            finally:
+                active.pop()
+                runtime.set_default_fp(literals)
+                _set(config, before)
+                forget()
+                if collects:
+                    gc.enable()
+
+    def beware(self) -> None:
+        """Be thorough from here on: a function that is not ours is being compiled."""
+        runtime: Any = impl.get_runtime()
+        self.thorough = True
+        _set(runtime.prog.config(), self._settings | SAFE)
+
+
+def refuse(error: Exception) -> None:
+    """Stop compiling because of what a user's function does, with this error and not what Taichi makes of it."""
+    if active:
+        active[-1].refused = error
+    raise error
+
+
+def readable(function: Any) -> bool:
+    """Whether Taichi will find the source of a Python function."""
+    try:
+        _wrap_inspect.getsourcelines(function)
+    except (OSError, TypeError):
+        return False
+    return True
+
+
+def inline(function: Any) -> Any:
+    """A function of one expression, for kernels to call as Python does: they get the expression itself.
+
+    Taichi compiles a call of a ti.func by reading its source, copying each argument to a variable, and each result: as much as
+    for ten more operations.
+    """
+    function._is_taichi_function, function.func = True, SimpleNamespace(has_print=False)  # it asks functions for these two
+    return function
+
+
+class Quick:
+    """A kernel of one object, for many launches: after the first one, past the door at which Taichi looks at the object and at
+    each argument anew, which takes 25 us.
+
+    Its arguments are arrays, which stay where they are; what they hold may change from launch to launch. It returns nothing. What
+    Taichi freezes at the first compile is frozen, as ever: an object that has changed takes a new Quick.
+    """
+
+    def __init__(self, owner: Any, name: str, compiler: Compiler, *arrays: np.ndarray):
+        self.owner, self.name, self.compiler, self.arrays = owner, name, compiler, arrays
+        self._ready: Any = None
+
+    def __call__(self) -> None:
+        """Launch it."""
+        if self._ready is None:
+            with self.compiler():
+                getattr(self.owner, self.name)(*self.arrays)
+                if patched:
+                    self._ready = self._prepared()
+        else:
+            self.launch()
+
+    def launch(self) -> None:
+        """Launch it when it is compiled."""
+        self._ready()
+
+    def _prepared(self) -> Callable[[], Any]:
+        """A launch; each one on a GPU, which copies arrays to and fro, has a context of its own."""
+        primal: Any = getattr(type(self.owner), self.name)._primal
+        kernel = primal.compiled_kernels[primal.ensure_compiled(self.owner, *self.arrays)]
+        program: Any = impl.get_runtime().prog
+        compiled = program.compile_kernel(program.config(), program.get_device_caps(), kernel)
+        if str(program.config().arch) in HOSTS:
+            return partial(program.launch_kernel, compiled, self._context(kernel))
+        return lambda: program.launch_kernel(compiled, self._context(kernel))
+
+    def _context(self, kernel: Any) -> Any:
+        """Where the arrays are."""
+        context = kernel.make_launch_context()
+        for k, array in enumerate(self.arrays):
+            context.set_arg_external_array_with_shape((k,), array.ctypes.data, array.nbytes, array.shape, 0)
+        return context
+
+
+def _set(config, settings: dict[str, Any]) -> None:
+    for name, value in settings.items():
+        setattr(config, name, value)

@@ -1,0 +1,1 @@
+"""The contract of all that acts on particles."""

@@ -1,0 +1,124 @@
+"""The arguments that an object was made with, what a recording needs to make it again; and which of them can be set later."""
+
+import difflib
+import functools
+import inspect
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from taichi.lang import impl
+
+from ..device.patches.syntax_cache import at
+from .read_only import assign_whole, handed_out, structure
+
+
+class Knob:
+    """A live setting: checked when assigned, written to the device before the next frame.
+
+    check: a function (feature, value) -> value that raises for a wrong one.
+    force: it changes a force, so that displacements are turned into velocities first, see World._restart().
+    compiled: kernels have its value in them, so that another one has the world built anew, see Feature.outgrown.
+    device: the attribute that is its field, for kernels, which read the setting by the same name; None where they do not.
+    """
+
+    def __init__(self, check: Callable, doc: str, *, force: bool = False, compiled: bool = False, device: str | None = None):
+        self.check, self.force, self.compiled, self.device = check, force, compiled, device
+        self.__doc__ = doc
+
+    def __set_name__(self, owner, name: str) -> None:
+        self.name = name
+
+    def __get__(self, feature, owner=None) -> Any:
+        if feature is None:
+            return self
+        if self.device and impl.inside_kernel() and self.device in feature.__dict__:
+            return at(feature.__dict__[self.device], None)
+        if self.name not in feature.__dict__:
+            raise AttributeError(f"{feature!r} has no {self.name}.")
+        return feature.__dict__[self.name]
+
+    def __set__(self, feature, value) -> None:
+        value = self.check(feature, value)
+        feature.__dict__[self.name] = handed_out(value, assign_whole(type(feature).__name__, self.name))
+        feature.changed = True
+        if self.force:
+            feature.new_force = True
+
+
+class Noted:
+    """Objects whose class keeps the arguments of __init__ in `arguments`, by name, as they were then.
+
+    From outside, only knobs can be set: what else an object consists of is compiled into kernels. Its own methods set what they
+    like; arrays become read-only, since no kernel would see what is written to them.
+    """
+
+    arguments: Mapping[str, Any] = MappingProxyType({})
+    kept_by_world: tuple[str, ...] = ()  # attributes that a world sets
+
+    def __init_subclass__(cls, **kwargs) -> None:
+        super().__init_subclass__(**kwargs)
+        if "__init__" in vars(cls):
+            type.__setattr__(cls, "__init__", _noting(cls.__init__))
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not name.startswith("_") and name not in self.kept_by_world and not isinstance(getattr(type(self), name, None), Knob):
+            if sys._getframe(1).f_locals.get("self") is not self:
+                raise AttributeError(self._refused(name))
+            value = handed_out(value, structure(type(self).__name__, name))
+        object.__setattr__(self, name, value)
+
+    def __delattr__(self, name: str) -> None:
+        raise AttributeError(f"{self!r}.{name} cannot be deleted.")
+
+    def _refused(self, name: str) -> str:
+        live, given = knobs_of(type(self)), [*inspect.signature(type(self)).parameters]
+        can = f"Live are {', '.join(live)}" if live else "Nothing of it is live"
+        if name in given or inspect.getattr_static(self, name, None) is not None:
+            return (
+                f"{self!r}.{name} cannot be set: it is fixed when {type(self).__name__} is made. {can}. For another {name} make "
+                f"a new {type(self).__name__}; in a world, world.remove(features=[old]) and world.add(features=[new])."
+            )
+        return f"{self!r} has no {name!r}{meant(name, [*live, *given])}. {can}."
+
+
+@functools.cache
+def knobs_of(kind: type) -> tuple[str, ...]:
+    """The names of the live settings of a class."""
+    return tuple(name for name in dir(kind) if isinstance(getattr(kind, name, None), Knob))
+
+
+def meant(name: str, names: Iterable[str]) -> str:
+    """A guess at what a misspelt name was to be, as the end of a sentence; empty if nothing is near."""
+    near = difflib.get_close_matches(name, [*names], 1)
+    return f"; did you mean {near[0]!r}?" if near else ""
+
+
+def _noting(init):
+    signature = inspect.signature(init)
+
+    @functools.wraps(init)
+    def noted(self, *args, **kwargs):
+        args, kwargs = _frozen(args), _frozen(kwargs)
+        init(self, *args, **kwargs)
+        self.arguments = dict(list(signature.bind(self, *args, **kwargs).arguments.items())[1:])
+
+    return noted
+
+
+def _frozen(value: Any) -> Any:
+    """The same value, safe from what its owner does with it later; what can be read only once is read."""
+    if isinstance(value, np.ndarray):
+        if value.flags.writeable or value.base is not None:
+            value = value.copy()
+            value.flags.writeable = False
+        return value
+    if isinstance(value, Mapping):
+        return {key: _frozen(item) for key, item in value.items()}
+    if isinstance(value, tuple):
+        return tuple(_frozen(item) for item in value)
+    if isinstance(value, (list, Iterator)):
+        return [_frozen(item) for item in value]
+    return value

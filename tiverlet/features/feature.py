@@ -1,0 +1,289 @@
+"""What acts on particles: the contract that every force, constraint and wall keeps, and the guide to writing one.
+
+A feature is a batch of arrays and one small kernel function. It checks its arguments in Python, declares its own
+fields, and is absent from memory, from the kernels and from the clock when it is not in the scene. There are these
+kinds, told apart by what the substep asks of them:
+
+    Acceleration   acceleration(i, x, v, t) of one particle, and/or a linear drag rate
+    Batch          relax(c, ...) of one constraint: reads its particles, writes the moves it wants into slots
+    Scalar         (scalar.py) a Batch whose constraint is one number: give measure(c, q) = f and its gradients, and
+                   C = f - rest gets compliance, damping, mass splitting, residual and load from there
+    Ragged         (variable_size.py) a Batch on any number of particles each, summed in blocks; Content, for such a Scalar
+    Tether         (anchored.py) a Batch of particles that are each drawn to a place of its own: give the vector to it
+    Wall           (collider.py) confine(i, ...) of one particle, with the last word
+
+A new constraint on k particles is one file with one Scalar subclass: `arity = k`, an __init__ that checks its arrays,
+`rest_of(position)` for a default rest value, and `measure`. See constraints/distance.py. Arrays of its own with a row for each
+constraint are named in `each`, and what depends on where particles were is taken from `self.start`, so that a world can be built
+anew around it (edit_scene.py).
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..device import ti
+from ..device.memory import Memory
+from ..device.patches.compiler import inline
+from ..device.patches.syntax_cache import at
+from ..particles import Particles, State
+from .arguments import Knob as Knob
+from .arguments import Noted, knobs_of
+from .read_only import handed_out
+
+BENT, FAR = 1, 2  # how far a constraint turned in a substep: by more than 26 degrees, by more than 41
+
+
+@dataclass
+class Scene:
+    """What a feature is bound to: the memory to declare fields in, and the particles they act on."""
+
+    memory: Memory
+    state: State
+    particles: Particles
+    inv_mass: np.ndarray  # (n,) after pins: 0 means that constraints cannot move it
+    radius: Any = None  # where something asks for radii
+    slots: Any = None  # where constraints leave their moves
+    residuals: Any = None  # batch -> what the last substep left of each of its violations
+    order: int = 2  # of the substep in h
+    hh: float = 0.0  # [s^2] what an acceleration added to the displacement in the last substep, see Batch.relax
+
+    @property
+    def real(self):
+        """The Taichi type of the world's real numbers."""
+        return self.memory.real
+
+
+class Feature(Noted):
+    """Base of all. `arguments` are those that it was made with; `changed` says that a knob waits to be uploaded, `new_force`
+    that it changes a force, `moving` that a target is under way."""
+
+    kept_by_world = ("scene", "start", "changed", "moving", "new_force", "arguments")
+    compiled_for: tuple[str, ...] = ()  # properties that decide what its kernels consist of
+    changed = True
+    moving = new_force = False
+    scene: Any = None  # Scene, from bind() on
+    start: Any = None  # Particles, as they were when it came: what it takes from them is what it took then, when bound again too
+
+    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Check the arguments against the particles; set inv_mass to 0 for those that this feature holds."""
+
+    def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Warn of what makes no sense, once it is settled which particles can move."""
+
+    def admit(self, particles: Particles, first: int) -> None:
+        """Check particles that come later, from number `first` on."""
+
+    def bind(self, scene: Scene) -> None:
+        """Declare fields with scene.memory.field(...). Called when the world is built, and again when it is built anew."""
+
+    def upload(self) -> None:
+        """Write changed knobs to the device. Called before a frame when `changed`."""
+
+    def settle(self) -> None:
+        """End a motion: what was the target of the last frame is where the next one starts. Called when `moving`."""
+
+    def compiled(self) -> dict[str, Any]:
+        """What its kernels have in them: the values of knobs that are compiled, and what they are compiled for."""
+        knobs = [name for name in knobs_of(type(self)) if getattr(type(self), name).compiled]
+        return {name: getattr(self, name) for name in (*knobs, *self.compiled_for)}
+
+    @property
+    def outgrown(self) -> bool:
+        """Whether knobs ask for what its kernels do not have, so that the world has to be built anew around it.
+
+        What once was compiled stays when a knob no longer needs it: friction of 0 where there was some costs no compiling.
+        """
+        built = vars(self).get("_on_built")
+        return built is not None and built != self.compiled()
+
+    def copy(self) -> "Feature":
+        """The same feature, unbound: same arrays and knobs, ready for another world."""
+        new = object.__new__(type(self))
+        new.__dict__.update(vars(self))
+        new.release()
+        return new
+
+    def release(self) -> None:
+        """Forget the world that it acted in."""
+        for name in ["scene", "start", "changed", "moving", "new_force", *(k for k in vars(self) if k.startswith("_on_"))]:
+            self.__dict__.pop(name, None)
+
+    def spared(self, number: np.ndarray) -> tuple[np.ndarray, ...]:
+        """When particles get new numbers, -1 for those that go: masks of what stays, for its fields of as many rows."""
+        return ()
+
+    def renumber(self, number: np.ndarray, count: int) -> None:
+        """Take the new numbers of its particles, of which there are `count` now, and leave out what had one that goes."""
+
+    def __repr__(self) -> str:
+        return type(self).__name__
+
+
+class Acceleration(Feature):
+    """A force that acts on each particle by itself: gravity, drag, a field.
+
+    accelerates: acceleration() adds something (a pure drag leaves it False).
+    uniform: it is the same everywhere, so it has no stiffness. common: it is the same for all particles, and asked only once.
+    uses_velocity: acceleration() reads v, which costs one more field to have it to second order.
+    conservative: potential() is known, so the energy report can account for it.
+    decays: it has a rate, a linear drag [1/s] that is solved exactly (exponential); several add up.
+    """
+
+    accelerates = True
+    uniform = False
+    common = False
+    uses_velocity = False
+    conservative = False
+    decays = False
+    rate = 0.0
+
+    @ti.func
+    def acceleration(self, i, x, v, t):
+        """Acceleration [m/s^2] of particle i at position x [m] with velocity v [m/s] at time t [s]."""
+        return 0.0 * x
+
+    @ti.func
+    def potential(self, i, x):
+        """Potential energy of particle i per unit of mass [J/kg] at x."""
+        return 0.0 * x[0]
+
+
+class Batch(Feature):
+    """m constraints of the same kind on `arity` particles each.
+
+    relax() writes, for each of its particles, the move that it wants, already multiplied by the inverse mass. What the
+    particles of constraint c are: self.members(c, k); where their moves go: self.push(c, k, move).
+    """
+
+    arity = 0  # 0: as many as each needs, see variable_size.py
+    reweighs = False  # miss() needs weigh()
+    blocks = corner_count = 0  # of ragged batches: how much there is for weigh() and for spread() to do
+    soft = False  # has springs, which act at a start
+    breaks = False  # has constraints that a load can break
+    drives = False  # puts its particles in place instead of relaxing them
+    transcends = False  # takes angles, cube roots or exponentials, which SPIR-V has for f32 only
+    indices: np.ndarray  # (m, arity)
+    each: tuple[str, ...] = ()  # its arrays with one row for each constraint, beside the indices
+    index_name = "indices"  # the argument of __init__ that they are, as `listing` gives them
+
+    @property
+    def count(self) -> int:
+        """The number of constraints."""
+        return len(self.indices)
+
+    @property
+    def residual(self) -> np.ndarray:
+        """What the last substep left of each violation, (m,), relative as in StepReport.residual; 0 where it is broken."""
+        if not self.count:
+            return np.zeros(0)
+        if self.scene is None:
+            raise RuntimeError(f"{self!r}.residual: there is none before a world has been stepped with it.")
+        return np.zeros(self.count) if self.drives or not self.acts else self.scene.residuals(self)
+
+    @property
+    def acts(self) -> bool:
+        """Whether it is in a world, and on the device: some of its particles can move, or it drives them."""
+        return self.scene is not None and "_on_members" in vars(self)
+
+    @property
+    def broken(self) -> np.ndarray:
+        """Which constraints have broken so far, Boolean (m,)."""
+        return np.zeros(self.count, dtype=bool)
+
+    def members_of(self, c: int) -> np.ndarray:
+        """The particles of constraint c."""
+        return self.indices[c]
+
+    def idle(self, inv_mass: np.ndarray) -> np.ndarray:
+        """Whether each constraint has no particle that can move, (m,)."""
+        return (inv_mass[self.indices] == 0).all(axis=1)
+
+    def spared(self, number: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Constraints stay as long as all of their particles do."""
+        return (np.all(number[self.indices] >= 0, axis=1),)
+
+    def renumber(self, number: np.ndarray, count: int) -> None:
+        """Keep the rows of what stays."""
+        some = self.spared(number)[0]
+        self.select(some, number)
+        for name in self.each:
+            if isinstance(rows := self.__dict__.get(name), np.ndarray):
+                self.__dict__[name] = handed_out(rows[some], getattr(rows, "advice", ""))
+        now = {self.index_name: self.listing} | {name: self.__dict__[name] for name in self.each if name in self.__dict__}
+        self.arguments = {k: v if v is None or np.isscalar(v) else now.get(k, v) for k, v in self.arguments.items()}
+
+    @property
+    def listing(self) -> Any:
+        """The particles of each constraint, as the user gives them."""
+        return self.indices
+
+    def select(self, some: np.ndarray, number: np.ndarray) -> None:
+        """Keep the particles of these constraints, by their new numbers."""
+        self.indices = number[self.indices[some]].astype(np.int32)
+
+    def partners(self, particles: Particles) -> np.ndarray:
+        """Pairs of particles that may overlap, (k, 2), because this batch says where they are to each other."""
+        pairs = [self.indices[:, [a, b]] for a in range(self.arity) for b in range(a)]
+        return np.concatenate([*pairs, np.zeros((0, 2), dtype=np.int32)])
+
+    def bind(self, scene: Scene) -> None:
+        """Declare the particles and slots of each constraint."""
+        self.scene = scene
+        self._on_state = scene.state
+        self._on_slots = scene.slots
+        self._on_w = scene.state.w
+        self._on_members = scene.memory.field(f"{self!r}.members", self.count, width=self.arity, kind=ti.i32, values=self.indices)
+        if not self.drives:
+            self._on_places = scene.memory.field(
+                f"{self!r}.slots", self.count, width=self.arity, kind=ti.i32, values=scene.slots.places(self)
+            )
+
+    @inline
+    def member(self, c, k):
+        """The particle at corner k of constraint c."""
+        return at(at(self._on_members, c), k)
+
+    @ti.func
+    def push(self, c, k: ti.template(), move):  # type: ignore[valid-type]
+        """Write the move of corner k into its slot; a particle that cannot move has none."""
+        place = self._on_places[c][k]
+        if place >= 0:
+            self._on_slots.move[place] = move
+
+    @ti.func
+    def relax(self, c, h, hh, when, first, fresh):
+        """One Jacobi correction of constraint c in a substep of h [s]: pushes one move for each corner.
+
+        hh: what a constant acceleration adds to the displacement, per m/s^2: h^2, half of it at a start, less with drag [s^2].
+        when: the fractions of the frame at the start and the end of the substep, for targets that move.
+        first: 1 in the first iteration of a substep. fresh: 1 in the first substep after a start.
+        """
+
+    @ti.func
+    def kick(self, c, h):
+        """Push what the constraint's spring, if it has one, adds to h^2 a at the present positions; for starts."""
+
+    @ti.func
+    def bond(self, c, firm, soft):
+        """Push what the constraint added to h^2 a in the last substep, along its directions at the present positions, about which
+        it has no moment. firm, soft: h^2 over what its multiplier stands for, where it is rigid and where not."""
+
+    @ti.func
+    def weigh(self, b, h, hh, first, fresh):
+        """Before relax() and kick() sum over block b of a ragged batch. first: -1 before kick()."""
+
+    @ti.func
+    def spread(self, e, h, hh, first, fresh):
+        """After relax() and kick(): push the move of corner e of a ragged batch."""
+
+    @ti.func
+    def miss(self, c, h, hh, when, fresh):
+        """How far constraint c is from fulfilled, relative to its size."""
+        return 0.0
+
+    @ti.func
+    def energy(self, c, back, hh, miss):
+        """Elastic energy [J] of constraint c at x - back d. hh: as in relax(), 0 where there was no substep yet. miss: miss()."""
+        return 0.0

@@ -1,0 +1,1 @@
+"""Which particles are near: cell list, search, neighbour list, queries."""

@@ -1,0 +1,170 @@
+"""A spatial hash over an unbounded domain, for particles of any sizes.
+
+The hash folds space onto a torus of cells, cell (a, b, ...) to bucket (a mod A, b mod B, ...) with A, B powers of two
+of at least 4. The three cells around a particle along each axis thus fall into different buckets, so every bucket is read
+once and every pair is seen once, however many far cells share a bucket; those are told apart by the distance itself. Cells
+of a row stand side by side in memory. Counting sort; no cell has a capacity. On a GPU the counters are atomic, and the order
+within a cell is another one in every run: no result may depend on it.
+
+Particles whose radii differ by more than a factor of two stand in tables of their own, with cells of their size: level 0 holds
+the largest, each next level radii down to half of those before. A particle looks at its own level and at the coarser ones, where
+its neighbours are in the 3^dim cells around it; of the finer ones it hears when they find it.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from ..device import ti
+from ..device.prefix_sum import Sums
+from ..device.thread_team import Team
+from ..features.feature import Scene
+from ..tools import distinct
+
+LEVELS = 14  # the last one holds all that are smaller, down to points
+
+
+class Cells:
+    """The tables. radius: (n,) [m]. skin: what is added to the distance at which two touch [m]."""
+
+    def __init__(self, scene: Scene, radius: np.ndarray, skin: float, team: Team, scratch: Any):
+        self.team = team
+        self.place = scratch  # of the particles as they are sorted, while a list is built: read one after the other
+        self.memory = scene.memory
+        n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
+        self.n, self.dim, self.state, self.real = n, dim, scene.state, scene.real
+        self.serial = not team.launched  # counting in order, on one thread, beats atomic counters in parallel on a CPU
+        with np.errstate(divide="ignore"):
+            level = np.minimum(np.floor(np.log2(radius.max() / radius)), LEVELS - 1).astype(int)
+        used, level, _ = distinct(level)
+        self.levels = len(used)
+        largest = np.array([radius[level == m].max() for m in range(self.levels)])
+        # Rounding of floor(x * scale) must not hide a neighbour.
+        self.sizes = (2 * largest + skin) * (1 + 2.0**-12)
+        counts = np.bincount(level, minlength=self.levels)
+        self.bits = np.maximum(2 * dim, np.ceil(np.log2(np.maximum(2 * counts, 1)))).astype(int)
+        offsets = np.concatenate([[0], np.cumsum(1 << self.bits)])
+        self.buckets = int(offsets[-1])
+        self._shapes = self.shapes(np.ptp(scene.particles.position, axis=0))
+        self.sums = Sums(self.buckets + 2, team)
+        self.edge = add("grid.edge", self.sums.room, kind=ti.i32)
+        self.sorted = add("grid.sorted", n, kind=ti.i32)
+        if self.state.compensated:
+            self.low = add("grid.place_low", n, width=dim)
+        self.shape = add("grid.shape", self.levels, width=dim, kind=ti.i32, values=self._shapes)
+        if self.levels > 1:
+            self.level = add("grid.level", n, kind=ti.i32, values=level)
+            self.per_meter = add("grid.cells_per_meter", self.levels, values=1 / self.sizes)
+            self.offset = add("grid.offset", self.levels, kind=ti.i32, values=offsets[:-1])
+
+    def shapes(self, extent: np.ndarray) -> np.ndarray:
+        """Bits of each axis of each table, (levels, dim): at least 2, the rest where there are most cells per bucket."""
+        out = np.full((self.levels, self.dim), 2)
+        for m in range(self.levels):
+            cells = np.nan_to_num(extent / self.sizes[m], nan=1.0, posinf=1e30)
+            for _ in range(self.bits[m] - 2 * self.dim):
+                out[m, int(np.argmax(cells / 2.0 ** out[m]))] += 1
+        return out
+
+    def fit(self, extent: np.ndarray) -> bool:
+        """Shape the tables for particles that fill a box of this size [m]; affects speed only. Returns whether they changed."""
+        shapes = self.shapes(extent)
+        changed = not np.array_equal(shapes, self._shapes)
+        if changed:
+            self._shapes = shapes
+            self.memory.write(self.shape, shapes)
+        return changed
+
+    @ti.func
+    def level_of(self, i):
+        """The level of particle i."""
+        m = 0
+        if ti.static(self.levels > 1):
+            m = self.level[i]
+        return m
+
+    @ti.func
+    def home(self, i, m):
+        """The cell of particle i at level m."""
+        return ti.floor(self.state.x[i] * self.scale(m), ti.i32)
+
+    @ti.func
+    def scale(self, m):
+        """Cells per meter at level m."""
+        scale = ti.cast(1 / self.sizes[0], self.real)
+        if ti.static(self.levels > 1):
+            scale = self.per_meter[m]
+        return scale
+
+    @ti.func
+    def bucket(self, cell, m):
+        """The bucket of a cell at level m; axis 0 varies fastest."""
+        bits = self.shape[m]
+        b = cell[self.dim - 1] & ((1 << bits[self.dim - 1]) - 1)
+        for k in ti.static(range(self.dim - 2, -1, -1)):
+            b = (b << bits[k]) | (cell[k] & ((1 << bits[k]) - 1))
+        if ti.static(self.levels > 1):
+            b += self.offset[m]
+        return b
+
+    @ti.func
+    def where(self, i):
+        """The bucket of particle i."""
+        m = self.level_of(i)
+        return self.bucket(self.home(i, m), m)
+
+    @ti.func
+    def sort(self, me):
+        """Sort the particles into buckets."""
+        for b in range(self.team.low(self.buckets + 2, me), self.team.high(self.buckets + 2, me)):
+            self.edge[b] = 0
+        self.team.wait()
+        ti.loop_config(serialize=self.serial)
+        for i in range(self.team.one(self.n, me)):
+            raised(self.edge, self.where(i) + 1, 1, self.serial)
+        self.sums.run(self.edge, me)
+        ti.loop_config(serialize=self.serial)
+        for back in range(self.team.one(self.n, me)):
+            # Filling a bucket from its end turns the end of each into its begin, and the next one's begin is its end. From the
+            # last particle on, so that each bucket comes out in order (on one thread) and leaves little to sort.
+            i = self.n - 1 - back
+            k = raised(self.edge, self.where(i) + 1, -1, self.serial) - 1
+            self.sorted[k] = i
+            self.place[k] = self.state.x[i]
+            if ti.static(self.state.compensated):
+                self.low[k] = self.state.low[i]
+        self.team.wait()
+
+    @ti.func
+    def apart(self, i, k):
+        """From the k-th of the sorted particles to particle i, as State.apart() has it."""
+        r = self.state.x[i] - self.place[k]
+        if ti.static(self.state.compensated):
+            r += self.state.low[i] - self.low[k]
+        return r
+
+    @ti.func
+    def row(self, cell, m, r):
+        """Row r of the 3^(dim - 1) around a cell at level m: its first bucket, how far along its three cells begin, the mask of
+        their axis, and 3 where they stand side by side, 1 where the torus wraps between them."""
+        mask = (1 << self.shape[m][0]) - 1
+        at, rest = cell, r
+        for k in ti.static(range(1, self.dim)):
+            at[k] += rest % 3 - 1
+            rest = rest // 3
+        at[0] = 0
+        low, span = (cell[0] - 1) & mask, 1
+        if low + 2 <= mask:
+            span = 3
+        return self.bucket(at, m), low, mask, span
+
+
+@ti.func
+def raised(field: ti.template(), at, by, serial: ti.template()):  # type: ignore[valid-type]
+    """Add to a counter; returns what it was. serial: one thread counts, without atomic operations, which take longer."""
+    old = field[at]
+    if ti.static(serial):
+        field[at] = old + by
+    else:
+        old = ti.atomic_add(field[at], by)
+    return old

@@ -1,0 +1,225 @@
+"""Neighbours: how the list of near pairs is built.
+
+It holds, for each particle, all others closer than the sum of radii plus a skin, sorted by index, and those with which it has
+something to carry along, wherever they are: what touched in the last substep may do so in the next, although a list was built
+in between. It stays valid until something has moved by half the skin, and no sum over it depends on when it was built, on the
+hash, or on the skin.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ..device import ti
+from ..device.patches.compiler import FEW
+from ..device.prefix_sum import MOST, Sums
+from ..device.sorting import exchange, sort, sorting_network
+from ..device.thread_team import Team
+from ..features.feature import Scene
+from ..features.material import Table
+from ..tools import distinct
+from .cell_list import Cells, raised
+from .neighbour_list import Luggage, Pairs
+
+FARTHEST = 1 << 22  # cells from the origin: beyond it, f32 cannot tell a cell from the next
+APPEND, COUNT, FILL = range(3)  # what a scan of the cells around a particle does with the neighbours that it finds
+
+
+class Grid(Pairs):
+    """The list of near pairs, from a hash of cells.
+
+    skin: what is listed beyond touching [m]. linked: (m, 2) pairs that are never listed. table: which groups touch. luggage: what
+    the entries of the list carry along when it is built anew. scratch: a field of vectors, (n,), to use while it is built.
+    """
+
+    def __init__(
+        self, scene: Scene, skin: float, linked: np.ndarray, table: Table, luggage: list[Luggage], team: Team, scratch: Any
+    ):  # fmt: skip
+        n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
+        self.sums = Sums(n, team, capped=True)
+        # Entries of a list that is sorted without branches; to compile that takes an eighth of all.
+        super().__init__(scene.memory, n, self.sums.room, luggage, team, 1 if n < FEW else 8 if dim == 2 else 16)
+        self.network = sorting_network(self.short)
+        self.dim, self.state, self.radius = dim, scene.state, scene.radius
+        self.table, self.skin = table, skin
+        self._extent: Sequence[float] = [-1.0] * dim
+        self.cells = Cells(scene, scene.particles.radius, skin, team, scratch)
+        self.several = self.cells.levels > 1
+        self.counts = self.several or team.launched  # before it lists
+        self.serial = not self.counts or (team.size == 1 and not team.launched)  # one thread makes a list, in order
+        self.blocks = max(1, -(-n // team.piece)) if team.size > 1 and not self.counts else 1
+        self.origin = add("grid.built_at", n, width=dim)
+        self.still = bool((scene.inv_mass == 0).any())  # whether there are pairs that cannot move
+        self.linked = len(linked) > 0
+        if self.linked:
+            both = np.concatenate([linked, linked[:, ::-1]])
+            both = distinct(both)[0]
+            begin = np.searchsorted(both[:, 0], np.arange(n + 1))
+            self.mates = add("grid.linked", len(both), kind=ti.i32, values=both[:, 1])
+            self.mates_begin = add("grid.linked_begin", n + 1, kind=ti.i32, values=begin)
+
+    @property
+    def finest(self) -> float:
+        """The size of the smallest cells [m]."""
+        return float(self.cells.sizes.min())
+
+    def fit(self, extent: Sequence[float]) -> None:
+        """Shape the hash for the extent of the particles [m], if it is another one by an eighth; affects speed only."""
+        for new, old in zip(extent, self._extent, strict=True):
+            if not abs(new - old) <= old / 8:
+                self._extent = extent
+                if self.cells.fit(np.asarray(extent)):
+                    self.age()
+                return
+
+    @ti.func
+    def outrun(self, i):
+        """1 if the list is stale: once a particle has moved by half the skin."""
+        r = self.state.x[i] - self.origin[i]
+        return ti.select(r.dot(r) <= ti.cast((0.49 * self.skin) ** 2, self.real), 0, 1)  # 1 for NaN
+
+    @ti.func
+    def build(self, me):
+        """Sort the particles into cells, then list the near ones of each. `me`: see Team."""
+        self.keep(me)
+        self.cells.sort(me)
+        if ti.static(self.counts):
+            self.pair_up(me)
+        else:
+            for k in range(self.team.deal(self.blocks, 1, me)):
+                self.fill(self.team.turn(k, 1, me))
+        for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
+            self.origin[i] = self.state.x[i]
+        self.team.wait()
+        ti.loop_config(serialize=True)
+        for _ in range(self.team.one(1, me)):
+            self.stale[None] = 0
+            if self.need[None] <= self.capacity:
+                self.kept[None] = 0
+        self.team.wait()
+
+    @ti.func
+    def fill(self, block):
+        """One level: list the neighbours of a block of particles, one after the other. Beyond the room they are only counted."""
+        start, room = block * self.pitch, self.capacity
+        size = ti.static(-(-self.n // self.blocks))
+        used = 0
+        for i in range(block * size, ti.min((block + 1) * size, self.n)):
+            self.first[i] = start + ti.min(used, room)
+            begin = used
+            used = self.scan(i, APPEND, start, ti.min(used, MOST))
+            self.number[i] = ti.max(ti.min(used, room) - begin, 0)
+        for i in range(block * size, ti.min((block + 1) * size, self.n)):
+            self.finish(i)
+        ti.atomic_max(self.need[None], used)
+
+    @ti.func
+    def pair_up(self, me):
+        """Count, then list: on a GPU, by a thread for each particle; and for several levels, each pair that one of the two finds
+        with both. What does not fit is only counted."""
+        for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
+            self.number[i] = 0
+        self.team.wait()
+        for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
+            raised(self.number, i, self.scan(i, COUNT, 0, 0), self.serial)
+        self.team.wait()
+        for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
+            self.first[i] = self.number[i]
+        self.team.wait()
+        self.sums.run(self.first, me)
+        ti.loop_config(serialize=True)
+        for _ in range(self.team.one(1, me)):
+            self.need[None] = self.first[self.n - 1]
+        self.team.wait()
+        for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
+            self.first[i] = self.first[i] - self.number[i]
+            self.number[i] = 0
+        self.team.wait()
+        for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
+            if self.need[None] <= self.capacity:
+                used = self.scan(i, FILL, self.first[i], 0)
+                if ti.static(not self.several):
+                    self.number[i] = used
+        self.team.wait()
+        for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
+            self.finish(i)
+
+    @ti.func
+    def finish(self, i):
+        """Put the list of particle i in order."""
+        self.order(self.first[i], self.number[i])
+        self.touching[i] = self.carry(i)
+
+    @ti.func
+    def scan(self, i, what: ti.template(), start, used):  # type: ignore[valid-type]
+        """Look for neighbours in the cells around particle i, at its own level and the coarser ones. Its list begins at `start`
+        and has `used` entries; returns how many it has then."""
+        own = self.cells.level_of(i)
+        for m in range(own + 1):
+            cell = self.cells.home(i, m)
+            for r in range(ti.static(3 ** (self.dim - 1))):
+                base, low, mask, span = self.cells.row(cell, m, r)
+                for part in range(3 // span):
+                    b = base + ((low + part) & mask)
+                    for e in range(self.cells.edge[b + 1], self.cells.edge[b + span + 1]):
+                        j = self.cells.sorted[e]
+                        listed = self.listed(i, j, self.cells.apart(i, e))
+                        if ti.static(what == APPEND):
+                            # No branch: it would be taken at random. What is not listed is written over by the next.
+                            self.near[start + ti.min(used, self.capacity)] = j
+                            used += listed
+                        elif ti.static(what == COUNT):
+                            used += listed
+                            if ti.static(self.several):
+                                if m < own and listed != 0:
+                                    raised(self.number, j, 1, self.serial)
+                        elif listed != 0:
+                            at = used
+                            if ti.static(self.several):  # others write to this list, too
+                                at = raised(self.number, i, 1, self.serial)
+                                if m < own:
+                                    self.near[self.first[j] + raised(self.number, j, 1, self.serial)] = i
+                            self.near[start + at] = j
+                            used += 1
+        for old in range(self.old_first[i], self.old_first[i] + self.old_number[i]):
+            j = self.aside[old]
+            if self.listed(i, j, self.state.apart(i, j)) == 0:
+                if ti.static(what == APPEND):
+                    self.near[start + ti.min(used, self.capacity)] = j
+                elif ti.static(what == FILL):
+                    at = used
+                    if ti.static(self.several):
+                        at = raised(self.number, i, 1, self.serial)
+                    self.near[start + at] = j
+                used += 1
+        return used
+
+    @ti.func
+    def listed(self, i, j, r):
+        """1 if a pair, apart by r, belongs on the list: near, not both immovable, not linked."""
+        far = self.table.reach(self.radius, i, j) + ti.cast(self.skin, self.real)
+        yes = ti.cast(r.dot(r) < far * far, ti.i32) & ti.cast(i != j, ti.i32)
+        if ti.static(self.still):
+            if yes != 0:
+                yes = ti.cast(self.state.w.of(i) + self.state.w.of(j) > 0, ti.i32)
+        if ti.static(not self.table.uniform):
+            if yes != 0:
+                yes = ti.cast(self.table.of(i, j)[3] > 0, ti.i32)
+        if ti.static(self.linked):
+            if yes != 0:
+                for e in range(self.mates_begin[i], self.mates_begin[i + 1]):
+                    if self.mates[e] == j:
+                        yes = 0
+        return yes
+
+    @ti.func
+    def order(self, begin, count):
+        """Sort by index, which makes every sum over the list independent of the table."""
+        if ti.static(self.several or self.short == 1):
+            sort(self.near, begin, count, self.serial)
+        elif count > ti.static(self.short):
+            sort(self.near, begin, count, self.serial)
+        else:
+            # Where neighbours in space are neighbours in number too, they are in order as they come.
+            exchange(self.near, begin, count, self.network, self.short)

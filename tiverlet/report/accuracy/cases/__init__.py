@@ -1,0 +1,39 @@
+"""Scenes with known answers: the entries of cases.json, each built only through the public names.
+
+A new case is one row in the list CASES of a file here.
+"""
+
+import difflib
+
+from . import chains, free, impacts, statics
+from .case import FRAME, METHODS, Case, Run, entries, known
+
+CASES: dict[str, Case] = {c.name: c for file in (chains, free, statics, impacts) for c in file.CASES}
+
+# Entries of cases.json that are no case of their own, and why.
+LEFT_OUT = {
+    "R04_oscillator_k100_dt0.1": "the same scene as R04_oscillator_k100_dt0.01, at another step",
+    "R10_catenary": "a continuum; R10b are the ropes of links that it is the limit of",
+    "R20_rolling": "particles do not spin",
+    "R22_packing": "statistics of many contacts: python -m tiverlet.report.accuracy.granular",
+    "R23_hard_gas_pressure": "statistics of many contacts: python -m tiverlet.report.accuracy.granular",
+    "R24_maxwell": "statistics of many contacts: python -m tiverlet.report.accuracy.granular",
+    "R25b_volume": "volumes are held at rest, which tests/test_bodies.py measures",
+}
+
+
+def chosen(names=None) -> list[Case]:
+    """The cases of these names, or whose names begin so; all for None. ValueError for a name that fits none."""
+    if names is None:
+        return list(CASES.values())
+    out: dict[str, Case] = {}
+    for name in [names] if isinstance(names, str) else names:
+        found = {k: c for k, c in CASES.items() if k == name or k.startswith(name)}
+        if not found:
+            near = difflib.get_close_matches(name, CASES, n=3, cutoff=0.3) or list(CASES)[:3]
+            raise ValueError(f"cases: {name!r} fits no case. Near it: {', '.join(near)}.")
+        out.update(found)
+    return list(out.values())
+
+
+__all__ = ["CASES", "FRAME", "LEFT_OUT", "METHODS", "Case", "Run", "chosen", "entries", "known"]

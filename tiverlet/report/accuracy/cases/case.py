@@ -1,0 +1,133 @@
+"""What a case is: a scene with a known answer, and how far from it a run ends."""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from importlib import resources
+
+import numpy as np
+
+from ....features.feature import Feature
+from ....measure import angular_momentum
+from ....particles import Particles
+from ....solvers import Chebyshev, ConjugateGradient, Direct, Jacobi
+from ....step_report import StepReport
+from ....world import World
+
+FRAME = 1 / 60
+EFFORTS = (5, 10, 20, 40, 80, 160, 320, 640)  # substeps of a frame
+
+# How a world is stepped: name -> (solver, iterations).
+METHODS = {
+    "Jacobi": (Jacobi(), 1),
+    "Jacobi x 10": (Jacobi(), 10),
+    "Direct": (Direct(), 1),
+    "Direct x 3": (Direct(), 3),
+    "Chebyshev x 10": (Chebyshev(), 10),
+    "CG x 20": (ConjugateGradient(20), 1),
+}
+
+
+@cache
+def _file() -> dict[str, dict]:
+    text = resources.files("tiverlet.report.accuracy.cases").joinpath("cases.json").read_text()
+    return {c["id"]: c for c in json.loads(text)["cases"]}
+
+
+def known(name: str) -> dict:
+    """An entry of cases.json: its parameters, values, formula and how far they can be trusted."""
+    return _file()[name]
+
+
+def entries() -> list[str]:
+    """The names of all entries of cases.json."""
+    return list(_file())
+
+
+@dataclass
+class Run:
+    """What a run leaves for its error measure."""
+
+    world: World
+    times: list[float] = field(default_factory=list)  # of the ends of frames [s]
+    seen: list[np.ndarray] = field(default_factory=list)  # what the case watches, after each frame
+    reports: list[StepReport] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One scene with a known answer, built only through the public names.
+
+    name: by which it is asked for; that of its entry in cases.json, or that and what tells several of one entry apart.
+    build: () -> particles and features, new ones at each call.
+    seconds [s]: when the error is taken, a whole number of frames of `frame` [s].
+    error: Run -> its error in `unit`. watch: World -> an array to keep after every frame, for errors of whole runs.
+    size: the error in `unit` of a run that has nothing to do with the answer; beyond it a run counts as diverged.
+    methods: names in METHODS, the best first. efforts: substeps of a frame to try; fit: those of them whose step is short enough
+    for an order of convergence to show. order: the order that the case must show with its first method in f64; None where the
+    error does not come from the step. limit: what its error must not exceed with its first method in f64 at `at` substeps.
+    trusted: how far the answer itself is known, in `unit`. single: what f32 may add to the error (numerics 4.6).
+    momentum: World -> what the motion conserves, as an array, and its natural size; None where nothing is. conserves: the energy.
+    """
+
+    name: str
+    title: str
+    build: Callable[[], tuple[Particles, Sequence[Feature]]]
+    seconds: float
+    error: Callable[[Run], float]
+    limit: float
+    size: float = 1.0
+    unit: str = "m"
+    frame: float = FRAME
+    watch: Callable[[World], np.ndarray] | None = None
+    methods: tuple[str, ...] = ("Jacobi",)
+    efforts: tuple[int, ...] = EFFORTS
+    fit: tuple[int, ...] = ()
+    at: int = 20
+    order: float | None = 2.0
+    trusted: float = 1e-12
+    single: float = 3e-4
+    momentum: Callable[[World], tuple[np.ndarray, float]] | None = None
+    conserves: bool = True
+
+    @property
+    def frames(self) -> int:
+        """Frames of a run."""
+        return round(self.seconds / self.frame)
+
+
+def rms(position, reference) -> float:
+    """Root mean square distance [m]."""
+    return float(np.sqrt(np.mean(np.sum((np.asarray(position) - np.asarray(reference)) ** 2, axis=-1))))
+
+
+def ends_at(index, reference) -> Callable[[Run], float]:
+    """The error measure of positions at the end: of particles `index` from `reference`, as many coordinates as it has."""
+    want = np.asarray(reference, dtype=np.float64)
+    return lambda run: rms(run.world.position[index][..., : want.shape[-1]], want)
+
+
+def spin(world: World) -> tuple[np.ndarray, float]:
+    """Angular momentum about the origin, and sum m |x| |v|."""
+    m = np.where(world.particles.inv_mass > 0, world.particles.mass, 0.0)
+    size = m @ (np.linalg.norm(world.position, axis=1) * np.linalg.norm(world.velocity, axis=1))
+    return angular_momentum(world), float(size)
+
+
+def upright(world: World) -> tuple[np.ndarray, float]:
+    """Angular momentum about the vertical through the origin, which gravity does not change."""
+    p, size = spin(world)
+    return p[1:2], size
+
+
+def sideways(world: World) -> tuple[np.ndarray, float]:
+    """Horizontal momentum, which gravity does not change, and sum m |v|."""
+    m = world.particles.mass
+    return m @ np.delete(world.velocity, 1, axis=1), float(m @ np.linalg.norm(world.velocity, axis=1))
+
+
+def links(n: int, first: int = 0) -> np.ndarray:
+    """Pairs of a chain of n links."""
+    k = np.arange(n) + first
+    return np.stack([k, k + 1], axis=1)

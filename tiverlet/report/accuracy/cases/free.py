@@ -1,0 +1,214 @@
+"""Particles that are free, or on springs: falls, orbits, oscillators and the modes of chains."""
+
+from typing import Any
+
+import numpy as np
+
+from ....constraints import Area, Distance, ShapeMatch
+from ....device import ti
+from ....features.feature import Feature
+from ....forces import Attractor, Drag, Force, Gravity
+from ....particles import Particles
+from .case import Case, ends_at, known, links, sideways, spin
+
+
+def fall(name: str) -> Case:
+    """A case of R01: constant acceleration, which position Verlet with half a kick at the start gets right."""
+    p = known(name)["params"]
+    t = p["steps"] * p["dt"]
+    y = p["y0"] + p["v0"] * t - p["g"] * t * t / 2
+    return Case(
+        name, f"Free fall in frames of {p['dt']:g} s",
+        lambda: (Particles([[0.0, p["y0"]]], velocity=(0, p["v0"])), [Gravity(p["g"])]), t, ends_at([0], [[0, y]]), 1e-10, 1.0,
+        frame=p["dt"], efforts=(1, 2, 4, 8), order=None, at=1,
+    )  # fmt: skip
+
+
+def thrown() -> tuple[Particles, list[Feature]]:
+    """R02: a projectile in space."""
+    p = known("R02_projectile")["params"]
+    e, a = np.radians(p["elevation_deg"]), np.radians(p["azimuth_deg"])
+    v = p["speed"] * np.array([np.cos(e) * np.cos(a), np.sin(e), np.cos(e) * np.sin(a)])
+    return Particles([[0, p["y0"], 0]], velocity=v), [Gravity(p["g"])]
+
+
+def dragged() -> tuple[Particles, list[Feature]]:
+    """R03: a projectile with linear drag."""
+    p = known("R03_linear_drag")["params"]
+    return Particles([[0.0, 0.0]], velocity=(p["vx0"], p["vy0"])), [Gravity(p["g"]), Drag(p["k"])]
+
+
+@ti.func
+def _soft_spring(x):
+    """k = 100 N/m."""
+    return -100.0 * x
+
+
+@ti.func
+def _hard_spring(x):
+    """k = 10000 N/m."""
+    return -10000.0 * x
+
+
+def rings(name: str, spring, seconds: float, limit: float, **more) -> Case:
+    """A case of R04: the user's own spring; its error is that of Verlet's frequency, 2 asin(omega h / 2) / h."""
+    p = known(name)["params"]
+    want = p["x0"] * np.cos(np.sqrt(p["k"] / p["m"]) * seconds)
+    return Case(
+        name, f"Oscillator by a force of the user's, {p['k']:g} N/m", lambda: (Particles([[p["x0"], 0.0]]), [Force(spring)]),
+        seconds, ends_at([0], [[want, 0.0]]), limit, p["x0"], conserves=False, **more,
+    )  # fmt: skip
+
+
+def sprung(name: str, seconds: float, limit: float) -> Case:
+    """A case of R04b: a compliant link between an anchor and a mass; XPBD loses all of its amplitude."""
+    p = known(name)["params"]
+    want = 1.0 + 0.1 * np.cos(np.sqrt(p["k"] / p["m"]) * seconds)
+
+    def build() -> tuple[Particles, list[Feature]]:
+        return Particles([[0.0, 0], [1.1, 0]], mass=p["m"], pinned=[0]), [Distance([[0, 1]], 1.0, compliance=p["alpha"])]
+
+    return Case(name, f"Oscillator by a compliant link, {p['k']:g} N/m", build, seconds, ends_at([1], [[want, 0]]), limit, 0.2)
+
+
+def dashpot() -> tuple[Particles, list[Feature]]:
+    """R05: a spring with a dashpot."""
+    p = known("R05_damped_oscillator")["params"]
+    link = Distance([[0, 1]], 1.0, compliance=1 / p["k"], damping=p["c"])
+    return Particles([[0, 0], [1 + p["x0"], 0]], mass=p["m"], pinned=[0]), [link]
+
+
+def orbit(e: str, limit: float, **more) -> Case:
+    """A case of R09: Kepler's orbit after 10 s."""
+    states = known("R09_kepler")["values"]["states"]
+    s, want = states[f"{e}_start"], states[f"{e}_t10"]
+
+    def build() -> tuple[Particles, list[Feature]]:
+        return Particles([[s["x"], s["y"]]], velocity=(s["vx"], s["vy"])), [Attractor((0, 0), 1.0)]
+
+    title = f"Kepler's orbit of eccentricity {e[1:]}"
+    error = ends_at([0], [[want["x"], want["y"]]])
+    return Case(f"R09_kepler:{e}", title, build, 10.0, error, limit, 1.0, momentum=spin, **more)
+
+
+def mode(j: int, limit: float) -> Case:
+    """A case of R12: mode j of a chain of springs between two walls, which keeps its amplitude."""
+    p, values = known("R12_chain_modes")["params"], known("R12_chain_modes")["values"]["modes"]["dt0.001"]
+    n, seconds = p["N"], 2.0
+    x = np.stack([np.arange(n + 2.0), np.zeros(n + 2)], axis=1)
+    u = np.sin(j * np.pi * np.arange(n + 2) / (n + 1))[:, None] * [0.01, 0.0]
+    u[-1] = 0
+    want = x + np.cos(values[f"mode{j}"]["omega"] * seconds) * u
+
+    def build() -> tuple[Particles, list[Feature]]:
+        link = Distance(links(n + 1), p["rest"], compliance=p["alpha"])
+        return Particles(x + u, mass=p["m"], pinned=[0, n + 1]), [link]
+
+    title = f"Mode {j} of a chain of {n} masses on springs"
+    methods = ("Direct", "Jacobi")
+    return Case(f"R12_chain_modes:{j}", title, build, seconds, ends_at(slice(None), want), limit, 0.01, methods=methods)
+
+
+def sway(n: int, limit: float) -> Case:
+    """A case of R13: the slowest transverse mode of a hanging chain of n links, 0.1 mm wide."""
+    omega, seconds = known("R13_hanging_chain_modes")["values"][f"N{n}"]["omega1"], 5.0
+    tension = np.arange(n, 0, -1) * 9.81 * n  # over the length of a link, with mass 1
+    K = np.diag(tension + np.append(tension[1:], 0)) - np.diag(tension[1:], 1) - np.diag(tension[1:], -1)
+    u = np.concatenate([[0.0], np.linalg.eigh(K)[1][:, 0]])
+    x = np.stack([1e-4 * u / np.abs(u).max(), np.zeros(n + 1)], axis=1)
+    x[1:, 1] = -np.cumsum(np.sqrt(1 / n**2 - np.diff(x[:, 0]) ** 2))
+    want = np.cos(omega * seconds)
+
+    def build() -> tuple[Particles, list[Feature]]:
+        return Particles(x, pinned=[0]), [Gravity(9.81), Distance(links(n), 1 / n)]
+
+    return Case(
+        f"R13_hanging_chain_modes:N{n}", f"Slowest mode of a hanging chain of {n} links", build, seconds,
+        lambda run: abs(float(run.world.position[:, 0] @ u / (x[:, 0] @ u)) - want), limit, 1.0, "relative",
+        methods=("Direct", "Jacobi"), trusted=1e-8, conserves=False,
+    )  # fmt: skip
+
+
+def racket() -> tuple[Particles, list[Feature]]:
+    """S05: a rigid cluster that tumbles about its middle axis."""
+    p = known("S05_tennis_racket")["params"]
+    x = np.repeat(np.diag(p["half_axes"]), 2, axis=0) * np.array([1, -1] * 3)[:, None]
+    return Particles(x, velocity=np.cross(p["omega0_body"], x)), [ShapeMatch([np.arange(6)])]
+
+
+def ring() -> tuple[Particles, list[Feature]]:
+    """R25: a soft ring of 12 links around a rigid area, let go out of shape."""
+    n = 12
+    k = np.arange(n)
+    a = 2 * np.pi * k / n
+    x = np.stack([1.2 * np.cos(a), np.sin(a) / 1.2], axis=1)
+    rim = Distance(np.stack([k, (k + 1) % n], axis=1), 2 * np.sin(np.pi / n), compliance=1e-2)
+    return Particles(x), [Area([k], known("R25_polygon_area")["values"]["n12"]["area"]), rim, Drag(2.0)]
+
+
+def swollen(run) -> float:
+    """How much the area of the ring is off, relative."""
+    area = run.world.features[0]
+    return abs(float(area.rest_of(run.world.position)[0] / area.rest[0]) - 1)
+
+
+def cast() -> tuple[Particles, list[Feature]]:
+    """A net of unequal masses, soft in places, that flies and tumbles."""
+    rng = np.random.default_rng(4)
+    k = np.arange(36).reshape(6, 6)
+    pairs = [np.stack([k[:-1].ravel(), k[1:].ravel()], axis=1), np.stack([k[:, :-1].ravel(), k[:, 1:].ravel()], axis=1)]
+    x = np.stack(np.divmod(np.arange(36.0), 6), axis=1) + rng.uniform(-0.1, 0.1, (36, 2))
+    v, mass = rng.normal(size=(36, 2)) + [2.0, 5.0], np.exp(rng.uniform(0, np.log(100), 36))
+    alpha: Any = np.where(np.arange(60) % 3 == 0, 1e-3, 0.0)
+    net = Distance(np.concatenate(pairs), 1.0, compliance=alpha)
+    return Particles(x, velocity=v, mass=mass), [Gravity(9.81), net]
+
+
+def astray(run) -> float:
+    """How far the centre of mass is from its parabola [m]."""
+    p, t = run.world.particles, run.times[-1]
+    share = p.mass / p.mass.sum()
+    return float(np.linalg.norm(share @ (run.world.position - p.position - p.velocity * t) - [0, -9.81 * t * t / 2]))
+
+
+R02, R03, R05 = (known(f"{n}")["values"] for n in ("R02_projectile", "R03_linear_drag", "R05_damped_oscillator"))
+S05 = known("S05_tennis_racket")["values"]["t2.0"]
+EXACT = {"order": None, "efforts": (1, 2, 4, 8), "at": 2}
+
+CASES = [
+    Case(
+        "M01_thrown_net", "Centre of mass of a net that is thrown", cast, 1.0, astray, 1e-11, order=None, momentum=sideways,
+        conserves=False,
+    ),
+    Case(
+        "S05_tennis_racket", "Tennis racket: six masses that tumble", racket, 2.0,
+        ends_at([0, 2], [S05["particle1_xyz"], S05["particle3_xyz"]]), 3e-5, momentum=spin,
+    ),
+    fall("R01_free_fall_dt0.01"),
+    fall("R01_free_fall_dt0.001"),
+    Case(
+        "R02_projectile", "Projectile", thrown, R02["t_flight"], ends_at([0], [[R02["x_end"], 0.0, R02["z_end"]]]), 1e-10, 1.0,
+        frame=R02["t_flight"] / 100, **EXACT,
+    ),
+    Case(
+        "R03_linear_drag", "Projectile with linear drag", dragged, 2.0, ends_at([0], [[R03["x"], R03["y"]]]), 1e-10, 1.0,
+        conserves=False, **EXACT,
+    ),
+    rings("R04_oscillator_k100_dt0.01", _soft_spring, 10.0, 2e-4),
+    rings("R04_oscillator_k10000_dt0.001", _hard_spring, 1.0, 4e-2, efforts=(10, 20, 40, 80, 160)),
+    sprung("R04b_xpbd_oscillator_decay_k100", 10.0, 1e-4),
+    sprung("R04b_xpbd_oscillator_decay_k1000", 2.0, 1e-3),
+    Case(
+        "R05_damped_oscillator", "Spring with a dashpot", dashpot, 1.0, ends_at([1], [[1 + R05["x_T"], 0.0]]), 1e-4, 0.3,
+        conserves=False,
+    ),
+    orbit("e0", 1e-3),
+    orbit("e0.5", 2e-3),
+    orbit("e0.9", 1.0, efforts=(20, 40, 80, 160, 320), at=320, fit=(80, 160, 320)),
+    mode(1, 1e-4),
+    mode(5, 1e-4),
+    sway(5, 1e-4),
+    sway(20, 1e-3),
+    Case("R25_polygon_area", "Soft ring around a rigid area", ring, 4.0, swollen, 1e-3, 0.1, "relative", conserves=False,
+         methods=("Jacobi", "Jacobi x 10"), order=None),
+]  # fmt: skip

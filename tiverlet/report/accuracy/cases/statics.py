@@ -1,0 +1,121 @@
+"""Ropes, beams and nets that come to rest: what is left is the error of the equilibrium, in positions or in shares."""
+
+from typing import Any
+
+import numpy as np
+
+from ....constraints import Bend, Distance
+from ....device import ti
+from ....features.feature import Feature
+from ....forces import Drag, Force, Gravity
+from ....particles import Particles
+from .case import Case, Run, ends_at, known, links
+
+RATE = 4.0  # [1/s] of the drag that brings them to rest; after 10 s exp(-20) of a swing is left
+FINER: dict[str, Any] = {"efforts": (10, 20, 40, 80, 160)}  # where the order of Jacobi shows late
+SETTLED: dict[str, Any] = {"conserves": False, "trusted": 3e-9, "efforts": (5, 10, 20, 40, 80)}
+
+
+def rope(n: int, length: float, span: float, alpha: float) -> tuple[Particles, list[Feature]]:
+    """n links between two pins of the same height, let go as a V."""
+    t, depth = np.linspace(0, 1, n + 1), np.sqrt(length**2 - span**2) / 2
+    x = np.stack([span * t, -depth * (1 - np.abs(2 * t - 1))], axis=1)
+    link = Distance(links(n), length / n, compliance=alpha)
+    return Particles(x, mass=0.1, pinned=[0, n]), [Gravity(9.81), link, Drag(RATE)]
+
+
+def sags(name: str, key: str, n: int, length: float, span: float, alpha: float, limit: float, **more) -> Case:
+    """A hanging rope: its sag, as a share of what it should be."""
+    values = known(name)["values"]
+    sag = (values[key] if key else values)["sag"]
+    what = f"Elastic rope of {n} links, {alpha:g} m/N" if alpha else f"Rope of {n} rigid links between two pins"
+    return Case(
+        f"{name}:{key}" if key else name, what, lambda: rope(n, length, span, alpha), 10.0,
+        lambda run: abs(float(-run.world.position[:, 1].min()) / sag - 1), limit, 0.1, "relative", **(SETTLED | more),
+    )  # fmt: skip
+
+
+def plumb(name: str) -> tuple[Particles, list[Feature]]:
+    """R11: an elastic chain that hangs straight down."""
+    p = known(name)["params"]
+    n = p["links"]
+    x = np.stack([np.zeros(n + 1), -p["rest"] * np.arange(n + 1)], axis=1)
+    link = Distance(links(n), p["rest"], compliance=p["alpha"])
+    return Particles(x, mass=p["m"], pinned=[0]), [Gravity(p["g"]), link, Drag(2.0)]
+
+
+def stretches(name: str, limit: float, **more) -> Case:
+    """A hanging elastic chain: its elongation, as a share of alpha m g N (N + 1) / 2."""
+    p, v = known(name)["params"], known(name)["values"]
+    length = p["links"] * p["rest"]
+    return Case(
+        name, f"Elastic chain of {p['links']} links, {p['alpha']:g} m/N, hanging", lambda: plumb(name), 20.0,
+        lambda run: abs(float(-run.world.position[-1, 1] - length) / v["total_elongation"] - 1), limit, 1.0, "relative",
+        methods=("Direct", "Jacobi"), **SETTLED, **more,
+    )  # fmt: skip
+
+
+@ti.func
+def _pull(x, v, t, i):
+    """1 N downward at the tip of the cantilever."""
+    out = 0 * x
+    if i == 11:
+        out[1] = -1.0
+    return out
+
+
+def cantilever() -> tuple[Particles, list[Feature]]:
+    """S06: a clamped strip of ten rigid links with angular springs, and a force at its tip."""
+    n = 10
+    k = np.arange(n)
+    x = np.stack([(np.arange(n + 2) - 1) / n, np.zeros(n + 2)], axis=1)
+    bend = Bend(np.stack([k, k + 1, k + 2], axis=1), 0.0, compliance=1 / n)
+    strip = Distance(np.stack([k + 1, k + 2], axis=1))
+    return Particles(x, mass=0.3, pinned=[0, 1]), [Force(_pull), strip, bend, Drag(3.0)]
+
+
+def net(n: int, alpha: float) -> tuple[Particles, list[Feature]]:
+    """S08: a net of n x n cells in a pinned frame of 1 m."""
+    k = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
+    i, j = np.meshgrid(np.arange(n + 1), np.arange(n + 1), indexing="ij")
+    pairs = [np.stack([k[:-1].ravel(), k[1:].ravel()], axis=1), np.stack([k[:, :-1].ravel(), k[:, 1:].ravel()], axis=1)]
+    edge = ((i % n == 0) | (j % n == 0)).ravel()
+    x = np.stack([i.ravel() / n, 0.0 * i.ravel(), j.ravel() / n], axis=1)
+    link = Distance(np.concatenate(pairs), 1 / n, compliance=alpha)
+    return Particles(x, mass=1 / n**2, pinned=np.flatnonzero(edge)), [Gravity(9.81), link, Drag(RATE)]
+
+
+def hollows(n: int, alpha: float, limit: float) -> Case:
+    """A net under its weight: how deep its middle is, as a share."""
+    key = f"n{n}_alpha{alpha:g}"
+    want = known("S08_net_sag")["values"][key]["center_y"]
+
+    def error(run: Run) -> float:
+        return abs(float(run.world.position[(n + 1) ** 2 // 2, 1]) / want - 1)
+
+    return Case(
+        f"S08_net_sag:{key}", f"Net of {n} x {n} cells, {alpha:g} m/N", lambda: net(n, alpha), 12.0, error, limit, 1.0,
+        "relative", methods=("CG x 20", "Jacobi"), **{**SETTLED, **FINER},
+    )  # fmt: skip
+
+
+TIP = known("S06_cantilever_elastica")["values"]["N10_FL2_EI_1.0"]
+ELASTIC = {"methods": ("Direct", "Jacobi"), "efforts": (5, 10, 20, 40, 80, 160)}
+CATENARY = {"methods": ("Direct", "Jacobi"), "order": None}
+
+CASES = [
+    Case(
+        "S06_cantilever_elastica", "Clamped strip with a force at its tip", cantilever, 15.0,
+        ends_at([-1], [[TIP["tip_x"], TIP["tip_y"]]]), 1e-3, methods=("Jacobi x 10", "Jacobi"), **SETTLED,
+    ),
+    sags("S07_elastic_catenary", "N10_alpha1e-3", 10, 1.0, 0.8, 1e-3, 1e-4, **ELASTIC),
+    sags("S07_elastic_catenary", "N20_alpha1e-4", 20, 1.0, 0.8, 1e-4, 1e-4, **ELASTIC),
+    hollows(10, 0.01, 1e-3),
+    hollows(10, 0.001, 1e-3),
+    sags("R10b_discrete_catenary_N10", "", 10, 10.0, 6.0, 0.0, 1e-7, **CATENARY),
+    sags("R10b_discrete_catenary_N20", "", 20, 10.0, 6.0, 0.0, 1e-7, **CATENARY),
+    sags("R10b_discrete_catenary_N100", "", 100, 10.0, 6.0, 0.0, 1e-7, **CATENARY),
+    stretches("R11_elastic_rope_N10_alpha1e-3", 1e-6, order=None),
+    stretches("R11_elastic_rope_N32_alpha1e-3", 1e-6, order=None),
+    stretches("R11_elastic_rope_N100_alpha1e-5", 1e-6, order=None),
+]  # fmt: skip

@@ -1,0 +1,231 @@
+"""Many bodies in contact against what is known of them: piles, gases, packings. `python -m tiverlet.report.accuracy.granular`."""
+
+import argparse
+import tempfile
+from time import perf_counter
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from ... import measure, tools
+from ...colliders import Box
+from ...contact import Contact
+from ...device import runtime
+from ...forces import Drag
+from ...particles import Particles
+from ...world import World
+from ..speed import c_baseline, scenes
+
+GASES = (
+    (2, 0.1, 400.0),
+    (2, 0.3, 160.0),
+    (2, 0.5, 80.0),
+    (3, 0.1, 160.0),
+    (3, 0.2, 80.0),
+    (3, 0.3, 80.0),
+)  # dim, fraction, time [s]
+FRAMES = 120  # of a pile
+BEATS = 0.1, 0.05, 0.025  # substeps over the mean time between two collisions
+
+
+def volume(radius: np.ndarray, dim: int) -> float:
+    """Of discs [m^2] or spheres [m^3] together."""
+    return float((np.pi * radius**2 if dim == 2 else 4 / 3 * np.pi * radius**3).sum())
+
+
+def lattice(n: int, dim: int, size: float) -> np.ndarray:
+    """n points of a square or cubic lattice that fills a box of this size [m]."""
+    m = int(np.ceil(n ** (1 / dim) - 1e-9))
+    return (np.stack(np.meshgrid(*[np.arange(m)] * dim, indexing="ij"), -1).reshape(-1, dim)[:n] + 0.5) * (size / m)
+
+
+def pile(n: int, dim: int, substeps: int) -> dict[str, float]:
+    """Equal discs or spheres, dropped from a loose lattice into a box 1.3 times as wide and twice as high.
+
+    Returns the mean overlap in diameters, the kinetic energy per particle in m g r, and the mean time of a frame [s].
+    """
+    particles, features = scenes.pile(n, dim)
+    with World(particles, features, substeps=substeps) as world:
+        world.step(1 / 60)
+        before = perf_counter()
+        world.run((FRAMES - 1) / 60)
+        seconds = (perf_counter() - before) / (FRAMES - 1)
+        energy = measure.kinetic_energy(world) / n / (9.81 * 0.5)
+        return {"overlap": float(world.contacts.overlap.mean()), "energy": energy, "seconds": seconds}
+
+
+def pile_in_c(program: str, n: int, substeps: int) -> dict[str, float]:
+    """The same discs by hand: mean overlap and time of a frame, on as many threads."""
+    with c_baseline.Yardstick(program, n, substeps, runtime.threads()) as talker:
+        talker.ask("restart")
+        seconds = talker.ask(f"run {FRAMES}") / FRAMES
+        return {"overlap": talker.ask("quality")["overlap"], "seconds": seconds}
+
+
+def compressibility(fraction: float, dim: int) -> float:
+    """Z = P / (density kT) of hard discs (Henderson 1975) or spheres (Carnahan and Starling 1969), to about 1 %."""
+    p = fraction
+    return (1 + p**2 / 8) / (1 - p) ** 2 if dim == 2 else (1 + p + p**2 - p**3) / (1 - p) ** 3
+
+
+def collision_rate(fraction: float, dim: int) -> float:
+    """Collisions per particle and second, for diameter, mass and kT of 1: each gives to Z - 1 in proportion (Enskog)."""
+    return 2 * dim * (compressibility(fraction, dim) - 1) / np.sqrt(np.pi)
+
+
+def box_of_gas(n: int, dim: int, fraction: float, substeps: int) -> tuple[World, float]:
+    """n elastic discs or spheres of radius 0.5 m and thermal speed 1 m/s on a lattice in an elastic box, and its size [m]."""
+    size = (volume(np.full(n, 0.5), dim) / fraction) ** (1 / dim)
+    v = np.random.default_rng(0).normal(size=(n, dim))
+    v -= v.mean(axis=0)
+    v /= np.sqrt((v**2).mean())
+    start = Particles(lattice(n, dim, size - 1) + 0.5, velocity=v, radius=0.5)
+    return World(start, [Contact(restitution=1.0), Box([0] * dim, [size] * dim, restitution=1.0)], substeps=substeps), size
+
+
+def gas(n: int, dim: int, fraction: float, h: float, seconds: float, away: float = 3.0) -> dict[str, float]:
+    """A gas in a box: the pressure on its walls over the known one, with the standard error of that, and the speed moment
+    <v^4> / <v^2>^2 over Maxwell's, in the last three quarters of the time.
+
+    The pressure on a whole wall is no pressure of the gas. Balance at the middle plane of a box of side L gives the force
+    P L^2 - 4 g L in 3D, where g is the tension of a wall; g = 3 p (2 + p) / (2 pi (1 - p)^2) kT / diameter^2 at a fraction p, by
+    the theory of scaled particles, which is 6 % of P for 4096 spheres. So only blows on the middle of each wall count, further
+    than `away` [m] from others, and density and temperature are those of the bulk, as far from all.
+
+    What a wall takes is known from x and v alone: S(t) = sum 2 m |v_k| over all that will cross it within t, and S(t) / t goes to
+    the momentum per second as t does to 0. It falls with t as the density does with the distance from the wall, by 2 % at 8 ms
+    and p = 0.3, since some are struck on their way; 2 S(h) / h - S(2 h) / (2 h) is free of that to second order.
+    """
+    world, size = box_of_gas(n, dim, fraction, 1)
+    steps = round(seconds / h)
+    warm, each = steps // 4, steps // 16
+    blocks, blows, bulk, moments = [], 0.0, [], []
+    with world:
+        for k in range(warm + 12 * each):
+            x, v = world.position, world.velocity
+            gap, toward = np.minimum(x, size - x) - 0.5, np.where(x < size / 2, -v, v)
+            i, axis = np.nonzero(gap < 2 * h * toward)
+            inner = gap[i] > away - 0.5
+            inner[np.arange(len(i)), axis] = True
+            speed = np.where(inner.all(axis=1), toward[i, axis], 0.0)
+            blows += 2 * float((speed * (2 * (gap[i, axis] < h * speed) - 0.5)).sum())
+            if k % 10 == 0:
+                inside = (gap > away - 0.5).all(axis=1)
+                square = (v**2).sum(axis=1)
+                bulk.append((inside.sum(), square[inside].sum() / dim))
+                moments.append((square**2).mean() / square.mean() ** 2)
+            if (k + 1 - warm) % each == 0:
+                count, energy = np.mean(bulk, axis=0)
+                middle = size - 2 * away
+                known = energy / middle**dim * compressibility(count / middle**dim * volume(np.array([0.5]), dim), dim)
+                blocks.append((blows / (each * h) / (2 * dim * middle ** (dim - 1)) / known, float(np.mean(moments))))
+                blows, bulk, moments = 0.0, [], []
+            world.step(h)
+    pressure, moment = np.array(blocks[-12:]).T
+    return {
+        "pressure": float(pressure.mean()),
+        "error": float(pressure.std(ddof=1) / np.sqrt(len(pressure))),
+        "moment": float(moment.mean()) / (2.0 if dim == 2 else 5 / 3),
+    }
+
+
+def energy_gained(n: int, dim: int, fraction: float, beat: float, collisions: float = 1000.0) -> float:
+    """The energy that a gas gains, relative, in so many collisions per particle; a substep is `beat` times the mean time between
+    two of them, b for short.
+
+    A blow keeps energy to the last digit, and what a blow leaves of an overlap is taken back of the positions alone, see Contact.
+    So nothing is made: in f64 energy is kept to 1e-15 where b is a tenth. Some is lost beyond, from b = 1/5 on, where a third
+    particle strikes a pair that has not parted yet, or one at a wall.
+    """
+    rate = collision_rate(fraction, dim)
+    with box_of_gas(n, dim, fraction, 20)[0] as world:
+        start = measure.kinetic_energy(world)
+        world.run(collisions / rate, dt=20 * beat / rate)
+        return measure.kinetic_energy(world) / start - 1
+
+
+def packing(n: int, dim: int, speed: float) -> dict[str, float]:
+    """Frictionless discs (half of them 1.4 times as large) or equal spheres, between walls that close in at `speed` [m/s].
+
+    Ends when they bear a load, at 2 dim contacts per particle on average, as an isostatic packing has.
+    Returns the packing fraction in the middle, away from the walls, less what they overlap.
+    """
+    radius = np.where(np.arange(n) % 2 == 0, 0.5, 0.7) if dim == 2 else np.full(n, 0.5)
+    radius = np.random.default_rng(1).permutation(radius)
+    total = volume(radius, dim)
+    size = (total / (0.6 if dim == 2 else 0.46)) ** (1 / dim)
+    x = lattice(n, dim, size)
+    v = np.random.default_rng(2).normal(size=x.shape) * 0.5
+    box = Box([0] * dim, [size] * dim)
+    with World(Particles(x, velocity=v, radius=radius), [Drag(1.0), Contact(), box], substeps=8) as world:
+        low, contacts = 0.0, 0.0
+        while contacts < 2 * dim:
+            low += speed / 120
+            box.lower, box.upper = [low] * dim, [size - low] * dim
+            report = world.step(1 / 60)
+            contacts = 2 * report.contacts / n
+            if size - 2 * low < total ** (1 / dim):
+                raise RuntimeError("packing: the particles fill more than the box, so contacts were lost.")
+        # The share of points in the middle that a particle covers.
+        points = (tools.golden(np.arange(40_000), dim) - 0.5) * 0.6 * (size - 2 * low) + size / 2
+        near = world.near(points, np.full(len(points), radius.max()))
+        distance = np.linalg.norm(world.position[near[:, 1]] - points[near[:, 0]], axis=1)
+        covered = np.unique(near[distance < radius[near[:, 1]], 0])
+        overlap = world.contacts.overlap.mean() / (2 * radius.mean())
+        return {"fraction": len(covered) / len(points) * (1 - overlap) ** dim, "overlap": float(overlap)}
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(prog="python -m tiverlet.report.accuracy.granular", description=__doc__)
+    parser.add_argument("--particles", type=int, default=10_000, help="of the piles (default 10000)")
+    parser.add_argument("--quick", action="store_true", help="piles only")
+    given = parser.parse_args()
+    console = Console()
+    heads = (
+        "dim",
+        "substeps",
+        "mean overlap (% d)",
+        "kinetic energy (m g r)",
+        "ms per frame",
+        "C: mean overlap",
+        "C: ms per frame",
+    )
+    table = Table(*heads, title=f"Piles after {FRAMES} frames")
+    with tempfile.TemporaryDirectory() as folder:
+        program, how = c_baseline.build(folder)
+        for dim in (2, 3):
+            for substeps in (4, 8, 20):
+                figures = pile(given.particles, dim, substeps)
+                row = [f"{100 * figures['overlap']:.3f}", f"{figures['energy']:.3g}", f"{1e3 * figures['seconds']:.2f}"]
+                if program and dim == 2:
+                    figures = pile_in_c(program, given.particles, substeps)
+                    row += [f"{100 * figures['overlap']:.3f}", f"{1e3 * figures['seconds']:.2f}"]
+                table.add_row(str(dim), str(substeps), *row)
+    console.print(table)
+    console.print(f"C: {how}, {runtime.threads()} threads")
+    if given.quick:
+        return
+    table = Table("scene", "pressure / known", "<v^4>/<v^2>^2 / Maxwell", title="Elastic gases, 4096 particles")
+    for dim, fraction, seconds in GASES:
+        figures = gas(4096, dim, fraction, 0.008, seconds)
+        pressure = f"{figures['pressure']:.4f} +- {figures['error']:.4f}"
+        table.add_row(f"{dim}D, {fraction}", pressure, f"{figures['moment']:.4f}")
+    console.print(table)
+    title = "Energy gained by elastic gases, 1000 particles, in 1000 collisions of each (%)"
+    table = Table("scene", *(f"{beat} of the time between two" for beat in BEATS), "order", title=title)
+    for dim, fraction in ((2, 0.3), (2, 0.5), (3, 0.2), (3, 0.3)):
+        gains = [energy_gained(1000, dim, fraction, beat) for beat in BEATS]
+        order = np.polyfit(np.log(BEATS), np.log(np.maximum(np.abs(gains), 1e-6)), 1)[0]
+        table.add_row(f"{dim}D, {fraction}", *(f"{100 * gain:.3g}" for gain in gains), f"{order:.1f}")
+    console.print(table)
+    table = Table("dim", "packing fraction", "known", "mean overlap (% d)", title="Jammed packings, 2000 particles")
+    for dim, known, speed in ((2, "0.842", 0.1), (3, "0.64", 0.05)):
+        figures = packing(2000, dim, speed)
+        table.add_row(str(dim), f"{figures['fraction']:.4f}", known, f"{100 * figures['overlap']:.3f}")
+    console.print(table)
+
+
+if __name__ == "__main__":
+    main()

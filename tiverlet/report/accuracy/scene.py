@@ -1,0 +1,295 @@
+"""Error against run time of a scene of the user's: its own reference, the cheapest settings, and what f32 has to do with it."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.progress import Progress
+from rich.table import Table
+
+from ... import checks
+from ...constraints import ShapeMatch
+from ...constraints.core.scalar import Scalar
+from ...features.feature import Batch
+from ...solvers import Direct, Jacobi
+from ...world import World
+from .. import output
+from .cases.case import rms
+
+EFFORTS = (2, 5, 10, 20, 40, 80, 160)
+RUNS = 3
+ITSELF = 0.1  # of the motion: a reference that is off by more than this is none
+MARGIN = 3.0  # an error below so many times that of the reference says no more than that
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One way to run the scene: what it costs and how wrong it is.
+
+    error: root mean square distance from the reference at the end [m]. rounding: how far f32 is from f64 with the same settings
+    [m], 0 in f64. share: of the error that is f32's. seconds: per simulated second, median. best: no setting is both faster and
+    more accurate. diverged: not finite. residual, energy_change [J], flags: as in StepReport, the worst of all frames.
+    """
+
+    solver: str
+    substeps: int
+    iterations: int
+    precision: str
+    error: float
+    rounding: float
+    share: float
+    seconds: float
+    best: bool
+    residual: float
+    energy_change: float
+    flags: tuple[str, ...]
+    order: int = 2
+
+    @property
+    def paste(self) -> str:
+        """The arguments of a World with these settings."""
+        words = [f"substeps={self.substeps}"]
+        words += [f"iterations={self.iterations}"] if self.iterations != 1 else []
+        words += [f"solver=tv.{self.solver}"]
+        words += [f'precision="{self.precision}"'] if self.precision != "f32" else []
+        words += [f"order={self.order}"] if self.order != 2 else []
+        return ", ".join(words)
+
+
+class SceneReport:
+    """Settings of a scene, with error and cost. print() shows them; see .recommended, .paste, .json(), .markdown().
+
+    settings: all that were tried. reference: what the reference is. reference_error [m]: how far it is itself from the truth, by
+    its own convergence; infinite where it does not converge. tolerance [m]: what was asked for. order: the order of convergence.
+    """
+
+    def __init__(
+        self, settings: list[Setting], reference: str, reference_error: float, order: float, tolerance: float, motion: float
+    ):
+        self.settings, self.reference, self.order = settings, reference, order
+        self.reference_error, self.tolerance, self.motion = reference_error, tolerance, motion
+
+    @property
+    def converges(self) -> bool:
+        """Whether the reference is one: closer to the truth than a tenth of the motion."""
+        return bool(self.reference_error < ITSELF * self.motion)
+
+    @property
+    def recommended(self) -> Setting | None:
+        """The cheapest setting that is within the tolerance even when the reference is as wrong as it may be; None if none is."""
+        if not self.converges:
+            return None
+        good = [s for s in self.settings if s.error + self.reference_error <= self.tolerance and "non-finite" not in s.flags]
+        return min(good, key=lambda s: s.seconds, default=None)
+
+    @property
+    def paste(self) -> str:
+        """The recommendation as code, or why there is none."""
+        if self.recommended:
+            return f"world = tv.World(particles, features, {self.recommended.paste})"
+        if not self.converges:
+            return (
+                f"# No setting can be recommended: the reference itself is uncertain by {self.reference_error:.2g} m of a motion "
+                f"of {self.motion:.2g} m, as of chaos or of impacts. Ask for fewer seconds."
+            )
+        reach = min((s.error for s in self.settings), default=np.inf) + self.reference_error
+        return f"# No setting tried is within {self.tolerance:.2g} m; the best reaches {reach:.2g} m. Try more substeps."
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        table = Table(title=f"Error against run time; reference: {self.reference}, itself within {self.reference_error:.1e} m")
+        for head in HEADS:
+            table.add_column(head, justify="left" if head in (HEADS[0], HEADS[-1]) else "right")
+        for s in self.settings:
+            table.add_row(*self.cells(s), style="bold" if s is self.recommended else "" if s.best else "dim")
+        yield table
+        yield f"Observed order: {self.order:.2f}. Tolerance: {self.tolerance:.2g} m. In bold the cheapest setting within it."
+        yield self.paste
+
+    def cells(self, s: Setting) -> tuple[str, ...]:
+        """A line of the table; an error near that of the reference is a bound."""
+        near = s.error < MARGIN * self.reference_error
+        error = f"< {MARGIN * self.reference_error:.1e}" if near else f"{s.error:.1e}"
+        error = error if self.converges else f"({s.error:.1e})"
+        return (
+            s.solver, f"{s.substeps} x {s.iterations}", s.precision, error if np.isfinite(s.error) else "diverged",
+            f"{100 * s.share:.0f} %" if s.precision != "f64" else "", f"{1e3 * s.seconds:.2f}", f"{s.residual:.1e}",
+            f"{s.energy_change:+.1e}", "*" if s.best else "", " ".join(s.flags),
+        )  # fmt: skip
+
+    def __str__(self) -> str:
+        return output.text(self, 150)
+
+    def markdown(self) -> str:
+        """The table as Markdown."""
+        lines = output.table(HEADS, map(self.cells, self.settings))
+        return "\n".join([*lines, "", "```python", self.paste, "```"]) + "\n"
+
+    def json(self) -> str:
+        """Everything, for machines."""
+        names = ("reference", "reference_error", "order", "tolerance", "motion", "converges", "paste")
+        about = output.plain({k: getattr(self, k) for k in names})
+        return json.dumps({**about, "settings": [output.plain(asdict(s)) for s in self.settings]}, indent=1, allow_nan=False)
+
+
+HEADS = ("solver", "substeps", "precision", "error [m]", "f32's share", "ms per s", "residual", "energy [J]", "Pareto", "flags")
+
+
+def scene_report(
+    world: World, seconds: float, tolerance: float | None = None, *, dt: float = 1 / 60, substeps: Sequence[int] = EFFORTS,
+    progress: bool = False,
+) -> SceneReport:  # fmt: skip
+    """See World.report."""
+    seconds = checks.number("World.report", "seconds", seconds, above=0.0)
+    dt = checks.number("World.report", "dt", dt, above=0.0)
+    if tolerance is not None:
+        tolerance = checks.number("World.report", "tolerance", tolerance, above=0.0)
+    efforts = sorted({checks.integer("World.report", "substeps", n, least=1) for n in substeps})
+    if len(efforts) < 2:
+        raise ValueError(f"World.report: substeps has {len(efforts)} different value(s), but convergence shows from 2 on.")
+    if not len(world.particles):
+        raise ValueError("World.report: there are no particles.")
+    frames = max(1, round(seconds / dt))
+    runner = Runner(world, frames, dt)
+    # The reference goes twice as far, so that the finest of the sweep is measured against something finer.
+    finer = [*efforts, 2 * efforts[-1]]
+    rows: dict[tuple[str, str], list[Result]] = {}
+    solvers, precisions = solvers_of(world), ("f64", "f32") if world.order == 2 else ("f64",)
+    with Progress(disable=not progress) as bar:
+        shown = bar.add_task("report", total=len(solvers) * (1 + len(precisions) * len(efforts)))
+        for solver in solvers:
+            for precision in precisions:
+                some = finer if precision == "f64" else efforts
+                rows[repr(solver), precision] = runner.run(solver, precision, some, lambda: bar.advance(shown))
+    best, truth, error, order = reference(rows)
+    motion = rms(truth, runner.start[0]) if np.isfinite(truth).all() else np.inf
+    made = []
+    for (solver, precision), results in rows.items():
+        exact = {r.substeps: r.position for r in rows[solver, "f64"]}
+        for r in results:
+            if r.substeps > efforts[-1]:
+                continue
+            wrong = distance(r.position, truth)
+            rounding = distance(r.position, exact[r.substeps]) if precision != "f64" else 0.0
+            share = min(1.0, rounding / wrong) if wrong > 0 and np.isfinite(wrong) and np.isfinite(rounding) else 0.0
+            made.append((solver, precision, r, wrong, rounding, share))
+    settings = []
+    for solver, precision, r, wrong, rounding, share in made:
+        beaten = any(o[2].seconds <= r.seconds and o[3] < wrong for o in made if o[2] is not r)
+        settings.append(
+            Setting(
+                solver,
+                r.substeps,
+                world.iterations,
+                precision,
+                wrong,
+                rounding,
+                share,
+                r.seconds / seconds,
+                not beaten,
+                r.residual,
+                r.energy,
+                r.flags,
+                world.order,
+            )  # fmt: skip
+        )
+    settings.sort(key=lambda s: s.seconds)
+    name = f"{best}, {finer[-1]} substeps, f64"
+    return SceneReport(settings, name, error, order, 1e-3 * motion if tolerance is None else tolerance, motion)
+
+
+@dataclass
+class Result:
+    """What one run left."""
+
+    substeps: int
+    position: np.ndarray
+    seconds: float
+    residual: float
+    energy: float
+    flags: tuple[str, ...]
+
+
+class Runner:
+    """Runs clones of a world from its present state."""
+
+    def __init__(self, world: World, frames: int, dt: float):
+        self.world, self.frames, self.dt = world, frames, dt
+        self.start = world.position.copy(), world.velocity.copy()
+        # Where the state is more than positions and velocities, every run needs a clone of its own.
+        self.fresh = any(isinstance(f, Batch) and f.breaks or isinstance(f, ShapeMatch) and f.creep.any() for f in world.features)
+
+    def run(self, solver, precision: str, efforts: Sequence[int], done) -> list[Result]:
+        """All efforts of one solver in one precision."""
+        clone, out = self.world.clone(solver=solver, precision=precision, substeps=1), []
+        try:
+            self.go(clone, 1)  # compiles
+            for n in efforts:
+                times, report = [], None
+                for _ in range(RUNS):
+                    if self.fresh:
+                        clone.close()
+                        clone = self.world.clone(solver=solver, precision=precision, substeps=n)
+                    report, energy, t = self.go(clone, n)
+                    times.append(t)
+                assert report
+                flags = tuple(sorted(report.flags))
+                out.append(Result(n, clone.position, float(np.median(times)), report.residual, energy, flags))
+                done()
+        finally:
+            clone.close()
+        return out
+
+    def go(self, clone: World, substeps: int) -> tuple[Any, float, float]:
+        """One run: the worst report, the change of energy, and the seconds it takes by its median frame, without compilation."""
+        if not self.fresh:
+            clone.position, clone.velocity = self.start
+        clone.substeps = substeps
+        worst, change, times = None, 0.0, []
+        for _ in range(self.frames):
+            report = clone.step(self.dt)
+            times.append(report.seconds)
+            change += report.energy_change
+            worst = report if worst is None else worst.worse(report)
+        return worst, change, float(np.median(times)) * self.frames
+
+
+def solvers_of(world: World) -> list[Any]:
+    """The solvers that make sense for a scene: its own, and Direct next to Jacobi where links hang together, at order 2."""
+    own = world._solver
+    if world.order > 2:
+        return [own]
+    scalars = [f for f in world.features if isinstance(f, Scalar) and f.joins and f.count]
+    other = Direct() if isinstance(own, Jacobi) else Jacobi()
+    return [own, other] if scalars and type(other) is not type(own) else [own]
+
+
+def distance(position: np.ndarray, reference: np.ndarray) -> float:
+    """Root mean square distance [m]; infinite where it is none."""
+    with np.errstate(all="ignore"):
+        value = rms(position, reference)
+    return value if np.isfinite(value) else np.inf
+
+
+def reference(rows: dict[tuple[str, str], list[Result]]) -> tuple[str, np.ndarray, float, float]:
+    """The solver whose finest two runs in f64 agree best, its finest positions, their error [m], and the order it converges with.
+
+    With an order p, runs at n/2 and n substeps differ by (2^p - 1) times the error at n (Richardson). p is measured on three
+    runs and not taken for more than 2; below 1/2 there is no convergence to speak of, and the error is not known.
+    """
+    best = ("", np.zeros(0), np.inf, np.nan)
+    for (solver, precision), results in rows.items():
+        if precision != "f64":
+            continue
+        a, b, c = [*results[-3:]] if len(results) > 2 else [results[0], *results[-2:]]
+        wide, close = distance(a.position, b.position), distance(b.position, c.position)
+        ratio = c.substeps / b.substeps
+        order = np.log(wide / close) / np.log(b.substeps / a.substeps) if close > 0 and wide > 0 and b is not a else 2.0
+        if wide <= 1e-12 * max(1.0, float(np.abs(c.position).max())):  # exact: nothing is left but rounding
+            order = 2.0
+        error = close / (ratio ** min(order, 2.0) - 1) if np.isfinite(close) and order > 0.5 else np.inf
+        if not best[0] or error < best[2]:
+            best = (solver, c.position, error, float(order))
+    return best

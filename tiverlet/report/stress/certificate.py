@@ -1,0 +1,137 @@
+"""The certificate: every row of the stiff and extreme matrix with what was tried, the figure and the verdict."""
+
+import json
+import warnings
+from collections.abc import Iterable, Sequence
+from concurrent.futures import as_completed
+from dataclasses import asdict, dataclass
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.progress import Progress
+from rich.table import Table
+
+from .. import output
+from ..accuracy.sweep import said
+from .rows import ROWS, NotAvailable
+
+if TYPE_CHECKING:
+    from ...world import World
+
+PASSED, FAILED, ABSENT = "passed", "FAILED", "not available"
+
+
+@dataclass(frozen=True)
+class Result:
+    """One row: what was tried, the criterion, the figure, and the verdict; failing: the parts that do not hold."""
+
+    number: int
+    what: str
+    criterion: str
+    figure: str
+    verdict: str
+    failing: tuple[str, ...]
+    seconds: float
+
+
+class Certificate:
+    """Results of rows. print() shows a table; passed says whether none has failed. See .markdown(), .json()."""
+
+    def __init__(self, results: Sequence[Result]):
+        self.results = sorted(results, key=lambda r: r.number)
+
+    @property
+    def passed(self) -> bool:
+        """Whether no row has failed."""
+        return all(r.verdict != FAILED for r in self.results)
+
+    @property
+    def summary(self) -> str:
+        """The count of verdicts."""
+        count = {v: sum(r.verdict == v for r in self.results) for v in (PASSED, FAILED, ABSENT)}
+        return f"{count[PASSED]} of {len(self.results)} passed, {count[FAILED]} failed, {count[ABSENT]} not available."
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        table = Table(title="Stiff and extreme cases")
+        for head in ("#", "case", "criterion", "figure", "verdict"):
+            table.add_column(head, justify="right" if head == "#" else "left")
+        for r in self.results:
+            style = {FAILED: "red", ABSENT: "yellow"}.get(r.verdict, "")
+            table.add_row(str(r.number), r.what, r.criterion, r.figure, verdict(r), style=style)
+        yield table
+        yield self.summary
+
+    def __str__(self) -> str:
+        return output.text(self, 160)
+
+    def markdown(self) -> str:
+        """The table as Markdown."""
+        rows = [(str(r.number), r.what, r.criterion, r.figure, verdict(r)) for r in self.results]
+        lines = output.table(("#", "case", "criterion", "figure", "verdict"), rows)
+        return "\n".join([*lines, "", self.summary]) + "\n"
+
+    def json(self) -> str:
+        """Everything, for machines."""
+        return json.dumps({"passed": self.passed, "rows": [asdict(r) for r in self.results]}, indent=1)
+
+
+def verdict(r: Result) -> str:
+    """A verdict, and what does not hold."""
+    return "; ".join([r.verdict, *r.failing])
+
+
+def certify(number: int) -> Result:
+    """Try one row; a function of plain data, so that any executor can run it anywhere."""
+    row, clock = ROWS[number], perf_counter()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what is extreme is warned of; rows that ask for a warning catch it themselves
+            found = row.attempt()
+        failing = tuple(name for name, holds in found.holds.items() if not holds)
+        figure, how = found.figure, FAILED if failing or not found.holds else PASSED
+    except NotAvailable as why:
+        figure, how, failing = str(why), ABSENT, ()
+    except Exception as error:
+        figure, how, failing = "", FAILED, (said(error),)
+    return Result(row.number, row.what, row.criterion, figure, how, failing, perf_counter() - clock)
+
+
+def stress(
+    world: "World | None" = None, *, rows: Iterable[int] | None = None, executor: Any = None, progress: bool = False, **more
+):  # fmt: skip
+    """Try what is stiff and extreme: the rows of the matrix, or the scene of a world of the user's.
+
+    world: None for the matrix; else its scene is perturbed, see tv.report.perturbed, which takes the further arguments.
+    rows: numbers; None for all. executor: with submit(), as in concurrent.futures, in whose workers rows are tried ("spawn").
+    progress: show a bar. Returns a Certificate; a row whose worker died has failed.
+    """
+    if world is not None:
+        from .robustness import perturbed
+
+        return perturbed(world, **more)
+    chosen = sorted(ROWS) if rows is None else list(rows)
+    for number in chosen:
+        if number not in ROWS:
+            raise ValueError(f"stress: rows has {number!r}, but they are {min(ROWS)} to {max(ROWS)}.")
+    results = []
+    with Progress(disable=not progress) as bar:
+        shown = bar.add_task("stiff and extreme cases", total=len(chosen))
+        for result in attempts(chosen, executor):
+            results.append(result)
+            bar.update(shown, advance=1, description=result.what)
+    return Certificate(results)
+
+
+def attempts(numbers: Sequence[int], executor: Any) -> Iterable[Result]:
+    """Rows as they are done."""
+    if executor is None:
+        yield from map(certify, numbers)
+        return
+    waiting = {executor.submit(certify, number): number for number in numbers}
+    for future in as_completed(waiting):
+        try:
+            yield future.result()
+        except Exception as error:
+            row = ROWS[waiting[future]]
+            yield Result(row.number, row.what, row.criterion, "", FAILED, (said(error),), 0.0)

@@ -1,0 +1,138 @@
+"""Rows of the stiff and extreme matrix: how one is written, and what is helpful in many."""
+
+import re
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ....features.feature import Feature
+from ....particles import Particles
+from ....step_report import StepReport
+from ....world import World
+
+NAN, INF = float("nan"), float("inf")
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row: its number, what is extreme, the criterion, and the function that tries it: () -> Finding."""
+
+    number: int
+    what: str
+    criterion: str
+    attempt: Callable[[], "Finding"]
+
+
+@dataclass
+class Finding:
+    """What a row has found: a figure in words, and whether each part of its criterion holds."""
+
+    figure: str
+    holds: dict[str, bool] = field(default_factory=dict)
+
+
+class NotAvailable(Exception):
+    """What a row is about is not part of this tiverlet."""
+
+
+ROWS: dict[int, Row] = {}
+
+
+def row(number: int, what: str, criterion: str) -> Callable:
+    """Register a function as the row of this number."""
+
+    def register(attempt: Callable[[], Finding]) -> Callable[[], Finding]:
+        if number in ROWS:
+            raise ValueError(f"row {number} is there twice.")
+        ROWS[number] = Row(number, what, criterion, attempt)
+        return attempt
+
+    return register
+
+
+@contextmanager
+def world(particles: Particles, features: Sequence[Feature] = (), **settings) -> Iterator[Any]:
+    """A world in f64 that is closed at the end; warnings about its structure are not shown."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        made = World(particles, features, **{"precision": "f64", **settings})
+        try:
+            yield made
+        finally:
+            made.close()
+
+
+def rerun(w: World, seconds: float, dt: float = 1 / 60, **settings) -> StepReport:
+    """Put a world back to its start and run it with other settings, at no compile cost; the worst of all frames."""
+    w.position, w.velocity = w.particles.position, w.particles.velocity
+    for name, value in settings.items():
+        setattr(w, name, value)
+    return w.run(seconds, dt=dt)
+
+
+def refused(*attempts: tuple[Callable[[], object], str]) -> Finding:
+    """Each attempt has to raise a ValueError or TypeError whose text fits the pattern."""
+    holds = {}
+    for attempt, pattern in attempts:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                made = attempt()
+            if isinstance(made, World):
+                made.close()
+            holds[f"{pattern!r} was not refused"] = False
+        except (ValueError, TypeError) as error:
+            holds[f"{pattern!r} was refused with: {error}"] = re.search(pattern, str(error)) is not None
+    return Finding(f"{sum(holds.values())} of {len(holds)} refused by name", holds)
+
+
+def warned(attempt: Callable[[], object], pattern: str) -> bool:
+    """Whether a warning fits the pattern."""
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        made = attempt()
+    if isinstance(made, World):
+        made.close()
+    return any(re.search(pattern, str(w.message)) for w in seen)
+
+
+def finite(w: World) -> bool:
+    """Whether all positions and velocities are."""
+    return bool(np.isfinite(w.position).all() and np.isfinite(w.velocity).all())
+
+
+def pairs_of(position: np.ndarray, radius) -> np.ndarray:
+    """All pairs that overlap, by sweeping along x: nothing in common with the grid."""
+    radius = np.broadcast_to(np.asarray(radius, dtype=float), len(position))
+    order = np.argsort(position[:, 0], kind="stable")
+    x, r, out = position[order], radius[order], []
+    ends = np.searchsorted(x[:, 0], x[:, 0] + 2 * r.max(), side="right")
+    for k in range(len(x)):
+        a = slice(k + 1, ends[k])
+        hit = np.flatnonzero(np.linalg.norm(x[a] - x[k], axis=1) < r[a] + r[k]) + k + 1
+        out += [(min(order[k], order[j]), max(order[k], order[j])) for j in hit]
+    return np.array(sorted(out), dtype=np.int64).reshape(-1, 2)
+
+
+def contacts_of(position: np.ndarray, radius, **settings) -> np.ndarray:
+    """All pairs that a world finds to overlap, in the same order."""
+    from ....contact import Contact
+
+    with world(Particles(position, radius=radius), [Contact(**settings)]) as w:
+        found = w.contacts.pairs
+    found = np.sort(found, axis=1)
+    return found[np.lexsort((found[:, 1], found[:, 0]))]
+
+
+def same_pairs(position: np.ndarray, radius, **settings) -> Finding:
+    """Contacts of a cloud against brute force."""
+    found, want = contacts_of(position, radius, **settings), pairs_of(position, radius)
+    missed = len(set(map(tuple, want)) - set(map(tuple, found)))
+    return Finding(
+        f"{len(found)} contacts, {missed} missed",
+        {"as many as by brute force": len(found) == len(want), "the same": np.array_equal(found, want), "some": len(want) > 0},
+    )

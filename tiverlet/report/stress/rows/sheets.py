@@ -1,0 +1,75 @@
+"""Rows about sheets: nets and cloth that are taut, wide, or stiffer than a solver resolves."""
+
+import numpy as np
+
+from ....colliders import Ball
+from ....constraints import Dihedral, Distance
+from ....forces import Gravity, Wind
+from ....particles import Particles
+from ....shapes import cloth, net
+from ....solvers import Chebyshev, ConjugateGradient, Jacobi
+from ....step_report import UNCONVERGED
+from .row import Finding, finite, row, world
+
+G = 9.81
+
+
+@row(
+    73,
+    "nets pinned at the rim, at four corners, drawn straight between two pins",
+    "no energy: any solver, 2, 20 and 200 substeps",
+)
+def _taut() -> Finding:
+    n, m = 10, 1e-3
+    sheet, k = net((0, 0, 0), (1, 0, 0), (0, 0, 1), (n, n)), np.arange(n * n).reshape(n, n)
+    rim = np.unique(np.concatenate([k[0], k[-1], k[:, 0], k[:, -1]]))
+    pins = [rim, [k[0, 0], k[0, -1], k[-1, 0], k[-1, -1]], [k[0, 0], k[0, -1]]]
+    x = np.concatenate([sheet.position + [2.0 * c, 0, 0] for c in range(3)])
+    pinned = np.concatenate([np.asarray(p) + c * n * n for c, p in enumerate(pins)])
+    pairs = np.concatenate([sheet.links + c * n * n for c in range(3)])
+    supply, holds, most = m * n * n * G, {}, -np.inf
+    for solver, precision in ((None, "f32"), (ConjugateGradient(8), "f64"), (Chebyshev(), "f64"), (Jacobi(), "f64")):
+        start = Particles(x, mass=m, pinned=pinned)
+        passes = 4 if isinstance(solver, Chebyshev) else 1
+        with world(start, [Gravity(G), Distance(pairs)], solver=solver, precision=precision, iterations=passes) as w:
+            for substeps in (2, 20, 200):
+                w.position, w.velocity, w.substeps = x, 0 * x, substeps
+                gain = max(w.step(1 / 60).energy for _ in range(20)) / supply
+                most = max(most, gain)
+                holds[f"{w._solver}, {substeps} substeps: {gain:.1e} m g L"] = finite(w) and gain <= 1e-3
+    return Finding(f"energy {most:+.0e} of m g L at most", holds)
+
+
+@row(
+    79,
+    "cloth, rigid or of 1e-6 m/N, with Dihedral, in wind, under a ball that moves",
+    "no energy, and flagged where it stretches",
+)
+def _wide() -> Finding:
+    n, mass, gale, speed = 16, 0.2, 3.0, 1.0
+    sheet = cloth((0, 0, 0), (1, 0, 0), (0, 0, 1), (n, n))
+    pairs = np.concatenate([sheet.links, sheet.braces])
+    supplied = 0.5 * mass * (gale + speed) ** 2  # by wind and ball: no more than what brings all to their speed
+    holds, worst, most = {}, 0.0, -np.inf
+    for name, compliance, solver in (("rigid", 0.0, None), ("1e-6", 1e-6, None), ("1e-6, Jacobi", 1e-6, Jacobi())):
+        ball = Ball((0.5, -0.5, 0.5), 0.3)
+        features = [
+            Gravity(G),
+            Distance(pairs, compliance=compliance),
+            Dihedral(sheet.quads, compliance=100.0),
+            Wind((gale, 0, 0), 0.5),
+            ball,
+        ]
+        start = Particles(sheet.position, mass=mass / n**2, pinned=[0, n - 1])
+        with world(start, features, solver=solver, precision="f32") as w:
+            for substeps in (5, 20):
+                w.position, w.velocity, w.substeps = sheet.position, 0 * sheet.position, substeps
+                reports = []
+                for frame in range(30):
+                    ball.center = (0.5, -0.5 + speed * frame / 60, 0.5)
+                    reports.append(w.step(1 / 60))
+                gain = max(r.energy for r in reports) - supplied
+                said = all("unconverged" in r.flags for r in reports if r.residual > UNCONVERGED)
+                worst, most = max(worst, max(r.residual for r in reports)), max(most, gain)
+                holds[f"{name}, {substeps} substeps: {gain:+.2g} J"] = finite(w) and gain <= 1e-3 * mass * G and said
+    return Finding(f"{most:+.2g} J beyond what wind and ball supply, stretch {worst:.2g} flagged", holds)

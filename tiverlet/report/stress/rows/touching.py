@@ -1,0 +1,270 @@
+"""Rows about contacts, cells and walls: no contact is lost, nothing explodes, nothing passes a wall."""
+
+import numpy as np
+
+from ....colliders import Ball, Box, Capsule, HalfSpace, Sdf
+from ....constraints import Distance, Path
+from ....contact import Contact
+from ....device import ti
+from ....forces import Drag, Gravity
+from ....measure import kinetic_energy
+from ....particles import Particles
+from ....solvers import Jacobi
+from .row import Finding, contacts_of, finite, pairs_of, rerun, row, same_pairs, warned, world
+
+
+@row(16, "coincident particles in contact: 2, 100, 1000", "they part the same way each time, and no momentum is made")
+def _coincident() -> Finding:
+    holds = {}
+    for count, dim in ((2, 2), (100, 2), (1000, 3)):
+        with world(Particles(np.zeros((count, dim)), radius=0.01), [Contact(push_out=0.25)], substeps=5) as w:
+            made = []
+            for _ in range(2):
+                rerun(w, 1.0)
+                made.append(w.position)
+            p = float(np.abs(w.velocity.sum(axis=0)).max())
+            holds[f"{count}: overlap {w.last.overlap:.2g}"] = (
+                np.array_equal(*made) and p <= 1e-12 * count and w.last.overlap < 0.05
+            )
+    return Finding(", ".join(holds), holds)
+
+
+@row(25, "radii of 1:1000", "no contact missed, by brute force; in 2D and 3D")
+def _wide() -> Finding:
+    rng = np.random.default_rng(7)
+    wide = 10.0 ** rng.uniform(-3, 0, 1500)
+    flat, deep = same_pairs(rng.uniform(-3, 3, (1500, 2)), wide), same_pairs(rng.uniform(-1.5, 1.5, (1500, 3)), wide)
+    holds = {f"{dim}: {k}": v for dim, f in (("2D", flat), ("3D", deep)) for k, v in f.holds.items()}
+    return Finding(f"{flat.figure}; {deep.figure}", holds)
+
+
+@row(30, "negative cells", "no contact missed left of the origin, nor across it")
+def _negative() -> Finding:
+    rng = np.random.default_rng(1)
+    here = same_pairs(rng.uniform(-2, 2, (600, 2)), 0.1)
+    far = same_pairs(rng.uniform(-900, -890, (400, 3)), rng.uniform(0.1, 0.5, 400))
+    return Finding(f"{here.figure}; {far.figure}", {**here.holds, **{f"far: {k}": v for k, v in far.holds.items()}})
+
+
+@row(31, "hash of negative operands", "mirrored clouds have mirrored contacts")
+def _mirrored() -> Finding:
+    x = np.random.default_rng(2).uniform(0, 6, (500, 2))
+    made = [contacts_of(x * s, 0.15) for s in ([1, 1], [-1, 1], [1, -1], [-1, -1])]
+    return Finding(f"{len(made[0])} contacts each", {f"mirror {k}": np.array_equal(made[0], m) for k, m in enumerate(made)})
+
+
+@row(32, "hash collisions: clusters at multiples of 64 cells", "the same contacts as by brute force")
+def _collide() -> Finding:
+    rng = np.random.default_rng(3)
+    return same_pairs(rng.integers(-40, 40, (500, 2)) * 64.0 * 1.1 + rng.normal(size=(500, 2)) * 0.4, 0.5)
+
+
+@row(33, "two neighbour cells in one bucket", "each pair once")
+def _once() -> Finding:
+    x = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0)), axis=-1).reshape(-1, 2) * 0.99
+    found = contacts_of(x, 0.5)
+    once = len(np.unique(found, axis=0)) == len(found)
+    return Finding(f"{len(found)} contacts", {"once": once, "all": np.array_equal(found, pairs_of(x, 0.5))})
+
+
+@row(34, "4096 particles in one cell", "all pairs are there, and it is warned of")
+def _crowd() -> Finding:
+    n = 4096
+    x = np.random.default_rng(0).uniform(0, 0.01, (n, 2))
+    made = []
+
+    def build() -> None:
+        from ....world import World
+
+        with World(Particles(x, radius=0.5), [Contact()], precision="f64") as w:
+            made.append(len(w.contacts.pairs))
+
+    told = warned(build, "near pairs per particle")
+    return Finding(f"{made[0]} pairs", {"all": made[0] == n * (n - 1) // 2, "warned": told})
+
+
+@row(35, "more near pairs than there was room for", "the list grows in the middle of a frame, and no contact is lost")
+def _grows() -> Finding:
+    side = 40
+    loose = np.stack(np.divmod(np.arange(side**2), side), axis=1) * 4.0
+    tight = np.stack(np.divmod(np.arange(side**2), side), axis=1) * 0.5
+    with world(Particles(loose, radius=0.3), [Contact()]) as w:
+        few = w.step(1 / 60).contacts
+        w.position = tight
+        found = len(w.contacts.pairs)
+        return Finding(f"{few}, then {found} contacts", {"none lost": found == len(pairs_of(tight, 0.3)), "few first": few == 0})
+
+
+@row(43, "1e5 idle substeps of a resting column", "no creep (1e-6 of a radius), no energy")
+def _creep() -> Finding:
+    x = [[0.5, 0.5], [0.5, 1.499]]
+    with world(Particles(x, radius=0.5), [Gravity(9.81), Drag(1.0), Contact(), Box((0, 0), (1, 9))], substeps=200) as w:
+        w.run(20.0, dt=0.2)
+        before = w.position
+        w.run(100.0, dt=0.2)
+        creep, energy = float(np.abs(w.position - before).max()), kinetic_energy(w)
+        return Finding(f"{creep:.1e} m, {energy:.0e} J", {"no creep": creep <= 0.5e-6, "no energy": energy <= 1e-6 * 9.81 * 0.5})
+
+
+@row(45, "speeds up to 1e6 m/s against a half-space and a box", "impossible to pass")
+def _fast() -> Finding:
+    rng = np.random.default_rng(0)
+    aim = rng.normal(size=(60, 2))
+    v = aim / np.linalg.norm(aim, axis=1)[:, None] * 10.0 ** rng.uniform(0, 6, 60)[:, None]
+    slope = np.array([1.0, 2.0]) / np.sqrt(5)
+    with world(Particles(np.zeros((60, 2)), velocity=v, radius=0.1), [Box((-1, -1), (1, 1)), HalfSpace(slope, -0.5)]) as w:
+        deepest = 0.0
+        for _ in range(20):
+            w.step(1 / 60)
+            deepest = max(deepest, float(np.abs(w.position).max() - 0.9), float(-0.4 - (w.position @ slope).min()))
+    return Finding(f"deepest {deepest:.0e} m, in the corner of both", {"inside": deepest <= 1e-3})
+
+
+ROOMS = {
+    "box": (lambda **k: [Box((-1, -1), (1, 1), **k)], lambda x: 1 - np.abs(x).max(axis=1)),
+    "corner": (lambda **k: [HalfSpace((1, 0), -1, **k), HalfSpace((0, 1), -1, **k)], lambda x: 1 + x.min(axis=1)),
+    "ball": (lambda **k: [Ball((0, 0), 1, inside=True, **k)], lambda x: 1 - np.linalg.norm(x, axis=1)),
+}
+
+
+def _kept_in(features, pinned, holds: dict[str, bool], **settings) -> float:
+    """Throw 40 particles about in every room, at v h = 0.1 ... 100 half widths; how far outside one was at worst."""
+    rng, worst = np.random.default_rng(0), 0.0
+    x = np.concatenate([rng.uniform(-0.6, 0.6, (40, 2)), rng.uniform(-3, 3, (len(pinned), 2))])
+    aim = rng.normal(size=x.shape)
+    aim /= np.linalg.norm(aim, axis=1)[:, None]
+    for name, (make, inside) in ROOMS.items():
+        for friction, restitution in ((0.5, 0.0), (0.4, 1.0)):
+            made = [*features(), *make(friction=friction, restitution=restitution)]
+            with world(Particles(x, radius=0.1, pinned=pinned), made, substeps=1, **settings) as w:
+                deepest = 0.0
+                for iterations in (1, 2, 8):
+                    w.iterations = iterations
+                    for ratio in (0.1, 1.0, 10.0, 100.0):
+                        w.position, w.velocity = x, 60 * ratio * aim
+                        for _ in range(10):
+                            w.step(1 / 60)
+                            deepest = max(deepest, 0.1 - float(inside(w.position[:40]).min()))
+            worst = max(worst, deepest)
+            holds[f"{name}, friction {friction:g}, restitution {restitution:g}: {deepest:.1e} m"] = deepest <= 1e-12
+    return worst
+
+
+@row(80, "v h = 0.1 ... 100 half widths in a Box, a corner of two HalfSpaces, inside a Ball", "inside after every substep")
+def _thrown() -> Finding:
+    holds: dict[str, bool] = {}
+    worst = _kept_in(lambda: [], [], holds)
+    return Finding(f"{worst:.0e} m outside", holds)
+
+
+@row(81, "links that pull through a wall, 1 ... 8 iterations, restitution 0 ... 1", "inside after every substep")
+def _drawn() -> Finding:
+    holds: dict[str, bool] = {}
+    pairs = np.stack([np.arange(20), np.arange(40, 60)], axis=1)
+    worst = _kept_in(lambda: [Distance(pairs, 0.1, compliance=1e-5)], np.arange(40, 60), holds, solver=Jacobi())
+    return Finding(f"{worst:.0e} m outside", holds)
+
+
+@row(46, "a rod of 1 mm, v h from 0.1 to 1000 mm", "nothing passes")
+def _thin() -> Finding:
+    n = 200
+    rng = np.random.default_rng(2)
+    x = np.stack([rng.uniform(-0.9, 0.9, n), np.full(n, 0.5)], axis=1)
+    v = np.stack([np.zeros(n), -(10.0 ** rng.uniform(-4, 0, n)) * 600], axis=1)
+    rod = Capsule((-1.0, 0.0), (1.0, 0.0), 0.0005)
+    with world(Particles(x, velocity=v), [rod, Gravity()], substeps=1) as w:
+        lowest = np.inf
+        for _ in range(600):
+            w.step(1 / 600)
+            lowest = min(lowest, float(w.position[:, 1].min()))
+    return Finding(f"lowest at {1e3 * lowest:.4f} mm", {"above": lowest >= 0.0005 - 1e-9})
+
+
+@row(47, "head-on at v h / r = 0.5, 0.9, 2, 5", "caught below 1, flagged above")
+def _passing() -> Finding:
+    holds = {}
+    with world(Particles([[-0.55, 0.0], [0.55, 0.0]], radius=0.1), [Contact()], substeps=10) as w:
+        for ratio in (0.5, 0.9, 2.0, 5.0):
+            v = ratio * 0.1 * 600
+            w.position, w.velocity = w.particles.position, [[v, 0], [-v, 0]]
+            told = "tunnelling-risk" in w.run(0.1).flags
+            caught = w.position[0, 0] < w.position[1, 0]
+            holds[f"{ratio:g}: {'flagged' if told else 'caught'}"] = told if ratio > 1 else caught and not told
+    return Finding(", ".join(holds), holds)
+
+
+@row(48, "deep initial overlap: 200 discs in a tenth of their room", "no explosion: kinetic energy at the scale of push_out")
+def _deep() -> Finding:
+    x = np.random.default_rng(0).uniform(0, 0.5, (200, 2))
+    with world(Particles(x, radius=0.1), [Contact(push_out=0.5)]) as w:
+        w.run(1.0)
+        energy, limit = kinetic_energy(w), 0.5 * 200 * (10 * 0.5) ** 2
+        return Finding(
+            f"{energy:.0f} J (limit {limit:.0f})",
+            {"finite": finite(w), "slow": energy <= limit, "apart": w.last.overlap < 0.2},
+        )
+
+
+@row(82, "a link draws a disc through a pinned one", "flagged; not where the link is as long as it should be")
+def _drawn_through() -> Finding:
+    holds = {}
+    for rest in (0.7, 3.0):
+        start = Particles([[0.0, 0], [3.0, 0], [1.15, 0.0]], radius=0.3, pinned=[1, 2])
+        with world(start, [Distance([[0, 1]], rest), Contact()], substeps=1) as w:
+            told, moved = "tunnelling-risk" in w.step(1 / 60).flags, float(w.position[0, 0])
+            holds[f"to {moved:.2f} m: {'flagged' if told else 'not flagged'}"] = told == (moved > 0.3)
+    return Finding(", ".join(holds), holds)
+
+
+@row(83, "skins of 0.01 ... 2 contact distances, discs with soft links", "the same bits")
+def _skins() -> Finding:
+    n, rng = 60, np.random.default_rng(3)
+    start = Particles(rng.uniform(-2, 2, (n, 2)), velocity=rng.normal(size=(n, 2)) * 4, radius=0.1)
+    rest, made = rng.uniform(0.2, 1.5, n // 2), []
+    for skin in (0.002, 0.05, 0.4):
+        features = [Gravity(9.81), Distance(np.arange(n).reshape(-1, 2), rest, compliance=1e-4), Contact(skin=skin)]
+        with world(start, [*features, Box((-2.2, -2.2), (2.2, 2.2))], substeps=4) as w:
+            w.run(1.0)
+            made.append((w.hash(), w.last.overlap))
+    return Finding(f"overlap {made[0][1]:.2g} each", {"the same": len({bits for bits, _ in made}) == 1})
+
+
+@row(67, "particles outside every wall", "they still collide")
+def _outside() -> Finding:
+    start = Particles([[-50.0, 0], [-50.5, 0.0]], velocity=[[-1, 0], [1, 0]], radius=0.2)
+    with world(start, [Contact()]) as w:
+        w.run(1.0)
+        gap = abs(w.position[0, 0] - w.position[1, 0])
+    return Finding(f"{gap:.3f} m apart", {"collided": gap >= 0.4 - 1e-9})
+
+
+@row(70, "resting contact on a moving belt", "friction drags the right way: up to its speed after v / (mu g), then along")
+def _belt() -> Finding:
+    belt = Capsule((-50.0, -1.0), (50.0, -1.0), 1.0, friction=0.4)
+    with world(Particles([[0.0, 0.1]], radius=0.1), [Gravity(9.81), belt]) as w:
+        for k in range(90):
+            shift = (k + 1) / 60
+            belt.a, belt.b = (-50.0 + shift, -1.0), (50.0 + shift, -1.0)
+            w.step(1 / 60)
+        error = abs(w.position[0, 0] - (1.5 - 0.5 / (0.4 * 9.81)))
+        return Finding(f"{error:.0e} m off", {"way": error <= 2e-3, "speed": abs(w.velocity[0, 0] - 1) < 1e-9})
+
+
+@row(85, "another particle at 1e2 ... 1e5 m, in f32: discs in a round room, beads on a wire", "the same bits for the rest")
+def _far() -> Finding:
+    x = [(-0.5, 0.2), (0.0, 0.1), (0.5, 0.3), (0.1, 0.4), (2.017036, -0.207938), (2.5, -1.0)]
+    made = []
+    for far in (1e2, 1e5):
+        wire = Path([4, 5], [[2.0, 0.0], [2.5, -1.0], [3.0, -0.5], [4.0, -1.5]])
+        start = Particles([*x, (far, far)], radius=0.05, pinned=[len(x)])
+        with world(start, [Gravity(9.81), Sdf(_round_room), wire, Contact()], precision="f32") as w:
+            w.run(1.0)
+            made.append(w.position[: len(x)])
+    gap = float((0.95 - np.linalg.norm(made[1][:4], axis=1)).min())
+    return Finding(f"{abs(gap):.0e} m above the ground", {"the same": np.array_equal(*made), "on the ground": abs(gap) < 1e-5})
+
+
+@ti.func
+def _round_room(p):
+    """Distance from a round wall, from inside."""
+    return 1 - p.norm()

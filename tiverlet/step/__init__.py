@@ -1,0 +1,1 @@
+"""The step of a world, and how a world is built, edited and kept."""

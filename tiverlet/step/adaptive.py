@@ -1,0 +1,185 @@
+"""Frames that are made again with more substeps until they are good: substeps="auto", tolerance and budget."""
+
+from dataclasses import replace
+from time import perf_counter
+from typing import TYPE_CHECKING
+
+from .. import checks
+from ..constraints.core.scalar import TENSEST
+from ..step_report import StepReport
+from . import checkpoint
+
+if TYPE_CHECKING:
+    from ..world import World
+
+START = 8  # substeps of the first frame
+MOST = 4096  # substeps of a frame
+PASSES = 64  # iterations of a substep
+RESIDUAL, OVERLAP = 1e-2, 0.1  # what is good where the user asks for nothing else
+TENSION = 2.0  # (omega h)^2: half the limit of stability
+RISKS = {"tunnelling-risk", "stiff-force", "non-finite"}
+GAIN = 1.4  # by which twice the effort has to lower the figures; of second order they fall by 4, of first order by 2
+IDLE = {"substeps": 2, "iterations": 1}  # doublings without a gain that are enough
+ROOM = 6.0  # by which the figures have to be better than asked before less is tried
+PATIENCE = 64  # frames, at most, until it is tried again
+
+Figures = tuple[float, ...]  # residual, overlap and tension, relative to what is asked
+TENSE = 2  # the place of the tension among them
+NOTHING: Figures = (1.0, 1.0, 1.0)
+WORST: Figures = (float("inf"),) * 3
+
+
+class Guard:
+    """Chooses the substeps of a frame.
+
+    A frame is undone, and made again with twice the substeps, when in one of them a constraint turned by more than 26 degrees
+    (cos < 0.9, where SHAKE's direction is no longer good), a residual above 1e-2 or an overlap above a tenth of a radius was
+    left, a tension made particles vibrate with (omega h)^2 > 2, or when it has a flag that shorter substeps remove. Where twice
+    the substeps bring no gain, twice the iterations are tried; where they bring none either, the flag is "stuck": the frame is
+    the one with the least effort of those that are as good, and what stays wrong is asked for no more in the next frames.
+    When all figures, which are of the order of h^2, leave room for it, the next frame is tried with half the effort. Each time
+    that fails, twice as many frames pass before the next try, up to 64.
+
+    Making a frame again needs the state at its begin, which is read back to the CPU before each frame: that is the price.
+    """
+
+    def __init__(self):
+        self.auto = False
+        self.substeps, self.iterations = START, 1  # of the next frame
+        self.dt = 0.0  # of the last one
+        self.wait, self.patience = 0, 1  # frames until less is tried, and after the next failure
+        self.stuck = NOTHING  # the figures that no effort improved
+        self.cost = 0.0  # measured seconds of an iteration
+
+    @property
+    def memory(self) -> tuple:
+        """What the next frames depend on."""
+        stuck = NOTHING[:1] if self.stuck == NOTHING else self.stuck
+        return self.substeps, self.iterations, self.dt, self.wait, self.patience, *stuck
+
+    @memory.setter
+    def memory(self, value: tuple) -> None:
+        self.substeps, self.iterations, self.dt, self.wait, self.patience, *stuck = value
+        self.stuck = tuple(stuck) if len(stuck) > 1 else NOTHING
+
+    def advance(self, world: "World", dt: float, tolerance: float | None, budget: float | None) -> StepReport:
+        """One frame, made again until it is good, nothing helps, or there can be no more."""
+        tolerance = None if tolerance is None else checks.number("World.step", "tolerance", tolerance, above=0.0)
+        budget = None if budget is None else checks.number("World.step", "budget", budget, above=0.0)
+        end = float("inf") if budget is None else perf_counter() + budget
+        self.prepare(world.iterations, dt, tolerance, budget)
+        n, k, stuck = self.substeps, self.iterations, self.stuck
+        before, flags = world._undo  # type: ignore[misc]  # of the step; where nothing was uploaded since, it is the state now
+        kept = checkpoint.keep(world) if any(map(any, flags)) else replace(before, guard=self.memory)
+        tries, best, idle, kind = 0, WORST, 0, "substeps"
+        known: dict[tuple[int, int], Figures] = {}  # of the tries without a risk
+        world._begin(dt / n * world._sub.first)
+        while True:
+            tries, begun = tries + 1, perf_counter()
+            report = world._advance(dt, n, k)
+            took = perf_counter() - begun
+            self.learn(took / (n * k))
+            figures, risks = judge(report, tolerance)
+            wrong = [f > max(1.0, s) for f, s in zip(figures, stuck, strict=True)]
+            if risks:
+                best, idle, kind = WORST, 0, "substeps"
+            elif (n, k) in known or not any(wrong):
+                verdict = "stuck" if max(figures) > 1 else "good"
+                break
+            else:
+                known[n, k] = figures
+                gains = any(f * GAIN <= b for f, b, w in zip(figures, best, wrong, strict=True) if w)
+                idle = 0 if gains else idle + 1
+                best = tuple(map(min, figures, best))
+                if idle >= IDLE[kind]:
+                    if kind == "iterations" or k >= PASSES:
+                        verdict = "stuck"
+                        stuck = tuple(max(s, GAIN * f) if w else s for s, f, w in zip(stuck, figures, wrong, strict=True))
+                        n, k, last = *cheapest(known, stuck), (n, k)
+                        if (n, k) == last:
+                            break
+                        checkpoint.put_back(world, kept)
+                        world._begin(dt / n * world._sub.first)
+                        continue
+                    kind, idle = "iterations", 0
+            if n >= MOST or perf_counter() + 2 * took > end:
+                verdict = "substeps-capped"
+                break
+            n, k = (min(2 * n, MOST), k) if kind == "substeps" else (n, 2 * k)
+            checkpoint.put_back(world, kept)
+            world._begin(dt / n * world._sub.first)
+        self.substeps, self.iterations, self.stuck = n, k, stuck  # and the next frames do not try in vain
+        self.look_ahead(world.iterations, report, max(figures), verdict, tries)
+        return told(report, max(figures), risks, verdict, tries)
+
+    def prepare(self, iterations: int, dt: float, tolerance: float | None, budget: float | None) -> None:
+        """The effort to begin with."""
+        self.iterations = max(self.iterations, iterations)
+        if self.dt and dt != self.dt:
+            self.substeps = max(1, min(round(self.substeps * dt / self.dt), MOST))
+        self.dt = dt
+        if budget is not None and self.cost:
+            fits = max(1, min(int(0.8 * budget / (self.cost * self.iterations)), MOST))
+            if fits < self.substeps or (tolerance is None and fits > 1.25 * self.substeps):
+                self.substeps = fits
+        elif self.wait:
+            self.wait -= 1
+            if not self.wait:
+                self.stuck = NOTHING
+
+    def learn(self, cost: float) -> None:
+        """Keep the cost of an iteration: lower ones at once, for the first frame compiles; higher ones by and by."""
+        self.cost = min(cost, self.cost + 0.3 * (cost - self.cost)) if self.cost else cost
+
+    def look_ahead(self, iterations: int, report: StepReport, figure: float, verdict: str, tries: int) -> None:
+        """Less for the next frame, if this one leaves room for it; and patience where that has just failed."""
+        if verdict != "good" or tries > 1:
+            self.patience = min(2 * self.patience, PATIENCE) if tries > 1 else self.patience
+            self.wait = self.patience
+        elif not self.wait and figure * ROOM <= 1:
+            if self.iterations > iterations:
+                self.iterations //= 2
+            elif self.substeps > 1:
+                self.substeps = (self.substeps + 1) // 2
+        elif not self.wait:
+            self.patience = 1
+
+
+def judge(report: StepReport, tolerance: float | None) -> tuple[Figures, set[str]]:
+    """How residual, overlap and tension compare with what is asked (1: just met), and what shorter substeps have to remove."""
+    risks = set(report.flags & RISKS)
+    if report.turn:
+        risks.add("turned")
+    if report.tension > TENSEST:
+        risks.add("softened")
+    ratios = (
+        report.residual / (tolerance or RESIDUAL),
+        report.overlap / (tolerance or OVERLAP),
+        report.tension / TENSION,
+    )
+    return tuple(r if r == r else float("inf") for r in ratios), risks  # NaN is the worst of all
+
+
+def cheapest(known: dict[tuple[int, int], Figures], stuck: Figures) -> tuple[int, int]:
+    """The least effort with which all figures are as good as they have to be, or as they were with the most.
+
+    Where a load has hardly a direction, the most substeps: the sag that bears it falls with h^2, and would spring back if they
+    were not enough later.
+    """
+    enough = [max(1.0, s) for s in stuck]
+    fit = [effort for effort, figures in known.items() if all(f <= e for f, e in zip(figures, enough, strict=True))]
+    return next(e for e in fit if stuck[TENSE] <= 1 or e[0] == max(fit)[0])
+
+
+def told(report: StepReport, figure: float, risks: set[str], verdict: str, tries: int) -> StepReport:
+    """The report with what the guard has to say."""
+    if verdict == "good":
+        return replace(report, tries=tries)
+    wrong = sorted(risks) or [f"a figure is {figure:.3g} times what is asked"]
+    why = {
+        "stuck": "Nothing helps: constraints contradict each other, a load has no direction to be carried in (that of a straight "
+        "rope between two pins; give it slack or compliance), or particles still part that began in one place.",
+        "substeps-capped": f"More than {report.substeps} substeps are needed, but the budget is spent or there can be no more.",
+    }[verdict]
+    note = f"The frame is not as good as asked: {', '.join(wrong)}. {why}"
+    return replace(report, flags=report.flags | {verdict}, notes=(*report.notes, note), tries=tries)

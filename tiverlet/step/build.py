@@ -1,0 +1,274 @@
+"""Building a world: what of its scene exists on the device, and in which order it comes to be."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+
+from ..colliders.collider import Wall
+from ..constraints.core.anchored import Tether
+from ..constraints.core.scalar import LOST, Scalar
+from ..contact.contact import Contact
+from ..device import runtime, ti
+from ..device.memory import Memory
+from ..device.thread_team import PIECES, Team, size_of
+from ..features.feature import Acceleration, Batch, Feature, Scene
+from ..neighbours.neighbour_search import Grid
+from ..particles import Particles, Radii, State
+from ..solvers.conjugate import ConjugateGradient
+from ..solvers.direct import Direct
+from ..solvers.elimination import plan_of
+from ..solvers.jacobi import Jacobi
+from ..solvers.slots import Slots
+from ..solvers.solver import Solver
+from . import high_order
+from .diagnostics import Survey
+from .step import Substep
+
+T = TypeVar("T", bound=Feature)
+PRECISIONS = {"f32": ti.f32, "f32-compensated": ti.f32, "f64": ti.f64}
+PATHS = ("auto", "fused", "parallel")
+# Near pairs per particle, in 2D and 3D, for which a list has room at first, by whether all radii are equal. Within 1.25
+# diameters equal discs have fewer than 6 neighbours on average: lines between these do not cross, which makes a planar graph.
+ROOM = {True: (6.5, 14), False: (12, 32)}
+# Particles and constraints from which a team of threads pays. On one thread and on two a frame took, of 8 substeps of a falling
+# pile, 0.122 and 0.136 ms with 500 discs, 0.169 and 0.170 with 1000, 0.50 and 0.37 with 4000; of 20 substeps of cloth with 225
+# particles (1200 with constraints) 0.55 and 0.35; of ropes with 205 (405) 0.18 and 0.18, with 820 (1620) 0.64 and 0.40.
+CROSSOVER = 1000
+USUAL = 1 / 1200  # [s] substep: 20 of a frame of 1/60 s
+MANY = 200  # stiff links from which systems are worth their sums
+STEPS = 5  # of conjugate gradients: at equal time 5 to 20 leave about the same, and these take the least of a frame
+WIDTH = 2  # of the systems that are solved directly where the user names no solver: chains, loops, joints of up to 3 rods
+
+
+@dataclass
+class Assembly:
+    """The parts of a world on the device."""
+
+    path: str
+    solver: Solver
+    memory: Memory
+    scene: Scene
+    batches: list[Batch]
+    grid: Grid | None
+    substep: Substep
+    survey: Survey
+
+
+def assemble(
+    particles: Particles, features: tuple[Feature, ...], starts: Sequence[Particles | None], first: int,
+    solver: Solver | None, precision: str, path: str, order: int,
+) -> Assembly:  # fmt: skip
+    """Check the features against the particles and each other, then declare and place every field, in one tree.
+
+    particles: as they are now. starts: for each feature how they were when it came; None if it comes now. first: from this
+    number on particles come now. solver: None for the one that suits the structure.
+    """
+    inv_mass = particles.inv_mass.copy()
+    for feature, start in zip(features, starts, strict=True):
+        feature.start = particles if start is None else start
+        feature.prepare(feature.start, inv_mass)
+    refuse_held_twice(particles, features)
+    for feature, start in zip(features, starts, strict=True):
+        if start is None:
+            feature.review(particles, inv_mass)
+        else:
+            feature.admit(particles, first)
+    runtime.ensure_started()
+    check_architecture(precision, features)
+    path = _chosen(path, particles, features) if order == 2 else "fused"
+    memory = Memory(PRECISIONS[precision], len(particles))
+    try:
+        state = State(memory, particles, inv_mass, precision == "f32-compensated")
+        return _bind(Scene(memory, state, particles, inv_mass, order=order), features, solver, path)
+    except BaseException:
+        memory.abandon()
+        for feature in features:
+            feature.scene = None
+        raise
+
+
+def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, path: str) -> Assembly:
+    memory, state, particles = scene.memory, scene.state, scene.particles
+
+    def of(kind: type[T]) -> list[T]:
+        return [f for f in features if isinstance(f, kind)]
+
+    accelerations, walls = of(Acceleration), of(Wall)
+    drivers = [f for f in of(Batch) if f.drives and f.count]
+    batches = [f for f in of(Batch) if not f.drives and (scene.inv_mass[f.indices] > 0).any()]
+    contact = next((c for c in of(Contact) if c.matters), None)
+    if contact or walls:
+        scene.radius = Radii(memory, particles.radius)
+    surfaces = [*walls, *([contact] if contact else [])]
+    rubs, bounces = any(f.rubs for f in surfaces), any(f.bounces for f in surfaces)
+    solver = solver or (by_structure(batches, scene.inv_mass) if scene.order == 2 else Direct())
+    if batches:
+        scene.slots = Slots(scene, batches, solver)
+        if not state.double and (state.compensated or (scene.slots.exact and sums_exactly())):
+            state.carry(memory, particles)
+        if scene.order > 2:
+            high_order.check_solved(batches, scene, solver)
+    state.remember(memory, rubs or any(w.sweeps for w in walls) or (bounces and bool(walls)), bounces, bool(contact and walls))
+    size = size_of(path, _work(particles, features))
+    team = Team(memory, size, len(particles), path == "parallel" and size == 1, pieces=PIECES if contact else size)
+    grid = contact.join(scene, batches, team) if contact else None
+    for feature in of(Batch):
+        feature.scene = scene  # also of those that do nothing, because all of their particles are held
+    for feature in [*accelerations, *drivers, *batches, *walls]:
+        feature.bind(scene)
+    for feature in features:
+        feature.new_force = False  # it was given when it was made
+        vars(feature)["_on_built"] = feature.compiled() if not isinstance(feature, Batch) or feature.acts else None
+    kind = Substep if scene.order == 2 else high_order.Composition
+    substep = kind(scene, accelerations, batches, drivers, contact, grid, walls, team)
+    survey = Survey(substep, solver)
+    if grid and contact:
+        grid.allocate(int(len(particles) * max(ROOM[scene.radius.uniform][particles.dim - 2], contact.room)) + 64)
+    memory.place()
+    return Assembly(path, solver, memory, scene, batches, grid, substep, survey)
+
+
+def checked_features(features: Iterable[Feature]) -> tuple[Feature, ...]:
+    """The features of a new world, each free and listed once."""
+    features = listed("World", features)
+    for k, feature in enumerate(features):
+        if not isinstance(feature, Feature):
+            hint = f"; write {feature.__name__}(...)" if isinstance(feature, type) else ""
+            raise TypeError(f"World: features[{k}] = {feature!r} is not a force, constraint or wall{hint}.")
+        if feature.scene is not None:
+            raise ValueError(
+                f"World: features[{k}] = {feature!r} already acts in another world. Make a new one, or use feature.copy()."
+            )
+    if len({id(f) for f in features}) < len(features):
+        raise ValueError("World: the same feature is listed twice.")
+    if sum(isinstance(f, Contact) for f in features) > 1:
+        raise ValueError("World: more than one Contact; one covers all particles.")
+    return features
+
+
+def listed(who: str, features: Any) -> tuple[Feature, ...]:
+    """Features as a tuple."""
+    if isinstance(features, Feature) or not isinstance(features, Iterable):
+        raise TypeError(f"{who}: features = {features!r} is a {type(features).__name__}; write a list, [...].")
+    return tuple(features)
+
+
+def refuse_held_twice(particles: Particles, features: tuple[Feature, ...]) -> None:
+    """A particle has one place: refuse pins and driven paths on one that is pinned, or that another one holds."""
+    holder = np.full(len(particles), -1)
+    tethers = [(k, f) for k, f in enumerate(features) if isinstance(f, Tether) and f.exclusive]
+    for k, f in sorted(tethers, key=lambda item: not item[1].drives):  # springs are lost on what is driven
+        rows = f.indices[:, 0]
+        wrong = particles.pinned[rows] | (holder[rows] >= 0)
+        if wrong.any():
+            i = int(rows[np.argmax(wrong)])
+            other = "is pinned" if particles.pinned[i] else f"is held by features[{holder[i]}] = {features[holder[i]]!r}"
+            raise ValueError(
+                f"World: features[{k}] = {f!r} holds particle {i}, which {other}. It has one place; leave one of them out."
+            )
+        if f.drives:
+            holder[rows] = k
+
+
+def by_structure(batches: list[Batch], inv_mass: np.ndarray) -> Solver:
+    """The solver of a world whose user names none.
+
+    Direct where links hang together like chains, trees or loops: for the cost of one relaxation it leaves some 1e-4 of the length
+    of a link where Jacobi leaves a tenth. ConjugateGradient for what is denser, such as cloth, where many links are stiff: at
+    equal time it leaves a third of what Jacobi and Chebyshev do. Jacobi for few or soft links; where there are rigid constraints
+    on more than two particles, which contacts can lock in a shape that Newton's method does not leave; and for scenes that start
+    with violated constraints, which may contradict each other: relaxed, they settle on a compromise.
+    """
+    links = [b for b in batches if isinstance(b, Scalar) and b.joins]
+    angles = [b for b in links if b.arity > 2]
+    if not links or any((b.compliance == 0).any() for b in angles):
+        return Jacobi()
+    for b in links:
+        C = b.violation(b.start.position)
+        if (np.where(b.side, np.maximum(b.side * C, 0), np.abs(C)) * b.closeness(b.start.position) > LOST).any():
+            return Jacobi()
+    if not angles and len(plan_of(links, inv_mass, WIDTH).column):
+        return Direct(WIDTH)
+    return ConjugateGradient(STEPS) if stiff_links(links, inv_mass) >= MANY else Jacobi()
+
+
+def stiff_links(links: list[Scalar], inv_mass: np.ndarray) -> int:
+    """How many act both ways and are stiffer than what one pass of a usual substep makes of them, alpha < W h^2."""
+    degree = np.bincount(np.concatenate([b.indices.ravel() for b in links]), minlength=len(inv_mass))
+    return sum(
+        int((b.compliance < (degree * inv_mass)[b.indices].sum(axis=1) * USUAL**2).sum())
+        for b in links
+        if b.arity == 2 and not b.side
+    )
+
+
+def reason(solver: Solver) -> str:
+    """Why by_structure() has chosen this one."""
+    if isinstance(solver, Direct):
+        return "links hang together like chains, trees or loops"
+    if isinstance(solver, ConjugateGradient):
+        return f"links are stiff, at least {MANY}, and hang together more closely than elimination takes"
+    return "links are few, soft or violated at the start, or there are rigid constraints on more than two particles, or none"
+
+
+def checked_solver(solver: Solver | None) -> Solver | None:
+    """The solver of a new world; None to have it chosen."""
+    if solver is not None and not isinstance(solver, Solver):
+        hint = f"; write {solver.__name__}()" if isinstance(solver, type) else ""
+        raise TypeError(f"World: solver = {solver!r} is not a solver, as tv.Jacobi() or tv.Direct() is{hint}.")
+    return solver
+
+
+def check_settings(precision: str, path: str, order: int, features: tuple[Feature, ...]) -> None:
+    """Refuse what does not exist, and an order that the features do not have."""
+    if precision not in PRECISIONS:
+        raise ValueError(f"World: precision = {precision!r}, but it must be one of {', '.join(map(repr, PRECISIONS))}.")
+    if path not in PATHS:
+        raise ValueError(f"World: path = {path!r}, but it must be one of {', '.join(map(repr, PATHS))}.")
+    if order not in high_order.ORDERS:
+        raise ValueError(f"World: order = {order!r}, but it must be one of {', '.join(map(str, high_order.ORDERS))}.")
+    if order > 2:
+        high_order.refuse(order, features, precision, path)
+
+
+def sums_exactly() -> bool:
+    """Whether (a + b) - a is compiled as it stands. Taichi does not mark it so on every architecture, where drivers write b."""
+    return runtime.architecture() in runtime.LLVM and not runtime.fast_math()
+
+
+def check_architecture(precision: str, features: tuple[Feature, ...]) -> None:
+    """Refuse what the running Taichi cannot compile, or not so that it is right."""
+    arch = runtime.architecture()
+    if precision == "f32-compensated" and runtime.fast_math():
+        raise ValueError(
+            'World: precision = "f32-compensated" needs exact rounding, but Taichi was started with fast_math=True. '
+            "Use tv.init(), or ti.init(fast_math=False)."
+        )
+    if arch in runtime.LLVM:
+        return
+    if precision == "f32-compensated":  # Taichi does not mark sums as exact there, and drivers replace (a + b) - a by b
+        raise ValueError(
+            f'World: precision = "f32-compensated" needs exact rounding, which Taichi does not have on {arch}. '
+            'Use "f64", or tv.init(arch="cpu").'
+        )
+    for feature in features:
+        if precision == "f64" and isinstance(feature, Batch) and feature.transcends:
+            raise ValueError(
+                f"World: {feature!r} takes an angle, a cube root or an exponential, which {arch} has for f32 only, but "
+                'precision = "f64". Use "f32", or tv.init(arch="cpu").'
+            )
+
+
+def _chosen(path: str, particles: Particles, features: tuple[Feature, ...]) -> str:
+    """The path for "auto": on one CPU thread while others would cost more than they do."""
+    if path != "auto":
+        return path
+    if runtime.architecture() != "cpu":
+        return "parallel"
+    return "fused" if _work(particles, features) < CROSSOVER or runtime.cores() == 1 else "parallel"
+
+
+def _work(particles: Particles, features: tuple[Feature, ...]) -> int:
+    return len(particles) + sum(f.count for f in features if isinstance(f, Batch))

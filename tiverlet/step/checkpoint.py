@@ -1,0 +1,147 @@
+"""The exact state of a world: what its future depends on, its hash, and how this or another world returns to it."""
+
+import hashlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from ..world import World
+
+HASHED = ("_time", "_tick", "_since", "_h", "_fresh")  # of the clock; the rest follows from the same past
+CARRIED = ("Contact.push", "Contact.slip", "Contact.slack")  # by pairs, for the next substep
+TOLD = "Contact.given"  # by pairs, of the last substep, for reports
+CLOCK = (*HASHED, "_frame", "_drag", "_started", "_owed", "_parted", "_placed", "_energy")
+
+
+@dataclass(frozen=True)
+class Kept:
+    """The state at one time: of every field that the future depends on, and of the clock."""
+
+    values: dict[str, np.ndarray]
+    clock: dict[str, Any]
+    guard: tuple
+
+    def digest(self) -> str:
+        """SHA-256 of the exact state, the clock, and what the guard remembers."""
+        out = hashlib.sha256(repr((*(self.clock[name] for name in HASHED), *self.guard)).encode())
+        for name, values in self._lasting().items():
+            out.update(name.encode())
+            out.update(values.tobytes())
+        return out.hexdigest()
+
+    def _lasting(self) -> dict[str, np.ndarray]:
+        """Without what pairs carry for reports: a pair that has just bounced may be on the list or far off it, by the skin."""
+        if TOLD not in self.values:
+            return self.values
+        carried = [name for name in CARRIED if name in self.values]
+        some = np.zeros(len(self.values["Contact.pairs"]), dtype=bool)
+        for name in carried:
+            values = self.values[name]
+            some |= values.any(axis=tuple(range(1, values.ndim)))
+        rows = {name: self.values[name][some] for name in ("Contact.pairs", *carried)}
+        return {name: rows.get(name, values) for name, values in self.values.items() if name != TOLD}
+
+    def position(self, count: int) -> np.ndarray:
+        """Positions [m] of `count` particles, in f64 where there is more than one word of f32."""
+        x = self.values["position"][:count]
+        if "position_low" in self.values:
+            x = x + self.values["position_low"][:count].astype(np.float64)
+        return x
+
+
+def state(world: "World", pairs: bool = True) -> dict[str, np.ndarray]:
+    """Every field that the future depends on: not what the neighbour list looks like, but what its pairs carry.
+
+    Without `pairs` that is left out, which takes a fraction of the time; it shows in the next frame.
+    """
+    out = {name: values for memory in world._memories for name, values in memory.state().items()}
+    if world._grid and pairs:
+        out["Contact.pairs"], carried = world._grid.carried()
+        out.update((f"Contact.{name}", values) for name, values in carried.items())
+    return out
+
+
+def keep(world: "World", pairs: bool = True) -> Kept:
+    """A copy of the exact state."""
+    return Kept(state(world, pairs), {name: getattr(world, name) for name in CLOCK}, world._guard.memory)
+
+
+def flags(world: "World") -> list[list[bool]]:
+    """Of each feature, whether knobs wait to be uploaded, and whether a target is under way."""
+    return [[f.changed, f.moving] for f in world.features]
+
+
+def put_back(world: "World", kept: Kept) -> None:
+    """Return to an earlier state, bit for bit."""
+    world._set(kept.clock["_h"], kept.clock["_drag"])
+    grid, stores = world._grid, list(map(id, world._memories))
+    if "Contact.shrunk" in kept.values:
+        world._sub.contacts[0].ease()
+    for memory in world._memories:
+        memory.restore(kept.values)
+    if grid:
+        pieces = {piece.name: kept.values[f"Contact.{piece.name}"] for piece in grid.lasting}
+        grid.restore(kept.values["Contact.pairs"], pieces)
+    if list(map(id, world._memories)) != stores:
+        world._renew()  # there are new fields
+    for name, value in kept.clock.items():
+        setattr(world, name, value)
+    world._guard.memory = kept.guard
+
+
+def install(world: "World", kept: Kept, flagged: list[list[bool]]) -> None:
+    """Give a world that was just built the state of another one of the same scene, knobs and precision, bit for bit."""
+    world._upload()
+    undo(world, kept, flagged)
+
+
+def check(world: "World", kept: Kept, flagged: list[list[bool]]) -> None:
+    """Raise ValueError unless a state that came from elsewhere fits the world; above all what kernels take for indices."""
+    present = keep(world)
+    late = {"Contact.shrunk"}  # a field that is made when it is needed
+    if set(present.values) - late != set(kept.values) - late or set(present.clock) != set(kept.clock):
+        raise ValueError("The state is not one of this scene: it has other fields.")
+    pieces = {f"Contact.{piece.name}" for piece in world._grid.lasting} if world._grid else set()
+    most = {"Contact.pairs": len(world.particles)}
+    for f in world.features:
+        if hasattr(f, "_on_pieces"):  # of a Path
+            most |= {name: f._on_pieces for name in kept.values if name.startswith("Path.piece")}  # type: ignore[attr-defined]
+    for name, value in kept.values.items():
+        ours, free = present.values.get(name), name in pieces or name in ("Contact.pairs", "Contact.shrunk")
+        shape = ours is None or ours.shape[free:] == value.shape[free:]
+        if not shape or (ours is not None and ours.dtype.kind != value.dtype.kind):
+            raise ValueError(f"The state is not one of this scene: {name} has shape {value.shape} of {value.dtype}.")
+        if name in most and value.size and not (value.min() >= 0 and value.max() < most[name]):
+            raise ValueError(f"The state is not one of this scene: {name} has {value.min()} to {value.max()}, of {most[name]}.")
+    if len({len(value) for name, value in kept.values.items() if name in pieces or name == "Contact.pairs"}) > 1:
+        raise ValueError("The state is not one of this scene: pairs in contact carry other numbers of values.")
+    clock = kept.clock
+    right = [type(clock[name]) is int and 0 <= clock[name] < 2**31 for name in ("_tick", "_since")]
+    right += [type(v) is bool for v in (clock["_fresh"], clock["_started"], *(b for pair in flagged for b in pair))]
+    right += [type(v) in (int, float) for v in (clock["_time"], clock["_h"], *clock["_frame"], clock["_energy"] or 0)]
+    right += [clock["_placed"] is None or 0 <= clock["_placed"] <= len(world.particles), len(flagged) == len(world.features)]
+    right += [clock["_drag"] is None or [type(v) for v in clock["_drag"]] == [float] * 5, len(clock["_frame"]) == 3]
+    if not all(right):
+        raise ValueError("The state is not one of this scene: its clock is none.")
+
+
+def undo(world: "World", kept: Kept, flagged: list[list[bool]]) -> None:
+    """Return to the state before a step that was not finished; what it uploaded is uploaded again in the next one."""
+    put_back(world, kept)
+    for feature, (changed, moving) in zip(world.features, flagged, strict=True):
+        feature.changed, feature.moving = changed, moving
+
+
+def transfer(old: "World", new: "World") -> None:
+    """Take over the state, bit for bit where both have the same precision."""
+    kept = keep(old)
+    if new._precision == old._precision and new._order == old._order:
+        install(new, kept, flags(old))
+        return
+    new._time, new._tick, new._since, new._frame = old._time, old._tick, old._since, old._frame
+    new._guard.memory = kept.guard
+    new.position, new.velocity = old.position, old.velocity
+    for ours, theirs in zip(old._sub.breakers, new._sub.breakers, strict=True):
+        new._memory.write(theirs._on_broken, ours.stamps())

@@ -1,0 +1,308 @@
+"""What a frame came to: one pass over the state when it ends."""
+
+import copy
+from typing import Any
+
+import numpy as np
+
+from ..constraints.core.scalar import TENSEST
+from ..device import runtime, ti
+from ..device.thread_team import LEAST
+from ..features.feature import FAR
+from ..neighbours.neighbour_search import FARTHEST
+from ..particles import LARGEST
+from ..solvers.solver import Solver
+from ..step_report import UNCONVERGED, StepReport
+from .step import CAME, END, FIGURES, SHEET, H, Substep, integer
+
+BLOCKS = 64  # partial sums: their number is fixed, so the total has the same bits on any number of threads; squared on a GPU
+TURNS = (0, 26, 41)  # degrees, for nothing, BENT and FAR
+STIFF = 4.0  # (omega h)^2 beyond which Verlet diverges
+
+STEPPED, STARTED, UNSTEPPED = range(3)  # how a state came about: by a substep, by the first one after a start, by none yet
+
+
+@ti.data_oriented
+class Survey:
+    """The figures behind a StepReport, on the sheet of a frame in the order in which report() reads them.
+
+    came: how the state came about. A frame that is one launch ends with them; where it is launched phase by phase, measure() is
+    the last one.
+    """
+
+    def __init__(self, substep: Substep, solver: Solver):
+        self.sub: Any = substep
+        self.solver = solver
+        self.remedy: str | None = None  # the setting that meets constraints better, known once it is asked for
+        self.team = substep.team
+        self.n, self.dim, self.state = substep.n, substep.dim, substep.state
+        self.batches = substep.batches
+        self.contacts = substep.contacts
+        self.fastest = substep.fastest
+        self.single = substep.real == ti.f32
+        self.farthest = LARGEST
+        if substep.grid:
+            self.farthest = min(LARGEST, substep.grid.finest * FARTHEST)
+        self.probes = [f for f in substep.accelerations if not f.uniform]
+        self.stride = substep.stride
+        add = substep.scene.memory.field
+        self.blocks = BLOCKS if runtime.architecture() == "cpu" else BLOCKS**2
+        self.parts = add("survey.figures", self.blocks, width=6, kind=ti.f64)
+        self.low = add("survey.low", self.blocks, width=self.dim, kind=ti.f64)
+        self.high = add("survey.high", self.blocks, width=self.dim, kind=ti.f64)
+        self.details: dict[int, Residuals] = {}  # compiled when asked for
+        self.sheet: Any = np.zeros(SHEET)
+        self.figures = self.sheet[: 11 + self.dim]
+        substep.survey = self
+
+    def of(self, substep: Substep) -> "Survey":
+        """The same fields, for another Substep."""
+        new = copy.copy(self)
+        new.sub, new.details = substep, {}
+        substep.survey = new
+        return new
+
+    @ti.func
+    def finite(self, x):
+        """By the bits of the exponent: comparisons with NaN are not to be trusted in Taichi."""
+        out = 1
+        for k in ti.static(range(self.dim)):
+            if ti.static(self.single):
+                if ti.bit_cast(x[k], ti.u32) & ti.u32(0x7F800000) == ti.u32(0x7F800000):
+                    out = 0
+            else:
+                mask = ti.u64(0x7FF0000000000000)
+                if ti.bit_cast(x[k], ti.u64) & mask == mask:
+                    out = 0
+        return out
+
+    @ti.func
+    def energy(self, i, x, scale, back):
+        """Kinetic and potential energy at x - back d, f64: second order at the middle of a substep, where d / h is v."""
+        d = self.state.d[i] * ti.cast(1, ti.f64)
+        out = ti.cast(0, ti.f64)
+        if self.state.w.of(i) > 0:
+            out = 0.5 * scale * scale * d.dot(d)
+            for f in ti.static(self.sub.accelerations):
+                if ti.static(f.conservative):
+                    out += f.potential(i, ti.cast(x, ti.f64) - back * d)
+            out /= self.state.w.of(i)
+        return out
+
+    @ti.func
+    def stiffness(self, i, x, h, t):
+        """(omega h)^2 of the motion that dominates: the force's Rayleigh quotient along the last move."""
+        d = self.state.d[i]
+        dd, out = d.dot(d), ti.cast(0, ti.f64)
+        if dd > 0 and self.state.w.of(i) > 0:
+            change = 0 * d
+            for f in ti.static(self.probes):
+                change += f.acceleration(i, x, d / h, t) - f.acceleration(i, x - d, d / h, t)
+            out = -change.dot(d) / dd * h * h
+        return out
+
+    @ti.func
+    def nothing(self):
+        """Figures to begin with."""
+        zero = ti.Vector.zero(ti.f64, self.dim)
+        return ti.Vector([0, 0, 0, 0, 0, 2.0**31], ti.f64), zero + ti.math.inf, zero - ti.math.inf
+
+    @ti.func
+    def block(self, b, h, t, when, fresh, begin):
+        """One block of particles and constraints. Returns energy, residual, overlap, stiffness, contacts, bad; low, high."""
+        figures, low, high = self.nothing()
+        scale, back = ti.cast(1, ti.f64), ti.cast(0, self.sub.real)
+        if begin == 0:
+            scale, back = 1 / ti.cast(h, ti.f64), ti.cast(0.5, self.sub.real)
+        size = (self.n + self.blocks - 1) // self.blocks
+        for i in range(b * size, ti.min((b + 1) * size, self.n)):
+            x = self.state.place(i)
+            if self.finite(x) == 0 or self.finite(self.state.d[i]) == 0:
+                figures[5] = ti.min(figures[5], ti.cast(i, ti.f64))
+            else:
+                low, high = ti.min(low, ti.cast(x, ti.f64)), ti.max(high, ti.cast(x, ti.f64))
+                figures[0] += self.energy(i, x, scale, back)
+                if ti.static(len(self.probes) > 0):
+                    if begin == 0:
+                        figures[3] = ti.max(figures[3], self.stiffness(i, x, h, t))
+                for c in ti.static(self.contacts):
+                    touching, worst = c.overlaps(i)
+                    figures[2] = ti.max(figures[2], worst)
+                    figures[4] += touching
+                    if begin == 0:
+                        c.push_bond(i)
+        for f in ti.static(self.batches):
+            part = (f.count + self.blocks - 1) // self.blocks
+            for c in range(b * part, ti.min((b + 1) * part, f.count)):
+                hh, miss = 0 * h, 0 * h
+                if begin == 0:
+                    hh = self.sub.reach(h, fresh)
+                    miss = f.miss(c, h, hh, when, fresh)
+                    figures[1] = ti.max(figures[1], ti.cast(miss, ti.f64))
+                figures[0] += f.energy(c, back, hh, miss)
+        return figures, low, high
+
+    @ti.func
+    def weigh(self, me, h64, came):
+        """The sums behind residuals."""
+        h, fresh = ti.cast(h64, self.sub.real), ti.cast(came == STARTED, ti.i32)
+        self.sub.weigh(me, h, self.sub.reach(h, fresh), 0, fresh, False)
+
+    @ti.kernel
+    def measure(self, sheet: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
+        """All figures."""
+        h64, t64, came = sheet[H], sheet[END], integer(sheet, CAME)
+        self.weigh(0, h64, came)
+        self.sum_up(0, h64, t64, came, sheet)
+
+    @ti.func
+    def sum_up(self, me, h64, t64, came, sheet: ti.template()):  # type: ignore[valid-type]
+        """By blocks, by blocks of these on a GPU, then by one thread."""
+        for k in range(self.team.low(self.blocks * self.stride, me), self.team.high(self.blocks * self.stride, me)):
+            if k % self.stride == 0:
+                h, t, b = ti.cast(h64, self.sub.real), ti.cast(t64, self.sub.real), k // self.stride
+                fresh, begin = ti.cast(came == STARTED, ti.i32), ti.cast(came == UNSTEPPED, ti.i32)
+                self.parts[b], self.low[b], self.high[b] = self.block(b, h, t, self.sub.clock(0, 1), fresh, begin)
+        self.team.wait()
+        if ti.static(self.blocks > BLOCKS):
+            for k in range(BLOCKS):
+                self.parts[k * BLOCKS], self.low[k * BLOCKS], self.high[k * BLOCKS] = self.fold(k * BLOCKS, 1)
+        ti.loop_config(serialize=True)
+        for _ in range(self.team.one(1, me)):
+            for k in range(FIGURES):
+                sheet[k] = 0  # what nobody writes comes back from a GPU as it was there
+            total, low, high = self.fold(0, self.blocks // BLOCKS)
+            for k in ti.static(range(6)):
+                sheet[k] = total[k]
+            if low[0] <= high[0]:
+                for k in ti.static(range(self.dim)):
+                    sheet[7] = ti.max(sheet[7], -low[k], high[k])
+                    sheet[11 + k] = high[k] - low[k]
+            for c in ti.static(self.contacts):
+                sheet[6] = c._on_fast[None]
+                c._on_fast[None] = 0
+            if ti.static(len(self.sub.breakers) > 0):
+                sheet[8] = self.sub.slots.broken[None]
+                self.sub.slots.broken[None] = 0
+            if ti.static(len(self.batches) > 0):
+                sheet[10] = self.sub.slots.turned[None]
+                self.sub.slots.turned[None] = 0
+                if ti.static(self.sub.slots.converges):
+                    sheet[9] = self.sub.slots.tension[None]
+                    self.sub.slots.tension[None] = 0
+
+    @ti.func
+    def fold(self, begin, step: ti.template()):  # type: ignore[valid-type]
+        """Of BLOCKS parts, `step` apart."""
+        total, low, high = self.nothing()
+        for b in range(BLOCKS):
+            at = begin + b * step
+            part = self.parts[at]
+            total[0] += part[0]
+            total[4] += part[4]
+            for k in ti.static(range(1, 4)):
+                total[k] = ti.max(total[k], part[k])
+            total[5] = ti.min(total[5], part[5])
+            low, high = ti.min(low, self.low[at]), ti.max(high, self.high[at])
+        return total, low, high
+
+    def residuals(self, batch, h: float, fresh: bool) -> np.ndarray:
+        """What the last substep left of each violation in a batch, (m,)."""
+        out = np.zeros(max(1, batch.count))
+        if id(batch) not in self.details:
+            self.details[id(batch)] = Residuals(self, batch)
+        self.details[id(batch)].measure(h, int(fresh), out)
+        return out[: batch.count]
+
+    def report(
+        self, time: float, h: float, substeps: int, iterations: int, before: float | None
+    ) -> tuple[StepReport, list[float]]:
+        """The report of a frame, and the size of the bounding box [m]. before: the energy one frame ago [J]."""
+        mine = vars(self)  # whose attributes Taichi looks at in Python, one by one
+        energy, residual, overlap, stiff, contacts, bad, fast, reach, broken, tension, turned, *extent = mine["figures"].tolist()
+        stiff = max(stiff, mine["fastest"] * h * h)
+        notes = {}
+        first = int(bad) if bad < mine["n"] else None
+        if first is not None:
+            notes["non-finite"] = (
+                f"The state of particle {first} is not finite (the first of them); go back and use a smaller step."
+            )
+        if reach >= mine["farthest"]:
+            notes["out-of-range"] = (
+                f"A coordinate is out of range: it reached {reach:g} m, and beyond {mine['farthest']:g} m the precision fails."
+            )
+        if fast > 0:
+            notes["tunnelling-risk"] = (
+                "A particle moved by more than its own size in one substep and may have passed another; use more substeps."
+            )
+        if turned == FAR:
+            notes["turned"] = "A constraint turned by more than 41 degrees in one substep and is damped there; use more substeps."
+        if tension > TENSEST:
+            need = int(np.ceil(substeps * np.sqrt(tension / STIFF)))
+            notes["softened"] = (
+                f"A tension makes particles vibrate too fast for the substep: omega h >= {np.sqrt(tension):.3g}, stable below 2. "
+                f"Its constraints give way instead. Use about {need} substeps."
+            )
+        elif tension == TENSEST:
+            notes["softened"] = (
+                "A load has hardly a direction to be carried in, as that of a straight rope between two pins: its constraints "
+                "give way and sag with h^2. Give them slack or compliance, or use more substeps."
+            )
+        if stiff > STIFF:
+            need = int(np.ceil(substeps * np.sqrt(stiff / STIFF))) + 1
+            notes["stiff-force"] = (
+                f"A force changes too fast for the substep: omega h = {np.sqrt(stiff):.3g}, stable below 2. "
+                f"Use at least {need} substeps."
+            )
+        if residual > UNCONVERGED:
+            need = int(np.ceil(substeps * residual / UNCONVERGED))  # of order h^2 under loads, h after impacts
+            if self.remedy is None:
+                scene = self.sub.scene
+                self.remedy = self.solver.remedy(self.batches, scene.slots, scene.inv_mass)
+            other = f", or {self.remedy}" if self.remedy else ""
+            notes["unconverged"] = (
+                f"Constraints are not met: the worst is off by {100 * residual:.3g} % of its size. "
+                f"Use about {need} substeps{other}. Where neither helps, constraints contradict each other."
+            )
+        report = StepReport.of(
+            {
+                "time": time,
+                "substeps": substeps,
+                "iterations": iterations,
+                "residual": residual,
+                "overlap": overlap,
+                "contacts": int(contacts),
+                "energy": energy,
+                "energy_change": 0.0 if before is None else energy - before,
+                "flags": frozenset(notes),
+                "notes": tuple(notes.values()),
+                "bad": first,
+                "broken": int(broken),
+                "turn": TURNS[int(turned)],
+                "tension": tension,
+                "tries": 1,
+                "seconds": 0.0,
+            }
+        )
+        return report, extent
+
+
+@ti.data_oriented
+class Residuals:
+    """The kernel behind the residual of one batch."""
+
+    def __init__(self, survey: Survey, batch):
+        self.survey, self.sub, self.batch = survey, survey.sub, batch
+
+    @ti.kernel
+    def measure(self, h64: ti.f64, fresh: ti.i32, out: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
+        """Of every constraint."""
+        if ti.static(self.sub.team.size == 1):
+            self.survey.weigh(0, h64, fresh)
+        elif ti.static(len(self.sub.ragged) > 0):
+            for thread in range(self.sub.team.spread):
+                if thread % LEAST == 0:
+                    self.survey.weigh(thread // LEAST, h64, fresh)
+        for c in range(self.batch.count):
+            h = ti.cast(h64, self.sub.real)
+            out[c] = self.batch.miss(c, h, self.sub.reach(h, fresh), self.sub.clock(0, 1), fresh)

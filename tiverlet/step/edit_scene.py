@@ -1,0 +1,244 @@
+"""Adding to a world and removing from it: it is built anew around the same features, and what stays is carried over."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from .. import checks
+from ..contact.contact import Contact
+from ..device.memory import Memory
+from ..features.feature import Acceleration, Batch, Feature
+from ..particles import Particles
+from . import checkpoint
+from .build import assemble, check_settings, checked_features, listed
+from .step import decay
+
+NOTHING = 2.0**-20  # of a velocity: less than this of it is in the next displacement
+
+
+class Handle:
+    """Some particles of a world, whatever happens to others: NumPy, and whatever takes indices, takes it for an index array.
+
+    drops = world.add(tv.Particles(places))
+    world.remove([0, 1])
+    world.position[drops]
+    """
+
+    def __init__(self, indices: np.ndarray):
+        self._indices = indices
+
+    @property
+    def indices(self) -> np.ndarray:
+        """The present numbers of those that were not removed."""
+        return self._indices.copy()
+
+    def follow(self, number: np.ndarray) -> None:
+        """Take new numbers, -1 for those that go."""
+        new = number[self._indices]
+        self._indices = new[new >= 0]
+
+    def __array__(self, dtype=None, copy=None) -> np.ndarray:
+        return self._indices.astype(dtype or np.int64)
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    def __repr__(self) -> str:
+        return f"Handle({len(self)} particles)"
+
+
+def add(world: Any, particles: Particles | None, features: Iterable[Feature]) -> Handle:
+    """See World.add."""
+    world._memory.check()
+    late = listed("World.add", features)
+    if particles is not None:
+        if not isinstance(particles, Particles):
+            raise TypeError(f"World.add: particles = {particles!r} is a {type(particles).__name__}; use tv.Particles(position).")
+        if particles.dim != world.particles.dim:
+            raise ValueError(f"World.add: particles are in {particles.dim}D, but the world is in {world.particles.dim}D.")
+    checked_features(late)
+    if sum(isinstance(f, Contact) for f in (*world.features, *late)) > 1:
+        raise ValueError("World.add: more than one Contact; one covers all particles.")
+    check_settings(world._precision, world._wanted[1], world._order, (*world.features, *late))
+    n, count = len(world.particles), 0 if particles is None else len(particles)
+    if late or count:
+        rebuild(world, np.ones(n, dtype=bool), particles, (*world.features, *late))
+    return handle(world, np.arange(n, n + count))
+
+
+def remove(world: Any, particles: Any, features: Iterable[Feature]) -> None:
+    """See World.remove."""
+    world._memory.check()
+    gone = listed("World.remove", features)
+    for k, feature in enumerate(gone):
+        if not any(feature is f for f in world.features):
+            raise ValueError(f"World.remove: features[{k}] = {feature!r} does not act in this world.")
+    some = np.ones(len(world.particles), dtype=bool)
+    some[chosen(world, "World.remove", particles)] = False
+    if gone or not some.all():
+        rebuild(world, some, None, tuple(f for f in world.features if not any(f is g for g in gone)))
+
+
+def handle(world: Any, indices: np.ndarray) -> Handle:
+    """One that the world keeps up to date."""
+    new = Handle(indices.astype(np.int64))
+    world._handles.add(new)
+    return new
+
+
+def chosen(world: Any, who: str, particles: Any) -> np.ndarray:
+    """Indices of particles that were given by a handle, indices or a mask."""
+    array, n = np.asarray(particles), len(world.particles)
+    if array.dtype == bool:
+        if array.shape != (n,):
+            raise ValueError(f"{who}: particles has shape {array.shape}, but a mask of shape ({n},) is needed.")
+        return np.flatnonzero(array)
+    return checks.indices(who, "particles", array, n)
+
+
+def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tuple[Feature, ...]) -> None:
+    """Build the world anew, of its particles in the mask `some` and the added ones, under these features."""
+    world._memory.check()
+    n, m, before = int(some.sum()), 0 if added is None else len(added), world.features
+    number = np.where(some, np.cumsum(some) - 1, -1)
+    now = world._particles.regrouped(some, added, world.position[some])
+    kept, attributes = checkpoint.keep(world), {f: dict(vars(f)) for f in {*before, *features}}
+    came = [f for f in features if f not in before]
+    went = [f for f in before if f not in features]
+    starts = {id(f.start): f.start.regrouped(some, added) for f in before}
+    starts = [None if f in came else starts[id(f.start)] for f in features]
+    parts, seen = None, None
+    if not world._fresh and (world._parted is not None or any(_loses(f, number, features) for f in before)):
+        seen = world.velocity
+    try:
+        turned = world._force_waits or any(_drives(f, number) for f in came + went)
+        if turned:
+            with world._memory.compiler():
+                world._restart()
+        old = checkpoint.state(world) if turned else kept.values
+        masks = {f: f.spared(number) for f in before}
+        for f in before:
+            f.release()
+            f.renumber(number, n + m)
+        parts = assemble(now, features, starts, n, *world._asked)
+        state = _carried(world, parts.memory, old, attributes, masks, some)
+    except BaseException:
+        if parts:
+            parts.memory.destroy()
+        for f, values in attributes.items():
+            f.__dict__.clear()
+            f.__dict__.update(values)
+        if world._fresh != kept.clock["_fresh"]:
+            checkpoint.put_back(world, kept)
+        raise
+    memories, particles = world._memories, world._particles.regrouped(some, added)
+    contact, reach = next((c for c in world._sub.contacts if c in features), None), world._scene.hh
+    world._parted = None
+    world._install(particles, features, parts)
+    world._scene.hh = reach
+    world._memory.restore(state)
+    if contact and contact in world._sub.contacts:
+        _give_contacts(world, contact, old, number, some)
+    drag, world._drag = world._drag, None
+    if world._sub.decays:
+        world._set(world._h, drag)
+    for f in features:
+        if f not in came:
+            f.changed, f.moving = attributes[f].get("changed", True), attributes[f].get("moving", False)
+            f.new_force = attributes[f].get("new_force", False)
+    for memory in memories:
+        memory.destroy()
+    for one in list(world._handles):
+        one.follow(number)
+    world._energy = None
+    if any(isinstance(f, Contact) for f in came):
+        world._placed = 0
+    elif world._placed is not None:
+        world._placed = int(some[: world._placed].sum())
+    elif m:
+        world._placed = n
+    if m and not world._fresh:
+        _launch(world, n)
+    if seen is not None and not world._fresh:  # what went has left its part in the velocities of what stays
+        world._parted = seen[some] if added is None else np.concatenate([seen[some], added.velocity])
+    for watcher in world._watchers:
+        watcher.regrouped()
+
+
+def _drives(feature: Feature, number: np.ndarray) -> bool:
+    """Whether a feature that comes or goes changes the force on particles that stay."""
+    if isinstance(feature, Batch):
+        return feature.soft and bool(feature.spared(number)[0].any()) if feature.scene else feature.soft
+    return isinstance(feature, Acceleration)
+
+
+def _loses(feature: Feature, number: np.ndarray, features: tuple[Feature, ...]) -> bool:
+    """Whether constraints go."""
+    return isinstance(feature, Batch) and (feature not in features or not feature.spared(number)[0].all())
+
+
+def _carried(
+    world: Any, memory: Memory, old: dict[str, np.ndarray], attributes: dict[Feature, dict], masks: dict, some: np.ndarray
+) -> dict[str, np.ndarray]:
+    """The state of a world that was built anew: the rows of what stayed are as they were."""
+    new = memory.state()
+    names = [{id(e.field): e.name for e in one.entries if e.state} for one in (world._memory, memory)]
+    owned: list[set[str]] = [set(), set()]
+    moves: list[tuple[str, str, tuple[np.ndarray, ...]]] = []
+    for feature, before in attributes.items():
+        pair = [_fields(values, known) for values, known in zip((before, vars(feature)), names, strict=True)]
+        for known, found in zip(owned, pair, strict=True):
+            known.update(found.values())
+        moves += [(pair[0][key], pair[1][key], masks[feature]) for key in pair[0].keys() & pair[1].keys()]
+    moves += [(name, name, (some,)) for name in (set(names[0].values()) - owned[0]) & (set(names[1].values()) - owned[1])]
+    for before, after, choices in moves:
+        rows = old[before]
+        mask = next((choice for choice in choices if len(choice) == len(rows)), None)
+        rows = rows if mask is None else rows[mask]
+        new[after][: len(rows)] = rows
+    return new
+
+
+def _fields(attributes: dict[str, Any], names: dict[int, str]) -> dict[str, str]:
+    """The attributes of a feature that are fields of the state, or the ends of a Track; and their names."""
+    fields = {key: getattr(value, "ends", value) for key, value in attributes.items() if key.startswith("_on_")}
+    return {key: names[id(field)] for key, field in fields.items() if id(field) in names}
+
+
+def _give_contacts(world: Any, contact: Contact, old: dict, number: np.ndarray, some: np.ndarray) -> None:
+    """What pairs in contact remember, and how much smaller particles are than they will be."""
+    if "Contact.shrunk" in old:
+        contact.ease()
+        less: Any = contact._on_store
+        values = less.state()
+        values["Contact.shrunk"][: some.sum()] = old["Contact.shrunk"][some]
+        less.restore(values)
+    grid, pairs = world._grid, number[old["Contact.pairs"]]
+    assert grid
+    both = (pairs >= 0).all(axis=1)
+    nothing = {p.name: np.zeros((len(pairs), p.width) if p.width else len(pairs)) for p in grid.lasting}  # of what came just now
+    grid.restore(pairs[both], {name: old.get(f"Contact.{name}", none)[both] for name, none in nothing.items()})
+
+
+def _launch(world: Any, first: int) -> None:
+    """Give particles from `first` on the displacements that their velocities need, between two substeps.
+
+    v = share d / h + what forces add, see decay(): from any d, what it lacks of v says what d lacks. Where drag leaves nothing of
+    a velocity in a substep, d does not matter.
+    """
+    h, memory, state = world._h, world._memory, world._scene.state
+    want = np.where(world._scene.inv_mass[first:, None] > 0, world._particles.velocity[first:], 0.0)
+    fields = [state.d, *([world._sub.earlier] if world._sub.uses_velocity else [])]
+    values = [memory.read(field).astype(np.float64) for field in fields]
+    for field, rows in zip(fields, values, strict=True):
+        rows[first:] = h * want
+        memory.write(field, rows)
+    share = max(decay(sum(f.rate for f in world._sub.drags), h)[0], NOTHING)
+    d = h * want + h / share * (want - world.velocity[first:])
+    d[world._scene.inv_mass[first:] == 0] = 0.0
+    values[0][first:] = d
+    for rows in values[1:]:
+        rows[first:] = 3 * d - 2 * h * want  # so that 3 d - earlier = 2 h v
+    for field, rows in zip(fields, values, strict=True):
+        memory.write(field, rows)

@@ -1,0 +1,111 @@
+"""What a world is made of: the text behind world.explain()."""
+
+from itertools import groupby
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..colliders.collider import Wall
+from ..device import runtime
+from ..features.feature import Acceleration, Batch
+from ..shapes.shape import morton
+from .build import reason
+
+if TYPE_CHECKING:
+    from ..world import World
+
+
+MANY = 10_000  # particles from which their order in memory matters
+
+
+def explain(world: "World") -> str:
+    """Particles, features, what was left out, launches and memory, as text of a few lines."""
+    p, sub = world.particles, world._sub
+    lines = [
+        f"{len(p)} particles in {p.dim}D, {int((p.inv_mass == 0).sum())} static; {world.precision} on "
+        f"{runtime.architecture()}, {runtime.threads()} threads",
+        f"{'auto, now ' * world._guard.auto}{world.substeps} substeps x {world.iterations} iterations, path {world.path}: "
+        f"{_launches(world)}" + (f"; order {world.order}, {world._sub.count} stages in a substep" if world.order > 2 else ""),
+        "In the kernels:",
+        *(f"    {line}" for line in _present(world)),
+        "Left out, at no cost:",
+        *(f"    {line}" for line in _absent(world)),
+    ]
+    total = sum(world.fields.values())
+    lines.append(f"Memory: {len(world.fields)} fields, {total} bytes, {total / max(1, len(p)):.0f} per particle")
+    for owner, own in groupby(sorted(world.fields, key=_owner), key=_owner):
+        names = list(own)
+        size = sum(world.fields[name] for name in names)
+        lines.append(f"    {owner:10s} {size:>9d} bytes: {', '.join(n.partition('.')[2] or n for n in names)}")
+    if sub.batches:
+        why = "" if world._wanted[0] else f"; chosen because {reason(world._solver)}"
+        lines.append(f"Solved by {world._solver.explain(sub.batches, sub.slots)}{why}")
+        lines.append(f"Constraint corners that can move: {sub.slots.total} of {sum(b.indices.size for b in sub.batches)}")
+    if _scattered(p.position):
+        lines.append(
+            "Numbered at random: neighbours are far apart in memory. tv.shapes.Shape(position).in_order() numbers them in turn; "
+            "large worlds then take half of the time."
+        )
+    return "\n".join(lines)
+
+
+def _scattered(position: np.ndarray) -> bool:
+    """Whether particles that are neighbours in space differ by a tenth of all numbers and more, in the median over a sample."""
+    if len(position) < MANY:
+        return False
+    number = np.arange(0, len(position), -(-len(position) // MANY))
+    return bool(np.median(np.abs(np.diff(number[np.argsort(morton(position[number]))]))) > len(position) / 10)
+
+
+def _owner(field: str) -> str:
+    return field.partition(".")[0] if "." in field else "particles"
+
+
+def _launches(world: "World") -> str:
+    if not world._sub.launched:
+        size = world._sub.team.size
+        return "1 launch per frame" + f", of {size} threads" * (size > 1)
+    passes = world.iterations if world._sub.batches or world._grid or world._sub.walls else 0
+    more = ", and one for each neighbour list" if world._grid else ""
+    return f"{world.substeps * (1 + passes) + 1} launches per frame{more}"
+
+
+def _present(world: "World") -> list[str]:
+    out = []
+    for f in world.features:
+        if isinstance(f, Batch):
+            idle = int(f.idle(world._scene.inv_mass).sum()) if f.count and not f.drives else 0
+            note = f", {idle} of them between particles that cannot move" if idle else ""
+            out.append(f"{f!r}: {f.count} {'driven particles' if f.drives else 'constraints'}{note}")
+        elif isinstance(f, Acceleration):
+            out.append(f"{f!r}: in the loop over particles")
+        elif isinstance(f, Wall):
+            out.append(f"{f!r}: in the loop over particles, last")
+        elif world._grid:
+            grid = world._grid
+            sizes = ", ".join(f"{size:.3g}" for size in grid.cells.sizes)
+            out.append(f"{f!r}: grid with cells of {sizes} m, neighbour list with a skin of {grid.skin:.3g} m")
+        else:
+            out.append(f"{f!r}: nothing, since all radii are 0")
+    return out or ["motion in a straight line"]
+
+
+def _absent(world: "World") -> list[str]:
+    sub = world._sub
+    rows = [
+        (not world._grid, "grid, neighbour list, contacts: no Contact between particles with radii"),
+        (not sub.batches, "slots and gathers: no constraint on particles that can move"),
+        (not sub.walls, "wall pass: no wall"),
+        (not sub.accelerations, "accelerations: no force"),
+        (not sub.decays, "exponential drag: no Drag or Wind"),
+        (not sub.uses_velocity, "second displacement: no force reads velocities"),
+        (
+            not any(getattr(b, "soft", False) for b in sub.batches),
+            "compliance and its history: every constraint is rigid",
+        ),
+        (not sub.breakers, "loads compared and breaks counted: no constraint has break_at"),
+        (sub.radius is None or sub.radius.uniform, "field of radii: all are equal or none is needed"),
+        (sub.state.w.uniform, "field of masses: all are equal"),
+        (not sub.state.sums, "low words: precision is not f32-compensated, and no chain is solved to rounding"),
+    ]
+    return [text for missing, text in rows if missing] or ["nothing"]

@@ -1,0 +1,187 @@
+"""Substeps of order 4, 6 and 8: symmetric compositions of the substep of order 2, which is reversible in time.
+
+A substep of H is made of stages of g_k H, some of them backwards, with g_k = g_(s+1-k), sum g_k = 1, sum g_k^3 = 0 and, from
+order 6 on, more conditions, so that the errors of the stages cancel (Suzuki 1990; Kahan and Li 1997; Suzuki and Umeno 1993; all
+in Hairer, Lubich and Wanner, Geometric Numerical Integration, V.3.2). A stage is Verlet, time-corrected from the one before,
+
+    d' = (h'/h) d + h' (h + h') / 2 a(x),   x' = x + d'
+
+where rigid constraints are fulfilled at its end along their directions at its begin. As a map of positions that is RATTLE, which
+is symmetric and symplectic, so their composition is both. A spring counts as a force, -C grad C / alpha, in a.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from ..colliders.collider import Wall
+from ..constraints.core.scalar import Scalar
+from ..contact.contact import Contact
+from ..device import ti
+from ..features.feature import Acceleration, Batch, Feature, Scene
+from ..solvers.solver import Solver
+from . import checkpoint
+from .step import BEGIN, CAME, END, FRESH, ITERATIONS, START, SUBSTEPS, UNTIL, H, Substep, integer
+
+# The first half of the stages; the one in the middle is what is missing to 1.
+_HALVES = {
+    2: (),
+    4: (1 / (4 - 4 ** (1 / 3)),) * 2,
+    6: (0.39216144400731413928, 0.33259913678935943860, -0.70624617255763935981, 0.082213596293550800230),
+    8: (
+        0.74167036435061295345, -0.40910082580003159400, 0.19075471029623837995, -0.57386247111608226666,
+        0.29906418130365592384, 0.33462491824529818378, 0.31529309239676659663,
+    ),
+}  # fmt: skip
+ORDERS = tuple(_HALVES)
+PASSES = {2: 1, 4: 2, 6: 3, 8: 3}  # Newton's method starts with an error of h^2 in x, and each pass squares it
+PROBE = 64  # a velocity is read from two stages of a 64th of the last one, forwards and backwards
+
+
+def stages(order: int) -> np.ndarray:
+    """The lengths of the stages of a substep of length 1."""
+    half = np.array(_HALVES[order])
+    return np.concatenate([half, [1 - 2 * half.sum()], half[::-1]])
+
+
+def refuse(order: int, features: tuple[Feature, ...], precision: str, path: str) -> None:
+    """Raise ValueError, with the reason, where a substep of this order could not be of it."""
+    who = f"World: order = {order}"
+    if precision != "f64":
+        raise ValueError(
+            f'{who} with precision = "{precision}", whose rounding is larger than what it gains. Use precision="f64".'
+        )
+    if path == "parallel":
+        raise ValueError(f'{who} runs in one launch and one thread only. Use path="auto".')
+    for f in features:
+        why = ""
+        if isinstance(f, (Contact, Wall)):
+            why = "is one-sided: where it starts to act, motion has no derivatives of that order"
+        elif isinstance(f, Acceleration) and (f.decays or f.uses_velocity):
+            why = "depends on velocities, so that the substep is not reversible"
+        elif isinstance(f, Scalar):
+            if f.side:
+                why = "is one-sided: where it starts to act, motion has no derivatives of that order"
+            elif (f.damping > 0).any():
+                why = "has damping, so that the substep is not reversible"
+            elif f.breaks:
+                why = "can break, where motion has no derivatives of that order"
+            elif not f.arity:
+                why = "has any number of corners, which this order is not made for"
+        elif isinstance(f, Batch) and not f.drives:
+            why = "is not one number, so that it cannot be solved exactly"
+        if why:
+            raise ValueError(f"{who}, but {f!r} {why}. Use order=2.")
+
+
+def check_solved(batches: list[Batch], scene: Scene, solver: Solver) -> None:
+    """Raise ValueError where a rigid constraint would be relaxed instead of solved."""
+    for b in batches:
+        assert isinstance(b, Scalar)
+        left = ~b.sprung(scene) & (scene.slots.rows(b) < 0) & ~b.idle(scene.inv_mass)
+        if left.any():
+            raise ValueError(
+                f"World: order = {scene.order} needs rigid constraints to be solved to the end, but {solver!r} relaxes {b!r} ("
+                f"{int(left.sum())} of them, the first is number {int(np.argmax(left))}). Use solver=tv.Direct(width=...), "
+                "a compliance, or order=2."
+            )
+
+
+@ti.data_oriented
+class Composition(Substep):
+    """The kernels of a world of order 4 or more; runs fused only."""
+
+    def __init__(self, scene: Scene, *args):
+        super().__init__(scene, *args)
+        g = stages(scene.order)
+        self.count, self.passes, self.first = len(g), PASSES[scene.order], float(g[0])
+        self.reaches = float(1 + g[-2] / g[-1]) / 2
+        begin = np.concatenate([[0], np.cumsum(g)[:-1]])
+        table = np.stack([g, np.roll(g, 1), begin, begin + g], axis=1)
+        self.table = scene.memory.field("composition.stages", self.count, width=4, kind=ti.f64, values=table)
+        self.fastest = (float(np.abs(g).max()) / self.first) ** 2 * fastest(self.batches, scene)
+
+    @ti.kernel
+    def fused(self, sheet: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
+        """All substeps of a frame, and the survey. The substep that is given is the first stage, which is as long as the last."""
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            h64, whole, t = sheet[H], sheet[H] / self.first, sheet[START]
+            fresh, came = integer(sheet, FRESH), integer(sheet, CAME)
+            substeps, iterations = integer(sheet, SUBSTEPS), integer(sheet, ITERATIONS)
+            until = integer(sheet, UNTIL)
+            for s in range(integer(sheet, BEGIN), ti.min(substeps, until)):
+                for q in range(self.count):
+                    g = self.table[q]
+                    starts = fresh if s + q == 0 else 0
+                    when = ti.Vector([(s + g[2]) / substeps, (s + g[3]) / substeps])
+                    final = ti.cast(s == substeps - 1 and q == self.count - 1, ti.i32)
+                    self.stage(g[0] * whole, g[1] * whole, t + (s + g[2]) * whole, when, starts, iterations, final)
+            if until > substeps:
+                self.survey.weigh(0, h64, came)
+                self.survey.sum_up(0, h64, sheet[END], came, sheet)
+
+    @ti.kernel
+    def probed(self, h: ti.f64, last: ti.f64, t: ti.f64, end: ti.f64, iterations: ti.i32):
+        """One more stage, to see where it leads. end: in frames."""
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            self.stage(h, last, t, ti.Vector([1.0, end]), 0, iterations, 1)
+
+    @ti.func
+    def stage(self, h, last, t, when, starts, iterations, final):
+        """A stage of h after one of `last`."""
+        if ti.static(self.springs):
+            self.kick(0, h)
+        for i in range(self.n):
+            self.propel(i, h, last, t, starts)
+        for f in ti.static(self.drivers):
+            for c in range(f.count):
+                f.drive(c, h, when[1])
+        if ti.static(len(self.systems) > 0):
+            for it in range(ti.max(iterations, self.passes)):
+                first = ti.cast(it == 0, ti.i32)
+                self.tell(0, h, when, first, 0)
+                self.settle(0, first)
+                self.collect(0, h, when, first, final, 0)
+
+    @ti.func
+    def propel(self, i, h, last, t, starts):
+        """Verlet with the force at x; at a start, d is the velocity."""
+        if self.state.w.of(i) > 0:
+            d = self.state.d[i]
+            a = self.accelerate(i, self.state.place(i), 0 * d, t, self.pull(t))
+            if ti.static(self.springs):
+                a += self.slots.total_of(i) / (h * h)
+            if starts != 0:
+                d = h * d + h * h / 2 * a
+            else:
+                d = h / last * d + h * (h + last) / 2 * a
+            self.state.d[i] = d
+            self.state.advance(i, d)
+        elif starts != 0:
+            self.state.d[i] = 0 * self.state.d[i]
+
+
+def fastest(batches: list[Any], scene: Scene) -> float:
+    """A bound on omega^2 of the springs [1/s^2]: that of the stiffest, if particles divide their mass among theirs."""
+    members = [b.indices[b.compliance > 0].ravel() for b in batches]
+    degree = np.bincount(np.concatenate([np.zeros(0, dtype=np.int64), *members]), minlength=len(scene.inv_mass))
+    worst = 0.0
+    for b in batches:
+        soft = b.compliance > 0
+        w = (degree * scene.inv_mass)[b.indices][:, :, None]
+        squares = (w * b.slopes(b.start.position) ** 2).sum(axis=(1, 2))
+        worst = max(worst, float((squares[soft] / b.compliance[soft]).max(initial=0.0)))
+    return worst
+
+
+def velocity(world: Any) -> np.ndarray:
+    """Velocities to the order of the world: the mean over two short stages, one forwards and one backwards, so that their own
+    accelerations cancel, and constraints take out what is along them."""
+    sub, h, kept, out = world._sub, world._h, checkpoint.keep(world), 0.0
+    for e in (h / PROBE, -h / PROBE):
+        sub.probed(e, h, world.time, 1 + e / world._frame[1], world.iterations)
+        out = out + world._memory.read(sub.state.d) / e
+        checkpoint.put_back(world, kept)
+    return out / 2

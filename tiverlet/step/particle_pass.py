@@ -1,0 +1,180 @@
+"""What happens to a tile of particles: loops so short that their state stays in a cache, and so simple that several are done at
+once."""
+
+from ..colliders.collider import AGAIN, FIRST, GENTLY, ROUNDS, SWEEPS, Wall
+from ..device import ti
+from ..device.patches.compiler import FEW
+from ..device.thread_team import Team, block, blocks
+from ..features.feature import Acceleration, Batch, Scene
+from .integrator import Motion
+
+TILE = 256  # particles that a thread takes at a time, through several loops: their state stays in its cache
+
+
+class Tiles(Motion):
+    """The motion of particles, and what they gather of constraints, contacts and walls. contact and grid may be None."""
+
+    def __init__(
+        self, scene: Scene, accelerations: list[Acceleration], batches: list[Batch], contact, grid, walls: list[Wall], team: Team
+    ):  # fmt: skip
+        super().__init__(scene, accelerations)
+        self.team = team
+        self.pieces = -(-self.n // team.piece)
+        self.tile = min(TILE, team.piece)
+        self.each = -(-team.piece // self.tile)  # tiles of a piece
+        self.slots, self.grid, self.walls, self.radius = scene.slots, grid, walls, scene.radius
+        self.batches: list[Batch] = [b for b in batches if b.count]
+        self.contacts = [contact] if contact else []
+        self.rough = any(w.rubs or w.bounces for w in walls)
+        if walls:
+            self.thrust = scene.memory.field("thrust", self.n, width=self.dim, state=True)
+
+    @ti.func
+    def part(self, k, me):
+        """The particles of the k-th piece of thread `me`: the first, and where they end."""
+        first = self.team.turn(k, 1, me) * self.team.piece
+        return first, ti.min(first + self.team.piece, self.n)
+
+    @ti.func
+    def within(self, tile):
+        """Those of a tile of a piece."""
+        piece, first = tile, tile * self.team.piece
+        if ti.static(self.each > 1):
+            piece = tile // self.each
+            first = piece * self.team.piece + tile % self.each * self.tile
+        return first, ti.min(first + self.tile, (piece + 1) * self.team.piece, self.n)
+
+    @ti.func
+    def advance(self, tile, h, t, tick, fresh, calming, final):
+        """Integrate a tile of particles. Short loops, so that each is done for several particles at once."""
+        first, end = self.within(tile)
+        for c in ti.static(self.contacts):
+            if final != 0:
+                scale = ti.select(fresh != 0, h, ti.cast(1, self.real))
+                for i in range(first, end):
+                    c.set_out(i, scale)
+        if ti.static(self.state.starts):
+            for i in range(first, end):
+                self.state.x0[i] = self.state.x[i]
+                if ti.static(self.state.sums):
+                    self.state.low0[i] = self.state.low[i]
+        if ti.static(self.state.leans):
+            if calming != 0:
+                for i in range(first, end):
+                    self.state.lean[i] = ti.zero(self.state.x[i])
+        pull, share, reach = self.pull(t), ti.cast(1, self.real), self.reach(h, fresh)
+        if fresh != 0:
+            share = h
+            if ti.static(self.decays):
+                share *= self.decay[None][1]
+        for i in range(first, end):
+            self.integrate(i, h, t, tick, fresh, pull, share, reach)
+        for c in ti.static(self.contacts):
+            stale, fast = 0, 0
+            for i in range(first, end):
+                c.grow(i, h)
+            for i in range(first, end):
+                stale |= self.grid.outrun(i)
+            for i in range(first, end):
+                fast |= c.overshoots(i)
+            c.heed(stale, fast)
+
+    @ti.func
+    def move(self, tile, h, when, first, final, looks):
+        """What a tile of particles gathers."""
+        begin, end = self.within(tile)
+        if ti.static(len(self.batches) > 0 and len(self.contacts) == 0):
+            for i in range(begin, end):
+                self.slots.gather(i)
+        for c in ti.static(self.contacts):
+            for b in range(blocks(begin, end)):
+                low, high = block(b, begin, end)
+                if c.busy(low) != 0:
+                    for i in range(low, high):
+                        c.gather(i, first)
+        if ti.static(len(self.walls) > 0):
+            if final != 0:
+                for i in range(begin, end):
+                    if first != 0:
+                        self.thrust[i] = -self.state.d[i]
+                    else:
+                        self.thrust[i] = self.thrust[i] - self.state.d[i]
+        if ti.static(len(self.walls) > 0 and self.n < FEW):
+            for i in range(begin, end):
+                self.confine(i, h, when)
+        elif ti.static(len(self.walls) > 0):
+            for b in range(blocks(begin, end)):
+                low, high = block(b, begin, end)
+                near = 0
+                for i in range(low, high):
+                    for f in ti.static(self.walls):
+                        near |= f.near(i, self.radius.of(i))
+                if near != 0:
+                    for i in range(low, high):
+                        self.confine(i, h, when)
+        for c in ti.static(self.contacts):
+            if looks != 0:
+                stale = 0
+                for i in range(begin, end):
+                    stale |= self.grid.outrun(i)
+                c.heed(stale, 0)
+        if ti.static(len(self.walls) > 0):
+            if final != 0:
+                for i in range(begin, end):
+                    self.thrust[i] = self.thrust[i] + self.state.d[i]
+
+    @ti.func
+    def confine(self, i, h, when):
+        """The walls, which have the last word; they take turns until they agree, see Wall."""
+        if self.state.w.of(i) > 0:
+            if ti.static(len(self.walls) == 1 and not self.walls[0].repeats):
+                for f in ti.static(self.walls):
+                    f.confine(i, self.radius.of(i), h, when, FIRST)
+            else:
+                moving, turn = True, FIRST
+                for k in range(SWEEPS + ROUNDS + 1):
+                    if moving:
+                        if k == SWEEPS + ROUNDS:
+                            self.stay(i)
+                        x, d = self.state.x[i], self.state.d[i]
+                        for f in ti.static(self.walls):
+                            f.confine(i, self.radius.of(i), h, when, turn)
+                        settled = (self.state.d[i] == d).all() and (self.state.x[i] == x).all()
+                        # With friction or bounces a round may come back to where it began, and not be free there.
+                        moving = not (settled and (turn == GENTLY or ti.static(not self.rough)))
+                        turn = FIRST if ti.static(len(self.walls) > 1) else AGAIN
+                        if settled or k + 1 >= SWEEPS:
+                            turn = GENTLY
+
+    @ti.func
+    def stay(self, i):
+        """Put particle i back to where it was at the start of the substep, at rest."""
+        if ti.static(self.state.starts):
+            if ti.static(self.state.befores):
+                self.state.before[i] = self.state.before[i] - self.state.d[i]
+            self.state.d[i] = ti.zero(self.state.d[i])
+            self.state.restart(i)
+        else:
+            self.state.shift(i, -self.state.d[i])
+
+    @ti.func
+    def felt(self, i, h, t, firm):
+        """h^2 times what constraints (from Slots), contacts and walls accelerated particle i by in the last substep.
+
+        Walls count as far as they balance the rest: a body at rest has velocity 0, but one that has just bounced is not credited
+        with half of the blow.
+        """
+        bond = 0 * self.state.d[i]
+        if ti.static(len(self.batches) > 0):
+            bond = self.slots.total_of(i)
+        for c in ti.static(self.contacts):
+            bond += firm * c.bond(i)
+        if ti.static(len(self.walls) > 0):
+            push = firm * self.thrust[i]
+            v = self.state.d[i] / h
+            limit = (h * h * self.accelerate(i, self.state.place(i), v, t, self.pull(t)) + bond).norm()
+            size = push.norm()
+            if size > limit:
+                push *= limit / size
+            bond += push
+        return bond
