@@ -57,7 +57,7 @@ class World(Launches):
         starts = [None] * len(features)
         self._build(particles, features, starts, substeps, iterations, solver, precision, path, order)
         for contact in self._sub.contacts:
-            if not contact._on_eases and contact.table.uniform and overlapping(self._scene, self._batches):
+            if not contact.dev.eases and contact.table.uniform and overlapping(self._scene, self._batches):
                 contact.ease()  # before anything is compiled: later, the frame would be compiled again
 
     @staticmethod

@@ -25,7 +25,7 @@ class Ball(Wall):
     dim = 0
     center = Knob(lambda f, v: checks.vector("Ball", "center", v, f.dim or len(np.atleast_1d(v))), "Middle of the ball [m].")
 
-    radius = Knob(lambda f, v: f._size(v), "Of the ball [m].", device="_on_size")
+    radius = Knob(lambda f, v: f._size(v), "Of the ball [m].", device="size")
     widest = 0.0  # radius of a particle [m]
 
     def __init__(self, center, radius, inside=False, *, friction=0.0, restitution=0.0, push_out=1.0):
@@ -53,25 +53,25 @@ class Ball(Wall):
     @property
     def repeats(self) -> bool:
         """Inside, the way along the surface leads out, and a bounce may lead to the other end."""
-        return self.inside and (self._on_rubs or self._on_bounces)
+        return self.inside and (self.dev.rubs or self.dev.bounces)
 
     def bind(self, scene: Scene) -> None:
         """The center at the start and the end of a frame."""
         Wall.bind(self, scene)
-        self._on_center = Track(scene.memory, "Ball.center", self.center)
-        self._on_size = scene.memory.field("Ball.radius", None, values=self.radius)
+        self.dev.center = Track(scene.memory, "Ball.center", self.center)
+        self.dev.size = scene.memory.field("Ball.radius", None, values=self.radius)
         self.changed = False
 
     def upload(self) -> None:
         """Move to the new center."""
         Wall.upload(self)
-        self.scene.memory.write(self._on_size, self.radius)
-        self._on_center.aim(self.center)
+        self.scene.memory.write(self.dev.size, self.radius)
+        self.dev.center.aim(self.center)
         self.moving = True
 
     def settle(self) -> None:
         """Stay."""
-        self._on_center.settle()
+        self.dev.center.settle()
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
         """A circle in 2D, three in 3D."""
@@ -88,9 +88,9 @@ class Ball(Wall):
     @ti.func
     def confine(self, i, radius, h, when, turn):
         """The surface where it was met, or where it is nearest."""
-        center, moved = self._on_center.at(when[1]), self._on_center.step(when)
-        r = self._on_state.place(i) - center
-        far = ti.cast(self.radius, self._on_real)
+        center, moved = self.dev.center.at(when[1]), self.dev.center.step(when)
+        r = self.dev.state.place(i) - center
+        far = ti.cast(self.radius, self.dev.real)
         depth, n = self.nearest(r, far, radius)
         d = self.way(i, moved)
         start = r - d

@@ -74,28 +74,28 @@ class Box(Wall):
     @property
     def repeats(self) -> bool:
         """In a corner friction on one side may lead into another, and a bounce may lead to the other end."""
-        return self._on_rubs or self._on_bounces
+        return self.dev.rubs or self.dev.bounces
 
     def bind(self, scene: Scene) -> None:
         """Corners at the start and the end of a frame."""
         Wall.bind(self, scene)
         sides = np.concatenate([self.lower, self.upper])
-        self._on_sides = scene.memory.field("Box.sides", len(sides), width=2, values=np.stack([sides, sides], 1), state=True)
-        self._on_now = scene.memory.field("Box.sides_now", len(sides), width=2)  # the plane, and how far it goes in the substep
+        self.dev.sides = scene.memory.field("Box.sides", len(sides), width=2, values=np.stack([sides, sides], 1), state=True)
+        self.dev.now = scene.memory.field("Box.sides_now", len(sides), width=2)  # the plane, and how far it goes in the substep
         self.changed = False
 
     def upload(self) -> None:
         """Move from the last corners to the new ones."""
         Wall.upload(self)
-        old, new = self.scene.memory.read(self._on_sides)[:, 1], np.concatenate([self.lower, self.upper])
+        old, new = self.scene.memory.read(self.dev.sides)[:, 1], np.concatenate([self.lower, self.upper])
         jump = np.isinf(old) | np.isinf(new)
-        self.scene.memory.write(self._on_sides, np.stack([np.where(jump, new, old), new], axis=1))
+        self.scene.memory.write(self.dev.sides, np.stack([np.where(jump, new, old), new], axis=1))
         self.moving = True
 
     def settle(self) -> None:
         """Stay."""
-        sides = self.scene.memory.read(self._on_sides)[:, 1]
-        self.scene.memory.write(self._on_sides, np.stack([sides, sides], axis=1))
+        sides = self.scene.memory.read(self.dev.sides)[:, 1]
+        self.scene.memory.write(self.dev.sides, np.stack([sides, sides], axis=1))
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
         """The edges, if all sides are closed."""
@@ -110,19 +110,19 @@ class Box(Wall):
     def pose(self, when):
         """Where the planes are; what stands is where it stands, to the bit, and at infinity too."""
         for side in range(ti.static(2 * self.dim)):
-            a, b = self._on_sides[side][0], self._on_sides[side][1]
+            a, b = self.dev.sides[side][0], self.dev.sides[side][1]
             at, shift = b, ti.zero(b)
             if a != b:
                 at, shift = a * (1 - when[1]) + b * when[1], (b - a) * (when[1] - when[0])
-            self._on_now[side] = ti.Vector([at, shift])
+            self.dev.now[side] = ti.Vector([at, shift])
 
     @ti.func
     def near(self, i, radius):
         """1 if there may be something to press()."""
-        out, x, close = 0, self._on_state.place(i), self._on_state.digits(i)
+        out, x, close = 0, self.dev.state.place(i), self.dev.state.digits(i)
         for k in ti.static(range(self.dim)):
-            out |= ti.cast(self._on_now[k][0] + radius - x[k] > -close, ti.i32)
-            out |= ti.cast(x[k] + radius - self._on_now[k + self.dim][0] > -close, ti.i32)
+            out |= ti.cast(self.dev.now[k][0] + radius - x[k] > -close, ti.i32)
+            out |= ti.cast(x[k] + radius - self.dev.now[k + self.dim][0] > -close, ti.i32)
         return out
 
     @ti.func
@@ -130,7 +130,7 @@ class Box(Wall):
         """Two planes per axis, lower ones first."""
         if self.near(i, radius) != 0:
             for side in range(ti.static(2 * self.dim)):
-                wall, shift, x = self._on_now[side][0], self._on_now[side][1], self._on_state.place(i)
+                wall, shift, x = self.dev.now[side][0], self.dev.now[side][1], self.dev.state.place(i)
                 n, moved, depth = ti.zero(x), ti.zero(x), ti.zero(wall)
                 for k in ti.static(range(self.dim)):
                     if side == k:

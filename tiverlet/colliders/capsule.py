@@ -29,7 +29,7 @@ class Capsule(Wall):
 
     dim = 0
     a, b = _end("a"), _end("b")
-    radius = Knob(lambda f, v: checks.number("Capsule", "radius", v, above=0.0), "Of the rod [m].", device="_on_size")
+    radius = Knob(lambda f, v: checks.number("Capsule", "radius", v, above=0.0), "Of the rod [m].", device="size")
 
     def __init__(self, a, b, radius, *, friction=0.0, restitution=0.0, push_out=1.0):
         self.a, self.b = a, b
@@ -44,22 +44,22 @@ class Capsule(Wall):
     def bind(self, scene: Scene) -> None:
         """The ends at the start and the end of a frame."""
         Wall.bind(self, scene)
-        self._on_size = scene.memory.field("Capsule.radius", None, values=self.radius)
-        self._on_a, self._on_b = Track(scene.memory, "Capsule.a", self.a), Track(scene.memory, "Capsule.b", self.b)
+        self.dev.size = scene.memory.field("Capsule.radius", None, values=self.radius)
+        self.dev.a, self.dev.b = Track(scene.memory, "Capsule.a", self.a), Track(scene.memory, "Capsule.b", self.b)
         self.changed = False
 
     def upload(self) -> None:
         """Move to the new ends."""
         Wall.upload(self)
-        self.scene.memory.write(self._on_size, self.radius)
-        self._on_a.aim(self.a)
-        self._on_b.aim(self.b)
+        self.scene.memory.write(self.dev.size, self.radius)
+        self.dev.a.aim(self.a)
+        self.dev.b.aim(self.b)
         self.moving = True
 
     def settle(self) -> None:
         """Stay."""
-        self._on_a.settle()
-        self._on_b.settle()
+        self.dev.a.settle()
+        self.dev.b.settle()
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
         """The axis, as thick as the rod."""
@@ -84,7 +84,7 @@ class Capsule(Wall):
     def along(self, x, a, b, when):
         """Where a point at x, at the start of the substep, would be if the rod took it along as it turns: beside the same place
         on the axis, which ends between a and b, and as far from it."""
-        t, length, n = self.nearest(x, self._on_a.at(when[0]), self._on_b.at(when[0]))
+        t, length, n = self.nearest(x, self.dev.a.at(when[0]), self.dev.b.at(when[0]))
         axis = b - a
         if 0 < t < 1:
             n -= axis * (n.dot(axis) / axis.dot(axis))
@@ -93,13 +93,13 @@ class Capsule(Wall):
     @ti.func
     def confine(self, i, radius, h, when, turn):
         """The surface where it was met, or where it is nearest."""
-        a, b = self._on_a.at(when[1]), self._on_b.at(when[1])
-        x, far = self._on_state.place(i), ti.cast(self.radius, self._on_real) + radius
+        a, b = self.dev.a.at(when[1]), self.dev.b.at(when[1])
+        x, far = self.dev.state.place(i), ti.cast(self.radius, self.dev.real) + radius
         t, length, n = self.nearest(x, a, b)
         depth = far - length
-        moved = self._on_a.step(when) * (1 - t) + self._on_b.step(when) * t
+        moved = self.dev.a.step(when) * (1 - t) + self.dev.b.step(when) * t
         d = self.way(i, moved)
-        if (self._on_a.step(when) != self._on_b.step(when)).any():
+        if (self.dev.a.step(when) != self.dev.b.step(when)).any():
             d = x - self.along(x - self.way(i, 0 * x), a, b, when)
         way = d.norm()
         _t, gap, _n = self.nearest(x - d, a, b)  # not twice the same name: Taichi would assign a vector to a number

@@ -38,7 +38,7 @@ class Wall(Feature):
     """
 
     friction = Knob(lambda f, v: _friction(f, v), "A number, or (static, dynamic).")
-    restitution = Knob(lambda f, v: restitution_of(repr(f), "restitution", v), "0 to 1.", device="_on_restitution")
+    restitution = Knob(lambda f, v: restitution_of(repr(f), "restitution", v), "0 to 1.", device="restitution")
     push_out = Knob(lambda f, v: checks.number(repr(f), "push_out", v, least=0.0), "[m/s].", compiled=True)
     compiled_for = ("rubs", "bounces")
     sweeps = False  # needs the exact position at the start of the substep
@@ -52,42 +52,42 @@ class Wall(Feature):
     @property
     def static(self) -> Any:
         """The coefficient of static friction, for kernels."""
-        return at(at(self._on_friction, None), 0)
+        return at(at(self.dev.friction, None), 0)
 
     @property
     def dynamic(self) -> Any:
         """The coefficient of dynamic friction, for kernels."""
-        return at(at(self._on_friction, None), 1)
+        return at(at(self.dev.friction, None), 1)
 
     @property
     def rubs(self) -> bool:
         """Whether there is friction, or was when kernels were compiled."""
-        return friction_of(repr(self), "friction", self.friction)[0] > 0 or "_on_friction" in vars(self)
+        return friction_of(repr(self), "friction", self.friction)[0] > 0 or "friction" in vars(self.dev)
 
     @property
     def bounces(self) -> bool:
         """Whether there is restitution, or was when kernels were compiled."""
-        return self.restitution > 0 or "_on_restitution" in vars(self)
+        return self.restitution > 0 or "restitution" in vars(self.dev)
 
     def bind(self, scene: Scene) -> None:
         """Keep the state at hand."""
         self.scene = scene
-        self._on_state = scene.state
-        self._on_real = scene.real
-        self._on_rubs, self._on_bounces = self.rubs, self.bounces
-        if self._on_rubs:
+        self.dev.state = scene.state
+        self.dev.real = scene.real
+        self.dev.rubs, self.dev.bounces = self.rubs, self.bounces
+        if self.dev.rubs:
             both = friction_of(repr(self), "friction", self.friction)
-            self._on_friction = scene.memory.field(f"{self!r}.friction", None, width=2, values=both)
-        if self._on_bounces:
-            self._on_restitution = scene.memory.field(f"{self!r}.restitution", None, values=self.restitution)
+            self.dev.friction = scene.memory.field(f"{self!r}.friction", None, width=2, values=both)
+        if self.dev.bounces:
+            self.dev.restitution = scene.memory.field(f"{self!r}.restitution", None, values=self.restitution)
 
     def upload(self) -> None:
         """Write friction and restitution."""
         write = self.scene.memory.write
-        if self._on_rubs:
-            write(self._on_friction, friction_of(repr(self), "friction", self.friction))
-        if self._on_bounces:
-            write(self._on_restitution, self.restitution)
+        if self.dev.rubs:
+            write(self.dev.friction, friction_of(repr(self), "friction", self.friction))
+        if self.dev.bounces:
+            write(self.dev.restitution, self.restitution)
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
         """For pictures of a scene between two corners: line strips (m, k, dim), and half their width [m], 0 for a thin line."""
@@ -105,16 +105,16 @@ class Wall(Feature):
     @ti.func
     def lifted(self, i):
         """Whether particle i is not where its displacement says, because it has bounced in this substep; and by how much."""
-        lift = 0 * self._on_state.d[i]
-        if ti.static(self._on_state.befores):
-            lift = self._on_state.place(i) - self._on_state.begin(i) - self._on_state.d[i]
-        return lift.norm() > 4 * self._on_state.digits(i), lift
+        lift = 0 * self.dev.state.d[i]
+        if ti.static(self.dev.state.befores):
+            lift = self.dev.state.place(i) - self.dev.state.begin(i) - self.dev.state.d[i]
+        return lift.norm() > 4 * self.dev.state.digits(i), lift
 
     @ti.func
     def way(self, i, moved):
         """From where particle i was at the start of the substep to where it is, as seen from a wall that moved by `moved`."""
-        out = self._on_state.d[i] - moved
-        if ti.static(self._on_state.befores):
+        out = self.dev.state.d[i] - moved
+        if ti.static(self.dev.state.befores):
             high, lift = self.lifted(i)
             if high:
                 out += lift
@@ -128,10 +128,10 @@ class Wall(Feature):
         What comes as close as the last digits of the position can tell touches: it does not sink, or slip, by these digits.
         Returns how the position was shifted.
         """
-        d = self._on_state.d[i] - moved
+        d = self.dev.state.d[i] - moved
         shift = 0 * d
         leaving = d.dot(n)
-        close = self._on_state.digits(i)
+        close = self.dev.state.digits(i)
         if depth > -close:
             depth = ti.max(depth, ti.min(-leaving, close))
         if depth > ti.select(turn == FIRST, 0, close):
@@ -139,17 +139,17 @@ class Wall(Feature):
             # Normal displacement after the substep; what has bounced may be moved further than that is to tell.
             after = ti.min(leaving + move, ti.max(ti.abs(leaving), self.push_out * h))
             rise = 0 * depth
-            if ti.static(self._on_bounces):
+            if ti.static(self.dev.bounces):
                 # Where the last bounce has put it back on a straight way, that way began at a height of `gap`.
                 gap = -depth - leaving
                 if gap >= 0 and leaving < 0 and turn != GENTLY:
-                    rise, after = self.bounce(gap, leaving, (self._on_state.before[i] - moved).dot(n), after)
+                    rise, after = self.bounce(gap, leaving, (self.dev.state.before[i] - moved).dot(n), after)
             change = (after - leaving) * n
-            if ti.static(self._on_state.leans):
-                self._on_state.lean[i] = self._on_state.lean[i] + change
+            if ti.static(self.dev.state.leans):
+                self.dev.state.lean[i] = self.dev.state.lean[i] + change
             shift = (move + rise) * n
             stuck = False
-            if ti.static(self._on_rubs):
+            if ti.static(self.dev.rubs):
                 if turn != GENTLY:
                     slip = d - leaving * n
                     size, given = slip.norm(), after - leaving
@@ -160,17 +160,17 @@ class Wall(Feature):
                         stuck = rise == 0 and not high
                     change -= slip
                     shift -= slip
-            self._on_state.d[i] = self._on_state.d[i] + change
-            if ti.static(self._on_state.befores):
+            self.dev.state.d[i] = self.dev.state.d[i] + change
+            if ti.static(self.dev.state.befores):
                 blow = change  # which is no acceleration
                 if rise == 0:
                     blow -= (after - leaving) * n
-                self._on_state.before[i] = self._on_state.before[i] + blow
-            if ti.static(self._on_rubs):
+                self.dev.state.before[i] = self.dev.state.before[i] + blow
+            if ti.static(self.dev.rubs):
                 if stuck:
-                    self._on_state.restart(i)
+                    self.dev.state.restart(i)
             if not stuck:
-                self._on_state.advance(i, shift)
+                self.dev.state.advance(i, shift)
         return shift
 
     @ti.func

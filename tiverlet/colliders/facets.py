@@ -56,38 +56,38 @@ class Facets(Solid):
         Solid.bind(self, scene)
         name, add, dim = repr(self), scene.memory.field, self.dim
         size = float(np.abs(self.corners).max())
-        self._on_close = size * (2.0**-21 if scene.real == ti.f32 else 2.0**-50)
-        self._on_touch = TOUCH * size
-        self._on_tilt, self._on_slight = (2.0**-18, 2.0**-20) if scene.real == ti.f32 else (2.0**-40, 2.0**-48)
+        self.dev.close = size * (2.0**-21 if scene.real == ti.f32 else 2.0**-50)
+        self.dev.touch = TOUCH * size
+        self.dev.tilt, self.dev.slight = (2.0**-18, 2.0**-20) if scene.real == ti.f32 else (2.0**-40, 2.0**-48)
         buckets = Buckets(self.corners, float(scene.particles.radius.max(initial=0.0)) + self.radius, self.closed)
-        self._on_reach, self._on_cell, self._on_shape = buckets.reach, buckets.cell, buckets.shape.tolist()
-        self._on_low, self._on_high = self.corners.min(axis=(0, 1)).tolist(), self.corners.max(axis=(0, 1)).tolist()
-        self._on_pieces = 4 * int(buckets.shape.sum()) + 64
-        self._on_all = len(buckets.begin) - 2  # the last bucket holds all facets, for what starts deep inside
-        self._on_beyond = self.closed and self.turned_in
+        self.dev.reach, self.dev.cell, self.dev.shape = buckets.reach, buckets.cell, buckets.shape.tolist()
+        self.dev.low, self.dev.high = self.corners.min(axis=(0, 1)).tolist(), self.corners.max(axis=(0, 1)).tolist()
+        self.dev.pieces = 4 * int(buckets.shape.sum()) + 64
+        self.dev.all = len(buckets.begin) - 2  # the last bucket holds all facets, for what starts deep inside
+        self.dev.beyond = self.closed and self.turned_in
         order = np.argsort(self.wings[0], kind="stable")
         begin = np.searchsorted(self.wings[0][order], np.arange(len(self.facing) + 1))
-        self._on_corner = add(f"{name}.corner", len(self.corners) * dim, width=dim, values=self.corners.reshape(-1, dim))
-        self._on_normal = add(f"{name}.normal", len(self.corners), width=dim, values=self.normals)
-        self._on_feature = add(f"{name}.feature", self.features.size, kind=ti.i32, values=self.features.ravel())
-        self._on_facing = add(f"{name}.facing", len(self.facing), width=dim, values=self.facing)
-        self._on_wing = add(f"{name}.wing", len(order), width=dim, values=self.wings[1][order])
-        self._on_wing_begin = add(f"{name}.wing_begin", len(begin), kind=ti.i32, values=begin)
-        self._on_bucket = add(f"{name}.bucket", len(buckets.bucket), kind=ti.i32, values=buckets.bucket)
-        self._on_begin = add(f"{name}.begin", len(buckets.begin), kind=ti.i32, values=buckets.begin)
-        self._on_list = add(f"{name}.list", len(buckets.list), kind=ti.i32, values=buckets.list)
+        self.dev.corner = add(f"{name}.corner", len(self.corners) * dim, width=dim, values=self.corners.reshape(-1, dim))
+        self.dev.normal = add(f"{name}.normal", len(self.corners), width=dim, values=self.normals)
+        self.dev.feature = add(f"{name}.feature", self.features.size, kind=ti.i32, values=self.features.ravel())
+        self.dev.facing = add(f"{name}.facing", len(self.facing), width=dim, values=self.facing)
+        self.dev.wing = add(f"{name}.wing", len(order), width=dim, values=self.wings[1][order])
+        self.dev.wing_begin = add(f"{name}.wing_begin", len(begin), kind=ti.i32, values=begin)
+        self.dev.bucket = add(f"{name}.bucket", len(buckets.bucket), kind=ti.i32, values=buckets.bucket)
+        self.dev.begin = add(f"{name}.begin", len(buckets.begin), kind=ti.i32, values=buckets.begin)
+        self.dev.list = add(f"{name}.list", len(buckets.list), kind=ti.i32, values=buckets.list)
 
     turned_in = False  # particles are kept inside: the solid is all around
 
     @ti.func
     def corner(self, f, k):
         """Corner k of facet f."""
-        return self._on_corner[f * self.dim + k]
+        return self.dev.corner[f * self.dim + k]
 
     @ti.func
     def nearest(self, f, q):
         """Distance from q to facet f, the direction from the nearest point to q, and the feature that has it (-1: none)."""
-        n = self._on_normal[f]
+        n = self.dev.normal[f]
         r, at, over = q - self.corner(f, 0), -1, True
         least = r.dot(r)
         for k in range(ti.static(1 if self.dim == 2 else 3)):
@@ -111,7 +111,7 @@ class Facets(Solid):
         distance = ti.abs(height)
         if at >= 0:
             distance = r.norm()
-            at = self._on_feature[f * ti.static(self.features.shape[1]) + at]
+            at = self.dev.feature[f * ti.static(self.features.shape[1]) + at]
             if distance > 0:
                 n = r / distance
         elif height < 0:
@@ -121,8 +121,8 @@ class Facets(Solid):
     @ti.func
     def around(self, q):
         """Where the list of the facets around q begins and ends, and how far from q there are no others."""
-        low, high = self.constant(self._on_low), self.constant(self._on_high)
-        reach, size = ti.cast(self._on_reach, self._on_real), ti.cast(self._on_cell, self._on_real)
+        low, high = self.constant(self.dev.low), self.constant(self.dev.high)
+        reach, size = ti.cast(self.dev.reach, self.dev.real), ti.cast(self.dev.cell, self.dev.real)
         off = ti.max(low - q, q - high)
         clear = off[0]
         for k in ti.static(range(1, self.dim)):
@@ -132,22 +132,22 @@ class Facets(Solid):
             cell = ti.floor((q - low + reach) / size, ti.i32)
             where = 0
             for k in ti.static(range(self.dim - 1, -1, -1)):
-                where = where * self._on_shape[k] + ti.min(ti.max(cell[k], 0), self._on_shape[k] - 1)
-            bucket = self._on_bucket[where]
+                where = where * self.dev.shape[k] + ti.min(ti.max(cell[k], 0), self.dev.shape[k] - 1)
+            bucket = self.dev.bucket[where]
             clear = reach
             if bucket < 0:
                 clear += (-1 - bucket) * size
-        elif ti.static(self._on_beyond):
-            bucket = self._on_all
+        elif ti.static(self.dev.beyond):
+            bucket = self.dev.all
         begin, end = 0, 0
         if bucket >= 0:
-            begin, end = self._on_begin[bucket], self._on_begin[bucket + 1]
+            begin, end = self.dev.begin[bucket], self.dev.begin[bucket + 1]
         return begin, end, clear
 
     @ti.func
     def constant(self, values: ti.template()):  # type: ignore[valid-type]
         """A vector of numbers that are known when the kernel is compiled."""
-        return ti.Vector([ti.cast(v, self._on_real) for v in ti.static(values)])
+        return ti.Vector([ti.cast(v, self.dev.real) for v in ti.static(values)])
 
     @ti.func
     def strike(self, a, e, far, close, limit):
@@ -155,28 +155,28 @@ class Facets(Solid):
         way, s, piece = e.norm(), 0 * far, 0
         best, depth, normal = 0 * far + 2, 0 * far, 0 * e
         least, outside, exit = far + way + 1, 0 * far + 1, 0 * e
-        while s < 1 and s < best and piece < self._on_pieces:
+        while s < 1 and s < best and piece < self.dev.pieces:
             begin, end, clear = self.around(a + s * e)
             for place in range(begin, end):
-                f, t, going = self._on_list[place], 0 * far, True
+                f, t, going = self.dev.list[place], 0 * far, True
                 for k in range(NEWTON):
                     if going:
                         distance, n, at = self.nearest(f, a + t * e)
-                        out = self._on_normal[f]
+                        out = self.dev.normal[f]
                         if at >= 0:
-                            out = self._on_facing[at]
+                            out = self.dev.facing[at]
                         side = n.dot(out)
                         if ti.static(self.closed):
                             if k == 0 and piece == 0 and distance < least:
                                 least, outside, exit = distance, side, -n
-                            if distance <= self._on_touch:
+                            if distance <= self.dev.touch:
                                 # On the surface itself, each facet that is touched there has its own direction.
-                                distance, n, at = ti.select(side < 0, -distance, distance), self._on_normal[f], -1
+                                distance, n, at = ti.select(side < 0, -distance, distance), self.dev.normal[f], -1
                         gap, slope = distance - far, e.dot(n)
                         if gap <= close or k == NEWTON - 1:
                             going = False
                             below = -(gap + (1 - t) * slope)
-                            toward = slope < -ti.cast(self._on_slight, self._on_real) * way
+                            toward = slope < -ti.cast(self.dev.slight, self.dev.real) * way
                             hit = toward and t > 0 and below > 0
                             if t == 0:
                                 if toward:
@@ -194,7 +194,7 @@ class Facets(Solid):
             s += (clear - far) / way
             piece += 1
         if ti.static(self.closed):
-            if outside < 0 and least > self._on_touch:
+            if outside < 0 and least > self.dev.touch:
                 below = far + least - e.dot(exit)
                 best = 0 * far + 2
                 if ti.min(below, limit - e.dot(exit)) > 2 * close:
@@ -206,7 +206,7 @@ class Facets(Solid):
         """Whether no neighbour of a feature is nearer in the direction n."""
         out = True
         if at >= 0:
-            for k in range(self._on_wing_begin[at], self._on_wing_begin[at + 1]):
-                if n.dot(self._on_wing[k]) > self._on_tilt:
+            for k in range(self.dev.wing_begin[at], self.dev.wing_begin[at + 1]):
+                if n.dot(self.dev.wing[k]) > self.dev.tilt:
                     out = False
         return out

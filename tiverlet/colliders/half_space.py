@@ -40,21 +40,21 @@ class HalfSpace(Wall):
     def bind(self, scene: Scene) -> None:
         """Normal, and the offsets at the start and the end of a frame."""
         Wall.bind(self, scene)
-        self._on_normal = scene.memory.field("HalfSpace.normal", None, width=len(self.normal), values=self.normal)
-        self._on_offset = scene.memory.field("HalfSpace.offset", None, width=2, values=[self.offset] * 2, state=True)
+        self.dev.normal = scene.memory.field("HalfSpace.normal", None, width=len(self.normal), values=self.normal)
+        self.dev.offset = scene.memory.field("HalfSpace.offset", None, width=2, values=[self.offset] * 2, state=True)
         self.changed = False
 
     def upload(self) -> None:
         """Move from the last offset to the new one."""
         Wall.upload(self)
         memory = self.scene.memory
-        memory.write(self._on_offset, [memory.read(self._on_offset)[0, 1], self.offset])
+        memory.write(self.dev.offset, [memory.read(self.dev.offset)[0, 1], self.offset])
         self.moving = True
 
     def settle(self) -> None:
         """Stay."""
         memory = self.scene.memory
-        memory.write(self._on_offset, memory.read(self._on_offset)[0, 1])
+        memory.write(self.dev.offset, memory.read(self.dev.offset)[0, 1])
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
         """Lines across the scene: one in 2D, two at right angles in 3D."""
@@ -66,10 +66,10 @@ class HalfSpace(Wall):
     @ti.func
     def confine(self, i, radius, h, when, turn):
         """One plane."""
-        n, offset = self._on_normal[None], self._on_offset[None]
+        n, offset = self.dev.normal[None], self.dev.offset[None]
         before, now = (
             offset[0] * (1 - when[0]) + offset[1] * when[0],
             offset[0] * (1 - when[1]) + offset[1] * when[1],
         )
-        depth, moved = now + radius - n.dot(self._on_state.place(i)), (now - before) * n
+        depth, moved = now + radius - n.dot(self.dev.state.place(i)), (now - before) * n
         self.press(i, depth, depth + self.way(i, moved).dot(n), n, moved, h, turn)

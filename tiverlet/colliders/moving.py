@@ -48,7 +48,6 @@ class Solid(Wall):
     radius: Any = Knob(
         lambda f, v: checks.number(repr(f), "radius", v, least=0.0), "It is rounded by so much [m].", compiled=True
     )
-    _on_close = 0.0  # what rounding amounts to in the wall's frame [m]
     position = Knob(_position, "Where the origin of the wall's frame is [m].")
     rotation = Knob(_rotation, "Angle (2D) or rotation vector (3D) [rad].")
 
@@ -66,24 +65,25 @@ class Solid(Wall):
     def bind(self, scene: Scene) -> None:
         """Position and rotation at the ends of a frame, and at the ends of the substep that is under way."""
         Wall.bind(self, scene)
+        self.dev.close = 0.0  # what rounding amounts to in the wall's frame [m]
         name, add = repr(self), scene.memory.field
-        self._on_position = Track(scene.memory, f"{name}.position", self.position)
-        self._on_rotation = Track(scene.memory, f"{name}.rotation", np.atleast_1d(self.rotation), kind=ti.f64)
-        self._on_turn = add(f"{name}.turn", 3 * self.dim, width=self.dim)  # rows of R at the start, the end, their difference
-        self._on_place = add(f"{name}.place", 3, width=self.dim)
+        self.dev.position = Track(scene.memory, f"{name}.position", self.position)
+        self.dev.rotation = Track(scene.memory, f"{name}.rotation", np.atleast_1d(self.rotation), kind=ti.f64)
+        self.dev.turn = add(f"{name}.turn", 3 * self.dim, width=self.dim)  # rows of R at the start, the end, their difference
+        self.dev.place = add(f"{name}.place", 3, width=self.dim)
         self.changed = False
 
     def upload(self) -> None:
         """Move and turn to the new place."""
         Wall.upload(self)
-        self._on_position.aim(self.position)
-        self._on_rotation.aim(np.atleast_1d(self.rotation))
+        self.dev.position.aim(self.position)
+        self.dev.rotation.aim(np.atleast_1d(self.rotation))
         self.moving = True
 
     def settle(self) -> None:
         """Stay."""
-        self._on_position.settle()
-        self._on_rotation.settle()
+        self.dev.position.settle()
+        self.dev.rotation.settle()
 
     def placed(self, points: np.ndarray) -> np.ndarray:
         """Where points (..., dim) of the wall's frame are in the world, for pictures."""
@@ -94,13 +94,13 @@ class Solid(Wall):
         """Where the wall is at the start and the end of a substep, and how it moves in between; differences are taken in f64."""
         before = ti.Matrix.zero(ti.f64, self.dim, self.dim)
         for k in range(2):
-            turn = self.matrix(self._on_rotation.at(ti.cast(ti.select(k == 0, when[0], when[1]), ti.f64)))
+            turn = self.matrix(self.dev.rotation.at(ti.cast(ti.select(k == 0, when[0], when[1]), ti.f64)))
             for a in ti.static(range(self.dim)):
-                self._on_turn[k * self.dim + a] = ti.cast(turn[a, :], self._on_real)
-                self._on_turn[2 * self.dim + a] = ti.cast(turn[a, :] - before[a, :], self._on_real)
+                self.dev.turn[k * self.dim + a] = ti.cast(turn[a, :], self.dev.real)
+                self.dev.turn[2 * self.dim + a] = ti.cast(turn[a, :] - before[a, :], self.dev.real)
             before = turn
-        self._on_place[0], self._on_place[1] = self._on_position.at(when[0]), self._on_position.at(when[1])
-        self._on_place[2] = self._on_position.step(when)
+        self.dev.place[0], self.dev.place[1] = self.dev.position.at(when[0]), self.dev.position.at(when[1])
+        self.dev.place[2] = self.dev.position.step(when)
 
     @ti.func
     def matrix(self, rotation):
@@ -126,7 +126,7 @@ class Solid(Wall):
         """R^T v: a vector of the world in the wall's frame, at the start (k = 0) or the end (1) of the substep."""
         out = 0 * v
         for a in ti.static(range(self.dim)):
-            out += self._on_turn[k * self.dim + a] * v[a]
+            out += self.dev.turn[k * self.dim + a] * v[a]
         return out
 
     @ti.func
@@ -134,7 +134,7 @@ class Solid(Wall):
         """R v, or with k = 2 how R v changes in the substep."""
         out = 0 * v
         for a in ti.static(range(self.dim)):
-            out[a] = self._on_turn[k * self.dim + a].dot(v)
+            out[a] = self.dev.turn[k * self.dim + a].dot(v)
         return out
 
     @ti.func
@@ -144,7 +144,7 @@ class Solid(Wall):
         close: what rounding amounts to. limit: how far a start that is inside may be pushed out.
         Returns the fraction of the way (2 for none), the depth at a + e below the plane that touches there, and its normal.
         """
-        return ti.cast(2, self._on_real), 0 * far, 0 * e
+        return ti.cast(2, self.dev.real), 0 * far, 0 * e
 
     @ti.func
     def confine(self, i, radius, h, when, turn):
@@ -152,12 +152,12 @@ class Solid(Wall):
 
         The wall moves by what its point under the start of the particle moves, so what sticks rides along and does not creep.
         """
-        start, far = self._on_state.begin(i), radius + ti.cast(self.radius, self._on_real)
-        first = self.inward(0, start - self._on_place[0])
-        moved = self._on_place[2] + self.outward(2, first)
-        e = self.inward(1, self._on_state.d[i] - moved)
-        close = ti.max(self._on_state.digits(i), self.rounding(first))
-        if ti.static(self._on_state.befores):
+        start, far = self.dev.state.begin(i), radius + ti.cast(self.radius, self.dev.real)
+        first = self.inward(0, start - self.dev.place[0])
+        moved = self.dev.place[2] + self.outward(2, first)
+        e = self.inward(1, self.dev.state.d[i] - moved)
+        close = ti.max(self.dev.state.digits(i), self.rounding(first))
+        if ti.static(self.dev.state.befores):
             # What has bounced in this substep is not where its displacement says.
             high, lift = self.lifted(i)
             if high:
@@ -182,19 +182,19 @@ class Solid(Wall):
         if going:
             # There with no more speed than it had.
             gone = self.outward(1, a - first)
-            d = self._on_state.d[i]
+            d = self.dev.state.d[i]
             size, speed = gone.norm(), (d - moved).norm()
-            self._on_state.d[i] = moved + gone
-            self._on_state.restart(i)
+            self.dev.state.d[i] = moved + gone
+            self.dev.state.restart(i)
             if size > speed:
-                self._on_state.d[i] = moved + gone * (speed / size)
-            if ti.static(self._on_state.befores):
-                self._on_state.before[i] = self._on_state.before[i] + (self._on_state.d[i] - d)
+                self.dev.state.d[i] = moved + gone * (speed / size)
+            if ti.static(self.dev.state.befores):
+                self.dev.state.before[i] = self.dev.state.before[i] + (self.dev.state.d[i] - d)
 
     @ti.func
     def rounding(self, q):
         """What it amounts to around a point q of the wall's frame [m]."""
-        return ti.cast(self._on_close, self._on_real)
+        return ti.cast(self.dev.close, self.dev.real)
 
     @ti.func
     def astray(self, q, far, close):

@@ -55,7 +55,7 @@ class Sdf(Solid):
         """Check the dimension, and refuse a function that is not finite, or not a distance, around the particles."""
         Solid.prepare(self, particles, inv_mass)
         runtime.ensure_started()
-        self._on_probe = _Probe(self)
+        self.dev.probe = _Probe(self)
         x = particles.position
         if not len(x):
             return
@@ -63,7 +63,7 @@ class Sdf(Solid):
         reach = float((high - low).max()) or float(particles.radius.max()) or 1.0
         around = low - reach / 2 + golden(np.arange(SAMPLES), dim=self.dim) * (high - low + reach)
         points = (np.concatenate([x[:SAMPLES], around]) - self.position) @ rotation_matrix(self.rotation)
-        value, slope = self._on_probe.value(points), self._on_probe.slope(points, 1e-6 * reach)
+        value, slope = self.dev.probe.value(points), self.dev.probe.slope(points, 1e-6 * reach)
         size = np.linalg.norm(slope, axis=1)
         bad = ~np.isfinite(value) | ~np.isfinite(size)
         if bad.any():
@@ -83,7 +83,7 @@ class Sdf(Solid):
                 "there. Divide the function by the size of its gradient at the surface, or particles would stay too far away."
             )
         if self.gradient:
-            off = np.linalg.norm(self._on_probe.gradient(points) - slope, axis=1)
+            off = np.linalg.norm(self.dev.probe.gradient(points) - slope, axis=1)
             if not (np.median(off) < 1 - FLAT):
                 k = int(np.argmax(off))
                 raise ValueError(
@@ -94,9 +94,9 @@ class Sdf(Solid):
         """No field of its own."""
         Solid.bind(self, scene)
         single = scene.real == ti.f32
-        self._on_digits = 2.0**-21 if single else 2.0**-50
-        self._on_slight = 2.0**-20 if single else 2.0**-48
-        self._on_step = 2.0**-6 if single else 2.0**-16
+        self.dev.digits = 2.0**-21 if single else 2.0**-50
+        self.dev.slight = 2.0**-20 if single else 2.0**-48
+        self.dev.step = 2.0**-6 if single else 2.0**-16
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
         """Where the surface meets the plane of a 2D scene, or the three planes through the middle of a 3D one."""
@@ -109,7 +109,7 @@ class Sdf(Solid):
                 grid[..., a] += line[:, None]
                 grid[..., b] += line[None, :]
                 local = (grid.reshape(-1, self.dim) - self.position) @ rotation_matrix(self.rotation)
-                out.append(contour(grid, self._on_probe.value(local).reshape(129, 129) - self.radius))
+                out.append(contour(grid, self.dev.probe.value(local).reshape(129, 129) - self.radius))
         return np.concatenate(out), 0.0
 
     @ti.func
@@ -120,7 +120,7 @@ class Sdf(Solid):
     @ti.func
     def rounding(self, q):
         """That of a function that is made of coordinates as large as those of q."""
-        return q.norm() * ti.cast(self._on_digits, self._on_real)
+        return q.norm() * ti.cast(self.dev.digits, self.dev.real)
 
     @ti.func
     def normal(self, q, far):
@@ -140,7 +140,7 @@ class Sdf(Solid):
         if ti.static(bool(self.gradient)):
             out = self.gradient(q)
         else:
-            step = ti.max(far, q.norm() / 100) * ti.cast(self._on_step, self._on_real)
+            step = ti.max(far, q.norm() / 100) * ti.cast(self.dev.step, self.dev.real)
             for k in range(self.dim):
                 ahead, behind = q, q
                 for a in ti.static(range(self.dim)):
@@ -175,7 +175,7 @@ class Sdf(Solid):
                 elif k == 0 or gap <= fine or ends or k == MARCH:
                     n = self.normal(q, far)
                     slope = e.dot(n)
-                    toward = slope < -ti.cast(self._on_slight, self._on_real) * way
+                    toward = slope < -ti.cast(self.dev.slight, self.dev.real) * way
                     if k == 0:
                         below = -(gap + slope)
                         if gap <= 4 * fine:

@@ -72,14 +72,14 @@ class AngleLimit(Turning):
 
     def bind(self, scene: Scene) -> None:
         """The middle of each range."""
-        self._on_middle = scene.memory.field("AngleLimit.middle", self.count, values=self.middle)
+        self.dev.middle = scene.memory.field("AngleLimit.middle", self.count, values=self.middle)
         Turning.bind(self, scene)
 
     def upload(self) -> None:
         """Write new limits."""
         if self.acts:
-            self.scene.memory.write(self._on_rest, self.rest)
-            self.scene.memory.write(self._on_middle, self.middle)
+            self.scene.memory.write(self.dev.rest, self.rest)
+            self.scene.memory.write(self.dev.middle, self.middle)
             self.upload_springs()
 
     near, distinct = Scalar.near, Scalar.distinct  # a distance from the middle has one value, and acts on one side of straight
@@ -88,7 +88,7 @@ class AngleLimit(Turning):
     def measure(self, c, q):
         """See the class."""
         f, g = self.turning(c, q)
-        middle = self._on_middle[c]
+        middle = self.dev.middle[c]
         f = Turning.near(self, f, middle) - middle
-        side = ti.select(f < 0, ti.cast(-1, self._on_real), ti.cast(1, self._on_real))
+        side = ti.select(f < 0, ti.cast(-1, self.dev.real), ti.cast(1, self.dev.real))
         return side * f, side * g

@@ -87,7 +87,7 @@ class Triangles(Area):
         a, b = q[1, :], q[2, :]
         f = 0 * a[0]
         u, v = 0 * a, 0 * b
-        if ti.static(self._on_state.dim == 2):
+        if ti.static(self.dev.state.dim == 2):
             f = (a[0] * b[1] - a[1] * b[0]) / 2
             u, v = ti.Vector([b[1], -b[0]]) / 2, ti.Vector([-a[1], a[0]]) / 2
         else:
@@ -145,11 +145,11 @@ class Loops(Area, Content):
         before = np.empty_like(self.after)
         before[self.after] = np.arange(len(before))
         sides = np.stack([self.indices[before], self.indices[self.after]], axis=1)
-        self._on_sides = scene.memory.field("Area.sides", self.corner_count, width=2, kind=ti.i32, values=sides)
+        self.dev.sides = scene.memory.field("Area.sides", self.corner_count, width=2, kind=ti.i32, values=sides)
 
     @ti.func
     def slope(self, e, back):
         """Half the way from the corner before to the corner after, turned by -90 degrees."""
-        i, j = self._on_sides[e]
-        r = self._on_state.apart(j, i) - back * (self._on_state.d[j] - self._on_state.d[i])
+        i, j = self.dev.sides[e]
+        r = self.dev.state.apart(j, i) - back * (self.dev.state.d[j] - self.dev.state.d[i])
         return ti.Vector([r[1], -r[0]]) / 2

@@ -55,30 +55,30 @@ class Turning(Angle):
     @ti.func
     def lean(self, c, normal):
         """The side of the plane from which the angle is seen, 1 or -1, and a direction for its normal where it has none."""
-        return ti.cast(1, self._on_real), 0 * normal
+        return ti.cast(1, self.dev.real), 0 * normal
 
     @ti.func
     def distinct(self, f, f0):
         """In 3D, the plane of a nearly straight path turns at the least motion."""
         out = True
-        if ti.static(self._on_state.dim == 3):
+        if ti.static(self.dev.state.dim == 3):
             out = ti.max(ti.abs(f), ti.abs(f0)) > 0.1
         return out
 
     @ti.func
     def faint(self):
         """|u x v| below which the normal is lost in rounding."""
-        return ti.cast(ti.static(1e-13 if self._on_state.double else 1e-6), self._on_real)
+        return ti.cast(ti.static(1e-13 if self.dev.state.double else 1e-6), self.dev.real)
 
     @ti.func
     def turning(self, c, q):
         """The angle and its gradients; none where two corners coincide."""
         a, b = q[1, :] - q[0, :], q[2, :] - q[1, :]
         aa, bb = a.dot(a), b.dot(b)
-        f, g, k = ti.cast(0, self._on_real), 0 * a, 0 * a
+        f, g, k = ti.cast(0, self.dev.real), 0 * a, 0 * a
         if aa > SHORT and bb > SHORT:
             u, v = a / ti.sqrt(aa), b / ti.sqrt(bb)
-            if ti.static(self._on_state.dim == 2):
+            if ti.static(self.dev.state.dim == 2):
                 f = ti.atan2(u[0] * v[1] - u[1] * v[0], u.dot(v))
                 g, k = ti.Vector([-u[1], u[0]]), ti.Vector([-v[1], v[0]])
             else:
@@ -126,29 +126,29 @@ class Bend(Turning):
         """In 3D, the normals as they were last."""
         Turning.bind(self, scene)
         if scene.state.dim == 3:
-            self._on_axis = scene.memory.field(f"{self!r}.axis", self.count, width=3, state=True)
+            self.dev.axis = scene.memory.field(f"{self!r}.axis", self.count, width=3, state=True)
 
     @ti.func
     def lean(self, c, normal):
         """The axis that is remembered; seen from its side where straight is the rest shape."""
-        axis = self._on_axis[c]
-        side = ti.cast(1, self._on_real)
-        if self._on_rest[c] == 0 and axis.dot(normal) < 0:
-            side = ti.cast(-1, self._on_real)
+        axis = self.dev.axis[c]
+        side = ti.cast(1, self.dev.real)
+        if self.dev.rest[c] == 0 and axis.dot(normal) < 0:
+            side = ti.cast(-1, self.dev.real)
         return side, axis
 
     @ti.func
     def begin(self, c, fresh):
         """Remember the normal, that of the end where the start is straight, and from which side it is seen."""
-        if ti.static(self._on_state.dim == 3):
+        if ti.static(self.dev.state.dim == 3):
             if fresh != 0:
-                self._on_axis[c] = 0 * self._on_axis[c]
+                self.dev.axis[c] = 0 * self.dev.axis[c]
             e = crossed(self.corners(c, 1))
             if e.norm() < 10 * self.faint():
                 e = crossed(self.corners(c, 0))
             if e.norm() > 10 * self.faint():
                 side, _ = self.lean(c, e)
-                self._on_axis[c] = side * e / e.norm()
+                self.dev.axis[c] = side * e / e.norm()
 
 
 @ti.func

@@ -92,16 +92,16 @@ class Constraint(Scalar):
             origin = np.zeros(particles.dim) if self.origin is None else self.origin
             self.origin = checks.vector(repr(self), "origin", origin, particles.dim)
             high = self.origin.astype(np.float32).astype(np.float64)  # two words: in f32 too, the origin is where it was put
-            self._on_origin = [high.tolist(), (self.origin - high).tolist()]
+            self.dev.origin = [high.tolist(), (self.origin - high).tolist()]
         self.size = particles.size
-        self._on_known: tuple[Any, Any, Any] = (None, None, None)
-        self._on_fixed = int(self.origin is None)
-        self._on_slopes = Slopes(self.function, self.gradient, self.arity, particles.dim, self._on_fixed, self.size)
+        self.dev.known: tuple[Any, Any, Any] = (None, None, None)
+        self.dev.fixed = int(self.origin is None)
+        self.dev.slopes = Slopes(self.function, self.gradient, self.arity, particles.dim, self.dev.fixed, self.size)
         Scalar.prepare(self, particles, inv_mass)
         values, slopes = np.zeros(0), np.zeros((0, self.arity, particles.dim))
         if self.count:
-            values, slopes, _ = self._on_slopes(self._corners(particles.position))
-        self._on_known = (particles.position, values, slopes)
+            values, slopes, _ = self.dev.slopes(self._corners(particles.position))
+        self.dev.known = (particles.position, values, slopes)
         if not np.isfinite(values).all():
             i = int(np.argmin(np.isfinite(values)))
             raise ValueError(f"{self!r}: the function is {values[i]} for {self.index_name}[{i}] at its initial position.")
@@ -114,7 +114,7 @@ class Constraint(Scalar):
         for k in range(4):
             q = self._corners(position)
             q = q + k * 0.01 * self.size * (golden(np.arange(1, q.size + 1) + 1000 * k).reshape(q.shape) - 0.5)
-            _, given, differences = self._on_slopes(q)
+            _, given, differences = self.dev.slopes(q)
             size = np.abs(differences).max(axis=(1, 2), keepdims=True)
             off = ~(np.abs(given - differences) <= WRONG * size + 1e-9 * np.abs(given))
             wrong += off & np.isfinite(differences)
@@ -134,31 +134,31 @@ class Constraint(Scalar):
 
     def rest_of(self, position: np.ndarray) -> np.ndarray:
         """The values of function."""
-        known, values, _ = self._on_known
+        known, values, _ = self.dev.known
         if position is known:  # while the world's fields are being declared, Taichi cannot launch kernels
             return values
-        return self._on_slopes(self._corners(position))[0] if self.count else np.zeros(0)
+        return self.dev.slopes(self._corners(position))[0] if self.count else np.zeros(0)
 
     def slopes(self, position: np.ndarray) -> np.ndarray:
         """The gradients at the positions that a world starts with."""
-        return self._on_known[2]
+        return self.dev.known[2]
 
     @ti.func
     def corners(self, c, back):
         """Corners at x - back d, relative to the origin or to the first."""
-        q = ti.Matrix.zero(self._on_real, self.arity, self._on_state.dim)
+        q = ti.Matrix.zero(self.dev.real, self.arity, self.dev.state.dim)
         for k in ti.static(range(self.arity)):
             i = self.member(c, k)
-            r = -back * self._on_state.d[i]
-            if ti.static(self._on_fixed == 0):
-                for a in ti.static(range(self._on_state.dim)):
-                    r[a] += (self._on_state.x[i][a] - ti.static(self._on_origin[0][a])) - ti.static(self._on_origin[1][a])
-                if ti.static(self._on_state.compensated):
-                    r += self._on_state.low[i]
+            r = -back * self.dev.state.d[i]
+            if ti.static(self.dev.fixed == 0):
+                for a in ti.static(range(self.dev.state.dim)):
+                    r[a] += (self.dev.state.x[i][a] - ti.static(self.dev.origin[0][a])) - ti.static(self.dev.origin[1][a])
+                if ti.static(self.dev.state.compensated):
+                    r += self.dev.state.low[i]
             else:
                 j = self.member(c, 0)
-                r += self._on_state.apart(i, j) + back * self._on_state.d[j]
-            for a in ti.static(range(self._on_state.dim)):
+                r += self.dev.state.apart(i, j) + back * self.dev.state.d[j]
+            for a in ti.static(range(self.dev.state.dim)):
                 q[k, a] = r[a]
         return q
 
@@ -170,12 +170,12 @@ class Constraint(Scalar):
     @ti.func
     def measure(self, c, q):
         """The function and its gradient; nothing where they are not finite."""
-        f, g = self._on_slopes.both(c, ti.cast(q, ti.f64))
+        f, g = self.dev.slopes.both(c, ti.cast(q, ti.f64))
         total = f
-        for k, a in ti.static(ti.ndrange(self.arity, self._on_state.dim)):
+        for k, a in ti.static(ti.ndrange(self.arity, self.dev.state.dim)):
             total += g[k, a] * g[k, a]
         good = not (ti.math.isnan(total) or ti.math.isinf(total))
-        n = ti.Matrix.zero(self._on_real, self.arity, self._on_state.dim)
-        for k, a in ti.static(ti.ndrange(self.arity, self._on_state.dim)):
-            n[k, a] = ti.select(good, ti.cast(g[k, a], self._on_real), 0)
-        return ti.select(good, ti.cast(f, self._on_real), 0), n
+        n = ti.Matrix.zero(self.dev.real, self.arity, self.dev.state.dim)
+        for k, a in ti.static(ti.ndrange(self.arity, self.dev.state.dim)):
+            n[k, a] = ti.select(good, ti.cast(g[k, a], self.dev.real), 0)
+        return ti.select(good, ti.cast(f, self.dev.real), 0), n

@@ -49,7 +49,7 @@ class Dihedral(Angle):
         """See the class."""
         edge, a, b = q[1, :], q[2, :], q[3, :]
         ee = edge.dot(edge)
-        f, g = ti.cast(0, self._on_real), ti.Matrix.zero(self._on_real, 4, 3)
+        f, g = ti.cast(0, self.dev.real), ti.Matrix.zero(self.dev.real, 4, 3)
         if ee > SHORT:
             e, s, t = edge / ti.sqrt(ee), a.dot(edge) / ee, b.dot(edge) / ee
             p, r = a - s * edge, b - t * edge

@@ -27,11 +27,11 @@ class Link(Scalar):
     def excess(self, c, f, rest):
         """|r| - rest = (r^2 - rest^2) / (|r| + rest): to all digits of the low words, where there are any."""
         C = f - rest
-        if ti.static(self._on_state.carries):
+        if ti.static(self.dev.state.carries):
             if f + rest > 0:
-                r = self._on_state.between(self.member(c, 0), self.member(c, 1))
+                r = self.dev.state.between(self.member(c, 0), self.member(c, 1))
                 goal = ti.cast(rest, ti.f64)
-                C = ti.cast(r.dot(r) - goal * goal, self._on_real) / (f + rest)
+                C = ti.cast(r.dot(r) - goal * goal, self.dev.real) / (f + rest)
         return C
 
     @ti.func
@@ -48,8 +48,8 @@ class Link(Scalar):
     @ti.func
     def exactly(self, c):
         """C in f64, which the difference of two lengths in f32 is not."""
-        r = self._on_state.between(self.member(c, 0), self.member(c, 1))
-        return ti.sqrt(r.dot(r)) - ti.cast(self._on_rest[c], ti.f64)  # type: ignore[reportOptionalCall]
+        r = self.dev.state.between(self.member(c, 0), self.member(c, 1))
+        return ti.sqrt(r.dot(r)) - ti.cast(self.dev.rest[c], ti.f64)  # type: ignore[reportOptionalCall]
 
 
 class Distance(Link):

@@ -117,79 +117,79 @@ class Path(Tether):
         """The curve, and where each particle is on it."""
         super().bind(scene)
         c, dim, add, m = self.curve, scene.particles.dim, scene.memory.field, self.count
-        self._on_pieces, self._on_closed = len(c.lengths), c.closed
-        self._on_a, self._on_b, self._on_c, self._on_d = (
-            add(f"Path.{name}", self._on_pieces, width=dim, values=v)
+        self.dev.pieces, self.dev.closed = len(c.lengths), c.closed
+        self.dev.a, self.dev.b, self.dev.c, self.dev.d = (
+            add(f"Path.{name}", self.dev.pieces, width=dim, values=v)
             for name, v in (("points", c.a), ("tangents", c.b), ("second", c.c), ("third", c.d))
         )
-        self._on_lengths = add("Path.lengths", self._on_pieces, values=c.lengths)
+        self.dev.lengths = add("Path.lengths", self.dev.pieces, values=c.lengths)
         piece, rest = c.split(self._start)
-        self._on_piece = add("Path.piece", m, kind=ti.i32, values=piece, state=True)
-        self._on_rest = add("Path.rest", m, values=rest, state=True)
-        self._on_least = float(np.ptp(self.points, axis=0).max()) * (2.0**-22 if scene.real == ti.f32 else 2.0**-44)
+        self.dev.piece = add("Path.piece", m, kind=ti.i32, values=piece, state=True)
+        self.dev.rest = add("Path.rest", m, values=rest, state=True)
+        self.dev.least = float(np.ptp(self.points, axis=0).max()) * (2.0**-22 if scene.real == ti.f32 else 2.0**-44)
         if self.drives:
-            self._on_moves = "speed" in self.__dict__
-            self._on_begin = add("Path.begin", self._on_pieces + 1, kind=ti.f64, values=c.starts)
-            self._on_from = add("Path.from", m, kind=ti.f64, values=self._start, state=True)
-            self._on_to = add("Path.to", m, kind=ti.f64, values=self.speed if self._on_moves else self._start, state=True)
+            self.dev.moves = "speed" in self.__dict__
+            self.dev.begin = add("Path.begin", self.dev.pieces + 1, kind=ti.f64, values=c.starts)
+            self.dev.source = add("Path.from", m, kind=ti.f64, values=self._start, state=True)
+            self.dev.target = add("Path.to", m, kind=ti.f64, values=self.speed if self.dev.moves else self._start, state=True)
         else:
-            self._on_tangent = add("Path.tangent", m, width=dim)
+            self.dev.tangent = add("Path.tangent", m, width=dim)
 
     def upload(self) -> None:
         """Take the new speed, or aim at the new arc lengths."""
         super().upload()
         if self.acts and self.drives:
-            self.scene.memory.write(self._on_to, self.speed if self._on_moves else self.at)
-            self.moving = not self._on_moves
+            self.scene.memory.write(self.dev.target, self.speed if self.dev.moves else self.at)
+            self.moving = not self.dev.moves
 
     def settle(self) -> None:
         """The next frame starts from where this one went."""
         if self.acts:
-            self.scene.memory.write(self._on_from, self.scene.memory.read(self._on_to)[: self.count])
+            self.scene.memory.write(self.dev.source, self.scene.memory.read(self.dev.target)[: self.count])
 
     @ti.func
     def point(self, k, r):
         """P and dP/dr on piece k."""
-        b, c, d = self._on_b[k], self._on_c[k], self._on_d[k]
-        return self._on_a[k] + r * (b + r * (c + r * d)), b + r * (2 * c + 3 * r * d)
+        b, c, d = self.dev.b[k], self.dev.c[k], self.dev.d[k]
+        return self.dev.a[k] + r * (b + r * (c + r * d)), b + r * (2 * c + 3 * r * d)
 
     @ti.func
     def drive(self, c, h, when):
         """Put the particle where it is to be."""
-        s, length = self._on_from[c], self._on_begin[self._on_pieces]
-        if ti.static(self._on_moves):
-            s += self._on_to[c] * h
-            self._on_from[c] = s
+        s, length = self.dev.source[c], self.dev.begin[self.dev.pieces]
+        if ti.static(self.dev.moves):
+            s += self.dev.target[c] * h
+            self.dev.source[c] = s
         else:
-            s = s * (1 - when) + self._on_to[c] * when
-        if ti.static(self._on_closed):
+            s = s * (1 - when) + self.dev.target[c] * when
+        if ti.static(self.dev.closed):
             s -= ti.floor(s / length) * length
         else:
             s = ti.min(ti.max(s, 0), length)
-        low, high = 0, self._on_pieces
+        low, high = 0, self.dev.pieces
         while high - low > 1:
             middle = (low + high) // 2
-            if self._on_begin[middle] <= s:
+            if self.dev.begin[middle] <= s:
                 low = middle
             else:
                 high = middle
-        P, T = self.point(low, ti.cast(s - self._on_begin[low], self._on_real))
+        P, T = self.point(low, ti.cast(s - self.dev.begin[low], self.dev.real))
         i = self.member(c, 0)
-        d = P - self._on_state.place(i)
-        self._on_state.d[i] = d
-        self._on_state.advance(i, d)
+        d = P - self.dev.state.place(i)
+        self.dev.state.d[i] = d
+        self.dev.state.advance(i, d)
 
     @ti.func
     def search(self, x):
         """The piece nearest to x, and how far along it, as if it were straight."""
-        best, piece, rest = ti.cast(ti.math.inf, self._on_real), 0, 0 * x[0]
-        for k in range(self._on_pieces):
-            a, end = self._on_a[k], self.point(k, self._on_lengths[k])[0]
+        best, piece, rest = ti.cast(ti.math.inf, self.dev.real), 0, 0 * x[0]
+        for k in range(self.dev.pieces):
+            a, end = self.dev.a[k], self.point(k, self.dev.lengths[k])[0]
             along = end - a
             u = ti.min(ti.max((x - a).dot(along) / along.dot(along), 0), 1)
             far = (x - a - u * along).norm_sqr()
             if far < best:
-                best, piece, rest = far, k, u * self._on_lengths[k]
+                best, piece, rest = far, k, u * self.dev.lengths[k]
         return piece, rest
 
     @ti.func
@@ -202,7 +202,7 @@ class Path(Tether):
         for _ in range(WALK):
             if going:
                 P, T = self.point(k, r)
-                n, length = T, self._on_lengths[k]
+                n, length = T, self.dev.lengths[k]
                 if across:
                     n = t
                     bent = T.dot(t) < 0.75 * T.norm()
@@ -210,43 +210,43 @@ class Path(Tether):
                 if bent:
                     going = False
                 elif r + step > length:
-                    ahead = k + 1 if k + 1 < self._on_pieces else 0
-                    if ahead == came or (ti.static(not self._on_closed) and ahead == 0):
+                    ahead = k + 1 if k + 1 < self.dev.pieces else 0
+                    if ahead == came or (ti.static(not self.dev.closed) and ahead == 0):
                         r, going = length, False
                     else:
                         came, k, r = k, ahead, 0 * r
                 elif r + step < 0:
-                    ahead = k - 1 if k > 0 else self._on_pieces - 1
-                    if ahead == came or (ti.static(not self._on_closed) and k == 0):
+                    ahead = k - 1 if k > 0 else self.dev.pieces - 1
+                    if ahead == came or (ti.static(not self.dev.closed) and k == 0):
                         r, going = 0 * r, False
                     else:
-                        came, k, r = k, ahead, self._on_lengths[ahead]
+                        came, k, r = k, ahead, self.dev.lengths[ahead]
                 else:
-                    r, came, going = r + step, -1, ti.abs(step) > self._on_least
+                    r, came, going = r + step, -1, ti.abs(step) > self.dev.least
         return k, r, bent or going
 
     @ti.func
     def offsets(self, c, when, first, fresh):
         """Across the curve, from where the plane across it meets it; at an end or a bend, from the nearest point."""
         i = self.member(c, 0)
-        x, t, C0 = self._on_state.place(i), self._on_tangent[c], 0 * self._on_tangent[c]
-        k, r = self._on_piece[c], self._on_rest[c]
+        x, t, C0 = self.dev.state.place(i), self.dev.tangent[c], 0 * self.dev.tangent[c]
+        k, r = self.dev.piece[c], self.dev.rest[c]
         if first != 0:
-            start = x - self._on_state.d[i]
+            start = x - self.dev.state.d[i]
             if fresh != 0:
                 k, r = self.search(start)
             k, r, lost = self.foot(k, r, start, t, False)
-            self._on_piece[c], self._on_rest[c] = k, r
+            self.dev.piece[c], self.dev.rest[c] = k, r
             P, T = self.point(k, r)
             t, C0 = T / T.norm(), start - P
-            self._on_tangent[c] = t
+            self.dev.tangent[c] = t
         k, r, bent = self.foot(k, r, x, t, True)
         if bent:
-            k, r, lost = self.foot(self._on_piece[c], self._on_rest[c], x, t, False)
-            self._on_slots.note(FAR)
+            k, r, lost = self.foot(self.dev.piece[c], self.dev.rest[c], x, t, False)
+            self.dev.slots.note(FAR)
         P, T = self.point(k, r)
         C = x - P
-        ends = ti.static(not self._on_closed) and ((k == 0 and r <= 0) or (k == self._on_pieces - 1 and r >= self._on_lengths[k]))
+        ends = ti.static(not self.dev.closed) and ((k == 0 and r <= 0) or (k == self.dev.pieces - 1 and r >= self.dev.lengths[k]))
         if not (bent or ends):
             C -= C.dot(t) * t
         return C, C0
@@ -255,13 +255,13 @@ class Path(Tether):
     def present(self, c, back):
         """From the nearest point."""
         i = self.member(c, 0)
-        x = self._on_state.place(i) - back * self._on_state.d[i]
-        k, r, lost = self.foot(self._on_piece[c], self._on_rest[c], x, x, False)
+        x = self.dev.state.place(i) - back * self.dev.state.d[i]
+        k, r, lost = self.foot(self.dev.piece[c], self.dev.rest[c], x, x, False)
         P, T = self.point(k, r)
         return x - P
 
     @ti.func
     def change(self, c):
         """What of the motion is across the curve."""
-        d, t = self._on_state.d[self.member(c, 0)], self._on_tangent[c]
+        d, t = self.dev.state.d[self.member(c, 0)], self.dev.tangent[c]
         return d - d.dot(t) * t

@@ -74,42 +74,42 @@ class Pin(Tether):
         # A driven particle sets out from where it is; a spring is anchored at the target from the start.
         here = self.start.position[self.indices[:, 0]] if self.drives else self.target
         self.changed = self.drives
-        self._on_from = scene.memory.field("Pin.from", self.count, width=self.dim, values=here, state=True)
-        self._on_to = scene.memory.field("Pin.to", self.count, width=self.dim, values=here, state=True)
+        self.dev.source = scene.memory.field("Pin.from", self.count, width=self.dim, values=here, state=True)
+        self.dev.target = scene.memory.field("Pin.to", self.count, width=self.dim, values=here, state=True)
 
     def upload(self) -> None:
         """Aim at the new target."""
         super().upload()
         if self.acts:
-            self.scene.memory.write(self._on_to, self.target)
+            self.scene.memory.write(self.dev.target, self.target)
             self.moving = True
 
     def settle(self) -> None:
         """The next frame starts from the target."""
         if self.acts:
-            self.scene.memory.write(self._on_from, self.scene.memory.read(self._on_to)[: self.count])
+            self.scene.memory.write(self.dev.source, self.scene.memory.read(self.dev.target)[: self.count])
 
     @ti.func
     def aim(self, c, when):
         """The target at the fraction `when` of the frame."""
-        return self._on_from[c] * (1 - when) + self._on_to[c] * when
+        return self.dev.source[c] * (1 - when) + self.dev.target[c] * when
 
     @ti.func
     def drive(self, c, h, when):
         """Put the particle on the target."""
         i = self.member(c, 0)
-        d = self.aim(c, when) - self._on_state.place(i)
-        self._on_state.d[i] = d
-        self._on_state.advance(i, d)
+        d = self.aim(c, when) - self.dev.state.place(i)
+        self.dev.state.d[i] = d
+        self.dev.state.advance(i, d)
 
     @ti.func
     def offsets(self, c, when, first, fresh):
         """x - target."""
-        x = self._on_state.place(self.member(c, 0))
-        return x - self.aim(c, when[1]), x - self._on_state.d[self.member(c, 0)] - self.aim(c, when[0])
+        x = self.dev.state.place(self.member(c, 0))
+        return x - self.aim(c, when[1]), x - self.dev.state.d[self.member(c, 0)] - self.aim(c, when[0])
 
     @ti.func
     def present(self, c, back):
         """x - target at the end of the frame, where it is at rest."""
         i = self.member(c, 0)
-        return self._on_state.place(i) - back * self._on_state.d[i] - self._on_to[c]
+        return self.dev.state.place(i) - back * self.dev.state.d[i] - self.dev.target[c]

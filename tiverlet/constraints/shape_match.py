@@ -58,41 +58,41 @@ class ShapeMatch(Clusters):
             return np.zeros(self.count)
         w = self.scene.inv_mass[self.indices]
         scale = np.divide(1, w * self.scene.hh, out=np.zeros_like(w), where=w * self.scene.hh > 0)
-        pull = self.scene.memory.read(self._on_pull).astype(np.float64)
+        pull = self.scene.memory.read(self.dev.pull).astype(np.float64)
         return np.maximum.reduceat(scale * np.linalg.norm(pull, axis=1), self.starts[:-1])
 
     @ti.func
     def relax(self, c, h, hh, when, first, fresh):
         """Find where the cluster goes."""
-        if self._on_mass[c] > 0:
+        if self.dev.mass[c] > 0:
             total, p, q, s, K, X = self.moments(c)
             rigid, soft, now, last, give = self.law(c, h, hh, fresh)
             mean, U = 0 * p, 0 * K
-            if ti.static(self._on_soft):
-                for b in range(self._on_blocks[c], self._on_blocks[c + 1]):
-                    mean += self._on_v[b] / total
-                    U += self.kept(self._on_U, b)
+            if ti.static(self.dev.soft):
+                for b in range(self.dev.blocks[c], self.dev.blocks[c + 1]):
+                    mean += self.dev.v[b] / total
+                    U += self.kept(self.dev.U, b)
                 U -= total * mean.outer_product(s)
-            start, end, cosine = rotation.turn(K, X, U, first > 0, rigid, soft, self._on_turn[c], LEAST, self._on_soft)
+            start, end, cosine = rotation.turn(K, X, U, first > 0, rigid, soft, self.dev.turn[c], LEAST, self.dev.soft)
             pose = rotation.matrix(end)
-            self._on_turn[c], self._on_place[c] = end, p - pose @ q
-            self.keep(self._on_pose, c, pose)
-            self._on_slots.note(self._on_slots.turn(cosine, 1.0))
-            if ti.static(self._on_soft):
+            self.dev.turn[c], self.dev.place[c] = end, p - pose @ q
+            self.keep(self.dev.pose, c, pose)
+            self.dev.slots.note(self.dev.slots.turn(cosine, 1.0))
+            if ti.static(self.dev.soft):
                 R = rotation.matrix(start)
                 if first > 0:  # in the frame of the body
                     mean = R @ mean
-                self._on_middle[c], self._on_mean[c] = s - R @ q, mean
-                self.keep(self._on_fit, c, R)
+                self.dev.middle[c], self.dev.mean[c] = s - R @ q, mean
+                self.keep(self.dev.fit, c, R)
 
     @ti.func
     def kick(self, c, h):
         """Find where the cluster is; spread() then adds h^2 times what its springs do now."""
-        if self._on_mass[c] > 0:
+        if self.dev.mass[c] > 0:
             total, p, q, s, K, X = self.moments(c)
-            R = rotation.matrix(rotation.fit(K, self._on_turn[c], LEAST))
-            self._on_place[c] = s - R @ q
-            self.keep(self._on_pose, c, R)
+            R = rotation.matrix(rotation.fit(K, self.dev.turn[c], LEAST))
+            self.dev.place[c] = s - R @ q
+            self.keep(self.dev.pose, c, R)
 
     @ti.func
     def bond(self, c, firm, soft):
@@ -100,141 +100,141 @@ class ShapeMatch(Clusters):
 
         Moves have no moment about the places at the start. Where something cannot move, forces from outside have one.
         """
-        begin, end, i0 = self._on_starts[c], self._on_starts[c + 1], self.hub(c)
+        begin, end, i0 = self.dev.starts[c], self.dev.starts[c + 1], self.hub(c)
         scale = firm
-        if ti.static(self._on_soft):
-            scale = ti.select(self._on_alpha[c] > 0, soft, firm)
-        total, mean, pull, held = ti.cast(0, ti.f64), 0 * self._on_place[c], 0 * self._on_place[c], False
+        if ti.static(self.dev.soft):
+            scale = ti.select(self.dev.alpha[c] > 0, soft, firm)
+        total, mean, pull, held = ti.cast(0, ti.f64), 0 * self.dev.place[c], 0 * self.dev.place[c], False
         S = mean.outer_product(mean)
         X = 0 * S
         for e in range(begin, end):
-            held = held or self._on_w.of(self._on_members[e]) == 0
+            held = held or self.dev.w.of(self.dev.members[e]) == 0
             m, r = self.weight(e, c), self.arm(e, i0, 0)
             total += m
             mean += m * r
-            pull += m * self._on_pull[e]
+            pull += m * self.dev.pull[e]
             S += m * r.outer_product(r)
-            X += m * r.outer_product(ti.cast(self._on_pull[e], ti.f64))
+            X += m * r.outer_product(ti.cast(self.dev.pull[e], ti.f64))
         mean, pull = mean / total, pull / total
         spin = rotation.spin(S - total * mean.outer_product(mean), X - total * mean.outer_product(pull))
         for e in range(begin, end):
-            move = ti.cast(self._on_pull[e], ti.f64)
+            move = ti.cast(self.dev.pull[e], ti.f64)
             if not held:
                 move -= spin @ (self.arm(e, i0, 0) - mean)
-            self.give(e, ti.cast(scale * move, self._on_real))
+            self.give(e, ti.cast(scale * move, self.dev.real))
 
     @ti.func
     def off(self, e, c):
         """C_i at the present places."""
-        return self.arm(e, self.hub(c), 0) - self._on_place[c] - self.kept(self._on_pose, c) @ self._on_shape[e]
+        return self.arm(e, self.hub(c), 0) - self.dev.place[c] - self.kept(self.dev.pose, c) @ self.dev.shape[e]
 
     @ti.func
     def spread(self, e, h, hh, first, fresh):
         """Move corner e towards its place."""
-        c, i = self._on_owner[e], self._on_members[e]
-        w, relaxation = self._on_w.of(i), self._on_slots.relaxation
+        c, i = self.dev.owner[e], self.dev.members[e]
+        w, relaxation = self.dev.w.of(i), self.dev.slots.relaxation
         if first > 0:
-            self._on_pull[e] = 0 * self._on_pull[e]
+            self.dev.pull[e] = 0 * self.dev.pull[e]
         if not self.holds(c):
-            self.give(e, 0 * self._on_pull[e])
+            self.give(e, 0 * self.dev.pull[e])
         elif w > 0:
-            C, n = self.off(e, c), self._on_slots.split[i] / w
-            if ti.static(not self._on_soft):
-                move = ti.cast(-relaxation * C / n, self._on_real)
+            C, n = self.off(e, c), self.dev.slots.split[i] / w
+            if ti.static(not self.dev.soft):
+                move = ti.cast(-relaxation * C / n, self.dev.real)
                 if first >= 0:
-                    self._on_pull[e] = self._on_pull[e] + move
+                    self.dev.pull[e] = self.dev.pull[e] + move
                 self.give(e, move)
             elif first < 0:
-                self.give(e, ti.cast(self.spring(e, c, C, h), self._on_real))
+                self.give(e, ti.cast(self.spring(e, c, C, h), self.dev.real))
             else:
                 rigid, soft, now, last, give = self.law(c, h, hh, fresh)
                 if first > 0:
                     self.look_back(e, c, h, now, last)
                 C = self.wrong(e, c, C, rigid, soft, give)
-                move = ti.cast(-relaxation * C / ((rigid + soft) * n + give), self._on_real)
-                self._on_pull[e] = self._on_pull[e] + move
+                move = ti.cast(-relaxation * C / ((rigid + soft) * n + give), self.dev.real)
+                self.dev.pull[e] = self.dev.pull[e] + move
                 self.give(e, move)
 
     @ti.func
     def wrong(self, e, c, C, rigid, soft, give):
         """C* + alpha' lam of a soft cluster, with the soft part of C_(n+1) = C in the frame at the start."""
-        back = self.kept(self._on_fit, c) @ (self.kept(self._on_pose, c).transpose() @ C)
-        return rigid * C + soft * back + self._on_history[e] + give * self._on_pull[e] - self._on_mean[c]
+        back = self.kept(self.dev.fit, c) @ (self.kept(self.dev.pose, c).transpose() @ C)
+        return rigid * C + soft * back + self.dev.history[e] + give * self.dev.pull[e] - self.dev.mean[c]
 
     @ti.func
     def look_back(self, e, c, h, now, last):
         """What C_n and C_(n-1) add to the violation; and flow, where the shape is plastic."""
-        R = self.kept(self._on_fit, c)
-        C = self.arm(e, self.hub(c), 1) - self._on_middle[c] - R @ self._on_shape[e]
-        self._on_history[e] = now * C + last * (R @ self._on_last[e])
+        R = self.kept(self.dev.fit, c)
+        C = self.arm(e, self.hub(c), 1) - self.dev.middle[c] - R @ self.dev.shape[e]
+        self.dev.history[e] = now * C + last * (R @ self.dev.last[e])
         body = R.transpose() @ C
-        if ti.static(self._on_plastic):
+        if ti.static(self.dev.plastic):
             size = body.norm()
-            if size > self._on_yield[c]:
-                flow = (1 - ti.exp(-self._on_creep[c] * h)) * (1 - self._on_yield[c] / size) * body
-                self._on_shape[e] = self._on_shape[e] + flow
+            if size > self.dev.yield_size[c]:
+                flow = (1 - ti.exp(-self.dev.creep[c] * h)) * (1 - self.dev.yield_size[c] / size) * body
+                self.dev.shape[e] = self.dev.shape[e] + flow
                 body -= flow
-        self._on_last[e] = body
+        self.dev.last[e] = body
 
     @ti.func
     def spring(self, e, c, C, h):
         """h^2 times the acceleration by the spring and the dashpot of corner e, as far as the step resolves them."""
-        alpha, mass = self._on_alpha[c], self._on_mass[c]
+        alpha, mass = self.dev.alpha[c], self.dev.mass[c]
         out = 0 * C
         if alpha > 0:
-            rate = (C - self.kept(self._on_pose, c) @ self._on_last[e]) / h
-            out = -h * h * (1 - stiff(alpha, h, 1 / mass)) * (C / alpha + self._on_damping[c] * rate) / mass
+            rate = (C - self.kept(self.dev.pose, c) @ self.dev.last[e]) / h
+            out = -h * h * (1 - stiff(alpha, h, 1 / mass)) * (C / alpha + self.dev.damping[c] * rate) / mass
         return out
 
     @ti.func
     def tear(self, c, hh, tick):
         """Let cluster c fall apart if the force on one of its particles was too large."""
         if self.holds(c):
-            most = ti.cast(0, self._on_real)
-            for e in range(self._on_starts[c], self._on_starts[c + 1]):
-                w = self._on_w.of(self._on_members[e])
+            most = ti.cast(0, self.dev.real)
+            for e in range(self.dev.starts[c], self.dev.starts[c + 1]):
+                w = self.dev.w.of(self.dev.members[e])
                 if w > 0:
-                    most = ti.max(most, self._on_pull[e].norm() / w)
-            if most > self._on_strength[c] * hh:
+                    most = ti.max(most, self.dev.pull[e].norm() / w)
+            if most > self.dev.strength[c] * hh:
                 self.part(c, tick)
 
     @ti.func
     def miss(self, c, h, hh, when, fresh):
         """The largest violation that is left, by where the last pass turned the cluster, relative to its radius."""
-        worst, total, mean, holds = ti.cast(0, ti.f64), ti.cast(0, ti.f64), 0 * self._on_place[c], self.holds(c)
+        worst, total, mean, holds = ti.cast(0, ti.f64), ti.cast(0, ti.f64), 0 * self.dev.place[c], self.holds(c)
         rigid, soft, now, last, give = self.law(c, h, hh, fresh)
-        for e in range(self._on_starts[c], self._on_starts[c + 1]):
+        for e in range(self.dev.starts[c], self.dev.starts[c + 1]):
             total += self.weight(e, c)
             mean += self.weight(e, c) * self.off(e, c)
-        for e in range(self._on_starts[c], self._on_starts[c + 1]):
-            if self._on_w.of(self._on_members[e]) > 0 and holds:
+        for e in range(self.dev.starts[c], self.dev.starts[c + 1]):
+            if self.dev.w.of(self.dev.members[e]) > 0 and holds:
                 C = self.off(e, c) - mean / total  # places are relative to a particle that has moved since
-                if ti.static(self._on_soft):
+                if ti.static(self.dev.soft):
                     C = self.wrong(e, c, C, rigid, soft, give)
                 worst = ti.max(worst, C.norm())
-        return ti.cast(worst / self._on_size[c], self._on_real)
+        return ti.cast(worst / self.dev.size[c], self.dev.real)
 
     @ti.func
     def energy(self, c, back, hh, miss):
         """Sum of m |C|^2 / (2 alpha M) at x - back d, about the best fit there."""
         out = ti.cast(0, ti.f64)
-        if ti.static(self._on_soft):
-            alpha, mass, i0 = self._on_alpha[c], self._on_mass[c], self.hub(c)
+        if ti.static(self.dev.soft):
+            alpha, mass, i0 = self.dev.alpha[c], self.dev.mass[c], self.hub(c)
             if alpha > 0 and mass > 0 and self.holds(c):
                 total = ti.cast(0, ti.f64)
-                s, q = 0 * self._on_place[c], 0 * self._on_place[c]
+                s, q = 0 * self.dev.place[c], 0 * self.dev.place[c]
                 K = s.outer_product(q)
-                for e in range(self._on_starts[c], self._on_starts[c + 1]):
+                for e in range(self.dev.starts[c], self.dev.starts[c + 1]):
                     mu = self.weight(e, c)
                     x = self.arm(e, i0, back)
                     total += mu
                     s += mu * x
-                    q += mu * self._on_shape[e]
-                    K += mu * self._on_shape[e].outer_product(x)
+                    q += mu * self.dev.shape[e]
+                    K += mu * self.dev.shape[e].outer_product(x)
                 s, q = s / total, q / total
-                R = rotation.matrix(rotation.fit(K - total * q.outer_product(s), self._on_turn[c], LEAST))
-                for e in range(self._on_starts[c], self._on_starts[c + 1]):
-                    C = self.arm(e, i0, back) - s - R @ (self._on_shape[e] - q)
-                    if self._on_w.of(self._on_members[e]) > 0:
-                        out += C.dot(C) / (2 * alpha * mass * self._on_w.of(self._on_members[e]))
+                R = rotation.matrix(rotation.fit(K - total * q.outer_product(s), self.dev.turn[c], LEAST))
+                for e in range(self.dev.starts[c], self.dev.starts[c + 1]):
+                    C = self.arm(e, i0, back) - s - R @ (self.dev.shape[e] - q)
+                    if self.dev.w.of(self.dev.members[e]) > 0:
+                        out += C.dot(C) / (2 * alpha * mass * self.dev.w.of(self.dev.members[e]))
         return out

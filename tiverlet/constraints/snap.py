@@ -56,16 +56,16 @@ class Snap(Tether):
         super().bind(scene)
         dim, free = scene.particles.dim, np.isinf(self._spacing)
         add, x = scene.memory.field, self.start.position[self.indices[:, 0]]
-        self._on_grid = add("Snap.grid", 2, width=dim, values=[self._origin, np.where(free, 0.0, self._spacing)])
-        self._on_node = add("Snap.node", self.count, width=dim, values=self.node(x), state=True)
+        self.dev.grid = add("Snap.grid", 2, width=dim, values=[self._origin, np.where(free, 0.0, self._spacing)])
+        self.dev.node = add("Snap.node", self.count, width=dim, values=self.node(x), state=True)
         self.changed = False
 
     @ti.func
     def nearest(self, x):
         """The node nearest to x; x itself along axes that are free."""
         node = x
-        for k in ti.static(range(self._on_state.dim)):
-            step, zero = self._on_grid[1][k], self._on_grid[0][k]
+        for k in ti.static(range(self.dev.state.dim)):
+            step, zero = self.dev.grid[1][k], self.dev.grid[0][k]
             if step > 0:
                 node[k] = zero + ti.floor((x[k] - zero) / step + 0.5) * step
         return node
@@ -74,18 +74,18 @@ class Snap(Tether):
     def offsets(self, c, when, first, fresh):
         """x - node; what is remembered of the substep before is put in terms of the same node."""
         i = self.member(c, 0)
-        x, start = self._on_state.place(i), self._on_state.place(i) - self._on_state.d[i]
+        x, start = self.dev.state.place(i), self.dev.state.place(i) - self.dev.state.d[i]
         if first != 0:
             node = self.nearest(start)
-            self._on_last[c] = self._on_last[c] + (self._on_node[c] - node)
-            for k in ti.static(range(self._on_state.dim)):
-                if self._on_grid[1][k] == 0:
-                    self._on_last[c][k] = 0
-            self._on_node[c] = node
-        node = self._on_node[c]
+            self.dev.last[c] = self.dev.last[c] + (self.dev.node[c] - node)
+            for k in ti.static(range(self.dev.state.dim)):
+                if self.dev.grid[1][k] == 0:
+                    self.dev.last[c][k] = 0
+            self.dev.node[c] = node
+        node = self.dev.node[c]
         C = x - node
-        for k in ti.static(range(self._on_state.dim)):
-            if self._on_grid[1][k] == 0:
+        for k in ti.static(range(self.dev.state.dim)):
+            if self.dev.grid[1][k] == 0:
                 C[k] = 0
         return C, start - node
 
@@ -93,5 +93,5 @@ class Snap(Tether):
     def present(self, c, back):
         """x - node."""
         i = self.member(c, 0)
-        x = self._on_state.place(i) - back * self._on_state.d[i]
+        x = self.dev.state.place(i) - back * self.dev.state.d[i]
         return x - self.nearest(x)

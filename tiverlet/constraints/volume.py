@@ -141,18 +141,18 @@ class Surfaces(Volume, Content):
         order = np.argsort(corner, kind="stable")
         rings = np.concatenate([[0], np.cumsum(np.bincount(corner, minlength=self.corner_count))])
         add = scene.memory.field
-        self._on_rings = add("Volume.rings", self.corner_count + 1, kind=ti.i32, values=rings)
-        self._on_ring = add("Volume.ring", len(order), width=2, kind=ti.i32, values=others[order])
+        self.dev.rings = add("Volume.rings", self.corner_count + 1, kind=ti.i32, values=rings)
+        self.dev.ring = add("Volume.ring", len(order), width=2, kind=ti.i32, values=others[order])
 
     @ti.func
     def slope(self, e, back):
         """Sum of b x c / 6 over the faces around a corner; b and c relative to it, which changes nothing in a closed ring."""
-        i = self._on_members[e]
-        total = 0 * self._on_state.d[i]
-        for k in range(self._on_rings[e], self._on_rings[e + 1]):
-            j, m = self._on_ring[k]
-            b = self._on_state.apart(j, i) - back * (self._on_state.d[j] - self._on_state.d[i])
-            c = self._on_state.apart(m, i) - back * (self._on_state.d[m] - self._on_state.d[i])
+        i = self.dev.members[e]
+        total = 0 * self.dev.state.d[i]
+        for k in range(self.dev.rings[e], self.dev.rings[e + 1]):
+            j, m = self.dev.ring[k]
+            b = self.dev.state.apart(j, i) - back * (self.dev.state.d[j] - self.dev.state.d[i])
+            c = self.dev.state.apart(m, i) - back * (self.dev.state.d[m] - self.dev.state.d[i])
             total += b.cross(c)
         return total / 6
 

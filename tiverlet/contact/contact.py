@@ -105,12 +105,12 @@ class Contact(Splitting):
     @property
     def rubs(self) -> bool:
         """Whether any pair has friction, or had when kernels were compiled."""
-        return self.wanted.rubs or vars(self).get("_on_rubs", False)
+        return self.wanted.rubs or vars(self.dev).get("rubs", False)
 
     @property
     def bounces(self) -> bool:
         """Whether any pair has restitution, or had when kernels were compiled."""
-        return self.wanted.bounces or vars(self).get("_on_bounces", False)
+        return self.wanted.bounces or vars(self.dev).get("bounces", False)
 
     def upload(self) -> None:
         """Write friction and restitution."""
@@ -119,11 +119,12 @@ class Contact(Splitting):
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Choose the skin, and refuse positions too far out for cells to be told apart."""
+        self.dev.eases, self.dev.store = False, None
         radius = particles.radius
         some = radius[radius > 0]
         auto = 0.75 * median(some) if len(some) else 1.0
-        self._on_size = auto if self.skin == "auto" else float(self.skin)
-        self._on_finest = float(radius.min(initial=np.inf))
+        self.dev.size = auto if self.skin == "auto" else float(self.skin)
+        self.dev.finest = float(radius.min(initial=np.inf))
         self.matters = len(some) > 0
         self.table = self.wanted
         if self.matters:
@@ -145,7 +146,7 @@ class Contact(Splitting):
 
     def check_range(self, position: np.ndarray) -> None:
         """Raise where coordinates are too large for the cells."""
-        cell = 2 * self._on_finest + self._on_size
+        cell = 2 * self.dev.finest + self.dev.size
         far = np.abs(position) >= FARTHEST * cell
         if far.any():
             i, k = np.unravel_index(int(np.argmax(far)), far.shape)
@@ -160,86 +161,86 @@ class Contact(Splitting):
         pairs = [b.partners(b.start) for b in batches]
         linked = np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=np.int32)
         self.scene = scene
-        self._on_state = scene.state
-        self._on_radius = scene.radius
-        self._on_move = scene.memory.field("Contact.move", n, width=dim)
-        self._on_split = scene.memory.field("Contact.split_mass", n, state=True)
-        self._on_press = scene.memory.field("Contact.press", n, width=dim, state=True)
-        self._on_before = scene.memory.field("Contact.before", n, width=dim, state=True)
+        self.dev.state = scene.state
+        self.dev.radius = scene.radius
+        self.dev.move = scene.memory.field("Contact.move", n, width=dim)
+        self.dev.split = scene.memory.field("Contact.split_mass", n, state=True)
+        self.dev.press = scene.memory.field("Contact.press", n, width=dim, state=True)
+        self.dev.before = scene.memory.field("Contact.before", n, width=dim, state=True)
         if self.rubs:
-            self._on_bond = scene.memory.field("Contact.bond", n, width=dim, state=True)
-        self._on_block = min(BLOCK, team.piece)
-        self._on_skips = n >= FEW and not self.bounces  # in relax() what bounces forgets the last blow
-        if self._on_skips:
-            self._on_some = scene.memory.field("Contact.some_touch", -(-n // self._on_block), kind=ti.i32)
-        self._on_fast = scene.memory.field("Contact.fast", None, kind=ti.i32)
-        self._on_rubs, self._on_bounces = self.rubs, self.bounces
+            self.dev.bond = scene.memory.field("Contact.bond", n, width=dim, state=True)
+        self.dev.block = min(BLOCK, team.piece)
+        self.dev.skips = n >= FEW and not self.bounces  # in relax() what bounces forgets the last blow
+        if self.dev.skips:
+            self.dev.some = scene.memory.field("Contact.some_touch", -(-n // self.dev.block), kind=ti.i32)
+        self.dev.fast = scene.memory.field("Contact.fast", None, kind=ti.i32)
+        self.dev.rubs, self.dev.bounces = self.rubs, self.bounces
         if self.bounces:
-            self._on_struck = scene.memory.field("Contact.struck", n)
-            self._on_kick = scene.memory.field("Contact.kick", n, width=dim)
-            self._on_lift = scene.memory.field("Contact.lift", n, width=dim)
-            self._on_left = scene.memory.field("Contact.left", n)
-            self._on_partner = scene.memory.field("Contact.partner", n, kind=ti.i32)
-            self._on_first = scene.memory.field("Contact.first", n, kind=ti.i32)
-            self._on_hit = scene.memory.field("Contact.hit", None, kind=ti.i32)
+            self.dev.struck = scene.memory.field("Contact.struck", n)
+            self.dev.kick = scene.memory.field("Contact.kick", n, width=dim)
+            self.dev.lift = scene.memory.field("Contact.lift", n, width=dim)
+            self.dev.left = scene.memory.field("Contact.left", n)
+            self.dev.partner = scene.memory.field("Contact.partner", n, kind=ti.i32)
+            self.dev.first = scene.memory.field("Contact.first", n, kind=ti.i32)
+            self.dev.hit = scene.memory.field("Contact.hit", None, kind=ti.i32)
         self.table.bind(scene)
         # What parted the pair in the last substep, per inverse mass [kg m].
-        self._on_push = Luggage("push", 0, lasting=True, marked=True)
-        self._on_slip = Luggage("slip", dim, lasting=True)
-        self._on_blow = Luggage("blow", 0, lasting=False)
-        luggage = [self._on_push, *([self._on_slip] if self.rubs else [])]
+        self.dev.push = Luggage("push", 0, lasting=True, marked=True)
+        self.dev.slip = Luggage("slip", dim, lasting=True)
+        self.dev.blow = Luggage("blow", 0, lasting=False)
+        luggage = [self.dev.push, *([self.dev.slip] if self.rubs else [])]
         if self.bounces:
-            self._on_slack = Luggage("slack", 0, lasting=True)  # of the overlap, what no push is for
-            self._on_given = Luggage("given", 0, lasting=True)  # pushes and blows in the last substep [kg m]
-            luggage += [self._on_slack, self._on_blow, self._on_given]
-        self._on_grid = Grid(scene, self._on_size, linked, self.table, luggage, team, self._on_move)
-        self._on_calm = Calm(self, -(-n // team.piece))
-        return self._on_grid
+            self.dev.slack = Luggage("slack", 0, lasting=True)  # of the overlap, what no push is for
+            self.dev.given = Luggage("given", 0, lasting=True)  # pushes and blows in the last substep [kg m]
+            luggage += [self.dev.slack, self.dev.blow, self.dev.given]
+        self.dev.grid = Grid(scene, self.dev.size, linked, self.table, luggage, team, self.dev.move)
+        self.dev.calm = Calm(self, -(-n // team.piece))
+        return self.dev.grid
 
     @ti.func
     def overshoots(self, i):
         """1 if particle i crosses more than its own size in one substep."""
-        d, limit = self._on_state.d[i], self._on_radius.stride(i)
+        d, limit = self.dev.state.d[i], self.dev.radius.stride(i)
         return ti.select(d.dot(d) <= limit * limit, 0, 1)
 
     @ti.func
     def heed(self, stale, fast):
         """Write down what was noticed; threads that all write to the same place would wait for each other."""
         if stale != 0:
-            if self._on_grid.stale[None] == 0:
-                self._on_grid.stale[None] = 1
+            if self.dev.grid.stale[None] == 0:
+                self.dev.grid.stale[None] = 1
         if fast != 0:
-            if self._on_fast[None] == 0:
-                self._on_fast[None] = 1
+            if self.dev.fast[None] == 0:
+                self.dev.fast[None] = 1
 
     @ti.func
     def relax(self, i, first, fresh, final):
         """What the pairs of particle i want of it."""
-        total, w = ti.Vector.zero(self.scene.real, self._on_state.dim), self._on_state.w.of(i)
+        total, w = ti.Vector.zero(self.scene.real, self.dev.state.dim), self.dev.state.w.of(i)
         lift, bond = total, total
-        if ti.static(self._on_bounces):
+        if ti.static(self.dev.bounces):
             if first != 0:
-                self._on_struck[i] = self._on_split[i]
-                for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
-                    self._on_blow.field[e] = 0
-                    self._on_given.field[e] = 0
-        if self._on_split[i] > 0:
-            for word in range(self._on_grid.words(i)):
+                self.dev.struck[i] = self.dev.split[i]
+                for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
+                    self.dev.blow.field[e] = 0
+                    self.dev.given.field[e] = 0
+        if self.dev.split[i] > 0:
+            for word in range(self.dev.grid.words(i)):
                 bits = self.touching(i, word)
                 while bits != 0:
-                    e = self._on_grid.first[i] + word * WORD + lowest(bits)
+                    e = self.dev.grid.first[i] + word * WORD + lowest(bits)
                     bits &= bits - ti.u32(1)
-                    j = self._on_grid.near[e]
-                    shared, last = self._on_split[i] + self._on_split[j], self._on_push.field[e]
+                    j = self.dev.grid.near[e]
+                    shared, last = self.dev.split[i] + self.dev.split[j], self.dev.push.field[e]
                     overlap, each, n = self.meet(i, j, self.far(i, j), shared)
                     each *= ti.static(RELAXATION)
-                    paid, given, rests, alone = overlap, ti.zero(overlap), True, w + self._on_state.w.of(j)
-                    if ti.static(self._on_bounces):
-                        given, slack, rests = self.bounce(i, j, n, overlap, self._on_slack.field[e], last, first)
+                    paid, given, rests, alone = overlap, ti.zero(overlap), True, w + self.dev.state.w.of(j)
+                    if ti.static(self.dev.bounces):
+                        given, slack, rests = self.bounce(i, j, n, overlap, self.dev.slack.field[e], last, first)
                         if first != 0:
                             back = ti.static(UPTAKE) * ti.min(slack * each, slack / alone)
                             lift += w * back * n
-                            self._on_slack.field[e] = slack - alone * back
+                            self.dev.slack.field[e] = slack - alone * back
                         paid -= slack
                     part, push = paid * each, ti.zero(overlap)
                     if first == 0:
@@ -247,56 +248,56 @@ class Contact(Splitting):
                     elif fresh == 0:
                         part += ti.max(ti.min(1 - alone * each, ti.static(CARRY)), 0) * last
                     part = lesser(part, paid / alone)  # without a branch: it would be taken at random
-                    if ti.static(self._on_bounces):
+                    if ti.static(self.dev.bounces):
                         if given > 0:
-                            self._on_blow.field[e] = 1
-                            if self._on_hit[None] == 0:
-                                self._on_hit[None] = 1
+                            self.dev.blow.field[e] = 1
+                            if self.dev.hit[None] == 0:
+                                self.dev.hit[None] = 1
                         if not rests:
                             part = ti.zero(part)
-                        self._on_given.field[e] = self._on_given.field[e] + part
+                        self.dev.given.field[e] = self.dev.given.field[e] + part
                     push += part
                     want = part * n
-                    if ti.static(self._on_rubs):
-                        want -= self.rub(i, j, n, part * shared + given, self._on_slip.field[e]) / shared
+                    if ti.static(self.dev.rubs):
+                        want -= self.rub(i, j, n, part * shared + given, self.dev.slip.field[e]) / shared
                     total += w * want
-                    if ti.static(self._on_rubs):
+                    if ti.static(self.dev.rubs):
                         if final != 0:
-                            came = -(self._on_before[i] - self._on_before[j]).dot(n)
+                            came = -(self.dev.before[i] - self.dev.before[j]).dot(n)
                             bond += self.steady(came, part * alone) * w * (want - part * n)
-                    self._on_push.field[e] = push
-        self._on_move[i] = total
-        if ti.static(self._on_rubs):
+                    self.dev.push.field[e] = push
+        self.dev.move[i] = total
+        if ti.static(self.dev.rubs):
             if final != 0:
                 self.sum_up(i, bond, first)
-        if ti.static(self._on_bounces):
-            self._on_lift[i] = lift
+        if ti.static(self.dev.bounces):
+            self.dev.lift[i] = lift
 
     @ti.func
     def push_bond(self, i):
         """Along the normals at the present places, where pushes have no moment. Friction is known from the passes."""
-        total, w = 0 * self._on_press[i], self._on_state.w.of(i)
-        if self._on_split[i] > 0:
-            for word in range(self._on_grid.words(i)):
-                bits = ti.select(word == 0, self._on_grid.touching[i], self._on_grid.whole(i, word))
+        total, w = 0 * self.dev.press[i], self.dev.state.w.of(i)
+        if self.dev.split[i] > 0:
+            for word in range(self.dev.grid.words(i)):
+                bits = ti.select(word == 0, self.dev.grid.touching[i], self.dev.grid.whole(i, word))
                 while bits != 0:
-                    e = self._on_grid.first[i] + word * WORD + lowest(bits)
+                    e = self.dev.grid.first[i] + word * WORD + lowest(bits)
                     bits &= bits - ti.u32(1)
-                    j, push = self._on_grid.near[e], self._on_push.field[e]
-                    r = self._on_state.apart(i, j)
+                    j, push = self.dev.grid.near[e], self.dev.push.field[e]
+                    r = self.dev.state.apart(i, j)
                     length = r.norm()
                     if push > 0 and length > 0:
                         n = r / length
-                        came = -(self._on_before[i] - self._on_before[j]).dot(n)
-                        total += self.steady(came, push * (w + self._on_state.w.of(j))) * w * push * n
-        self._on_press[i] = total
+                        came = -(self.dev.before[i] - self.dev.before[j]).dot(n)
+                        total += self.steady(came, push * (w + self.dev.state.w.of(j))) * w * push * n
+        self.dev.press[i] = total
 
     @ti.func
     def bond(self, i):
         """Pushes, and friction."""
-        total = self._on_press[i]
-        if ti.static(self._on_rubs):
-            total += self._on_bond[i]
+        total = self.dev.press[i]
+        if ti.static(self.dev.rubs):
+            total += self.dev.bond[i]
         return total
 
     @ti.func
@@ -322,47 +323,47 @@ class Contact(Splitting):
     @ti.func
     def leap(self, i, j, n):
         """What takes a pair from coming together to leaving; how far it comes together in this substep, and without forces."""
-        a = -(self._on_state.before[i] - self._on_state.before[j]).dot(n)
-        here = -(self._on_state.d[i] - self._on_state.d[j]).dot(n)
+        a = -(self.dev.state.before[i] - self.dev.state.before[j]).dot(n)
+        here = -(self.dev.state.d[i] - self.dev.state.d[j]).dot(n)
         return here + self.table.of(i, j)[2] * ti.max(a, 0), here, a
 
     @ti.func
     def rebound(self, i):
         """The first of the pairs of particle i that were struck and still come together, and what it does to i."""
-        first, partner, most, w = -1, -1, 0 * self._on_struck[i], self._on_state.w.of(i)
-        if self._on_struck[i] > 0:
-            for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
-                if self._on_blow.field[e] > 0:
-                    j = self._on_grid.near[e]
-                    overlap, _each, n = self.meet(i, j, self.far(i, j), self._on_struck[i])
+        first, partner, most, w = -1, -1, 0 * self.dev.struck[i], self.dev.state.w.of(i)
+        if self.dev.struck[i] > 0:
+            for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
+                if self.dev.blow.field[e] > 0:
+                    j = self.dev.grid.near[e]
+                    overlap, _each, n = self.meet(i, j, self.far(i, j), self.dev.struck[i])
                     given, here, a = self.leap(i, j, n)
                     if overlap > 0 and a > 0 and given > 0:
                         left = ti.select(overlap < here, overlap / here, 1)
                         if left > most or (left == most and earlier(i, j, partner)):
                             first, partner, most = e, j, left
-                            self._on_kick[i] = w / (w + self._on_state.w.of(j)) * given * n
-                            if self._on_hit[None] == 0:
-                                self._on_hit[None] = 1
-        self._on_first[i] = first
-        self._on_partner[i] = partner
-        self._on_left[i] = most
+                            self.dev.kick[i] = w / (w + self.dev.state.w.of(j)) * given * n
+                            if self.dev.hit[None] == 0:
+                                self.dev.hit[None] = 1
+        self.dev.first[i] = first
+        self.dev.partner[i] = partner
+        self.dev.left[i] = most
 
     @ti.func
     def part_ways(self, i):
         """Let particle i bounce off its partner, if it is the partner's partner."""
-        j = self._on_partner[i]
+        j = self.dev.partner[i]
         if j >= 0:
-            if self._on_partner[j] == i or self._on_state.w.of(j) == 0:
-                e, kick = self._on_first[i], self._on_kick[i]
-                self._on_given.field[e] = self._on_given.field[e] + kick.norm() / self._on_state.w.of(i)
-                self._on_state.d[i] = self._on_state.d[i] + kick
-                self._on_state.before[i] = self._on_state.before[i] + kick
-                self._on_state.advance(i, self._on_left[i] * kick)
+            if self.dev.partner[j] == i or self.dev.state.w.of(j) == 0:
+                e, kick = self.dev.first[i], self.dev.kick[i]
+                self.dev.given.field[e] = self.dev.given.field[e] + kick.norm() / self.dev.state.w.of(i)
+                self.dev.state.d[i] = self.dev.state.d[i] + kick
+                self.dev.state.before[i] = self.dev.state.before[i] + kick
+                self.dev.state.advance(i, self.dev.left[i] * kick)
 
     @ti.func
     def rub(self, i, j, n, normal, slip):
         """The part of a pair's slip, with the present displacements, that friction takes back for a normal displacement."""
-        s = slip + self._on_state.d[i] - self._on_state.d[j]
+        s = slip + self.dev.state.d[i] - self.dev.state.d[j]
         s -= s.dot(n) * n
         row, size = self.table.of(i, j), s.norm()
         if size > row[0] * normal:
@@ -372,32 +373,32 @@ class Contact(Splitting):
     @ti.func
     def gather(self, i, first):
         """Move particle i as its pairs want."""
-        if self._on_state.w.of(i) > 0:  # what touches nothing moves by 0, without a branch
-            self._on_state.shift(i, self._on_move[i])
-            if ti.static(self._on_bounces):
-                self._on_state.advance(i, self._on_lift[i])
+        if self.dev.state.w.of(i) > 0:  # what touches nothing moves by 0, without a branch
+            self.dev.state.shift(i, self.dev.move[i])
+            if ti.static(self.dev.bounces):
+                self.dev.state.advance(i, self.dev.lift[i])
 
     @ti.func
     def remember(self, i):
         """At the end of a substep: add to each pair's slip what it has moved, as far as friction can hold it; a pair that parted
         has no slack. What came to overlap after pairs were pushed, which a list with a narrow skin may not know yet, waits."""
-        if ti.static(self._on_rubs):
-            for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
-                j = self._on_grid.near[e]
+        if ti.static(self.dev.rubs):
+            for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
+                j = self.dev.grid.near[e]
                 overlap, n = self.touch(i, j, self.far(i, j))
-                slip = 0 * self._on_state.x[i]
-                if overlap > 0 and self._on_push.field[e] > 0:
-                    pressed = self._on_push.field[e] * (self._on_split[i] + self._on_split[j])
-                    slip = self.rub(i, j, n, ti.max(overlap, pressed), self._on_slip.field[e])
-                self._on_slip.field[e] = slip
-        if ti.static(self._on_bounces):
-            if self._on_split[i] > 0:
-                for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
-                    if self._on_slack.field[e] > 0:
-                        j = self._on_grid.near[e]
+                slip = 0 * self.dev.state.x[i]
+                if overlap > 0 and self.dev.push.field[e] > 0:
+                    pressed = self.dev.push.field[e] * (self.dev.split[i] + self.dev.split[j])
+                    slip = self.rub(i, j, n, ti.max(overlap, pressed), self.dev.slip.field[e])
+                self.dev.slip.field[e] = slip
+        if ti.static(self.dev.bounces):
+            if self.dev.split[i] > 0:
+                for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
+                    if self.dev.slack.field[e] > 0:
+                        j = self.dev.grid.near[e]
                         overlap, _n = self.touch(i, j, self.far(i, j))
                         if overlap <= 0:
-                            self._on_slack.field[e] = 0
+                            self.dev.slack.field[e] = 0
 
 
 def _skin(value):

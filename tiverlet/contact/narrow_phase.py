@@ -14,28 +14,19 @@ class Touch(Feature):
     """The geometry of pairs. Particles that the user put into each other may be smaller than they are, for a while."""
 
     push_out: Any
-    _on_grid: Any
-    _on_state: Any
-    _on_radius: Any
-    _on_push: Any
-    _on_bond: Any
-    _on_before: Any
-    _on_given: Any
-    _on_bounces: bool
-    _on_eases, _on_store = False, None
 
     @ti.func
     def far(self, i, j):
         """The distance at which particles i and j touch."""
-        far = self._on_radius.of(i) + self._on_radius.of(j)
-        if ti.static(self._on_eases):
-            far -= self._on_less[i] + self._on_less[j]
+        far = self.dev.radius.of(i) + self.dev.radius.of(j)
+        if ti.static(self.dev.eases):
+            far -= self.dev.less[i] + self.dev.less[j]
         return far
 
     @ti.func
     def depth(self, i, j, far):
         """The overlap alone."""
-        r = self._on_state.apart(i, j)
+        r = self.dev.state.apart(i, j)
         rr = r.dot(r)
         overlap = 0 * far - 1
         if rr < far * far:
@@ -47,7 +38,7 @@ class Touch(Feature):
     @ti.func
     def touch(self, i, j, far):
         """Overlap [m] of a pair that touches at a distance `far` (negative where apart) and its direction, from j to i."""
-        r = self._on_state.apart(i, j)
+        r = self.dev.state.apart(i, j)
         rr = r.dot(r)
         overlap, n = 0 * far - 1, 0 * r
         if rr < far * far:
@@ -70,15 +61,15 @@ class Touch(Feature):
     @ti.func
     def set_out(self, i, scale):
         """At the start of the last substep of a frame: keep the displacement of particle i, `scale` times what is kept there."""
-        self._on_before[i] = scale * self._on_state.d[i]
+        self.dev.before[i] = scale * self.dev.state.d[i]
 
     @ti.func
     def sum_up(self, i, bond, first):
         """Keep what forces of a pass moved particle i by in the last substep of a frame, for its velocity."""
         if first != 0:
-            self._on_bond[i] = bond
+            self.dev.bond[i] = bond
         else:
-            self._on_bond[i] = self._on_bond[i] + bond
+            self.dev.bond[i] = self.dev.bond[i] + bond
 
     @ti.func
     def push_bond(self, i):
@@ -87,7 +78,7 @@ class Touch(Feature):
     @ti.func
     def bond(self, i):
         """What forces moved particle i by in the last substep of a frame."""
-        return self._on_bond[i]
+        return self.dev.bond[i]
 
     @ti.func
     def meet(self, i, j, far, shared):
@@ -97,7 +88,7 @@ class Touch(Feature):
         start and d the relative displacement; what is left of d along n is the overlap. This is exact for free flight, where
         the direction at the end is off by the way that a pair slides past each other.
         """
-        r = self._on_state.apart(i, j)
+        r = self.dev.state.apart(i, j)
         rr = r.dot(r)
         length = ti.sqrt(rr)
         per = 1 / (shared * length)  # of all that takes time, divisions take most
@@ -106,7 +97,7 @@ class Touch(Feature):
         if rr <= far * far * ti.static(2.0**-80):
             overlap, n = far, self.part(i, j, r)
             each = 1 / shared
-        d = self._on_state.d[i] - self._on_state.d[j]
+        d = self.dev.state.d[i] - self.dev.state.d[j]
         r -= d
         c = r.dot(r) - far * far
         if c > 0:
@@ -125,7 +116,7 @@ class Touch(Feature):
         mixed = (low * ti.u32(2654435769)) ^ ((high + ti.u32(1)) * ti.u32(2246822519))
         n = 0 * r
         n[0], n[1] = self.around(mixed * ti.u32(2654435769))
-        if ti.static(self._on_state.dim == 3):
+        if ti.static(self.dev.state.dim == 3):
             z = self.fraction(mixed * ti.u32(3242174889))
             n *= ti.sqrt(1 - z * z)
             n[2] = z
@@ -148,42 +139,42 @@ class Touch(Feature):
 
     def ease(self) -> None:
         """From now on particles may be smaller than they are; the field for it exists only once it is needed."""
-        if not self._on_eases:
-            self._on_store = Memory(self.scene.real)
-            self._on_less = self._on_store.field("Contact.shrunk", self.scene.particles.count, state=True)
-            self._on_store.place()
-            self._on_eases = True
+        if not self.dev.eases:
+            self.dev.store = Memory(self.scene.real)
+            self.dev.less = self.dev.store.field("Contact.shrunk", self.scene.particles.count, state=True)
+            self.dev.store.place()
+            self.dev.eases = True
 
     @ti.func
     def shrink(self, i, first):
         """Make particle i small enough: each pair with a particle from number `first` on gives up its overlap in proportion to
         the radii."""
-        less = ti.select(first > 0, self._on_less[i], ti.cast(0, self.scene.real))
-        for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
-            j = self._on_grid.near[e]
+        less = ti.select(first > 0, self.dev.less[i], ti.cast(0, self.scene.real))
+        for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
+            j = self.dev.grid.near[e]
             if ti.max(i, j) >= first:
-                far = self._on_radius.of(i) + self._on_radius.of(j)
+                far = self.dev.radius.of(i) + self.dev.radius.of(j)
                 overlap, _ = self.touch(i, j, far)
-                less = ti.max(less, overlap * self._on_radius.of(i) / far)
-        self._on_less[i] = less
+                less = ti.max(less, overlap * self.dev.radius.of(i) / far)
+        self.dev.less[i] = less
 
     @ti.func
     def grow(self, i, h):
         """Let particle i grow back."""
-        if ti.static(self._on_eases):
-            self._on_less[i] = ti.max(self._on_less[i] - self.push_out * h / 2, 0)
+        if ti.static(self.dev.eases):
+            self.dev.less[i] = ti.max(self.dev.less[i] - self.push_out * h / 2, 0)
 
     @ti.func
     def overlaps(self, i):
         """For the report: contacts of particle i with later ones, and the worst overlap in radii of the smaller."""
         touching, worst = 0, ti.cast(0, ti.f64)
-        number = self._on_grid.number[i]
-        last = self._on_grid.first[i] + number - 1
+        number = self.dev.grid.number[i]
+        last = self.dev.grid.first[i] + number - 1
         for k in range(number):
-            j = self._on_grid.near[last - k]
+            j = self.dev.grid.near[last - k]
             if j < i:  # and so are the rest
                 break
-            a, b = self._on_radius.of(i), self._on_radius.of(j)
+            a, b = self.dev.radius.of(i), self.dev.radius.of(j)
             overlap = self.depth(i, j, a + b)
             if overlap > 0:
                 small = ti.min(a, b)
@@ -196,10 +187,10 @@ class Touch(Feature):
     def found(self, x: np.ndarray, h: float) -> Contacts:
         """The pairs that touch, of particles at x (n, dim) [m], for world.contacts."""
         r = self.scene.particles.radius
-        pairs, at = self._on_grid.entries()
-        push = self._on_grid.read(self._on_given if self._on_bounces else self._on_push, at)
+        pairs, at = self.dev.grid.entries()
+        push = self.dev.grid.read(self.dev.given if self.dev.bounces else self.dev.push, at)
         low = pairs[:, 0] < pairs[:, 1]
-        if self._on_grid.still:  # what is static does not keep what it gives: the other one of the pair does
+        if self.dev.grid.still:  # what is static does not keep what it gives: the other one of the pair does
             back = np.lexsort(pairs[~low].T)  # (j, i) in the order of (i, j)
             push[low] = np.maximum(push[low], push[~low][back])
         pairs, push = pairs[low], push[low]

@@ -1,7 +1,5 @@
 """Where vertices are to the edges of bodies made of loops of particles (2D)."""
 
-from typing import Any
-
 import numpy as np
 
 from ..device import ti
@@ -18,23 +16,15 @@ VERTEX, START, END = range(3)  # what a particle is in a contact with one that i
 class Rim(Contact):
     """The geometry of Polygons: which vertex is beside, over or inside of which edge, and who takes part in that contact."""
 
-    _on_w: Any
-    _on_loop: Any
-    _on_met: Any
-    _on_back: Any
-    _on_h: Any
-    _on_less: Any
-    _on_ends: Any
-
     @ti.func
     def after(self, i):
         """The next particle around the body of particle i; -1 if it has none."""
-        return self._on_loop[i][0]
+        return self.dev.loop[i][0]
 
     @ti.func
     def before(self, i):
         """The one before."""
-        return self._on_loop[i][1]
+        return self.dev.loop[i][1]
 
     @ti.func
     def corner(self, v, a):
@@ -44,7 +34,7 @@ class Rim(Contact):
         """
         out = 1
         if self.after(a) >= 0:
-            r, u, w = self._on_state.apart(v, a), self._on_state.apart(self.after(a), a), self._on_state.apart(self.before(a), a)
+            r, u, w = self.dev.state.apart(v, a), self.dev.state.apart(self.after(a), a), self.dev.state.apart(self.before(a), a)
             if r.dot(u) > 0 or r.dot(w) > 0:
                 out = 0
             elif u.cross(w) < 0:
@@ -59,7 +49,7 @@ class Rim(Contact):
         already goes out over the nearest one that faces its own body, at push_out. moved: as in look().
         """
         b = self.after(a)
-        r, u = self._on_state.apart(v, a), self._on_state.apart(b, a)
+        r, u = self.dev.state.apart(v, a), self.dev.state.apart(b, a)
         uu, t = u.dot(u), 0 * r[0]
         overlap, n = t - 1, 0 * r
         if uu > 0:
@@ -69,8 +59,8 @@ class Rim(Contact):
             if height < 0:
                 came = height >= -SLACK * length
                 if ti.static(moved):
-                    d = self._on_state.d[a]
-                    r0, u0 = r - (self._on_state.d[v] - d), u - (self._on_state.d[b] - d)
+                    d = self.dev.state.d[a]
+                    r0, u0 = r - (self.dev.state.d[v] - d), u - (self.dev.state.d[b] - d)
                     height0, t0 = r0.dot(ti.Vector([u0[1], -u0[0]])) / length, r0.dot(u0) / ti.max(u0.dot(u0), uu * SLACK)
                     came = height0 >= -SLACK * length
                     if height0 > 0:
@@ -82,14 +72,14 @@ class Rim(Contact):
                     height, shared = -r.norm(), self.before(a)
                     n = r / ti.min(height, -uu * TINY)
             t = ti.min(ti.max(t, 0), 1)
-            far = self._on_radius.of(v) + (1 - t) * self._on_radius.of(a) + t * self._on_radius.of(b)
+            far = self.dev.radius.of(v) + (1 - t) * self.dev.radius.of(a) + t * self.dev.radius.of(b)
             if beside and height < far and height >= -length / 2:
                 out, back = far - height, 0 * r
                 if ti.static(moved):
-                    out -= self._on_less[v]
+                    out -= self.dev.less[v]
                 if not came:
                     if ti.static(moved):
-                        out = ti.min(out, self.push_out * self._on_h[None] - self.relative(self._on_state.d, v, a, b, t).dot(n))
+                        out = ti.min(out, self.push_out * self.dev.h[None] - self.relative(self.dev.state.d, v, a, b, t).dot(n))
                         back = self.inward(v)
                     if back.dot(n) >= 0 and self.inside(v, a):
                         came = self.nearest(v, a, shared, height, back)
@@ -103,11 +93,11 @@ class Rim(Contact):
 
         What is behind one edge may be in front of the next, where they meet at less than 90 degrees.
         """
-        out, k, r = False, a, self._on_state.apart(a, v)
+        out, k, r = False, a, self.dev.state.apart(a, v)
         going = True
         while going:
             k = self.after(k)
-            s = self._on_state.apart(k, v)
+            s = self.dev.state.apart(k, v)
             up = s[1] > 0
             if (r[1] > 0) != up and (r.cross(s) > 0) == up:
                 out = not out
@@ -117,9 +107,9 @@ class Rim(Contact):
     @ti.func
     def inward(self, v):
         """The way from an outer corner v into its own body; 0 where there is none."""
-        out = 0 * self._on_state.x[v]
+        out = 0 * self.dev.state.x[v]
         if self.after(v) >= 0:
-            u, w = self._on_state.apart(self.after(v), v), self._on_state.apart(self.before(v), v)
+            u, w = self.dev.state.apart(self.after(v), v), self.dev.state.apart(self.before(v), v)
             if u.cross(w) > 0:
                 out = u * w.norm() + w * u.norm()
         return out
@@ -131,10 +121,10 @@ class Rim(Contact):
         Edges that face away from the body of v, which lies in the direction `back`, are no way out for it.
         """
         out = True
-        for e in range(self._on_grid.first[v], self._on_grid.first[v] + self._on_grid.number[v]):
-            j = self._on_grid.near[e]
-            if j != a and j != shared and self._on_loop[j][2] == self._on_loop[a][2]:
-                r, u = self._on_state.apart(v, j), self._on_state.apart(self.after(j), j)
+        for e in range(self.dev.grid.first[v], self.dev.grid.first[v] + self.dev.grid.number[v]):
+            j = self.dev.grid.near[e]
+            if j != a and j != shared and self.dev.loop[j][2] == self.dev.loop[a][2]:
+                r, u = self.dev.state.apart(v, j), self.dev.state.apart(self.after(j), j)
                 uu, faces = u.dot(u), u[1] * back[0] - u[0] * back[1] >= 0
                 if uu > 0:
                     r -= ti.min(ti.max(r.dot(u) / uu, 0), 1) * u
@@ -150,41 +140,41 @@ class Rim(Contact):
         moved: in a substep, by how particles moved in it, and without the overlap that is allowed. Otherwise by where they are
         and the nearest edges: before the first substep after a start, d is the velocity.
         """
-        for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
-            j = self._on_grid.near[e]
-            overlap, n, t = 0 * self._on_w.of(i) - 1, 0 * self._on_state.x[i], 0 * self._on_w.of(i)
+        for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
+            j = self.dev.grid.near[e]
+            overlap, n, t = 0 * self.dev.w.of(i) - 1, 0 * self.dev.state.x[i], 0 * self.dev.w.of(i)
             front = self.corner(i, j)
             if self.after(j) >= 0:
                 overlap, n, t = self.edge(i, j, front, moved)
             if overlap <= 0 and i < j and front > 0:
-                overlap, n = self.touch(i, j, self._on_radius.of(i) + self._on_radius.of(j))
+                overlap, n = self.touch(i, j, self.dev.radius.of(i) + self.dev.radius.of(j))
                 if ti.static(moved):
-                    overlap -= self._on_less[i]
+                    overlap -= self.dev.less[i]
                 if overlap > 0:
                     t = 0 * t - 1
                     if self.corner(j, i) <= 0:
                         overlap = -overlap
-            self._on_met.field[e] = ti.Vector([overlap, t, n[0], n[1]])
+            self.dev.met.field[e] = ti.Vector([overlap, t, n[0], n[1]])
             back = ti.Vector([self.find(j, i), -1])
             if self.before(i) >= 0:
                 back[1] = self.find(j, self.before(i))
-            self._on_back.field[e] = ti.cast(back, self.scene.real)
+            self.dev.back.field[e] = ti.cast(back, self.scene.real)
 
     @ti.func
     def find(self, v, a):
         """Where a is in the list of v, counted from its begin; -1 if it is not."""
-        low, end = self._on_grid.first[v], self._on_grid.first[v] + self._on_grid.number[v]
+        low, end = self.dev.grid.first[v], self.dev.grid.first[v] + self.dev.grid.number[v]
         high = end
         while low < high:
             middle = (low + high) // 2
-            if self._on_grid.near[middle] < a:
+            if self.dev.grid.near[middle] < a:
                 low = middle + 1
             else:
                 high = middle
         out = -1
         if low < end:
-            if self._on_grid.near[low] == a:
-                out = low - self._on_grid.first[v]
+            if self.dev.grid.near[low] == a:
+                out = low - self.dev.grid.first[v]
         return out
 
     @ti.func
@@ -194,18 +184,18 @@ class Rim(Contact):
         Returns the entry that keeps it (-1: there is none), its particles v, a, b, where on the edge, and the part of its move
         that is that of i: 1, -(1 - t) or -t. Two discs are an edge of which only the start is touched.
         """
-        j = self._on_grid.near[e]
+        j = self.dev.grid.near[e]
         at, v, a = e, i, j
         if role != VERTEX:
-            back = self._on_back.field[e]
+            back = self.dev.back.field[e]
             v, a, at = j, i, ti.cast(back[0], ti.i32)
             if role == END:
                 a, at = self.before(i), ti.cast(back[1], ti.i32)
             if at >= 0:
-                at += self._on_grid.first[j]
-        b, t, part = a, 0 * self._on_w.of(i), 0 * self._on_w.of(i) + 1
+                at += self.dev.grid.first[j]
+        b, t, part = a, 0 * self.dev.w.of(i), 0 * self.dev.w.of(i) + 1
         if at >= 0:
-            t = self._on_met.field[at][1]
+            t = self.dev.met.field[at][1]
             if t >= 0:
                 b = self.after(a)
             elif role == END:
@@ -226,15 +216,15 @@ class Rim(Contact):
 
     def found(self, x: np.ndarray, h: float) -> Contacts:
         """Vertices and edges, and pairs of discs, by what look() found last; also those that were pushed apart since."""
-        grid, r = self._on_grid, self.scene.particles.radius
+        grid, r = self.dev.grid, self.scene.particles.radius
         pairs, at = grid.entries()
-        met, push = grid.read(self._on_met, at), grid.read(self._on_given, at)
+        met, push = grid.read(self.dev.met, at), grid.read(self.dev.given, at)
         some = (met[:, 0] > 0) | (push > 0)
         pairs, met, push = pairs[some], met[some], push[some]
         (i, j), overlap, t, n = pairs.T, met[:, 0], met[:, 1], met[:, 2:]
         parted, no_way = overlap <= 0, (n == 0).all(axis=1)
         discs = (t < 0) | (no_way & (r[i] + r[j] > 0))
-        ends, t = np.where(discs, j, self._on_ends[j, 0]), np.where(discs, 0.0, t)
+        ends, t = np.where(discs, j, self.dev.ends[j, 0]), np.where(discs, 0.0, t)
         edge, apart = x[ends] - x[j], x[i] - (1 - t)[:, None] * x[j] - t[:, None] * x[ends]
         straight = np.where(discs[:, None], apart, np.stack([edge[:, 1], -edge[:, 0]], axis=1))
         n = np.where(no_way[:, None], straight / np.linalg.norm(straight, axis=1)[:, None], n)
@@ -251,8 +241,8 @@ class Apart:
 
     def __init__(self, rim: Rim):
         self.table: Table = rim.table
-        self.loop = rim._on_loop
-        self.radius = rim._on_radius
+        self.loop = rim.dev.loop
+        self.radius = rim.dev.radius
 
     @ti.func
     def reach(self, radius: ti.template(), i, j):  # type: ignore[valid-type]

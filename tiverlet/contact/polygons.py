@@ -45,7 +45,6 @@ class Polygons(Rim):
     measures, calms = True, False
     room = 64  # the particles of near bodies
     groups: Any = None  # all touch
-    _on_store: Any = None
 
     def __init__(self, loops: Iterable, friction=0.0, restitution=0.0, *, skin="auto", push_out=1.0):
         Contact.__init__(self, friction, restitution, skin=skin, push_out=push_out)
@@ -56,17 +55,17 @@ class Polygons(Rim):
         if particles.dim != 2:
             raise ValueError("Polygons: bodies of particle loops are for 2D worlds; these particles are in 3D.")
         n, x = particles.count, particles.position
-        self._on_ends, self._on_body, length = laid(self.loops, x)
-        refuse_deep(self.loops, self._on_body, x, 0)
+        self.dev.ends, self.dev.body, length = laid(self.loops, x)
+        refuse_deep(self.loops, self.dev.body, x, 0)
         # Two particles are listed when their reaches add up: a vertex with both ends of an edge that it is beside.
-        self._on_length = length
+        self.dev.length = length
         far = 1.5 * STRETCH * length
         share = median(far[far > 0]) / 2 if self.loops else 0.0
-        self._on_cover = particles.radius + np.maximum(share, far - share)
-        loops = self._on_body >= 0
-        self._on_reach = float(length[loops].min(initial=np.inf)) / 4
-        self._on_size = 0.15 * median(self._on_cover) if self.skin == "auto" else float(self.skin)
-        self._on_finest = float(self._on_cover.min(initial=np.inf))
+        self.dev.cover = particles.radius + np.maximum(share, far - share)
+        loops = self.dev.body >= 0
+        self.dev.reach = float(length[loops].min(initial=np.inf)) / 4
+        self.dev.size = 0.15 * median(self.dev.cover) if self.skin == "auto" else float(self.skin)
+        self.dev.finest = float(self.dev.cover.min(initial=np.inf))
         self.table = self.wanted
         self.matters = n > 0 and bool(self.loops or (particles.radius > 0).any())
         if self.matters:
@@ -75,7 +74,7 @@ class Polygons(Rim):
     def admit(self, particles: Particles, first: int) -> None:
         """Refuse positions too far out, or inside of bodies."""
         super().admit(particles, first)
-        refuse_deep(self.loops, self._on_body, particles.position, first)
+        refuse_deep(self.loops, self.dev.body, particles.position, first)
 
     def renumber(self, number: np.ndarray, count: int) -> None:
         """Bodies stay as long as all of their particles do."""
@@ -86,38 +85,38 @@ class Polygons(Rim):
     def join(self, scene: Scene, batches: list[Batch], team: Team) -> Grid:
         """Declare the fields, among them the grid's, which lists particles by their reach."""
         n, p, add = scene.particles.count, scene.particles, scene.memory.field
-        self.scene, self._on_state, self._on_radius, self._on_w = scene, scene.state, scene.radius, scene.state.w
-        self._on_rubs, self._on_bounces = self.rubs, self.bounces
-        self._on_eases = True
-        self._on_move = add("Contact.move", n, width=2)
-        self._on_active = add("Contact.active", n, kind=ti.i32)
-        self._on_bond = add("Contact.bond", n, width=2, state=True)
-        self._on_before = add("Contact.before", n, width=2)
-        self._on_fast = add("Contact.fast", None, kind=ti.i32)
+        self.scene, self.dev.state, self.dev.radius, self.dev.w = scene, scene.state, scene.radius, scene.state.w
+        self.dev.rubs, self.dev.bounces = self.rubs, self.bounces
+        self.dev.eases, self.dev.store, self.dev.skips = True, None, False
+        self.dev.move = add("Contact.move", n, width=2)
+        self.dev.active = add("Contact.active", n, kind=ti.i32)
+        self.dev.bond = add("Contact.bond", n, width=2, state=True)
+        self.dev.before = add("Contact.before", n, width=2)
+        self.dev.fast = add("Contact.fast", None, kind=ti.i32)
         if self.bounces:
-            self._on_struck = add("Contact.struck", n, kind=ti.i32)
-            self._on_kick = add("Contact.kick", n, width=2)
-            self._on_lift = add("Contact.lift", n, width=2)
-            self._on_hit = add("Contact.hit", None, kind=ti.i32)
-        self._on_loop = add("Polygons.loop", n, width=3, kind=ti.i32, values=np.c_[self._on_ends, self._on_body])
-        self._on_limit = add("Polygons.longest_edge", n, values=STRETCH * self._on_length)
-        self._on_less = add("Polygons.allowed", n, state=True)
-        self._on_h = add("Polygons.substep", None)
+            self.dev.struck = add("Contact.struck", n, kind=ti.i32)
+            self.dev.kick = add("Contact.kick", n, width=2)
+            self.dev.lift = add("Contact.lift", n, width=2)
+            self.dev.hit = add("Contact.hit", None, kind=ti.i32)
+        self.dev.loop = add("Polygons.loop", n, width=3, kind=ti.i32, values=np.c_[self.dev.ends, self.dev.body])
+        self.dev.limit = add("Polygons.longest_edge", n, values=STRETCH * self.dev.length)
+        self.dev.less = add("Polygons.allowed", n, state=True)
+        self.dev.h = add("Polygons.substep", None)
         self.table.bind(scene, asked=True)
-        cover: Any = SimpleNamespace(count=n, dim=2, position=p.position, radius=self._on_cover, group=p.group)
-        reach = replace(scene, particles=cover, radius=Radii(scene.memory, self._on_cover))
+        cover: Any = SimpleNamespace(count=n, dim=2, position=p.position, radius=self.dev.cover, group=p.group)
+        reach = replace(scene, particles=cover, radius=Radii(scene.memory, self.dev.cover))
         pairs = [f.partners(f.start) for f in batches]
         linked = np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=np.int32)
         # For each entry the contact of which its particle is the vertex: overlap, place on the edge (-1: discs), normal; where
         # in the list of the other particle those are in which it is the start, and the end, of the edge (-1: nowhere).
-        self._on_met, self._on_back = Luggage("met", 4, False, kept=False), Luggage("back", 2, False, kept=False)
-        self._on_slip, self._on_aim = Luggage("slip", 2, lasting=True), Luggage("aim", 2, lasting=False)
-        self._on_given = Luggage("given", 0, lasting=True)  # pushes and blows in the last substep [kg m]
-        luggage = [self._on_met, self._on_back, self._on_given, *([self._on_slip] if self.rubs else [])]
-        luggage += [self._on_aim] if self.bounces else []
+        self.dev.met, self.dev.back = Luggage("met", 4, False, kept=False), Luggage("back", 2, False, kept=False)
+        self.dev.slip, self.dev.aim = Luggage("slip", 2, lasting=True), Luggage("aim", 2, lasting=False)
+        self.dev.given = Luggage("given", 0, lasting=True)  # pushes and blows in the last substep [kg m]
+        luggage = [self.dev.met, self.dev.back, self.dev.given, *([self.dev.slip] if self.rubs else [])]
+        luggage += [self.dev.aim] if self.bounces else []
         apart: Any = Apart(self)
-        self._on_grid = Grid(reach, self._on_size, linked, apart, luggage, team, self._on_move)
-        return self._on_grid
+        self.dev.grid = Grid(reach, self.dev.size, linked, apart, luggage, team, self.dev.move)
+        return self.dev.grid
 
     def ease(self) -> None:
         """The field is there from the start."""
@@ -126,25 +125,25 @@ class Polygons(Rim):
     def shrink(self, i, first):
         """Allow particle i the overlap that it has as a vertex, as far as particles from number `first` on have to do with it."""
         self.look(i, False)
-        less = ti.select(first > 0, self._on_less[i], 0 * self._on_w.of(i))
-        for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
-            if ti.max(i, self._on_grid.near[e]) >= first:
-                less = ti.max(less, self._on_met.field[e][0])
-        self._on_less[i] = less
+        less = ti.select(first > 0, self.dev.less[i], 0 * self.dev.w.of(i))
+        for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
+            if ti.max(i, self.dev.grid.near[e]) >= first:
+                less = ti.max(less, self.dev.met.field[e][0])
+        self.dev.less[i] = less
 
     @ti.func
     def grow(self, i, h):
         """Allow particle i less, and keep the length of the substep at hand."""
         if i == 0:
-            self._on_h[None] = h
-        self._on_less[i] = ti.max(self._on_less[i] - self.push_out * h, 0)
+            self.dev.h[None] = h
+        self.dev.less[i] = ti.max(self.dev.less[i] - self.push_out * h, 0)
 
     @ti.func
     def overshoots(self, i):
         """1 if particle i crosses a quarter of an edge in one substep."""
-        d, limit = self._on_state.d[i], ti.cast(self._on_reach, self.scene.real)
+        d, limit = self.dev.state.d[i], ti.cast(self.dev.reach, self.scene.real)
         if self.after(i) < 0:
-            limit = ti.min(limit, self._on_radius.stride(i) if ti.static(self._on_radius.least > 0) else limit)
+            limit = ti.min(limit, self.dev.radius.stride(i) if ti.static(self.dev.radius.least > 0) else limit)
         return ti.select(d.dot(d) <= limit * limit, 0, 1)
 
     @ti.func
@@ -153,77 +152,77 @@ class Polygons(Rim):
         self.look(i, True)
         after = self.after(i)
         if after >= 0:
-            u = self._on_state.apart(after, i)
-            if u.dot(u) > self._on_limit[i] ** 2:
+            u = self.dev.state.apart(after, i)
+            if u.dot(u) > self.dev.limit[i] ** 2:
                 self.heed(0, 1)
 
     @ti.func
     def split(self, count: ti.template(), v, a, b, t):  # type: ignore[valid-type]
         """The mass-split weight of a contact."""
-        at_a, at_b = (1 - t) * (1 - t) * count[a] * self._on_w.of(a), t * t * count[b] * self._on_w.of(b)
-        return count[v] * self._on_w.of(v) + at_a + at_b
+        at_a, at_b = (1 - t) * (1 - t) * count[a] * self.dev.w.of(a), t * t * count[b] * self.dev.w.of(b)
+        return count[v] * self.dev.w.of(v) + at_a + at_b
 
     @ti.func
     def alone(self, v, a, b, t):
         """The weight of a contact that is the only one."""
-        return self._on_w.of(v) + (1 - t) * (1 - t) * self._on_w.of(a) + t * t * self._on_w.of(b)
+        return self.dev.w.of(v) + (1 - t) * (1 - t) * self.dev.w.of(a) + t * t * self.dev.w.of(b)
 
     @ti.func
     def count(self, begin, end):
         """How many contacts some particles are in."""
         for i in range(begin, end):
             active = 0
-            for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
+            for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
                 for role in range(3):
                     at, _, _, _, _, _ = self.meeting(i, e, role)
                     if at >= 0:
-                        if self._on_met.field[at][0] > 0:
+                        if self.dev.met.field[at][0] > 0:
                             active += 1
-            self._on_active[i] = active
+            self.dev.active[i] = active
 
     @ti.func
     def relax(self, i, first, fresh, final):
         """What the contacts of particle i want of it."""
-        total, lifts, bond = 0 * self._on_state.x[i], 0 * self._on_state.x[i], 0 * self._on_state.x[i]
-        for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
+        total, lifts, bond = 0 * self.dev.state.x[i], 0 * self.dev.state.x[i], 0 * self.dev.state.x[i]
+        for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
             if first != 0:
-                self._on_given.field[e] = 0
-                if ti.static(self._on_bounces):
-                    self._on_aim.field[e] = 0 * self._on_aim.field[e]
+                self.dev.given.field[e] = 0
+                if ti.static(self.dev.bounces):
+                    self.dev.aim.field[e] = 0 * self.dev.aim.field[e]
             for role in range(3):
                 at, v, a, b, t, part = self.meeting(i, e, role)
                 if at >= 0:
-                    met = self._on_met.field[at]
+                    met = self.dev.met.field[at]
                     overlap, n = met[0], ti.Vector([met[2], met[3]])
                     if overlap > 0:
-                        d, shared = self.relative(self._on_state.d, v, a, b, t), self.split(self._on_active, v, a, b, t)
-                        share, kick = part * self._on_w.of(i) / shared, 0 * overlap
+                        d, shared = self.relative(self.dev.state.d, v, a, b, t), self.split(self.dev.active, v, a, b, t)
+                        share, kick = part * self.dev.w.of(i) / shared, 0 * overlap
                         back = overlap  # what is taken back of the position and of the displacement
-                        if ti.static(self._on_bounces):
+                        if ti.static(self.dev.bounces):
                             if first != 0:
                                 aim, kick, lift = self.leap(v, a, b, t, n, overlap, d.dot(n))
                                 if kick > 0:
                                     lifts += share * (overlap + lift) * n
                                     back = 0 * overlap
-                                    self._on_hit[None] = 1
+                                    self.dev.hit[None] = 1
                                     if role == VERTEX:
-                                        self._on_aim.field[e] = aim * n
+                                        self.dev.aim.field[e] = aim * n
                         if role == VERTEX:
-                            self._on_given.field[e] = self._on_given.field[e] + back / shared
+                            self.dev.given.field[e] = self.dev.given.field[e] + back / shared
                         want = back * n
-                        if ti.static(self._on_rubs):
-                            want -= self.held(v, a, n, overlap + kick, self._on_slip.field[at] + d)
+                        if ti.static(self.dev.rubs):
+                            want -= self.held(v, a, n, overlap + kick, self.dev.slip.field[at] + d)
                         total += share * want
                         if final != 0:
-                            came = -self.relative(self._on_before, v, a, b, t).dot(n)
+                            came = -self.relative(self.dev.before, v, a, b, t).dot(n)
                             bond += self.steady(came, overlap * self.alone(v, a, b, t) / shared) * share * want
-        self._on_move[i] = total
+        self.dev.move[i] = total
         if final != 0:
             self.sum_up(i, bond, first)
-        if ti.static(self._on_bounces):
+        if ti.static(self.dev.bounces):
             if first != 0:
-                self._on_lift[i] = lifts
-                self._on_struck[i] = self._on_active[i]
+                self.dev.lift[i] = lifts
+                self.dev.struck[i] = self.dev.active[i]
 
     @ti.func
     def push_bond(self, i):
@@ -232,22 +231,22 @@ class Polygons(Rim):
     @ti.func
     def bond(self, i):
         """Pushes, and friction."""
-        return self._on_bond[i]
+        return self.dev.bond[i]
 
     @ti.func
     def gather(self, i, first):
         """Move particle i as its contacts want; what bounced goes where it is at the end of the substep."""
-        if self._on_w.of(i) > 0:
-            if self._on_active[i] > 0:
-                self._on_state.shift(i, self._on_move[i])
-            if ti.static(self._on_bounces):
+        if self.dev.w.of(i) > 0:
+            if self.dev.active[i] > 0:
+                self.dev.state.shift(i, self.dev.move[i])
+            if ti.static(self.dev.bounces):
                 if first != 0:
-                    self._on_state.advance(i, self._on_lift[i])
+                    self.dev.state.advance(i, self.dev.lift[i])
 
     @ti.func
     def leap(self, v, a, b, t, n, overlap, leaving):
         """Contact.bounce, for a vertex and an edge."""
-        before = self._on_state.before[v] - (1 - t) * self._on_state.before[a] - t * self._on_state.before[b]
+        before = self.dev.state.before[v] - (1 - t) * self.dev.state.before[a] - t * self.dev.state.before[b]
         approach, restitution = -before.dot(n), self.table.of(v, a)[2]
         aim, kick, lift = restitution * ti.max(approach, 0), 0 * overlap, 0 * overlap
         if approach > 0:
@@ -268,44 +267,44 @@ class Polygons(Rim):
     @ti.func
     def rebound(self, i):
         """One Jacobi pass over displacements alone: what the contacts of particle i that bounce lack."""
-        total = 0 * self._on_state.x[i]
-        if self._on_struck[i] > 0:
-            for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
+        total = 0 * self.dev.state.x[i]
+        if self.dev.struck[i] > 0:
+            for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
                 for role in range(3):
                     at, v, a, b, t, part = self.meeting(i, e, role)
                     if at >= 0:
-                        aim = self._on_aim.field[at]
+                        aim = self.dev.aim.field[at]
                         size = aim.norm()
                         if size > 0:
                             n = aim / size
-                            lack = size - self.relative(self._on_state.d, v, a, b, t).dot(n)
+                            lack = size - self.relative(self.dev.state.d, v, a, b, t).dot(n)
                             if lack > 0:
-                                shared = self.split(self._on_struck, v, a, b, t)
-                                self._on_hit[None] = 1
-                                total += part * self._on_w.of(i) * lack / shared * n
+                                shared = self.split(self.dev.struck, v, a, b, t)
+                                self.dev.hit[None] = 1
+                                total += part * self.dev.w.of(i) * lack / shared * n
                                 if role == VERTEX:
-                                    self._on_given.field[e] = self._on_given.field[e] + lack / shared
-        self._on_kick[i] = total
+                                    self.dev.given.field[e] = self.dev.given.field[e] + lack / shared
+        self.dev.kick[i] = total
 
     @ti.func
     def part_ways(self, i):
         """Change the displacement of particle i, and the one before the substep with it."""
-        self._on_state.d[i] = self._on_state.d[i] + self._on_kick[i]
-        self._on_state.before[i] = self._on_state.before[i] + self._on_kick[i]
+        self.dev.state.d[i] = self.dev.state.d[i] + self.dev.kick[i]
+        self.dev.state.before[i] = self.dev.state.before[i] + self.dev.kick[i]
 
     @ti.func
     def remember(self, i):
         """At the end of a substep: add to the slip of each contact what it has moved, as far as friction can hold it."""
-        if ti.static(self._on_rubs):
-            for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
-                slip = 0 * self._on_state.x[i]
+        if ti.static(self.dev.rubs):
+            for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
+                slip = 0 * self.dev.state.x[i]
                 at, v, a, b, t, _ = self.meeting(i, e, VERTEX)
                 if at >= 0:
-                    met = self._on_met.field[at]
+                    met = self.dev.met.field[at]
                     if met[0] > 0:
                         n = ti.Vector([met[2], met[3]])
-                        slip = self.held(v, a, n, met[0], self._on_slip.field[e] + self.relative(self._on_state.d, v, a, b, t))
-                self._on_slip.field[e] = slip
+                        slip = self.held(v, a, n, met[0], self.dev.slip.field[e] + self.relative(self.dev.state.d, v, a, b, t))
+                self.dev.slip.field[e] = slip
 
     @ti.func
     def overlaps(self, i):
@@ -315,14 +314,14 @@ class Polygons(Rim):
         """
         touching, worst = 0, ti.cast(0, ti.f64)
         self.look(i, False)
-        for e in range(self._on_grid.first[i], self._on_grid.first[i] + self._on_grid.number[i]):
-            j, met = self._on_grid.near[e], self._on_met.field[e]
+        for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
+            j, met = self.dev.grid.near[e], self.dev.met.field[e]
             if met[0] > 0:
-                size = ti.min(self._on_radius.of(i), self._on_radius.of(j))
+                size = ti.min(self.dev.radius.of(i), self.dev.radius.of(j))
                 if met[1] >= 0:
-                    size = self._on_state.apart(self.after(j), j).norm() / 2
+                    size = self.dev.state.apart(self.after(j), j).norm() / 2
                 elif size == 0:
-                    size = ti.max(self._on_radius.of(i), self._on_radius.of(j))
+                    size = ti.max(self.dev.radius.of(i), self.dev.radius.of(j))
                 worst = ti.max(worst, met[0] / size)
                 touching += 1
         return touching, worst

@@ -26,8 +26,8 @@ class Calm:
 
     def __init__(self, contact: Any, pieces: int):
         scene = contact.scene
-        self.contact, self.grid, self.state = contact, contact._on_grid, scene.state
-        self.change = contact._on_move  # is free at the end of a substep
+        self.contact, self.grid, self.state = contact, contact.dev.grid, scene.state
+        self.change = contact.dev.move  # is free at the end of a substep
         # So is what is put aside while lists are built: here for the loaded pairs of each particle, how many they are, and for
         # those who have any, piece by piece.
         self.number, self.loaded = self.grid.old_number, self.grid.old_first
@@ -37,10 +37,10 @@ class Calm:
     @ti.func
     def bears(self, i, e):
         """Whether entry e in the list of particle i is a pair that bears a load."""
-        out = self.contact._on_push.field[e] > 0
-        if ti.static(self.contact._on_bounces):
-            if self.contact._on_struck[i] > 0:
-                out = out and self.contact._on_blow.field[e] == 0
+        out = self.contact.dev.push.field[e] > 0
+        if ti.static(self.contact.dev.bounces):
+            if self.contact.dev.struck[i] > 0:
+                out = out and self.contact.dev.blow.field[e] == 0
         return out
 
     @ti.func
@@ -48,7 +48,7 @@ class Calm:
         """Put aside the loaded pairs of particle i, each with what all passes multiply by; returns how many there are."""
         first, w = self.grid.first[i], self.state.w.of(i)
         at = first
-        if self.contact._on_split[i] > 0:
+        if self.contact.dev.split[i] > 0:
             for word in range(self.grid.words(i)):
                 # Not touches(): the pair may have parted in this pass, and both of it have to agree.
                 bits = ti.select(word == 0, self.grid.touching[i], self.grid.whole(i, word))
@@ -60,9 +60,9 @@ class Calm:
                         r = self.state.apart(i, j)
                         rr = r.dot(r)
                         if rr > 0:
-                            shared = self.contact._on_split[i] + self.contact._on_split[j]
+                            shared = self.contact.dev.split[i] + self.contact.dev.split[j]
                             self.grid.aside[at] = j
-                            self.contact._on_push.aside[at] = w / (rr * shared)
+                            self.contact.dev.push.aside[at] = w / (rr * shared)
                             at += 1
         return at - first
 
@@ -85,7 +85,7 @@ class Calm:
         for e in range(first, first + self.number[i]):
             j = self.grid.aside[e]
             r = self.state.apart(i, j)
-            want -= self.contact._on_push.aside[e] * (self.state.d[i] - self.state.d[j]).dot(r) * r
+            want -= self.contact.dev.push.aside[e] * (self.state.d[i] - self.state.d[j]).dot(r) * r
         if ti.static(self.state.leans):
             lean = self.state.lean[i]
             size = lean.dot(lean)

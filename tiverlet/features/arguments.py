@@ -34,8 +34,8 @@ class Knob:
     def __get__(self, feature, owner=None) -> Any:
         if feature is None:
             return self
-        if self.device and impl.inside_kernel() and self.device in feature.__dict__:
-            return at(feature.__dict__[self.device], None)
+        if self.device and impl.inside_kernel() and self.device in vars(feature.dev):
+            return at(vars(feature.dev)[self.device], None)
         if self.name not in feature.__dict__:
             raise AttributeError(f"{feature!r} has no {self.name}.")
         return feature.__dict__[self.name]

@@ -18,7 +18,9 @@ constraint are named in `each`, and what depends on where particles were is take
 anew around it (edit_scene.py).
 """
 
+import functools
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -66,6 +68,11 @@ class Feature(Noted):
     scene: Any = None  # Scene, from bind() on
     start: Any = None  # Particles, as they were when it came: what it takes from them is what it took then, when bound again too
 
+    @functools.cached_property
+    def dev(self) -> Any:
+        """What it has on the device while it is bound: fields, and constants of the kernels."""
+        return SimpleNamespace()
+
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the arguments against the particles; set inv_mass to 0 for those that this feature holds."""
 
@@ -95,7 +102,7 @@ class Feature(Noted):
 
         What once was compiled stays when a knob no longer needs it: friction of 0 where there was some costs no compiling.
         """
-        built = vars(self).get("_on_built")
+        built = vars(self.dev).get("built")
         return built is not None and built != self.compiled()
 
     def copy(self) -> "Feature":
@@ -107,7 +114,7 @@ class Feature(Noted):
 
     def release(self) -> None:
         """Forget the world that it acted in."""
-        for name in ["scene", "start", "changed", "moving", "new_force", *(k for k in vars(self) if k.startswith("_on_"))]:
+        for name in ("scene", "start", "changed", "moving", "new_force", "dev"):
             self.__dict__.pop(name, None)
 
     def spared(self, number: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -185,7 +192,7 @@ class Batch(Feature):
     @property
     def acts(self) -> bool:
         """Whether it is in a world, and on the device: some of its particles can move, or it drives them."""
-        return self.scene is not None and "_on_members" in vars(self)
+        return self.scene is not None and "members" in vars(self.dev)
 
     @property
     def broken(self) -> np.ndarray:
@@ -231,26 +238,26 @@ class Batch(Feature):
     def bind(self, scene: Scene) -> None:
         """Declare the particles and slots of each constraint."""
         self.scene = scene
-        self._on_state = scene.state
-        self._on_slots = scene.slots
-        self._on_w = scene.state.w
-        self._on_members = scene.memory.field(f"{self!r}.members", self.count, width=self.arity, kind=ti.i32, values=self.indices)
+        self.dev.state = scene.state
+        self.dev.slots = scene.slots
+        self.dev.w = scene.state.w
+        self.dev.members = scene.memory.field(f"{self!r}.members", self.count, width=self.arity, kind=ti.i32, values=self.indices)
         if not self.drives:
-            self._on_places = scene.memory.field(
+            self.dev.places = scene.memory.field(
                 f"{self!r}.slots", self.count, width=self.arity, kind=ti.i32, values=scene.slots.places(self)
             )
 
     @inline
     def member(self, c, k):
         """The particle at corner k of constraint c."""
-        return at(at(self._on_members, c), k)
+        return at(at(self.dev.members, c), k)
 
     @ti.func
     def push(self, c, k: ti.template(), move):  # type: ignore[valid-type]
         """Write the move of corner k into its slot; a particle that cannot move has none."""
-        place = self._on_places[c][k]
+        place = self.dev.places[c][k]
         if place >= 0:
-            self._on_slots.move[place] = move
+            self.dev.slots.move[place] = move
 
     @ti.func
     def relax(self, c, h, hh, when, first, fresh):

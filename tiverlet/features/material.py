@@ -84,22 +84,22 @@ class Table:
         if self.uniform:
             rows = rows[:1]
         else:
-            self._on_rank = scene.memory.field("Contact.group", len(rank), kind=ti.i32, values=rank)
+            self.rank = scene.memory.field("Contact.group", len(rank), kind=ti.i32, values=rank)
         if self.rubs or self.bounces or not self.uniform or asked:
-            self._on_table = scene.memory.field("Contact.table", len(rows), width=4, values=rows)
+            self.entries = scene.memory.field("Contact.table", len(rows), width=4, values=rows)
 
     def upload(self, scene: Scene, other: "Table") -> None:
         """Write the values of another table, for the same kernels."""
-        if "_on_table" in vars(self):
-            scene.memory.write(self._on_table, other.rows(scene.particles.group)[1][: 1 if self.uniform else None])
+        if "entries" in vars(self):
+            scene.memory.write(self.entries, other.rows(scene.particles.group)[1][: 1 if self.uniform else None])
 
     @ti.func
     def of(self, i, j):
         """Static friction, dynamic friction and restitution of particles i and j, and 1 if they touch."""
         row = 0
         if ti.static(not self.uniform):
-            row = self._on_rank[i] * self.groups + self._on_rank[j]
-        return self._on_table[row]
+            row = self.rank[i] * self.groups + self.rank[j]
+        return self.entries[row]
 
     @inline
     def reach(self, radius, i, j):

@@ -32,31 +32,31 @@ class Attractor(Acceleration):
     def bind(self, scene: Scene) -> None:
         """Center and strength on the device."""
         self.scene = scene
-        self._on_center = scene.memory.field("Attractor.center", None, width=self.dim, values=self.center)
-        self._on_strength = scene.memory.field("Attractor.strength", None, values=self.strength)
+        self.dev.center = scene.memory.field("Attractor.center", None, width=self.dim, values=self.center)
+        self.dev.strength = scene.memory.field("Attractor.strength", None, values=self.strength)
         self.changed = False
 
     def upload(self) -> None:
         """Write both."""
-        self.scene.memory.write(self._on_center, self.center)
-        self.scene.memory.write(self._on_strength, self.strength)
+        self.scene.memory.write(self.dev.center, self.center)
+        self.scene.memory.write(self.dev.strength, self.strength)
 
     @ti.func
     def acceleration(self, i, x, v, t):
         """-strength r / |r|^3."""
-        r = x - self._on_center[None]
+        r = x - self.dev.center[None]
         rr = r.dot(r)
         out = 0 * r
         if rr > 0:
-            out = -self._on_strength[None] / (rr * ti.sqrt(rr)) * r
+            out = -self.dev.strength[None] / (rr * ti.sqrt(rr)) * r
         return out
 
     @ti.func
     def potential(self, i, x):
         """-strength / |r|."""
-        r = x - self._on_center[None]
+        r = x - self.dev.center[None]
         rr = r.dot(r)
         out = 0 * rr
         if rr > 0:
-            out = -self._on_strength[None] / ti.sqrt(rr)
+            out = -self.dev.strength[None] / ti.sqrt(rr)
         return out

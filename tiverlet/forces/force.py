@@ -54,12 +54,12 @@ class Force(Acceleration):
     def bind(self, scene: Scene) -> None:
         """No field of its own."""
         self.scene = scene
-        self._on_w, self._on_dim = scene.state.w, scene.particles.dim
+        self.dev.w, self.dev.dim = scene.state.w, scene.particles.dim
 
     @inline
     def force(self, value):
         """What the function returned, if it is a vector; as a number it would be added to all components."""
-        dim, name = self._on_dim, self.function.func.func.__name__
+        dim, name = self.dev.dim, self.function.func.func.__name__
         shape = (tuple(value.get_shape()) if value.is_tensor() else ()) if isinstance(value, Expr) else np.shape(value)
         if shape != (dim,):
             what = f"{shape[0]} components" if len(shape) == 1 else f"a matrix of shape {shape}" if shape else "a number"
@@ -78,4 +78,4 @@ class Force(Acceleration):
             out = self.force(self.function(x, v, t))
         else:
             out = self.force(self.function(x, v, t, i))
-        return self._on_w.of(i) * out
+        return self.dev.w.of(i) * out

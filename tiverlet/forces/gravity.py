@@ -36,7 +36,7 @@ class Gravity(Acceleration):
     def bind(self, scene: Scene) -> None:
         """One vector on the device."""
         self.scene = scene
-        self._on_g = scene.memory.field("Gravity.g", None, width=scene.particles.dim, values=self._vector())
+        self.dev.g = scene.memory.field("Gravity.g", None, width=scene.particles.dim, values=self._vector())
         self.changed = False
 
     def _vector(self) -> list[float]:
@@ -46,14 +46,14 @@ class Gravity(Acceleration):
 
     def upload(self) -> None:
         """Write g."""
-        self.scene.memory.write(self._on_g, self._vector())
+        self.scene.memory.write(self.dev.g, self._vector())
 
     @ti.func
     def acceleration(self, i, x, v, t):
         """g."""
-        return self._on_g[None]
+        return self.dev.g[None]
 
     @ti.func
     def potential(self, i, x):
         """-g . x."""
-        return -self._on_g[None].dot(x)
+        return -self.dev.g[None].dot(x)

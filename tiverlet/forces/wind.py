@@ -32,14 +32,14 @@ class Wind(Acceleration):
     def bind(self, scene: Scene) -> None:
         """One vector on the device: rate * velocity, the acceleration that is left when the drag is taken apart."""
         self.scene = scene
-        self._on_push = scene.memory.field("Wind.push", None, width=self.dim, values=self.rate * self.velocity)
+        self.dev.push = scene.memory.field("Wind.push", None, width=self.dim, values=self.rate * self.velocity)
         self.changed = False
 
     def upload(self) -> None:
         """Write rate * velocity."""
-        self.scene.memory.write(self._on_push, self.rate * self.velocity)
+        self.scene.memory.write(self.dev.push, self.rate * self.velocity)
 
     @ti.func
     def acceleration(self, i, x, v, t):
         """rate * velocity; the part -rate v is in `rate`."""
-        return self._on_push[None]
+        return self.dev.push[None]

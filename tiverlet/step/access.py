@@ -270,5 +270,5 @@ class Access:
     @property
     def _memories(self) -> list[Memory]:
         """The trees of fields: one from the start, others where a list or a need has grown."""
-        grown = [self._grid.store if self._grid else None, *(c._on_store for c in self._sub.contacts)]
+        grown = [self._grid.store if self._grid else None, *(c.dev.store for c in self._sub.contacts)]
         return [self._memory, *(m for m in grown if m)]

@@ -120,7 +120,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
         feature.bind(scene)
     for feature in features:
         feature.new_force = False  # it was given when it was made
-        vars(feature)["_on_built"] = feature.compiled() if not isinstance(feature, Batch) or feature.acts else None
+        feature.dev.built = feature.compiled() if not isinstance(feature, Batch) or feature.acts else None
     kind = Substep if scene.order == 2 else high_order.Composition
     substep = kind(scene, accelerations, batches, drivers, contact, grid, walls, team)
     survey = Survey(substep, solver)

@@ -106,8 +106,8 @@ def check(world: "World", kept: Kept, flagged: list[list[bool]]) -> None:
     pieces = {f"Contact.{piece.name}" for piece in world._grid.lasting} if world._grid else set()
     most = {"Contact.pairs": len(world.particles)}
     for f in world.features:
-        if hasattr(f, "_on_pieces"):  # of a Path
-            most |= {name: f._on_pieces for name in kept.values if name.startswith("Path.piece")}  # type: ignore[attr-defined]
+        if hasattr(f.dev, "pieces"):  # of a Path
+            most |= {name: f.dev.pieces for name in kept.values if name.startswith("Path.piece")}  # type: ignore[attr-defined]
     for name, value in kept.values.items():
         ours, free = present.values.get(name), name in pieces or name in ("Contact.pairs", "Contact.shrunk")
         shape = ours is None or ours.shape[free:] == value.shape[free:]
@@ -144,4 +144,4 @@ def transfer(old: "World", new: "World") -> None:
     new._guard.memory = kept.guard
     new.position, new.velocity = old.position, old.velocity
     for ours, theirs in zip(old._sub.breakers, new._sub.breakers, strict=True):
-        new._memory.write(theirs._on_broken, ours.stamps())
+        new._memory.write(theirs.dev.broken, ours.stamps())

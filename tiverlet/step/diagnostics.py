@@ -179,8 +179,8 @@ class Survey:
                     sheet[7] = ti.max(sheet[7], -low[k], high[k])
                     sheet[11 + k] = high[k] - low[k]
             for c in ti.static(self.contacts):
-                sheet[6] = c._on_fast[None]
-                c._on_fast[None] = 0
+                sheet[6] = c.dev.fast[None]
+                c.dev.fast[None] = 0
             if ti.static(len(self.sub.breakers) > 0):
                 sheet[8] = self.sub.slots.broken[None]
                 self.sub.slots.broken[None] = 0

@@ -202,7 +202,8 @@ def _carried(
 
 def _fields(attributes: dict[str, Any], names: dict[int, str]) -> dict[str, str]:
     """The attributes of a feature that are fields of the state, or the ends of a Track; and their names."""
-    fields = {key: getattr(value, "ends", value) for key, value in attributes.items() if key.startswith("_on_")}
+    bound = vars(attributes["dev"]) if "dev" in attributes else {}
+    fields = {key: getattr(value, "ends", value) for key, value in bound.items()}
     return {key: names[id(field)] for key, field in fields.items() if id(field) in names}
 
 
@@ -210,7 +211,7 @@ def _give_contacts(world: Any, contact: Contact, old: dict, number: np.ndarray, 
     """What pairs in contact remember, and how much smaller particles are than they will be."""
     if "Contact.shrunk" in old:
         contact.ease()
-        less: Any = contact._on_store
+        less: Any = contact.dev.store
         values = less.state()
         values["Contact.shrunk"][: some.sum()] = old["Contact.shrunk"][some]
         less.restore(values)

@@ -37,7 +37,7 @@ class Phases(Tiles):
         for system in self.systems:
             system.team, system.spread = team, self.stride
         self.hurries = bool(scene.slots) and scene.slots.accelerates
-        self.told = [b for b in self.batches if isinstance(b, Scalar) and b._on_told]
+        self.told = [b for b in self.batches if isinstance(b, Scalar) and b.dev.told]
         self.ragged = [b for b in self.batches if b.blocks]
         self.drivers = drivers
         self.hashes = bool(grid)
@@ -185,7 +185,7 @@ class Phases(Tiles):
                 self.team.wait()
                 ti.loop_config(serialize=True)
                 for _ in range(self.team.one(1, me)):
-                    c._on_hit[None] = 0
+                    c.dev.hit[None] = 0
                 self.team.wait()
                 for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
                     c.rebound(i)
@@ -219,7 +219,7 @@ class Phases(Tiles):
             if ti.static(c.bounces):
                 ti.loop_config(serialize=True)
                 for _ in range(self.team.one(1, me)):
-                    c._on_hit[None] = 0
+                    c.dev.hit[None] = 0
         self.team.wait()
 
     @ti.func
@@ -235,14 +235,14 @@ class Phases(Tiles):
                 begin, end = self.part(p, me)
                 piece = self.team.turn(p, 1, me)
                 if k == 0:
-                    c._on_calm.open(piece, begin, end)
-                for m in range(begin, begin + c._on_calm.count[piece]):
-                    c._on_calm.want(c._on_calm.loaded[m], k)
+                    c.dev.calm.open(piece, begin, end)
+                for m in range(begin, begin + c.dev.calm.count[piece]):
+                    c.dev.calm.want(c.dev.calm.loaded[m], k)
             self.team.wait()
             for p in range(self.team.deal(self.pieces, 1, me)):
                 begin, end = self.part(p, me)
-                for m in range(begin, begin + c._on_calm.count[self.team.turn(p, 1, me)]):
-                    c._on_calm.move(c._on_calm.loaded[m])
+                for m in range(begin, begin + c.dev.calm.count[self.team.turn(p, 1, me)]):
+                    c.dev.calm.move(c.dev.calm.loaded[m])
             self.team.wait()
 
     @ti.func
@@ -251,7 +251,7 @@ class Phases(Tiles):
         out = 0
         for c in ti.static(self.contacts):
             if ti.static(c.bounces):
-                out = c._on_hit[None]
+                out = c.dev.hit[None]
         return out
 
     @ti.func

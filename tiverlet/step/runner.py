@@ -126,7 +126,7 @@ class Launches(Access):
     def _ease(self, first: int) -> None:
         """Let particles part gently that the user put into each other, from number `first` on."""
         contact = self._sub.contacts[0]
-        if not contact._on_eases:
+        if not contact.dev.eases:
             contact.ease()
             self._renew()
         self._sub.shrunk(first)

@@ -43,13 +43,13 @@ class Tether(Batch):
     @property
     def soft(self) -> bool:
         """Whether any of them is a spring, or was when kernels were compiled."""
-        return bool(np.any(self.compliance > 0)) or vars(self).get("_on_soft", False)
+        return bool(np.any(self.compliance > 0)) or vars(self.dev).get("soft", False)
 
     def upload(self) -> None:
         """Write new stiffnesses."""
-        if self.acts and not self.drives and self._on_soft:
-            self.scene.memory.write(self._on_alpha, self.compliance)
-            self.scene.memory.write(self._on_damping, self.damping)
+        if self.acts and not self.drives and self.dev.soft:
+            self.scene.memory.write(self.dev.alpha, self.compliance)
+            self.scene.memory.write(self.dev.damping, self.damping)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check that the particles exist."""
@@ -62,15 +62,15 @@ class Tether(Batch):
     def bind(self, scene: Scene) -> None:
         """For what is not driven its multiplier, and for springs their memory."""
         super().bind(scene)
-        self._on_size, self._on_real, self._on_soft = self.start.size, scene.real, self.soft
+        self.dev.size, self.dev.real, self.dev.soft = self.start.size, scene.real, self.soft
         if not self.drives:
             name, m, dim, add = repr(self), self.count, scene.particles.dim, scene.memory.field
-            self._on_lam = add(f"{name}.multiplier", m, width=dim, state=True)
+            self.dev.lam = add(f"{name}.multiplier", m, width=dim, state=True)
             if self.soft:
-                self._on_alpha = add(f"{name}.compliance", m, values=self.compliance)
-                self._on_damping = add(f"{name}.damping", m, values=self.damping)
-                self._on_last = add(f"{name}.last", m, width=dim, values=self.begin(self.start.position), state=True)
-                self._on_history = add(f"{name}.history", m, width=dim)
+                self.dev.alpha = add(f"{name}.compliance", m, values=self.compliance)
+                self.dev.damping = add(f"{name}.damping", m, values=self.damping)
+                self.dev.last = add(f"{name}.last", m, width=dim, values=self.begin(self.start.position), state=True)
+                self.dev.history = add(f"{name}.history", m, width=dim)
 
     @property
     def load(self) -> np.ndarray:
@@ -84,86 +84,86 @@ class Tether(Batch):
         if not self.acts:
             return np.zeros((self.count, self.scene.particles.dim))
         scale = 1 / self.scene.hh if self.scene.hh else 0.0
-        return scale * self.scene.memory.read(self._on_lam)[: self.count].astype(np.float64)
+        return scale * self.scene.memory.read(self.dev.lam)[: self.count].astype(np.float64)
 
     @ti.func
     def offsets(self, c, when, first, fresh):
         """C at the end and at the start of the substep."""
-        zero = 0 * self._on_state.d[0]
+        zero = 0 * self.dev.state.d[0]
         return zero, zero
 
     @ti.func
     def present(self, c, back):
         """C at x - back d."""
-        return 0 * self._on_state.d[0]
+        return 0 * self.dev.state.d[0]
 
     @ti.func
     def change(self, c):
         """How far C changed in the last substep, by the motion of the particle."""
-        return self._on_state.d[self.member(c, 0)]
+        return self.dev.state.d[self.member(c, 0)]
 
     @ti.func
     def solve(self, c, h, hh, when, first, fresh):
         """Multiplier before and after, and the size of the violation that this removes."""
-        w = self._on_w.of(self.member(c, 0))
+        w = self.dev.w.of(self.member(c, 0))
         C, C0 = self.offsets(c, when, first, fresh)
-        lam, B = self._on_lam[c], 0 * C
+        lam, B = self.dev.lam[c], 0 * C
         if first != 0:
             lam = 0 * lam
         new, size = lam, 0 * w
         if w > 0:
             alpha, A = 0 * w, 1 + 0 * w
-            if ti.static(self._on_soft):
-                alpha = self._on_alpha[c] / hh
-                A, now, last = law(self._on_alpha[c], self._on_damping[c], h, w, fresh)
+            if ti.static(self.dev.soft):
+                alpha = self.dev.alpha[c] / hh
+                A, now, last = law(self.dev.alpha[c], self.dev.damping[c], h, w, fresh)
                 if first != 0:
-                    self._on_history[c] = now * C0 + last * self._on_last[c]
-                    self._on_last[c] = C0
-                B = self._on_history[c]
-            K = A * self._on_slots.split[self.member(c, 0)] + alpha
-            new = lam - self._on_slots.relaxation * (A * C + B + alpha * lam) / K
-            size = (new - lam).norm() * K / self._on_slots.relaxation
+                    self.dev.history[c] = now * C0 + last * self.dev.last[c]
+                    self.dev.last[c] = C0
+                B = self.dev.history[c]
+            K = A * self.dev.slots.split[self.member(c, 0)] + alpha
+            new = lam - self.dev.slots.relaxation * (A * C + B + alpha * lam) / K
+            size = (new - lam).norm() * K / self.dev.slots.relaxation
         return lam, new, size
 
     @ti.func
     def relax(self, c, h, hh, when, first, fresh):
         """Draw the particle to its place."""
         lam, new, size = self.solve(c, h, hh, when, first, fresh)
-        self._on_lam[c] = new
-        self.push(c, 0, self._on_w.of(self.member(c, 0)) * (new - lam))
+        self.dev.lam[c] = new
+        self.push(c, 0, self.dev.w.of(self.member(c, 0)) * (new - lam))
 
     @ti.func
     def kick(self, c, h):
         """As in Scalar, for each axis."""
-        move = 0 * self._on_state.d[0]
-        if ti.static(self._on_soft):
-            w, alpha = self._on_w.of(self.member(c, 0)), self._on_alpha[c]
+        move = 0 * self.dev.state.d[0]
+        if ti.static(self.dev.soft):
+            w, alpha = self.dev.w.of(self.member(c, 0)), self.dev.alpha[c]
             if w > 0 and alpha > 0:
                 C = self.present(c, 0)
                 rate = self.change(c) / h
-                move = -h * h * w * (1 - stiff(alpha, h, w)) * (C / alpha + self._on_damping[c] * rate)
+                move = -h * h * w * (1 - stiff(alpha, h, w)) * (C / alpha + self.dev.damping[c] * rate)
         self.push(c, 0, move)
 
     @ti.func
     def bond(self, c, firm, soft):
         """As in Scalar, for each axis."""
         scale = firm
-        if ti.static(self._on_soft):
-            scale = ti.select(self._on_alpha[c] > 0, soft, firm)
-        self.push(c, 0, scale * self._on_w.of(self.member(c, 0)) * self._on_lam[c])
+        if ti.static(self.dev.soft):
+            scale = ti.select(self.dev.alpha[c] > 0, soft, firm)
+        self.push(c, 0, scale * self.dev.w.of(self.member(c, 0)) * self.dev.lam[c])
 
     @ti.func
     def miss(self, c, h, hh, when, fresh):
         """What is left, relative to the size of the scene."""
         _, _, size = self.solve(c, h, hh, when, 0, fresh)
-        return size / self._on_size
+        return size / self.dev.size
 
     @ti.func
     def energy(self, c, back, hh, miss):
         """|C|^2 / (2 alpha)."""
         out = ti.cast(0, ti.f64)
-        if ti.static(self._on_soft):
-            alpha = self._on_alpha[c]
+        if ti.static(self.dev.soft):
+            alpha = self.dev.alpha[c]
             if alpha > 0:
                 C = self.present(c, back)
                 out = ti.cast(C.dot(C) / (2 * alpha), ti.f64)

@@ -47,23 +47,23 @@ class Clusters(Ragged, Breaking):
         """Write new stiffnesses, rates and strengths."""
         if self.acts:
             write = self.scene.memory.write
-            if self._on_soft:
-                write(self._on_alpha, self.compliance)
-                write(self._on_damping, self.damping)
-            if self._on_plastic:
-                write(self._on_creep, self.creep)
-                write(self._on_yield, self.yield_strain * self._radius)
+            if self.dev.soft:
+                write(self.dev.alpha, self.compliance)
+                write(self.dev.damping, self.damping)
+            if self.dev.plastic:
+                write(self.dev.creep, self.creep)
+                write(self.dev.yield_size, self.yield_strain * self._radius)
             self.upload_strength()
 
     @property
     def soft(self) -> bool:
         """Whether any cluster has compliance."""
-        return bool((self.compliance > 0).any()) or vars(self).get("_on_soft", False)
+        return bool((self.compliance > 0).any()) or vars(self.dev).get("soft", False)
 
     @property
     def transcends(self) -> bool:
         """Whether any cluster flows, at an exponential rate."""
-        return bool((self.creep > 0).any()) or vars(self).get("_on_plastic", False)
+        return bool((self.creep > 0).any()) or vars(self.dev).get("plastic", False)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Settle the shapes at rest, each about its center."""
@@ -97,57 +97,57 @@ class Clusters(Ragged, Breaking):
         """Shapes, rotations, sums; for soft clusters multipliers and the memory of the averaged constraint."""
         super().bind(scene)
         name, dim, m, add = repr(self), scene.state.dim, self.count, scene.memory.field
-        self._on_soft, self._on_plastic = self.soft, self.transcends
+        self.dev.soft, self.dev.plastic = self.soft, self.transcends
         w = scene.inv_mass[self.indices]
         mass = np.bincount(self.owner, weights=np.divide(1, w, where=w > 0, out=np.zeros_like(w)), minlength=m)
-        self._on_mass = add(f"{name}.mass", m, values=mass)
-        self._on_size = add(f"{name}.radius", m, values=np.maximum(self._radius, 1e-6 * self.start.size))
-        self._on_shape = add(f"{name}.shape", self.corner_count, width=dim, values=self._shape, state=self._on_plastic)
+        self.dev.mass = add(f"{name}.mass", m, values=mass)
+        self.dev.size = add(f"{name}.radius", m, values=np.maximum(self._radius, 1e-6 * self.start.size))
+        self.dev.shape = add(f"{name}.shape", self.corner_count, width=dim, values=self._shape, state=self.dev.plastic)
         turn = rotation.identity(dim)
-        self._on_pull = add(f"{name}.multiplier", self.corner_count, width=dim, state=True)
+        self.dev.pull = add(f"{name}.multiplier", self.corner_count, width=dim, state=True)
         self.bind_strength(scene)
-        self._on_turn = add(f"{name}.turn", m, width=len(turn), kind=ti.f64, values=[turn] * m, state=True)
-        self._on_pose = add(f"{name}.pose", m, width=dim * dim, kind=ti.f64)
-        self._on_place = add(f"{name}.place", m, width=dim, kind=ti.f64)
+        self.dev.turn = add(f"{name}.turn", m, width=len(turn), kind=ti.f64, values=[turn] * m, state=True)
+        self.dev.pose = add(f"{name}.pose", m, width=dim * dim, kind=ti.f64)
+        self.dev.place = add(f"{name}.place", m, width=dim, kind=ti.f64)
 
         def moment(what, width):
             return add(f"{name}.{what}", self.blocks, width=width, kind=ti.f64)
 
-        self._on_total = moment("total", 0)
-        self._on_p, self._on_q, self._on_s = moment("p", dim), moment("q", dim), moment("s", dim)
-        self._on_K, self._on_X = moment("K", dim * dim), moment("X", dim * dim)
-        if self._on_soft:
-            self._on_v, self._on_U = moment("v", dim), moment("U", dim * dim)
-            self._on_alpha = add(f"{name}.compliance", m, values=self.compliance)
-            self._on_damping = add(f"{name}.damping", m, values=self.damping)
-            self._on_fit = add(f"{name}.fit", m, width=dim * dim, kind=ti.f64)
-            self._on_middle = add(f"{name}.middle", m, width=dim, kind=ti.f64)
-            self._on_mean = add(f"{name}.mean", m, width=dim, kind=ti.f64)
-            self._on_last = add(f"{name}.last", self.corner_count, width=dim, state=True)
-            self._on_history = add(f"{name}.history", self.corner_count, width=dim)
-        if self._on_plastic:
-            self._on_creep = add(f"{name}.creep", m, values=self.creep)
-            self._on_yield = add(f"{name}.yield", m, values=self.yield_strain * self._radius)
+        self.dev.total = moment("total", 0)
+        self.dev.p, self.dev.q, self.dev.s = moment("p", dim), moment("q", dim), moment("s", dim)
+        self.dev.K, self.dev.X = moment("K", dim * dim), moment("X", dim * dim)
+        if self.dev.soft:
+            self.dev.v, self.dev.U = moment("v", dim), moment("U", dim * dim)
+            self.dev.alpha = add(f"{name}.compliance", m, values=self.compliance)
+            self.dev.damping = add(f"{name}.damping", m, values=self.damping)
+            self.dev.fit = add(f"{name}.fit", m, width=dim * dim, kind=ti.f64)
+            self.dev.middle = add(f"{name}.middle", m, width=dim, kind=ti.f64)
+            self.dev.mean = add(f"{name}.mean", m, width=dim, kind=ti.f64)
+            self.dev.last = add(f"{name}.last", self.corner_count, width=dim, state=True)
+            self.dev.history = add(f"{name}.history", self.corner_count, width=dim)
+        if self.dev.plastic:
+            self.dev.creep = add(f"{name}.creep", m, values=self.creep)
+            self.dev.yield_size = add(f"{name}.yield", m, values=self.yield_strain * self._radius)
         self.changed = False
 
     @ti.func
     def arm(self, e, i0, back):
         """Corner e relative to particle i0, at x - back d; in f64, so that places at the start and predicted ones differ by d."""
-        i = self._on_members[e]
-        move = ti.cast(self._on_state.d[i], ti.f64) - ti.cast(self._on_state.d[i0], ti.f64)
-        return ti.cast(self._on_state.apart(i, i0), ti.f64) - back * move
+        i = self.dev.members[e]
+        move = ti.cast(self.dev.state.d[i], ti.f64) - ti.cast(self.dev.state.d[i0], ti.f64)
+        return ti.cast(self.dev.state.apart(i, i0), ti.f64) - back * move
 
     @ti.func
     def law(self, c, h, hh, fresh):
         """The coefficients of C_(n+1) (the rigid part and the rest), C_n and C_(n-1), and alpha M / h^2: alpha' of a move."""
-        rigid, soft = ti.cast(1, self._on_real), ti.cast(0, self._on_real)
+        rigid, soft = ti.cast(1, self.dev.real), ti.cast(0, self.dev.real)
         now, last, give = 0 * soft, 0 * soft, 0 * soft
-        if ti.static(self._on_soft):
-            alpha, mass = self._on_alpha[c], self._on_mass[c]
+        if ti.static(self.dev.soft):
+            alpha, mass = self.dev.alpha[c], self.dev.mass[c]
             if alpha > 0 and mass > 0:
-                soft, now, last = law(alpha, self._on_damping[c], h, 1 / mass, fresh)
+                soft, now, last = law(alpha, self.dev.damping[c], h, 1 / mass, fresh)
                 if soft < 1 / 64:  # a start asks for nothing at the end where it is soft: c and R need something to go by
-                    soft, now = ti.cast(1 / 64, self._on_real), now + soft - 1 / 64
+                    soft, now = ti.cast(1 / 64, self.dev.real), now + soft - 1 / 64
                 rigid = ti.min(stiff(alpha, h, 1 / mass), soft)
                 soft -= rigid
                 give = alpha * mass / hh
@@ -156,16 +156,16 @@ class Clusters(Ragged, Breaking):
     @ti.func
     def share(self, e, A, give):
         """mu of corner e in a pass: its mass, times what a violation of 1 moves it."""
-        i = self._on_members[e]
-        w, mu = self._on_w.of(i), ti.cast(HEAVY * self._on_mass[self._on_owner[e]], ti.f64)
+        i = self.dev.members[e]
+        w, mu = self.dev.w.of(i), ti.cast(HEAVY * self.dev.mass[self.dev.owner[e]], ti.f64)
         if w > 0:
-            mu = 1 / ti.cast(A * self._on_slots.split[i] + give * w, ti.f64)
+            mu = 1 / ti.cast(A * self.dev.slots.split[i] + give * w, ti.f64)
         return mu
 
     @ti.func
     def weight(self, e, c):
         """The mass of corner e in a fit."""
-        w, mu = self._on_w.of(self._on_members[e]), ti.cast(HEAVY * self._on_mass[c], ti.f64)
+        w, mu = self.dev.w.of(self.dev.members[e]), ti.cast(HEAVY * self.dev.mass[c], ti.f64)
         if w > 0:
             mu = ti.cast(1, ti.f64) / w
         return mu
@@ -173,14 +173,14 @@ class Clusters(Ragged, Breaking):
     @ti.func
     def weigh(self, b, h, hh, first, fresh):
         """The moments of a block about the places s at the start: of shapes q, predicted places p, and of what else pulls."""
-        begin, end, c = self._on_block[b]
+        begin, end, c = self.dev.block[b]
         i0 = self.hub(c)
         rigid, soft, now, last, give = self.law(c, h, hh, fresh)
-        total, p1, q1, s1 = ti.cast(0, ti.f64), 0 * self._on_place[0], 0 * self._on_place[0], 0 * self._on_place[0]
+        total, p1, q1, s1 = ti.cast(0, ti.f64), 0 * self.dev.place[0], 0 * self.dev.place[0], 0 * self.dev.place[0]
         K = p1.outer_product(p1)
         X, v1, U = 0 * K, 0 * p1, 0 * K
         for e in range(begin, end):
-            mu, p, q, s = self.share(e, rigid + soft, give), self.arm(e, i0, 0), self._on_shape[e], self.arm(e, i0, 1)
+            mu, p, q, s = self.share(e, rigid + soft, give), self.arm(e, i0, 0), self.dev.shape[e], self.arm(e, i0, 1)
             if first < 0:
                 mu, s = self.weight(e, c), p
             total += mu
@@ -189,47 +189,47 @@ class Clusters(Ragged, Breaking):
             s1 += mu * s
             K += (mu * q).outer_product(s)
             X += (mu * p).outer_product(s)
-            if ti.static(self._on_soft):
-                v = mu * last * self._on_last[e]
+            if ti.static(self.dev.soft):
+                v = mu * last * self.dev.last[e]
                 if first == 0:
-                    v = mu * (self._on_history[e] + give * self._on_pull[e])
+                    v = mu * (self.dev.history[e] + give * self.dev.pull[e])
                 v1 += v
                 U += v.outer_product(s)
-        self._on_total[b], self._on_p[b], self._on_q[b], self._on_s[b] = total, p1, q1, s1
-        self.keep(self._on_K, b, K)
-        self.keep(self._on_X, b, X)
-        if ti.static(self._on_soft):
-            self._on_v[b] = v1
-            self.keep(self._on_U, b, U)
+        self.dev.total[b], self.dev.p[b], self.dev.q[b], self.dev.s[b] = total, p1, q1, s1
+        self.keep(self.dev.K, b, K)
+        self.keep(self.dev.X, b, X)
+        if ti.static(self.dev.soft):
+            self.dev.v[b] = v1
+            self.keep(self.dev.U, b, U)
 
     @ti.func
     def moments(self, c):
         """Sum of mu, means of p, q and s, and the moments of q and p, about these means."""
-        total, p, q, s = ti.cast(0, ti.f64), 0 * self._on_place[0], 0 * self._on_place[0], 0 * self._on_place[0]
+        total, p, q, s = ti.cast(0, ti.f64), 0 * self.dev.place[0], 0 * self.dev.place[0], 0 * self.dev.place[0]
         K = p.outer_product(p)
         X = 0 * K
-        for b in range(self._on_blocks[c], self._on_blocks[c + 1]):
-            total += self._on_total[b]
-            p += self._on_p[b]
-            q += self._on_q[b]
-            s += self._on_s[b]
-            K += self.kept(self._on_K, b)
-            X += self.kept(self._on_X, b)
+        for b in range(self.dev.blocks[c], self.dev.blocks[c + 1]):
+            total += self.dev.total[b]
+            p += self.dev.p[b]
+            q += self.dev.q[b]
+            s += self.dev.s[b]
+            K += self.kept(self.dev.K, b)
+            X += self.kept(self.dev.X, b)
         p, q, s = p / total, q / total, s / total
         return total, p, q, s, K - total * q.outer_product(s), X - total * p.outer_product(s)
 
     @ti.func
     def keep(self, field: ti.template(), c, R):
         """Write a matrix."""
-        for j in ti.static(range(self._on_dim)):
-            for k in ti.static(range(self._on_dim)):
-                field[c][self._on_dim * j + k] = R[j, k]
+        for j in ti.static(range(self.dev.dim)):
+            for k in ti.static(range(self.dev.dim)):
+                field[c][self.dev.dim * j + k] = R[j, k]
 
     @ti.func
     def kept(self, field: ti.template(), c):
         """Read a matrix."""
         return ti.Matrix(
-            [[field[c][self._on_dim * j + k] for k in ti.static(range(self._on_dim))] for j in ti.static(range(self._on_dim))]
+            [[field[c][self.dev.dim * j + k] for k in ti.static(range(self.dev.dim))] for j in ti.static(range(self.dev.dim))]
         )
 
 

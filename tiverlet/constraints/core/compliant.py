@@ -75,12 +75,12 @@ class Elastic(Number, Breaking):
     @property
     def soft(self) -> bool:
         """Whether any constraint of the batch has compliance, or had when kernels were compiled."""
-        return bool((self.compliance > 0).any()) or vars(self).get("_on_soft", False)
+        return bool((self.compliance > 0).any()) or vars(self.dev).get("soft", False)
 
     @property
     def damped(self) -> bool:
         """Whether any has a dashpot."""
-        return self.soft and bool((self.damping > 0).any()) or vars(self).get("_on_damped", False)
+        return self.soft and bool((self.damping > 0).any()) or vars(self.dev).get("damped", False)
 
     @property
     def _strictly(self) -> bytes | None:
@@ -94,51 +94,51 @@ class Elastic(Number, Breaking):
     def bind(self, scene: Scene) -> None:
         """Declare rest values, multipliers, and for soft ones the memory that the averaged constraint needs."""
         super().bind(scene)
-        self._on_soft = self.soft
-        self._on_sprung = bool(self.sprung(scene).any())
-        self._on_damped = self.damped
+        self.dev.soft = self.soft
+        self.dev.sprung = bool(self.sprung(scene).any())
+        self.dev.damped = self.damped
         start = self.rest_of(self.start.position) if self.count else np.zeros(0)
-        self._on_scale = self.unit or (float(np.abs(start).mean()) if np.any(start) else self.start.size)
+        self.dev.scale = self.unit or (float(np.abs(start).mean()) if np.any(start) else self.start.size)
         name, m, add = repr(self), self.count, scene.memory.field
-        self._on_rest = add(f"{name}.rest", m, values=self.goal)
-        self._on_lam = add(f"{name}.multiplier", m, state=True)
-        if self._on_soft:
-            self._on_alpha = add(f"{name}.compliance", m, values=self.compliance)
-            self._on_last = add(f"{name}.last", m, values=start, state=True)
-            self._on_history = add(f"{name}.history", m)
-        if self._on_damped:
-            self._on_damping = add(f"{name}.damping", m, values=self.damping)
+        self.dev.rest = add(f"{name}.rest", m, values=self.goal)
+        self.dev.lam = add(f"{name}.multiplier", m, state=True)
+        if self.dev.soft:
+            self.dev.alpha = add(f"{name}.compliance", m, values=self.compliance)
+            self.dev.last = add(f"{name}.last", m, values=start, state=True)
+            self.dev.history = add(f"{name}.history", m)
+        if self.dev.damped:
+            self.dev.damping = add(f"{name}.damping", m, values=self.damping)
         self.bind_strength(scene)
         self.changed = False
 
     def upload(self) -> None:
         """Write new rest values, stiffnesses and strengths."""
         if self.acts:
-            self.scene.memory.write(self._on_rest, self.goal)
+            self.scene.memory.write(self.dev.rest, self.goal)
             self.upload_springs()
 
     def upload_springs(self) -> None:
         """Write new stiffnesses and strengths."""
-        if self._on_soft:
-            self.scene.memory.write(self._on_alpha, self.compliance)
-        if self._on_damped:
-            self.scene.memory.write(self._on_damping, self.damping)
+        if self.dev.soft:
+            self.scene.memory.write(self.dev.alpha, self.compliance)
+        if self.dev.damped:
+            self.scene.memory.write(self.dev.damping, self.damping)
         self.upload_strength()
 
     @ti.func
     def dashpot(self, c):
         """Damping of constraint c."""
-        out = ti.cast(0, self._on_real)
-        if ti.static(self._on_damped):
-            out = self._on_damping[c]
+        out = ti.cast(0, self.dev.real)
+        if ti.static(self.dev.damped):
+            out = self.dev.damping[c]
         return out
 
     @ti.func
     def is_rigid(self, c):
         """Whether constraint c has no compliance."""
         out = True
-        if ti.static(self._on_soft):
-            out = self._on_alpha[c] == 0
+        if ti.static(self.dev.soft):
+            out = self.dev.alpha[c] == 0
         return out
 
     @ti.func
@@ -154,28 +154,28 @@ class Elastic(Number, Breaking):
         if ti.static(self.breaks):
             if not self.holds(c):
                 W = 0
-        if ti.static(self._on_sprung):
+        if ti.static(self.dev.sprung):
             if not self.is_rigid(c):
                 W = 0
-        C, A = self.excess(c, f, self._on_rest[c]), ti.cast(1, self._on_real)
-        B, alpha = ti.cast(0, self._on_real), ti.cast(0, self._on_real)
-        lam = self._on_lam[c]
+        C, A = self.excess(c, f, self.dev.rest[c]), ti.cast(1, self.dev.real)
+        B, alpha = ti.cast(0, self.dev.real), ti.cast(0, self.dev.real)
+        lam = self.dev.lam[c]
         if first != 0:
             lam = 0
-        if ti.static(self._on_soft):
+        if ti.static(self.dev.soft):
             if W > 0:
-                A, now, last = law(self._on_alpha[c], self.dashpot(c), h, w, fresh)
-                alpha = self._on_alpha[c] / hh
+                A, now, last = law(self.dev.alpha[c], self.dashpot(c), h, w, fresh)
+                alpha = self.dev.alpha[c] / hh
                 if first != 0:
-                    rest = self._on_rest[c]
-                    B = now * self.bounded(f0 - rest) + last * self.bounded(self.near(self._on_last[c], f0) - rest)
-                    self._on_history[c] = B
-                    self._on_last[c] = f0
+                    rest = self.dev.rest[c]
+                    B = now * self.bounded(f0 - rest) + last * self.bounded(self.near(self.dev.last[c], f0) - rest)
+                    self.dev.history[c] = B
+                    self.dev.last[c] = f0
                 else:
-                    B = self._on_history[c]
+                    B = self.dev.history[c]
             elif first != 0:  # it has no direction now, and may get one in a later pass
-                self._on_history[c] = 0
-                self._on_last[c] = f0
+                self.dev.history[c] = 0
+                self.dev.last[c] = f0
         return A * C + B + alpha * lam, A, alpha, lam, W
 
     @ti.func
@@ -185,39 +185,39 @@ class Elastic(Number, Breaking):
         Rigid links find their force in the next substep.
         """
         f, g = self.measure(c, self.corners(c, 0))
-        f = self.near(f, self._on_rest[c])
-        f0, w = f, ti.cast(0, self._on_real)
-        if ti.static(self._on_damped):
+        f = self.near(f, self.dev.rest[c])
+        f0, w = f, ti.cast(0, self.dev.real)
+        if ti.static(self.dev.damped):
             f0, _ = self.measure(c, self.corners(c, 1))
         for k in ti.static(range(self.arity)):
-            w += self._on_w.of(self.member(c, k)) * g[k, :].dot(g[k, :])
+            w += self.dev.w.of(self.member(c, k)) * g[k, :].dot(g[k, :])
         force = self.force(c, f, self.near(f0, f), w, h)
         for k in ti.static(range(self.arity)):
-            self.push(c, k, h * h * self._on_w.of(self.member(c, k)) * force * g[k, :])
+            self.push(c, k, h * h * self.dev.w.of(self.member(c, k)) * force * g[k, :])
 
     @ti.func
     def bond(self, c, firm, soft):
         """scale w_j lam grad_j C(x_n)."""
         _, g = self.measure(c, self.corners(c, 0))
-        pull = self._on_lam[c] * ti.select(self.is_rigid(c), firm, soft)
+        pull = self.dev.lam[c] * ti.select(self.is_rigid(c), firm, soft)
         for k in ti.static(range(self.arity)):
-            self.push(c, k, self._on_w.of(self.member(c, k)) * pull * g[k, :])
+            self.push(c, k, self.dev.w.of(self.member(c, k)) * pull * g[k, :])
 
     @ti.func
     def force(self, c, f, f0, w, h):
         """F of kick(), from f now and a substep ago."""
-        force = ti.cast(0, self._on_real)
-        if ti.static(self._on_soft):
-            alpha = self._on_alpha[c]
+        force = ti.cast(0, self.dev.real)
+        if ti.static(self.dev.soft):
+            alpha = self.dev.alpha[c]
             if w > 0 and alpha > 0 and self.holds(c):
-                resolved = ti.cast(1, self._on_real)
-                if ti.static(not self._on_sprung):
+                resolved = ti.cast(1, self.dev.real)
+                if ti.static(not self.dev.sprung):
                     resolved -= stiff(alpha, h, w)
-                C = self.bounded(f - self._on_rest[c])
+                C = self.bounded(f - self.dev.rest[c])
                 force = -resolved * C / alpha
-                if ti.static(self._on_damped):
+                if ti.static(self.dev.damped):
                     if ti.static(self.side == 0) or C != 0:
-                        force -= resolved * self._on_damping[c] * (f - f0) / h
+                        force -= resolved * self.dev.damping[c] * (f - f0) / h
         return force
 
     @ti.func
@@ -228,22 +228,22 @@ class Elastic(Number, Breaking):
         adds), and 1 / alpha would count energy that nobody supplied. hh: F = -lam / hh; 0 where there was no substep yet.
         """
         out = ti.cast(0, ti.f64)
-        if ti.static(self._on_soft):
-            alpha = self._on_alpha[c]
+        if ti.static(self.dev.soft):
+            alpha = self.dev.alpha[c]
             if alpha > 0 and self.holds(c):
-                C = self.bounded(self.near(self.value(c, back), self._on_rest[c]) - self._on_rest[c])
+                C = self.bounded(self.near(self.value(c, back), self.dev.rest[c]) - self.dev.rest[c])
                 out = ti.cast(C, ti.f64) * C / (2 * alpha)
-                if ti.static(not self._on_sprung):
+                if ti.static(not self.dev.sprung):
                     if hh > 0 and miss > 0:
-                        borne = ti.abs(self._on_lam[c]) * alpha / hh
+                        borne = ti.abs(self.dev.lam[c]) * alpha / hh
                         out *= borne / (borne + miss * self.extent(c))
         return out
 
     @ti.func
     def extent(self, c):
         """What the residual of constraint c is relative to."""
-        size = ti.cast(self._on_scale, self._on_real)
+        size = ti.cast(self.dev.scale, self.dev.real)
         if ti.static(not self.unit):
-            if self._on_rest[c] != 0:
-                size = ti.abs(self._on_rest[c])
+            if self.dev.rest[c] != 0:
+                size = ti.abs(self.dev.rest[c])
         return size

@@ -41,15 +41,15 @@ class Scalar(Elastic):
         super().bind(scene)
         name, m, add = repr(self), self.count, scene.memory.field
         rows = scene.slots.rows(self)
-        self._on_told, self._on_alone = bool((rows >= 0).any()), bool((rows < 0).any())
-        if self._on_told:
-            self._on_row = add(f"{name}.row", m, kind=ti.i32, values=rows)
-        self._on_firm = self.joins and (self._on_told or scene.slots.accelerates)
-        if self._on_firm:
-            self._on_close = add(f"{name}.close", m, values=self.closeness(self.start.position))
-        self._on_hurries = self._on_firm and scene.slots.accelerates and self._on_alone and self.side == 0
-        if self._on_hurries:
-            self._on_step = add(f"{name}.step", m)
+        self.dev.told, self.dev.alone = bool((rows >= 0).any()), bool((rows < 0).any())
+        if self.dev.told:
+            self.dev.row = add(f"{name}.row", m, kind=ti.i32, values=rows)
+        self.dev.firm = self.joins and (self.dev.told or scene.slots.accelerates)
+        if self.dev.firm:
+            self.dev.close = add(f"{name}.close", m, values=self.closeness(self.start.position))
+        self.dev.hurries = self.dev.firm and scene.slots.accelerates and self.dev.alone and self.side == 0
+        if self.dev.hurries:
+            self.dev.step = add(f"{name}.step", m)
 
     @ti.func
     def known(self, c, h, hh, first, fresh):
@@ -63,24 +63,24 @@ class Scalar(Elastic):
         now, start = self.ends(c)
         f, g = self.measure(c, now)
         f0, n = self.measure(c, start)
-        f0 = self.near(f0, self._on_rest[c])
+        f0 = self.near(f0, self.dev.rest[c])
         f = self.near(f, f0)
-        w = ti.cast(0, self._on_real)  # sum of w |grad|^2, then mass-split: along both, current, start
-        both, here, there = ti.cast(0, self._on_real), ti.cast(0, self._on_real), ti.cast(0, self._on_real)
+        w = ti.cast(0, self.dev.real)  # sum of w |grad|^2, then mass-split: along both, current, start
+        both, here, there = ti.cast(0, self.dev.real), ti.cast(0, self.dev.real), ti.cast(0, self.dev.real)
         for k in ti.static(range(self.arity)):
             i = self.member(c, k)
-            gg, split = g[k, :].dot(g[k, :]), self._on_slots.split[i]
-            w += self._on_w.of(i) * gg
+            gg, split = g[k, :].dot(g[k, :]), self.dev.slots.split[i]
+            w += self.dev.w.of(i) * gg
             both += split * g[k, :].dot(n[k, :])
             here += split * gg
             there += split * n[k, :].dot(n[k, :])
-        turn = self._on_slots.turn(both, ti.sqrt(here * there))
+        turn = self.dev.slots.turn(both, ti.sqrt(here * there))
         lost = turn == FAR
         if ti.static(self.cusp):
-            lost = lost or (self._on_rest[c] == 0 and self.is_rigid(c))
-        if ti.static(self._on_firm):
+            lost = lost or (self.dev.rest[c] == 0 and self.is_rigid(c))
+        if ti.static(self.dev.firm):
             if self.is_rigid(c):
-                lost = lost or ti.abs(self.bounded(f0 - self._on_rest[c])) * self._on_close[c] > LOST
+                lost = lost or ti.abs(self.bounded(f0 - self.dev.rest[c])) * self.dev.close[c] > LOST
         if lost:
             n, both = g, here
         violation, A, alpha, lam, W = self.equation(c, f, f0, w, both, h, hh, first, fresh)
@@ -89,14 +89,14 @@ class Scalar(Elastic):
     @ti.func
     def answer(self, violation, A, alpha, lam, W, turn):
         """The multiplier of a Jacobi pass, and the size of the violation that it removes."""
-        new, size = lam, ti.cast(0, self._on_real)
+        new, size = lam, ti.cast(0, self.dev.real)
         if W > 0:
-            new = lam - self._on_slots.relaxation * violation / (A * W + alpha)
+            new = lam - self.dev.slots.relaxation * violation / (A * W + alpha)
             if ti.static(self.side != 0):
                 new = -self.bounded(-new)
-            size = ti.abs(new - lam) * (A * W + alpha) / self._on_slots.relaxation
+            size = ti.abs(new - lam) * (A * W + alpha) / self.dev.slots.relaxation
             if new != lam:
-                self._on_slots.note(turn)
+                self.dev.slots.note(turn)
         return new, size
 
     @ti.func
@@ -105,7 +105,7 @@ class Scalar(Elastic):
 
         extent: squared size of the body. move: squared size of what a multiplier of 1 moves.
         """
-        size = ti.abs(self._on_rest[c])
+        size = ti.abs(self.dev.rest[c])
         if ti.static(self.collapses == 2):
             size = ti.sqrt(size)
         else:
@@ -120,64 +120,64 @@ class Scalar(Elastic):
     def relax(self, c, h, hh, when, first, fresh):
         """Move each corner by w_j dlam grad_j C; a constraint that belongs to a system tells it what it knows."""
         violation, A, alpha, lam, W, n, g, turn = self.known(c, h, hh, first, fresh)
-        step = ti.cast(1, self._on_real)
-        if ti.static(self._on_told):
-            row = self._on_row[c]
+        step = ti.cast(1, self.dev.real)
+        if ti.static(self.dev.told):
+            row = self.dev.row[c]
             if row >= 0:
-                self._on_slots.system.tell(row, violation, A, alpha, lam, W, self.lever(c, W))
+                self.dev.slots.system.tell(row, violation, A, alpha, lam, W, self.lever(c, W))
                 for k in ti.static(range(self.arity)):
-                    self._on_slots.system.lean(self._on_places[c][k], self.member(c, k), g[k, :])
+                    self.dev.slots.system.lean(self.dev.places[c][k], self.member(c, k), g[k, :])
                 if violation != 0:
-                    self._on_slots.note(turn)
-        if ti.static(self._on_alone):
+                    self.dev.slots.note(turn)
+        if ti.static(self.dev.alone):
             if self.relaxed_alone(c):
                 new, _ = self.answer(violation, A, alpha, lam, W, turn)
                 if ti.static(self.collapses > 0):
-                    move = ti.cast(0, self._on_real)
+                    move = ti.cast(0, self.dev.real)
                     for k in ti.static(range(self.arity)):
-                        w = self._on_w.of(self.member(c, k))
+                        w = self.dev.w.of(self.member(c, k))
                         move += w * w * n[k, :].dot(n[k, :])
                     new = self.tempered(c, lam, new, self.corners(c, 0).norm_sqr(), move)
                 step = new - lam
-                if ti.static(self._on_hurries):
-                    last = self._on_step[c]
+                if ti.static(self.dev.hurries):
+                    last = self.dev.step[c]
                     if first != 0:
                         last = 0
                     most = TENSEST / self.lever(c, W / 2)  # split by two in a chain
-                    wanted = lam + self._on_slots.hurried(last, step)
+                    wanted = lam + self.dev.slots.hurried(last, step)
                     step = ti.max(-most, ti.min(most, wanted)) - lam
-                    self._on_step[c] = step
+                    self.dev.step[c] = step
                     if ti.abs(wanted) >= most:
-                        ti.atomic_max(self._on_slots.tension[None], ti.cast(TENSEST * ti.abs(wanted) / most, ti.f64))
+                        ti.atomic_max(self.dev.slots.tension[None], ti.cast(TENSEST * ti.abs(wanted) / most, ti.f64))
                     new = lam + step
-                self._on_lam[c] = new
+                self.dev.lam[c] = new
         for k in ti.static(range(self.arity)):
-            self.push(c, k, self._on_w.of(self.member(c, k)) * step * n[k, :])
+            self.push(c, k, self.dev.w.of(self.member(c, k)) * step * n[k, :])
 
     @ti.func
     def lever(self, c, W):
         """(omega h)^2 of the fastest vibration across a tension, for a multiplier of 1: of a chain 4 w / l, where W = 2 w."""
-        return 2 * W * self._on_close[c]
+        return 2 * W * self.dev.close[c]
 
     @ti.func
     def relaxed_alone(self, c):
         """Whether constraint c belongs to no system."""
         out = True
-        if ti.static(self._on_told):
-            out = self._on_row[c] < 0
+        if ti.static(self.dev.told):
+            out = self.dev.row[c] < 0
         return out
 
     @ti.func
     def take(self, c, first):
         """Add what the system has found to the multiplier."""
-        if ti.static(self._on_told):
-            row = self._on_row[c]
+        if ti.static(self.dev.told):
+            row = self.dev.row[c]
             if row >= 0:
-                step = ti.cast(self._on_slots.system.step[row], self._on_real)
+                step = ti.cast(self.dev.slots.system.step[row], self.dev.real)
                 if first != 0:
-                    self._on_lam[c] = step
+                    self.dev.lam[c] = step
                 else:
-                    self._on_lam[c] = self._on_lam[c] + step
+                    self.dev.lam[c] = self.dev.lam[c] + step
 
     @ti.func
     def miss(self, c, h, hh, when, fresh):
@@ -187,5 +187,5 @@ class Scalar(Elastic):
         if ti.static(self.collapses > 0):
             f, g = self.measure(c, self.corners(c, 0))
             if g.norm_sqr() == 0 and self.holds(c):
-                left = ti.abs(self.bounded(f - self._on_rest[c]))
+                left = ti.abs(self.bounded(f - self.dev.rest[c]))
         return left / self.extent(c)

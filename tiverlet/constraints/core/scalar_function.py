@@ -72,7 +72,7 @@ class Number(Batch):
     def bind(self, scene: Scene) -> None:
         """The type of its numbers."""
         super().bind(scene)
-        self._on_real = scene.real
+        self.dev.real = scene.real
 
     @ti.func
     def measure(self, c, q):
@@ -102,11 +102,11 @@ class Number(Batch):
     def corners(self, c, back):
         """Corners of constraint c relative to the first, at x - back d: near the origin, so nothing is lost in f32."""
         i = self.member(c, 0)
-        q = ti.Matrix.zero(self._on_real, self.arity, self._on_state.dim)
+        q = ti.Matrix.zero(self.dev.real, self.arity, self.dev.state.dim)
         for k in ti.static(range(1, self.arity)):
             j = self.member(c, k)
-            r = self._on_state.apart(j, i) - back * (self._on_state.d[j] - self._on_state.d[i])
-            for a in ti.static(range(self._on_state.dim)):
+            r = self.dev.state.apart(j, i) - back * (self.dev.state.d[j] - self.dev.state.d[i])
+            for a in ti.static(range(self.dev.state.dim)):
                 q[k, a] = r[a]
         return q
 
@@ -114,12 +114,12 @@ class Number(Batch):
     def ends(self, c):
         """Corners of constraint c, as above, now and at the start of the substep."""
         i = self.member(c, 0)
-        now = ti.Matrix.zero(self._on_real, self.arity, self._on_state.dim)
+        now = ti.Matrix.zero(self.dev.real, self.arity, self.dev.state.dim)
         start = now
         for k in ti.static(range(1, self.arity)):
             j = self.member(c, k)
-            r, moved = self._on_state.apart(j, i), self._on_state.d[j] - self._on_state.d[i]
-            for a in ti.static(range(self._on_state.dim)):
+            r, moved = self.dev.state.apart(j, i), self.dev.state.d[j] - self.dev.state.d[i]
+            for a in ti.static(range(self.dev.state.dim)):
                 now[k, a], start[k, a] = r[a] - 0 * moved[a], r[a] - moved[a]
         return now, start
 

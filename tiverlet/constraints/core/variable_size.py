@@ -37,8 +37,8 @@ class Ragged(Batch):
     The corners of all constraints lie one after the other in `indices` (total,); constraint c owns starts[c] to starts[c + 1].
     A pass has three loops, so that one constraint on a hundred thousand particles is as parallel as many small ones:
 
-        weigh(b)   sums over at most BLOCK corners of one constraint: self._on_block[b] = first corner, last + 1, constraint
-        relax(c)   adds up its blocks, self._on_blocks[c] to self._on_blocks[c + 1], in order, and solves
+        weigh(b)   sums over at most BLOCK corners of one constraint: self.dev.block[b] = first corner, last + 1, constraint
+        relax(c)   adds up its blocks, self.dev.blocks[c] to self.dev.blocks[c + 1], in order, and solves
         spread(e)  gives corner e its move, with self.give(e, move)
 
     The same loops run before kick(), and weigh() before miss() where it `reweighs`.
@@ -95,8 +95,8 @@ class Ragged(Batch):
     def bind(self, scene: Scene) -> None:
         """Declare the corners, their slots, and the blocks."""
         self.scene = scene
-        self._on_state, self._on_slots, self._on_w = scene.state, scene.slots, scene.state.w
-        self._on_real, self._on_dim = scene.real, scene.state.dim
+        self.dev.state, self.dev.slots, self.dev.w = scene.state, scene.slots, scene.state.w
+        self.dev.real, self.dev.dim = scene.real, scene.state.dim
         self.corner_count = len(self.indices)
         sizes = np.diff(self.starts)
         parts = -(-sizes // BLOCK)
@@ -106,30 +106,30 @@ class Ragged(Batch):
         begin = self.starts[owner] + BLOCK * (np.arange(self.blocks) - first[owner])
         end = np.minimum(begin + BLOCK, self.starts[owner + 1])
         name, add = repr(self), scene.memory.field
-        self._on_members = add(f"{name}.members", self.corner_count, kind=ti.i32, values=self.indices)
-        self._on_owner = add(f"{name}.owner", self.corner_count, kind=ti.i32, values=self.owner)
-        self._on_starts = add(f"{name}.starts", self.count + 1, kind=ti.i32, values=self.starts)
-        self._on_block = add(f"{name}.block", self.blocks, width=3, kind=ti.i32, values=np.stack([begin, end, owner], axis=1))
-        self._on_blocks = add(f"{name}.blocks", self.count + 1, kind=ti.i32, values=first)
-        self._on_places = add(f"{name}.slots", self.corner_count, kind=ti.i32, values=scene.slots.places(self))
+        self.dev.members = add(f"{name}.members", self.corner_count, kind=ti.i32, values=self.indices)
+        self.dev.owner = add(f"{name}.owner", self.corner_count, kind=ti.i32, values=self.owner)
+        self.dev.starts = add(f"{name}.starts", self.count + 1, kind=ti.i32, values=self.starts)
+        self.dev.block = add(f"{name}.block", self.blocks, width=3, kind=ti.i32, values=np.stack([begin, end, owner], axis=1))
+        self.dev.blocks = add(f"{name}.blocks", self.count + 1, kind=ti.i32, values=first)
+        self.dev.places = add(f"{name}.slots", self.corner_count, kind=ti.i32, values=scene.slots.places(self))
 
     @ti.func
     def give(self, e, move):
         """Write the move of corner e into its slot; a particle that cannot move has none."""
-        place = self._on_places[e]
+        place = self.dev.places[e]
         if place >= 0:
-            self._on_slots.move[place] = move
+            self.dev.slots.move[place] = move
 
     @ti.func
     def hub(self, c):
         """The particle relative to which corners of constraint c are given, so that nothing is lost in f32."""
-        return self._on_members[self._on_starts[c]]
+        return self.dev.members[self.dev.starts[c]]
 
     @ti.func
     def arm(self, e, i0, back):
         """Corner e relative to particle i0, at x - back d."""
-        i = self._on_members[e]
-        return self._on_state.apart(i, i0) - back * (self._on_state.d[i] - self._on_state.d[i0])
+        i = self.dev.members[e]
+        return self.dev.state.apart(i, i0) - back * (self.dev.state.d[i] - self.dev.state.d[i0])
 
 
 class Content(Scalar, Ragged):
@@ -153,47 +153,47 @@ class Content(Scalar, Ragged):
         """What Scalar needs, and the sums of each block."""
         super().bind(scene)
         name, dim, add = repr(self), scene.state.dim, scene.memory.field
-        self._on_sums = add(f"{name}.sums", self.blocks, width=8)
-        self._on_start = add(f"{name}.gradient", self.corner_count, width=dim)
-        self._on_change = add(f"{name}.change", self.count)
-        self._on_astray = add(f"{name}.turned", self.count, kind=ti.i32)
+        self.dev.sums = add(f"{name}.sums", self.blocks, width=8)
+        self.dev.start = add(f"{name}.gradient", self.corner_count, width=dim)
+        self.dev.change = add(f"{name}.change", self.count)
+        self.dev.astray = add(f"{name}.turned", self.count, kind=ti.i32)
 
     @ti.func
     def slope(self, e, back):
         """The gradient of f with respect to corner e, at x - back d."""
-        return 0 * self._on_state.d[0]
+        return 0 * self.dev.state.d[0]
 
     @ti.func
     def weigh(self, b, h, hh, first, fresh):
         """Of a block: f and f0, w |grad|^2; mass-split along both, current, start; its squared size, and of what it moves."""
-        begin, end, c = self._on_block[b]
+        begin, end, c = self.dev.block[b]
         i0 = self.hub(c)
-        sums = ti.Vector.zero(self._on_real, 8)
+        sums = ti.Vector.zero(self.dev.real, 8)
         for e in range(begin, end):
-            i = self._on_members[e]
+            i = self.dev.members[e]
             g, n = self.slope(e, 0), self.slope(e, 1)
             sums[0] += self.arm(e, i0, 0).dot(g)
             sums[1] += self.arm(e, i0, 1).dot(n)
-            sums[2] += self._on_w.of(i) * g.dot(g)
-            sums[3] += self._on_slots.split[i] * g.dot(n)
-            sums[4] += self._on_slots.split[i] * g.dot(g)
-            sums[5] += self._on_slots.split[i] * n.dot(n)
+            sums[2] += self.dev.w.of(i) * g.dot(g)
+            sums[3] += self.dev.slots.split[i] * g.dot(n)
+            sums[4] += self.dev.slots.split[i] * g.dot(g)
+            sums[5] += self.dev.slots.split[i] * n.dot(n)
             sums[6] += self.arm(e, i0, 0).norm_sqr()
-            sums[7] += self._on_w.of(i) * self._on_w.of(i) * ti.max(g.dot(g), n.dot(n))
-            self._on_start[e] = n
-        self._on_sums[b] = sums
+            sums[7] += self.dev.w.of(i) * self.dev.w.of(i) * ti.max(g.dot(g), n.dot(n))
+            self.dev.start[e] = n
+        self.dev.sums[b] = sums
 
     @ti.func
     def total(self, c):
         """f, f0, the sum of w |grad|^2, the mass-split weight, how far it turned, and the last two sums."""
-        sums = ti.Vector.zero(self._on_real, 8)
-        for b in range(self._on_blocks[c], self._on_blocks[c + 1]):
-            sums += self._on_sums[b]
-        turn = self._on_slots.turn(sums[3], ti.sqrt(sums[4] * sums[5]))
+        sums = ti.Vector.zero(self.dev.real, 8)
+        for b in range(self.dev.blocks[c], self.dev.blocks[c + 1]):
+            sums += self.dev.sums[b]
+        turn = self.dev.slots.turn(sums[3], ti.sqrt(sums[4] * sums[5]))
         W = sums[3]
         if turn == FAR:
             W = sums[4]
-        return sums[0] / self._on_dim, sums[1] / self._on_dim, sums[2], W, turn, sums[6], sums[7]
+        return sums[0] / self.dev.dim, sums[1] / self.dev.dim, sums[2], W, turn, sums[6], sums[7]
 
     @ti.func
     def relax(self, c, h, hh, when, first, fresh):
@@ -202,29 +202,29 @@ class Content(Scalar, Ragged):
         violation, A, alpha, lam, W = self.equation(c, f, f0, w, W, h, hh, first, fresh)
         new, left = self.answer(violation, A, alpha, lam, W, turn)
         new = self.tempered(c, lam, new, extent, move)
-        self._on_lam[c], self._on_change[c], self._on_astray[c] = new, new - lam, turn == FAR
+        self.dev.lam[c], self.dev.change[c], self.dev.astray[c] = new, new - lam, turn == FAR
 
     @ti.func
     def spread(self, e, h, hh, first, fresh):
         """Move each corner by w_j dlam grad_j C."""
-        c = self._on_owner[e]
-        n = self._on_start[e]
-        if self._on_astray[c] != 0:
+        c = self.dev.owner[e]
+        n = self.dev.start[e]
+        if self.dev.astray[c] != 0:
             n = self.slope(e, 0)
-        self.give(e, self._on_w.of(self._on_members[e]) * self._on_change[c] * n)
+        self.give(e, self.dev.w.of(self.dev.members[e]) * self.dev.change[c] * n)
 
     @ti.func
     def kick(self, c, h):
         """As in Scalar."""
         f, f0, w, W, turn, extent, move = self.total(c)
-        self._on_change[c], self._on_astray[c] = h * h * self.force(c, f, f0, w, h), 1
+        self.dev.change[c], self.dev.astray[c] = h * h * self.force(c, f, f0, w, h), 1
 
     @ti.func
     def bond(self, c, firm, soft):
         """As in Scalar."""
-        pull = self._on_lam[c] * ti.select(self.is_rigid(c), firm, soft)
-        for e in range(self._on_starts[c], self._on_starts[c + 1]):
-            self.give(e, self._on_w.of(self._on_members[e]) * pull * self.slope(e, 0))
+        pull = self.dev.lam[c] * ti.select(self.is_rigid(c), firm, soft)
+        for e in range(self.dev.starts[c], self.dev.starts[c + 1]):
+            self.give(e, self.dev.w.of(self.dev.members[e]) * pull * self.slope(e, 0))
 
     @ti.func
     def miss(self, c, h, hh, when, fresh):
@@ -233,15 +233,15 @@ class Content(Scalar, Ragged):
         violation, A, alpha, lam, W = self.equation(c, f, f0, w, W, h, hh, 0, fresh)
         new, left = self.answer(violation, A, alpha, lam, W, turn)
         if w == 0:  # collapsed, or static
-            for e in range(self._on_starts[c], self._on_starts[c + 1]):
-                if self._on_w.of(self._on_members[e]) > 0 and self.holds(c):
-                    left = ti.abs(f - self._on_rest[c])
+            for e in range(self.dev.starts[c], self.dev.starts[c + 1]):
+                if self.dev.w.of(self.dev.members[e]) > 0 and self.holds(c):
+                    left = ti.abs(f - self.dev.rest[c])
         return left / self.extent(c)
 
     @ti.func
     def value(self, c, back):
         """f at x - back d, by Euler's theorem."""
-        f, i0 = ti.cast(0, self._on_real), self.hub(c)
-        for e in range(self._on_starts[c], self._on_starts[c + 1]):
+        f, i0 = ti.cast(0, self.dev.real), self.hub(c)
+        for e in range(self.dev.starts[c], self.dev.starts[c + 1]):
             f += self.arm(e, i0, back).dot(self.slope(e, back))
-        return f / self._on_dim
+        return f / self.dev.dim
