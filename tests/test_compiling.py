@@ -80,9 +80,9 @@ if os.environ["ALONE"]:
     ti.__version__ = (1, 7, 5)
 import tiverlet as tv
 from taichi.lang import matrix_ops
-from tiverlet import compiling, expanding
-assert compiling.patched != bool(os.environ["ALONE"])
-compiling.patched, matrix_ops.dot = False, expanding._product
+from tiverlet.device.patches import compiler, syntax_cache
+assert compiler.patched != bool(os.environ["ALONE"])
+compiler.patched, matrix_ops.dot = False, syntax_cache._product
 @ti.func
 def spring(x):
     out = 0 * x

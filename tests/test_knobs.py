@@ -11,7 +11,7 @@ import pytest
 import taichi as ti
 
 import tiverlet as tv
-from tiverlet import constraints, forces
+from tiverlet import colliders, constraints, contact, forces
 from tiverlet.features.arguments import knobs_of
 
 from .conftest import order
@@ -168,7 +168,7 @@ class Scene:
         self.place = {name: k * BLOCK[:dim] for k, name in enumerate(rows)}
         self.x = np.concatenate(points)
         self.v = np.random.default_rng(2).normal(size=self.x.shape) * 0.7
-        walls = [name for name in rows if issubclass(getattr(tv, name.split(",")[0]), tv.wall.Wall)]
+        walls = [name for name in rows if issubclass(getattr(tv, name.split(",")[0]), colliders.collider.Wall)]
         for name in walls:  # they come in, with a slant
             self.v[self.indices[name]] = 4.0
             self.v[self.indices[name], 1:] = np.array([-3.0, 1.0])[: self.x.shape[1] - 1] * (-1 if name == "Box" else 1)
@@ -225,7 +225,8 @@ LIKE = {  # settings that the same code writes for the same code to read; these 
 
 def test_the_rows_have_every_feature():
     shown = {name.split(",")[0] for names in GROUPED.values() for name in names}
-    assert shown | {*LIKE, "Force"} == {*constraints.__all__, *forces.__all__} == {name.split(",")[0] for name in (ROWS3 | ROWS2)}
+    exported = {name for package in (colliders, constraints, contact, forces) for name in package.__all__}
+    assert shown | {*LIKE, "Force"} == exported == {name.split(",")[0] for name in (ROWS3 | ROWS2)}
     for name, like in LIKE.items():
         kind = getattr(tv, name)
         assert {*knobs_of(kind)} == {*knobs_of(like)} - (

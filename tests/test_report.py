@@ -200,7 +200,7 @@ def test_commands(capsys):
 PLANTS = {
     "the gradient at the predicted position": (
         "error_vs_time('D01', methods=['Jacobi'], precisions=('f64',), efforts=(20, 40, 80), baselines=False, runs=1)",
-        [("scalar.py", "f0, n = self.measure(c, start)", "f0, n = self.measure(c, now)")],
+        [("constraints/core/scalar.py", "f0, n = self.measure(c, start)", "f0, n = self.measure(c, now)")],
     ),
     "averaging by the count of constraints": (
         "error_vs_time('M01', precisions=('f64',), efforts=(20,), baselines=False, runs=1)",
@@ -217,7 +217,7 @@ PLANTS = {
         "stress(rows=[30])",
         [
             (
-                "neighbour_search.py",
+                "neighbours/neighbour_search.py",
                 "< far * far, ti.i32) & ti.cast(i != j, ti.i32)",
                 "< far * far, ti.i32) & ti.cast((i + j) % 100 != 7, ti.i32)",
             )
@@ -227,7 +227,7 @@ PLANTS = {
         "stress(rows=[11])",
         [
             (
-                "integrator.py",
+                "step/integrator.py",
                 "self.state.x[i] = x + step",
                 "self.state.x[i] = x + d; self.state.d[i] = self.state.x[i] - x",
             )

@@ -199,7 +199,7 @@ def test_worlds_are_capped_and_freed():
     python(
         START
         + """
-from tiverlet import memory
+from tiverlet.device import memory
 tv.init()
 point = tv.Particles([[0.0, 0.0]])
 memory.MAX_TREES = 12  # the rule, without the minutes that 400 worlds take

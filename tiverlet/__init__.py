@@ -3,7 +3,6 @@
 from typing import Any
 
 from .device import runtime  # first: it sets what Taichi reads when it is imported  # isort: skip
-from .device.patches import compiler  # noqa: F401  # next: what comes after it is imported in half the time  # isort: skip
 from . import measure, shapes
 from .colliders import Ball, Box, Capsule, HalfSpace, Mesh, Polygon, Sdf
 from .constraints import AngleLimit, Area, Bend, Constraint, Dihedral, Distance, Path, Pin, Rope, ShapeMatch, Snap, Spacer, Volume

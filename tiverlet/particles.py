@@ -4,10 +4,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from . import checks
-from .device import ti
+from .device import at, inline, ti
 from .device.memory import Memory
-from .device.patches.compiler import inline
-from .device.patches.syntax_cache import at
 from .features.arguments import meant
 from .features.read_only import read_only, structure
 

@@ -5,9 +5,9 @@ import functools
 from collections.abc import Callable
 
 import numpy as np
-from taichi.lang import impl
 
 from .device import ti
+from .device.patches import inside
 
 # x**(d + 1) = x + 1 has one positive root, the golden ratio of dimension d (Roberts 2018, the R_d sequence). Its
 # inverse powers are the steps along each axis. As odd 32-bit integers, i * step mod 2**32 visits every value once,
@@ -50,7 +50,7 @@ def _both(kernel: Callable) -> Callable[[Callable], Callable]:
     def decorate(python: Callable) -> Callable:
         @functools.wraps(python)
         def chosen(*args, **kwargs):
-            return kernel(*args, **kwargs) if impl.inside_kernel() else python(*args, **kwargs)
+            return kernel(*args, **kwargs) if inside.inside_kernel() else python(*args, **kwargs)
 
         # Taichi asks for these two before it calls a function from a kernel without a warning.
         chosen._is_taichi_function = True  # type: ignore[attr-defined]

@@ -159,7 +159,7 @@ def script(structure: Structure, events: list[Event], says: str = "") -> str:
     used = [plain(v) for v in values if callable(v) or getattr(v, "_is_taichi_function", False)]
     body = structure.lines()
     if structure.settings.get("path") == "launched":
-        body = ["from tiverlet import team", *body[:-1], "with thread_team.launching():", "    " + body[-1]]
+        body = ["from tiverlet.device import thread_team", *body[:-1], "with thread_team.launching():", "    " + body[-1]]
     return "\n".join(
         [
             *(f"# {line}" for line in says.splitlines()), "import taichi as ti", "", "import tiverlet as tv", "",

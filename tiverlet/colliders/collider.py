@@ -5,9 +5,8 @@ from typing import Any
 import numpy as np
 
 from .. import checks
-from ..device import ti
+from ..device import at, ti
 from ..device.memory import Memory
-from ..device.patches.syntax_cache import at
 from ..features.feature import Feature, Knob, Scene
 from ..features.material import friction_of, restitution_of
 

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 import taichi as ti
-from taichi.lang import impl
 
 from . import runtime
 from .host_copy import Entry, Places, Transfer, chain
+from .patches import inside
 from .patches.compiler import FEW, Compiler
 
 GROUP = 16  # fields that one transfer kernel serves; Taichi unrolls the loop over them
@@ -41,7 +41,7 @@ class Memory:
         self._apart = not aligned()
         self._builders: dict[bool, Any] = {}  # of the trees, by whether what they hold stands apart
         self._trees: list = []
-        self._runtime = impl.get_runtime()
+        self._runtime = inside.current()
         self._transfers: dict[tuple, Transfer] = {}  # compiled once, since that costs more than running them
         self._views: dict[int, np.ndarray] | None = None  # see _seen()
         self._address = 0  # of the first element of the first field
@@ -117,7 +117,7 @@ class Memory:
 
     def check(self) -> None:
         """Raise RuntimeError when the fields are gone or belong to a runtime that is."""
-        if impl.get_runtime() is not self._runtime:
+        if inside.current() is not self._runtime:
             raise RuntimeError(
                 "Taichi was started again after this world was built, which destroyed its fields. Build the world anew."
             )
@@ -128,7 +128,7 @@ class Memory:
 
     def destroy(self) -> None:
         """Free the fields. Calling it twice, or after another ti.init, does nothing."""
-        if self._trees and impl.get_runtime() is self._runtime and not runtime.forked():
+        if self._trees and inside.current() is self._runtime and not runtime.forked():
             self._runtime.materialize()  # see abandon(); no kernel may have run since place()
             for tree in self._trees:
                 tree.destroy()

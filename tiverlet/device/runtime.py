@@ -2,7 +2,6 @@
 
 import contextlib
 import ctypes
-import functools
 import io
 import os
 import sys
@@ -20,24 +19,19 @@ if "taichi" not in sys.modules:
         os.environ["HOME"] = next(folder for folder in (os.path.expanduser("~"), tempfile.gettempdir()) if os.path.isabs(folder))
 
 import taichi as ti
-from taichi.lang import impl
+
+from .patches import inside
 
 
-def _asks_for_start(create: Any) -> Any:
+def _ask_for_start() -> None:
     """Say how to start Taichi where a field is made before it runs; ti.init, as Taichi says, would round otherwise."""
-
-    @functools.wraps(create)
-    def created(*args, **kwargs):
-        if impl.get_runtime().prog is None:
-            raise RuntimeError(
-                "A field of Taichi was asked for before Taichi runs. Call tv.init() first; else the first tv.World starts it."
-            )
-        return create(*args, **kwargs)
-
-    return created
+    if inside.current().prog is None:
+        raise RuntimeError(
+            "A field of Taichi was asked for before Taichi runs. Call tv.init() first; else the first tv.World starts it."
+        )
 
 
-impl.create_field_member = _asks_for_start(impl.create_field_member)
+inside.before_fields(_ask_for_start)
 
 ARCHITECTURES = ("cpu", "cuda", "metal", "vulkan")
 LLVM = ("cpu", "cuda")  # what LLVM compiles for; for the others Taichi writes SPIR-V
@@ -63,13 +57,13 @@ def init(arch: str = "cpu", threads: int | None = None, debug: bool = False, see
         raise ValueError(f"init: threads = {threads!r}, but it must be an integer of at least 1, or None for all cores.")
     wanted = {"arch": arch, "threads": threads, "debug": debug, "seed": seed}
     if ti.cfg is not None:
-        if _started.get("runtime") is impl.get_runtime() and wanted == _started["wanted"]:
+        if _started.get("runtime") is inside.current() and wanted == _started["wanted"]:
             return
         raise RuntimeError(
             f"init: Taichi already runs (arch {architecture()}), and starting it again would destroy every live "
             "world's fields. Call tv.init before the first World and before any ti.init, or leave it out."
         )
-    if arch != "cpu" and not _available(arch):
+    if arch != "cpu" and not inside.has(arch):
         offer = ", ".join(map(repr, available()))
         raise RuntimeError(f'init: arch "{arch}" is not available on this machine. Available: {offer}.')
     running = _threads()
@@ -117,7 +111,7 @@ def architecture() -> str:
 
 def available() -> list[str]:
     """The architectures that this machine and this Taichi have."""
-    return [a for a in ARCHITECTURES if a == "cpu" or _available(a)]
+    return [a for a in ARCHITECTURES if a == "cpu" or inside.has(a)]
 
 
 def threads() -> int:
@@ -157,7 +151,7 @@ def ensure_started() -> None:
     """Start Taichi with the defaults if it does not run, and refuse where building fields would crash."""
     if ti.cfg is None:
         init()
-    if _started.get("runtime") is not impl.get_runtime():
+    if _started.get("runtime") is not inside.current():
         _adopt()
     if forked():
         raise RuntimeError(
@@ -177,17 +171,10 @@ def _config() -> Any:
     return ti.cfg
 
 
-def _available(arch: str) -> bool:
-    with contextlib.suppress(Exception):
-        library: Any = ti._lib
-        return bool(getattr(library.core, f"with_{arch}")())
-    return False
-
-
 def _leave() -> None:
     """In a forked child: keep Taichi from being ended there, which waits for ever for threads that only the parent has."""
     runtime = _started.get("runtime")
-    if runtime is not None and runtime is impl.get_runtime() and runtime.prog:
+    if runtime is not None and runtime is inside.current() and runtime.prog:
         hold = ctypes.pythonapi.Py_IncRef
         hold.argtypes = [ctypes.py_object]
         hold(runtime.prog)
@@ -201,4 +188,4 @@ def _adopt(wanted: dict | None = None) -> None:
     """Remember the running Taichi, and what it was asked for if it was started here."""
     global trees
     trees = 0
-    _started.update(runtime=impl.get_runtime(), pid=os.getpid(), thread=threading.get_ident(), wanted=wanted)
+    _started.update(runtime=inside.current(), pid=os.getpid(), thread=threading.get_ident(), wanted=wanted)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from taichi.lang import impl
 
-from ..device.patches.syntax_cache import at
+from ..device import at
 from .read_only import assign_whole, handed_out, structure
 
 

@@ -25,10 +25,8 @@ from typing import Any
 
 import numpy as np
 
-from ..device import ti
+from ..device import at, inline, ti
 from ..device.memory import Memory
-from ..device.patches.compiler import inline
-from ..device.patches.syntax_cache import at
 from ..particles import Particles, State
 from .arguments import Knob as Knob
 from .arguments import Noted, knobs_of

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 
 from .. import checks
-from ..device import ti
-from ..device.patches.compiler import inline
+from ..device import inline, ti
 from ..tools import distinct
 from .feature import Scene
 

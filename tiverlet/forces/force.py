@@ -3,10 +3,10 @@
 import inspect
 
 import numpy as np
-from taichi.lang.expr import Expr
 
-from ..device import ti
-from ..device.patches.compiler import inline, readable, refuse
+from ..device import inline, ti
+from ..device.patches import inside
+from ..device.patches.compiler import readable, refuse
 from ..features.feature import Acceleration, Scene
 from ..particles import Particles
 
@@ -60,7 +60,8 @@ class Force(Acceleration):
     def force(self, value):
         """What the function returned, if it is a vector; as a number it would be added to all components."""
         dim, name = self.dev.dim, self.function.func.func.__name__
-        shape = (tuple(value.get_shape()) if value.is_tensor() else ()) if isinstance(value, Expr) else np.shape(value)
+        known = isinstance(value, inside.Expression)
+        shape = (tuple(value.get_shape()) if value.is_tensor() else ()) if known else np.shape(value)
         if shape != (dim,):
             what = f"{shape[0]} components" if len(shape) == 1 else f"a matrix of shape {shape}" if shape else "a number"
             refuse(TypeError(f"Force: {name} returns {what}, but in {dim}D a force has {dim} components [N]: ti.Vector([...])."))

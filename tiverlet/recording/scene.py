@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .. import constraints, forces, solvers
+from .. import colliders, constraints, contact, forces, solvers
 from ..device import runtime
 from ..features.arguments import Noted, knobs_of
 from ..features.feature import Feature
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 PARTICLES = ("position", "velocity", "mass", "radius", "pinned", "group")
 PUBLIC = {
-    name: kind for module in (constraints, forces, solvers) for name, kind in vars(module).items()
+    name: kind for module in (colliders, constraints, contact, forces, solvers) for name, kind in vars(module).items()
     if isinstance(kind, type) and issubclass(kind, Noted)
 }  # fmt: skip
 Turned = tuple[int, dict[str, Any]]  # the number of a feature, and its knobs

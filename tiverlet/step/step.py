@@ -10,9 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..contact.velocity_projection import PASSES
-from ..device import ti
-from ..device.patches.compiler import inline
-from ..device.patches.syntax_cache import at
+from ..device import at, inline, ti
 from ..device.thread_team import LEAST
 from .phases import Phases
 

@@ -160,10 +160,11 @@ def _trace(stacklevel: int = 1) -> str:
 
 
 def _patch() -> bool:
-    """Put these in the place of what Taichi calls; whether it is the Taichi that they are made for."""
+    """Put these in the place of what Taichi calls, if it is the Taichi that they are made for and TIVERLET_PATCHES is not 0."""
     names = ("getsourcelines", "getsourcefile", "textwrap", "_inside_class", "_get_tree_and_ctx", "transform_tree")
     if (
-        ti.__version__ != (1, 7, 4)
+        os.environ.get("TIVERLET_PATCHES") == "0"
+        or ti.__version__ != (1, 7, 4)
         or not all(hasattr(kernel_impl, name) for name in names)
         or not all(hasattr(expr, name) for name in CONSTANT)
     ):

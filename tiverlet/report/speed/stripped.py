@@ -7,7 +7,7 @@ import re
 import shutil
 
 PACKAGE = pathlib.Path(__file__).parents[2]
-FOLDERS = ("constraints", "forces")
+FOLDERS = ("colliders", "constraints", "contact", "forces")
 HERE = ("child.py", "counting.py", "scenes.py")  # what the process of a scene runs
 IGNORED = shutil.ignore_patterns("__pycache__", "recording", "report", "commands")
 
@@ -27,8 +27,8 @@ def copy(folder: str, needs: frozenset[str]) -> str:
         names[part] = [name for module, name in lines if module in kept]
         init.write_text("".join(f"from .{module} import {name}\n" for module, name in lines if module in kept))
     imports = [f"from .{part} import {', '.join(some)}\n" for part, some in names.items() if some]
-    imports += ["from .particles import Particles\n", "from .runtime import init\n", "from .world import World\n"]
-    (bare / "__init__.py").write_text("from . import runtime  # first\nfrom . import shapes\n" + "".join(imports))
+    imports += ["from .particles import Particles\n", "from .device.runtime import init\n", "from .world import World\n"]
+    (bare / "__init__.py").write_text("from .device import runtime  # first\nfrom . import shapes\n" + "".join(imports))
     speed = bare / "report" / "speed"
     os.makedirs(speed)
     for init in (bare / "report" / "__init__.py", speed / "__init__.py"):

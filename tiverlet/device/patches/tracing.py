@@ -1,0 +1,151 @@
+"""Watches Taichi translate and launch kernels: what `report speed` counts. Nothing is watched otherwise."""
+
+import contextlib
+from collections import Counter
+from collections.abc import Iterator
+from time import perf_counter
+from typing import Any
+
+import taichi as ti
+from taichi.lang import common_ops, impl, kernel_impl
+from taichi.lang.ast.ast_transformer import ASTTransformer
+
+from .compiler import Quick
+
+ATOMIC = (ti.atomic_add, ti.atomic_sub, ti.atomic_max, ti.atomic_min)
+
+
+@contextlib.contextmanager
+def replaced(*places: tuple[Any, str, Any]) -> Iterator[None]:
+    """While this lasts, attributes have other values."""
+    before = [(owner, name, owner.__dict__[name]) for owner, name, _ in places]
+    for owner, name, value in places:
+        setattr(owner, name, value)
+    try:
+        yield
+    finally:
+        for owner, name, value in before:
+            setattr(owner, name, value)
+
+
+class Launches(Counter[str]):
+    """How often kernels were launched, by name; seconds: in all, if they were timed."""
+
+    def __init__(self):
+        super().__init__()
+        self.seconds: dict[str, float] = {}
+
+
+@contextlib.contextmanager
+def launches(timed: bool = False) -> Iterator[Launches]:
+    """The kernels that are launched while this lasts. timed: wait for the end of each."""
+    count = Launches()
+
+    def counted(launch, name):
+        def run(self, *args):
+            clock = perf_counter()
+            out = launch(self, *args)
+            count[name(self)] += 1
+            if timed:
+                ti.sync()
+                count.seconds[name(self)] = count.seconds.get(name(self), 0.0) + perf_counter() - clock
+            return out
+
+        return run
+
+    with replaced(
+        (kernel_impl.Kernel, "launch_kernel", counted(kernel_impl.Kernel.launch_kernel, lambda kernel: kernel.func.__name__)),
+        (Quick, "launch", counted(Quick.launch, lambda quick: quick.name)),
+    ):
+        yield count
+
+
+class Sweep:
+    """One outermost loop of a kernel: how often it runs (None: known only when it runs), and what it reads and writes."""
+
+    def __init__(self):
+        self.trips: int | None = None
+        self.sites: list[list] = []  # [field, read, written, whether in a loop inside the loop]
+
+    def bytes(self, lengths: dict[int, tuple[int, int]]) -> int:
+        """What it moves, if each element of a field that it names is read once and written once. lengths: see traffic()."""
+        total, fields = 0, {id(site[0]) for site in self.sites}
+        for key in fields & lengths.keys():
+            sites = [s for s in self.sites if id(s[0]) == key]
+            length, size = lengths[key]
+            if self.trips is not None and not any(deep for *_, deep in sites):
+                length = min(length, self.trips * len(sites))
+            total += length * size * (any(s[1] for s in sites) + any(s[2] for s in sites))
+        return total
+
+
+class Tracer:
+    """Watches Taichi translate kernels: .sweeps has the loops of each, by its name."""
+
+    def __init__(self):
+        self.sweeps: dict[str, list[Sweep]] = {}
+        self._open: list[Sweep] = []
+        self._depth = 0
+        self._known: dict[int, tuple[Any, list]] = {}  # expressions that are elements of fields; kept, so that ids stay theirs
+
+    @contextlib.contextmanager
+    def watching(self) -> Iterator[None]:
+        """While this lasts."""
+        materialize, subscript = kernel_impl.Kernel.materialize, impl.subscript
+        loop, call = ASTTransformer.build_range_for, ASTTransformer.build_Call
+        common: Any = common_ops.TaichiOperations
+        assign, augment = common._assign, common._augassign
+
+        def translated(kernel, *args, **kwargs):
+            self._open, self._known = [], {}
+            out = materialize(kernel, *args, **kwargs)
+            if self._known:  # it was not there already
+                self.sweeps[kernel.func.__name__] = self._open
+            return out
+
+        def looped(ctx, node):
+            self._depth += 1
+            if self._depth == 1:
+                self._open.append(Sweep())
+            try:
+                out = loop(ctx, node)
+            finally:
+                self._depth -= 1
+            if self._depth == 0:
+                ends = [0, *(arg.ptr for arg in node.iter.args)][-2:]
+                self._open[-1].trips = ends[1] - ends[0] if all(isinstance(e, int) for e in ends) else None
+            return out
+
+        def subscripted(builder, value, *args, **kwargs):
+            out = subscript(builder, value, *args, **kwargs)
+            if isinstance(value, ti.Field) and self._open and self._depth:
+                site = [value, True, False, self._depth > 1]
+                self._open[-1].sites.append(site)
+                self._known[id(out)] = (out, site)
+            elif id(value) in self._known and isinstance(out, type(value)):  # a component
+                self._known[id(out)] = (out, self._known[id(value)][1])
+            return out
+
+        def assigned(to, value):
+            if id(to) in self._known:
+                site = self._known[id(to)][1]
+                site[1], site[2] = False, True
+            return assign(to, value)
+
+        def changed(to, value, op):
+            if id(to) in self._known:
+                self._known[id(to)][1][2] = True
+            return augment(to, value, op)
+
+        def called(ctx, node):
+            out = call(ctx, node)
+            if any(node.func.ptr is function for function in ATOMIC) and id(node.args[0].ptr) in self._known:
+                self._known[id(node.args[0].ptr)][1][2] = True
+            return out
+
+        with replaced(
+            (kernel_impl.Kernel, "materialize", translated), (ASTTransformer, "build_range_for", staticmethod(looped)),
+            (impl, "subscript", subscripted), (common, "_assign", assigned), (common, "_augassign", changed),
+            (ASTTransformer, "build_Call", staticmethod(called)),
+        ):  # fmt: skip
+            yield
