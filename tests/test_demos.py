@@ -37,7 +37,7 @@ def test_hello_is_the_readmes_example_and_runs():
     shown = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
     assert shown and shown.group(1).strip() == script.split('"""', 2)[2].strip()
     done = python(script)
-    blocks = (ROOT / "README.md").read_text().split("```\n")
+    blocks = (ROOT / "demos" / "README.md").read_text().split("```\n")
     block = next(b for b in blocks if b.startswith("StepReport("))
     # The report's figures may differ between processors; what the scene is made of may not, but for the number of threads.
     want, got = (re.sub(r"\d+ threads", "threads", text).strip().splitlines() for text in (block, done.stdout))

@@ -1,0 +1,51 @@
+"""The pages that people read: their code runs, their links lead somewhere, and the first of them is short."""
+
+import importlib.util
+import pathlib
+import re
+
+import pytest
+
+ROOT = pathlib.Path(__file__).parent.parent
+PAGES = [p.relative_to(ROOT) for p in (ROOT / "README.md", *ROOT.glob("demos/*.md"), *ROOT.glob("tiverlet/**/*.md"))]
+
+
+def blocks(page: pathlib.Path) -> list[str]:
+    """The Python code of a page, piece by piece."""
+    return re.findall(r"^```python\n(.*?)^```$", (ROOT / page).read_text(), re.S | re.M)
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if blocks(p)], ids=str)
+def test_code_runs(page, tmp_path, monkeypatch):
+    # In the order in which it is read, each page in a file of its own, since Taichi reads the source of functions.
+    script = tmp_path / "page.py"
+    script.write_text("\n\n".join(blocks(page)))
+    monkeypatch.chdir(tmp_path)
+    spec = importlib.util.spec_from_file_location("page", script)
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    for value in vars(module).values():
+        if hasattr(value, "close") and hasattr(value, "step"):
+            value.close()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=str)
+def test_links_lead_somewhere(page):
+    text = (ROOT / page).read_text()
+    links = re.findall(r"\]\(([^)#]+)[^)]*\)", re.sub(r"^```.*?^```$", "", text, flags=re.S | re.M))
+    missing = [link for link in links if "://" not in link and not ((ROOT / page).parent / link).exists()]
+    assert not missing
+
+
+def test_files_that_pages_name_are_there():
+    # `name.py` in a folder's page is a file of that folder or below it, or of the tree.
+    for page in PAGES:
+        for name in re.findall(r"`([\w/]+\.(?:py|json))`", (ROOT / page).read_text()):
+            assert (ROOT / name).exists() or any((ROOT / page).parent.rglob(name)), f"{page}: {name}"
+
+
+def test_the_first_page_is_short_and_leads_to_all_others():
+    text = (ROOT / "README.md").read_text()
+    assert len(text.encode()) <= 8192
+    assert all(str(page) in text for page in PAGES[1:])
