@@ -9,9 +9,9 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from taichi.lang import impl
 
 from ..device import at
+from ..device.patches import inside
 from .read_only import assign_whole, handed_out, structure
 
 
@@ -34,7 +34,7 @@ class Knob:
     def __get__(self, feature, owner=None) -> Any:
         if feature is None:
             return self
-        if self.device and impl.inside_kernel() and self.device in vars(feature.dev):
+        if self.device and inside.inside_kernel() and self.device in vars(feature.dev):
             return at(vars(feature.dev)[self.device], None)
         if self.name not in feature.__dict__:
             raise AttributeError(f"{feature!r} has no {self.name}.")
