@@ -5,6 +5,7 @@ import os
 import pathlib
 import re
 import resource
+import signal
 import struct
 import subprocess
 import tempfile
@@ -310,6 +311,12 @@ def test_a_budget_is_kept_and_said(world, tmp_path):
     frames, values = recording.curves["energy"]
     assert {*range(8, 401, 8)} <= {*frames.tolist()} and len(frames) < 110 and np.isfinite(values).all()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["b.rrd"]
+    whole = (tmp_path / "b.rrd").read_bytes()  # which was written anew: cut, it is as any other that is cut
+    for share in (0.25, 0.5, 0.8, 0.999):
+        (tmp_path / "cut.rrd").write_bytes(whole[: int(share * len(whole))])
+        part = tv.replay(tmp_path / "cut.rrd")
+        assert not part.complete and "the file is cut short" in part.text and len(part.frames) <= len(recording.frames)
+    assert part.verify().kind == "incomplete" and part.verify().frames == len(part.frames)
 
     # What the user does in each step is in the file, too: where not even that fits, the recording ends, and says so.
     gravity = w.features[0]
@@ -381,6 +388,22 @@ def test_names_and_frames_of_pictures(falling, tmp_path, monkeypatch):
         viewer.picture(str(falling), str(tmp_path / "a.png"), [5])
     with pytest.raises(ValueError, match="need a name with %d"):
         viewer.picture(str(falling), str(tmp_path / "a.png"), [2, 4])
+
+
+def test_a_picture_that_is_told_to_end_ends_its_viewer(falling, tmp_path, monkeypatch):
+    started = []
+
+    def start(*words, **options):
+        started.append(subprocess.Popen(["sleep", "60"], start_new_session=True))
+        return started[0]
+
+    monkeypatch.setattr(viewer, "_start", start)
+    monkeypatch.setattr(viewer, "_settled", lambda *words: os.kill(os.getpid(), signal.SIGTERM))
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit) as end:
+        viewer.picture(str(falling), str(tmp_path / "a.png"))
+    assert end.value.code == 128 + signal.SIGTERM and started[0].poll() is not None
+    assert signal.getsignal(signal.SIGTERM) is before
 
 
 def test_a_picture_without_a_window(falling, tmp_path, monkeypatch):

@@ -215,7 +215,9 @@ def read(path: str, contents: rrd.Contents) -> tuple[list[Entry], str, int | Non
         rows.append((serials[0], ident, text, blob, mark))
     if not rows:
         why = (
-            "is not a recording of tiverlet; `rerun` shows it" if contents.whole else "was cut short before anything was flushed"
+            "is not a recording of tiverlet; `rerun` shows it"
+            if contents.whole
+            else "was cut short before anything that can be replayed"
         )
         raise ValueError(f"replay: {path} {why}.")
     rows.sort(key=lambda row: row[:2])
@@ -238,7 +240,7 @@ def read(path: str, contents: rrd.Contents) -> tuple[list[Entry], str, int | Non
     if entries[-1].kind == "scene":  # its state was not flushed
         entries.pop()
     if not entries:
-        raise ValueError(f"replay: {path} was cut short before anything was flushed.")
+        raise ValueError(f"replay: {path} was cut short before anything that can be replayed.")
     kinds = [entry.kind for entry in entries]
     if kinds[:2] != ["scene", "state"][: len(kinds)] or "end" in kinds[:-1]:
         raise ValueError(f"replay: {path} is damaged, or was not written by a Recorder: its entries are {', '.join(kinds[:5])}.")

@@ -2,7 +2,7 @@
 
 import struct
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -107,7 +107,8 @@ def thins(entity: str) -> bool:
 def thinned(messages: list[tuple[int, bytes]], stride: int) -> Iterator[tuple[int, bytes]]:
     """Messages (kind, bytes) with the picture of one of `stride` frames; all others as they are.
 
-    stride = 1: nothing is left out, but the rows of each entity stand together, and so do entries of the journal.
+    stride = 1: nothing is left out, but the rows of each entity stand together, and so do entries of the journal, which come
+    first, and in pieces: what is left of a file that was cut short can be replayed.
     """
     found, frames = [], defaultdict(list)
     for kind, message in messages:
@@ -123,7 +124,7 @@ def thinned(messages: list[tuple[int, bytes]], stride: int) -> Iterator[tuple[in
     for entity, numbers in frames.items():
         numbers = np.unique(np.concatenate(numbers))
         gone[entity] = numbers[droppable(numbers, stride)]
-    entries = []
+    entries, pictures = [], []
     waiting: dict[tuple, list] = defaultdict(list)  # rows that go together: a message of a single one takes 1 kB
     for (kind, message), entity in zip(messages, found, strict=True):
         if not entity:
@@ -137,24 +138,39 @@ def thinned(messages: list[tuple[int, bytes]], stride: int) -> Iterator[tuple[in
         rows = rows.take(np.flatnonzero(~np.isin(rows.column("frame").to_numpy(), gone[entity])))
         together = waiting[entity, tuple(zip(rows.schema.names, rows.schema.types, strict=True))]
         if together and sum(rows.nbytes for _, rows in together) + rows.nbytes > BATCH:
-            yield CHUNK, _joined(together)
+            pictures.append(_joined(together))
             together.clear()
         if rows.num_rows:
             together.append((chunk, rows))
-    if entries:
-        yield CHUNK, _joined(entries, _packed)
-    for together in waiting.values():
-        if together:
-            yield CHUNK, _joined(together)
+    yield from ((CHUNK, message) for message in _packed(entries))
+    pictures += [_joined(together) for together in waiting.values() if together]
+    yield from ((CHUNK, message) for message in pictures)
 
 
-def _packed(rows: Any) -> Any:
-    """Rows of a journal with entries of frames that follow each other in one: a row takes 60 bytes beside its text."""
+def _packed(entries: list[tuple[Chunk, Any]]) -> Iterator[bytes]:
+    """Messages with rows of a journal: the first by itself, so that it is there as soon as can be, the others together."""
+    pieces, size, mark = [], BATCH, ""
+    for chunk, rows in entries:
+        size += rows.nbytes
+        if len(pieces) < 2 or size > BATCH:
+            pieces.append([])
+            size = rows.nbytes
+        pieces[-1].append((chunk, rows))
+    for piece in pieces:
+        rows, mark = _in_runs(_together(piece), mark)
+        yield piece[0][0].holding(rows)
+
+
+def _in_runs(rows: Any, mark: str) -> tuple[Any, str]:
+    """Rows of a journal with entries of frames that follow each other in one: a row takes 60 bytes beside its text.
+
+    mark: the checksum of the row before. Returns that of the last row, too.
+    """
     import pyarrow as pa
 
     texts = [text for (text,) in rows.column("text").to_pylist()]
     blobs = [bytes(blob or ()) for blob in rows.column("blob").to_pylist()]
-    firsts, together, marks = [], [], []
+    firsts, together, marks = [], [], [mark]
     for k, text in enumerate(texts):
         alike = k and all(not blobs[j] and journal.is_frame(texts[j]) for j in (k - 1, k))
         if alike and k - firsts[-1] < PACKED:
@@ -164,20 +180,25 @@ def _packed(rows: Any) -> Any:
             together.append([text])
     together = ["\n".join(lines) for lines in together]
     for k, text in zip(firsts, together, strict=True):
-        marks.append(journal.checksum(marks[-1] if marks else "", text, blobs[k]))
+        marks.append(journal.checksum(marks[-1], text, blobs[k]))
     rows = rows.take(firsts)
-    for name, values in (("text", together), ("checksum", marks)):
+    for name, values in (("text", together), ("checksum", marks[1:])):
         at = rows.schema.get_field_index(name)
         rows = rows.set_column(at, rows.schema.field(at), pa.array([[v] for v in values], rows.schema.field(at).type))
-    return rows
+    return rows, marks[-1]
 
 
-def _joined(parts: list[tuple[Chunk, Any]], change: Callable[[Any], Any] = lambda rows: rows) -> bytes:
+def _together(parts: list[tuple[Chunk, Any]]) -> Any:
+    """The rows of some messages as those of the first."""
     import pyarrow as pa
 
-    chunk, first = parts[0]
+    first = parts[0][1]
     table = pa.Table.from_batches([rows.replace_schema_metadata(first.schema.metadata) for _, rows in parts], first.schema)
-    return chunk.holding(change(table.combine_chunks().to_batches()[0]))
+    return table.combine_chunks().to_batches()[0]
+
+
+def _joined(parts: list[tuple[Chunk, Any]]) -> bytes:
+    return parts[0][0].holding(_together(parts))
 
 
 def split(data: bytes) -> list[tuple[int, bytes]]:

@@ -157,7 +157,7 @@ def picture(path: str, png: str, frames: list[int] | None = None, scene: bool = 
     if missing := [name for name in out if not os.path.isdir(os.path.dirname(name))]:
         raise ValueError(f"The folder of {missing[0]} does not exist.")
     port = _free_port()
-    with tempfile.TemporaryFile() as said, _folder() as folder:
+    with _told_to_end(), tempfile.TemporaryFile() as said, _folder() as folder:
         words = ("--headless", "--hide-welcome-screen", "--port", str(port), os.path.abspath(path))
         process = _start(folder, *words, stdout=said, stderr=said)
         try:
