@@ -15,6 +15,7 @@ import tiverlet as tv
 from tiverlet.device import thread_team
 from tiverlet.device.patches import source_cache
 from tiverlet.report.accuracy.cases import entries, known
+from tiverlet.step import build
 
 # Taichi keeps kernels that it has compiled, by their content, and finds them when a worker comes by the same tests in the same
 # order: a second run takes half of the time or less. All of them are about as large as what it keeps by default, 100 MB.
@@ -22,12 +23,12 @@ os.environ.setdefault("TI_OFFLINE_CACHE_MAX_SIZE_OF_FILES", str(512 << 20))
 
 ARCH = os.environ.get("TIVERLET_ARCH", "cpu")
 SOURCES = str(pathlib.Path(tv.__file__).parent)
-# Files of tests whose functions are compiled as ours are, in a third of the time. Those of all others are a user's: they get the
-# whole of Taichi's analysis, also in the same features (Sdf in test_walls.py, Constraint in test_constraint.py, and so on).
-OURS = tuple(
-    str(pathlib.Path(__file__).with_name(f"test_{k}.py")) for k in ("solids", "properties", "references", "scene_report")
-)
+# Functions of tests are compiled as ours are, in a third of the time; those of these files are a user's, as those in the pages
+# and demos are, and get the whole of Taichi's analysis.
+USERS = ("test_free_motion", "test_walls")
+OURS = tuple(str(path) for path in pathlib.Path(__file__).parent.rglob("*.py") if path.stem not in USERS)
 CASES = {name: known(name) for name in entries()}
+CROSSOVER = build.CROSSOVER  # particles and constraints from which a world has a team of threads by default
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -44,9 +45,13 @@ def taichi():
         return assign(to, value)
 
     ops.assign = checked
+    if int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) > 1:
+        # The cores are all taken by workers: threads of one team would wait for those of another, for three times as long as one
+        # takes for all. The bits are the same; who wants a team asks for path="parallel".
+        build.CROSSOVER = sys.maxsize
     home, source_cache.HOME = source_cache.HOME, source_cache.HOME + OURS
     yield
-    ops.assign, source_cache.HOME = assign, home
+    ops.assign, source_cache.HOME, build.CROSSOVER = assign, home, CROSSOVER
 
 
 @pytest.fixture

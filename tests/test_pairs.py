@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
+from tiverlet.step import build
+
+from .conftest import CROSSOVER
 
 
 def near_pairs(position, radius, skin):
@@ -102,7 +105,8 @@ def test_pairs_equal_brute_force(world, path, name, radius, several):
         assert touching.overlap == pytest.approx((depth / small).max(initial=0.0), rel=1e-12)
 
 
-def test_many_particles(world):
+def test_many_particles(world, monkeypatch):
+    monkeypatch.setattr(build, "CROSSOVER", CROSSOVER)
     rng = np.random.default_rng(8)
     position = rng.uniform(-63, 63, (40_000, 2))
     radius = rng.uniform(0.1, 0.5, 40_000)
