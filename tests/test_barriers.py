@@ -121,7 +121,7 @@ def test_orientation_is_found(world):
         np.testing.assert_array_equal(tv.Mesh(CUBE, faces).normals, want)
         np.testing.assert_array_equal(tv.Mesh(CUBE, faces, inside=True).normals, -want)
     assert (tv.Polygon(SQUARE[::-1]).normals.sum(axis=0) == 0).all()
-    centers = tv.Polygon(STAR[::-1]).corners.mean(axis=1)
+    centers = tv.Polygon(STAR[::-1]).facets.corners.mean(axis=1)
     assert (outside(centers + 1e-6 * tv.Polygon(STAR[::-1]).normals, STAR) > 0).all()
 
 

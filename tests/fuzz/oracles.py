@@ -72,7 +72,7 @@ def gap(wall: Any, p: np.ndarray, r: np.ndarray) -> np.ndarray:
     if name == "Sdf":
         return SDF[plain(wall.function).__name__](p) - wall.radius - r
     d = polygon(p, wall.vertices) if name == "Polygon" else convex(p, wall.vertices)
-    return (-d if wall.turned_in else d) - wall.radius - r
+    return (-d if wall.inside else d) - wall.radius - r
 
 
 def excluded(features: list[Any], particles: Any) -> set[tuple[int, int]]:

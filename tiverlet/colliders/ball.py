@@ -6,7 +6,8 @@ from .. import checks
 from ..device import ti
 from ..features.feature import Knob, Scene
 from ..particles import Particles
-from .collider import TOUCH, Track, Wall
+from .collider import TOUCH, Wall
+from .track import Track
 
 
 class Ball(Wall):
@@ -53,7 +54,7 @@ class Ball(Wall):
     @property
     def repeats(self) -> bool:
         """Inside, the way along the surface leads out, and a bounce may lead to the other end."""
-        return self.inside and (self.dev.rubs or self.dev.bounces)
+        return self.inside and (self.dev.surface.rubs or self.dev.surface.bounces)
 
     def bind(self, scene: Scene) -> None:
         """The center at the start and the end of a frame."""
@@ -92,9 +93,9 @@ class Ball(Wall):
         r = self.dev.state.place(i) - center
         far = ti.cast(self.radius, self.dev.real)
         depth, n = self.nearest(r, far, radius)
-        d = self.way(i, moved)
+        d = self.dev.surface.path(i, moved)
         start = r - d
-        sunk, _n = self.nearest(start, far, radius)
+        start_depth, _n = self.nearest(start, far, radius)
         if ti.static(not self.inside):
             far += radius
             c, b, a = start.dot(start) - far * far, start.dot(d), d.dot(d)
@@ -104,7 +105,7 @@ class Ball(Wall):
                 if s < 1:
                     n = (start + s * d).normalized()
                     depth = (s - 1) * d.dot(n)
-        self.press(i, depth, sunk, n, moved, h, turn)
+        self.dev.surface.press(i, depth, start_depth, n, moved, h, turn)
 
     @ti.func
     def nearest(self, r, far, radius):

@@ -74,7 +74,7 @@ class Box(Wall):
     @property
     def repeats(self) -> bool:
         """In a corner friction on one side may lead into another, and a bounce may lead to the other end."""
-        return self.dev.rubs or self.dev.bounces
+        return self.dev.surface.rubs or self.dev.surface.bounces
 
     def bind(self, scene: Scene) -> None:
         """Corners at the start and the end of a frame."""
@@ -137,4 +137,4 @@ class Box(Wall):
                         n[k], moved[k], depth = 1, shift, wall + radius - x[k]
                     elif side == k + self.dim:
                         n[k], moved[k], depth = -1, shift, x[k] + radius - wall
-                self.press(i, depth, depth + self.way(i, moved).dot(n), n, moved, h, turn)
+                self.dev.surface.press(i, depth, depth + self.dev.surface.path(i, moved).dot(n), n, moved, h, turn)

@@ -6,7 +6,8 @@ from .. import checks
 from ..device import ti
 from ..features.feature import Knob, Scene
 from ..particles import Particles
-from .collider import TOUCH, Track, Wall
+from .collider import TOUCH, Wall
+from .track import Track
 
 MARCH = 32  # steps along a path; what only grazes is then within 1e-6 of its way
 
@@ -98,13 +99,13 @@ class Capsule(Wall):
         t, length, n = self.nearest(x, a, b)
         depth = far - length
         moved = self.dev.a.step(when) * (1 - t) + self.dev.b.step(when) * t
-        d = self.way(i, moved)
+        d = self.dev.surface.path(i, moved)
         if (self.dev.a.step(when) != self.dev.b.step(when)).any():
-            d = x - self.along(x - self.way(i, 0 * x), a, b, when)
+            d = x - self.along(x - self.dev.surface.path(i, 0 * x), a, b, when)
         way = d.norm()
         _t, gap, _n = self.nearest(x - d, a, b)  # not twice the same name: Taichi would assign a vector to a number
         gap -= far
-        sunk = -gap
+        start_depth = -gap
         # It was outside, or touched, and may have come in: walk along the path, never further than the surface is away.
         if gap > -TOUCH * far and gap < way:
             s = ti.max(gap, 0) / way
@@ -116,4 +117,4 @@ class Capsule(Wall):
             if s < 1:
                 _t, _gap, n = self.nearest(x - (1 - s) * d, a, b)
                 depth = (s - 1) * d.dot(n)
-        self.press(i, depth, sunk, n, moved, h, turn)
+        self.dev.surface.press(i, depth, start_depth, n, moved, h, turn)

@@ -1,4 +1,6 @@
-"""Walls made of facets: segments in 2D, triangles in 3D."""
+"""Shapes made of facets: segments in 2D, triangles in 3D."""
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -7,87 +9,97 @@ from ..features.feature import Scene
 from ..particles import Particles
 from .collider import TOUCH
 from .facet_grid import Buckets
-from .moving import Solid
+from .shape import Shape
 
 NEWTON = 16  # steps to the moment of a touch; only what grazes needs more than 3
 
 
-class Facets(Solid):
-    """A wall made of facets: corners (m, dim, dim) [m], and the outward normal of each by the order of its corners.
+@dataclass(frozen=True)
+class Facets:
+    """Facets in the frame of the collider that holds them; the order of a facet's corners says which way it faces.
 
-    C(x) = dist(x, facets) - (R + r) >= 0 with R the rounding, grad C the direction from the nearest point.
-
-    The distance to one facet is convex along a straight way, so Newton's method from its start goes to the moment of the touch
-    without ever overshooting. A facet that is touched at a corner or an edge counts only where no neighbour is nearer, which is
-    seen from the directions (`wings`) in which the neighbours go on; so nothing catches on the seams of a flat surface.
-
-    Subclasses set, in the wall's frame: corners, features (m, k) the numbers of the corners (and in 3D, from column 3, of the
-    edges 01, 12, 20), wings as (feature, direction) pairs, facing (features, dim) the mean normals there.
+    corners: (m, dim, dim) [m]. features: (m, k) the numbers of the corners (and in 3D, from column 3, of the edges 01, 12, 20).
+    wings: (feature, direction) pairs, in which directions facets go on from a feature. facing: (features, dim) mean normals.
+    closed: they enclose something. inside: particles are kept inside, so that the solid is all around.
     """
 
-    closed = True
     corners: np.ndarray
     features: np.ndarray
     wings: tuple[np.ndarray, np.ndarray]
     facing: np.ndarray
+    closed: bool
+    inside: bool
 
     @property
     def normals(self) -> np.ndarray:
-        """Unit normals of the facets."""
-        c = self.corners
-        if c.shape[1] == 2:
-            u = c[:, 1] - c[:, 0]
-            n = np.stack([u[:, 1], -u[:, 0]], axis=1)
-        else:
-            n = np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0])
-        return n / np.linalg.norm(n, axis=1)[:, None]
+        """Outward unit normals of the facets, (m, dim)."""
+        return facet_normals(self.corners)
 
-    def check_thickness(self, particles: Particles) -> None:
+    def check_thickness(self, who: str, particles: Particles, radius: float) -> None:
         """Refuse points that meet a wall without thickness: a point on it would have no side."""
-        points = particles.radius + self.radius == 0
+        points = particles.radius + radius == 0
         if not self.closed and points.any():
             raise ValueError(
-                f"{self!r}: particle {int(np.argmax(points))} has radius 0, and so has the open wall, so nothing tells on which "
+                f"{who}: particle {int(np.argmax(points))} has radius 0, and so has the open wall, so nothing tells on which "
                 "side of it the particle is. Give one of them a radius."
             )
 
-    def bind(self, scene: Scene) -> None:
-        """The facets, and for each cell of space those within reach."""
-        Solid.bind(self, scene)
-        name, add, dim = repr(self), scene.memory.field, self.dim
-        size = float(np.abs(self.corners).max())
-        self.dev.close = size * (2.0**-21 if scene.real == ti.f32 else 2.0**-50)
-        self.dev.touch = TOUCH * size
-        self.dev.tilt, self.dev.slight = (2.0**-18, 2.0**-20) if scene.real == ti.f32 else (2.0**-40, 2.0**-48)
-        buckets = Buckets(self.corners, float(scene.particles.radius.max(initial=0.0)) + self.radius, self.closed)
-        self.dev.reach, self.dev.cell, self.dev.shape = buckets.reach, buckets.cell, buckets.shape.tolist()
-        self.dev.low, self.dev.high = self.corners.min(axis=(0, 1)).tolist(), self.corners.max(axis=(0, 1)).tolist()
-        self.dev.pieces = 4 * int(buckets.shape.sum()) + 64
-        self.dev.all = len(buckets.begin) - 2  # the last bucket holds all facets, for what starts deep inside
-        self.dev.beyond = self.closed and self.turned_in
-        order = np.argsort(self.wings[0], kind="stable")
-        begin = np.searchsorted(self.wings[0][order], np.arange(len(self.facing) + 1))
-        self.dev.corner = add(f"{name}.corner", len(self.corners) * dim, width=dim, values=self.corners.reshape(-1, dim))
-        self.dev.normal = add(f"{name}.normal", len(self.corners), width=dim, values=self.normals)
-        self.dev.feature = add(f"{name}.feature", self.features.size, kind=ti.i32, values=self.features.ravel())
-        self.dev.facing = add(f"{name}.facing", len(self.facing), width=dim, values=self.facing)
-        self.dev.wing = add(f"{name}.wing", len(order), width=dim, values=self.wings[1][order])
-        self.dev.wing_begin = add(f"{name}.wing_begin", len(begin), kind=ti.i32, values=begin)
-        self.dev.bucket = add(f"{name}.bucket", len(buckets.bucket), kind=ti.i32, values=buckets.bucket)
-        self.dev.begin = add(f"{name}.begin", len(buckets.begin), kind=ti.i32, values=buckets.begin)
-        self.dev.list = add(f"{name}.list", len(buckets.list), kind=ti.i32, values=buckets.list)
 
-    turned_in = False  # particles are kept inside: the solid is all around
+def facet_normals(corners: np.ndarray) -> np.ndarray:
+    """Unit normals of facets with corners (m, dim, dim)."""
+    if corners.shape[1] == 2:
+        u = corners[:, 1] - corners[:, 0]
+        n = np.stack([u[:, 1], -u[:, 0]], axis=1)
+    else:
+        n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return n / np.linalg.norm(n, axis=1)[:, None]
+
+
+class FacetShape(Shape):
+    """Facets on the device: C(x) = dist(x, facets) - (R + r) >= 0 with R what they are thickened by.
+
+    grad C is the direction from the nearest point.
+
+    The distance to one facet is convex along a straight way, so Newton's method from its start goes to the moment of the touch
+    without ever overshooting. A facet that is touched at a corner or an edge counts only where no neighbour is nearer, which is
+    seen from the directions (`wings`) in which the neighbours go on; so nothing catches on the seams of a flat surface.
+    """
+
+    def __init__(self, facets: Facets, scene: Scene, name: str, radius: float):
+        corners, features, wings, facing = facets.corners, facets.features, facets.wings, facets.facing
+        self.dim, self.closed, self.columns, self.real = corners.shape[1], facets.closed, features.shape[1], scene.real
+        size = float(np.abs(corners).max())
+        self.close = size * (2.0**-21 if scene.real == ti.f32 else 2.0**-50)
+        self.touch = TOUCH * size
+        self.tilt, self.slight = (2.0**-18, 2.0**-20) if scene.real == ti.f32 else (2.0**-40, 2.0**-48)
+        buckets = Buckets(corners, float(scene.particles.radius.max(initial=0.0)) + radius, self.closed)
+        self.reach, self.cell, self.shape = buckets.reach, buckets.cell, buckets.shape.tolist()
+        self.low, self.high = corners.min(axis=(0, 1)).tolist(), corners.max(axis=(0, 1)).tolist()
+        self.pieces = 4 * int(buckets.shape.sum()) + 64
+        self.all = len(buckets.begin) - 2  # the last bucket holds all facets, for what starts deep inside
+        self.beyond = self.closed and facets.inside
+        order = np.argsort(wings[0], kind="stable")
+        begin = np.searchsorted(wings[0][order], np.arange(len(facing) + 1))
+        add = scene.memory.field
+        self.points = add(f"{name}.corner", len(corners) * self.dim, width=self.dim, values=corners.reshape(-1, self.dim))
+        self.normal = add(f"{name}.normal", len(corners), width=self.dim, values=facets.normals)
+        self.feature = add(f"{name}.feature", features.size, kind=ti.i32, values=features.ravel())
+        self.facing = add(f"{name}.facing", len(facing), width=self.dim, values=facing)
+        self.wing = add(f"{name}.wing", len(order), width=self.dim, values=wings[1][order])
+        self.wing_begin = add(f"{name}.wing_begin", len(begin), kind=ti.i32, values=begin)
+        self.bucket = add(f"{name}.bucket", len(buckets.bucket), kind=ti.i32, values=buckets.bucket)
+        self.begin = add(f"{name}.begin", len(buckets.begin), kind=ti.i32, values=buckets.begin)
+        self.list = add(f"{name}.list", len(buckets.list), kind=ti.i32, values=buckets.list)
 
     @ti.func
     def corner(self, f, k):
         """Corner k of facet f."""
-        return self.dev.corner[f * self.dim + k]
+        return self.points[f * self.dim + k]
 
     @ti.func
     def nearest(self, f, q):
         """Distance from q to facet f, the direction from the nearest point to q, and the feature that has it (-1: none)."""
-        n = self.dev.normal[f]
+        n = self.normal[f]
         r, at, over = q - self.corner(f, 0), -1, True
         least = r.dot(r)
         for k in range(ti.static(1 if self.dim == 2 else 3)):
@@ -111,7 +123,7 @@ class Facets(Solid):
         distance = ti.abs(height)
         if at >= 0:
             distance = r.norm()
-            at = self.dev.feature[f * ti.static(self.features.shape[1]) + at]
+            at = self.feature[f * ti.static(self.columns) + at]
             if distance > 0:
                 n = r / distance
         elif height < 0:
@@ -121,8 +133,8 @@ class Facets(Solid):
     @ti.func
     def around(self, q):
         """Where the list of the facets around q begins and ends, and how far from q there are no others."""
-        low, high = self.constant(self.dev.low), self.constant(self.dev.high)
-        reach, size = ti.cast(self.dev.reach, self.dev.real), ti.cast(self.dev.cell, self.dev.real)
+        low, high = self.constant(self.low), self.constant(self.high)
+        reach, size = ti.cast(self.reach, self.real), ti.cast(self.cell, self.real)
         off = ti.max(low - q, q - high)
         clear = off[0]
         for k in ti.static(range(1, self.dim)):
@@ -132,22 +144,27 @@ class Facets(Solid):
             cell = ti.floor((q - low + reach) / size, ti.i32)
             where = 0
             for k in ti.static(range(self.dim - 1, -1, -1)):
-                where = where * self.dev.shape[k] + ti.min(ti.max(cell[k], 0), self.dev.shape[k] - 1)
-            bucket = self.dev.bucket[where]
+                where = where * self.shape[k] + ti.min(ti.max(cell[k], 0), self.shape[k] - 1)
+            bucket = self.bucket[where]
             clear = reach
             if bucket < 0:
                 clear += (-1 - bucket) * size
-        elif ti.static(self.dev.beyond):
-            bucket = self.dev.all
+        elif ti.static(self.beyond):
+            bucket = self.all
         begin, end = 0, 0
         if bucket >= 0:
-            begin, end = self.dev.begin[bucket], self.dev.begin[bucket + 1]
+            begin, end = self.begin[bucket], self.begin[bucket + 1]
         return begin, end, clear
 
     @ti.func
     def constant(self, values: ti.template()):  # type: ignore[valid-type]
         """A vector of numbers that are known when the kernel is compiled."""
-        return ti.Vector([ti.cast(v, self.dev.real) for v in ti.static(values)])
+        return ti.Vector([ti.cast(v, self.real) for v in ti.static(values)])
+
+    @ti.func
+    def rounding(self, q):
+        """That of the largest of the coordinates of the corners."""
+        return ti.cast(self.close, self.real)
 
     @ti.func
     def strike(self, a, e, far, close, limit):
@@ -155,28 +172,28 @@ class Facets(Solid):
         way, s, piece = e.norm(), 0 * far, 0
         best, depth, normal = 0 * far + 2, 0 * far, 0 * e
         least, outside, exit = far + way + 1, 0 * far + 1, 0 * e
-        while s < 1 and s < best and piece < self.dev.pieces:
+        while s < 1 and s < best and piece < self.pieces:
             begin, end, clear = self.around(a + s * e)
             for place in range(begin, end):
-                f, t, going = self.dev.list[place], 0 * far, True
+                f, t, going = self.list[place], 0 * far, True
                 for k in range(NEWTON):
                     if going:
                         distance, n, at = self.nearest(f, a + t * e)
-                        out = self.dev.normal[f]
+                        out = self.normal[f]
                         if at >= 0:
-                            out = self.dev.facing[at]
+                            out = self.facing[at]
                         side = n.dot(out)
                         if ti.static(self.closed):
                             if k == 0 and piece == 0 and distance < least:
                                 least, outside, exit = distance, side, -n
-                            if distance <= self.dev.touch:
+                            if distance <= self.touch:
                                 # On the surface itself, each facet that is touched there has its own direction.
-                                distance, n, at = ti.select(side < 0, -distance, distance), self.dev.normal[f], -1
+                                distance, n, at = ti.select(side < 0, -distance, distance), self.normal[f], -1
                         gap, slope = distance - far, e.dot(n)
                         if gap <= close or k == NEWTON - 1:
                             going = False
                             below = -(gap + (1 - t) * slope)
-                            toward = slope < -ti.cast(self.dev.slight, self.dev.real) * way
+                            toward = slope < -ti.cast(self.slight, self.real) * way
                             hit = toward and t > 0 and below > 0
                             if t == 0:
                                 if toward:
@@ -194,7 +211,7 @@ class Facets(Solid):
             s += (clear - far) / way
             piece += 1
         if ti.static(self.closed):
-            if outside < 0 and least > self.dev.touch:
+            if outside < 0 and least > self.touch:
                 below = far + least - e.dot(exit)
                 best = 0 * far + 2
                 if ti.min(below, limit - e.dot(exit)) > 2 * close:
@@ -206,7 +223,7 @@ class Facets(Solid):
         """Whether no neighbour of a feature is nearer in the direction n."""
         out = True
         if at >= 0:
-            for k in range(self.dev.wing_begin[at], self.dev.wing_begin[at + 1]):
-                if n.dot(self.dev.wing[k]) > self.dev.tilt:
+            for k in range(self.wing_begin[at], self.wing_begin[at + 1]):
+                if n.dot(self.wing[k]) > self.tilt:
                     out = False
         return out

@@ -72,4 +72,4 @@ class HalfSpace(Wall):
             offset[0] * (1 - when[1]) + offset[1] * when[1],
         )
         depth, moved = now + radius - n.dot(self.dev.state.place(i)), (now - before) * n
-        self.press(i, depth, depth + self.way(i, moved).dot(n), n, moved, h, turn)
+        self.dev.surface.press(i, depth, depth + self.dev.surface.path(i, moved).dot(n), n, moved, h, turn)

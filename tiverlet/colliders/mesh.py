@@ -3,20 +3,23 @@
 import numpy as np
 
 from .. import checks
+from ..features.feature import Scene
 from ..particles import Particles
-from .facets import Facets
+from .facets import Facets, FacetShape, facet_normals
+from .moving import Moving
+from .shape import Shape
 
 FLAT = 0.999  # cosine between faces whose common edge is not drawn
 
 
-class Mesh(Facets):
+class Mesh(Moving):
     """Particles stay outside of a closed triangle mesh, or inside; or on their own side of an open sheet (3D).
 
-    C(x) = dist(x, faces) - (R + r) >= 0, grad C the direction from the nearest point of the mesh (see Facets).
+    C(x) = dist(x, faces) - (R + r) >= 0, grad C the direction from the nearest point of the mesh (see FacetShape).
 
     vertices: (m, 3) [m]. faces: (k, 3) vertices of each triangle, either way round: they are turned alike here, and outwards.
     inside: keep particles in. closed: False for a sheet, a thin wall with two sides. radius: R [m], what the faces are thickened
-    by; a sheet that points (particles of radius 0) meet needs some. position, rotation: where the vertices are put (see Solid);
+    by; a sheet that points (particles of radius 0) meet needs some. position, rotation: where the vertices are put (see Moving);
     live. friction, restitution, push_out: see Wall.
 
     Nothing passes, at any speed of the particle or of the wall. The cost for a particle grows with the faces around it, not with
@@ -31,9 +34,9 @@ class Mesh(Facets):
     ):  # fmt: skip
         vertices = checks.points("Mesh", "vertices", vertices, dim=3)
         faces = checks.indices("Mesh", "faces", faces, len(vertices), arity=3).astype(int)
-        self.closed, self.turned_in = bool(closed), bool(inside)
+        self.closed, self.inside = bool(closed), bool(inside)
         self.radius = radius
-        if self.turned_in and not self.closed:
+        if self.inside and not self.closed:
             raise ValueError("Mesh: inside = True needs an inside; a sheet (closed = False) has none.")
         if not len(faces):
             raise ValueError("Mesh: faces is empty; a wall needs at least one.")
@@ -51,7 +54,7 @@ class Mesh(Facets):
             array.flags.writeable = False
         self.place(position, rotation)
         self.surface(friction, restitution, push_out)
-        self._join()
+        self.facets = self._joined()
 
     def _outward(self, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
         """The faces with their corners in the order that makes normals point away from the solid."""
@@ -75,24 +78,24 @@ class Mesh(Facets):
         volume = float(np.einsum("ij,ij->i", c[:, 0], np.cross(c[:, 1], c[:, 2])).sum()) / 6
         if abs(volume) <= 1e-12 * np.abs(c).max() ** 3:
             raise ValueError(f"Mesh: faces enclose a volume of {volume:g} m^3; closed = False makes a sheet of them.")
-        return faces[:, ::-1] if (volume < 0) != self.turned_in else faces
+        return faces[:, ::-1] if (volume < 0) != self.inside else faces
 
-    def _join(self) -> None:
+    def _joined(self) -> Facets:
         """Corners and edges, the ways in which the faces go on from them, and the mean normals there."""
         faces, m = self.faces, len(self.vertices)
-        self.corners = c = self.vertices[faces]
-        normal = self.normals
+        c = self.vertices[faces]
+        normal = facet_normals(c)
         pairs = faces[:, [[0, 1], [1, 2], [2, 0]]]
         self.edges, which = np.unique(np.sort(pairs.reshape(-1, 2), axis=1), axis=0, return_inverse=True)
         edge = which.reshape(-1, 3)
-        self.features = np.concatenate([faces, m + edge], axis=1)
+        features = np.concatenate([faces, m + edge], axis=1)
         along = self.vertices[self.edges[:, 1]] - self.vertices[self.edges[:, 0]]
         along /= np.linalg.norm(along, axis=1)[:, None]
         # From an edge, the face goes on at right angles to it; from a corner, along its edges.
         opposite = c[:, [2, 0, 1]] - c
         across = opposite - (opposite * along[edge]).sum(axis=2)[:, :, None] * along[edge]
         across /= np.linalg.norm(across, axis=2)[:, :, None]
-        self.wings = (
+        wings = (
             np.concatenate([m + edge.ravel(), self.edges[:, 0], self.edges[:, 1]]),
             np.concatenate([across.reshape(-1, 3), along, -along]),
         )
@@ -105,14 +108,24 @@ class Mesh(Facets):
         np.add.at(facing, m + edge, np.repeat(normal[:, None], 3, axis=1))
         self.creases = np.linalg.norm(facing[m:], axis=1) < 2 * np.sqrt((1 + FLAT) / 2)
         size = np.linalg.norm(facing, axis=1)
-        weak = np.flatnonzero(size[self.features].ravel() < 1e-9)
-        facing[self.features.ravel()[weak]] = np.repeat(normal, 6, axis=0)[weak]  # a knife's edge: either side will do
-        self.facing = facing / np.maximum(np.linalg.norm(facing, axis=1), 1e-9)[:, None]
+        weak = np.flatnonzero(size[features].ravel() < 1e-9)
+        facing[features.ravel()[weak]] = np.repeat(normal, 6, axis=0)[weak]  # a knife's edge: either side will do
+        facing /= np.maximum(np.linalg.norm(facing, axis=1), 1e-9)[:, None]
+        return Facets(c, features, wings, facing, self.closed, self.inside)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the dimension, and that particles and sheet are not both without thickness."""
-        Facets.prepare(self, particles, inv_mass)
-        self.check_thickness(particles)
+        Moving.prepare(self, particles, inv_mass)
+        self.facets.check_thickness(repr(self), particles, self.radius)
+
+    def shape_on(self, scene: Scene) -> Shape:
+        """Its facets."""
+        return FacetShape(self.facets, scene, repr(self), self.radius)
+
+    @property
+    def normals(self) -> np.ndarray:
+        """Outward unit normals of the faces, (m, 3)."""
+        return self.facets.normals
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
         """The edges where the mesh bends."""

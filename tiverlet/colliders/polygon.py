@@ -3,20 +3,23 @@
 import numpy as np
 
 from .. import checks
+from ..features.feature import Scene
 from ..particles import Particles
-from .facets import Facets
+from .facets import Facets, FacetShape, facet_normals
+from .moving import Moving
+from .shape import Shape
 
 BLOCK = 1 << 20  # pairs of edges that are compared together
 
 
-class Polygon(Facets):
+class Polygon(Moving):
     """Particles stay outside of a polygon, or inside; or on their own side of an open line (2D).
 
-    C(x) = dist(x, outline) - (R + r) >= 0, grad C the direction from the nearest point of the outline (see Facets).
+    C(x) = dist(x, outline) - (R + r) >= 0, grad C the direction from the nearest point of the outline (see FacetShape).
 
     vertices: (m, 2) [m], in order, either way round; concave outlines are fine. inside: keep particles in. closed: False for a
     line from the first vertex to the last, a thin wall with two sides. radius: R [m], what the outline is thickened by; a line
-    that points (particles of radius 0) meet needs some. position, rotation: where the vertices are put (see Solid); live.
+    that points (particles of radius 0) meet needs some. position, rotation: where the vertices are put (see Moving); live.
     friction, restitution, push_out: see Wall.
 
     Nothing passes, at any speed of the particle or of the wall. Raises ValueError for edges of no length, and for a closed
@@ -30,9 +33,9 @@ class Polygon(Facets):
         push_out=1.0,
     ):  # fmt: skip
         vertices = checks.points("Polygon", "vertices", vertices, dim=2)
-        self.closed, self.turned_in = bool(closed), bool(inside)
+        self.closed, self.inside = bool(closed), bool(inside)
         self.radius = radius
-        if self.turned_in and not self.closed:
+        if self.inside and not self.closed:
             raise ValueError("Polygon: inside = True needs an inside; an open line (closed = False) has none.")
         if self.closed and len(vertices) > 1 and (vertices[0] == vertices[-1]).all():
             vertices = vertices[:-1]  # written as a loop that ends where it began
@@ -51,7 +54,7 @@ class Polygon(Facets):
             area = float((v[i, 0] * v[j, 1] - v[j, 0] * v[i, 1]).sum()) / 2
             if abs(area) <= 1e-12 * size**2:
                 raise ValueError(f"Polygon: vertices enclose an area of {area:g} m^2; closed = False makes a line of them.")
-            if (area < 0) != self.turned_in:
+            if (area < 0) != self.inside:
                 i, j = j, i
         self.vertices = vertices
         self.vertices.flags.writeable = False
@@ -59,19 +62,29 @@ class Polygon(Facets):
         self.surface(friction, restitution, push_out)
         along = vertices[j] - vertices[i]
         along /= np.linalg.norm(along, axis=1)[:, None]
-        self.corners, self.features = vertices[np.stack([i, j], axis=1)], np.stack([i, j], axis=1)
-        self.wings = np.concatenate([i, j]), np.concatenate([along, -along])
+        features = np.stack([i, j], axis=1)
+        wings = np.concatenate([i, j]), np.concatenate([along, -along])
         facing = np.zeros_like(vertices)
-        normal = self.normals
+        normal = facet_normals(vertices[features])
         np.add.at(facing, i, normal)
         np.add.at(facing, j, normal)
         facing[i] = np.where(np.linalg.norm(facing[i], axis=1)[:, None] > 1e-9, facing[i], normal)
-        self.facing = facing / np.maximum(np.linalg.norm(facing, axis=1)[:, None], 1e-9)
+        facing /= np.maximum(np.linalg.norm(facing, axis=1)[:, None], 1e-9)
+        self.facets = Facets(vertices[features], features, wings, facing, self.closed, self.inside)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the dimension, and that particles and line are not both without thickness."""
-        Facets.prepare(self, particles, inv_mass)
-        self.check_thickness(particles)
+        Moving.prepare(self, particles, inv_mass)
+        self.facets.check_thickness(repr(self), particles, self.radius)
+
+    def shape_on(self, scene: Scene) -> Shape:
+        """Its facets."""
+        return FacetShape(self.facets, scene, repr(self), self.radius)
+
+    @property
+    def normals(self) -> np.ndarray:
+        """Outward unit normals of the edges, (m, 2)."""
+        return self.facets.normals
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
         """The polygon."""

@@ -10,7 +10,9 @@ from ..device.patches.compiler import Compiler
 from ..features.feature import Scene
 from ..particles import Particles
 from ..tools import golden
-from .moving import Solid, rotation_matrix
+from .moving import Moving
+from .pose import rotation_matrix
+from .shape import Shape
 
 MARCH = 64  # steps along a way; what has not come to its end by then stays where it is
 FINE = 1 / 64  # of a way: closer than that, the surface is taken for its tangent plane
@@ -18,14 +20,14 @@ SAMPLES = 4096  # places where the function is looked at before it is used
 STEEP, FLAT = 1.1, 0.9  # bounds of the gradient that pass for 1
 
 
-class Sdf(Solid):
+class Sdf(Moving):
     """Particles stay where a function is positive: outside of any shape that can be written down.
 
     C(x) = function(x) - (R + r) >= 0, grad C = grad function.
 
     function: a ti.func that takes a position [m] and returns the signed distance to the surface [m], negative inside of the
     solid. Its literals have the world's precision. gradient: a ti.func of the position that returns the gradient; None for
-    central differences. radius: R [m], what the shape is thickened by. position, rotation: where the shape is put (see Solid);
+    central differences. radius: R [m], what the shape is thickened by. position, rotation: where the shape is put (see Moving);
     live. friction, restitution, push_out: see Wall.
 
         @ti.func
@@ -40,8 +42,6 @@ class Sdf(Solid):
     checked where particles start and around, and ValueError names the place.
     """
 
-    guesses = True
-
     def __init__(
         self, function, gradient=None, *, radius=0.0, position=0.0, rotation=0.0, friction=0.0, restitution=0.0, push_out=1.0
     ):  # fmt: skip
@@ -53,7 +53,7 @@ class Sdf(Solid):
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the dimension, and refuse a function that is not finite, or not a distance, around the particles."""
-        Solid.prepare(self, particles, inv_mass)
+        Moving.prepare(self, particles, inv_mass)
         runtime.ensure_started()
         self.dev.probe = _Probe(self)
         x = particles.position
@@ -90,13 +90,9 @@ class Sdf(Solid):
                     f"Sdf: gradient is off by {off[k]:.3g} at {_at(points[k])}, compared with differences of function."
                 )
 
-    def bind(self, scene: Scene) -> None:
-        """No field of its own."""
-        Solid.bind(self, scene)
-        single = scene.real == ti.f32
-        self.dev.digits = 2.0**-21 if single else 2.0**-50
-        self.dev.slight = 2.0**-20 if single else 2.0**-48
-        self.dev.step = 2.0**-6 if single else 2.0**-16
+    def shape_on(self, scene: Scene) -> Shape:
+        """Its function."""
+        return FunctionShape(self.function, self.gradient, scene, self.dim)
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
         """Where the surface meets the plane of a 2D scene, or the three planes through the middle of a 3D one."""
@@ -112,6 +108,19 @@ class Sdf(Solid):
                 out.append(contour(grid, self.dev.probe.value(local).reshape(129, 129) - self.radius))
         return np.concatenate(out), 0.0
 
+
+class FunctionShape(Shape):
+    """The shape where a function of the position is negative, on the device."""
+
+    guesses = True
+
+    def __init__(self, function: Any, gradient: Any, scene: Scene, dim: int):
+        self.function, self.gradient, self.dim, self.real = function, gradient, dim, scene.real
+        single = scene.real == ti.f32
+        self.digits = 2.0**-21 if single else 2.0**-50
+        self.slight = 2.0**-20 if single else 2.0**-48
+        self.step = 2.0**-6 if single else 2.0**-16
+
     @ti.func
     def astray(self, q, far, close):
         """By more than rounding."""
@@ -120,7 +129,7 @@ class Sdf(Solid):
     @ti.func
     def rounding(self, q):
         """That of a function that is made of coordinates as large as those of q."""
-        return q.norm() * ti.cast(self.dev.digits, self.dev.real)
+        return q.norm() * ti.cast(self.digits, self.real)
 
     @ti.func
     def normal(self, q, far):
@@ -140,7 +149,7 @@ class Sdf(Solid):
         if ti.static(bool(self.gradient)):
             out = self.gradient(q)
         else:
-            step = ti.max(far, q.norm() / 100) * ti.cast(self.dev.step, self.dev.real)
+            step = ti.max(far, q.norm() / 100) * ti.cast(self.step, self.real)
             for k in range(self.dim):
                 ahead, behind = q, q
                 for a in ti.static(range(self.dim)):
@@ -175,7 +184,7 @@ class Sdf(Solid):
                 elif k == 0 or gap <= fine or ends or k == MARCH:
                     n = self.normal(q, far)
                     slope = e.dot(n)
-                    toward = slope < -ti.cast(self.dev.slight, self.dev.real) * way
+                    toward = slope < -ti.cast(self.slight, self.real) * way
                     if k == 0:
                         below = -(gap + slope)
                         if gap <= 4 * fine:

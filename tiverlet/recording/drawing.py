@@ -5,9 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..colliders import Box
+from ..colliders import Box, Mesh, Polygon
 from ..colliders.collider import Wall
-from ..colliders.facets import Facets
 from ..constraints import Path
 from ..constraints.distance import Link
 from ..features.feature import Batch
@@ -200,8 +199,8 @@ def bounds(world: "World") -> tuple[np.ndarray, np.ndarray]:
     low = (x - r).min(axis=0, initial=np.inf) if len(x) else np.zeros(world.particles.dim)
     high = (x + r).max(axis=0, initial=-np.inf) if len(x) else np.ones(world.particles.dim)
     for f in world.features:
-        if isinstance(f, Facets) and f.turned_in:  # a container
-            corners = f.placed(f.corners).reshape(-1, world.particles.dim)
+        if isinstance(f, (Mesh, Polygon)) and f.inside:  # a container
+            corners = f.placed(f.facets.corners).reshape(-1, world.particles.dim)
             low, high = np.minimum(low, corners.min(axis=0)), np.maximum(high, corners.max(axis=0))
         if isinstance(f, Box):
             low = np.where(np.isfinite(f.lower), np.minimum(low, f.lower), low)

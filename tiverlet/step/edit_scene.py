@@ -200,10 +200,11 @@ def _carried(
     return new
 
 
-def _fields(attributes: dict[str, Any], names: dict[int, str]) -> dict[str, str]:
-    """The attributes of a feature that are fields of the state, or the ends of a Track; and their names."""
+def _fields(attributes: dict[str, Any], names: dict[int, str]) -> dict[tuple[str, str], str]:
+    """The fields of the state that a feature holds, or a part of it that lists them as `in_state`; and their names."""
     bound = vars(attributes["dev"]) if "dev" in attributes else {}
-    fields = {key: getattr(value, "ends", value) for key, value in bound.items()}
+    parts = {key: getattr(value, "in_state", {"": value}) for key, value in bound.items()}
+    fields = {(key, part): field for key, held in parts.items() for part, field in held.items()}
     return {key: names[id(field)] for key, field in fields.items() if id(field) in names}
 
 

@@ -1,7 +1,8 @@
 """What happens to a tile of particles: loops so short that their state stays in a cache, and so simple that several are done at
 once."""
 
-from ..colliders.collider import AGAIN, FIRST, GENTLY, ROUNDS, SWEEPS, Wall
+from ..colliders.collider import ROUNDS, SWEEPS, Wall
+from ..colliders.surface import AGAIN, FIRST, GENTLY
 from ..device import ti
 from ..device.patches.compiler import FEW
 from ..device.thread_team import Team, block, blocks

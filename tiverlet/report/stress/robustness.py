@@ -12,7 +12,7 @@ from rich.table import Table
 
 from ... import checks
 from ...colliders import Box, HalfSpace
-from ...colliders.moving import Solid
+from ...colliders.moving import Moving
 from ...constraints import Constraint, Path, Snap
 from ...features.feature import Batch, Feature
 from ...forces import Force, Gravity
@@ -256,7 +256,7 @@ def shifted(world: World, dt: float, shift: float) -> Scene | str:
         if isinstance(f, (Force, Path, Snap)) or (isinstance(f, Constraint)):
             return f"{f!r} cannot be moved from outside"
         own = f.__dict__
-        if isinstance(f, Solid):
+        if isinstance(f, Moving):
             own["position"] = np.asarray(f.position) + by
         elif isinstance(f, HalfSpace):
             own["offset"] = float(f.offset + np.asarray(f.normal) @ by)

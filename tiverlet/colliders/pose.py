@@ -1,0 +1,96 @@
+"""Where the frame of a moving collider is, and how it moves in a substep."""
+
+import numpy as np
+
+from ..device import ti
+from ..features.feature import Scene
+from .angle import cos_sin
+from .track import Track
+
+
+class Pose:
+    """A point p of the collider's own frame is at position + R p in the world; R p is kept for the substep that is under way.
+
+    position: (dim,) [m]; rotation: an angle (2D) or a rotation vector (3D) [rad]: where the first frame starts.
+    in_state: what it has in the exact state, by name.
+    """
+
+    def __init__(self, scene: Scene, name: str, position: np.ndarray, rotation):
+        self.dim, self.real = len(position), scene.real
+        self.position = Track(scene.memory, f"{name}.position", position)
+        self.rotation = Track(scene.memory, f"{name}.rotation", np.atleast_1d(rotation), kind=ti.f64)
+        # Rows of R at the start and the end of the substep, and of their difference; and the position likewise.
+        self.turn = scene.memory.field(f"{name}.turn", 3 * self.dim, width=self.dim)
+        self.place = scene.memory.field(f"{name}.place", 3, width=self.dim)
+        self.in_state = {"position": self.position.ends, "rotation": self.rotation.ends}
+
+    def aim(self, position: np.ndarray, rotation) -> None:
+        """Go there during the next frame."""
+        self.position.aim(position)
+        self.rotation.aim(np.atleast_1d(rotation))
+
+    def settle(self) -> None:
+        """Stay where the last frame ended."""
+        self.position.settle()
+        self.rotation.settle()
+
+    @ti.func
+    def update(self, when):
+        """Work out where it is at the start and the end of a substep, and how it moves in between, by differences in f64."""
+        before = ti.Matrix.zero(ti.f64, self.dim, self.dim)
+        for k in range(2):
+            turn = self.matrix(self.rotation.at(ti.cast(ti.select(k == 0, when[0], when[1]), ti.f64)))
+            for a in ti.static(range(self.dim)):
+                self.turn[k * self.dim + a] = ti.cast(turn[a, :], self.real)
+                self.turn[2 * self.dim + a] = ti.cast(turn[a, :] - before[a, :], self.real)
+            before = turn
+        self.place[0], self.place[1] = self.position.at(when[0]), self.position.at(when[1])
+        self.place[2] = self.position.step(when)
+
+    @ti.func
+    def matrix(self, rotation):
+        """R of an angle or a rotation vector (Rodrigues); exactly 1 at 0."""
+        angle, out = rotation.norm(), ti.Matrix.identity(ti.f64, self.dim)
+        if angle > 0:
+            if ti.static(self.dim == 2):
+                c, s = cos_sin(rotation[0])
+                out = ti.Matrix([[c, -s], [s, c]])
+            else:
+                u = rotation / angle
+                c, s = cos_sin(angle)
+                _, half = cos_sin(angle / 2)
+                out = c * out + 2 * half * half * u.outer_product(u)
+                for a in ti.static(range(3)):
+                    b, d = ti.static((a + 1) % 3, (a + 2) % 3)
+                    out[d, b] += s * u[a]
+                    out[b, d] -= s * u[a]
+        return out
+
+    @ti.func
+    def inward(self, k: ti.template(), v):  # type: ignore[valid-type]
+        """R^T v: a vector of the world in the wall's frame, at the start (k = 0) or the end (1) of the substep."""
+        out = 0 * v
+        for a in ti.static(range(self.dim)):
+            out += self.turn[k * self.dim + a] * v[a]
+        return out
+
+    @ti.func
+    def outward(self, k: ti.template(), v):  # type: ignore[valid-type]
+        """R v, or with k = 2 how R v changes in the substep."""
+        out = 0 * v
+        for a in ti.static(range(self.dim)):
+            out[a] = self.turn[k * self.dim + a].dot(v)
+        return out
+
+
+def rotation_matrix(rotation) -> np.ndarray:
+    """R of an angle (2D) or a rotation vector (3D)."""
+    w = np.atleast_1d(np.asarray(rotation, dtype=np.float64))
+    if len(w) == 1:
+        return np.array([[np.cos(w[0]), -np.sin(w[0])], [np.sin(w[0]), np.cos(w[0])]])
+    angle = float(np.linalg.norm(w))
+    if angle == 0:
+        return np.eye(3)
+    x, y, z = w / angle
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * cross + 2 * np.sin(angle / 2) ** 2 * (cross @ cross)

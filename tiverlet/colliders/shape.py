@@ -1,0 +1,31 @@
+"""The contract of the shapes that moving colliders hold."""
+
+from ..device import ti
+
+
+class Shape:
+    """What particles stay outside of, on the device, in a frame of its own; radius: what it is thickened by [m].
+
+    guesses: strike() may miss a touch, so that ends of ways are looked at: a place is free or astray().
+    """
+
+    guesses = False
+
+    @ti.func
+    def strike(self, a, e, far, close, limit):
+        """The first touch of a particle, whose center must stay at least `far` from the shape, on its way from a to a + e.
+
+        close: what rounding amounts to. limit: how far a start that is inside may be pushed out.
+        Returns the fraction of the way (2 for none), the depth at a + e below the plane that touches there, and its normal.
+        """
+        return 0 * far + 2, 0 * far, 0 * e
+
+    @ti.func
+    def rounding(self, q):
+        """What it amounts to around a point q of the shape's frame [m]."""
+        return 0 * q[0]
+
+    @ti.func
+    def astray(self, q, far, close):
+        """Whether a particle with its center at q, in the shape's frame, is inside of it."""
+        return False

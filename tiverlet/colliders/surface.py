@@ -1,0 +1,130 @@
+"""What happens to a particle that is inside of a collider: it is taken out, with friction and restitution."""
+
+from ..device import at, inline, ti
+from ..features.feature import Scene
+
+# How a collider confines: as it comes; only what is further out than rounding; of that, without friction and bounces.
+FIRST, AGAIN, GENTLY = range(3)
+
+
+class Surface:
+    """How the surface of one collider answers on the device: friction, restitution, push_out; see Wall for what they mean.
+
+    friction: (static, dynamic), or None for a surface without. restitution: 0 to 1, or None. push_out: [m/s].
+    """
+
+    def __init__(self, scene: Scene, name: str, friction: tuple[float, float] | None, restitution: float | None, push_out: float):
+        self._memory, self.state, self.push_out = scene.memory, scene.state, push_out
+        self.rubs, self.bounces = friction is not None, restitution is not None
+        if self.rubs:
+            self.friction = scene.memory.field(f"{name}.friction", None, width=2, values=friction)
+        if self.bounces:
+            self.restitution = scene.memory.field(f"{name}.restitution", None, values=restitution)
+
+    def upload(self, friction: tuple[float, float], restitution: float) -> None:
+        """Write both to the device, as far as kernels read them."""
+        if self.rubs:
+            self._memory.write(self.friction, friction)
+        if self.bounces:
+            self._memory.write(self.restitution, restitution)
+
+    @inline
+    def static(self):
+        """The coefficient of static friction."""
+        return at(at(self.friction, None), 0)
+
+    @inline
+    def dynamic(self):
+        """The coefficient of dynamic friction."""
+        return at(at(self.friction, None), 1)
+
+    @ti.func
+    def bounced(self, i):
+        """Whether particle i is not where its displacement says, because it has bounced in this substep; and by how much."""
+        lift = 0 * self.state.d[i]
+        if ti.static(self.state.befores):
+            lift = self.state.place(i) - self.state.begin(i) - self.state.d[i]
+        return lift.norm() > 4 * self.state.digits(i), lift
+
+    @ti.func
+    def path(self, i, moved):
+        """From where particle i was at the start of the substep to where it is, as seen from a wall that moved by `moved`."""
+        out = self.state.d[i] - moved
+        if ti.static(self.state.befores):
+            high, lift = self.bounced(i)
+            if high:
+                out += lift
+        return out
+
+    @ti.func
+    def press(self, i, depth, start_depth, n, moved, h, turn):
+        """Take particle i out of a wall that it entered by `depth` [m], along the normal n; the wall itself moved by `moved`.
+
+        start_depth: how deep it was at the start of the substep, 0 or less outside [m]. turn: FIRST, AGAIN or GENTLY.
+        What comes as close as the last digits of the position can tell touches: it does not sink, or slip, by these digits.
+        Returns how the position was shifted.
+        """
+        d = self.state.d[i] - moved
+        shift = 0 * d
+        leaving = d.dot(n)
+        close = self.state.digits(i)
+        if depth > -close:
+            depth = ti.max(depth, ti.min(-leaving, close))
+        if depth > ti.select(turn == FIRST, 0, close):
+            move = ti.max(depth - ti.max(start_depth - self.push_out * h, 0), 0)
+            # Normal displacement after the substep; what has bounced may be moved further than that is to tell.
+            after = ti.min(leaving + move, ti.max(ti.abs(leaving), self.push_out * h))
+            rise = 0 * depth
+            if ti.static(self.bounces):
+                # Where the last bounce has put it back on a straight way, that way began at a height of `gap`.
+                gap = -depth - leaving
+                if gap >= 0 and leaving < 0 and turn != GENTLY:
+                    rise, after = self.bounce(gap, leaving, (self.state.before[i] - moved).dot(n), after)
+            change = (after - leaving) * n
+            if ti.static(self.state.leans):
+                self.state.lean[i] = self.state.lean[i] + change
+            shift = (move + rise) * n
+            stuck = False
+            if ti.static(self.rubs):
+                if turn != GENTLY:
+                    slip = d - leaving * n
+                    size, support = slip.norm(), after - leaving
+                    if size > self.static() * support:
+                        slip *= self.dynamic() * support / size
+                    else:
+                        high, _lift = self.bounced(i)
+                        stuck = rise == 0 and not high
+                    change -= slip
+                    shift -= slip
+            self.state.d[i] = self.state.d[i] + change
+            if ti.static(self.state.befores):
+                impact = change  # which is no acceleration
+                if rise == 0:
+                    impact -= (after - leaving) * n
+                self.state.before[i] = self.state.before[i] + impact
+            if ti.static(self.rubs):
+                if stuck:
+                    self.state.restart(i)
+            if not stuck:
+                self.state.advance(i, shift)
+        return shift
+
+    @ti.func
+    def bounce(self, gap, leaving, before, after):
+        """What is above the wall at the end of the substep, and the normal displacement that carries the velocity then.
+
+        In units of the substep, the height is gap + v s + k s^2 / 2, with k the acceleration and v = leaving - k / 2; the impact
+        is at its root s. A bounce that would end below the wall has come to rest.
+        """
+        k = leaving - before
+        v = leaving - k / 2
+        root = ti.sqrt(ti.max(v * v - 2 * k * gap, 0)) - v
+        rise = 0 * gap
+        if root > 0:
+            s = ti.min(2 * gap / root, 1)
+            out = -self.restitution[None] * (v + k * s)
+            height = (1 - s) * (out + k / 2 * (1 - s))
+            if height > 0 and out > 0:
+                rise = height
+                after = out + k * (1 - s) - k / 2
+        return rise, after

@@ -1,0 +1,37 @@
+"""A point that goes where it is sent during a frame."""
+
+import numpy as np
+
+from ..device import ti
+from ..device.memory import Memory
+
+
+class Track:
+    """A point of a wall that goes where it is sent during a frame, in a straight line.
+
+    in_state: what it has in the exact state, by name.
+    """
+
+    def __init__(self, memory: Memory, name: str, value: np.ndarray, kind=None):
+        self._memory = memory
+        self.ends = memory.field(name, 2, width=len(value), kind=kind, values=[value, value], state=True)
+        self.in_state = {"ends": self.ends}
+
+    def aim(self, value: np.ndarray) -> None:
+        """Go to `value` during the next frame."""
+        self._memory.write(self.ends, [self._memory.read(self.ends)[1], value])
+
+    def settle(self) -> None:
+        """Stay where the last frame ended."""
+        self._memory.write(self.ends, [self._memory.read(self.ends)[1]] * 2)
+
+    @ti.func
+    def at(self, when):
+        """Where it is at the fraction `when` of the frame; what stands is where it stands, to the bit."""
+        a, b = self.ends[0], self.ends[1]
+        return ti.select(a == b, a, a * (1 - when) + b * when)
+
+    @ti.func
+    def step(self, when):
+        """How far it goes in a substep."""
+        return (self.ends[1] - self.ends[0]) * (when[1] - when[0])
