@@ -10,6 +10,8 @@ from .contact import Contact
 SLACK = 1 / 512  # of an edge: as much further it goes at its ends, so that bodies of the same width stand on each other
 CLOSE = 1e-4  # edges whose distances differ by less are equally near: the first of them counts
 TINY = 1e-30
+DISCS = -1  # as a place on an edge: there is no edge, two discs touch
+OVER_EDGE = 1  # what tips_cross() returns where the way out is over the edge of the second corner
 VERTEX, START, END = range(3)  # what a particle is in a contact with one that it is listed with
 
 
@@ -55,7 +57,7 @@ class Rim(Contact):
         if uu > 0:
             length = ti.sqrt(uu)
             t, n = r.dot(u) / uu, ti.Vector([u[1], -u[0]]) / length
-            height, cross, came, shared = r.dot(n), t, True, a
+            height, cross, came, shared, passed = r.dot(n), t, True, a, False
             if height < 0:
                 came = height >= -SLACK * length
                 if ti.static(moved):
@@ -65,13 +67,20 @@ class Rim(Contact):
                     came = height0 >= -SLACK * length
                     if height0 > 0:
                         cross = t0 + height0 / (height0 - height) * (t - t0)
-            beside = -SLACK <= cross <= 1 + SLACK
-            if not came and t < 0:
-                beside = front < 0
-                if beside:  # the nearest way out is over an inner corner
-                    height, shared = -r.norm(), self.before(a)
-                    n = r / ti.min(height, -uu * TINY)
-            t = ti.min(ti.max(t, 0), 1)
+                        passed = -SLACK <= cross <= 1 + SLACK
+            beside, tips = -SLACK <= cross <= 1 + SLACK, 0
+            if height < 0 and height >= -length / 2 and not passed:
+                at_end = t > 0.5
+                tips = self.tips_cross(v, ti.select(at_end, b, a)) * ti.select(at_end, -1, 1)
+            if tips == OVER_EDGE:
+                beside = True
+            else:
+                if not came and t < 0:
+                    beside = front < 0
+                    if beside:  # the nearest way out is over an inner corner
+                        height, shared = -r.norm(), self.before(a)
+                        n = r / ti.min(height, -uu * TINY)
+                t = ti.min(ti.max(t, 0), 1)
             far = self.dev.radius.of(v) + (1 - t) * self.dev.radius.of(a) + t * self.dev.radius.of(b)
             if beside and height < far and height >= -length / 2:
                 out, back = far - height, 0 * r
@@ -81,11 +90,45 @@ class Rim(Contact):
                     if ti.static(moved):
                         out = ti.min(out, self.push_out * self.dev.h[None] - self.relative(self.dev.state.d, v, a, b, t).dot(n))
                         back = self.inward(v)
-                    if back.dot(n) >= 0 and self.inside(v, a):
+                    if tips == OVER_EDGE:
+                        came = True
+                    elif back.dot(n) >= 0 and self.inside(v, a):
                         came = self.nearest(v, a, shared, height, back)
                 if came:
                     overlap = out
         return overlap, n, t
+
+    @ti.func
+    def tips_cross(self, v, c):
+        """Whether the bodies of two corners v and c cross there although neither corner is inside of the other body.
+
+        Each corner has then passed between the edges of the other: it is behind one of them and in front of the next, and the
+        latter is crossed by both edges of the corner. The shortest way out is over the edge that v is behind, or over that which
+        c is behind. Returns 1 for the edge from c to the next, -1 for that which ends at c; twice that where the way over the
+        edge of v is shorter; and 0 where they do not cross.
+        """
+        out = 0
+        if self.after(v) >= 0 and self.after(c) >= 0:
+            r = self.dev.state.apart(v, c)
+            p, q = self.dev.state.apart(self.after(v), v), self.dev.state.apart(self.before(v), v)
+            a, b = self.dev.state.apart(self.after(c), c), self.dev.state.apart(self.before(c), c)
+            # Heights, times the lengths of the edges: of v over those of c, and of c over those of v.
+            over_a, over_b, over_p, over_q = r.cross(a), b.cross(r), p.cross(r), r.cross(q)
+            if p.cross(q) > 0 and a.cross(b) > 0 and over_a * over_b < 0 and over_p * over_q < 0:
+                side, behind, front = 1, a, b
+                if over_a > 0:
+                    side, behind, front = -1, b, a
+                own, other, turn = p, q, 1
+                if over_p > 0:
+                    own, other, turn = q, p, -1
+                # Both corners leave over the edge that the other one is behind, and the edges in front are crossed.
+                leaves = side * p.cross(behind) >= 0 and side * q.cross(behind) >= 0
+                leaves = leaves and turn * a.cross(own) >= 0 and turn * b.cross(own) >= 0
+                if leaves and meets(r, other, front) and meets(r, own, front) and meets(r, other, behind):
+                    deep, deep_v = ti.min(over_a, over_b), ti.min(over_p, over_q)
+                    shorter = deep_v * deep_v * behind.dot(behind) < deep * deep * own.dot(own)
+                    out = ti.select(shorter, 2 * side, side)
+        return out
 
     @ti.func
     def inside(self, v, a):
@@ -148,10 +191,13 @@ class Rim(Contact):
                 overlap, n, t = self.edge(i, j, front, moved)
             if overlap <= 0 and i < j and front > 0:
                 overlap, n = self.touch(i, j, self.dev.radius.of(i) + self.dev.radius.of(j))
+                if overlap > 0:
+                    if self.tips_cross(i, j) != 0:
+                        overlap = -overlap
                 if ti.static(moved):
                     overlap -= self.dev.less[i]
                 if overlap > 0:
-                    t = 0 * t - 1
+                    t = 0 * t + DISCS
                     if self.corner(j, i) <= 0:
                         overlap = -overlap
             self.dev.met.field[e] = ti.Vector([overlap, t, n[0], n[1]])
@@ -196,11 +242,11 @@ class Rim(Contact):
         b, t, part = a, 0 * self.dev.w.of(i), 0 * self.dev.w.of(i) + 1
         if at >= 0:
             t = self.dev.met.field[at][1]
-            if t >= 0:
+            if t > DISCS:
                 b = self.after(a)
             elif role == END:
                 at = -1
-            t = ti.max(t, 0)
+            t = ti.select(t > DISCS, t, 0)
             if b < 0:
                 at = -1
             if role == START:
@@ -223,7 +269,7 @@ class Rim(Contact):
         pairs, met, push = pairs[some], met[some], push[some]
         (i, j), overlap, t, n = pairs.T, met[:, 0], met[:, 1], met[:, 2:]
         parted, no_way = overlap <= 0, (n == 0).all(axis=1)
-        discs = (t < 0) | (no_way & (r[i] + r[j] > 0))
+        discs = (t <= DISCS) | (no_way & (r[i] + r[j] > 0))
         ends, t = np.where(discs, j, self.dev.ends[j, 0]), np.where(discs, 0.0, t)
         edge, apart = x[ends] - x[j], x[i] - (1 - t)[:, None] * x[j] - t[:, None] * x[ends]
         straight = np.where(discs[:, None], apart, np.stack([edge[:, 1], -edge[:, 0]], axis=1))
@@ -232,6 +278,16 @@ class Rim(Contact):
         overlap = np.where(parted, r[i] + far - (apart * n).sum(axis=1), overlap)
         point = x[i] - apart + (far - overlap / 2)[:, None] * n
         return Contacts(pairs, ends, t, overlap, n, point, push / h)
+
+
+@ti.func
+def meets(r, s, q):
+    """Whether the line from r to r + s crosses that from 0 to q."""
+    d = s.cross(q)
+    at_s, at_q = q.cross(r), s.cross(r)
+    if d < 0:
+        d, at_s, at_q = -d, -at_s, -at_q
+    return d > 0 and 0 <= at_s <= d and 0 <= at_q <= d
 
 
 class Apart:

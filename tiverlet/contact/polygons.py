@@ -16,7 +16,7 @@ from ..particles import Particles, Radii
 from ..tools import median
 from .contact import Contact
 from .loops import checked, laid, refuse_deep
-from .polygon_narrow_phase import VERTEX, Apart, Rim
+from .polygon_narrow_phase import DISCS, VERTEX, Apart, Rim
 
 STRETCH = 1.25  # of an edge, beyond which a contact in its middle might not be listed
 
@@ -38,8 +38,10 @@ class Polygons(Rim):
     if it is not deeper than half the length of that edge: in a substep nothing should get there, and the step flags
     "tunnelling-risk" where it might. Particles that start deeper are refused.
 
-    Bodies that cross each other without a corner of one inside of the other are not seen. Walls act on particles: a sharp corner
-    of a wall passes between two of them.
+    Two sharp corners may pass each other, so that neither is inside of the other body but their edges cross. They part over that
+    of their edges which is nearer, C as above with t beyond the end of the edge. Other bodies that cross each other without a
+    corner of one inside of the other, such as two bars, are not seen. Walls act on particles: a sharp corner of a wall passes
+    between two of them.
     """
 
     measures, calms = True, False
@@ -318,7 +320,7 @@ class Polygons(Rim):
             j, met = self.dev.grid.near[e], self.dev.met.field[e]
             if met[0] > 0:
                 size = ti.min(self.dev.radius.of(i), self.dev.radius.of(j))
-                if met[1] >= 0:
+                if met[1] > DISCS:
                     size = self.dev.state.apart(self.after(j), j).norm() / 2
                 elif size == 0:
                     size = ti.max(self.dev.radius.of(i), self.dev.radius.of(j))
