@@ -340,6 +340,20 @@ def test_what_was_absent_is_compiled_when_it_is_first_asked_for(world):
     np.testing.assert_allclose(w.position, other.position, atol=1e-9)
 
 
+def test_a_link_whose_rest_length_becomes_zero(world):
+    # It needs a direction of its own, for which links that have a length have no code.
+    built = []
+    for rest in (None, 0.0):
+        link = tv.Distance([[0, 1]], rest)
+        w = falling(world, [link])
+        link.rest = 0.0
+        w.run(0.1)
+        built.append(w)
+    assert built[0].position.tolist() == built[1].position.tolist()
+    r, v = (a[0] - a[1] for a in (built[0].position, built[0].velocity))
+    assert np.hypot(*r) < 1e-3 and np.hypot(*v) < 0.1  # they are one, and fall as one
+
+
 def test_what_is_turned_stays_in_edited_worlds_and_in_recordings(world, tmp_path):
     link, floor = tv.Distance([[0, 1]]), tv.HalfSpace((0, 1), friction=0.5)
     w = falling(world, [link, floor])

@@ -15,13 +15,19 @@ class Link(Scalar):
     """
 
     arity = 2
-    precise = cusp = True
+    precise = True
+    compiled_for = (*Scalar.compiled_for, "cusp")
     rest = Knob(lambda f, v: checks.per_item(repr(f), f.rest_name, v, f.count, least=0.0), "Rest length [m].")
 
     def rest_of(self, position: np.ndarray) -> np.ndarray:
         """Lengths of the links."""
         i, j = self.indices.T
         return np.linalg.norm(position[i] - position[j], axis=1)
+
+    @property
+    def cusp(self) -> bool:
+        """Whether any rest length is 0, or was when kernels were compiled."""
+        return bool((self.goal == 0).any()) or vars(self.dev).get("cusp", False)
 
     @ti.func
     def excess(self, c, f, rest):

@@ -28,7 +28,7 @@ class Scalar(Elastic):
     """
 
     precise = False  # whether exactly() measures to all the digits that positions have
-    cusp = False  # whether f = 0 is where gradients end: no direction at the start of the step means anything for rest = 0
+    cusp = False  # whether any goal is f = 0, where gradients end: no direction at the start of the step means anything there
     collapses = 0  # the power of a length that f is, where gradients vanish with the size of the body; else 0
 
     @property
@@ -44,6 +44,7 @@ class Scalar(Elastic):
         self.dev.told, self.dev.alone = bool((rows >= 0).any()), bool((rows < 0).any())
         if self.dev.told:
             self.dev.row = add(f"{name}.row", m, kind=ti.i32, values=rows)
+        self.dev.cusp = self.cusp
         self.dev.firm = self.joins and (self.dev.told or scene.slots.accelerates)
         if self.dev.firm:
             self.dev.close = add(f"{name}.close", m, values=self.closeness(self.start.position))
@@ -76,7 +77,7 @@ class Scalar(Elastic):
             there += split * n[k, :].dot(n[k, :])
         turn = self.dev.slots.turn(both, ti.sqrt(here * there))
         lost = turn == FAR
-        if ti.static(self.cusp):
+        if ti.static(self.dev.cusp):
             lost = lost or (self.dev.rest[c] == 0 and self.is_rigid(c))
         if ti.static(self.dev.firm):
             if self.is_rigid(c):
