@@ -21,7 +21,7 @@ from .step.build import Assembly, assemble, check_settings, checked_features, ch
 from .step.diagnostics import STARTED, STEPPED
 from .step.edit_scene import Handle
 from .step.explain import explain
-from .step.projection import SHORTER, project
+from .step.projection import project
 from .step.runner import Launches
 from .step.step import FREE, decay
 from .step_report import StepReport
@@ -78,6 +78,7 @@ class World(Launches):
         self._handles: weakref.WeakSet[Handle] = weakref.WeakSet()
         self._time, self._tick, self._h = 0.0, 0, 0.0
         self._since = 0  # substeps since the last start
+        self._longest = 0.0  # [s] substep since violations were last taken out, see project()
         self._frame = (0.0, 0.0, 0)  # when frames of the present length began, their length, their number
         self._fresh, self._started = True, False  # d holds velocities; the last substep was the first after a start
         self._owed = 0.0  # [s] of the kick by rigid constraints that the velocities at the last start lacked
@@ -227,10 +228,10 @@ class World(Launches):
             return
         with self._memory.compiler():
             if h != self._h or drag != self._drag:
-                ratio = 1.0 if self._fresh or self._order > 2 else h / self._h
+                self._longest = max(self._longest, self._h if self._placed is None else 0.0)
                 self._restart()
-                if ratio < SHORTER:
-                    project(self, ratio)
+                if h < self._longest and self._order == 2 and project(self, h, self._longest):
+                    self._longest = h
             if self._fresh:
                 self._since = 0
             if self._placed is not None and self._sub.slots and self._sub.slots.system:

@@ -29,6 +29,14 @@ class Link(Scalar):
         """Whether any rest length is 0, or was when kernels were compiled."""
         return bool((self.goal == 0).any()) or vars(self.dev).get("cusp", False)
 
+    def slopes(self, position: np.ndarray) -> np.ndarray:
+        """As in measure()."""
+        i, j = self.indices.T
+        r = position[i] - position[j]
+        length = np.linalg.norm(r, axis=1, keepdims=True)
+        n = np.divide(r, length, out=np.eye(1, r.shape[1]).repeat(len(r), axis=0), where=length > 0)
+        return np.stack([n, -n], axis=1)
+
     @ti.func
     def excess(self, c, f, rest):
         """|r| - rest = (r^2 - rest^2) / (|r| + rest): to all digits of the low words, where there are any."""

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 HASHED = ("_time", "_tick", "_since", "_h", "_fresh")  # of the clock; the rest follows from the same past
 CARRIED = ("Contact.push", "Contact.slip", "Contact.slack")  # by pairs, for the next substep
 TOLD = "Contact.given"  # by pairs, of the last substep, for reports
-CLOCK = (*HASHED, "_frame", "_drag", "_started", "_owed", "_parted", "_placed", "_energy")
+CLOCK = (*HASHED, "_longest", "_frame", "_drag", "_started", "_owed", "_parted", "_placed", "_energy")
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,8 @@ class Kept:
 
     def digest(self) -> str:
         """SHA-256 of the exact state, the clock, and what the guard remembers."""
-        out = hashlib.sha256(repr((*(self.clock[name] for name in HASHED), *self.guard)).encode())
+        longer = [self.clock["_longest"]] if self.clock["_longest"] > self.clock["_h"] else []
+        out = hashlib.sha256(repr((*(self.clock[name] for name in HASHED), *longer, *self.guard)).encode())
         for name, values in self._lasting().items():
             out.update(name.encode())
             out.update(values.tobytes())
@@ -120,7 +121,8 @@ def check(world: "World", kept: Kept, flagged: list[list[bool]]) -> None:
     clock = kept.clock
     right = [type(clock[name]) is int and 0 <= clock[name] < 2**31 for name in ("_tick", "_since")]
     right += [type(v) is bool for v in (clock["_fresh"], clock["_started"], *(b for pair in flagged for b in pair))]
-    right += [type(v) in (int, float) for v in (clock["_time"], clock["_h"], *clock["_frame"], clock["_energy"] or 0)]
+    numbers = [clock[name] for name in ("_time", "_h", "_longest")]
+    right += [type(v) in (int, float) for v in (*numbers, *clock["_frame"], clock["_energy"] or 0)]
     right += [clock["_placed"] is None or 0 <= clock["_placed"] <= len(world.particles), len(flagged) == len(world.features)]
     right += [clock["_drag"] is None or [type(v) for v in clock["_drag"]] == [float] * 5, len(clock["_frame"]) == 3]
     if not all(right):

@@ -1,113 +1,235 @@
-"""Back to the rigid constraints where the substep gets shorter: what is left of them would become energy.
+"""What constraints leave undone becomes less where the substep gets shorter: else it would become energy.
 
-A pass holds a load F by a violation C = D h^2 F, as a spring of stiffness 1 / (D h^2) would. A shorter substep makes that spring
-stiffer while it is stretched, and its energy (h / h')^2 times as large. So positions and velocities first go to where constraints
-are fulfilled, by the least moves in the metric of the masses:
+A pass holds a load F by a violation Z = D h^2 F, beside what its compliance takes, as a spring of stiffness 1 / (D h^2) would.
+A shorter substep h' makes that spring stiffer while it is stretched, and its energy (h / h')^2 times as large. So positions
+first go to where the same loads need the violations (h' / h)^2 Z, and velocities to where they do not change:
 
-    x += w J^T lam,  (J w J^T + mu) lam = -C;     v += w J^T lam,  (J w J^T + mu) lam = -J v
+    x += w J^T lam,  C(x) = C - (1 - (h' / h)^2) theta Z;     v += w J^T lam,  (J w J^T + mu) lam = -J v
 
-for what is violated. Positions move without velocities, as contacts do that an impact left overlapping.
+Z = C + alpha lam / h^2 is what the last substep left of a constraint; theta says how rigid it is, see Scalar: springs that the
+substep resolves stay as they are. Positions move without velocities, as contacts do that an impact left overlapping.
+
+Where that lifts what hangs, motion pays for it as far as it can: a taut net has no direction to sag in, so velocities know
+nothing of its fall, and lifting it back at the end of each fall would be a pump. The energy that was gained is taken out of the
+velocities, of the part along the moves first, then of the whole of what is anchored. What hangs at rest is lifted for nothing:
+its fall became heat when it stretched.
 """
 
+import copy
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..constraints.core.scalar import Scalar
+from ..solvers.elimination import components
 
 if TYPE_CHECKING:
     from ..world import World
 
-SHORTER = 0.75  # of what it was: a substep from where on it matters
-ENOUGH = 1e-3  # of its size: a violation whose energy in the shorter substep matters, times (h' / h)^2
-NEWTON = 20  # steps, at most, and the least part of one
-LEAST = 1e-2
+ENOUGH = 1e-3  # of its size: a violation that matters, over (r - 1)^2 / r with r = (h / h')^2: what one jump leaves to vibrate
+FIRM = 0.9  # theta of what velocities do not change
+FAR = 0.75  # of the longest: a substep in which what is small now has had its chance
+NEWTON = 20  # steps, at most
+BEGIN, HARDEST = 1e-3, 10.0  # mu of the first, and of the last try
+LEFT = 0.01  # of what violations store: what may be left of it in the shorter substep
 DONE = 1e-6  # of its size: a violation that is none
 STEPS = 200  # of conjugate gradients in each, at most
 SOFT = 1e-6  # of the diagonal: what has hardly a direction to move in stays
 
 
-def project(world: "World", ratio: float) -> None:
-    """Fulfil rigid constraints; d holds velocities. Nothing happens where they are, or where particles would overlap.
+def project(world: "World", h: float, longest: float) -> bool:
+    """Take out what violations would store; d holds velocities. Nothing happens where they are small, or would overlap.
 
-    ratio: of the coming substep to the last one.
+    h: the coming substep [s]; longest: since this was done last. Returns whether positions have been looked after.
     """
-    enough = ENOUGH * ratio**2
+    ratio = h / longest
     slots = world._scene.slots
     eliminated = slots and slots.system and not slots.system.steps  # holds loads without a violation
-    batches = [b for b in world._batches if isinstance(b, Scalar) and b.joins and b.count and not b.breaks]
+    batches = [b for b in world._batches if isinstance(b, Scalar) and b.joins and b.count]
     batches = [b for b in batches if not (eliminated and (slots.rows(b) >= 0).any())]
     w, state, memory = world._scene.inv_mass, world._scene.state, world._memory
     if not batches:
-        return
+        return True
     x = before = state.get(memory)
-    if not np.isfinite(x).all() or (rows := Rows(batches, x, w)).worst <= enough:
-        return
-    first, far = rows, 1.0
+    if not np.isfinite(x).all():
+        return True
+    start = Rows(batches, w, x)
+    undone = start.undone(world)
+    if float(np.abs(undone * start.close).max(initial=0.0)) * (1 - ratio**2) ** 2 <= ENOUGH * ratio**2:
+        return ratio < FAR
+    rows = start = start.towards(start.C - (1 - ratio**2) * undone)
+    mu, enough = BEGIN, LEFT * ratio**2 * rows.stored
     for _ in range(NEWTON):
-        move = rows.solve(-rows.C, SOFT)
-        new = Rows(batches, x + far * move, w)
-        while new.size >= rows.size and far > LEAST:
-            far /= 2
-            new = Rows(batches, x + far * move, w)
-        if new.size >= rows.size:
+        new = rows.at(x + rows.step(mu))
+        better = new.stored < rows.stored
+        mu = max(mu / 8, SOFT) if better else 8 * mu
+        if better:
+            x, rows = new.x, new
+        if rows.stored <= enough or rows.worst <= DONE or mu > HARDEST:
             break
-        x, rows, far = new.x, new, min(1.0, 2 * far)
-        if rows.worst <= max(0.1 * enough, DONE):
-            break
-    v = memory.read(state.d).astype(np.float64)
+    kept = memory.read(state.d)
+    v = kept.astype(np.float64)
     n = len(x)
-    rows = Rows(batches, x, w, first.active)
-    v[:n] += rows.solve(-rows.rates(v[:n]), SOFT)
-    overlap = _overlap(world)
+    still = (undone != 0) & (start.theta > FIRM)
+    v[:n] += rows.solve(-rows.rates(v[:n]) * still, still, SOFT)
+    energy, overlap = _seen(world)
+    if world._energy is not None:  # by the loads of the last substep: what springs of its violations would hold is not there
+        energy = world._energy
     state.put(memory, x)
-    if overlap is not None and (_overlap(world) or 0.0) > overlap:
+    memory.write(state.d, v)
+    more, deeper = _seen(world)
+    if deeper > overlap:
         state.put(memory, before)
-    else:
+        memory.write(state.d, kept)
+    elif more > energy:
+        v[:n] = start.paid(v[:n], x - before, more - energy)
         memory.write(state.d, v)
+    return True
 
 
-def _overlap(world: Any) -> float | None:
-    """That of the worst contact, in radii; None without contacts."""
-    if not world._sub.contacts:
-        return None
+def _seen(world: Any) -> tuple[float, float]:
+    """Energy [J], and the overlap of the worst contact, in radii."""
     world._look()
-    return world._report().overlap
+    report = world._report()
+    return report.energy, report.overlap
+
+
+def _over(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """a / b; 0 where b is."""
+    return np.divide(a, b, out=np.zeros_like(a), where=b > 0)
 
 
 class Rows:
-    """The rigid constraints that act: their violations, and their gradients by corners."""
+    """Constraints at positions x: what they are to give up, C, and their gradients J by corners.
 
-    def __init__(self, batches: list[Scalar], x: np.ndarray, w: np.ndarray, active: list[np.ndarray] | None = None):
-        self.x, self.n, self.dim, self.w = x, len(x), x.shape[1], w
-        found = [b.violation(x) for b in batches]
-        if active is None:
-            active = [
-                (b.compliance == 0) & ((C * b.side > 0) if b.side else True) & ~b.idle(w)
-                for b, C in zip(batches, found, strict=True)
-            ]
-        self.active = active
-        slopes = [b.slopes(x)[some] for b, some in zip(batches, active, strict=True)]
-        self.C = np.concatenate([C[some] for C, some in zip(found, active, strict=True)])
-        self.who = np.concatenate([b.indices[some].ravel() for b, some in zip(batches, active, strict=True)])
-        arity = np.concatenate([np.full(len(g), b.arity) for b, g in zip(batches, slopes, strict=True)])
-        self.row = np.repeat(np.arange(len(self.C)), arity)
-        self.J = np.concatenate([g.reshape(-1, self.dim) for g in slopes])
-        close = np.concatenate([b.closeness(b.start.position)[some] for b, some in zip(batches, active, strict=True)])
-        self.worst, self.size = float(np.abs(self.C * close).max(initial=0.0)), float(((self.C * close) ** 2).sum())
-        self.diagonal = np.bincount(self.row, w[self.who] * (self.J**2).sum(axis=1), minlength=len(self.C))
+    Corner k belongs to row[k] and is particle who[k].
+    """
+
+    goal: Any = 0.0  # what C is measured from
+    theta: Any = 1.0  # how rigid they are
+    weight: Any = 1.0  # the same as passes see it, which split masses
+
+    def __init__(self, batches: list[Scalar], w: np.ndarray, x: np.ndarray):
+        self.batches, self.w, self.n, self.dim = batches, w, *x.shape
+        self.some = [~b.idle(w) & ~b.broken if b.breaks else ~b.idle(w) for b in batches]
+        self.side, arity = (
+            np.concatenate([np.full(some.sum(), of(b)) for b, some in zip(batches, self.some, strict=True)])
+            for of in (lambda b: b.side, lambda b: b.arity)
+        )
+        self.m = len(self.side)
+        self.who = np.concatenate([b.indices[some].ravel() for b, some in zip(batches, self.some, strict=True)])
+        self.row = np.repeat(np.arange(self.m), arity)
+        self.close = self._each([b.closeness(b.start.position) for b in batches])
+        first = (np.cumsum(arity) - arity)[arity == 2]
+        self.pairs = self.row[first], self.who[first], self.who[first + 1]
+        self._measure(x)
+
+    def _each(self, values: list[np.ndarray]) -> np.ndarray:
+        """Values of every constraint of the batches, for the rows."""
+        return np.concatenate([value[some] for value, some in zip(values, self.some, strict=True)])
+
+    def _measure(self, x: np.ndarray) -> None:
+        self.x, self.C = x, self._bounded(self._each([b.violation(x) for b in self.batches]) - self.goal)
+        self.J = np.concatenate(
+            [b.slopes(x)[some].reshape(-1, self.dim) for b, some in zip(self.batches, self.some, strict=True)]
+        )
+        self.diagonal = np.bincount(self.row, self.w[self.who] * (self.J**2).sum(axis=1), minlength=self.m)
+        self.worst = float(np.abs(self.C * self.close).max(initial=0.0))
+        self.stored = float(_over(self.weight * self.C * self.C, self.diagonal).sum())
+
+    def _bounded(self, C: np.ndarray) -> np.ndarray:
+        """C on the side on which constraints act."""
+        return np.where(self.side == 0, C, np.maximum(self.side * C, 0.0) * self.side)
+
+    def at(self, x: np.ndarray) -> "Rows":
+        """The same rows elsewhere."""
+        new = copy.copy(self)
+        new._measure(x)
+        return new
+
+    def towards(self, goal: np.ndarray) -> "Rows":
+        """The same rows, with C from what it is to be."""
+        new = copy.copy(self)
+        new.goal = goal
+        new._measure(self.x)
+        return new
+
+    def undone(self, world: Any) -> np.ndarray:
+        """Z, by what the last substep knew; and how rigid the rows are."""
+        read, h = world._memory.read, world._h
+        alpha, damping = (self._each([getattr(b, name) for b in self.batches]) for name in ("compliance", "damping"))
+        split = read(world._scene.slots.split)[: self.n].astype(np.float64)
+        self.theta = self._rigid(alpha, self.diagonal * h * h)
+        shared = np.bincount(self.row, split[self.who] * (self.J**2).sum(axis=1), minlength=self.m)
+        self.weight = self._rigid(alpha, shared * h * h)
+        gamma = damping * alpha / h
+        A = self.theta + gamma if world._started else (1 + 3 * self.theta) / 4 + gamma * (1 + self.theta) / 2
+        known = [
+            (read(b.dev.history) if b.dev.soft else 0) + b.compliance * read(b.dev.lam)[: b.count] / world._scene.hh
+            for b in self.batches
+        ]
+        return self._bounded(np.where(alpha > 0, A, 1.0) * self.C + self._each(known))
+
+    def _rigid(self, alpha: np.ndarray, reach: np.ndarray) -> np.ndarray:
+        """theta, by what a force of 1 N moves in a substep."""
+        return _over(reach * reach, reach * reach + alpha * alpha)
 
     def rates(self, v: np.ndarray) -> np.ndarray:
         """J v."""
-        return np.bincount(self.row, (self.J * v[self.who]).sum(axis=1), minlength=len(self.C))
+        return np.bincount(self.row, (self.J * v[self.who]).sum(axis=1), minlength=self.m)
 
     def moves(self, lam: np.ndarray) -> np.ndarray:
         """w J^T lam."""
-        pull = self.J * lam[self.row][:, None]
-        return np.stack([self.w * np.bincount(self.who, pull[:, a], minlength=self.n) for a in range(self.dim)], axis=1)
+        return self.w[:, None] * self._gathered(self.J * lam[self.row][:, None], self.who)
 
-    def solve(self, right: np.ndarray, soft: float) -> np.ndarray:
-        """w J^T lam with (J w J^T + mu) lam = right, by conjugate gradients with the diagonal for a preconditioner.
+    def _gathered(self, values: np.ndarray, who: np.ndarray) -> np.ndarray:
+        """The sums of values over the particles that they belong to."""
+        sums = [np.bincount(who, column, minlength=self.n) for column in values.reshape(len(values), -1).T]
+        return np.stack(sums, axis=1).reshape(self.n, *values.shape[1:])
+
+    def step(self, mu: float) -> np.ndarray:
+        """Moves p that minimize sum (C + J p)^2 / (2 D) + mu p^T M p / 2 + p^T K p / 2, with D the diagonal of J w J^T.
+
+        K is what tensions C / D across links are: without it, those that are in one line have no direction to give way in, and
+        what would draw a taut rope straight throws it into a zigzag. Conjugate gradients with blocks of a particle.
+        """
+        free, m = self.w > 0, _over(np.ones(self.n), self.w)
+        stiff = _over(self.weight, self.diagonal)
+        row, i, j = self.pairs
+        across, length = self.x[i] - self.x[j], np.linalg.norm(self.x[i] - self.x[j], axis=1)
+        across = across * _over(np.ones_like(length), length)[:, None]
+        taut = _over(np.maximum(self.C[row], 0.0) * stiff[row], length)
+
+        one = np.eye(self.dim)
+        sides = taut[:, None, None] * (one - across[:, :, None] * across[:, None, :])
+        blocks = self._gathered((stiff[self.row, None] * self.J)[:, :, None] * self.J[:, None, :], self.who)
+        blocks += self._gathered(np.concatenate([sides, sides]), np.concatenate([i, j])) + (mu * m)[:, None, None] * one
+        inverse = np.linalg.inv(np.where(free[:, None, None], blocks, one)) * free[:, None, None]
+
+        def applied(p: np.ndarray) -> np.ndarray:
+            q = p[i] - p[j]
+            q = taut[:, None] * (q - across * (across * q).sum(axis=1)[:, None])
+            out = self._gathered(self.J * (stiff * self.rates(p))[self.row, None], self.who) + (mu * m)[:, None] * p
+            return out + self._gathered(np.concatenate([q, -q]), np.concatenate([i, j]))
+
+        r = -self._gathered(self.J * (stiff * self.C)[self.row, None], self.who) * free[:, None]
+        out = np.zeros_like(r)
+        z = np.einsum("iab,ib->ia", inverse, r)
+        p, now = z, float((r * z).sum())
+        least = 1e-4 * now
+        for _ in range(STEPS):
+            if now <= least:
+                break
+            q = applied(p) * free[:, None]
+            far = now / float((p * q).sum())
+            out, r = out + far * p, r - far * q
+            z = np.einsum("iab,ib->ia", inverse, r)
+            now, last = float((r * z).sum()), now
+            p = z + now / last * p
+        return out
+
+    def solve(self, right: np.ndarray, some: np.ndarray, soft: float) -> np.ndarray:
+        """w J^T lam with (J w J^T + mu) lam = right, for some rows: conjugate gradients.
 
         mu: `soft` of the diagonal.
         """
@@ -119,10 +241,39 @@ class Rows:
         for _ in range(STEPS):
             if now <= 1e-12 * first:
                 break
-            q = self.rates(self.moves(p)) + mu * p
+            q = some * self.rates(self.moves(p)) + mu * p
             step = now / float(p @ q)
             lam, r = lam + step * p, r - step * q
             z = scale * r
             now, last = float(r @ z), now
             p = z + now / last * p
         return self.moves(lam)
+
+    def paid(self, v: np.ndarray, moves: np.ndarray, energy: float) -> np.ndarray:
+        """Velocities without the energy [J] that moves added: of their part along them first, then of what is anchored.
+
+        Each body pays by the mass that it has lifted, up to all it has.
+        """
+        m = np.divide(1, self.w, out=np.zeros_like(self.w), where=self.w > 0)
+        free = self.w[self.who] > 0
+        label, rows = components(self.m, self.row[free], self.who[free]), self.m
+        body = np.full(self.n, rows)  # the last one: what no row holds
+        body[self.who[free]] = label[self.row[free]]
+
+        def summed(values: np.ndarray) -> np.ndarray:
+            return np.bincount(body, m * values, minlength=rows + 1)
+
+        work, size, along = summed(np.linalg.norm(moves, axis=1)), summed((moves**2).sum(axis=1)), summed((moves * v).sum(axis=1))
+        due = energy * work / work.sum()
+        part = _over(along, size)
+        due, left = _settled(due, part * along / 2)
+        v = v - ((1 - left) * part)[body][:, None] * moves
+        held = np.bincount(label[self.row[~free]], minlength=rows + 1) > 0
+        _, left = _settled(np.where(held, due, 0.0), summed((v**2).sum(axis=1)) / 2)
+        return v * left[body][:, None]
+
+
+def _settled(due: np.ndarray, kinetic: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What is still due after kinetic energies have paid, and the factor of the velocities that they have left."""
+    pays = np.minimum(due, kinetic)
+    return due - pays, np.sqrt(np.maximum(1 - _over(pays, kinetic), 0.0))
