@@ -49,15 +49,12 @@ class Wall(Feature):
     @property
     def rubs(self) -> bool:
         """Whether there is friction, or was when kernels were compiled."""
-        return friction_of(repr(self), "friction", self.friction)[0] > 0 or self._built("rubs")
+        return friction_of(repr(self), "friction", self.friction)[0] > 0 or self._built("surface", "rubs")
 
     @property
     def bounces(self) -> bool:
         """Whether there is restitution, or was when kernels were compiled."""
-        return self.restitution > 0 or self._built("bounces")
-
-    def _built(self, what: str) -> bool:
-        return "surface" in vars(self.dev) and getattr(self.dev.surface, what)
+        return self.restitution > 0 or self._built("surface", "bounces")
 
     def bind(self, scene: Scene) -> None:
         """Keep the state at hand, and make the surface."""

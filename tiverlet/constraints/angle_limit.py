@@ -77,10 +77,9 @@ class AngleLimit(Turning):
 
     def upload(self) -> None:
         """Write new limits."""
+        Turning.upload(self)
         if self.acts:
-            self.scene.memory.write(self.dev.rest, self.rest)
             self.scene.memory.write(self.dev.middle, self.middle)
-            self.upload_springs()
 
     near, distinct = Scalar.near, Scalar.distinct  # a distance from the middle has one value, and acts on one side of straight
 

@@ -5,7 +5,7 @@ import numpy as np
 from ..device import ti
 from .core import rotation
 from .core.clusters import Clusters
-from .core.compliance import stiff
+from .core.spring import stiff
 
 LEAST = 2.0**-46  # relative changes of a rotation that are rounding
 
@@ -68,17 +68,17 @@ class ShapeMatch(Clusters):
             total, p, q, s, K, X = self.moments(c)
             rigid, soft, now, last, give = self.law(c, h, hh, fresh)
             mean, U = 0 * p, 0 * K
-            if ti.static(self.dev.soft):
+            if ti.static(self.dev.spring.soft):
                 for b in range(self.dev.blocks[c], self.dev.blocks[c + 1]):
                     mean += self.dev.v[b] / total
                     U += self.kept(self.dev.U, b)
                 U -= total * mean.outer_product(s)
-            start, end, cosine = rotation.turn(K, X, U, first > 0, rigid, soft, self.dev.turn[c], LEAST, self.dev.soft)
+            start, end, cosine = rotation.turn(K, X, U, first > 0, rigid, soft, self.dev.turn[c], LEAST, self.dev.spring.soft)
             pose = rotation.matrix(end)
             self.dev.turn[c], self.dev.place[c] = end, p - pose @ q
             self.keep(self.dev.pose, c, pose)
             self.dev.slots.note(self.dev.slots.turn(cosine, 1.0))
-            if ti.static(self.dev.soft):
+            if ti.static(self.dev.spring.soft):
                 R = rotation.matrix(start)
                 if first > 0:  # in the frame of the body
                     mean = R @ mean
@@ -102,8 +102,8 @@ class ShapeMatch(Clusters):
         """
         begin, end, i0 = self.dev.starts[c], self.dev.starts[c + 1], self.hub(c)
         scale = firm
-        if ti.static(self.dev.soft):
-            scale = ti.select(self.dev.alpha[c] > 0, soft, firm)
+        if ti.static(self.dev.spring.soft):
+            scale = ti.select(self.dev.spring.alpha[c] > 0, soft, firm)
         total, mean, pull, held = ti.cast(0, ti.f64), 0 * self.dev.place[c], 0 * self.dev.place[c], False
         S = mean.outer_product(mean)
         X = 0 * S
@@ -135,11 +135,11 @@ class ShapeMatch(Clusters):
         w, relaxation = self.dev.w.of(i), self.dev.slots.relaxation
         if first > 0:
             self.dev.pull[e] = 0 * self.dev.pull[e]
-        if not self.holds(c):
+        if not self.dev.strength.holds(c):
             self.give(e, 0 * self.dev.pull[e])
         elif w > 0:
             C, n = self.off(e, c), self.dev.slots.split[i] / w
-            if ti.static(not self.dev.soft):
+            if ti.static(not self.dev.spring.soft):
                 move = ti.cast(-relaxation * C / n, self.dev.real)
                 if first >= 0:
                     self.dev.pull[e] = self.dev.pull[e] + move
@@ -159,14 +159,14 @@ class ShapeMatch(Clusters):
     def wrong(self, e, c, C, rigid, soft, give):
         """C* + alpha' lam of a soft cluster, with the soft part of C_(n+1) = C in the frame at the start."""
         back = self.kept(self.dev.fit, c) @ (self.kept(self.dev.pose, c).transpose() @ C)
-        return rigid * C + soft * back + self.dev.history[e] + give * self.dev.pull[e] - self.dev.mean[c]
+        return rigid * C + soft * back + self.dev.spring.history[e] + give * self.dev.pull[e] - self.dev.mean[c]
 
     @ti.func
     def look_back(self, e, c, h, now, last):
         """What C_n and C_(n-1) add to the violation; and flow, where the shape is plastic."""
         R = self.kept(self.dev.fit, c)
         C = self.arm(e, self.hub(c), 1) - self.dev.middle[c] - R @ self.dev.shape[e]
-        self.dev.history[e] = now * C + last * (R @ self.dev.last[e])
+        self.dev.spring.history[e] = now * C + last * (R @ self.dev.spring.last[e])
         body = R.transpose() @ C
         if ti.static(self.dev.plastic):
             size = body.norm()
@@ -174,34 +174,33 @@ class ShapeMatch(Clusters):
                 flow = (1 - ti.exp(-self.dev.creep[c] * h)) * (1 - self.dev.yield_size[c] / size) * body
                 self.dev.shape[e] = self.dev.shape[e] + flow
                 body -= flow
-        self.dev.last[e] = body
+        self.dev.spring.last[e] = body
 
     @ti.func
     def spring(self, e, c, C, h):
         """h^2 times the acceleration by the spring and the dashpot of corner e, as far as the step resolves them."""
-        alpha, mass = self.dev.alpha[c], self.dev.mass[c]
+        alpha, mass = self.dev.spring.alpha[c], self.dev.mass[c]
         out = 0 * C
         if alpha > 0:
-            rate = (C - self.kept(self.dev.pose, c) @ self.dev.last[e]) / h
-            out = -h * h * (1 - stiff(alpha, h, 1 / mass)) * (C / alpha + self.dev.damping[c] * rate) / mass
+            rate = (C - self.kept(self.dev.pose, c) @ self.dev.spring.last[e]) / h
+            out = -h * h * (1 - stiff(alpha, h, 1 / mass)) * (C / alpha + self.dev.spring.damping[c] * rate) / mass
         return out
 
     @ti.func
     def tear(self, c, hh, tick):
         """Let cluster c fall apart if the force on one of its particles was too large."""
-        if self.holds(c):
+        if self.dev.strength.holds(c):
             most = ti.cast(0, self.dev.real)
             for e in range(self.dev.starts[c], self.dev.starts[c + 1]):
                 w = self.dev.w.of(self.dev.members[e])
                 if w > 0:
                     most = ti.max(most, self.dev.pull[e].norm() / w)
-            if most > self.dev.strength[c] * hh:
-                self.part(c, tick)
+            self.dev.strength.test(c, most, hh, tick)
 
     @ti.func
     def miss(self, c, h, hh, when, fresh):
         """The largest violation that is left, by where the last pass turned the cluster, relative to its radius."""
-        worst, total, mean, holds = ti.cast(0, ti.f64), ti.cast(0, ti.f64), 0 * self.dev.place[c], self.holds(c)
+        worst, total, mean, holds = ti.cast(0, ti.f64), ti.cast(0, ti.f64), 0 * self.dev.place[c], self.dev.strength.holds(c)
         rigid, soft, now, last, give = self.law(c, h, hh, fresh)
         for e in range(self.dev.starts[c], self.dev.starts[c + 1]):
             total += self.weight(e, c)
@@ -209,7 +208,7 @@ class ShapeMatch(Clusters):
         for e in range(self.dev.starts[c], self.dev.starts[c + 1]):
             if self.dev.w.of(self.dev.members[e]) > 0 and holds:
                 C = self.off(e, c) - mean / total  # places are relative to a particle that has moved since
-                if ti.static(self.dev.soft):
+                if ti.static(self.dev.spring.soft):
                     C = self.wrong(e, c, C, rigid, soft, give)
                 worst = ti.max(worst, C.norm())
         return ti.cast(worst / self.dev.size[c], self.dev.real)
@@ -218,9 +217,9 @@ class ShapeMatch(Clusters):
     def energy(self, c, back, hh, miss):
         """Sum of m |C|^2 / (2 alpha M) at x - back d, about the best fit there."""
         out = ti.cast(0, ti.f64)
-        if ti.static(self.dev.soft):
-            alpha, mass, i0 = self.dev.alpha[c], self.dev.mass[c], self.hub(c)
-            if alpha > 0 and mass > 0 and self.holds(c):
+        if ti.static(self.dev.spring.soft):
+            alpha, mass, i0 = self.dev.spring.alpha[c], self.dev.mass[c], self.hub(c)
+            if alpha > 0 and mass > 0 and self.dev.strength.holds(c):
                 total = ti.cast(0, ti.f64)
                 s, q = 0 * self.dev.place[c], 0 * self.dev.place[c]
                 K = s.outer_product(q)

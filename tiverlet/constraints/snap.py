@@ -77,10 +77,10 @@ class Snap(Tether):
         x, start = self.dev.state.place(i), self.dev.state.place(i) - self.dev.state.d[i]
         if first != 0:
             node = self.nearest(start)
-            self.dev.last[c] = self.dev.last[c] + (self.dev.node[c] - node)
+            self.dev.spring.last[c] = self.dev.spring.last[c] + (self.dev.node[c] - node)
             for k in ti.static(range(self.dev.state.dim)):
                 if self.dev.grid[1][k] == 0:
-                    self.dev.last[c][k] = 0
+                    self.dev.spring.last[c][k] = 0
             self.dev.node[c] = node
         node = self.dev.node[c]
         C = x - node

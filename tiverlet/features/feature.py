@@ -94,6 +94,10 @@ class Feature(Noted):
         knobs = [name for name in knobs_of(type(self)) if getattr(type(self), name).compiled]
         return {name: getattr(self, name) for name in (*knobs, *self.compiled_for)}
 
+    def _built(self, part: str, what: str) -> bool:
+        """Whether kernels were compiled for a part of it that is, say, soft."""
+        return part in vars(self.dev) and getattr(vars(self.dev)[part], what)
+
     @property
     def outgrown(self) -> bool:
         """Whether knobs ask for what its kernels do not have, so that the world has to be built anew around it.
@@ -195,7 +199,11 @@ class Batch(Feature):
     @property
     def broken(self) -> np.ndarray:
         """Which constraints have broken so far, Boolean (m,)."""
-        return np.zeros(self.count, dtype=bool)
+        return self.stamps() > 0
+
+    def stamps(self) -> np.ndarray:
+        """When each constraint broke, (m,): the number of the substep from 1 on, see Strength; 0 where it holds."""
+        return self.dev.strength.stamps() if self.breaks and self.acts else np.zeros(self.count, dtype=np.int32)
 
     def members_of(self, c: int) -> np.ndarray:
         """The particles of constraint c."""

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from .. import checks
-from ..constraints.core.breakable import BREAKS
+from ..constraints.core.strength import BREAKS
 from ..device.interrupts import whole
 from ..device.memory import Memory
 from ..features.feature import Feature

@@ -146,4 +146,4 @@ def transfer(old: "World", new: "World") -> None:
     new._guard.memory = kept.guard
     new.position, new.velocity = old.position, old.velocity
     for ours, theirs in zip(old._sub.breakers, new._sub.breakers, strict=True):
-        new._memory.write(theirs.dev.broken, ours.stamps())
+        new._memory.write(theirs.dev.strength.stamp, ours.stamps())

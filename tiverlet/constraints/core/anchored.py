@@ -6,7 +6,7 @@ from ... import checks
 from ...device import ti
 from ...features.feature import Batch, Knob, Scene
 from ...particles import Particles
-from .compliance import law, stiff
+from .spring import Spring, stiff
 
 
 class Tether(Batch):
@@ -43,13 +43,12 @@ class Tether(Batch):
     @property
     def soft(self) -> bool:
         """Whether any of them is a spring, or was when kernels were compiled."""
-        return bool(np.any(self.compliance > 0)) or vars(self.dev).get("soft", False)
+        return bool(np.any(self.compliance > 0)) or self._built("spring", "soft")
 
     def upload(self) -> None:
         """Write new stiffnesses."""
-        if self.acts and not self.drives and self.dev.soft:
-            self.scene.memory.write(self.dev.alpha, self.compliance)
-            self.scene.memory.write(self.dev.damping, self.damping)
+        if self.acts and not self.drives:
+            self.dev.spring.upload(self.compliance, self.damping)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check that the particles exist."""
@@ -62,15 +61,11 @@ class Tether(Batch):
     def bind(self, scene: Scene) -> None:
         """For what is not driven its multiplier, and for springs their memory."""
         super().bind(scene)
-        self.dev.size, self.dev.real, self.dev.soft = self.start.size, scene.real, self.soft
+        self.dev.size, self.dev.real = self.start.size, scene.real
         if not self.drives:
-            name, m, dim, add = repr(self), self.count, scene.particles.dim, scene.memory.field
-            self.dev.lam = add(f"{name}.multiplier", m, width=dim, state=True)
-            if self.soft:
-                self.dev.alpha = add(f"{name}.compliance", m, values=self.compliance)
-                self.dev.damping = add(f"{name}.damping", m, values=self.damping)
-                self.dev.last = add(f"{name}.last", m, width=dim, values=self.begin(self.start.position), state=True)
-                self.dev.history = add(f"{name}.history", m, width=dim)
+            self.dev.lam = scene.memory.field(f"{self!r}.multiplier", self.count, width=scene.particles.dim, state=True)
+            compliance, damping = (self.compliance, self.damping) if self.soft else (None, None)
+            self.dev.spring = Spring(scene, repr(self), compliance, damping, self.begin(self.start.position))
 
     @property
     def load(self) -> np.ndarray:
@@ -113,13 +108,13 @@ class Tether(Batch):
         new, size = lam, 0 * w
         if w > 0:
             alpha, A = 0 * w, 1 + 0 * w
-            if ti.static(self.dev.soft):
-                alpha = self.dev.alpha[c] / hh
-                A, now, last = law(self.dev.alpha[c], self.dev.damping[c], h, w, fresh)
+            if ti.static(self.dev.spring.soft):
+                alpha = self.dev.spring.alpha[c] / hh
+                A, now, last = self.dev.spring.law(c, h, w, fresh)
                 if first != 0:
-                    self.dev.history[c] = now * C0 + last * self.dev.last[c]
-                    self.dev.last[c] = C0
-                B = self.dev.history[c]
+                    self.dev.spring.history[c] = now * C0 + last * self.dev.spring.last[c]
+                    self.dev.spring.last[c] = C0
+                B = self.dev.spring.history[c]
             K = A * self.dev.slots.split[self.member(c, 0)] + alpha
             new = lam - self.dev.slots.relaxation * (A * C + B + alpha * lam) / K
             size = (new - lam).norm() * K / self.dev.slots.relaxation
@@ -136,20 +131,20 @@ class Tether(Batch):
     def kick(self, c, h):
         """As in Scalar, for each axis."""
         move = 0 * self.dev.state.d[0]
-        if ti.static(self.dev.soft):
-            w, alpha = self.dev.w.of(self.member(c, 0)), self.dev.alpha[c]
+        if ti.static(self.dev.spring.soft):
+            w, alpha = self.dev.w.of(self.member(c, 0)), self.dev.spring.alpha[c]
             if w > 0 and alpha > 0:
                 C = self.present(c, 0)
                 rate = self.change(c) / h
-                move = -h * h * w * (1 - stiff(alpha, h, w)) * (C / alpha + self.dev.damping[c] * rate)
+                move = -h * h * w * (1 - stiff(alpha, h, w)) * (C / alpha + self.dev.spring.damping[c] * rate)
         self.push(c, 0, move)
 
     @ti.func
     def bond(self, c, firm, soft):
         """As in Scalar, for each axis."""
         scale = firm
-        if ti.static(self.dev.soft):
-            scale = ti.select(self.dev.alpha[c] > 0, soft, firm)
+        if ti.static(self.dev.spring.soft):
+            scale = ti.select(self.dev.spring.alpha[c] > 0, soft, firm)
         self.push(c, 0, scale * self.dev.w.of(self.member(c, 0)) * self.dev.lam[c])
 
     @ti.func
@@ -162,8 +157,8 @@ class Tether(Batch):
     def energy(self, c, back, hh, miss):
         """|C|^2 / (2 alpha)."""
         out = ti.cast(0, ti.f64)
-        if ti.static(self.dev.soft):
-            alpha = self.dev.alpha[c]
+        if ti.static(self.dev.spring.soft):
+            alpha = self.dev.spring.alpha[c]
             if alpha > 0:
                 C = self.present(c, back)
                 out = ti.cast(C.dot(C) / (2 * alpha), ti.f64)

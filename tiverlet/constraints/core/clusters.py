@@ -7,14 +7,14 @@ from ...device import ti
 from ...features.feature import Knob, Scene
 from ...particles import Particles
 from . import rotation
-from .breakable import Breaking
-from .compliance import law, stiff
+from .spring import Spring, stiff
+from .strength import Strength, strength_of
 from .variable_size import Ragged, rows
 
 HEAVY = 1024  # masses of the cluster: what a particle that cannot move weighs in it
 
 
-class Clusters(Ragged, Breaking):
+class Clusters(Ragged):
     """The half of ShapeMatch that does not move anything: shapes, stiffnesses, and moments about the places at the start."""
 
     each = ("compliance", "damping", "creep", "yield_strain", "break_at")
@@ -23,6 +23,7 @@ class Clusters(Ragged, Breaking):
     damping = Knob(lambda f, v: f._setting("damping", v), "Of the dashpots [N s/m], (m,).", force=True)
     creep = Knob(lambda f, v: f._setting("creep", v), "Rate of flow [1/s], (m,).")
     yield_strain = Knob(lambda f, v: f._setting("yield_strain", v), "Strain without flow, (m,).")
+    break_at = Knob(strength_of, "Load beyond which a constraint breaks, (m,); None for never.")
     compiled_for = ("soft", "transcends", "breaks")
 
     def setup(self, clusters, rest, compliance, damping, creep, yield_strain, break_at) -> None:
@@ -47,18 +48,21 @@ class Clusters(Ragged, Breaking):
         """Write new stiffnesses, rates and strengths."""
         if self.acts:
             write = self.scene.memory.write
-            if self.dev.soft:
-                write(self.dev.alpha, self.compliance)
-                write(self.dev.damping, self.damping)
+            self.dev.spring.upload(self.compliance, self.damping)
             if self.dev.plastic:
                 write(self.dev.creep, self.creep)
                 write(self.dev.yield_size, self.yield_strain * self._radius)
-            self.upload_strength()
+            self.dev.strength.upload(self.break_at)
 
     @property
     def soft(self) -> bool:
         """Whether any cluster has compliance."""
-        return bool((self.compliance > 0).any()) or vars(self.dev).get("soft", False)
+        return bool((self.compliance > 0).any()) or self._built("spring", "soft")
+
+    @property
+    def breaks(self) -> bool:
+        """Whether a load can break clusters, or could when kernels were compiled."""
+        return self.break_at is not None or self._built("strength", "breaks")
 
     @property
     def transcends(self) -> bool:
@@ -97,7 +101,7 @@ class Clusters(Ragged, Breaking):
         """Shapes, rotations, sums; for soft clusters multipliers and the memory of the averaged constraint."""
         super().bind(scene)
         name, dim, m, add = repr(self), scene.state.dim, self.count, scene.memory.field
-        self.dev.soft, self.dev.plastic = self.soft, self.transcends
+        self.dev.plastic = self.transcends
         w = scene.inv_mass[self.indices]
         mass = np.bincount(self.owner, weights=np.divide(1, w, where=w > 0, out=np.zeros_like(w)), minlength=m)
         self.dev.mass = add(f"{name}.mass", m, values=mass)
@@ -105,7 +109,7 @@ class Clusters(Ragged, Breaking):
         self.dev.shape = add(f"{name}.shape", self.corner_count, width=dim, values=self._shape, state=self.dev.plastic)
         turn = rotation.identity(dim)
         self.dev.pull = add(f"{name}.multiplier", self.corner_count, width=dim, state=True)
-        self.bind_strength(scene)
+        self.dev.strength = Strength(scene, name, self)
         self.dev.turn = add(f"{name}.turn", m, width=len(turn), kind=ti.f64, values=[turn] * m, state=True)
         self.dev.pose = add(f"{name}.pose", m, width=dim * dim, kind=ti.f64)
         self.dev.place = add(f"{name}.place", m, width=dim, kind=ti.f64)
@@ -116,15 +120,13 @@ class Clusters(Ragged, Breaking):
         self.dev.total = moment("total", 0)
         self.dev.p, self.dev.q, self.dev.s = moment("p", dim), moment("q", dim), moment("s", dim)
         self.dev.K, self.dev.X = moment("K", dim * dim), moment("X", dim * dim)
-        if self.dev.soft:
+        compliance, damping = (self.compliance, self.damping) if self.soft else (None, None)
+        self.dev.spring = Spring(scene, name, compliance, damping, np.zeros((self.corner_count, dim)))
+        if self.dev.spring.soft:
             self.dev.v, self.dev.U = moment("v", dim), moment("U", dim * dim)
-            self.dev.alpha = add(f"{name}.compliance", m, values=self.compliance)
-            self.dev.damping = add(f"{name}.damping", m, values=self.damping)
             self.dev.fit = add(f"{name}.fit", m, width=dim * dim, kind=ti.f64)
             self.dev.middle = add(f"{name}.middle", m, width=dim, kind=ti.f64)
             self.dev.mean = add(f"{name}.mean", m, width=dim, kind=ti.f64)
-            self.dev.last = add(f"{name}.last", self.corner_count, width=dim, state=True)
-            self.dev.history = add(f"{name}.history", self.corner_count, width=dim)
         if self.dev.plastic:
             self.dev.creep = add(f"{name}.creep", m, values=self.creep)
             self.dev.yield_size = add(f"{name}.yield", m, values=self.yield_strain * self._radius)
@@ -142,10 +144,10 @@ class Clusters(Ragged, Breaking):
         """The coefficients of C_(n+1) (the rigid part and the rest), C_n and C_(n-1), and alpha M / h^2: alpha' of a move."""
         rigid, soft = ti.cast(1, self.dev.real), ti.cast(0, self.dev.real)
         now, last, give = 0 * soft, 0 * soft, 0 * soft
-        if ti.static(self.dev.soft):
-            alpha, mass = self.dev.alpha[c], self.dev.mass[c]
+        if ti.static(self.dev.spring.soft):
+            alpha, mass = self.dev.spring.alpha[c], self.dev.mass[c]
             if alpha > 0 and mass > 0:
-                soft, now, last = law(alpha, self.dev.damping[c], h, 1 / mass, fresh)
+                soft, now, last = self.dev.spring.law(c, h, 1 / mass, fresh)
                 if soft < 1 / 64:  # a start asks for nothing at the end where it is soft: c and R need something to go by
                     soft, now = ti.cast(1 / 64, self.dev.real), now + soft - 1 / 64
                 rigid = ti.min(stiff(alpha, h, 1 / mass), soft)
@@ -189,16 +191,16 @@ class Clusters(Ragged, Breaking):
             s1 += mu * s
             K += (mu * q).outer_product(s)
             X += (mu * p).outer_product(s)
-            if ti.static(self.dev.soft):
-                v = mu * last * self.dev.last[e]
+            if ti.static(self.dev.spring.soft):
+                v = mu * last * self.dev.spring.last[e]
                 if first == 0:
-                    v = mu * (self.dev.history[e] + give * self.dev.pull[e])
+                    v = mu * (self.dev.spring.history[e] + give * self.dev.pull[e])
                 v1 += v
                 U += v.outer_product(s)
         self.dev.total[b], self.dev.p[b], self.dev.q[b], self.dev.s[b] = total, p1, q1, s1
         self.keep(self.dev.K, b, K)
         self.keep(self.dev.X, b, X)
-        if ti.static(self.dev.soft):
+        if ti.static(self.dev.spring.soft):
             self.dev.v[b] = v1
             self.keep(self.dev.U, b, U)
 

@@ -1,15 +1,24 @@
 """Constraints that are one number, C = f - rest: how a substep fulfils them, from soft to rigid."""
 
+import warnings
+from typing import Any
+
+import numpy as np
+
+from ... import checks
 from ...device import ti
-from ...features.feature import FAR, Scene
-from .compliant import Elastic
+from ...features.feature import FAR, Batch, Knob, Scene
+from ...particles import Particles
+from ...tools import distinct
+from .spring import Spring, stiff
+from .strength import Strength, strength_of
 
 # Where constraints converge within a substep, SHAKE is an explicit method for what is across them, with its limits:
 TENSEST = 4.0  # (omega h)^2 of a vibration across a tension, beyond which Verlet diverges
 LOST = 0.015  # violation at the start of a substep, relative to the size, from where on its direction would bring in energy
 
 
-class Scalar(Elastic):
+class Scalar(Batch):
     """Constraints C(x) = f(x) - rest = 0, >= 0 or <= 0, soft or rigid, from `measure`. numerics: one formula for all.
 
         theta = s^4 / (1 + s^4), s^2 = (omega h)^2 = w h^2 / alpha     0: resolved by the step, 1: rigid
@@ -27,9 +36,134 @@ class Scalar(Elastic):
     With drag, alpha' = alpha / (phi h^2) with the factor phi that the exact solution gives every other acceleration.
     """
 
+    index_name = "pairs"
+    exchangeable: tuple[tuple[int, ...], ...] | None = None  # groups of corners that may swap; None: all of them
+    side = 0  # 0: C = 0;  1: C <= 0, pulls when f > rest;  -1: C >= 0, pushes when f < rest
+    rest: Any  # a Knob in each constraint: (m,) array
+    compliance = Knob(lambda f, v: checks.per_item(repr(f), "compliance", v, f.count, least=0.0), "Of springs.", force=True)
+    damping = Knob(lambda f, v: checks.per_item(repr(f), "damping", v, f.count, least=0.0), "Of the dashpot.", force=True)
+    break_at = Knob(strength_of, "Load beyond which a constraint breaks, (m,); None for never.")
+    compiled_for = ("soft", "damped", "breaks", "_strictly")
+
+    each = ("rest", "compliance", "damping", "break_at")
+    rest_name = "rest"
+    unit: float | None = None  # what residuals are relative to; None: the rest value
     precise = False  # whether exactly() measures to all the digits that positions have
     cusp = False  # whether any goal is f = 0, where gradients end: no direction at the start of the step means anything there
     collapses = 0  # the power of a length that f is, where gradients vanish with the size of the body; else 0
+
+    def setup(self, indices, rest, compliance, damping, break_at=None) -> None:
+        """Keep the arguments of __init__; what depends on the particles is checked in prepare()."""
+        self.lay(indices)
+        self._rest_given = rest
+        self.break_at, self.compliance, self.damping = break_at, compliance, damping
+
+    def lay(self, indices) -> None:
+        """Keep the particles of each constraint."""
+        self.indices = checks.indices(repr(self), self.index_name, indices, checks.ANY, arity=self.arity)
+        self._warn_duplicates()
+
+    def fit(self, particles: Particles) -> None:
+        """Check the particles of each constraint against those that there are."""
+        checks.indices(repr(self), self.index_name, self.indices, particles.count, arity=self.arity)
+
+    def _warn_duplicates(self) -> None:
+        ordered = self.indices.copy()
+        for group in [range(self.arity)] if self.exchangeable is None else self.exchangeable:
+            ordered[:, group] = np.sort(ordered[:, group], axis=1)
+        unique, _, counts = distinct(ordered)
+        if len(unique) < len(ordered):
+            first = tuple(int(v) for v in unique[int(np.argmax(counts > 1))])
+            warnings.warn(
+                f"{self!r}: {len(ordered) - len(unique)} of the {self.index_name} are duplicates, the first of them {first}. "
+                "They act together: the same result where rigid, stiffer by their number where compliant.",
+                stacklevel=5,
+            )
+
+    def rest_of(self, position: np.ndarray) -> np.ndarray:
+        """f at the given positions, (m,): the rest value when none is given."""
+        raise NotImplementedError
+
+    @property
+    def goal(self) -> np.ndarray:
+        """What f is to be, (m,)."""
+        return self.rest
+
+    def violation(self, position: np.ndarray) -> np.ndarray:
+        """C at the given positions, (m,)."""
+        return self.rest_of(position) - self.goal
+
+    def slopes(self, position: np.ndarray) -> np.ndarray:
+        """grad_k f of every constraint, (m, arity, dim), by central differences: each constraint on particles of its own."""
+        twin: Any = self.copy()
+        vars(twin)["indices"] = np.arange(self.indices.size).reshape(self.indices.shape)
+        x = position[self.indices]
+        step = 1e-6 * (float(np.ptp(x, axis=1).max(initial=0.0)) or 1.0)
+        out = np.zeros_like(x)
+        for k in range(self.arity):
+            for a in range(x.shape[2]):
+                ends = np.stack([x, x])
+                ends[:, :, k, a] += [[step], [-step]]
+                up, down = (twin.rest_of(end.reshape(-1, x.shape[2])) for end in ends)
+                out[:, k, a] = (up - down) / (2 * step)
+        return out
+
+    def closeness(self, position: np.ndarray) -> np.ndarray:
+        """What makes C a share of the size of its constraint, (m,): 1 / length for links, 0 for what has no extent."""
+        x = position[self.indices]
+        size = np.linalg.norm(x - x[:, :1], axis=2).max(axis=1, initial=0.0)
+        size *= np.sqrt((self.slopes(position) ** 2).sum(axis=(1, 2)) / 2)
+        return np.divide(1, size, out=np.zeros(self.count), where=size > 0)
+
+    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Check indices against the number of particles and settle the rest values."""
+        self.fit(particles)
+        if "rest" not in self.__dict__:
+            if self._rest_given is None:
+                self.__dict__["rest"] = self.rest_of(particles.position)
+            else:
+                self.rest = self._rest_given
+
+    def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Warn of constraints that are violated between particles that cannot move."""
+        stuck = self.idle(inv_mass)
+        if stuck.any():
+            C = self.violation(particles.position)
+            wrong = stuck & (
+                np.abs(C if self.side == 0 else np.maximum(self.side * C, 0)) > 1e-6 * np.maximum(np.abs(self.goal), 1e-6)
+            )
+            if wrong.any():
+                k = int(np.argmax(wrong))
+                at = tuple(int(i) for i in self.members_of(k))
+                warnings.warn(
+                    f"{self!r}: {self.index_name}[{k}] = {at} is off by {C[k]:g}, but its particles cannot move "
+                    f"({int(wrong.sum())} such in all). They are skipped.",
+                    stacklevel=3,
+                )
+
+    @property
+    def soft(self) -> bool:
+        """Whether any constraint of the batch has compliance, or had when kernels were compiled."""
+        return bool((self.compliance > 0).any()) or self._built("spring", "soft")
+
+    @property
+    def damped(self) -> bool:
+        """Whether any has a dashpot."""
+        return self.soft and bool((self.damping > 0).any()) or self._built("spring", "damped")
+
+    @property
+    def breaks(self) -> bool:
+        """Whether a load can break constraints of the batch."""
+        return self.break_at is not None or self._built("strength", "breaks")
+
+    @property
+    def _strictly(self) -> bytes | None:
+        """The compliances, where a world of higher order is made for these."""
+        return self.compliance.tobytes() if self.scene and self.scene.order > 2 else None
+
+    def sprung(self, scene: Scene) -> np.ndarray:
+        """Which constraints act as forces, (m,): soft ones in substeps of an order above 2. See high_order.py."""
+        return (self.compliance > 0) & (scene.order > 2)
 
     @property
     def joins(self) -> bool:
@@ -37,9 +171,19 @@ class Scalar(Elastic):
         return self.arity > 0 and not self.collapses
 
     def bind(self, scene: Scene) -> None:
-        """Declare what solvers need: which rows of a system constraints are, and how they are relaxed."""
+        """Declare rest values, multipliers, springs and strengths; and, for solvers, which rows of a system constraints are."""
         super().bind(scene)
+        self.dev.real = scene.real
+        self.dev.sprung = bool(self.sprung(scene).any())
+        start = self.rest_of(self.start.position) if self.count else np.zeros(0)
+        self.dev.scale = self.unit or (float(np.abs(start).mean()) if np.any(start) else self.start.size)
         name, m, add = repr(self), self.count, scene.memory.field
+        self.dev.rest = add(f"{name}.rest", m, values=self.goal)
+        self.dev.lam = add(f"{name}.multiplier", m, state=True)
+        compliance, damping = self.compliance if self.soft else None, self.damping if self.damped else None
+        self.dev.spring = Spring(scene, name, compliance, damping, start)
+        self.dev.strength = Strength(scene, name, self)
+        self.changed = False
         rows = scene.slots.rows(self)
         self.dev.told, self.dev.alone = bool((rows >= 0).any()), bool((rows < 0).any())
         if self.dev.told:
@@ -51,6 +195,121 @@ class Scalar(Elastic):
         self.dev.hurries = self.dev.firm and scene.slots.accelerates and self.dev.alone and self.side == 0
         if self.dev.hurries:
             self.dev.step = add(f"{name}.step", m)
+
+    def upload(self) -> None:
+        """Write new rest values, stiffnesses and strengths."""
+        if self.acts:
+            self.scene.memory.write(self.dev.rest, self.goal)
+            self.dev.spring.upload(self.compliance, self.damping)
+            self.dev.strength.upload(self.break_at)
+
+    @property
+    def load(self) -> np.ndarray:
+        """The force in each constraint during the last substep [N], (m,); positive where it pulls (f above rest).
+
+        More exactly the force along grad f: newtons where f is a length, N m where it is an angle. In f32, rounding of positions
+        is felt as about m ulp(x) / h^2, 1 N for 1 kg some 10 m from the origin at 1200 substeps/s; use f64 where that matters.
+        """
+        if not self.count:
+            return np.zeros(0)
+        if self.scene is None:
+            raise RuntimeError(f"{self!r}.load: there is none before a world has been stepped with it.")
+        if not self.acts:
+            return np.zeros(self.count)
+        scale = 1 / self.scene.hh if self.scene.hh else 0.0
+        return -scale * self.scene.memory.read(self.dev.lam)[: self.count].astype(np.float64)
+
+    @ti.func
+    def measure(self, c, q):
+        """f and its (arity, dim) gradients at corners q (arity, dim), which are relative to corner 0."""
+        return 0.0, q
+
+    @ti.func
+    def near(self, f, other):
+        """Of the values that mean the same as f, the one nearest to `other`; more than one only for angles."""
+        return f
+
+    @ti.func
+    def excess(self, c, f, rest):
+        """f - rest."""
+        return f - rest
+
+    @ti.func
+    def distinct(self, f, f0):
+        """Whether the direction is clear enough at f and f0, now and at the start, for a turn of 41 degrees to mean something."""
+        return True
+
+    @ti.func
+    def begin(self, c, fresh):
+        """Before the first pass of a substep: what `measure` has to remember of its start."""
+
+    @ti.func
+    def corners(self, c, back):
+        """Corners of constraint c relative to the first, at x - back d: near the origin, so nothing is lost in f32."""
+        i = self.member(c, 0)
+        q = ti.Matrix.zero(self.dev.real, self.arity, self.dev.state.dim)
+        for k in ti.static(range(1, self.arity)):
+            j = self.member(c, k)
+            r = self.dev.state.apart(j, i) - back * (self.dev.state.d[j] - self.dev.state.d[i])
+            for a in ti.static(range(self.dev.state.dim)):
+                q[k, a] = r[a]
+        return q
+
+    @ti.func
+    def ends(self, c):
+        """Corners of constraint c, as above, now and at the start of the substep."""
+        i = self.member(c, 0)
+        now = ti.Matrix.zero(self.dev.real, self.arity, self.dev.state.dim)
+        start = now
+        for k in ti.static(range(1, self.arity)):
+            j = self.member(c, k)
+            r, moved = self.dev.state.apart(j, i), self.dev.state.d[j] - self.dev.state.d[i]
+            for a in ti.static(range(self.dev.state.dim)):
+                now[k, a], start[k, a] = r[a] - 0 * moved[a], r[a] - moved[a]
+        return now, start
+
+    @ti.func
+    def value(self, c, back):
+        """f at x - back d."""
+        f, _ = self.measure(c, self.corners(c, back))
+        return f
+
+    @ti.func
+    def bounded(self, value):
+        """`value` on the side on which the constraint acts, 0 on the other."""
+        if ti.static(self.side != 0):
+            value = ti.max(self.side * value, 0) * self.side
+        return value
+
+    @ti.func
+    def equation(self, c, f, f0, w, W, h, hh, first, fresh):
+        """A C + B + alpha' lam, A, alpha', lam and W (0 where it is broken), from f at the end and at the start, and w."""
+        if ti.static(self.dev.strength.breaks):
+            if not self.dev.strength.holds(c):
+                W = 0
+        if ti.static(self.dev.sprung):
+            if not self.dev.spring.is_rigid(c):
+                W = 0
+        C, A = self.excess(c, f, self.dev.rest[c]), ti.cast(1, self.dev.real)
+        B, alpha = ti.cast(0, self.dev.real), ti.cast(0, self.dev.real)
+        lam = self.dev.lam[c]
+        if first != 0:
+            lam = 0
+        if ti.static(self.dev.spring.soft):
+            if W > 0:
+                A, now, last = self.dev.spring.law(c, h, w, fresh)
+                alpha = self.dev.spring.alpha[c] / hh
+                if first != 0:
+                    rest = self.dev.rest[c]
+                    B = now * self.bounded(f0 - rest) + last * self.bounded(self.near(self.dev.spring.last[c], f0) - rest)
+                    self.dev.spring.history[c] = B
+                    self.dev.spring.last[c] = f0
+                else:
+                    B = self.dev.spring.history[c]
+            elif first != 0:  # it has no direction now, and may get one in a later pass
+                self.dev.spring.history[c] = 0
+                self.dev.spring.last[c] = f0
+        return A * C + B + alpha * lam, A, alpha, lam, W
 
     @ti.func
     def known(self, c, h, hh, first, fresh):
@@ -78,9 +337,9 @@ class Scalar(Elastic):
         turn = self.dev.slots.turn(both, ti.sqrt(here * there))
         lost = turn == FAR
         if ti.static(self.dev.cusp):
-            lost = lost or (self.dev.rest[c] == 0 and self.is_rigid(c))
+            lost = lost or (self.dev.rest[c] == 0 and self.dev.spring.is_rigid(c))
         if ti.static(self.dev.firm):
-            if self.is_rigid(c):
+            if self.dev.spring.is_rigid(c):
                 lost = lost or ti.abs(self.bounded(f0 - self.dev.rest[c])) * self.dev.close[c] > LOST
         if lost:
             n, both = g, here
@@ -181,12 +440,87 @@ class Scalar(Elastic):
                     self.dev.lam[c] = self.dev.lam[c] + step
 
     @ti.func
+    def kick(self, c, h):
+        """h^2 w_j F grad_j C with F = -(1 - theta) (C / alpha + damping dC/dt).
+
+        Rigid links find their force in the next substep.
+        """
+        f, g = self.measure(c, self.corners(c, 0))
+        f = self.near(f, self.dev.rest[c])
+        f0, w = f, ti.cast(0, self.dev.real)
+        if ti.static(self.dev.spring.damped):
+            f0, _ = self.measure(c, self.corners(c, 1))
+        for k in ti.static(range(self.arity)):
+            w += self.dev.w.of(self.member(c, k)) * g[k, :].dot(g[k, :])
+        force = self.force(c, f, self.near(f0, f), w, h)
+        for k in ti.static(range(self.arity)):
+            self.push(c, k, h * h * self.dev.w.of(self.member(c, k)) * force * g[k, :])
+
+    @ti.func
+    def force(self, c, f, f0, w, h):
+        """F of kick(), from f now and a substep ago."""
+        force = ti.cast(0, self.dev.real)
+        if ti.static(self.dev.spring.soft):
+            alpha = self.dev.spring.alpha[c]
+            if w > 0 and alpha > 0 and self.dev.strength.holds(c):
+                resolved = ti.cast(1, self.dev.real)
+                if ti.static(not self.dev.sprung):
+                    resolved -= stiff(alpha, h, w)
+                C = self.bounded(f - self.dev.rest[c])
+                force = -resolved * C / alpha
+                if ti.static(self.dev.spring.damped):
+                    if ti.static(self.side == 0) or C != 0:
+                        force -= resolved * self.dev.spring.damping[c] * (f - f0) / h
+        return force
+
+    @ti.func
+    def bond(self, c, firm, soft):
+        """scale w_j lam grad_j C(x_n)."""
+        _, g = self.measure(c, self.corners(c, 0))
+        pull = self.dev.lam[c] * ti.select(self.dev.spring.is_rigid(c), firm, soft)
+        for k in ti.static(range(self.arity)):
+            self.push(c, k, self.dev.w.of(self.member(c, k)) * pull * g[k, :])
+
+    @ti.func
+    def tear(self, c, hh, tick):
+        """Break constraint c if its load in this substep was too large; it acts no more from the next one on."""
+        self.dev.strength.test(c, ti.abs(self.dev.lam[c]), hh, tick)
+
+    @ti.func
     def miss(self, c, h, hh, when, fresh):
         """The violation that is left, relative to the rest value (to the batch's mean f where that is 0)."""
         violation, A, alpha, lam, W, _, _, _ = self.known(c, h, hh, 0, fresh)
         _, left = self.answer(violation, A, alpha, lam, W, 0)
         if ti.static(self.collapses > 0):
             f, g = self.measure(c, self.corners(c, 0))
-            if g.norm_sqr() == 0 and self.holds(c):
+            if g.norm_sqr() == 0 and self.dev.strength.holds(c):
                 left = ti.abs(self.bounded(f - self.dev.rest[c]))
         return left / self.extent(c)
+
+    @ti.func
+    def energy(self, c, back, hh, miss):
+        """Elastic energy [J] at x - back d: F C / 2, which is C^2 / (2 alpha) once solved.
+
+        What a solver leaves of the violation bears no load: the spring is as soft as it was solved, F = C / (alpha + what that
+        adds), and 1 / alpha would count energy that nobody supplied. hh: F = -lam / hh; 0 where there was no substep yet.
+        """
+        out = ti.cast(0, ti.f64)
+        if ti.static(self.dev.spring.soft):
+            alpha = self.dev.spring.alpha[c]
+            if alpha > 0 and self.dev.strength.holds(c):
+                C = self.bounded(self.near(self.value(c, back), self.dev.rest[c]) - self.dev.rest[c])
+                out = ti.cast(C, ti.f64) * C / (2 * alpha)
+                if ti.static(not self.dev.sprung):
+                    if hh > 0 and miss > 0:
+                        borne = ti.abs(self.dev.lam[c]) * alpha / hh
+                        out *= borne / (borne + miss * self.extent(c))
+        return out
+
+    @ti.func
+    def extent(self, c):
+        """What the residual of constraint c is relative to."""
+        size = ti.cast(self.dev.scale, self.dev.real)
+        if ti.static(not self.unit):
+            if self.dev.rest[c] != 0:
+                size = ti.abs(self.dev.rest[c])
+        return size

@@ -222,7 +222,7 @@ class Content(Scalar, Ragged):
     @ti.func
     def bond(self, c, firm, soft):
         """As in Scalar."""
-        pull = self.dev.lam[c] * ti.select(self.is_rigid(c), firm, soft)
+        pull = self.dev.lam[c] * ti.select(self.dev.spring.is_rigid(c), firm, soft)
         for e in range(self.dev.starts[c], self.dev.starts[c + 1]):
             self.give(e, self.dev.w.of(self.dev.members[e]) * pull * self.slope(e, 0))
 
@@ -234,7 +234,7 @@ class Content(Scalar, Ragged):
         new, left = self.answer(violation, A, alpha, lam, W, turn)
         if w == 0:  # collapsed, or static
             for e in range(self.dev.starts[c], self.dev.starts[c + 1]):
-                if self.dev.w.of(self.dev.members[e]) > 0 and self.holds(c):
+                if self.dev.w.of(self.dev.members[e]) > 0 and self.dev.strength.holds(c):
                     left = ti.abs(f - self.dev.rest[c])
         return left / self.extent(c)
 

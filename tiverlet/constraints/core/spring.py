@@ -1,0 +1,75 @@
+"""Springs of constraints: one law from soft to rigid, for every constraint that has a spring. See Scalar for the letters."""
+
+import numpy as np
+
+from ...device import ti
+from ...features.feature import Scene
+
+
+@ti.func
+def stiff(alpha, h, w):
+    """theta = s^4 / (1 + s^4), s^2 = w h^2 / alpha: 0 where the step resolves the spring, 1 where it is rigid."""
+    ratio = alpha / (h * h * w)  # 1 / s^2; s^4 would overflow in f32
+    return 1 / (1 + ratio * ratio)
+
+
+@ti.func
+def law(alpha, damping, h, w, fresh):
+    """The coefficients of C_(n+1), C_n and C_(n-1) in C* + alpha c dC/dt: central where resolved, backward where stiff."""
+    rigid, gamma = stiff(alpha, h, w), damping * alpha / h
+    A = (1 + 3 * rigid) / 4 + gamma * (1 + rigid) / 2
+    now, last = (1 - rigid) / 2 - gamma * rigid, (1 - rigid) / 4 - gamma * (1 - rigid) / 2
+    if fresh != 0:
+        A, now, last = rigid + gamma, 1 - rigid - gamma, 0 * rigid
+    return A, now, last
+
+
+class Spring:
+    """The springs of a batch on the device: compliance, damping, and what soft constraints remember of the substeps before.
+
+    compliance: (m,), or None where all are rigid, which costs nothing. damping: (m,), or None where there is no dashpot.
+    start: what C (or f) is at the start, one row for each number or vector that is remembered.
+    in_state: what it has in the exact state, by name.
+    """
+
+    def __init__(
+        self, scene: Scene, name: str, compliance: np.ndarray | None, damping: np.ndarray | None, start: np.ndarray
+    ):  # fmt: skip
+        add, width = scene.memory.field, start.shape[1] if start.ndim == 2 else 0
+        self._memory, self.real = scene.memory, scene.real
+        self.soft, self.damped, self.in_state = compliance is not None, damping is not None, {}
+        if compliance is not None:
+            self.alpha = add(f"{name}.compliance", len(compliance), values=compliance)
+            self.last = add(f"{name}.last", len(start), width=width, values=start, state=True)
+            self.history = add(f"{name}.history", len(start), width=width)
+            self.in_state = {"last": self.last}
+        if damping is not None:
+            self.damping = add(f"{name}.damping", len(damping), values=damping)
+
+    def upload(self, compliance: np.ndarray, damping: np.ndarray) -> None:
+        """Write new values to the device, as far as kernels read them."""
+        if self.soft:
+            self._memory.write(self.alpha, compliance)
+        if self.damped:
+            self._memory.write(self.damping, damping)
+
+    @ti.func
+    def is_rigid(self, c):
+        """Whether constraint c has no compliance."""
+        out = True
+        if ti.static(self.soft):
+            out = self.alpha[c] == 0
+        return out
+
+    @ti.func
+    def dashpot(self, c):
+        """Damping of constraint c."""
+        out = ti.cast(0, self.real)
+        if ti.static(self.damped):
+            out = self.damping[c]
+        return out
+
+    @ti.func
+    def law(self, c, h, w, fresh):
+        """See law(), of constraint c."""
+        return law(self.alpha[c], self.dashpot(c), h, w, fresh)
