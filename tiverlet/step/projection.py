@@ -165,7 +165,7 @@ class Rows:
         gamma = damping * alpha / h
         A = self.theta + gamma if world._started else (1 + 3 * self.theta) / 4 + gamma * (1 + self.theta) / 2
         known = [
-            (read(b.dev.history) if b.dev.soft else 0) + b.compliance * read(b.dev.lam)[: b.count] / world._scene.hh
+            (read(b.dev.spring.history) if b.dev.spring.soft else 0) + b.compliance * read(b.dev.lam)[: b.count] / world._scene.hh
             for b in self.batches
         ]
         return self._bounded(np.where(alpha > 0, A, 1.0) * self.C + self._each(known))
