@@ -15,6 +15,7 @@ from .reader import SEAL
 
 WAIT = 10.0  # [s] that a flush may take
 PIECE = 1 << 20  # bytes that are read at a time
+TICK = 0.1  # [s] at which rerun sends what is older than that: it waits for two at most
 
 
 class Sink:
@@ -33,7 +34,7 @@ class Sink:
 
         self.path, self.bytes = path, 0
         self.error: Exception | None = None
-        batches = rr.ChunkBatcherConfig(flush_num_bytes=BATCH)
+        batches = rr.ChunkBatcherConfig(flush_tick=TICK, flush_num_bytes=BATCH)
         self.stream: Any = rr.RecordingStream(application, recording_id=uuid.uuid4(), batcher_config=batches)
         if not self.stream.is_enabled():
             raise RuntimeError("Recorder: rerun is switched off by RERUN in the environment; unset it to record.")
