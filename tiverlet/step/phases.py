@@ -156,7 +156,7 @@ class Phases(Tiles):
         for c in ti.static(self.contacts):
             if ti.static(c.measures):
                 for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
-                    c.measure(i)
+                    c.measure(i, first)
                 self.team.wait()
             for k in range(self.team.deal(self.pieces, 1, me)):
                 begin, end = self.part(k, me)
