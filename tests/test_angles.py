@@ -37,7 +37,7 @@ def test_rods_swing_through_straight_and_every_compliance_is_stable(world):
         for _ in range(180):
             w.step(1 / 60)
             supplied = 0.1 * 9.81 * (x[..., 1] - w.position[:-rod].reshape(x.shape)[..., 1]).sum(axis=1)
-            speed = w._memory.state()["displacement"][:-rod].reshape(x.shape) * 240
+            speed = w._runner.memory.state()["displacement"][:-rod].reshape(x.shape) * 240
             assert (0.05 * (speed**2).sum(axis=(1, 2)) <= begin + supplied * 1.001 + 1e-4).all()
         made.append((w.position[-rod:], np.abs(bend.load[-rod + 2 :])))
     np.testing.assert_allclose(made[1][0][:, :2], made[0][0], atol=1e-9)

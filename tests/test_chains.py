@@ -145,7 +145,7 @@ def test_too_few_substeps_are_bounded_and_said(world, iterations):
     span = np.bincount(chain, mass * 9.81 * length * free)
 
     def energy():
-        x, d = w.position, w._memory.state()["displacement"] * w.substeps * 60
+        x, d = w.position, w._runner.memory.state()["displacement"] * w.substeps * 60
         return np.bincount(chain, free * mass * (0.5 * (d**2).sum(axis=1) + 9.81 * (x - d / (120 * w.substeps))[:, 1]))
 
     for substeps in (1, 2, 4, 10, 20):

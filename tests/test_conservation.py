@@ -8,8 +8,6 @@ from tiverlet.step import checkpoint
 
 from .test_links import net
 
-pytestmark = pytest.mark.usefixtures("read_here")
-
 
 @pytest.mark.parametrize("precision, limit", [("f64", 1e-12), ("f32", 1e-6)])
 def test_momentum_is_conserved_for_ten_thousand_steps(world, precision, limit):
@@ -23,8 +21,8 @@ def test_momentum_is_conserved_for_ten_thousand_steps(world, precision, limit):
     touched, worst = 0, 0.0
 
     def moving():
-        d = w._memory.state()["displacement"].astype(np.float64)
-        return mass @ d / w._h, (mass @ np.abs(d)).sum() / w._h
+        d = w._runner.memory.state()["displacement"].astype(np.float64)
+        return mass @ d / w._clock.h, (mass @ np.abs(d)).sum() / w._clock.h
 
     w.step(1 / 60)
     start, size = moving()
@@ -56,7 +54,7 @@ def test_velocities_have_the_momentum_of_the_motion(world, what):
     for frame in range(80):
         w.substeps = 1 + frame % 17 // 10
         touched += w.step(2e-3).contacts
-        d, size = w._memory.state()["displacement"][: len(x)] / w._h, mass @ np.linalg.norm(w.velocity, axis=1)
+        d, size = w._runner.memory.state()["displacement"][: len(x)] / w._clock.h, mass @ np.linalg.norm(w.velocity, axis=1)
         assert np.abs(mass @ (w.velocity - d)).max() <= 1e-12 * size
         for a, b in zip(*np.triu_indices(x.shape[1], 1), strict=True):
             more = w.position[:, a] * (w.velocity - d)[:, b] - w.position[:, b] * (w.velocity - d)[:, a]
@@ -152,15 +150,15 @@ def test_motion_is_reversible(world):
         precision="f64",
     )
     w.step(1 / 60)
-    begin = w._memory.state()
+    begin = w._runner.memory.state()
     for _ in range(12):
         w.step(1 / 60)
-    s = w._memory.state()
+    s = w._runner.memory.state()
     s["position"], s["displacement"] = s["position"] - s["displacement"], -s["displacement"]
-    w._memory.restore(s)
+    w._runner.memory.restore(s)
     for _ in range(12):
         w.step(1 / 60)
-    s = w._memory.state()
+    s = w._runner.memory.state()
     np.testing.assert_allclose(s["position"], begin["position"] - begin["displacement"], atol=1e-8)
 
 

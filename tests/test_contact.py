@@ -189,7 +189,7 @@ def test_walls_move_and_push(world):
         box.lower = (0.1 * (k + 1), 0)
         w.step(1 / 60)
         assert w.position[0, 0] == pytest.approx(0.1 * (k + 1) + 0.5, abs=1e-12)
-    assert w._memory.state()["displacement"][0, 0] * 600 == pytest.approx(6.0, rel=1e-9)
+    assert w._runner.memory.state()["displacement"][0, 0] * 600 == pytest.approx(6.0, rel=1e-9)
     floor = tv.HalfSpace((0, 1), 0.0)
     w = world(tv.Particles([[0.0, 0.25]], radius=0.25), [tv.Gravity(9.81), floor], precision="f64")
     for k in range(10):
@@ -238,7 +238,7 @@ def test_both_of_a_pair_agree_that_they_touch(world):
     w = world(tv.Particles(x, velocity=v, radius=radius.ravel()), [tv.Contact()], precision="f32-compensated", substeps=1)
     for _ in range(5):
         w.step(1e-2)
-        d = w._memory.state()["displacement"].astype(float).reshape(n, 3, 2)
+        d = w._runner.memory.state()["displacement"].astype(float).reshape(n, 3, 2)
         np.testing.assert_allclose(d.sum(axis=1), -1e-6 * way, atol=4e-12)
     assert w.last.contacts > n / 10
 
@@ -254,7 +254,7 @@ def test_what_a_failed_frame_left_behind_is_gone(world):
     ends = []
     for failed in (False, True):
         if failed:
-            for piece in w._grid.luggage:
+            for piece in w._runner.grid.luggage:
                 piece.field.fill(np.nan)
         checkpoint.put_back(w, kept)
         w.run(0.2)
@@ -270,16 +270,13 @@ def test_the_skin_changes_no_bits_of_what_links_move(world):
     links = np.arange(n).reshape(-1, 2)
     start, rest = tv.Particles(x, velocity=v, radius=0.1), rng.uniform(0.2, 1.5, len(links))
     hashes = set()
-    for path, skins in (("fused", (0.002, 0.4)), ("launched", (0.05,))):
-        contact = tv.Contact(skin=skins[0], friction=0.2)
+    for skin, path in ((0.002, "fused"), (0.05, "launched"), (0.4, "fused")):
+        contact = tv.Contact(skin=skin, friction=0.2)
         features = [tv.Gravity(9.81), tv.Distance(links, rest, compliance=1e-4), contact, tv.Box((-2.2, -2.2), (2.2, 2.2))]
         w = world(start, features, substeps=4, iterations=2, solver=tv.Jacobi(), path=path)
-        begin = checkpoint.keep(w)
-        for contact.skin in skins:
-            checkpoint.put_back(w, begin)
-            for _ in range(25):
-                w.step(1 / 60)
-            hashes.add(w.hash())
+        for _ in range(25):
+            w.step(1 / 60)
+        hashes.add(w.hash())
     assert len(hashes) == 1
 
 

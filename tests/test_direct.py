@@ -248,7 +248,7 @@ def test_ropes_that_touch_are_solved_and_come_to_rest(world):
     assert "Solved by Direct" in w.explain()
     report = w.run(0.1)
     assert report.contacts > 10
-    momentum = 0.01 * w._memory.state()["displacement"].astype(float).sum(axis=0) * 1200  # half a substep ago
+    momentum = 0.01 * w._runner.memory.state()["displacement"].astype(float).sum(axis=0) * 1200  # half a substep ago
     falling = 0.01 * (speed.sum(axis=0) - len(x) * np.array([0, 9.81 * (w.time - 1 / 2400)]))
     np.testing.assert_allclose(momentum, falling, atol=1e-6 * np.abs(falling).max())
     fastest, length = np.hypot(3 * 1.04, np.sqrt(2 * 9.81 * 0.7)), np.linalg.norm(x[1] - x[0])

@@ -133,6 +133,6 @@ def test_34_thousands_in_one_cell(world):
     x = np.random.default_rng(0).uniform(0, 0.01, (n, 2))
     w = world(tv.Particles(x, radius=0.5), [tv.Contact()])
     with pytest.warns(UserWarning, match="near pairs per particle"):
-        w._list()
-    np.testing.assert_array_equal(w._grid.number.to_numpy(), n - 1)
-    assert w._grid.need[None] * w._grid.blocks >= n * (n - 1)
+        w._runner.list_neighbours()
+    np.testing.assert_array_equal(w._runner.grid.number.to_numpy(), n - 1)
+    assert w._runner.grid.need[None] * w._runner.grid.blocks >= n * (n - 1)

@@ -83,19 +83,19 @@ class Again:
 
 def lists(w) -> tuple[np.ndarray, np.ndarray]:
     """How many neighbours each particle has, and all of them, one list after the other."""
-    _, at = w._grid._entries(w._grid.first, w._grid.number)
-    return w._memory.read(w._grid.number), w._grid.store.read(w._grid.near)[at]
+    _, at = w._runner.grid._entries(w._runner.grid.first, w._runner.grid.number)
+    return w._runner.memory.read(w._runner.grid.number), w._runner.grid.store.read(w._runner.grid.near)[at]
 
 
 def shuffle(w, rng) -> None:
     """Put the particles of each bucket into another order."""
-    cells = w._grid.cells
-    begin, who, place = (w._memory.read(f) for f in (cells.edge, cells.sorted, cells.place))
+    cells = w._runner.grid.cells
+    begin, who, place = (w._runner.memory.read(f) for f in (cells.edge, cells.sorted, cells.place))
     bucket = np.repeat(np.arange(cells.buckets), np.diff(begin[1 : cells.buckets + 2]))
     order = np.lexsort((rng.random(N), bucket))
     assert (order != np.arange(N)).sum() > N / 8
-    w._memory.write(cells.sorted, who[order])
-    w._memory.write(cells.place, place[order])
+    w._runner.memory.write(cells.sorted, who[order])
+    w._runner.memory.write(cells.place, place[order])
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -116,10 +116,10 @@ def test_lists_of_a_gpu_are_those_of_one_thread(world, dim, sizes):
     features = [tv.Contact(skin=0.04, groups=[(0, 0), (0, 1), (1, 1), (2, 2)]), tv.Distance(pairs, compliance=1.0)]
     start = tv.Particles(x, radius=radius, pinned=static, group=group)
     w = world(start, features, precision="f64", path="launched")
-    w._grid.allocate(1)
+    w._runner.grid.allocate(1)
     w._renew()
-    w._list()
-    far = radius[:, None] + radius + w._grid.skin
+    w._runner.list_neighbours()
+    far = radius[:, None] + radius + w._runner.grid.skin
     near = ((x[:, None] - x) ** 2).sum(axis=2) < far**2
     free = np.ones(N, dtype=bool)
     free[static] = False
@@ -129,12 +129,12 @@ def test_lists_of_a_gpu_are_those_of_one_thread(world, dim, sizes):
     number, entries = lists(w)
     np.testing.assert_array_equal(number, near.sum(axis=1))
     np.testing.assert_array_equal(entries, np.nonzero(near)[1])
-    assert number.max() > LONG and w._grid.need[None] == number.sum() <= w._grid.capacity
-    again = Again(w._grid)
+    assert number.max() > LONG and w._runner.grid.need[None] == number.sum() <= w._runner.grid.capacity
+    again = Again(w._runner.grid)
     for _ in range(2):
         shuffle(w, rng)
-        w._memory.write(w._grid.number, 0)
-        with w._memory.compiler():
+        w._runner.memory.write(w._runner.grid.number, 0)
+        with w._runner.memory.compiler():
             again.run()
         for a, b in zip(lists(w), (number, entries), strict=True):
             np.testing.assert_array_equal(a, b)
@@ -150,9 +150,9 @@ def test_what_pairs_carry_goes_with_them(world):
         features = [tv.Gravity(9.81), tv.Contact(friction=0.3), tv.Box((0, 0), (10, 12))]
         w = world(tv.Particles(x, radius=radius, mass=radius**2), features, path=path)
         if path == "launched":
-            w._grid.allocate(1)
+            w._runner.grid.allocate(1)
             w._renew()
         w.run(0.2)
-        made.append((w.hash(), w._grid.need[None]))
-        assert w._grid.cells.levels > 3
+        made.append((w.hash(), w._runner.grid.need[None]))
+        assert w._runner.grid.cells.levels > 3
     assert made[0] == made[1]

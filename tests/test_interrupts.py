@@ -12,8 +12,6 @@ import tiverlet as tv
 from tiverlet.device import interrupts
 from tiverlet.step import checkpoint
 
-pytestmark = pytest.mark.usefixtures("read_here")
-
 
 def frames_of(world, dt=1 / 60):
     """How many frames it has made."""
@@ -39,11 +37,10 @@ def piled():
 @pytest.fixture
 def w(piled):
     """One world for all tests, since compiling it takes longer than all else."""
-    start = checkpoint.keep(piled)
+    start, passes = checkpoint.keep(piled), piled._runner.passes_at_once
     yield piled
     checkpoint.put_back(piled, start)
-    piled.substeps, piled.iterations = 4, 3
-    piled._make()
+    piled.substeps, piled.iterations, piled._runner.passes_at_once = 4, 3, passes
 
 
 def test_a_signal_waits_for_the_end_of_the_frame(w, tmp_path):
@@ -89,9 +86,9 @@ def test_a_signal_waits_for_the_end_of_the_frame(w, tmp_path):
 def in_parts(w, passes, frames):
     """Hashes of frames made in one launch each, and made in launches of so many passes."""
     start, out = checkpoint.keep(w), []
-    for some in (w._passes, passes):
+    for some in (w._runner.passes_at_once, passes):
         checkpoint.put_back(w, start)
-        w._passes = some
+        w._runner.passes_at_once = some
         out.append([(w.step(1 / 60).residual, w.hash()) for _ in range(frames)])
     return out
 
@@ -125,7 +122,7 @@ def test_an_endless_frame_is_undone(w, endless):
     pin.target = [[0.05, 0.35]]
     for name, value in endless.items():
         setattr(w, name, value)
-    w._passes = 10_000  # as in a large scene
+    w._runner.passes_at_once = 10_000  # as in a large scene
     timer = threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT))
     timer.start()
     with pytest.raises(KeyboardInterrupt):
@@ -155,10 +152,10 @@ def test_a_handler_that_raises_nothing_is_called_after_the_frame(w):
 def test_a_step_that_fails_is_recorded_as_it_is(w, tmp_path):
     with tv.Recorder(tmp_path / "a.rrd", w) as recorder:
         w.run(0.05, recorder=recorder)
-        w.__dict__["_report"] = lambda *_: 1 / 0
+        w._runner.__dict__["report"] = lambda *_: 1 / 0
         with pytest.raises(ZeroDivisionError):
             w.step(1 / 60)
-        del w.__dict__["_report"]
+        del w._runner.__dict__["report"]
         w.run(0.05, recorder=recorder)
         end = w.hash()
     recording = tv.replay(tmp_path / "a.rrd")

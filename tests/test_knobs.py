@@ -16,8 +16,6 @@ from tiverlet.features.arguments import knobs_of
 
 from .conftest import order
 
-pytestmark = pytest.mark.usefixtures("read_here")
-
 DT = 1 / 60
 LINK = np.array([[0.0, 0.3, 0.1], [0.5, -0.1, 0.3]])
 PATH = np.array([[-0.4, 0.3, 0.1], [0.1, -0.2, 0.0], [0.6, 0.4, 0.3]])
@@ -241,7 +239,7 @@ def test_the_rows_have_every_feature():
 def test_every_setting_is_live(world, group):
     rows = {name: ROWS3[name] for name in GROUPED[group]}
     scene = Scene(world, rows, False)
-    memory, before = scene.world._memory, scene.go()
+    memory, before = scene.world._runner.memory, scene.go()
     fields = scene.world.fields
     some = np.ones(len(before), dtype=bool)
     some[scene.indices.get("Path, speed", [])] = False  # which goes on from where it is
@@ -260,7 +258,7 @@ def test_every_setting_is_live(world, group):
             assert group == "forces" or name in ("Box", "HalfSpace") or moved.max() < 1e-12, (name, setting)
             setattr(feature, setting, scene.values(name, False)[setting])
     np.testing.assert_allclose(scene.go()[some], before[some], atol=1e-9)
-    assert scene.world._memory is memory and scene.world.fields == fields
+    assert scene.world._runner.memory is memory and scene.world.fields == fields
 
     # All of them together: as a world that was built so. What is compiled is compiled anew.
     scene.assign(True)
@@ -268,7 +266,7 @@ def test_every_setting_is_live(world, group):
     np.testing.assert_allclose(scene.go()[some], other.go()[some], atol=1e-9)
     assert np.abs(scene.go() - before).max() > 1e-3
     compiles = any(inspect.getattr_static(type(f), k).compiled for f in scene.features.values() for k in knobs_of(type(f)))
-    assert (scene.world._memory is memory) != compiles
+    assert (scene.world._runner.memory is memory) != compiles
     for name, feature in scene.features.items():
         if "break_at" in rows[name][2]:
             feature.break_at = 1e-9
@@ -363,10 +361,10 @@ def test_what_is_turned_stays_in_edited_worlds_and_in_recordings(world, tmp_path
     with tv.Recorder(tmp_path / "a.rrd", w) as recorder:
         link.compliance, link.break_at, floor.friction = 1e-2, 1e9, (0.4, 0.2)  # which compiles
         w.run(0.05, recorder=recorder)
-        memory = w._memory
+        memory = w._runner.memory
         link.compliance, link.break_at, link.damping = 1e-3, None, 0.0
         w.run(0.05, recorder=recorder)
-        assert w._memory is memory and np.isfinite(link.residual).all() and link.load[0] != 0
+        assert w._runner.memory is memory and np.isfinite(link.residual).all() and link.load[0] != 0
     replay = tv.replay(tmp_path / "a.rrd")
     assert replay.verify() and replay.world(6).hash() == w.hash()
     w.remove(w.add(tv.Particles([[9.0, 9.0]]), [tv.Drag(0.1)]))

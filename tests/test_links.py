@@ -117,7 +117,7 @@ def test_every_compliance_is_stable(world, precision):
     for _ in range(360):
         w.step(1 / 60)
         supplied = 0.1 * 9.81 * (x - w.position)[:, 1].reshape(-1, n).sum(axis=1)
-        speed = w._memory.state()["displacement"].astype(np.float64) * 240
+        speed = w._runner.memory.state()["displacement"].astype(np.float64) * 240
         kinetic = 0.05 * (speed**2).sum(axis=1).reshape(-1, n).sum(axis=1)
         assert (kinetic <= supplied * 1.001 + 1e-4).all()
 
@@ -259,7 +259,7 @@ def test_over_constrained_bodies(world):
         spins = []
         for _ in range(120):
             report = w.step(1 / 60)
-            s = w._memory.state()
+            s = w._runner.memory.state()
             turn = np.cross(s["position"], s["displacement"]) * 1200
             spins.append([turn[body].sum(axis=0) for body in bodies])
         assert np.ptp(spins, axis=0).max() <= 1e-13 * np.linalg.norm(spins[0])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
-from tiverlet.step import build, checkpoint
+from tiverlet.step import build
 
 from .conftest import CROSSOVER
 
@@ -26,7 +26,7 @@ def near_pairs(position, radius, skin):
 
 def roomy(w: tv.World, entries: int) -> None:
     """Give the list of near pairs room before anything compiles; a list that grows makes all compile anew."""
-    w._grid.allocate(entries)
+    w._runner.grid.allocate(entries)
     w._renew()
 
 
@@ -82,21 +82,21 @@ def test_pairs_equal_brute_force(world, path, name, radius, several):
     roomy(w, 4 * max(map(len, wanted)))
     for (position, filled), want in zip(several, wanted, strict=True):
         position = np.asarray(position)
-        w._memory.write(w._scene.state.x, position)
-        w._grid.fit(np.ptp(position, axis=0))
-        w._grid.stale[None] = 1
-        w._list()
-        pairs, _ = w._grid.entries()
+        w._runner.memory.write(w._runner.scene.state.x, position)
+        w._runner.grid.fit(np.ptp(position, axis=0))
+        w._runner.grid.stale[None] = 1
+        w._runner.list_neighbours()
+        pairs, _ = w._runner.grid.entries()
         pairs = pairs[pairs[:, 0] < pairs[:, 1]]
         np.testing.assert_array_equal(pairs, want)
-        found = w._grid.number.to_numpy()[: len(position)]
+        found = w._runner.grid.number.to_numpy()[: len(position)]
         np.testing.assert_array_equal(found, np.bincount(pairs.ravel(), minlength=len(position)))  # each by both
         if filled:
-            in_bucket = np.diff(w._grid.cells.edge.to_numpy()[: w._grid.cells.buckets + 2])
+            in_bucket = np.diff(w._runner.grid.cells.edge.to_numpy()[: w._runner.grid.cells.buckets + 2])
             assert ((in_bucket > 0).sum(), in_bucket.max()) == filled
-        w._look()
-        touching = w._report()
-        reach, *extent = w._survey.figures[[7, *range(11, 11 + w.particles.dim)]]
+        w._runner.look()
+        touching = w._runner.report()
+        reach, *extent = w._runner.diagnostics.figures[[7, *range(11, 11 + w.particles.dim)]]
         assert reach == np.abs(position).max() and extent == np.ptp(position, axis=0).tolist()
         brute, depth = tv.measure.overlapping(position, radius)
         assert touching.contacts == len(brute)
@@ -112,9 +112,9 @@ def test_many_particles(world, monkeypatch):
     radius = rng.uniform(0.1, 0.5, 40_000)
     w = world(tv.Particles(position, radius=radius), [tv.Contact(skin=0.05)], precision="f64")
     assert w.path == ("parallel" if tv.runtime.cores() > 1 else "fused")
-    w._list()
-    first, number = w._grid.first.to_numpy(), w._grid.number.to_numpy()
-    near = w._grid.store.read(w._grid.near)
+    w._runner.list_neighbours()
+    first, number = w._runner.grid.first.to_numpy(), w._runner.grid.number.to_numpy()
+    near = w._runner.grid.store.read(w._runner.grid.near)
     i = np.repeat(np.arange(len(position)), number)
     j = near[np.repeat(first, number) + np.arange(len(i)) - np.repeat(np.cumsum(number) - number, number)]
     assert (np.diff(j)[np.diff(i) == 0] > 0).all()  # sorted, no pair twice
@@ -127,21 +127,13 @@ def test_neither_room_nor_skin_nor_path_changes_a_bit(world):
     # matter when lists are built: with the least skin in nearly all substeps.
     position = np.random.default_rng(9).uniform(-1, 1, (200, 2))
     hashes = set()
-    for path, ways in (
-        ("fused", ((100_000, "auto"), (1, 0.001))),
-        ("parallel", ((1, 0.3),)),
-        ("launched", ((1, 0.05),)),
-    ):
-        contact = tv.Contact(skin=ways[0][1])
-        features = [tv.Gravity(9.81), contact, tv.Box((-1.2, -1.2), (1.2, 3))]
+    for path, capacity, skin in (("fused", 100_000, "auto"), ("fused", 1, 0.001), ("parallel", 1, 0.3), ("launched", 1, 0.05)):
+        features = [tv.Gravity(9.81), tv.Contact(skin=skin), tv.Box((-1.2, -1.2), (1.2, 3))]
         w = world(tv.Particles(position, radius=0.1), features, path=path)
-        begin = checkpoint.keep(w)
-        for capacity, contact.skin in ways:
-            checkpoint.put_back(w, begin)
-            roomy(w, capacity)
-            w.run(0.2)
-            hashes.add(w.hash())
-            assert w._grid.capacity * w._grid.blocks >= len(w._grid.entries()[0]) > 0
+        roomy(w, capacity)
+        w.run(0.2)
+        hashes.add(w.hash())
+        assert w._runner.grid.capacity * w._runner.grid.blocks >= len(w._runner.grid.entries()[0]) > 0
     assert len(hashes) == 1
 
 
@@ -151,11 +143,9 @@ def test_the_skin_changes_no_bit_of_what_rubs_and_bounces(world):
     x = np.stack([k % 14 * 0.215, 0.2 + k // 14 * 0.215], axis=1) + rng.uniform(0, 0.005, (200, 2))
     start = tv.Particles(x, velocity=2 * rng.normal(size=(200, 2)), radius=0.08 + 0.02 * tv.golden(k))
     hashes = set()
-    contact, box = tv.Contact(friction=(0.6, 0.4), restitution=0.8), tv.Box((-0.2, 0), (3.2, 9), friction=0.5, restitution=0.3)
-    w = world(start, [tv.Gravity(9.81), contact, box], substeps=5)
-    begin = checkpoint.keep(w)
-    for contact.skin in (0.5, 0.002):
-        checkpoint.put_back(w, begin)
+    for skin in (0.5, 0.002):
+        box = tv.Box((-0.2, 0), (3.2, 9), friction=0.5, restitution=0.3)
+        w = world(start, [tv.Gravity(9.81), tv.Contact(friction=(0.6, 0.4), restitution=0.8, skin=skin), box], substeps=5)
         w.run(0.5)
         hashes.add(w.hash())
     assert len(hashes) == 1 and w.last.contacts > 20

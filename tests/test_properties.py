@@ -127,7 +127,7 @@ def test_a_constraint_does_what_all_constraints_do(world, name):
     history, seen = [], []
     for _ in range(20):
         w.step(dt)
-        s = w._memory.state()
+        s = w._runner.memory.state()
         now = [scene.block(b, a) for b in ("free", "swing") for a in (s["position"], s["displacement"])]
         m = MASS[: scene.arity, None]
         history.append([])

@@ -7,8 +7,6 @@ import taichi as ti
 import tiverlet as tv
 from tiverlet.recording import journal, scene
 
-pytestmark = pytest.mark.usefixtures("read_here")
-
 S = tv.shapes
 
 
@@ -146,14 +144,14 @@ def test_every_feature_is_built_again_from_its_description():
                 assert repr(again.settings["solver"]) == repr(world.settings["solver"])
                 assert [type(f) for f in again.features] == [type(f) for f in world.features]
                 again.features[0].upload(), world.features[0].upload()
-                mine, theirs = (w._memory._dump(w._memory.entries) for w in (world, again))
-                for field, a, b in zip(world._memory.entries, mine, theirs, strict=True):
+                mine, theirs = (w._runner.memory._dump(w._runner.memory.entries) for w in (world, again))
+                for field, a, b in zip(world._runner.memory.entries, mine, theirs, strict=True):
                     np.testing.assert_array_equal(a, b, err_msg=field.name)
     assert seen == set(scene.PUBLIC)
 
 
 @pytest.mark.parametrize("build, precision", [(swing, "f32"), (race, "f32-compensated"), (race, "f64")])
-def test_round_trip(build, precision, tmp_path, built_once):
+def test_round_trip(build, precision, tmp_path):
     path = tmp_path / "a.rrd"
     with build(precision) as world, tv.Recorder(path, world) as recorder:
         drive(world, recorder)

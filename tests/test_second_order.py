@@ -122,7 +122,7 @@ def test_spherical_pendulum_for_a_million_steps(world):
     spin = []
     for _ in range(1000):
         w.step(1.0)  # h = 1e-3
-        x, d = w._memory.state()["position"][1], w._memory.state()["displacement"][1]
+        x, d = w._runner.memory.state()["position"][1], w._runner.memory.state()["displacement"][1]
         spin.append(np.cross(x, d)[1] / 1e-3)  # x_n x x_(n-1) is conserved exactly by the discrete motion
         assert abs(w.last.energy - case("S01_spherical_pendulum")["values"]["energy_per_m"]) < 3e-5
     assert np.ptp(spin) < 1e-10
@@ -155,7 +155,7 @@ def test_a_free_rod_spins_for_ever(world, dim):
         turn = []
         for _ in range(2):
             # The angle of one substep, from the last displacement: arg of x_n against x_(n-1).
-            s = w._memory.state()
+            s = w._runner.memory.state()
             r1, d = s["position"][0] - s["position"][1], s["displacement"][0] - s["displacement"][1]
             r0 = r1 - d
             turn.append(np.arctan2(r0[0] * r1[1] - r0[1] * r1[0], r0[:2] @ r1[:2]))

@@ -10,7 +10,7 @@ from .conftest import case, order, rerun, rms
 
 def angular(w, m, steps):
     """sum m x_(n-1) x d / h, which the discrete motion conserves exactly; three numbers, in 2D too."""
-    s = w._memory.state()
+    s = w._runner.memory.state()
     d, x = s["displacement"].astype(float), s["position"].astype(float)
     pad = ((0, 0), (0, 3 - d.shape[1]))
     return np.cross(np.pad(x - d, pad), np.pad(m[:, None] * d, pad)).sum(axis=0) * steps
@@ -158,6 +158,6 @@ def test_plastic_shapes_keep_what_they_were_pressed_into(world):
     shape = tv.ShapeMatch([[0, 1]], rest=x * 2 / 3, compliance=1e-2, creep=creep, yield_strain=0.1)
     w = world(tv.Particles(x, pinned=[0]), [shape, tv.Pin([1], x[1], compliance=1e-12)], precision="f64")
     w.run(seconds)
-    length = np.linalg.norm(np.diff(w._memory.state()["ShapeMatch.shape"], axis=0))
+    length = np.linalg.norm(np.diff(w._runner.memory.state()["ShapeMatch.shape"], axis=0))
     # What is pinned stays in place, so all of the deformation e is at the other: e' = -creep (e - 0.1) from 1.
     assert 3 - length == pytest.approx(0.1 + 0.9 * np.exp(-creep * seconds), rel=2e-3)

@@ -36,9 +36,9 @@ def test_largest_eigenvalue_of_a_net(world, shear, figure):
     alive = D > 0
     A = np.einsum("jia,i,kia->jk", G, inv, G)[np.ix_(alive, alive)] / np.sqrt(np.outer(D[alive], D[alive]))
     value = float(np.linalg.eigvalsh(A).max())
-    assert largest(w._scene, [w.features[1]], split) == pytest.approx(value, rel=1e-3)
+    assert largest(w._runner.scene, [w.features[1]], split) == pytest.approx(value, rel=1e-3)
     assert value == pytest.approx(figure, rel=0.03)
-    assert w._scene.slots.relaxation == pytest.approx(1.2 / value, rel=1e-3)
+    assert w._runner.scene.slots.relaxation == pytest.approx(1.2 / value, rel=1e-3)
     assert f"relaxation {1.2 / value:.3g}" in w.explain()
 
 
@@ -55,7 +55,7 @@ def test_the_largest_safe_relaxation_is_stable_and_better(world):
 
 def test_auto_is_one_where_springs_would_change(world):
     w = world(tv.Particles(np.eye(2)), [tv.Distance([[0, 1]], compliance=1e-3)], solver=tv.Jacobi("auto"))
-    assert w._scene.slots.relaxation == 1.0
+    assert w._runner.scene.slots.relaxation == 1.0
 
 
 def hung(world, solver, n=10, **settings):

@@ -9,25 +9,26 @@ from typing import Any
 import numpy as np
 
 from . import checks
+from .constraints.core.strength import BREAKS
 from .contact.initial_overlap import overlapping
 from .device.interrupts import whole
 from .features.arguments import meant
 from .features.feature import Acceleration, Feature
-from .particles import Particles
+from .features.read_only import assign_whole, read_only
+from .neighbours.queries import Contacts, Search, near_by_all, nearest
+from .particles import Particles, in_range
 from .solvers.solver import Solver
-from .step import checkpoint, edit_scene, high_order
+from .step import checkpoint, edit_scene
 from .step.adaptive import Guard
 from .step.build import Assembly, assemble, check_settings, checked_features, checked_solver
-from .step.diagnostics import STARTED, STEPPED
+from .step.clock import Clock
 from .step.edit_scene import Handle
 from .step.explain import explain
-from .step.projection import project
-from .step.runner import Launches
-from .step.step import FREE, decay
+from .step.runner import Runner
 from .step_report import StepReport
 
 
-class World(Launches):
+class World:
     """Particles and what acts on them.
 
     particles: Particles. features: what acts, in any order; at most one Contact. What is not in the list costs nothing.
@@ -56,8 +57,8 @@ class World(Launches):
         features = checked_features(features)
         starts = [None] * len(features)
         self._build(particles, features, starts, substeps, iterations, solver, precision, path, order)
-        for contact in self._sub.contacts:
-            if not contact.dev.eases and contact.table.uniform and overlapping(self._scene, self._batches):
+        for contact in self._runner.step.contacts:
+            if not contact.dev.eases and contact.table.uniform and overlapping(self._runner.scene, self._runner.batches):
                 contact.ease()  # before anything is compiled: later, the frame would be compiled again
 
     @staticmethod
@@ -70,41 +71,30 @@ class World(Launches):
     def _build(self, particles, features, starts, substeps, iterations, solver, precision, path, order) -> None:
         """starts: for each feature the particles as they were when it came; None if it comes now."""
         check_settings(precision, path, order, features)
-        self._wanted, self._order = (checked_solver(solver), path), order
-        self._solver, self._precision, self._batches = self._wanted[0] or Solver(), precision, []
+        self._requested = checked_solver(solver), path  # None where the solver is to be chosen
+        self._solver, self._precision, self._order = self._requested[0] or Solver(), precision, order
         self._guard = Guard()
         self.substeps, self.iterations = substeps, iterations
-        self._install(particles, features, assemble(particles, features, starts, len(particles), *self._asked))
+        self._clock = Clock()
+        parts = assemble(particles, features, starts, len(particles), self._requested[0], precision, path, order)
+        self._install(particles, features, parts)
         self._handles: weakref.WeakSet[Handle] = weakref.WeakSet()
-        self._time, self._tick, self._h = 0.0, 0, 0.0
-        self._since = 0  # substeps since the last start
-        self._longest = 0.0  # [s] substep since violations were last taken out, see project()
-        self._frame = (0.0, 0.0, 0)  # when frames of the present length began, their length, their number
-        self._fresh, self._started = True, False  # d holds velocities; the last substep was the first after a start
-        self._owed = 0.0  # [s] of the kick by rigid constraints that the velocities at the last start lacked
-        self._parted: Any = None  # velocities, until the next step, where constraints were removed that have a part in them
-        self._placed: int | None = 0  # the first of the particles that the user placed and that were not looked at yet
-        self._drag: list[float] | None = None
-        self._energy: float | None = None
         self._last: StepReport | None = None
         self._watchers: list[Any] = []  # recorders: told of what the user assigns, and before and after every step
         self._undo: tuple | None = None  # the state before a step that takes long, and flags of features
 
     @property
-    def _asked(self) -> tuple[Solver | None, str, str, int]:
+    def _build_options(self) -> tuple[Solver | None, str, str, int]:
         """What assemble() takes. A solver that was chosen for constraints that there are stays."""
-        solver = self._wanted[0] or (self._solver if self._batches else None)
-        return solver, self._precision, self._wanted[1], self._order
+        solver = self._requested[0] or (self._solver if self._runner.batches else None)
+        return solver, self._precision, self._requested[1], self._order
 
     def _install(self, particles: Particles, features: tuple[Feature, ...], parts: Assembly) -> None:
         """Take these for the parts of the world."""
         self._particles, self._features = particles, features
-        self._memory, self._scene, self._batches = parts.memory, parts.scene, parts.batches
-        self._grid, self._sub, self._survey, self._path = parts.grid, parts.substep, parts.survey, parts.path
-        self._solver = parts.solver
-        self._make()
-        self._search = None  # compiled when it is first asked
-        parts.scene.residuals = self._residuals
+        self._runner, self._solver = Runner(parts, self._clock), parts.solver
+        self._search: Search | None = None  # compiled when it is first asked
+        parts.scene.residuals = self._runner.residuals
 
     # The step.
 
@@ -120,7 +110,7 @@ class World(Launches):
         displacements are turned into velocities first and back after (time-corrected Verlet), so the step stays second order.
         A signal such as Ctrl-C is handled after the frame. One that takes seconds is undone at once if the handler raises.
         """
-        self._memory.check()
+        self._runner.memory.check()
         dt = checks.number("World.step", "dt", dt, above=0.0)
         with whole:
             for watcher in self._watchers:
@@ -128,21 +118,21 @@ class World(Launches):
             clock = perf_counter()
             try:
                 guarded = self._guard.auto or tolerance is not None or budget is not None
-                if guarded or self._substeps * self._iterations > self._passes:
+                if guarded or self._substeps * self._iterations > self._runner.passes_at_once:
                     self._undo = checkpoint.keep(self), checkpoint.flags(self)
-                self._heed()
+                self._upload_parameters()
+                self._runner.interruptible = self._undo is not None
                 if guarded:
-                    with self._memory.compiler():
+                    with self._runner.memory.compiler():
                         report = self._guard.advance(self, dt, tolerance, budget)
                 else:
-                    self._begin(dt / self._substeps * self._plain["first"])
-                    report = self._advance(dt, self._substeps, self._iterations)
+                    self._begin(dt / self._substeps * self._runner.integrator.first)
+                    report = self._runner.advance(dt, self._substeps, self._iterations)
             except BaseException:
                 self._broken_off()
                 raise
             report.__dict__["seconds"] = perf_counter() - clock  # which is no part of what it says
-            # All at once, which is quicker than one after the other.
-            self.__dict__.update(_last=report, _energy=report.energy, _undo=None)
+            self._last, self._clock.energy, self._undo = report, report.energy, None
             for watcher in self._watchers:
                 watcher.after(dt, report)
         return report
@@ -156,40 +146,12 @@ class World(Launches):
         for watcher in self._watchers:
             watcher.broken_off()
 
-    def _advance(self, dt: float, substeps: int, iterations: int) -> StepReport:
-        """One frame from where _begin() left off."""
-        sub = self._plain
-        if sub["hurries"]:
-            with self._memory.compiler():
-                self._memory.write(self._sub.slots.kappa, self._solver.condition(iterations))
-        done, frame = substeps if sub["n"] else 0, self._counted(dt)
-        started, end = self._fresh and substeps == 1, frame[0] + frame[1] * frame[2]
-        if sub["launched"]:
-            with self._memory.compiler():
-                self._parallel(done, iterations)
-        else:
-            self._fused(done, iterations, end, STARTED if started else STEPPED)
-        self.__dict__.update(
-            _tick=(self._tick + substeps) % 2**31, _since=(self._since + substeps) % 2**31,
-            _started=started, _fresh=False, _parted=None, _frame=frame, _time=end,
-        )  # fmt: skip
-        if sub["launched"]:
-            self._look()
-        self._scene.hh = self._h**2 * sub["reaches"] * (self._drag or FREE)[2 if started else 1]
-        return self._report(substeps, iterations)
-
-    def _counted(self, dt: float) -> tuple[float, float, int]:
-        """When frames of this length began, their length, and their number, with one more: frames of the same length are counted,
-        not summed, so that they add no rounding errors."""
-        since, length, count = self._frame
-        return (since, dt, count + 1) if dt == length else (self._time, dt, 1)
-
-    def _heed(self) -> None:
+    def _upload_parameters(self) -> None:
         """Bring the knobs to the device; where a force has changed, start anew while the device still has what it was."""
         for feature in self._features:
             if feature.changed or feature.moving:
                 self._adapt()
-                with self._memory.compiler():
+                with self._runner.memory.compiler():
                     self._upload()
                 return
 
@@ -201,14 +163,14 @@ class World(Launches):
     def _settle_forces(self) -> None:
         """Where a force has changed, take velocities by what it was: before that is overwritten, or left behind by a copy."""
         if self._force_waits:
-            with self._memory.compiler():
-                self._restart()
+            with self._runner.memory.compiler():
+                self._runner.restart(self._iterations)
 
     def _adapt(self) -> None:
         """Settle forces; where knobs ask for what the kernels do not have, build the world anew."""
         self._settle_forces()
         if any(f.changed and f.outgrown for f in self._features):
-            check_settings(self._precision, self._wanted[1], self._order, self._features)
+            check_settings(self._precision, self._requested[1], self._order, self._features)
             edit_scene.rebuild(self, np.ones(len(self._particles), dtype=bool), None, self._features)
 
     def _upload(self) -> None:
@@ -222,43 +184,8 @@ class World(Launches):
                 feature.upload()
 
     def _begin(self, h: float) -> None:
-        """Take h for the substep; with another one than before, displacements mean something else: start anew from velocities."""
-        drag = decay(sum(f.rate for f in self._sub.drags), h) if self._plain["decays"] else None
-        if h == self._h and drag == self._drag and not self._fresh and self._energy is not None and self._placed is None:
-            return
-        with self._memory.compiler():
-            if h != self._h or drag != self._drag:
-                self._longest = max(self._longest, self._h if self._placed is None else 0.0)
-                self._restart()
-                if h < self._longest and self._order == 2 and project(self, h, self._longest):
-                    self._longest = h
-            if self._fresh:
-                self._since = 0
-            if self._placed is not None and self._sub.slots and self._sub.slots.system:
-                self._sub.slots.system.forget()
-            self._set(h, drag)
-            if self._energy is None:
-                self._look()
-                report = self._report()
-                self._energy = report.energy
-                if report.overlap > 0 and self._placed is not None:
-                    self._ease(self._placed)
-            self._placed = None
-
-    def _set(self, h: float, drag: list[float] | None) -> None:
-        if drag and drag != self._drag:
-            self._memory.write(self._sub.decay, drag)
-        self._h, self._drag = h, drag
-
-    def _restart(self) -> None:
-        """Turn displacements into velocities, so that the next substep starts from the state at this time."""
-        if not self._fresh:
-            if self._order == 2:
-                self._sub.to_velocity(self._h, self._time)
-                self._owed = (self._drag or FREE)[3] * self._h
-            else:
-                self._memory.write(self._scene.state.d, high_order.velocity(self))
-            self._fresh, self._parted = True, None
+        """Take h for the substep."""
+        self._runner.begin(h, self._iterations)
 
     def run(
         self, seconds: float, dt: float = 1 / 60, recorder=None, progress: bool = False, *, tolerance: float | None = None,
@@ -306,11 +233,214 @@ class World(Launches):
         """What was compiled and what was left out, with fields, bytes and launches."""
         return explain(self)
 
+    # State.
+
+    @property
+    def position(self) -> np.ndarray:
+        """Positions [m], (n, dim), a read-only copy in f64. Assign an array to move particles; velocities are kept."""
+        return read_only(self._runner.scene.state.get(self._runner.memory), assign_whole("World", "position"))
+
+    @position.setter
+    def position(self, value) -> None:
+        value = checks.points("World", "position", value, dim=self._particles.dim, count=len(self._particles))
+        in_range("World", "position", value)
+        if self._runner.step.contacts:
+            self._runner.step.contacts[0].check_range(value)
+        self._runner.memory.check()
+        with whole:
+            for watcher in self._watchers:
+                watcher.assigned("position", value)
+            with self._runner.memory.compiler():
+                self._runner.restart(self._iterations)
+                self._runner.scene.state.put(self._runner.memory, value)
+            self._clock.energy, self._clock.first_moved = None, 0
+            if self._runner.grid:
+                self._runner.grid.age()
+
+    @property
+    def velocity(self) -> np.ndarray:
+        """Velocities [m/s], (n, dim), a read-only copy in f64; of the order of the world. Assign an array to set them."""
+        out = self._clock.parted
+        if out is None:
+            self._runner.memory.check()
+            with whole, self._runner.memory.compiler():
+                out = self._runner.velocity(self._iterations)
+        return read_only(out.copy(), assign_whole("World", "velocity"))
+
+    @velocity.setter
+    def velocity(self, value) -> None:
+        value = checks.points("World", "velocity", value, dim=self._particles.dim, count=len(self._particles))
+        self._runner.memory.check()
+        with whole:
+            for watcher in self._watchers:
+                watcher.assigned("velocity", value)
+            self._runner.scene.state.start(self._runner.memory, value)
+            clock = self._clock
+            clock.d_is_velocity, clock.energy, clock.owed, clock.parted = True, None, 0.0, None
+
+    def near(self, points, radius) -> np.ndarray:
+        """The particles whose centers are within `radius` [m] of points: (m, 2), rows of `points` and particles, in order.
+
+        points: (k, dim) [m]. radius: number or (k,), at least 0. With a Contact in the world its grid is used; without, all are
+        compared.
+        """
+        points = checks.points("World.near", "points", points, dim=self._particles.dim)
+        radius = checks.per_item("World.near", "radius", radius, len(points), least=0.0)
+        self._runner.memory.check()
+        if not len(points) or not len(self._particles):
+            return np.zeros((0, 2), dtype=np.int64)
+        if not self._runner.grid:
+            return near_by_all(self.position, points, radius)
+        with whole:
+            self._runner.list_neighbours()
+            with self._runner.memory.compiler():
+                self._search = self._search or Search(self._runner.grid)
+                return self._search.near(points, radius)
+
+    def nearest(self, points) -> tuple[np.ndarray, np.ndarray]:
+        """Index of, and distance [m] to, the particle whose center is nearest to each point; of equally near ones the first."""
+        points = checks.points("World.nearest", "points", points, dim=self._particles.dim)
+        if not len(self._particles):
+            raise ValueError("World.nearest: there are no particles.")
+        position = self.position
+        start = (
+            self._runner.grid.finest if self._runner.grid else 2 * float(np.abs(position).max() + np.abs(points).max(initial=1.0))
+        )
+        return nearest(self.near, position, points, start)
+
+    @property
+    def contacts(self) -> Contacts:
+        """What touches now, as arrays: discs or spheres, and vertices and edges of Polygons. Empty without a Contact."""
+        self._runner.memory.check()
+        if not self._runner.grid:
+            none, index = np.zeros(0), np.zeros((0, 2), dtype=np.int64)
+            vectors = np.zeros((0, self._particles.dim))
+            return Contacts(index, index[:, 0], none, none, vectors, vectors, none)
+        contact = self._runner.step.contacts[0]
+        with whole:
+            self._runner.list_neighbours()
+            if contact.measures and self._runner.step.launched:
+                self._runner.look()  # which measures; elsewhere it makes the list, too
+        return contact.found(self.position, self._clock.h or 1.0)
+
+    @property
+    def broken(self) -> list[tuple[Feature, np.ndarray]]:
+        """What broke in the last frame: features, and the indices of their constraints. Those of all frames: feature.broken."""
+        self._runner.memory.check()
+        out = []
+        if self._last and self._last.broken:
+            for f in self._runner.step.breakers:
+                stamps = f.stamps()
+                recent = (stamps > 0) & ((self._clock.tick - stamps) % BREAKS < self._last.substeps)
+                if recent.any():
+                    out.append((f, np.flatnonzero(recent)))
+        return out
+
+    @property
+    def time(self) -> float:
+        """Simulated time [s]."""
+        return self._clock.time
+
+    @property
+    def last(self) -> StepReport | None:
+        """The report of the last step; None before the first."""
+        return self._last
+
+    @property
+    def particles(self) -> Particles:
+        """What the world was built from: initial state and structure."""
+        return self._particles
+
+    @property
+    def features(self) -> tuple[Feature, ...]:
+        """What acts on the particles."""
+        return self._features
+
+    @property
+    def precision(self) -> str:
+        """ "f32", "f32-compensated" or "f64"."""
+        return self._precision
+
+    @property
+    def order(self) -> int:
+        """Of the error in the substep."""
+        return self._order
+
+    @property
+    def path(self) -> str:
+        """ "fused" or "parallel"."""
+        return self._runner.path
+
+    @property
+    def substeps(self) -> int:
+        """Substeps of a frame; of the next one where they are chosen. Assign a number, or "auto"."""
+        return self._guard.substeps if self._guard.auto else self._substeps
+
+    @substeps.setter
+    def substeps(self, value: int | str) -> None:
+        if isinstance(value, str) and value != "auto":
+            raise ValueError(f'World: substeps = {value!r}, but it must be an integer of at least 1, or "auto".')
+        self._guard.auto = value == "auto"
+        if not self._guard.auto:
+            self._substeps = checks.integer("World", "substeps", value, least=1)
+
+    @property
+    def iterations(self) -> int:
+        """Passes over the constraints in a substep."""
+        return self._iterations
+
+    @iterations.setter
+    def iterations(self, value: int) -> None:
+        value = checks.integer("World", "iterations", value, least=1)
+        self._solver.check(value)
+        self._iterations = value
+
+    @property
+    def fields(self) -> dict[str, int]:
+        """Every field on the device, by name, and its size [bytes]."""
+        return {e.name: e.bytes for memory in self._runner.memories for e in memory.entries}
+
+    def add(self, particles: Particles | None = None, features: Iterable[Feature] = ()) -> Handle:
+        """Add particles and features, between frames. Returns a handle to the particles, see Handle.
+
+        The new particles come after the last; features name all of them by their numbers, so a rope that is added on top of n
+        particles has the links shapes.rope(...).links + n. Rest values that are not given are taken from the present positions.
+        Particles that overlap others part gently, as at the start.
+
+        What was there goes on to the bit: time, positions, velocities, multipliers, the history of springs, what pairs in contact
+        remember. Where a force or a spring is added, displacements are first turned into velocities, as when a force changes.
+        It costs what building a world costs, some seconds of compiling for a large scene: add many things at once.
+
+        Raises as World() does; the world is then as before.
+        """
+        with whole:
+            return edit_scene.add(self, particles, features)
+
+    def remove(self, particles: Any = (), features: Iterable[Feature] = ()) -> None:
+        """Remove particles and features, between frames.
+
+        particles: a handle, indices or a Boolean mask. The others close up, in order. A constraint goes with any of its
+        particles, and so do a loop, a surface, a cluster or a body of Polygons, whole; what it was part of stays, with what is
+        left, in the same Python object, and costs nothing once it is empty. features: of world.features; they become free.
+
+        What stays goes on to the bit, see add(). A force that goes with a particle is gone from the next substep on, as when a
+        constraint breaks. Functions of the user's own that take the number of a particle or constraint get the new one.
+
+        Raises ValueError or TypeError for what there is not; the world is then as before.
+        """
+        with whole:
+            edit_scene.remove(self, particles, features)
+
+    def handle(self, particles: Any) -> Handle:
+        """A handle to some particles, by indices or a Boolean mask; it knows their numbers when others are removed."""
+        self._runner.memory.check()
+        return edit_scene.handle(self, edit_scene.chosen(self, "World.handle", particles))
+
     @property
     def settings(self) -> dict[str, Any]:
         """How it is computed: substeps, iterations, solver, precision, path and order, as __init__ takes them."""
         out: dict[str, Any] = {"substeps": "auto" if self._guard.auto else self.substeps, "iterations": self.iterations}
-        return out | {"solver": self._solver, "precision": self._precision, "path": self._path, "order": self._order}
+        return out | {"solver": self._solver, "precision": self._precision, "path": self._runner.path, "order": self._order}
 
     def clone(self, **changes) -> "World":
         """The same scene in the same state, with other substeps, iterations, solver, precision, path or order.
@@ -320,7 +450,7 @@ class World(Launches):
         settings = self.settings
         if unknown := set(changes) - set(settings):
             raise TypeError(f"World.clone: {sorted(unknown)[0]} cannot be changed; one of {', '.join(settings)} can.")
-        self._memory.check()
+        self._runner.memory.check()
         self._adapt()
         copies = tuple(f.copy() for f in self._features)
         new = World._of(self._particles, copies, [f.start for f in self._features], **{**settings, **changes})
@@ -340,7 +470,7 @@ class World(Launches):
 
     def close(self) -> None:
         """Free the memory on the device. Using the world afterwards raises RuntimeError."""
-        for memory in self._memories:
+        for memory in self._runner.memories:
             memory.destroy()
         for feature in self._features:
             feature.scene = None
@@ -369,3 +499,41 @@ class World(Launches):
     def __repr__(self) -> str:
         names = ", ".join(map(repr, self._features))
         return f"World({self._particles!r}, [{names}], substeps={self.substeps}, iterations={self.iterations})"
+
+    # What step/projection.py, step/adaptive.py and tests ask for.
+
+    @property
+    def _memory(self) -> Any:
+        return self._runner.memory
+
+    @property
+    def _scene(self) -> Any:
+        return self._runner.scene
+
+    @property
+    def _batches(self) -> Any:
+        return self._runner.batches
+
+    @property
+    def _sub(self) -> Any:
+        return self._runner.step
+
+    @property
+    def _grid(self) -> Any:
+        return self._runner.grid
+
+    @property
+    def _h(self) -> float:
+        return self._clock.h
+
+    def _list(self) -> None:
+        self._runner.list_neighbours()
+
+    def _look(self) -> None:
+        self._runner.look()
+
+    def _report(self) -> StepReport:
+        return self._runner.report()
+
+    def _advance(self, dt: float, substeps: int, iterations: int) -> StepReport:
+        return self._runner.advance(dt, substeps, iterations)

@@ -64,7 +64,7 @@ class Trial:
         w = self.world
         self.kept, self.flags = checkpoint.keep(w), checkpoint.flags(w)
         self.knobs = [dict(knobs(f)) for f in self.features]
-        self.free = w._scene.inv_mass.copy()
+        self.free = w._runner.scene.inv_mass.copy()
         self.eps = oracles.EPS[w.precision]
         self.soft = any(getattr(f, "soft", False) for f in self.features)
 
@@ -201,7 +201,7 @@ class Judge:
         high = digit * fall / max(float((self.high - self.low).max()), 1e-300)
         alphas = [f.compliance[f.compliance > 0] for f in t.features if hasattr(f, "compliance")]
         stiff = sum(float((1 / a).sum()) for a in alphas)
-        h = w._h or 1.0
+        h = w._clock.h or 1.0
         return high + m * (digit / h) ** 2 + digit**2 * stiff
 
     def figures(self, report: tv.StepReport, x: np.ndarray) -> None:

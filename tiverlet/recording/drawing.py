@@ -59,7 +59,7 @@ class Drawing:
         if self.scenes:
             self._log(SCENE, self._rr.Clear(recursive=True))
         self.scenes += 1
-        self._contacts = len(p) <= FEW and bool(world._sub.contacts)
+        self._contacts = len(p) <= FEW and bool(world._runner.step.contacts)
         self._broken = {k: f.broken for k, f in enumerate(world.features) if isinstance(f, Batch) and f.breaks}
         hues = golden_colors(len(p))
         hues[p.inv_mass == 0] = (140, 140, 150)
@@ -155,7 +155,7 @@ class Drawing:
         """Where particles touch: between the two."""
         world = self.world
         middle = np.zeros((0, world.particles.dim))
-        if world._h:
+        if world._clock.h:
             found = world.contacts
             most = np.argsort(-found.impulse, kind="stable")[: -(-len(world.particles) // TOUCH)]
             middle = found.point[np.sort(most)]

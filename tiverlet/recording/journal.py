@@ -157,7 +157,7 @@ class Journal:
     def state(self, kind: str = "state") -> int:
         """Write the exact state; returns the size of the entry [bytes]."""
         kept, world = checkpoint.keep(self.world), self.world
-        more = {"flags": checkpoint.flags(world), "reach": world._scene.hh}
+        more = {"flags": checkpoint.flags(world), "reach": world._runner.scene.hh}
         return self.put(kind, {"clock": kept.clock, **more}, kept.values)
 
     def before(self) -> None:

@@ -226,7 +226,7 @@ class Replay:
         world = scene.rebuild(source.data, source.arrays, self._given, before)
         _settle(world, [e.data["now"] for e in self._entries[: start + 1] if "now" in e.data][-1])
         checkpoint.install(world, _kept(state, world), state.data["flags"])
-        world._scene.hh = state.data["reach"]
+        world._runner.scene.hh = state.data["reach"]
         return world
 
     def _run(self, start: int, end: int) -> Iterator[tuple["World", Entry]]:
@@ -256,7 +256,7 @@ class Replay:
                 scene.turn(world.features[k], values)
         elif entry.kind == "taken":
             checkpoint.install(world, _kept(entry, world), entry.data["flags"])
-            world._scene.hh = entry.data["reach"]
+            world._runner.scene.hh = entry.data["reach"]
         elif entry.kind == "assigned":
             if entry.data["name"] not in ("position", "velocity"):
                 raise ValueError(f"replay: {self.path} says that {plain(entry.data['name'])!r} was assigned.")

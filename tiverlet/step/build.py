@@ -23,8 +23,9 @@ from ..solvers.jacobi import Jacobi
 from ..solvers.slots import Slots
 from ..solvers.solver import Solver
 from . import high_order
-from .diagnostics import Survey
-from .step import Substep
+from .diagnostics import Diagnostics
+from .integrator import Forces, Verlet
+from .step import Step
 
 T = TypeVar("T", bound=Feature)
 PRECISIONS = {"f32": ti.f32, "f32-compensated": ti.f32, "f64": ti.f64}
@@ -52,8 +53,8 @@ class Assembly:
     scene: Scene
     batches: list[Batch]
     grid: Grid | None
-    substep: Substep
-    survey: Survey
+    step: Step
+    diagnostics: Diagnostics
 
 
 def assemble(
@@ -121,13 +122,14 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     for feature in features:
         feature.new_force = False  # it was given when it was made
         feature.dev.built = feature.compiled() if not isinstance(feature, Batch) or feature.acts else None
-    kind = Substep if scene.order == 2 else high_order.Composition
-    substep = kind(scene, accelerations, batches, drivers, contact, grid, walls, team)
-    survey = Survey(substep, solver)
+    forces = Forces(scene, accelerations)
+    integrator = Verlet(scene, forces) if scene.order == 2 else high_order.Composition(scene, forces, batches)
+    step = Step(scene, integrator, batches, drivers, contact, grid, walls, team)
+    diagnostics = Diagnostics(step, solver)
     if grid and contact:
         grid.allocate(int(len(particles) * max(ROOM[scene.radius.uniform][particles.dim - 2], contact.room)) + 64)
     memory.place()
-    return Assembly(path, solver, memory, scene, batches, grid, substep, survey)
+    return Assembly(path, solver, memory, scene, batches, grid, step, diagnostics)
 
 
 def checked_features(features: Iterable[Feature]) -> tuple[Feature, ...]:

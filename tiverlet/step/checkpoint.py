@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .clock import HASHED
+
 if TYPE_CHECKING:
     from ..world import World
 
-HASHED = ("_time", "_tick", "_since", "_h", "_fresh")  # of the clock; the rest follows from the same past
 CARRIED = ("Contact.push", "Contact.slip", "Contact.slack")  # by pairs, for the next substep
 TOLD = "Contact.given"  # by pairs, of the last substep, for reports
-CLOCK = (*HASHED, "_longest", "_frame", "_drag", "_started", "_owed", "_parted", "_placed", "_energy")
 
 
 @dataclass(frozen=True)
@@ -57,16 +57,16 @@ def state(world: "World", pairs: bool = True) -> dict[str, np.ndarray]:
 
     Without `pairs` that is left out, which takes a fraction of the time; it shows in the next frame.
     """
-    out = {name: values for memory in world._memories for name, values in memory.state().items()}
-    if world._grid and pairs:
-        out["Contact.pairs"], carried = world._grid.carried()
+    out = {name: values for memory in world._runner.memories for name, values in memory.state().items()}
+    if world._runner.grid and pairs:
+        out["Contact.pairs"], carried = world._runner.grid.carried()
         out.update((f"Contact.{name}", values) for name, values in carried.items())
     return out
 
 
 def keep(world: "World", pairs: bool = True) -> Kept:
     """A copy of the exact state."""
-    return Kept(state(world, pairs), {name: getattr(world, name) for name in CLOCK}, world._guard.memory)
+    return Kept(state(world, pairs), world._clock.keep(), world._guard.memory)
 
 
 def flags(world: "World") -> list[list[bool]]:
@@ -76,19 +76,18 @@ def flags(world: "World") -> list[list[bool]]:
 
 def put_back(world: "World", kept: Kept) -> None:
     """Return to an earlier state, bit for bit."""
-    world._set(kept.clock["_h"], kept.clock["_drag"])
-    grid, stores = world._grid, list(map(id, world._memories))
+    world._runner.set_substep(kept.clock["_h"], kept.clock["_drag"])
+    grid, stores = world._runner.grid, list(map(id, world._runner.memories))
     if "Contact.shrunk" in kept.values:
-        world._sub.contacts[0].ease()
-    for memory in world._memories:
+        world._runner.step.contacts[0].ease()
+    for memory in world._runner.memories:
         memory.restore(kept.values)
     if grid:
         pieces = {piece.name: kept.values[f"Contact.{piece.name}"] for piece in grid.lasting}
         grid.restore(kept.values["Contact.pairs"], pieces)
-    if list(map(id, world._memories)) != stores:
-        world._renew()  # there are new fields
-    for name, value in kept.clock.items():
-        setattr(world, name, value)
+    if list(map(id, world._runner.memories)) != stores:
+        world._runner.renew()  # there are new fields
+    world._clock.put_back(kept.clock)
     world._guard.memory = kept.guard
 
 
@@ -104,7 +103,7 @@ def check(world: "World", kept: Kept, flagged: list[list[bool]]) -> None:
     late = {"Contact.shrunk"}  # a field that is made when it is needed
     if set(present.values) - late != set(kept.values) - late or set(present.clock) != set(kept.clock):
         raise ValueError("The state is not one of this scene: it has other fields.")
-    pieces = {f"Contact.{piece.name}" for piece in world._grid.lasting} if world._grid else set()
+    pieces = {f"Contact.{piece.name}" for piece in world._runner.grid.lasting} if world._runner.grid else set()
     most = {"Contact.pairs": len(world.particles)}
     for f in world.features:
         if hasattr(f.dev, "pieces"):  # of a Path
@@ -142,8 +141,9 @@ def transfer(old: "World", new: "World") -> None:
     if new._precision == old._precision and new._order == old._order:
         install(new, kept, flags(old))
         return
-    new._time, new._tick, new._since, new._frame = old._time, old._tick, old._since, old._frame
+    ours, theirs = new._clock, old._clock
+    ours.time, ours.tick, ours.since, ours.frame = theirs.time, theirs.tick, theirs.since, theirs.frame
     new._guard.memory = kept.guard
     new.position, new.velocity = old.position, old.velocity
-    for ours, theirs in zip(old._sub.breakers, new._sub.breakers, strict=True):
-        new._memory.write(theirs.dev.strength.stamp, ours.stamps())
+    for broke, breaks in zip(old._runner.step.breakers, new._runner.step.breakers, strict=True):
+        new._runner.memory.write(breaks.dev.strength.stamp, broke.stamps())

@@ -13,7 +13,7 @@ from ..neighbours.neighbour_search import FARTHEST
 from ..particles import LARGEST
 from ..solvers.solver import Solver
 from ..step_report import UNCONVERGED, StepReport
-from .step import CAME, END, FIGURES, SHEET, H, Substep, integer
+from .step import CAME, END, FIGURES, SHEET, H, Step, integer
 
 BLOCKS = 64  # partial sums: their number is fixed, so the total has the same bits on any number of threads; squared on a GPU
 TURNS = (0, 26, 41)  # degrees, for nothing, BENT and FAR
@@ -23,29 +23,29 @@ STEPPED, STARTED, UNSTEPPED = range(3)  # how a state came about: by a substep, 
 
 
 @ti.data_oriented
-class Survey:
+class Diagnostics:
     """The figures behind a StepReport, on the sheet of a frame in the order in which report() reads them.
 
     came: how the state came about. A frame that is one launch ends with them; where it is launched phase by phase, measure() is
     the last one.
     """
 
-    def __init__(self, substep: Substep, solver: Solver):
-        self.sub: Any = substep
+    def __init__(self, step: Step, solver: Solver):
+        self.step: Any = step
         self.solver = solver
         self.remedy: str | None = None  # the setting that meets constraints better, known once it is asked for
-        self.team = substep.team
-        self.n, self.dim, self.state = substep.n, substep.dim, substep.state
-        self.batches = substep.batches
-        self.contacts = substep.contacts
-        self.fastest = substep.fastest
-        self.single = substep.real == ti.f32
+        self.team = step.team
+        self.n, self.dim, self.state = step.n, step.dim, step.state
+        self.batches = step.batches
+        self.contacts = step.contacts
+        self.fastest = step.integrator.fastest
+        self.single = step.real == ti.f32
         self.farthest = LARGEST
-        if substep.grid:
-            self.farthest = min(LARGEST, substep.grid.finest * FARTHEST)
-        self.probes = [f for f in substep.accelerations if not f.uniform]
-        self.stride = substep.stride
-        add = substep.scene.memory.field
+        if step.grid:
+            self.farthest = min(LARGEST, step.grid.finest * FARTHEST)
+        self.probes = [f for f in step.integrator.forces.all if not f.uniform]
+        self.stride = step.stride
+        add = step.scene.memory.field
         self.blocks = BLOCKS if runtime.architecture() == "cpu" else BLOCKS**2
         self.parts = add("survey.figures", self.blocks, width=6, kind=ti.f64)
         self.low = add("survey.low", self.blocks, width=self.dim, kind=ti.f64)
@@ -53,13 +53,13 @@ class Survey:
         self.details: dict[int, Residuals] = {}  # compiled when asked for
         self.sheet: Any = np.zeros(SHEET)
         self.figures = self.sheet[: 11 + self.dim]
-        substep.survey = self
+        step.diagnostics = self
 
-    def of(self, substep: Substep) -> "Survey":
-        """The same fields, for another Substep."""
+    def of(self, step: Step) -> "Diagnostics":
+        """The same fields, for another Step."""
         new = copy.copy(self)
-        new.sub, new.details = substep, {}
-        substep.survey = new
+        new.step, new.details = step, {}
+        step.diagnostics = new
         return new
 
     @ti.func
@@ -83,7 +83,7 @@ class Survey:
         out = ti.cast(0, ti.f64)
         if self.state.w.of(i) > 0:
             out = 0.5 * scale * scale * d.dot(d)
-            for f in ti.static(self.sub.accelerations):
+            for f in ti.static(self.step.integrator.forces.all):
                 if ti.static(f.conservative):
                     out += f.potential(i, ti.cast(x, ti.f64) - back * d)
             out /= self.state.w.of(i)
@@ -111,9 +111,9 @@ class Survey:
     def block(self, b, h, t, when, fresh, begin):
         """One block of particles and constraints. Returns energy, residual, overlap, stiffness, contacts, bad; low, high."""
         figures, low, high = self.nothing()
-        scale, back = ti.cast(1, ti.f64), ti.cast(0, self.sub.real)
+        scale, back = ti.cast(1, ti.f64), ti.cast(0, self.step.real)
         if begin == 0:
-            scale, back = 1 / ti.cast(h, ti.f64), ti.cast(0.5, self.sub.real)
+            scale, back = 1 / ti.cast(h, ti.f64), ti.cast(0.5, self.step.real)
         size = (self.n + self.blocks - 1) // self.blocks
         for i in range(b * size, ti.min((b + 1) * size, self.n)):
             x = self.state.place(i)
@@ -136,39 +136,40 @@ class Survey:
             for c in range(b * part, ti.min((b + 1) * part, f.count)):
                 hh, miss = 0 * h, 0 * h
                 if begin == 0:
-                    hh = self.sub.reach(h, fresh)
+                    hh = self.step.integrator.reach(h, fresh)
                     miss = f.miss(c, h, hh, when, fresh)
                     figures[1] = ti.max(figures[1], ti.cast(miss, ti.f64))
                 figures[0] += f.energy(c, back, hh, miss)
         return figures, low, high
 
     @ti.func
-    def weigh(self, me, h64, came):
+    def reduce_blocks(self, thread, h64, came):
         """The sums behind residuals."""
-        h, fresh = ti.cast(h64, self.sub.real), ti.cast(came == STARTED, ti.i32)
-        self.sub.weigh(me, h, self.sub.reach(h, fresh), 0, fresh, False)
+        h, fresh = ti.cast(h64, self.step.real), ti.cast(came == STARTED, ti.i32)
+        self.step.constraints.reduce_blocks(thread, h, self.step.integrator.reach(h, fresh), 0, fresh, False)
 
     @ti.kernel
     def measure(self, sheet: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
         """All figures."""
         h64, t64, came = sheet[H], sheet[END], integer(sheet, CAME)
-        self.weigh(0, h64, came)
+        self.reduce_blocks(0, h64, came)
         self.sum_up(0, h64, t64, came, sheet)
 
     @ti.func
-    def sum_up(self, me, h64, t64, came, sheet: ti.template()):  # type: ignore[valid-type]
+    def sum_up(self, thread, h64, t64, came, sheet: ti.template()):  # type: ignore[valid-type]
         """By blocks, by blocks of these on a GPU, then by one thread."""
-        for k in range(self.team.low(self.blocks * self.stride, me), self.team.high(self.blocks * self.stride, me)):
+        for k in range(self.team.low(self.blocks * self.stride, thread), self.team.high(self.blocks * self.stride, thread)):
             if k % self.stride == 0:
-                h, t, b = ti.cast(h64, self.sub.real), ti.cast(t64, self.sub.real), k // self.stride
+                h, t, b = ti.cast(h64, self.step.real), ti.cast(t64, self.step.real), k // self.stride
                 fresh, begin = ti.cast(came == STARTED, ti.i32), ti.cast(came == UNSTEPPED, ti.i32)
-                self.parts[b], self.low[b], self.high[b] = self.block(b, h, t, self.sub.clock(0, 1), fresh, begin)
+                fraction = self.step.integrator.frame_fraction(0, 1)
+                self.parts[b], self.low[b], self.high[b] = self.block(b, h, t, fraction, fresh, begin)
         self.team.wait()
         if ti.static(self.blocks > BLOCKS):
             for k in range(BLOCKS):
                 self.parts[k * BLOCKS], self.low[k * BLOCKS], self.high[k * BLOCKS] = self.fold(k * BLOCKS, 1)
         ti.loop_config(serialize=True)
-        for _ in range(self.team.one(1, me)):
+        for _ in range(self.team.one(1, thread)):
             for k in range(FIGURES):
                 sheet[k] = 0  # what nobody writes comes back from a GPU as it was there
             total, low, high = self.fold(0, self.blocks // BLOCKS)
@@ -181,15 +182,15 @@ class Survey:
             for c in ti.static(self.contacts):
                 sheet[6] = c.dev.fast[None]
                 c.dev.fast[None] = 0
-            if ti.static(len(self.sub.breakers) > 0):
-                sheet[8] = self.sub.slots.broken[None]
-                self.sub.slots.broken[None] = 0
+            if ti.static(len(self.step.breakers) > 0):
+                sheet[8] = self.step.slots.broken[None]
+                self.step.slots.broken[None] = 0
             if ti.static(len(self.batches) > 0):
-                sheet[10] = self.sub.slots.turned[None]
-                self.sub.slots.turned[None] = 0
-                if ti.static(self.sub.slots.converges):
-                    sheet[9] = self.sub.slots.tension[None]
-                    self.sub.slots.tension[None] = 0
+                sheet[10] = self.step.slots.turned[None]
+                self.step.slots.turned[None] = 0
+                if ti.static(self.step.slots.converges):
+                    sheet[9] = self.step.slots.tension[None]
+                    self.step.slots.tension[None] = 0
 
     @ti.func
     def fold(self, begin, step: ti.template()):  # type: ignore[valid-type]
@@ -257,7 +258,7 @@ class Survey:
         if residual > UNCONVERGED:
             need = int(np.ceil(substeps * residual / UNCONVERGED))  # of order h^2 under loads, h after impacts
             if self.remedy is None:
-                scene = self.sub.scene
+                scene = self.step.scene
                 self.remedy = self.solver.remedy(self.batches, scene.slots, scene.inv_mass)
             other = f", or {self.remedy}" if self.remedy else ""
             notes["unconverged"] = (
@@ -291,18 +292,19 @@ class Survey:
 class Residuals:
     """The kernel behind the residual of one batch."""
 
-    def __init__(self, survey: Survey, batch):
-        self.survey, self.sub, self.batch = survey, survey.sub, batch
+    def __init__(self, diagnostics: Diagnostics, batch):
+        self.diagnostics, self.step, self.batch = diagnostics, diagnostics.step, batch
 
     @ti.kernel
     def measure(self, h64: ti.f64, fresh: ti.i32, out: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
         """Of every constraint."""
-        if ti.static(self.sub.team.size == 1):
-            self.survey.weigh(0, h64, fresh)
-        elif ti.static(len(self.sub.ragged) > 0):
-            for thread in range(self.sub.team.spread):
+        if ti.static(self.step.team.size == 1):
+            self.diagnostics.reduce_blocks(0, h64, fresh)
+        elif ti.static(len(self.step.constraints.ragged) > 0):
+            for thread in range(self.step.team.spread):
                 if thread % LEAST == 0:
-                    self.survey.weigh(thread // LEAST, h64, fresh)
+                    self.diagnostics.reduce_blocks(thread // LEAST, h64, fresh)
         for c in range(self.batch.count):
-            h = ti.cast(h64, self.sub.real)
-            out[c] = self.batch.miss(c, h, self.sub.reach(h, fresh), self.sub.clock(0, 1), fresh)
+            h = ti.cast(h64, self.step.real)
+            fraction = self.step.integrator.frame_fraction(0, 1)
+            out[c] = self.batch.miss(c, h, self.step.integrator.reach(h, fresh), fraction, fresh)

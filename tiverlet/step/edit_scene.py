@@ -12,7 +12,7 @@ from ..features.feature import Acceleration, Batch, Feature
 from ..particles import Particles
 from . import checkpoint
 from .build import assemble, check_settings, checked_features, listed
-from .step import decay
+from .integrator import decay
 
 NOTHING = 2.0**-20  # of a velocity: less than this of it is in the next displacement
 
@@ -50,7 +50,7 @@ class Handle:
 
 def add(world: Any, particles: Particles | None, features: Iterable[Feature]) -> Handle:
     """See World.add."""
-    world._memory.check()
+    world._runner.memory.check()
     late = listed("World.add", features)
     if particles is not None:
         if not isinstance(particles, Particles):
@@ -60,7 +60,7 @@ def add(world: Any, particles: Particles | None, features: Iterable[Feature]) ->
     checked_features(late)
     if sum(isinstance(f, Contact) for f in (*world.features, *late)) > 1:
         raise ValueError("World.add: more than one Contact; one covers all particles.")
-    check_settings(world._precision, world._wanted[1], world._order, (*world.features, *late))
+    check_settings(world._precision, world._requested[1], world._order, (*world.features, *late))
     n, count = len(world.particles), 0 if particles is None else len(particles)
     if late or count:
         rebuild(world, np.ones(n, dtype=bool), particles, (*world.features, *late))
@@ -69,7 +69,7 @@ def add(world: Any, particles: Particles | None, features: Iterable[Feature]) ->
 
 def remove(world: Any, particles: Any, features: Iterable[Feature]) -> None:
     """See World.remove."""
-    world._memory.check()
+    world._runner.memory.check()
     gone = listed("World.remove", features)
     for k, feature in enumerate(gone):
         if not any(feature is f for f in world.features):
@@ -99,7 +99,7 @@ def chosen(world: Any, who: str, particles: Any) -> np.ndarray:
 
 def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tuple[Feature, ...]) -> None:
     """Build the world anew, of its particles in the mask `some` and the added ones, under these features."""
-    world._memory.check()
+    world._runner.memory.check()
     n, m, before = int(some.sum()), 0 if added is None else len(added), world.features
     number = np.where(some, np.cumsum(some) - 1, -1)
     now = world._particles.regrouped(some, added, world.position[some])
@@ -109,19 +109,19 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
     starts = {id(f.start): f.start.regrouped(some, added) for f in before}
     starts = [None if f in came else starts[id(f.start)] for f in features]
     parts, seen = None, None
-    if not world._fresh and (world._parted is not None or any(_loses(f, number, features) for f in before)):
+    if not world._clock.d_is_velocity and (world._clock.parted is not None or any(_loses(f, number, features) for f in before)):
         seen = world.velocity
     try:
         turned = world._force_waits or any(_drives(f, number) for f in came + went)
         if turned:
-            with world._memory.compiler():
-                world._restart()
+            with world._runner.memory.compiler():
+                world._runner.restart(world.iterations)
         old = checkpoint.state(world) if turned else kept.values
         masks = {f: f.spared(number) for f in before}
         for f in before:
             f.release()
             f.renumber(number, n + m)
-        parts = assemble(now, features, starts, n, *world._asked)
+        parts = assemble(now, features, starts, n, *world._build_options)
         state = _carried(world, parts.memory, old, attributes, masks, some)
     except BaseException:
         if parts:
@@ -129,20 +129,20 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
         for f, values in attributes.items():
             f.__dict__.clear()
             f.__dict__.update(values)
-        if world._fresh != kept.clock["_fresh"]:
+        if world._clock.d_is_velocity != kept.clock["_fresh"]:
             checkpoint.put_back(world, kept)
         raise
-    memories, particles = world._memories, world._particles.regrouped(some, added)
-    contact, reach = next((c for c in world._sub.contacts if c in features), None), world._scene.hh
-    world._parted = None
+    memories, particles = world._runner.memories, world._particles.regrouped(some, added)
+    contact, reach = next((c for c in world._runner.step.contacts if c in features), None), world._runner.scene.hh
+    world._clock.parted = None
     world._install(particles, features, parts)
-    world._scene.hh = reach
-    world._memory.restore(state)
-    if contact and contact in world._sub.contacts:
+    world._runner.scene.hh = reach
+    world._runner.memory.restore(state)
+    if contact and contact in world._runner.step.contacts:
         _give_contacts(world, contact, old, number, some)
-    drag, world._drag = world._drag, None
-    if world._sub.decays:
-        world._set(world._h, drag)
+    drag, world._clock.drag = world._clock.drag, None
+    if world._runner.integrator.decays:
+        world._runner.set_substep(world._clock.h, drag)
     for f in features:
         if f not in came:
             f.changed, f.moving = attributes[f].get("changed", True), attributes[f].get("moving", False)
@@ -151,17 +151,17 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
         memory.destroy()
     for one in list(world._handles):
         one.follow(number)
-    world._energy = None
+    world._clock.energy = None
     if any(isinstance(f, Contact) for f in came):
-        world._placed = 0
-    elif world._placed is not None:
-        world._placed = int(some[: world._placed].sum())
+        world._clock.first_moved = 0
+    elif world._clock.first_moved is not None:
+        world._clock.first_moved = int(some[: world._clock.first_moved].sum())
     elif m:
-        world._placed = n
-    if m and not world._fresh:
+        world._clock.first_moved = n
+    if m and not world._clock.d_is_velocity:
         _launch(world, n)
-    if seen is not None and not world._fresh:  # what went has left its part in the velocities of what stays
-        world._parted = seen[some] if added is None else np.concatenate([seen[some], added.velocity])
+    if seen is not None and not world._clock.d_is_velocity:  # what went has left its part in the velocities of what stays
+        world._clock.parted = seen[some] if added is None else np.concatenate([seen[some], added.velocity])
     for watcher in world._watchers:
         watcher.regrouped()
 
@@ -183,7 +183,7 @@ def _carried(
 ) -> dict[str, np.ndarray]:
     """The state of a world that was built anew: the rows of what stayed are as they were."""
     new = memory.state()
-    names = [{id(e.field): e.name for e in one.entries if e.state} for one in (world._memory, memory)]
+    names = [{id(e.field): e.name for e in one.entries if e.state} for one in (world._runner.memory, memory)]
     owned: list[set[str]] = [set(), set()]
     moves: list[tuple[str, str, tuple[np.ndarray, ...]]] = []
     for feature, before in attributes.items():
@@ -216,7 +216,7 @@ def _give_contacts(world: Any, contact: Contact, old: dict, number: np.ndarray, 
         values = less.state()
         values["Contact.shrunk"][: some.sum()] = old["Contact.shrunk"][some]
         less.restore(values)
-    grid, pairs = world._grid, number[old["Contact.pairs"]]
+    grid, pairs = world._runner.grid, number[old["Contact.pairs"]]
     assert grid
     both = (pairs >= 0).all(axis=1)
     nothing = {p.name: np.zeros((len(pairs), p.width) if p.width else len(pairs)) for p in grid.lasting}  # of what came just now
@@ -229,16 +229,17 @@ def _launch(world: Any, first: int) -> None:
     v = share d / h + what forces add, see decay(): from any d, what it lacks of v says what d lacks. Where drag leaves nothing of
     a velocity in a substep, d does not matter.
     """
-    h, memory, state = world._h, world._memory, world._scene.state
-    want = np.where(world._scene.inv_mass[first:, None] > 0, world._particles.velocity[first:], 0.0)
-    fields = [state.d, *([world._sub.earlier] if world._sub.uses_velocity else [])]
+    h, memory, state = world._clock.h, world._runner.memory, world._runner.scene.state
+    integrator = world._runner.integrator
+    want = np.where(world._runner.scene.inv_mass[first:, None] > 0, world._particles.velocity[first:], 0.0)
+    fields = [state.d, *([integrator.earlier] if integrator.uses_velocity else [])]
     values = [memory.read(field).astype(np.float64) for field in fields]
     for field, rows in zip(fields, values, strict=True):
         rows[first:] = h * want
         memory.write(field, rows)
-    share = max(decay(sum(f.rate for f in world._sub.drags), h)[0], NOTHING)
+    share = max(decay(sum(f.rate for f in integrator.forces.drags), h)[0], NOTHING)
     d = h * want + h / share * (want - world.velocity[first:])
-    d[world._scene.inv_mass[first:] == 0] = 0.0
+    d[world._runner.scene.inv_mass[first:] == 0] = 0.0
     values[0][first:] = d
     for rows in values[1:]:
         rows[first:] = 3 * d - 2 * h * want  # so that 3 d - earlier = 2 h v

@@ -20,12 +20,12 @@ MANY = 10_000  # particles from which their order in memory matters
 
 def explain(world: "World") -> str:
     """Particles, features, what was left out, launches and memory, as text of a few lines."""
-    p, sub = world.particles, world._sub
+    p, step = world.particles, world._runner.step
     lines = [
         f"{len(p)} particles in {p.dim}D, {int((p.inv_mass == 0).sum())} static; {world.precision} on "
         f"{runtime.architecture()}, {runtime.threads()} threads",
         f"{'auto, now ' * world._guard.auto}{world.substeps} substeps x {world.iterations} iterations, path {world.path}: "
-        f"{_launches(world)}" + (f"; order {world.order}, {world._sub.count} stages in a substep" if world.order > 2 else ""),
+        f"{_launches(world)}" + (f"; order {world.order}, {step.integrator.stages} stages in a substep" * (world.order > 2)),
         "In the kernels:",
         *(f"    {line}" for line in _present(world)),
         "Left out, at no cost:",
@@ -37,10 +37,10 @@ def explain(world: "World") -> str:
         names = list(own)
         size = sum(world.fields[name] for name in names)
         lines.append(f"    {owner:10s} {size:>9d} bytes: {', '.join(n.partition('.')[2] or n for n in names)}")
-    if sub.batches:
-        why = "" if world._wanted[0] else f"; chosen because {reason(world._solver)}"
-        lines.append(f"Solved by {world._solver.explain(sub.batches, sub.slots)}{why}")
-        lines.append(f"Constraint corners that can move: {sub.slots.total} of {sum(b.indices.size for b in sub.batches)}")
+    if step.batches:
+        why = "" if world._requested[0] else f"; chosen because {reason(world._runner.solver)}"
+        lines.append(f"Solved by {world._runner.solver.explain(step.batches, step.slots)}{why}")
+        lines.append(f"Constraint corners that can move: {step.slots.total} of {sum(b.indices.size for b in step.batches)}")
     if _scattered(p.position):
         lines.append(
             "Numbered at random: neighbours are far apart in memory. tv.shapes.Shape(position).in_order() numbers them in turn; "
@@ -62,11 +62,11 @@ def _owner(field: str) -> str:
 
 
 def _launches(world: "World") -> str:
-    if not world._sub.launched:
-        size = world._sub.team.size
-        return "1 launch per frame" + f", of {size} threads" * (size > 1)
-    passes = world.iterations if world._sub.batches or world._grid or world._sub.walls else 0
-    more = ", and one for each neighbour list" if world._grid else ""
+    step = world._runner.step
+    if not step.launched:
+        return "1 launch per frame" + f", of {step.team.size} threads" * (step.team.size > 1)
+    passes = world.iterations if step.particles.acts else 0
+    more = ", and one for each neighbour list" if step.grid else ""
     return f"{world.substeps * (1 + passes) + 1} launches per frame{more}"
 
 
@@ -74,15 +74,15 @@ def _present(world: "World") -> list[str]:
     out = []
     for f in world.features:
         if isinstance(f, Batch):
-            idle = int(f.idle(world._scene.inv_mass).sum()) if f.count and not f.drives else 0
+            idle = int(f.idle(world._runner.scene.inv_mass).sum()) if f.count and not f.drives else 0
             note = f", {idle} of them between particles that cannot move" if idle else ""
             out.append(f"{f!r}: {f.count} {'driven particles' if f.drives else 'constraints'}{note}")
         elif isinstance(f, Acceleration):
             out.append(f"{f!r}: in the loop over particles")
         elif isinstance(f, Wall):
             out.append(f"{f!r}: in the loop over particles, last")
-        elif world._grid:
-            grid = world._grid
+        elif world._runner.grid:
+            grid = world._runner.grid
             sizes = ", ".join(f"{size:.3g}" for size in grid.cells.sizes)
             out.append(f"{f!r}: grid with cells of {sizes} m, neighbour list with a skin of {grid.skin:.3g} m")
         else:
@@ -91,21 +91,21 @@ def _present(world: "World") -> list[str]:
 
 
 def _absent(world: "World") -> list[str]:
-    sub = world._sub
+    step = world._runner.step
     rows = [
-        (not world._grid, "grid, neighbour list, contacts: no Contact between particles with radii"),
-        (not sub.batches, "slots and gathers: no constraint on particles that can move"),
-        (not sub.walls, "wall pass: no wall"),
-        (not sub.accelerations, "accelerations: no force"),
-        (not sub.decays, "exponential drag: no Drag or Wind"),
-        (not sub.uses_velocity, "second displacement: no force reads velocities"),
+        (not step.grid, "grid, neighbour list, contacts: no Contact between particles with radii"),
+        (not step.batches, "slots and gathers: no constraint on particles that can move"),
+        (not step.walls, "wall pass: no wall"),
+        (not step.integrator.forces.all, "accelerations: no force"),
+        (not step.integrator.decays, "exponential drag: no Drag or Wind"),
+        (not step.integrator.uses_velocity, "second displacement: no force reads velocities"),
         (
-            not any(getattr(b, "soft", False) for b in sub.batches),
+            not any(getattr(b, "soft", False) for b in step.batches),
             "compliance and its history: every constraint is rigid",
         ),
-        (not sub.breakers, "loads compared and breaks counted: no constraint has break_at"),
-        (sub.radius is None or sub.radius.uniform, "field of radii: all are equal or none is needed"),
-        (sub.state.w.uniform, "field of masses: all are equal"),
-        (not sub.state.sums, "low words: precision is not f32-compensated, and no chain is solved to rounding"),
+        (not step.breakers, "loads compared and breaks counted: no constraint has break_at"),
+        (step.scene.radius is None or step.scene.radius.uniform, "field of radii: all are equal or none is needed"),
+        (step.state.w.uniform, "field of masses: all are equal"),
+        (not step.state.sums, "low words: precision is not f32-compensated, and no chain is solved to rounding"),
     ]
     return [text for missing, text in rows if missing] or ["nothing"]

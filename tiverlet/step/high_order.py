@@ -18,10 +18,12 @@ from ..colliders.collider import Wall
 from ..constraints.core.scalar import Scalar
 from ..contact.contact import Contact
 from ..device import ti
+from ..device.memory import Memory
 from ..features.feature import Acceleration, Batch, Feature, Scene
 from ..solvers.solver import Solver
-from . import checkpoint
-from .step import BEGIN, CAME, END, FRESH, ITERATIONS, START, SUBSTEPS, UNTIL, H, Substep, integer
+from .clock import Clock
+from .integrator import Forces
+from .step import Moment, Span, Step, substep
 
 # The first half of the stages; the one in the middle is what is missing to 1.
 _HALVES = {
@@ -87,71 +89,60 @@ def check_solved(batches: list[Batch], scene: Scene, solver: Solver) -> None:
             )
 
 
-@ti.data_oriented
-class Composition(Substep):
-    """The kernels of a world of order 4 or more; runs fused only."""
+class Composition:
+    """The integrator of a world of order 4 or more: Verlet in stages, with springs as forces. Runs fused only."""
 
-    def __init__(self, scene: Scene, *args):
-        super().__init__(scene, *args)
+    uses_velocity = decays = half_kick = False
+
+    def __init__(self, scene: Scene, forces: Forces, batches: list[Batch]):
+        self.forces, self.state, self.slots = forces, scene.state, scene.slots
+        self.real, self.dim = scene.real, scene.particles.dim
         g = stages(scene.order)
-        self.count, self.passes, self.first = len(g), PASSES[scene.order], float(g[0])
+        self.stages, self.first = len(g), float(g[0])
         self.reaches = float(1 + g[-2] / g[-1]) / 2
+        self.springs_pull = any(b.soft for b in batches)
+        self.solved = PASSES[scene.order] if scene.slots and scene.slots.system else 0
         begin = np.concatenate([[0], np.cumsum(g)[:-1]])
         table = np.stack([g, np.roll(g, 1), begin, begin + g], axis=1)
-        self.table = scene.memory.field("composition.stages", self.count, width=4, kind=ti.f64, values=table)
-        self.fastest = (float(np.abs(g).max()) / self.first) ** 2 * fastest(self.batches, scene)
+        self.table = scene.memory.field("composition.stages", self.stages, width=4, kind=ti.f64, values=table)
+        self.fastest = (float(np.abs(g).max()) / self.first) ** 2 * fastest(batches, scene)
 
-    @ti.kernel
-    def fused(self, sheet: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
-        """All substeps of a frame, and the survey. The substep that is given is the first stage, which is as long as the last."""
-        ti.loop_config(serialize=True)
-        for _ in range(1):
-            h64, whole, t = sheet[H], sheet[H] / self.first, sheet[START]
-            fresh, came = integer(sheet, FRESH), integer(sheet, CAME)
-            substeps, iterations = integer(sheet, SUBSTEPS), integer(sheet, ITERATIONS)
-            until = integer(sheet, UNTIL)
-            for s in range(integer(sheet, BEGIN), ti.min(substeps, until)):
-                for q in range(self.count):
-                    g = self.table[q]
-                    starts = fresh if s + q == 0 else 0
-                    when = ti.Vector([(s + g[2]) / substeps, (s + g[3]) / substeps])
-                    final = ti.cast(s == substeps - 1 and q == self.count - 1, ti.i32)
-                    self.stage(g[0] * whole, g[1] * whole, t + (s + g[2]) * whole, when, starts, iterations, final)
-            if until > substeps:
-                self.survey.weigh(0, h64, came)
-                self.survey.sum_up(0, h64, sheet[END], came, sheet)
-
-    @ti.kernel
-    def probed(self, h: ti.f64, last: ti.f64, t: ti.f64, end: ti.f64, iterations: ti.i32):
-        """One more stage, to see where it leads. end: in frames."""
-        ti.loop_config(serialize=True)
-        for _ in range(1):
-            self.stage(h, last, t, ti.Vector([1.0, end]), 0, iterations, 1)
+    def passes(self, iterations: int) -> int:
+        """Over the constraints, in each stage."""
+        return max(iterations, self.solved) if self.solved else 0
 
     @ti.func
-    def stage(self, h, last, t, when, starts, iterations, final):
-        """A stage of h after one of `last`."""
-        if ti.static(self.springs):
-            self.kick(0, h)
-        for i in range(self.n):
-            self.propel(i, h, last, t, starts)
-        for f in ti.static(self.drivers):
-            for c in range(f.count):
-                f.drive(c, h, when[1])
-        if ti.static(len(self.systems) > 0):
-            for it in range(ti.max(iterations, self.passes)):
-                first = ti.cast(it == 0, ti.i32)
-                self.tell(0, h, when, first, 0)
-                self.settle(0, first)
-                self.collect(0, h, when, first, final, 0)
+    def times(self, span, s):
+        """Of stage s of a frame, as Verlet.times has them for substeps. The substep that is given is the first stage, which is as
+        long as the last."""
+        whole, g = span.h64 / self.first, self.table[s % self.stages]
+        substep, substeps = s // self.stages, span.substeps // self.stages
+        fraction = ti.Vector([(substep + g[2]) / substeps, (substep + g[3]) / substeps])
+        return g[0] * whole, g[1] * whole, span.start + (substep + g[2]) * whole, fraction
 
     @ti.func
-    def propel(self, i, h, last, t, starts):
-        """Verlet with the force at x; at a start, d is the velocity."""
+    def frame_fraction(self, s, substeps):
+        """The fractions of the frame at the start and the end of substep s."""
+        return ti.Vector([ti.cast(s, self.real) / substeps, ti.cast(s + 1, self.real) / substeps])
+
+    @ti.func
+    def reach(self, h, fresh):
+        """What a constant acceleration adds to the displacement in a substep, per m/s^2."""
+        return h * h / 2 if fresh != 0 else h * h
+
+    @ti.func
+    def advance(self, first, end, now):
+        """Integrate some particles."""
+        for i in range(first, end):
+            self.integrate(i, now.h, now.last, now.time, now.fresh)
+
+    @ti.func
+    def integrate(self, i, h, last, t, starts):
+        """Verlet with the force at x, in a stage of h after one of `last`; at a start, d is the velocity."""
         if self.state.w.of(i) > 0:
             d = self.state.d[i]
-            a = self.accelerate(i, self.state.place(i), 0 * d, t, self.pull(t))
-            if ti.static(self.springs):
+            a = self.forces.accelerate(i, self.state.place(i), 0 * d, t, self.forces.pull(t))
+            if ti.static(self.springs_pull):
                 a += self.slots.total_of(i) / (h * h)
             if starts != 0:
                 d = h * d + h * h / 2 * a
@@ -161,6 +152,27 @@ class Composition(Substep):
             self.state.advance(i, d)
         elif starts != 0:
             self.state.d[i] = 0 * self.state.d[i]
+
+    @ti.func
+    def velocity_after(self, i, h, t, bond):
+        """That at a start; velocity() finds all others."""
+        return self.state.d[i]
+
+
+@ti.data_oriented
+class Probe:
+    """The kernel that looks where a stage would lead."""
+
+    def __init__(self, step: Step):
+        self.step = step
+
+    @ti.kernel
+    def stage(self, h: ti.f64, last: ti.f64, t: ti.f64, end: ti.f64, passes: ti.i32):
+        """One more stage of h after one of `last`. end: in frames."""
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            span = Span(h, t, t, 0, 0, 0, 0, 1, passes, part=passes)
+            substep(self.step, Moment(span, 0, h, last, t, 0, ti.Vector([1.0, end]), final=1))
 
 
 def fastest(batches: list[Any], scene: Scene) -> float:
@@ -176,12 +188,12 @@ def fastest(batches: list[Any], scene: Scene) -> float:
     return worst
 
 
-def velocity(world: Any) -> np.ndarray:
+def velocity(probe: Probe, clock: Clock, memory: Memory, iterations: int) -> np.ndarray:
     """Velocities to the order of the world: the mean over two short stages, one forwards and one backwards, so that their own
     accelerations cancel, and constraints take out what is along them."""
-    sub, h, kept, out = world._sub, world._h, checkpoint.keep(world), 0.0
+    kept, out, h, step = memory.state(), 0.0, clock.h, probe.step
     for e in (h / PROBE, -h / PROBE):
-        sub.probed(e, h, world.time, 1 + e / world._frame[1], world.iterations)
-        out = out + world._memory.read(sub.state.d) / e
-        checkpoint.put_back(world, kept)
-    return out / 2
+        probe.stage(e, h, clock.time, 1 + e / clock.frame[1], step.integrator.passes(iterations))
+        out = out + memory.read(step.state.d) / e
+        memory.restore(kept)
+    return np.asarray(out / 2)

@@ -1,5 +1,7 @@
 """How one particle moves on its own: position Verlet in displacement form, with drag that is exact."""
 
+import numpy as np
+
 from ..device import ti
 from ..features.feature import Acceleration, Scene
 from ..tools import golden_steps
@@ -8,24 +10,15 @@ from ..tools import golden_steps
 DITHER = golden_steps(2)
 
 
-class Motion:
-    """What accelerates and slows the particles of one world."""
+class Forces:
+    """What accelerates the particles of one world, and what slows them."""
 
     def __init__(self, scene: Scene, accelerations: list[Acceleration]):
-        # For substeps made of stages: the share of the first, what accelerates in the last per h^2, omega^2 of springs.
-        self.first, self.reaches, self.fastest = 1.0, 1.0, 0.0
-        self.scene, self.state = scene, scene.state
-        self.n, self.dim, self.real = scene.particles.count, scene.particles.dim, scene.real
-        self.accelerations = [f for f in accelerations if f.accelerates]
-        self.common, self.others = ([f for f in self.accelerations if f.common is it] for it in (True, False))
-        self.uses_velocity = any(f.uses_velocity for f in accelerations)
+        self.real, self.dim = scene.real, scene.particles.dim
+        self.all = [f for f in accelerations if f.accelerates]
+        self.common, self.others = ([f for f in self.all if f.common is it] for it in (True, False))
+        self.use_velocity = any(f.uses_velocity for f in accelerations)
         self.drags = [f for f in accelerations if f.decays]
-        self.decays = bool(self.drags)
-        self.dithers = scene.real == ti.f32 and not scene.state.carries
-        if self.uses_velocity:
-            self.earlier = scene.memory.field("displacement_before", self.n, width=self.dim, state=True)
-        if self.decays:
-            self.decay = scene.memory.field("decay", None, width=5)
 
     @ti.func
     def pull(self, t):
@@ -42,6 +35,54 @@ class Motion:
         for f in ti.static(self.others):
             a += f.acceleration(i, x, v, t)
         return a
+
+
+class Verlet:
+    """d += h^2 a, x += d: the substep of order 2. It is one stage; see high_order.Composition for more."""
+
+    stages = 1  # of a substep
+    first = 1.0  # the share of the first of them
+    reaches = 1.0  # what accelerates in the last of them, per h^2
+    fastest = 0.0  # omega^2 of springs that act as forces [1/s^2]
+    springs_pull = False  # springs act as forces in every stage, and not only at starts
+    half_kick = True  # at a start, constraints know that the force acts for half of the substep
+
+    def __init__(self, scene: Scene, forces: Forces):
+        self.forces, self.state = forces, scene.state
+        self.dim, self.real = scene.particles.dim, scene.real
+        self.uses_velocity = forces.use_velocity
+        self.decays = bool(forces.drags)
+        self.dithers = scene.real == ti.f32 and not scene.state.carries
+        if self.uses_velocity:
+            self.earlier = scene.memory.field("displacement_before", scene.particles.count, width=self.dim, state=True)
+        if self.decays:
+            self.decay = scene.memory.field("decay", None, width=5)
+
+    def passes(self, iterations: int) -> int:
+        """Over the constraints, in each stage."""
+        return iterations
+
+    @ti.func
+    def times(self, at, s):
+        """Of substep s: its length, that of the one before [s], its start [s], and where it starts and ends in the frame."""
+        h = ti.cast(at.h64, self.real)
+        return h, h, ti.cast(at.start + s * at.h64, self.real), self.frame_fraction(s, at.substeps)
+
+    @ti.func
+    def frame_fraction(self, s, substeps):
+        """The fractions of the frame at the start and the end of substep s."""
+        return ti.Vector([ti.cast(s, self.real) / substeps, ti.cast(s + 1, self.real) / substeps])
+
+    @ti.func
+    def advance(self, first, end, now):
+        """Integrate some particles. Short loops, so that it is done for several of them at once."""
+        pull, share, reach = self.forces.pull(now.time), ti.cast(1, self.real), self.reach(now.h, now.fresh)
+        if now.fresh != 0:
+            share = now.h
+            if ti.static(self.decays):
+                share *= self.decay[None][1]
+        for i in range(first, end):
+            self.integrate(i, now, pull, share, reach)
 
     @ti.func
     def velocity_before(self, i, h, fresh):
@@ -71,32 +112,32 @@ class Motion:
         return small
 
     @ti.func
-    def integrate(self, i, h, t, tick, fresh, pull, share, reach):
+    def integrate(self, i, now, pull, share, reach):
         """d += h^2 a, x += d; at a start (d is v) x += h v + h^2 a / 2. Linear drag is exact in both.
 
         Only the writes depend on whether it moves, so that several particles are integrated at once.
         """
-        live, x, d = self.state.w.of(i) > 0, self.state.x[i], self.state.d[i]
-        v = self.velocity_before(i, h, fresh)
-        a = self.accelerate(i, self.state.place(i), v, t, pull)
-        before, low = ti.select(fresh != 0, h * v - h * h / 2 * a, d), ti.zero(d)
+        live, x, d, h = self.state.w.of(i) > 0, self.state.x[i], self.state.d[i], now.h
+        v = self.velocity_before(i, h, now.fresh)
+        a = self.forces.accelerate(i, self.state.place(i), v, now.time, pull)
+        before, low = ti.select(now.fresh != 0, h * v - h * h / 2 * a, d), ti.zero(d)
         if ti.static(self.state.carries):
             low = self.state.d_low[i]
-        if ti.static(self.decays or len(self.accelerations) > 0):
+        if ti.static(self.decays or len(self.forces.all) > 0):
             kick = reach * a
             if ti.static(self.decays):
                 # d' = exp(-z) d + phi1 h^2 a, as a small change of d, which f32 holds to more digits.
-                kick -= ti.select(fresh != 0, ti.zero(d), self.decay[None][4] * d)
+                kick -= ti.select(now.fresh != 0, ti.zero(d), self.decay[None][4] * d)
             d *= share
             if ti.static(self.state.carries):
                 d, low = self.state.sum(d, low, kick)
             else:
-                d += self.dithered(d, kick, tick, DITHER[0])
+                d += self.dithered(d, kick, now.tick, DITHER[0])
         else:
             d *= share
         step = d
         if ti.static(not self.state.sums):
-            step = self.dithered(x, d, tick, DITHER[1])
+            step = self.dithered(x, d, now.tick, DITHER[1])
         if live:
             self.state.d[i] = d
             if ti.static(self.state.carries):
@@ -110,7 +151,7 @@ class Motion:
                 self.state.before[i] = before
             if ti.static(self.uses_velocity):
                 self.earlier[i] = before
-        elif fresh != 0:
+        elif now.fresh != 0:
             self.state.d[i] = ti.zero(d)
 
     @ti.func
@@ -134,9 +175,32 @@ class Motion:
         if self.state.w.of(i) > 0:
             if ti.static(self.uses_velocity):
                 v = (3 * d - self.earlier[i]) / (2 * h)
-            force = h * h * self.accelerate(i, self.state.place(i), v, t, self.pull(t)) + bond
+            force = h * h * self.forces.accelerate(i, self.state.place(i), v, t, self.forces.pull(t)) + bond
             if ti.static(self.decays):
                 v = (self.decay[None][0] * d + self.decay[None][3] * force) / h
             else:
                 v = (d + force / 2) / h
         return v
+
+
+def decay(rate: float, h: float) -> list[float]:
+    """What drag makes of a substep, for z = rate h.
+
+    share = z / (exp(z) - 1), phi1 = (1 - exp(-z)) / z, phi2 = (z - 1 + exp(-z)) / z^2, rest = (1 - share) / z, 1 - exp(-z).
+    The velocity at its end is (share d + rest h^2 a) / h; no exp(z) is left in it, which leaves f32 at z = 88.
+    """
+    z = rate * h
+    if z < 1e-3:  # series: the closed forms cancel
+        share = 1 - z / 2 + z * z / 12
+        phi1 = 1 - z / 2 + z * z / 6 - z**3 / 24
+        phi2 = 1 / 2 - z / 6 + z * z / 24 - z**3 / 120
+        rest = 1 / 2 - z / 12 + z**3 / 720
+    else:
+        share = -z * np.exp(-z) / np.expm1(-z)
+        phi1 = -np.expm1(-z) / z
+        phi2 = (z + np.expm1(-z)) / z**2
+        rest = (1 - share) / z
+    return [float(share), float(phi1), float(phi2), float(rest), float(-np.expm1(-z))]
+
+
+FREE = decay(0.0, 1.0)  # what no drag makes of a substep

@@ -1,44 +1,46 @@
 """What happens to a tile of particles: loops so short that their state stays in a cache, and so simple that several are done at
 once."""
 
+from typing import Any
+
 from ..colliders.collider import ROUNDS, SWEEPS, Wall
 from ..colliders.surface import AGAIN, FIRST, GENTLY
 from ..device import ti
 from ..device.patches.compiler import FEW
 from ..device.thread_team import Team, block, blocks
-from ..features.feature import Acceleration, Batch, Scene
-from .integrator import Motion
+from ..features.feature import Batch, Scene
 
 TILE = 256  # particles that a thread takes at a time, through several loops: their state stays in its cache
 
 
-class Tiles(Motion):
+class ParticlePass:
     """The motion of particles, and what they gather of constraints, contacts and walls. contact and grid may be None."""
 
-    def __init__(
-        self, scene: Scene, accelerations: list[Acceleration], batches: list[Batch], contact, grid, walls: list[Wall], team: Team
-    ):  # fmt: skip
-        super().__init__(scene, accelerations)
-        self.team = team
+    def __init__(self, scene: Scene, integrator: Any, batches: list[Batch], contact, grid, walls: list[Wall], team: Team):
+        self.integrator, self.forces, self.team = integrator, integrator.forces, team
+        self.state, self.n, self.real = scene.state, scene.particles.count, scene.real
         self.pieces = -(-self.n // team.piece)
         self.tile = min(TILE, team.piece)
         self.each = -(-team.piece // self.tile)  # tiles of a piece
         self.slots, self.grid, self.walls, self.radius = scene.slots, grid, walls, scene.radius
-        self.batches: list[Batch] = [b for b in batches if b.count]
+        self.gathers = bool(batches) and not contact  # else the moves of constraints are applied before contacts are solved
+        self.held = bool(batches)
         self.contacts = [contact] if contact else []
+        self.acts = bool(batches or contact or walls)
         self.rough = any(w.rubs or w.bounces for w in walls)
         if walls:
-            self.thrust = scene.memory.field("thrust", self.n, width=self.dim, state=True)
+            self.wall_push = scene.memory.field("thrust", self.n, width=scene.particles.dim, state=True)
 
     @ti.func
-    def part(self, k, me):
-        """The particles of the k-th piece of thread `me`: the first, and where they end."""
-        first = self.team.turn(k, 1, me) * self.team.piece
+    def piece(self, k, thread):
+        """The particles of the k-th piece of a thread: the first, and where they end."""
+        first = self.team.turn(k, 1, thread) * self.team.piece
         return first, ti.min(first + self.team.piece, self.n)
 
     @ti.func
-    def within(self, tile):
-        """Those of a tile of a piece."""
+    def tile_of(self, k, thread):
+        """Those of the k-th tile of a thread."""
+        tile = self.team.turn(k, self.each, thread)
         piece, first = tile, tile * self.team.piece
         if ti.static(self.each > 1):
             piece = tile // self.each
@@ -46,12 +48,18 @@ class Tiles(Motion):
         return first, ti.min(first + self.tile, (piece + 1) * self.team.piece, self.n)
 
     @ti.func
-    def advance(self, tile, h, t, tick, fresh, calming, final):
+    def integrate(self, now):
+        """All particles."""
+        for k in range(self.team.deal(self.pieces * self.each, self.each, now.thread)):
+            self.advance(k, now)
+
+    @ti.func
+    def advance(self, k, now):
         """Integrate a tile of particles. Short loops, so that each is done for several particles at once."""
-        first, end = self.within(tile)
+        first, end = self.tile_of(k, now.thread)
         for c in ti.static(self.contacts):
-            if final != 0:
-                scale = ti.select(fresh != 0, h, ti.cast(1, self.real))
+            if now.final != 0:
+                scale = ti.select(now.fresh != 0, now.h, ti.cast(1, self.real))
                 for i in range(first, end):
                     c.set_out(i, scale)
         if ti.static(self.state.starts):
@@ -60,20 +68,14 @@ class Tiles(Motion):
                 if ti.static(self.state.sums):
                     self.state.low0[i] = self.state.low[i]
         if ti.static(self.state.leans):
-            if calming != 0:
+            if now.damps != 0:
                 for i in range(first, end):
                     self.state.lean[i] = ti.zero(self.state.x[i])
-        pull, share, reach = self.pull(t), ti.cast(1, self.real), self.reach(h, fresh)
-        if fresh != 0:
-            share = h
-            if ti.static(self.decays):
-                share *= self.decay[None][1]
-        for i in range(first, end):
-            self.integrate(i, h, t, tick, fresh, pull, share, reach)
+        self.integrator.advance(first, end, now)
         for c in ti.static(self.contacts):
             stale, fast = 0, 0
             for i in range(first, end):
-                c.grow(i, h)
+                c.grow(i, now.h)
             for i in range(first, end):
                 stale |= self.grid.outrun(i)
             for i in range(first, end):
@@ -81,10 +83,27 @@ class Tiles(Motion):
             c.heed(stale, fast)
 
     @ti.func
-    def move(self, tile, h, when, first, final, looks):
+    def apply_constraints(self, thread):
+        """Move particles as constraints want, before their contacts are solved; the list has to hear of it."""
+        for c in ti.static(self.contacts):
+            for i in range(self.team.low(self.n, thread), self.team.high(self.n, thread)):
+                self.slots.gather(i)
+                c.heed(self.grid.outrun(i), c.overshoots(i))
+            self.team.wait()
+
+    @ti.func
+    def apply_corrections(self, now):
+        """Move particles as constraints or contacts want, and walls after that."""
+        if ti.static(self.acts):
+            for k in range(self.team.deal(self.pieces * self.each, self.each, now.thread)):
+                self.move(k, now)
+        self.team.wait()
+
+    @ti.func
+    def move(self, k, now):
         """What a tile of particles gathers."""
-        begin, end = self.within(tile)
-        if ti.static(len(self.batches) > 0 and len(self.contacts) == 0):
+        begin, end = self.tile_of(k, now.thread)
+        if ti.static(self.gathers):
             for i in range(begin, end):
                 self.slots.gather(i)
         for c in ti.static(self.contacts):
@@ -92,17 +111,17 @@ class Tiles(Motion):
                 low, high = block(b, begin, end)
                 if c.busy(low) != 0:
                     for i in range(low, high):
-                        c.gather(i, first)
+                        c.gather(i, now.first)
         if ti.static(len(self.walls) > 0):
-            if final != 0:
+            if now.final != 0:
                 for i in range(begin, end):
-                    if first != 0:
-                        self.thrust[i] = -self.state.d[i]
+                    if now.first != 0:
+                        self.wall_push[i] = -self.state.d[i]
                     else:
-                        self.thrust[i] = self.thrust[i] - self.state.d[i]
+                        self.wall_push[i] = self.wall_push[i] - self.state.d[i]
         if ti.static(len(self.walls) > 0 and self.n < FEW):
             for i in range(begin, end):
-                self.confine(i, h, when)
+                self.confine(i, now.h, now.frame_fraction)
         elif ti.static(len(self.walls) > 0):
             for b in range(blocks(begin, end)):
                 low, high = block(b, begin, end)
@@ -112,25 +131,25 @@ class Tiles(Motion):
                         near |= f.near(i, self.radius.of(i))
                 if near != 0:
                     for i in range(low, high):
-                        self.confine(i, h, when)
+                        self.confine(i, now.h, now.frame_fraction)
         for c in ti.static(self.contacts):
-            if looks != 0:
+            if now.looks != 0:
                 stale = 0
                 for i in range(begin, end):
                     stale |= self.grid.outrun(i)
                 c.heed(stale, 0)
         if ti.static(len(self.walls) > 0):
-            if final != 0:
+            if now.final != 0:
                 for i in range(begin, end):
-                    self.thrust[i] = self.thrust[i] + self.state.d[i]
+                    self.wall_push[i] = self.wall_push[i] + self.state.d[i]
 
     @ti.func
-    def confine(self, i, h, when):
+    def confine(self, i, h, frame_fraction):
         """The walls, which have the last word; they take turns until they agree, see Wall."""
         if self.state.w.of(i) > 0:
             if ti.static(len(self.walls) == 1 and not self.walls[0].repeats):
                 for f in ti.static(self.walls):
-                    f.confine(i, self.radius.of(i), h, when, FIRST)
+                    f.confine(i, self.radius.of(i), h, frame_fraction, FIRST)
             else:
                 moving, turn = True, FIRST
                 for k in range(SWEEPS + ROUNDS + 1):
@@ -139,7 +158,7 @@ class Tiles(Motion):
                             self.stay(i)
                         x, d = self.state.x[i], self.state.d[i]
                         for f in ti.static(self.walls):
-                            f.confine(i, self.radius.of(i), h, when, turn)
+                            f.confine(i, self.radius.of(i), h, frame_fraction, turn)
                         settled = (self.state.d[i] == d).all() and (self.state.x[i] == x).all()
                         # With friction or bounces a round may come back to where it began, and not be free there.
                         moving = not (settled and (turn == GENTLY or ti.static(not self.rough)))
@@ -166,14 +185,14 @@ class Tiles(Motion):
         with half of the blow.
         """
         bond = 0 * self.state.d[i]
-        if ti.static(len(self.batches) > 0):
+        if ti.static(self.held):
             bond = self.slots.total_of(i)
         for c in ti.static(self.contacts):
             bond += firm * c.bond(i)
         if ti.static(len(self.walls) > 0):
-            push = firm * self.thrust[i]
+            push = firm * self.wall_push[i]
             v = self.state.d[i] / h
-            limit = (h * h * self.accelerate(i, self.state.place(i), v, t, self.pull(t)) + bond).norm()
+            limit = (h * h * self.forces.accelerate(i, self.state.place(i), v, t, self.forces.pull(t)) + bond).norm()
             size = push.norm()
             if size > limit:
                 push *= limit / size

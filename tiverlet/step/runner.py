@@ -5,154 +5,371 @@ from typing import Any
 
 import numpy as np
 
-from ..contact.velocity_projection import EVERY, PASSES
+from ..contact.velocity_projection import EVERY
 from ..device.interrupts import whole
 from ..device.patches.compiler import Quick
 from ..step_report import StepReport
-from .access import Access
+from . import high_order
+from .clock import Clock
 from .diagnostics import STARTED, STEPPED, UNSTEPPED
-from .step import CAME, END, GIVE, HALT, HANDS, REBOUNDS, H
+from .integrator import FREE, decay
+from .projection import project
+from .step import CAME, END, GIVE, HALT, HANDS, H, Moment, Span, frame
 
 LONG = 10_000_000  # particles and constraints, times passes, in a launch: it takes about a second
 
 
-class Launches(Access):
-    """What a World launches: a frame in one kernel or phase by phase, the survey after it, and the list where it does not fit."""
+class Runner:
+    """Takes the parts of a world from frame to frame.
 
-    _batches: list[Any]
-    _since: int
-    _started: bool
-    _undo: Any
+    A frame is one launch, resumed where the list of neighbours had to grow, or some launches for each substep, see Launcher.
+    """
 
-    def _make(self) -> None:
+    def __init__(self, parts: Any, clock: Clock):
+        self.memory, self.scene, self.batches, self.grid = parts.memory, parts.scene, parts.batches, parts.grid
+        self.step, self.diagnostics, self.path, self.solver = parts.step, parts.diagnostics, parts.path, parts.solver
+        self.clock = clock
+        self.interruptible = False  # what handlers of signals raise in the middle of a frame is followed by an undo
+        # Asked in every frame, and Taichi looks at each attribute of what has kernels.
+        step = self.step
+        self.n, self.launched, self.team, self.integrator = step.n, step.launched, step.team, step.integrator
+        self.hurries, self.drags = step.constraints.hurries, step.integrator.forces.drags
+        self.probe = high_order.Probe(step) if self.scene.order > 2 else None
+        self.passes_at_once = max(1, LONG // (1 + self.n + sum(b.count for b in self.batches)))  # in a launch
+        self.launcher = Launcher(self)
+        self._prepare()
+
+    def _prepare(self) -> None:
         """The kernels that are launched in every frame."""
-        compiler, sheet = self._memory.compiler, self._survey.sheet
-        self._frames = Quick(self._sub, "fused", compiler, sheet)
-        self._sums = Quick(self._survey, "measure", compiler, sheet)
-        self._sheet, self._given = sheet.data, sheet.data[H:]
-        self._plain, self._told = vars(self._sub), self._survey.report  # Taichi looks at attributes in Python whenever we do
-        self._passes = max(1, LONG // (1 + len(self._particles) + sum(b.count for b in self._batches)))  # in a launch
+        self.sheet = self.diagnostics.sheet
+        self._fused = Quick(self.step, "fused", self.memory.compiler, self.sheet)
+        self._measure = Quick(self.diagnostics, "measure", self.memory.compiler, self.sheet)
+        self._data, self._given = self.sheet.data, self.sheet.data[H:]
 
-    def _renew(self) -> None:
-        """Kernels that know of a new field; Taichi compiles them for each Substep anew."""
-        self._sub = copy.copy(self._sub)
-        self._survey = self._survey.of(self._sub)
-        self._make()
+    def renew(self) -> None:
+        """Kernels that know of a new field; Taichi compiles them for each Step anew."""
+        self.step = copy.copy(self.step)
+        self.diagnostics = self.diagnostics.of(self.step)
+        self._prepare()
 
-    def _fused(self, substeps: int, iterations: int, end: float, came: int) -> None:
-        """All substeps and the survey in one launch, resumed where the neighbour list had to grow; a long frame in several."""
-        self._plain["team"].muster(self._sheet[HANDS])
-        begin = it0 = resumed = 0
-        until, part, some = substeps + 1, iterations, self._passes
-        if substeps * iterations > some:
-            until, part = max(1, some // iterations), min(iterations, some) if self._order == 2 else iterations
+    # Frames.
+
+    def begin(self, h: float, iterations: int) -> None:
+        """Take h for the substep; with another one than before, displacements mean something else: start anew from velocities."""
+        clock = self.clock
+        drag = decay(sum(f.rate for f in self.drags), h) if self.drags else None
+        known = clock.energy is not None and clock.first_moved is None
+        if h == clock.h and drag == clock.drag and not clock.d_is_velocity and known:
+            return
+        with self.memory.compiler():
+            if h != clock.h or drag != clock.drag:
+                clock.longest = max(clock.longest, clock.h if clock.first_moved is None else 0.0)
+                self.restart(iterations)
+                if h < clock.longest and not self.probe and project(self, h, clock.longest):
+                    clock.longest = h
+            if clock.d_is_velocity:
+                clock.since = 0
+            if clock.first_moved is not None and self.scene.slots and self.scene.slots.system:
+                self.scene.slots.system.forget()
+            self.set_substep(h, drag)
+            if clock.energy is None:
+                self.look()
+                report = self.report()
+                clock.energy = report.energy
+                if report.overlap > 0 and clock.first_moved is not None:
+                    self.ease(clock.first_moved)
+            clock.first_moved = None
+
+    def advance(self, dt: float, substeps: int, iterations: int) -> StepReport:
+        """One frame from where begin() left off."""
+        if self.hurries:
+            with self.memory.compiler():
+                self.memory.write(self.scene.slots.kappa, self.solver.condition(iterations))
+        clock = self.clock
+        span, started = clock.counted(dt), clock.d_is_velocity and substeps == 1
+        self.run(substeps if self.n else 0, iterations, span[0] + span[1] * span[2], STARTED if started else STEPPED)
+        clock.advance(substeps, span, started)
+        self.scene.hh = clock.h**2 * self.integrator.reaches * (clock.drag or FREE)[2 if started else 1]
+        return self.report(substeps, iterations)
+
+    def set_substep(self, h: float, drag: list[float] | None) -> None:
+        """Take h, and what drag makes of it."""
+        if drag and drag != self.clock.drag:
+            self.memory.write(self.integrator.decay, drag)
+        self.clock.h, self.clock.drag = h, drag
+
+    def restart(self, iterations: int) -> None:
+        """Turn displacements into velocities, so that the next substep starts from the state at this time. iterations: of the
+        substep, for velocities of higher order."""
+        clock = self.clock
+        if not clock.d_is_velocity:
+            if self.probe:
+                self.memory.write(self.scene.state.d, high_order.velocity(self.probe, clock, self.memory, iterations))
+            else:
+                self.step.to_velocity(clock.h, clock.time)
+                clock.owed = (clock.drag or FREE)[3] * clock.h
+            clock.d_is_velocity, clock.parted = True, None
+
+    def velocity(self, iterations: int) -> np.ndarray:
+        """Velocities as the user sees them, to the order of the world."""
+        clock = self.clock
+        if clock.d_is_velocity:
+            out = self.memory.read(self.scene.state.d).astype(np.float64)
+        elif self.probe:
+            out = high_order.velocity(self.probe, clock, self.memory, iterations)
+        else:
+            out = np.zeros((max(1, self.n), self.step.dim))
+            self.step.velocities(clock.h, clock.time, *self._shares(), out)
+        return out[: self.n]
+
+    def _shares(self) -> tuple[float, float]:
+        """What multipliers of the last substep are to be taken for: h^2 over what an acceleration added to the displacement. A
+        start from velocities without what rigid constraints did in half a substep left that to them, too."""
+        clock = self.clock
+        drag = clock.drag or FREE
+        if not clock.started:
+            return 1 / drag[1], 1 / drag[1]
+        owed = drag[1] * clock.owed / clock.h
+        return 1 / (drag[2] + owed), 1 / drag[2]
+
+    # Launches.
+
+    def run(self, substeps: int, iterations: int, end: float, came: int) -> None:
+        """All substeps of a frame, and the diagnostics."""
+        clock, stages = self.clock, self.integrator.stages * substeps
+        passes = self.integrator.passes(iterations)
+        if self.launched:
+            with self.memory.compiler():
+                span = Span(clock.h, clock.time, end, clock.tick, clock.since, clock.d_is_velocity, came, stages, passes)
+                span.until, span.part = stages + 1, passes
+                frame(self.launcher, span)
+            return
+        self.team.muster(self._data[HANDS])
+        begin = half = resumed = 0
+        until, part, some = stages + 1, passes, self.passes_at_once
+        splits = self.integrator.stages == 1
+        if stages * passes > some:
+            until, part = max(1, some // passes), min(passes, some) if splits else passes
         while True:
             GIVE(
-                self._given, 0, self._h, self._time, end, self._tick, self._since, self._fresh, substeps, iterations,
-                begin, it0, resumed, 0, came, until, part,
+                self._given, 0, clock.h, clock.time, end, clock.tick, clock.since, clock.d_is_velocity, stages, passes,
+                begin, half, resumed, 0, came, until, part,
             )  # fmt: skip
-            self._frames()
-            if self._sheet[HALT]:
-                resumed, begin, it0 = (int(v) for v in self._sheet[HALT:HANDS])
-                self._memory.write(self._sub.halt, 0)
-                self._grow()
+            self._fused()
+            if self._data[HALT]:
+                resumed, begin, half = (int(v) for v in self._data[HALT:HANDS])
+                self.memory.write(self.step.halt, 0)
+                self.grow()
                 continue
-            if begin == substeps or (until > substeps and part == iterations):
+            if begin == stages or (until > stages and part == passes):
                 return
-            if part < iterations:  # go on with this substep
-                resumed, begin, it0, part = 1, until - 1, part * self._sub.halves, min(iterations, part + some)
+            if part < passes:  # go on with this substep
+                resumed, begin, half, part = 1, until - 1, part * self.step.halves, min(passes, part + some)
             else:
-                resumed, begin, it0, part = 0, until, 0, min(iterations, some) if self._order == 2 else iterations
-                until = min(substeps + 1, until + max(1, some // iterations))
-            self._heed_signals()
+                resumed, begin, half, part = 0, until, 0, min(passes, some) if splits else passes
+                until = min(stages + 1, until + max(1, some // passes))
+            self.heed_signals()
 
-    def _heed_signals(self) -> None:
+    def measure(self, end: float, came: int) -> None:
+        """Launch the diagnostics alone."""
+        self._data[H], self._data[END], self._data[CAME] = self.clock.h, end, came
+        self._measure()
+
+    def heed_signals(self) -> None:
         """In a long frame: call the handlers of signals that came. What they raise undoes the frame, see World.step."""
-        if self._undo:
+        if self.interruptible:
             whole.heed()
 
-    def _parallel(self, n: int, iterations: int) -> None:
-        """A few launches per substep."""
-        h, relaxes = self._h, self._batches or self._grid or self._sub.walls
-        for s in range(n):
-            self._heed_signals()
-            fresh = int(self._fresh and s == 0)
-            stale = self._sub.predicted(h, self._time, self._tick, self._since, fresh, s, n)
-            for it in range(iterations if relaxes else 0):
-                if it:
-                    self._heed_signals()
-                if stale:
-                    self._list()
-                if self._sub.steps:
-                    self._sub.opened(h, s, n, it, fresh)
-                    for _ in range(self._sub.steps):
-                        self._sub.iterated()
-                    state = self._sub.collected(h, s, n, it, fresh)
-                else:
-                    state = self._sub.relaxed(h, s, n, it, fresh)
-                if self._sub.halves == 2:
-                    if state & 1:
-                        self._list()
-                    state = self._sub.met(h, s, n, it, fresh)
-                if self._sub.bounces:
-                    rounds = REBOUNDS if it == 0 and state & 2 else 0
-                    while rounds and self._sub.rebounded():
-                        rounds -= 1
-                    state = self._sub.gathered(h, s, n, it)
-                stale = state & 1
-            if self._sub.concludes:
-                self._sub.remembered(h, self._tick + s)
-            if self._sub.calms and (self._since + s) % EVERY == EVERY - 1:
-                for k in range(PASSES):
-                    self._sub.calmed(k)
+    def look(self) -> None:
+        """Diagnose the state where no frame did."""
+        clock = self.clock
+        self.run(0, 1, clock.time, UNSTEPPED if clock.d_is_velocity else STARTED if clock.started else STEPPED)
 
-    def _list(self) -> None:
-        """Build the neighbour list, growing it until everything fits."""
-        assert self._grid
-        if not self._sub.launched:
-            self._grid.age()
-            self._look()  # whose kernel is there anyway, and lists
+    def list_neighbours(self) -> None:
+        """Build the list, growing it until everything fits."""
+        if not self.launched:
+            self.grid.age()
+            self.look()  # whose kernel is there anyway, and lists
             return
-        with self._memory.compiler():
-            while self._sub.listed() > self._grid.capacity:
-                self._grow()
+        with self.memory.compiler():
+            while self.step.listed() > self.grid.capacity:
+                self.grow()
 
-    def _grow(self) -> None:
+    def grow(self) -> None:
         """More room for near pairs, and kernels that know of it. Nothing is lost: what did not fit was counted."""
-        assert self._grid
-        self._grid.grow()
-        self._renew()
+        self.grid.grow()
+        self.renew()
 
-    def _ease(self, first: int) -> None:
+    def ease(self, first: int) -> None:
         """Let particles part gently that the user put into each other, from number `first` on."""
-        contact = self._sub.contacts[0]
+        contact = self.step.contacts[0]
         if not contact.dev.eases:
             contact.ease()
-            self._renew()
-        self._sub.shrunk(first)
+            self.renew()
+        self.step.shrunk(first)
 
-    def _look(self) -> None:
-        """Survey the state where no frame did."""
-        came = UNSTEPPED if self._fresh else STARTED if self._started else STEPPED
-        if not self._sub.launched:
-            self._fused(0, 1, self._time, came)
-            return
-        if self._grid and self._memory.read(self._grid.stale)[0]:
-            self._list()
-        self._sheet[H], self._sheet[END], self._sheet[CAME] = self._h, self._time, came
-        self._sums()
-
-    def _report(self, substeps: int = 1, iterations: int = 1) -> StepReport:
-        """What the survey found."""
-        report, extent = self._told(self._time, self._h, substeps, iterations, self._energy)
-        if self._grid:
-            self._grid.fit(extent)
+    def report(self, substeps: int = 1, iterations: int = 1) -> StepReport:
+        """What the diagnostics found."""
+        report, extent = self.diagnostics.report(self.clock.time, self.clock.h, substeps, iterations, self.clock.energy)
+        if self.grid:
+            self.grid.fit(extent)
         return report
 
-    def _residuals(self, batch) -> np.ndarray:
+    def residuals(self, batch) -> np.ndarray:
         """What the last substep left of each violation in a batch."""
-        self._memory.check()
-        if not self._h:
+        self.memory.check()
+        if not self.clock.h:
             raise RuntimeError(f"{batch!r}.residual: there is none before the world has been stepped.")
-        with self._memory.compiler():
-            return self._survey.residuals(batch, self._h, self._started)
+        with self.memory.compiler():
+            return self.diagnostics.residuals(batch, self.clock.h, self.clock.started)
+
+    @property
+    def memories(self) -> list[Any]:
+        """The trees of fields: one from the start, others where a list or a need has grown."""
+        grown = [self.grid.store if self.grid else None, *(c.dev.store for c in self.step.contacts)]
+        return [self.memory, *(m for m in grown if m)]
+
+
+class Launcher:
+    """Goes through frame() where each phase is launched, as on a GPU.
+
+    Phases wait until the host has to know what came of them, and then go together in one launch; so do those of a pass that
+    nobody has to ask in between. What a scene does not have is left out.
+    """
+
+    def __init__(self, runner: Runner):
+        self.runner, step = runner, runner.step
+        self.halves, self.bounces, self.finishes, self.calms = step.halves, step.bounces, step.finishes, step.calms
+        self.drives, self.constrains, self.touches, self.acts = map(
+            bool, (step.drivers, step.batches, step.contacts, step.particles.acts)
+        )
+        self.systems, self.steps = bool(step.constraints.systems), step.constraints.steps
+        self.waiting: list[str] = []
+        self.now: Any = None  # the pass that they are in
+        self.stale: bool | None = None  # whether the list is; None where nothing was launched since others could change that
+        self.hit = False  # whether a pair bounces
+
+    def flush(self) -> None:
+        """Launch what waits."""
+        if self.waiting:
+            names, now, span = " ".join(self.waiting), self.now, self.now.span
+            self.waiting = []
+            found = self.runner.step.phases(
+                names, span.h64, span.start, span.tick, span.since, span.fresh, now.s, span.substeps, span.iterations, now.it
+            )
+            self.stale, self.hit = bool(found & 1), bool(found & 2)
+
+    def put(self, now: Moment, name: str, there: bool = True) -> None:
+        """One more phase that waits, if the scene has it."""
+        if there:
+            self.waiting.append(name)
+            self.now = now
+
+    def moment(self, span: Span, s: int) -> Moment:
+        """Substep s, as far as the host has to know of it."""
+        return Moment(span, s, damps=(span.since + s) % EVERY == EVERY - 1)
+
+    def turn(self, now: Moment, half: int) -> Moment:
+        """A pass."""
+        return now.of(half // self.halves, half < self.halves)
+
+    def works(self, now: Moment) -> bool:
+        """Between two substeps, signals are heeded."""
+        self.runner.heed_signals()
+        if now.s == now.span.begin:
+            self.stale = None
+        return True
+
+    def enters(self, now: Moment) -> bool:
+        """Whether there is such a substep."""
+        return now.s < now.span.substeps
+
+    solves = leaves = enters
+
+    def ends(self, now: Moment) -> bool:
+        """Whether all are done."""
+        return now.s >= now.span.substeps
+
+    def first_half(self, now: Moment) -> int:
+        """The half of a pass in which the substep begins."""
+        return 0
+
+    def last_half(self, now: Moment) -> int:
+        """The one before which it ends; one more for the list after all of them."""
+        return now.span.iterations * self.halves if now.s < now.span.substeps else 1
+
+    def integrate(self, now: Moment) -> None:
+        """A launch of its own, with the next one."""
+        self.flush()
+        self.put(now, "integrate")
+
+    def drive(self, now: Moment) -> None:
+        """Behind it."""
+        self.put(now, "drive", self.drives)
+
+    def update_neighbours(self, now: Moment, half: int) -> None:
+        """Here the list may have to grow."""
+        self.flush()
+        if half and not half % self.halves:
+            self.runner.heed_signals()
+        grid = self.runner.grid
+        if grid and self.stale is None:
+            self.stale = bool(self.runner.memory.read(grid.stale)[0])
+        if grid and self.stale:
+            self.runner.list_neighbours()
+            self.stale = False
+
+    def solve_constraints(self, now: Moment) -> None:
+        """The first of a pass."""
+        self.put(now, "solve_constraints", self.constrains)
+
+    def solve_systems(self, now: Moment) -> None:
+        """Steps of systems that iterate are launches of their own."""
+        self.put(now, "open_systems" if self.steps else "solve_systems", self.systems)
+        for _ in range(self.steps):
+            self.flush()
+            self.put(now, "iterate_systems")
+        if self.steps:
+            self.flush()
+
+    def update_multipliers(self, now: Moment) -> None:
+        """Behind it, and so on."""
+        self.put(now, "update_multipliers", self.systems)
+
+    def apply_constraints(self, now: Moment) -> None:
+        """The list has to hear of it."""
+        self.put(now, "apply_constraints", self.halves == 2)
+
+    def solve_contacts(self, now: Moment) -> None:
+        """Where pairs bounce, it has to be asked whether any does."""
+        self.put(now, "solve_contacts", self.touches)
+        if self.bounces:
+            self.flush()
+
+    def struck(self) -> bool:
+        """Whether one does."""
+        return self.hit
+
+    def rebound(self, now: Moment) -> None:
+        """A launch of its own, that is asked, too."""
+        self.put(now, "rebound")
+        self.flush()
+
+    def apply_corrections(self, now: Moment) -> None:
+        """The last of a pass."""
+        self.put(now, "apply_corrections", self.acts)
+
+    def finish_substep(self, now: Moment) -> None:
+        """A launch of its own."""
+        self.flush()
+        self.put(now, "finish_substep")
+
+    def project_contact_velocities(self, now: Moment) -> None:
+        """A launch for each pass."""
+        self.flush()
+        self.put(now, "project_contact_velocities")
+
+    def diagnose(self, now: Moment) -> None:
+        """The last launch of a frame."""
+        self.flush()
+        self.runner.measure(now.span.end, now.span.came)

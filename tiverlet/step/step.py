@@ -1,32 +1,120 @@
-"""The substep on the device, and two ways to run it that give the same bits.
+"""The step from top to bottom, and its kernels.
 
-fused: a whole frame in one launch, by one CPU thread or by a team of them.
-parallel: a few launches per substep, whose loops Taichi spreads over the threads of a GPU.
+frame() and substep() are the order of the phases, for every path. Taichi compiles them into one kernel, where `do` is a Step:
+a whole frame in one launch, by one CPU thread or a team of them ("fused" and "parallel"). Where each phase is launched by itself,
+as on a GPU, Python runs the same lines, and `do` is a Launcher (runner.py). Higher orders differ in the integrator alone.
 """
 
 from struct import Struct
 from typing import Any
 
-import numpy as np
+from ..colliders.collider import Wall
+from ..contact.velocity_projection import EVERY, PASSES
+from ..device import at, inline, record, runtime, ti
+from ..device.thread_team import LEAST, Team
+from ..features.feature import Batch, Scene
+from .constraint_pass import ConstraintPass
+from .contact_pass import ContactPass
+from .particle_pass import ParticlePass
 
-from ..contact.velocity_projection import PASSES
-from ..device import at, inline, ti
-from ..device.thread_team import LEAST
-from .phases import Phases
+REBOUNDS = 8  # rounds of restitution in a substep, at most
 
-# The sheet of a frame, one array, since a launch takes 0.25 us more for each. First what the frame came to, see Survey; then how
-# it ended: whether, in which substep and before which iteration it stopped to have the list grown; how many threads of a team
-# were at work. Then what it is given: the substep, and the times at the start and the end of the frame [s]; substeps so far, and
-# since the last start; whether it starts; how many substeps and iterations; where it goes on if it stopped (substep, pass or half
-# of it, 1); 0, the number of the first thread; how the state that it leaves came about, see Survey; before which substep, and
-# which iteration of it, the launch ends: a long frame is made in several, between which Python looks at signals.
+
+@ti.pyfunc
+def frame(do, span):
+    """A frame: its substeps, and what they came to. The last round is for the list that diagnose() needs."""
+    for s in range(span.begin, span.until):
+        now = do.moment(span, s)
+        if do.works(now):
+            substep(do, now)
+            if do.ends(now):
+                do.diagnose(now)
+
+
+@ti.pyfunc
+def substep(do, now):
+    """A substep. Where there are constraints and contacts, a pass has two halves, and each begins with a good list."""
+    if do.enters(now):
+        do.integrate(now)
+        do.drive(now)
+    for half in range(do.first_half(now), do.last_half(now)):
+        do.update_neighbours(now, half)
+        if do.solves(now):
+            turn = do.turn(now, half)
+            if half % do.halves == 0:
+                do.solve_constraints(turn)
+                do.solve_systems(turn)
+                do.update_multipliers(turn)
+                do.apply_constraints(turn)
+            if half % do.halves == do.halves - 1:
+                do.solve_contacts(turn)
+                if ti.static(do.bounces):
+                    for _ in range(REBOUNDS):
+                        if turn.first != 0 and do.struck() != 0:
+                            do.rebound(turn)
+                do.apply_corrections(turn)
+    if ti.static(do.finishes):
+        if do.leaves(now):
+            do.finish_substep(now)
+    if ti.static(do.calms):
+        if do.leaves(now) and now.damps != 0:
+            for k in range(PASSES):
+                do.project_contact_velocities(now.of(k))
+
+
+@record
+class Span:
+    """What a launch is to do.
+
+    h64: the substep (of orders above 2: its first stage) [s]. start, end: of the frame [s]. tick, since: substeps so far, and
+    since the last start. fresh: whether displacements are velocities. came: how the state came about, see Diagnostics. substeps,
+    iterations: of the frame. begin, until: substeps of it that this launch makes. part: iterations of the last of these.
+    resumed: 1 where `begin` was interrupted before its `half`-th half of a pass.
+    """
+
+    def __init__(
+        self, h64, start, end, tick, since, fresh, came, substeps, iterations, begin=0, half=0, resumed=0, until=1, part=1,
+        thread=0, sheet=None,
+    ):  # fmt: skip
+        self.h64, self.start, self.end, self.tick, self.since, self.fresh, self.came = h64, start, end, tick, since, fresh, came
+        self.substeps, self.iterations, self.begin, self.half = substeps, iterations, begin, half
+        self.resumed, self.until, self.part, self.thread, self.sheet = resumed, until, part, thread, sheet
+
+
+@record
+class Moment:
+    """What phases have to know of the substep, and of the pass over the constraints, in which they are.
+
+    s, h, last, time: number, length, length of the one before, start [s]. frame_fraction: where it starts and ends in the frame.
+    fresh: whether it is a start. damps: whether sound is taken out after it. final: whether it is the last of the frame.
+    it: the pass. first: whether it is the first one. looks: whether the list is asked for after it; the next substep does, too.
+    """
+
+    def __init__(
+        self, span, s, h=0.0, last=0.0, time=0.0, tick=0, frame_fraction=None, fresh=0, damps=0, final=0, it=0, first=0, looks=0
+    ):  # fmt: skip
+        self.span, self.thread, self.s, self.h, self.last, self.time, self.tick = span, span.thread, s, h, last, time, tick
+        self.frame_fraction, self.fresh, self.damps, self.final = frame_fraction, fresh, damps, final
+        self.it, self.first, self.looks = it, first, looks
+
+    @inline
+    def of(self, it, first=0, looks=0):
+        """The same, in a pass."""
+        return Moment(
+            self.span, self.s, self.h, self.last, self.time, self.tick, self.frame_fraction, self.fresh, self.damps, self.final,
+            it, first, looks,
+        )  # fmt: skip
+
+
+# The sheet of a frame, one array, since a launch takes 0.25 us more for each. First what the frame came to, see Diagnostics; then
+# how it ended: whether, in which substep and before which half of a pass it stopped to have the list grown; how many threads of a
+# team were at work. Then what it is given, see Span, and the number of the first thread.
 FIGURES = 14
 HALT, HANDS = FIGURES, FIGURES + 3
 GIVEN = tuple(range(HANDS + 1, HANDS + 16))
-H, START, END, TICK, SINCE, FRESH, SUBSTEPS, ITERATIONS, BEGIN, PASS, RESUMED, FIRST, CAME, UNTIL, PART = GIVEN
+H, START, END, TICK, SINCE, FRESH, SUBSTEPS, ITERATIONS, BEGIN, HALF, RESUMED, FIRST, CAME, UNTIL, PART = GIVEN
 SHEET = PART + 1
 GIVE = Struct(f"{len(GIVEN)}d").pack_into  # in a third of the time of an assignment to an array
-REBOUNDS = 8  # rounds of restitution in a substep, at most
 
 
 @inline
@@ -36,10 +124,38 @@ def integer(sheet, k):
 
 
 @ti.data_oriented
-class Substep(Phases):
-    """The kernels of one world."""
+class Step:
+    """The phases as loops on the device, and the kernels of one world.
 
-    survey: Any  # what sums up a frame; given once it is there
+    A `thread` goes through each of them, see Team. Where there is no team, loops are serial inside the fused kernel, and Taichi
+    spreads them over threads at the top of the others.
+    """
+
+    diagnostics: Any  # what sums up a frame; given once it is there
+
+    def __init__(
+        self, scene: Scene, integrator: Any, batches: list[Batch], drivers: list[Batch], contact: Any, grid: Any,
+        walls: list[Wall], team: Team,
+    ):  # fmt: skip
+        self.scene, self.state, self.slots, self.team = scene, scene.state, scene.slots, team
+        self.n, self.dim, self.real = scene.particles.count, scene.particles.dim, scene.real
+        self.integrator, self.grid, self.walls, self.drivers, self.batches = integrator, grid, walls, drivers, batches
+        self.first = integrator.first  # of adaptive.py
+        self.posed = [w for w in walls if w.poses]
+        self.breakers: list[Any] = [b for b in batches if b.breaks]
+        self.launched = team.launched
+        # Iterations of a loop for each of few pieces of work: to each CPU thread Taichi gives LEAST of them, at least.
+        self.stride = LEAST if self.launched and runtime.architecture() == "cpu" else 1
+        self.particles = ParticlePass(scene, integrator, batches, contact, grid, walls, team)
+        self.constraints = ConstraintPass(scene, integrator, batches, team, self.stride)
+        self.contact_pass = ContactPass(scene, contact, self.particles, team)
+        self.contacts = self.particles.contacts
+        self.halves = 2 if batches and contact else 1  # of a pass, each with a list that is good
+        self.bounces, self.calms = self.contact_pass.bounces, self.contact_pass.calms
+        self.finishes = self.contact_pass.remembers or bool(self.breakers)
+        self.hashes = bool(grid)
+        if grid:
+            self.halt = scene.memory.field("halt", None, width=3, kind=ti.i32)
 
     @ti.kernel
     def fused(self, sheet: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
@@ -47,57 +163,24 @@ class Substep(Phases):
         ti.loop_config(serialize=self.team.size == 1)
         for thread in range(self.team.spread):
             if thread % LEAST == 0:
-                self.frame(integer(sheet, FIRST) + thread // LEAST, sheet)
+                self.run(integer(sheet, FIRST) + thread // LEAST, sheet)
 
     @ti.func
-    def frame(self, me, sheet: ti.template()):  # type: ignore[valid-type]
-        """What thread `me` does of a frame. All threads of a team take the same branches, for what they depend on is written only
+    def run(self, thread, sheet: ti.template()):  # type: ignore[valid-type]
+        """What a thread does of a frame. All threads of a team take the same branches, for what they depend on is written only
         where the others wait."""
-        h64, t, end = sheet[H], sheet[START], sheet[END]
+        h64, start, end = sheet[H], sheet[START], sheet[END]
         tick, since, fresh, came = integer(sheet, TICK), integer(sheet, SINCE), integer(sheet, FRESH), integer(sheet, CAME)
         substeps, iterations = integer(sheet, SUBSTEPS), integer(sheet, ITERATIONS)
-        begin, it0, resumed = integer(sheet, BEGIN), integer(sheet, PASS), integer(sheet, RESUMED)
+        begin, half, resumed = integer(sheet, BEGIN), integer(sheet, HALF), integer(sheet, RESUMED)
         until, part = integer(sheet, UNTIL), integer(sheet, PART)
-        for s in range(begin, until):
-            h, more = ti.cast(h64, self.real), s < substeps
-            when = self.clock(s, substeps)
-            starts, again = ti.select(s == 0, fresh, 0), ti.select(s == begin, resumed, 0)
-            if self.team.works(me) and self.halted() == 0:
-                if more and again == 0:
-                    time, final = ti.cast(t + s * h64, self.real), ti.cast(s == substeps - 1, ti.i32)
-                    self.predict(me, h, time, tick + s, starts, when, self.calming(since + s), final)
-                for q in range(ti.select(again != 0, it0, 0), ti.select(more, part * self.halves, 1)):
-                    it = q // self.halves
-                    if ti.static(self.hashes):
-                        if self.halted() == 0 and self.is_stale() != 0:
-                            self.grid.build(me)
-                            if self.grid.need[None] > self.grid.capacity:
-                                self.halt[None] = [1, s, q]  # all write the same
-                    if more and self.halted() == 0:
-                        first, final = ti.cast(it == 0, ti.i32), ti.cast(s == substeps - 1, ti.i32)
-                        if q % self.halves == 0:
-                            self.tell(me, h, when, first, starts)
-                            self.settle(me, first)
-                            self.draw(me)
-                        if q % self.halves == self.halves - 1:
-                            self.meet(me, first, starts, final)
-                            if ti.static(self.bounces):
-                                for _ in range(REBOUNDS):
-                                    if it == 0 and self.struck() != 0:
-                                        self.rebound(me)
-                            self.collect(me, h, when, first, final, ti.cast(final != 0 or it + 1 < iterations, ti.i32))
-                if ti.static(self.concludes):
-                    if more and part == iterations and self.halted() == 0:
-                        self.remember(me, h, tick + s)
-                if ti.static(self.calms):
-                    if more and part == iterations and self.halted() == 0 and self.calming(since + s) != 0:
-                        for k in range(PASSES):
-                            self.calm(me, k)
-                if not more and self.halted() == 0:
-                    self.survey.weigh(me, h, came)
-                    self.survey.sum_up(me, h64, end, came, sheet)
-                    self.team.forgive()
-        if me == 0:
+        frame(
+            self,
+            Span(
+                h64, start, end, tick, since, fresh, came, substeps, iterations, begin, half, resumed, until, part, thread, sheet
+            ),
+        )
+        if thread == 0:
             if ti.static(self.hashes):
                 for k in ti.static(range(3)):
                     sheet[HALT + k] = self.halt[None][k]
@@ -105,87 +188,200 @@ class Substep(Phases):
                 sheet[HANDS] = self.team.hands[None]
 
     @ti.kernel
-    def predicted(
-        self, h64: ti.f64, t: ti.f64, tick: ti.i32, since: ti.i32, fresh: ti.i32, s: ti.i32, substeps: ti.i32
+    def phases(
+        self, names: ti.template(), h64: ti.f64, start: ti.f64, tick: ti.i32, since: ti.i32, fresh: ti.i32, s: ti.i32,  # type: ignore[valid-type]
+        substeps: ti.i32, iterations: ti.i32, it: ti.i32,
     ) -> ti.i32:  # fmt: skip
-        """Phases 1 and 2 of substep s; returns whether the neighbour list is stale."""
-        h = ti.cast(h64, self.real)
-        when, calming, final = self.clock(s, substeps), self.calming(since + s), ti.cast(s == substeps - 1, ti.i32)
-        self.predict(0, h, ti.cast(t + s * h64, self.real), tick + s, fresh, when, calming, final)
-        return self.is_stale()
-
-    @ti.kernel
-    def relaxed(self, h64: ti.f64, s: ti.i32, substeps: ti.i32, it: ti.i32, fresh: ti.i32) -> ti.i32:
-        """One pass of phase 3, or the half of it before contacts where there are constraints, too, or what comes before bounces;
-        returns whether the list is stale, and 2 more if a pair bounces."""
-        h, when = ti.cast(h64, self.real), self.clock(s, substeps)
-        first = ti.cast(it == 0, ti.i32)
-        self.tell(0, h, when, first, fresh)
-        self.settle(0, first)
-        self.draw(0)
-        if ti.static(self.halves == 1):
-            self.go_on(h, when, first, fresh, ti.cast(s == substeps - 1, ti.i32))
+        """Some phases of a substep, by their names; returns whether the list is stale, and 2 more if a pair bounces."""
+        now = self.turn(self.moment(Span(h64, start, start, tick, since, fresh, 0, substeps, iterations), s), it * self.halves)
+        for phase in ti.static(self.named(names)):
+            phase(now)
         return self.is_stale() + 2 * self.struck()
+
+    def named(self, names: str) -> list[Any]:
+        """The phases of these names, one after the other."""
+        return [getattr(self, name) for name in names.split()]
 
     @ti.func
-    def go_on(self, h, when, first, fresh, final):
-        """The rest of a pass, or what of it comes before bounces."""
-        self.meet(0, first, fresh, final)
-        if ti.static(not self.bounces):
-            self.collect(0, h, when, first, final, 1)
+    def moment(self, span, s):
+        """Substep s of a frame; where s = span.substeps, what comes after them."""
+        h, last, time, frame_fraction = self.integrator.times(span, s)
+        tick, fresh, final = span.tick + s, ti.select(s == 0, span.fresh, 0), ti.cast(s == span.substeps - 1, ti.i32)
+        damps = ti.cast((span.since + s) % EVERY == EVERY - 1, ti.i32)
+        return Moment(span, s, h, last, time, tick, frame_fraction, fresh, damps, final)
 
-    @ti.kernel
-    def met(self, h64: ti.f64, s: ti.i32, substeps: ti.i32, it: ti.i32, fresh: ti.i32) -> ti.i32:
-        """The other half; returns what relaxed() does."""
-        first, final = ti.cast(it == 0, ti.i32), ti.cast(s == substeps - 1, ti.i32)
-        self.go_on(ti.cast(h64, self.real), self.clock(s, substeps), first, fresh, final)
-        return self.is_stale() + 2 * self.struck()
-
-    @ti.kernel
-    def opened(self, h64: ti.f64, s: ti.i32, substeps: ti.i32, it: ti.i32, fresh: ti.i32):
-        """The start of a pass in which a system iterates."""
-        self.tell(0, ti.cast(h64, self.real), self.clock(s, substeps), ti.cast(it == 0, ti.i32), fresh)
-        for system in ti.static(self.systems):
-            system.open(0)
-
-    @ti.kernel
-    def iterated(self):
-        """One step of such a system."""
-        for system in ti.static(self.systems):
-            system.go(0)
-
-    @ti.kernel
-    def collected(self, h64: ti.f64, s: ti.i32, substeps: ti.i32, it: ti.i32, fresh: ti.i32) -> ti.i32:
-        """The end of the pass, or of its half; returns what relaxed() does."""
+    @ti.func
+    def turn(self, now, half):
+        """A pass over the constraints, by its first or second half."""
+        it = half // self.halves
         first = ti.cast(it == 0, ti.i32)
-        self.take(0, first)
-        self.draw(0)
-        if ti.static(self.halves == 1):
-            self.go_on(ti.cast(h64, self.real), self.clock(s, substeps), first, fresh, ti.cast(s == substeps - 1, ti.i32))
-        return self.is_stale() + 2 * self.struck()
+        looks = ti.cast(now.final != 0 or it + 1 < now.span.iterations, ti.i32)
+        return now.of(it, first, looks)
 
-    @ti.kernel
-    def rebounded(self) -> ti.i32:
-        """One round of bounces; returns whether another one is needed."""
-        self.rebound(0)
-        return self.struck()
+    @ti.func
+    def works(self, now):
+        """Whether the thread takes part in this substep; all must ask."""
+        return self.team.works(now.thread) and self.halted() == 0
 
-    @ti.kernel
-    def gathered(self, h64: ti.f64, s: ti.i32, substeps: ti.i32, it: ti.i32) -> ti.i32:
-        """What comes after bounces; returns whether the list is stale."""
-        first, final = ti.cast(it == 0, ti.i32), ti.cast(s == substeps - 1, ti.i32)
-        self.collect(0, ti.cast(h64, self.real), self.clock(s, substeps), first, final, 1)
-        return self.is_stale()
+    @ti.func
+    def again(self, now):
+        """1 where the substep goes on in the middle."""
+        return ti.select(now.s == now.span.begin, now.span.resumed, 0)
 
-    @ti.kernel
-    def remembered(self, h64: ti.f64, tick: ti.i32):
-        """The end of a substep with constraints that break, or contacts that rub or bounce."""
-        self.remember(0, ti.cast(h64, self.real), tick)
+    @ti.func
+    def enters(self, now):
+        """Whether the substep begins here."""
+        return now.s < now.span.substeps and self.again(now) == 0
 
-    @ti.kernel
-    def calmed(self, k: ti.i32):
-        """Pass k of phase 5."""
-        self.calm(0, k)
+    @ti.func
+    def first_half(self, now):
+        """The half of a pass in which it begins or goes on."""
+        return ti.select(self.again(now) != 0, now.span.half, 0)
+
+    @ti.func
+    def last_half(self, now):
+        """The one before which it ends; after all substeps there is one more for the list."""
+        return ti.select(now.s < now.span.substeps, now.span.part * self.halves, 1)
+
+    @ti.func
+    def solves(self, now):
+        """Whether there is a pass to go through, with a good list."""
+        return now.s < now.span.substeps and self.halted() == 0
+
+    @ti.func
+    def leaves(self, now):
+        """Whether all passes of the substep are done."""
+        return now.s < now.span.substeps and now.span.part == now.span.iterations and self.halted() == 0
+
+    @ti.func
+    def ends(self, now):
+        """Whether all substeps are done."""
+        return now.s >= now.span.substeps and self.halted() == 0
+
+    @ti.func
+    def integrate(self, now):
+        """Particles move on their own. Walls go to where they are in this substep."""
+        if ti.static(self.integrator.springs_pull):
+            self.constraints.kick(now.thread, now.h)
+        for w in ti.static(self.posed):
+            ti.loop_config(serialize=True)
+            for _ in range(self.team.one(1, now.thread)):
+                w.pose(now.frame_fraction)
+        self.particles.integrate(now)
+        self.team.wait()
+        self.team.watch(now.thread)
+
+    @ti.func
+    def drive(self, now):
+        """Driven particles go to where they are to be."""
+        for f in ti.static(self.drivers):
+            for c in range(self.team.low(f.count, now.thread), self.team.high(f.count, now.thread)):
+                f.drive(c, now.h, now.frame_fraction[1])
+                if ti.static(self.state.befores):  # at the velocity with which it is driven, others meet it
+                    self.state.before[f.member(c, 0)] = self.state.d[f.member(c, 0)]
+                for k in ti.static(self.contacts):
+                    k.heed(self.grid.outrun(f.member(c, 0)), k.overshoots(f.member(c, 0)))
+            self.team.wait()
+
+    @ti.func
+    def update_neighbours(self, now, half):
+        """Build the list of neighbours anew where it is stale. Where it has no room for all of them, the frame stops."""
+        if ti.static(self.hashes):
+            if self.halted() == 0 and self.is_stale() != 0:
+                self.grid.build(now.thread)
+                if self.grid.need[None] > self.grid.capacity:
+                    self.halt[None] = [1, now.s, half]  # all write the same
+
+    @ti.func
+    def solve_constraints(self, now):
+        """Every constraint leaves the moves that it wants, or tells its system what it is about."""
+        self.constraints.solve(now)
+
+    @ti.func
+    def solve_systems(self, now):
+        """Chains and cloth are solved together."""
+        self.constraints.solve_systems(now.thread)
+
+    @ti.func
+    def open_systems(self, now):
+        """The same in pieces: the start,"""
+        self.constraints.open_systems(now.thread)
+
+    @ti.func
+    def iterate_systems(self, now):
+        """and a step."""
+        self.constraints.iterate_systems(now.thread)
+
+    @ti.func
+    def update_multipliers(self, now):
+        """What was found goes to the multipliers."""
+        self.constraints.update_multipliers(now)
+
+    @ti.func
+    def apply_constraints(self, now):
+        """Where there are contacts, particles move as constraints want before these are solved."""
+        if ti.static(self.halves == 2):
+            self.particles.apply_constraints(now.thread)
+
+    @ti.func
+    def solve_contacts(self, now):
+        """Every pair in contact is worked out from both sides."""
+        self.contact_pass.solve(now)
+
+    @ti.func
+    def struck(self):
+        """1 when a pair bounces in this substep."""
+        return self.contact_pass.struck()
+
+    @ti.func
+    def rebound(self, now):
+        """One round of restitution."""
+        self.contact_pass.rebound(now.thread)
+
+    @ti.func
+    def apply_corrections(self, now):
+        """Particles move as contacts, or constraints, want; walls have the last word."""
+        self.particles.apply_corrections(now)
+
+    @ti.func
+    def finish_substep(self, now):
+        """What bears too much breaks; contacts keep what friction and restitution need.
+
+        A rigid constraint may find a whole kick in a start that follows another step, so loads are never taken for half a kick.
+        """
+        for f in ti.static(self.breakers):
+            for c in range(self.team.low(f.count, now.thread), self.team.high(f.count, now.thread)):
+                f.tear(c, self.integrator.reach(now.h, 0), now.tick)
+        self.contact_pass.finish(now.thread)
+        self.team.wait()
+
+    @ti.func
+    def project_contact_velocities(self, now):
+        """Now and then: take the sound out of loaded contacts."""
+        self.contact_pass.project_velocities(now.thread, now.it)
+
+    @ti.func
+    def diagnose(self, now):
+        """What the frame came to."""
+        self.diagnostics.reduce_blocks(now.thread, now.span.h64, now.span.came)
+        self.diagnostics.sum_up(now.thread, now.span.h64, now.span.end, now.span.came, now.span.sheet)
+        self.team.forgive()
+
+    @ti.func
+    def is_stale(self):
+        """1 when the neighbour list has to be built anew."""
+        out = 0
+        if ti.static(self.hashes):
+            out = self.grid.stale[None]
+        return out
+
+    @ti.func
+    def halted(self):
+        """1 when the frame waits for a longer list."""
+        out = 0
+        if ti.static(self.hashes):
+            out = self.halt[None][0]
+        return out
 
     @ti.kernel
     def listed(self) -> ti.i32:
@@ -208,58 +404,31 @@ class Substep(Phases):
         and across them d / h + h a / 2 is what RATTLE has, so nothing is lost to second order nor to any other.
         """
         h = ti.cast(h64, self.real)
-        if ti.static(self.springs):
+        if ti.static(self.constraints.springs):
             if ti.static(self.team.size == 1):
-                self.kick(0, h)
+                self.constraints.kick(0, h)
             else:
                 for thread in range(self.team.spread):
                     if thread % LEAST == 0:
-                        self.kick(thread // LEAST, h)
+                        self.constraints.kick(thread // LEAST, h)
         for i in range(self.n):
             bond = 0 * self.state.d[i]
-            if ti.static(self.springs):
+            if ti.static(self.constraints.springs):
                 bond = self.slots.total_of(i)
-            self.state.d[i] = self.velocity_after(i, h, ti.cast(t, self.real), bond)
+            self.state.d[i] = self.integrator.velocity_after(i, h, ti.cast(t, self.real), bond)
             if ti.static(self.state.carries):
                 self.state.d_low[i] = ti.zero(self.state.d[i])
 
     @ti.kernel
-    def velocities(self, h64: ti.f64, t: ti.f64, fresh: ti.i32, firm64: ti.f64, soft64: ti.f64, out: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
+    def velocities(self, h64: ti.f64, t: ti.f64, firm64: ti.f64, soft64: ti.f64, out: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
         """Velocities as the user sees them. firm, soft: see Batch.bond.
 
         With the multipliers of the last substep along the directions at its end they are second order, and have the momentum and
         the angular momentum of the motion, sum m x_n x (x_n - x_(n-1)) / h and what forces from outside add in h / 2.
         """
-        for f in ti.static(self.batches):
-            for c in range(f.count):
-                f.bond(c, ti.cast(firm64, self.real), ti.cast(soft64, self.real))
+        self.constraints.bond(ti.cast(firm64, self.real), ti.cast(soft64, self.real))
         for i in range(self.n):
-            v = self.state.d[i]
-            if fresh == 0:
-                h, time, firm = ti.cast(h64, self.real), ti.cast(t, self.real), ti.cast(firm64, self.real)
-                v = self.velocity_after(i, h, time, self.felt(i, h, time, firm))
+            h, time, firm = ti.cast(h64, self.real), ti.cast(t, self.real), ti.cast(firm64, self.real)
+            v = self.integrator.velocity_after(i, h, time, self.particles.felt(i, h, time, firm))
             for k in ti.static(range(self.dim)):
                 out[i, k] = v[k]
-
-
-def decay(rate: float, h: float) -> list[float]:
-    """What drag makes of a substep, for z = rate h.
-
-    share = z / (exp(z) - 1), phi1 = (1 - exp(-z)) / z, phi2 = (z - 1 + exp(-z)) / z^2, rest = (1 - share) / z, 1 - exp(-z).
-    The velocity at its end is (share d + rest h^2 a) / h; no exp(z) is left in it, which leaves f32 at z = 88.
-    """
-    z = rate * h
-    if z < 1e-3:  # series: the closed forms cancel
-        share = 1 - z / 2 + z * z / 12
-        phi1 = 1 - z / 2 + z * z / 6 - z**3 / 24
-        phi2 = 1 / 2 - z / 6 + z * z / 24 - z**3 / 120
-        rest = 1 / 2 - z / 12 + z**3 / 720
-    else:
-        share = -z * np.exp(-z) / np.expm1(-z)
-        phi1 = -np.expm1(-z) / z
-        phi2 = (z + np.expm1(-z)) / z**2
-        rest = (1 - share) / z
-    return [float(share), float(phi1), float(phi2), float(rest), float(-np.expm1(-z))]
-
-
-FREE = decay(0.0, 1.0)  # what no drag makes of a substep

@@ -28,6 +28,11 @@ def replaced(*places: tuple[Any, str, Any]) -> Iterator[None]:
             setattr(owner, name, value)
 
 
+def known_as(kernel: Any, args: tuple) -> str:
+    """The name of a kernel, or what it is compiled for where that is a name."""
+    return next((a for a in args if isinstance(a, str)), kernel.func.__name__)
+
+
 class Launches(Counter[str]):
     """How often kernels were launched, by name; seconds: in all, if they were timed."""
 
@@ -45,17 +50,18 @@ def launches(timed: bool = False) -> Iterator[Launches]:
         def run(self, *args):
             clock = perf_counter()
             out = launch(self, *args)
-            count[name(self)] += 1
+            known = name(self, args)
+            count[known] += 1
             if timed:
                 ti.sync()
-                count.seconds[name(self)] = count.seconds.get(name(self), 0.0) + perf_counter() - clock
+                count.seconds[known] = count.seconds.get(known, 0.0) + perf_counter() - clock
             return out
 
         return run
 
     with replaced(
-        (kernel_impl.Kernel, "launch_kernel", counted(kernel_impl.Kernel.launch_kernel, lambda kernel: kernel.func.__name__)),
-        (Quick, "launch", counted(Quick.launch, lambda quick: quick.name)),
+        (kernel_impl.Kernel, "launch_kernel", counted(kernel_impl.Kernel.launch_kernel, known_as)),
+        (Quick, "launch", counted(Quick.launch, lambda quick, _: quick.name)),
     ):
         yield count
 
@@ -96,11 +102,11 @@ class Tracer:
         common: Any = common_ops.TaichiOperations
         assign, augment = common._assign, common._augassign
 
-        def translated(kernel, *args, **kwargs):
+        def translated(kernel, key=None, args=(), arg_features=None):
             self._open, self._known = [], {}
-            out = materialize(kernel, *args, **kwargs)
+            out = materialize(kernel, key=key, args=args, arg_features=arg_features)
             if self._known:  # it was not there already
-                self.sweeps[kernel.func.__name__] = self._open
+                self.sweeps[known_as(kernel, args)] = self._open
             return out
 
         def looped(ctx, node):

@@ -127,7 +127,7 @@ def dissect(w: World, dt: float, seen: StepReport, frame: int, wrong, last: int)
     x = states[-1]
     lost = np.flatnonzero(~np.isfinite(x).all(axis=1))
     put_back(w, kept)
-    held = suspects(w, None) if w._h else []
+    held = suspects(w, None) if w._clock.h else []
     if len(lost):
         # What is solved together is lost together; the force that did it shows in the velocity before.
         spoilt = np.flatnonzero(~np.isfinite(w.velocity).all(axis=1))
@@ -138,7 +138,7 @@ def dissect(w: World, dt: float, seen: StepReport, frame: int, wrong, last: int)
         jump = np.linalg.norm(x - before, axis=1)
         candidates = free if free and "turned" in report.flags else range(len(x))
         particle = max(candidates, key=lambda i: jump[i], default=None)
-    near = suspects(w, particle) if w._h and particle is not None else []
+    near = suspects(w, particle) if w._clock.h and particle is not None else []
     keepers = slice(-last, None)
     return Autopsy(
         report if wrong(report) else seen, frame, substep, particle, tuple(int(i) for i in lost if i != particle)[:8],

@@ -1,0 +1,63 @@
+"""Where a world is in time, and what its displacements stand for."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+# What the future depends on, by its name in recordings. The hash of a state has the first five; the rest follows from the past.
+NAMES = {
+    "_time": "time", "_tick": "tick", "_since": "since", "_h": "h", "_fresh": "d_is_velocity", "_longest": "longest",
+    "_frame": "frame", "_drag": "drag", "_started": "started", "_owed": "owed", "_parted": "parted", "_placed": "first_moved",
+    "_energy": "energy",
+}  # fmt: skip
+HASHED = tuple(NAMES)[:5]
+
+
+@dataclass
+class Clock:
+    """The time of a world, and what belongs to it.
+
+    time: simulated [s]. tick, since: substeps so far, and since the last start, modulo 2^31. h: the last substep [s].
+    d_is_velocity: whether displacements are velocities, as before a start. started: whether the last substep was the first after
+    one. longest: substep [s] since violations were last taken out, see projection.py. frame: when frames of the present length
+    began [s], their length [s], their number. drag: what it makes of h, see integrator.decay(). owed: [s] of the kick by rigid
+    constraints that the velocities at the last start lacked. parted: velocities, until the next step, where constraints were
+    removed that have a part in them. first_moved: the first of the particles that the user placed and that were not looked at
+    yet. energy: at the end of the last frame [J]; None: not known.
+    """
+
+    time: float = 0.0
+    tick: int = 0
+    since: int = 0
+    h: float = 0.0
+    d_is_velocity: bool = True
+    started: bool = False
+    longest: float = 0.0
+    frame: tuple[float, float, int] = (0.0, 0.0, 0)
+    drag: list[float] | None = None
+    owed: float = 0.0
+    parted: np.ndarray | None = None
+    first_moved: int | None = 0
+    energy: float | None = None
+
+    def keep(self) -> dict[str, Any]:
+        """A copy, by the names in recordings."""
+        return {name: getattr(self, own) for name, own in NAMES.items()}
+
+    def put_back(self, kept: dict[str, Any]) -> None:
+        """Return to an earlier one."""
+        for name, own in NAMES.items():
+            setattr(self, own, kept[name])
+
+    def counted(self, dt: float) -> tuple[float, float, int]:
+        """When frames of this length began, their length, and their number, with one more: frames of the same length are counted,
+        not summed, so that they add no rounding errors."""
+        since, length, count = self.frame
+        return (since, dt, count + 1) if dt == length else (self.time, dt, 1)
+
+    def advance(self, substeps: int, frame: tuple[float, float, int], started: bool) -> None:
+        """So many substeps have gone by, and with them a frame."""
+        self.tick, self.since = (self.tick + substeps) % 2**31, (self.since + substeps) % 2**31
+        self.started, self.d_is_velocity, self.parted = started, False, None
+        self.frame, self.time = frame, frame[0] + frame[1] * frame[2]

@@ -1,0 +1,111 @@
+"""The loops over constraints: each is read once in a pass, and leaves what it wants of its particles in slots."""
+
+from typing import Any
+
+from ..constraints.core.scalar import Scalar
+from ..device import ti
+from ..device.thread_team import Team
+from ..features.feature import Batch, Scene
+
+
+class ConstraintPass:
+    """The constraints of one world, and the systems of those that are solved together."""
+
+    def __init__(self, scene: Scene, integrator: Any, batches: list[Batch], team: Team, stride: int):
+        self.integrator, self.batches, self.slots, self.team = integrator, batches, scene.slots, team
+        self.systems = [scene.slots.system] if scene.slots and scene.slots.system else []
+        self.steps = max([s.steps for s in self.systems], default=0)
+        for system in self.systems:
+            system.team, system.spread = team, stride
+        self.hurries = bool(scene.slots) and scene.slots.accelerates
+        self.told = [b for b in batches if isinstance(b, Scalar) and b.dev.told]
+        self.ragged = [b for b in batches if b.blocks]
+        self.springs = any(b.soft for b in batches)
+
+    @ti.func
+    def reduce_blocks(self, thread, h, h2_effective, first, fresh, some: ti.template()):  # type: ignore[valid-type]
+        """The sums of constraints on many particles, by blocks. some: for which; those of the residual, or all."""
+        for f in ti.static([f for f in self.ragged if f.reweighs or some]):
+            for b in range(self.team.low(f.blocks, thread), self.team.high(f.blocks, thread)):
+                f.weigh(b, h, h2_effective, first, fresh)
+            self.team.wait()
+
+    @ti.func
+    def scatter_blocks(self, thread, h, h2_effective, first, fresh):
+        """The moves of constraints on many particles."""
+        for f in ti.static(self.ragged):
+            for e in range(self.team.low(f.corner_count, thread), self.team.high(f.corner_count, thread)):
+                f.spread(e, h, h2_effective, first, fresh)
+            self.team.wait()
+
+    @ti.func
+    def kick(self, thread, h):
+        """h^2 times what springs, at the present positions, accelerate: to the slots."""
+        self.reduce_blocks(thread, h, h * h, -1, 0, True)
+        for f in ti.static(self.batches):
+            for c in range(self.team.low(f.count, thread), self.team.high(f.count, thread)):
+                f.kick(c, h)
+        self.team.wait()
+        self.scatter_blocks(thread, h, h * h, -1, 0)
+
+    @ti.func
+    def solve(self, now):
+        """Every constraint leaves the moves that it wants in its slots, or tells its system what it is about."""
+        fresh = now.fresh if ti.static(self.integrator.half_kick) else 0
+        h2_effective = self.integrator.reach(now.h, fresh)
+        self.reduce_blocks(now.thread, now.h, h2_effective, now.first, fresh, True)
+        if ti.static(self.hurries):
+            ti.loop_config(serialize=True)
+            for _ in range(self.team.one(1, now.thread)):
+                self.slots.hurry(now.first)
+            self.team.wait()
+        for f in ti.static(self.batches):
+            for c in range(self.team.low(f.count, now.thread), self.team.high(f.count, now.thread)):
+                f.relax(c, now.h, h2_effective, now.frame_fraction, now.first, fresh)
+        if ti.static(len(self.batches) > 0):
+            self.team.wait()
+        self.scatter_blocks(now.thread, now.h, h2_effective, now.first, fresh)
+
+    @ti.func
+    def solve_systems(self, thread):
+        """Find the steps of the multipliers of each system."""
+        for system in ti.static(self.systems):
+            if ti.static(system.steps > 0):
+                system.open(thread)
+                for _ in range(system.steps):
+                    system.go(thread)
+            else:
+                for b in range(self.team.low(system.parts, thread), self.team.high(system.parts, thread)):
+                    system.solve(b)
+                self.team.wait()
+
+    @ti.func
+    def open_systems(self, thread):
+        """The same in pieces: what comes before the steps of those that iterate."""
+        for system in ti.static(self.systems):
+            system.open(thread)
+
+    @ti.func
+    def iterate_systems(self, thread):
+        """One of their steps."""
+        for system in ti.static(self.systems):
+            system.go(thread)
+
+    @ti.func
+    def update_multipliers(self, now):
+        """What systems found goes to the multipliers."""
+        for system in ti.static(self.systems):
+            if ti.static(system.steps > 0):
+                system.close(now.thread)
+        for f in ti.static(self.told):
+            for c in range(self.team.low(f.count, now.thread), self.team.high(f.count, now.thread)):
+                f.take(c, now.first)
+        if ti.static(len(self.told) > 0):
+            self.team.wait()
+
+    @ti.func
+    def bond(self, firm, soft):
+        """What constraints added to h^2 a in the last substep, to the slots; see Batch.bond."""
+        for f in ti.static(self.batches):
+            for c in range(f.count):
+                f.bond(c, firm, soft)

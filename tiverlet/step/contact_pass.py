@@ -1,0 +1,103 @@
+"""The loops over contacts: which there are, what they want, and what they remember."""
+
+from typing import Any
+
+from ..device import ti
+from ..device.thread_team import Team, block, blocks
+from ..features.feature import Scene
+from .particle_pass import ParticlePass
+
+
+class ContactPass:
+    """The contacts of one world, of which there may be none. They are worked out from both sides, particle by particle."""
+
+    def __init__(self, scene: Scene, contact: Any, particles: ParticlePass, team: Team):
+        self.contacts, self.particles, self.team = particles.contacts, particles, team
+        self.n, self.real, self.dim = particles.n, scene.real, scene.particles.dim
+        self.bounces = bool(contact) and contact.bounces
+        self.remembers = bool(contact) and (contact.rubs or contact.bounces)
+        self.calms = bool(contact) and contact.calms
+
+    @ti.func
+    def solve(self, now):
+        """Which contacts there are, and what they want of their particles."""
+        for c in ti.static(self.contacts):
+            if ti.static(c.measures):
+                for i in range(self.team.low(self.n, now.thread), self.team.high(self.n, now.thread)):
+                    c.measure(i)
+                self.team.wait()
+            for k in range(self.team.deal(self.particles.pieces, 1, now.thread)):
+                begin, end = self.particles.piece(k, now.thread)
+                for b in range(blocks(begin, end)):
+                    low, high = block(b, begin, end)
+                    c.count(low, high)
+            self.team.wait()
+            for k in range(self.team.deal(self.particles.pieces, 1, now.thread)):
+                begin, end = self.particles.piece(k, now.thread)
+                for b in range(blocks(begin, end)):
+                    low, high = block(b, begin, end)
+                    if c.busy(low) != 0:
+                        for i in range(low, high):
+                            c.relax(i, now.first, now.fresh, now.final)
+                    elif now.final != 0:
+                        if ti.static(c.rubs):
+                            for i in range(low, high):
+                                c.sum_up(i, ti.Vector.zero(self.real, self.dim), now.first)
+            self.team.wait()
+
+    @ti.func
+    def struck(self):
+        """1 when a pair bounces in this substep."""
+        out = 0
+        for c in ti.static(self.contacts):
+            if ti.static(c.bounces):
+                out = c.dev.hit[None]
+        return out
+
+    @ti.func
+    def rebound(self, thread):
+        """One round of restitution; struck() tells whether another one is needed."""
+        for c in ti.static(self.contacts):
+            if ti.static(c.bounces):
+                self.team.wait()
+                ti.loop_config(serialize=True)
+                for _ in range(self.team.one(1, thread)):
+                    c.dev.hit[None] = 0
+                self.team.wait()
+                for i in range(self.team.low(self.n, thread), self.team.high(self.n, thread)):
+                    c.rebound(i)
+                self.team.wait()
+                for i in range(self.team.low(self.n, thread), self.team.high(self.n, thread)):
+                    c.part_ways(i)
+                self.team.wait()
+
+    @ti.func
+    def finish(self, thread):
+        """Keep the slip of friction, and what was left of bounces."""
+        for c in ti.static(self.contacts):
+            if ti.static(c.rubs or c.bounces):
+                for i in range(self.team.low(self.n, thread), self.team.high(self.n, thread)):
+                    c.remember(i)
+            self.team.wait()
+            if ti.static(c.bounces):
+                ti.loop_config(serialize=True)
+                for _ in range(self.team.one(1, thread)):
+                    c.dev.hit[None] = 0
+
+    @ti.func
+    def project_velocities(self, thread, k):
+        """Pass k of taking the sound out of loaded contacts."""
+        for c in ti.static(self.contacts):
+            for p in range(self.team.deal(self.particles.pieces, 1, thread)):
+                begin, end = self.particles.piece(p, thread)
+                piece = self.team.turn(p, 1, thread)
+                if k == 0:
+                    c.dev.calm.open(piece, begin, end)
+                for m in range(begin, begin + c.dev.calm.count[piece]):
+                    c.dev.calm.want(c.dev.calm.loaded[m], k)
+            self.team.wait()
+            for p in range(self.team.deal(self.particles.pieces, 1, thread)):
+                begin, end = self.particles.piece(p, thread)
+                for m in range(begin, begin + c.dev.calm.count[self.team.turn(p, 1, thread)]):
+                    c.dev.calm.move(c.dev.calm.loaded[m])
+            self.team.wait()
