@@ -9,21 +9,6 @@ from tiverlet.step import build
 from .conftest import CROSSOVER
 
 
-def near_pairs(position, radius, skin):
-    """All pairs closer than the sum of radii plus skin, by sweeping along x: nothing shared with the grid."""
-    radius = np.broadcast_to(radius, len(position))
-    order = np.argsort(position[:, 0], kind="stable")
-    x, r = position[order], radius[order]
-    out = []
-    reach = 2 * radius.max() + skin
-    ends = np.searchsorted(x[:, 0], x[:, 0] + reach, side="right")
-    for k in range(len(x)):
-        a = slice(k + 1, ends[k])
-        hit = np.flatnonzero(((x[a] - x[k]) ** 2).sum(axis=1) < (r[a] + r[k] + skin) ** 2) + k + 1
-        out += [(min(order[k], order[j]), max(order[k], order[j])) for j in hit]
-    return np.array(sorted(out), dtype=np.int64).reshape(-1, 2)
-
-
 def roomy(w: tv.World, entries: int) -> None:
     """Give the list of near pairs room before anything compiles; a list that grows makes all compile anew."""
     w._runner.grid.allocate(entries)
@@ -78,7 +63,7 @@ def clouds():
 )
 def test_pairs_equal_brute_force(world, path, name, radius, several):
     w = world(tv.Particles(several[0][0], radius=radius), [tv.Contact(skin=SKIN)], precision="f64", path=path)
-    wanted = [near_pairs(np.asarray(position), radius, SKIN) for position, _ in several]
+    wanted = [tv.measure.overlapping(position, radius, SKIN)[0] for position, _ in several]
     roomy(w, 4 * max(map(len, wanted)))
     for (position, filled), want in zip(several, wanted, strict=True):
         position = np.asarray(position)
@@ -119,7 +104,7 @@ def test_many_particles(world, monkeypatch):
     j = near[np.repeat(first, number) + np.arange(len(i)) - np.repeat(np.cumsum(number) - number, number)]
     assert (np.diff(j)[np.diff(i) == 0] > 0).all()  # sorted, no pair twice
     got = np.stack([i, j], axis=1)[i < j]
-    np.testing.assert_array_equal(got, near_pairs(position, radius, 0.05))
+    np.testing.assert_array_equal(got, tv.measure.overlapping(position, radius, 0.05)[0])
 
 
 def test_neither_room_nor_skin_nor_path_changes_a_bit(world):

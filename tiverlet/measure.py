@@ -1,22 +1,25 @@
 """What a scene amounts to, from plain arrays in f64: for tests, for reports, for the curious."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
-from .world import World
+if TYPE_CHECKING:
+    from .world import World
 
 
-def kinetic_energy(world: World) -> float:
+def kinetic_energy(world: "World") -> float:
     """Sum of m v^2 / 2 [J]; static particles have none."""
     m = _mass(world)
     return float(0.5 * np.sum(m * np.sum(world.velocity**2, axis=1)))
 
 
-def momentum(world: World) -> np.ndarray:
+def momentum(world: "World") -> np.ndarray:
     """Sum of m v [kg m/s], (dim,)."""
     return _mass(world) @ world.velocity
 
 
-def angular_momentum(world: World, about=None) -> np.ndarray:
+def angular_momentum(world: "World", about=None) -> np.ndarray:
     """Sum of m (x - about) x v [kg m^2/s]: (1,) in 2D, (3,) in 3D; about the origin where no point is given."""
     r = world.position - (0.0 if about is None else np.asarray(about))
     p = _mass(world)[:, None] * world.velocity
@@ -25,32 +28,38 @@ def angular_momentum(world: World, about=None) -> np.ndarray:
     return np.cross(r, p).sum(axis=0)
 
 
-def center_of_mass(world: World) -> np.ndarray:
+def center_of_mass(world: "World") -> np.ndarray:
     """Of the particles that can move [m], (dim,)."""
     m = _mass(world)
     return m @ world.position / m.sum()
 
 
-def strain(world: World, pairs, rest) -> np.ndarray:
+def strain(world: "World", pairs, rest) -> np.ndarray:
     """(|x_i - x_j| - rest) / rest of each pair, (m,)."""
     i, j = np.asarray(pairs).T
     x = world.position
     return np.linalg.norm(x[i] - x[j], axis=1) / np.asarray(rest) - 1
 
 
-def overlapping(position: np.ndarray, radius) -> tuple[np.ndarray, np.ndarray]:
-    """All pairs of discs or spheres that overlap, by comparing each with each: pairs (m, 2) with i < j, and depths (m,) [m]."""
+def overlapping(position: np.ndarray, radius, skin: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """All pairs of discs or spheres that overlap, or lack less than `skin` [m] of it: pairs (m, 2) with i < j, in order, and how
+    deep they overlap, with the skin (m,) [m]. By a sweep along x, which has nothing in common with how a World finds contacts."""
     position = np.asarray(position, dtype=np.float64)
     radius = np.broadcast_to(np.asarray(radius, dtype=np.float64), (len(position),))
+    order = np.argsort(position[:, 0], kind="stable")
+    x, r = position[order], radius[order]
+    ends = np.searchsorted(x[:, 0], x[:, 0] + r + (r.max(initial=0.0) + skin), side="right")
     pairs, depths = [np.zeros((0, 2), dtype=np.int64)], [np.zeros(0)]
-    for i in range(len(position) - 1):
-        depth = radius[i] + radius[i + 1 :] - np.linalg.norm(position[i + 1 :] - position[i], axis=1)
-        j = np.flatnonzero(depth > 0)
-        pairs.append(np.stack([np.full(len(j), i), i + 1 + j], axis=1))
-        depths.append(depth[j])
-    return np.concatenate(pairs), np.concatenate(depths)
+    for k, end in enumerate(ends):
+        depth = r[k] + r[k + 1 : end] + skin - np.linalg.norm(x[k + 1 : end] - x[k], axis=1)
+        near = np.flatnonzero(depth > 0)
+        pairs.append(np.stack([np.full(len(near), order[k]), order[k + 1 + near]], axis=1))
+        depths.append(depth[near])
+    both, deep = np.sort(np.concatenate(pairs), axis=1), np.concatenate(depths)
+    order = np.lexsort((both[:, 1], both[:, 0]))
+    return both[order], deep[order]
 
 
-def _mass(world: World) -> np.ndarray:
+def _mass(world: "World") -> np.ndarray:
     p = world.particles
     return np.where(p.inv_mass > 0, p.mass, 0.0)

@@ -8,6 +8,7 @@ from tiverlet.constraints.bend import Angle
 from tiverlet.constraints.core.scalar import Scalar
 from tiverlet.constraints.core.variable_size import Ragged
 from tiverlet.features.feature import Batch
+from tiverlet.measure import overlapping
 
 from .functions import SDF
 from .scenes import Structure, plain
@@ -88,19 +89,12 @@ def overlap(contact: Any, features: list[Any], particles: Any, free: np.ndarray,
     """Pairs that overlap, and the worst, in radii of the smaller one."""
     r, group, out = particles.radius, particles.group, excluded(features, particles)
     allowed = None if contact.table.touching is None else {tuple(sorted(p)) for p in contact.table.touching}
-    count, worst = 0, 0.0
-    for i in range(len(x)):
-        for j in range(i + 1, len(x)):
-            far = r[i] + r[j]
-            if far == 0 or (r[i] == 0 and r[j] == 0) or (i, j) in out or not (free[i] or free[j]):
-                continue
-            if allowed is not None and tuple(sorted((int(group[i]), int(group[j])))) not in allowed:
-                continue
-            depth = far - np.linalg.norm(x[i] - x[j])
-            if depth > 0:
-                small = min(r[i], r[j]) or max(r[i], r[j])
-                count, worst = count + 1, max(worst, depth / small)
-    return count, worst
+    deep = []
+    for (i, j), depth in zip(*(a.tolist() for a in overlapping(x, r)), strict=True):
+        grouped = allowed is None or tuple(sorted((int(group[i]), int(group[j])))) in allowed
+        if grouped and (i, j) not in out and (free[i] or free[j]):
+            deep.append(depth / (min(r[i], r[j]) or max(r[i], r[j])))
+    return len(deep), max(deep, default=0.0)
 
 
 def shapeless(f: Any, x: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ def main(args: argparse.Namespace) -> int:
     from importlib import metadata
 
     from ..device import runtime
-    from ..report.accuracy.sweep import machine
+    from ..report.output import machine
 
     print(f"machine        {machine()}")
     for package in ("tiverlet", "taichi", "numpy", "rerun-sdk", "rich", "matplotlib"):

@@ -1,6 +1,7 @@
-"""What all reports print with: text, Markdown, and numbers that JSON has."""
+"""What all reports print with: text, Markdown, numbers that JSON has, errors in a line, the machine."""
 
 import os
+import platform
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -35,3 +36,20 @@ def canvas(folder) -> Any:
         raise RuntimeError('plot: matplotlib is not there. Install it with the extra: pip install "tiverlet[plots]".') from error
     os.makedirs(folder, exist_ok=True)
     return Figure
+
+
+def said(error: BaseException) -> str:
+    """An error in a line."""
+    text = " ".join(f"{type(error).__name__}: {error}".split())
+    return text if len(text) <= 200 else text[:197] + "..."
+
+
+def machine() -> str:
+    """What the times were measured on."""
+    name = platform.processor() or platform.machine()
+    try:
+        with open("/proc/cpuinfo") as file:
+            name = next(line.split(":", 1)[1].strip() for line in file if line.startswith("model name"))
+    except (OSError, StopIteration):
+        pass
+    return f"{name}, {os.cpu_count()} cores, {platform.system()}, Python {platform.python_version()}"

@@ -1,6 +1,5 @@
 """Error against run time: sweep substeps, solvers and precisions of the cases, with the baselines on the same axes."""
 
-import platform
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor, as_completed
 from dataclasses import dataclass
@@ -8,6 +7,7 @@ from typing import Any
 
 from rich.progress import Progress
 
+from ..output import machine, said
 from .baselines import BASELINES
 from .cases import CASES, LEFT_OUT, METHODS, Case, chosen
 from .errors import ErrorReport, Missing
@@ -115,22 +115,3 @@ def attempt(task: Task) -> tuple[Task, list[Point], str]:
         return task, curve(task), ""
     except Exception as error:
         return task, [], said(error)
-
-
-def said(error: BaseException) -> str:
-    """An error in a line."""
-    text = " ".join(f"{type(error).__name__}: {error}".split())
-    return text if len(text) <= 200 else text[:197] + "..."
-
-
-def machine() -> str:
-    """What the times were measured on."""
-    import os
-
-    name = platform.processor() or platform.machine()
-    try:
-        with open("/proc/cpuinfo") as file:
-            name = next(line.split(":", 1)[1].strip() for line in file if line.startswith("model name"))
-    except (OSError, StopIteration):
-        pass
-    return f"{name}, {os.cpu_count()} cores, {platform.system()}, Python {platform.python_version()}"

@@ -13,7 +13,7 @@ import numpy as np
 from rich.progress import Progress
 
 from ... import checks
-from ..accuracy.sweep import machine, said
+from ..output import machine, said
 from . import c_baseline, processes, stripped
 from . import peers as others
 from .result import Absent, Peer, Run, SpeedReport

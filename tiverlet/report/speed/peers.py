@@ -18,6 +18,7 @@ import numpy as np
 
 from ...colliders import Box
 from ...constraints import Distance
+from ...measure import overlapping
 from .counting import DT
 from .processes import Talker, paths
 from .scenes import SCENES
@@ -191,14 +192,9 @@ def main(job: dict[str, Any]) -> None:
             say({"overlap": overlap(x, particles.radius), "residual": max((strain(x, f, particles) for f in links), default=0.0)})
 
 
-def overlap(x: np.ndarray, radius: np.ndarray, block: int = 256) -> float:
-    """The mean overlap of pairs that overlap, in diameters of the first; every pair is looked at."""
-    found = []
-    for i in range(0, len(x), block):
-        far = np.linalg.norm(x[i : i + block, None] - x[None], axis=2)
-        depth = radius[i : i + block, None] + radius - far
-        found.append(depth[np.triu(depth > 0, k=i + 1)])
-    deep = np.concatenate(found)
+def overlap(x: np.ndarray, radius: np.ndarray) -> float:
+    """The mean overlap of pairs that overlap, in diameters of the first."""
+    deep = overlapping(x, radius)[1]
     return float(deep.mean() / (2 * radius[0])) if len(deep) else 0.0
 
 

@@ -1,4 +1,4 @@
-"""What is timed. Nothing is imported here that a scene does not need: see absent.py."""
+"""What is timed. Nothing is imported here that a scene does not need: see stripped.py."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -13,7 +13,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from .. import output
-from ..accuracy.sweep import said
+from ..output import said
 from .rows import ROWS, NotAvailable
 
 if TYPE_CHECKING:

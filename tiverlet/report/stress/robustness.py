@@ -20,7 +20,7 @@ from ...measure import kinetic_energy
 from ...particles import Particles
 from ...world import World
 from .. import output
-from ..accuracy.sweep import said
+from ..output import said
 
 if TYPE_CHECKING:
     from ...step_report import StepReport

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ....features.feature import Feature
+from ....measure import overlapping
 from ....particles import Particles
 from ....step_report import StepReport
 from ....world import World
@@ -105,19 +106,6 @@ def finite(w: World) -> bool:
     return bool(np.isfinite(w.position).all() and np.isfinite(w.velocity).all())
 
 
-def pairs_of(position: np.ndarray, radius) -> np.ndarray:
-    """All pairs that overlap, by sweeping along x: nothing in common with the grid."""
-    radius = np.broadcast_to(np.asarray(radius, dtype=float), len(position))
-    order = np.argsort(position[:, 0], kind="stable")
-    x, r, out = position[order], radius[order], []
-    ends = np.searchsorted(x[:, 0], x[:, 0] + 2 * r.max(), side="right")
-    for k in range(len(x)):
-        a = slice(k + 1, ends[k])
-        hit = np.flatnonzero(np.linalg.norm(x[a] - x[k], axis=1) < r[a] + r[k]) + k + 1
-        out += [(min(order[k], order[j]), max(order[k], order[j])) for j in hit]
-    return np.array(sorted(out), dtype=np.int64).reshape(-1, 2)
-
-
 def contacts_of(position: np.ndarray, radius, **settings) -> np.ndarray:
     """All pairs that a world finds to overlap, in the same order."""
     from ....contact import Contact
@@ -130,7 +118,7 @@ def contacts_of(position: np.ndarray, radius, **settings) -> np.ndarray:
 
 def same_pairs(position: np.ndarray, radius, **settings) -> Finding:
     """Contacts of a cloud against brute force."""
-    found, want = contacts_of(position, radius, **settings), pairs_of(position, radius)
+    found, want = contacts_of(position, radius, **settings), overlapping(position, radius)[0]
     missed = len(set(map(tuple, want)) - set(map(tuple, found)))
     return Finding(
         f"{len(found)} contacts, {missed} missed",

@@ -7,10 +7,10 @@ from ....constraints import Distance, Path
 from ....contact import Contact
 from ....device import ti
 from ....forces import Drag, Gravity
-from ....measure import kinetic_energy
+from ....measure import kinetic_energy, overlapping
 from ....particles import Particles
 from ....solvers import Jacobi
-from .row import Finding, contacts_of, finite, pairs_of, rerun, row, same_pairs, warned, world
+from .row import Finding, contacts_of, finite, rerun, row, same_pairs, warned, world
 
 
 @row(16, "coincident particles in contact: 2, 100, 1000", "they part the same way each time, and no momentum is made")
@@ -64,7 +64,7 @@ def _once() -> Finding:
     x = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0)), axis=-1).reshape(-1, 2) * 0.99
     found = contacts_of(x, 0.5)
     once = len(np.unique(found, axis=0)) == len(found)
-    return Finding(f"{len(found)} contacts", {"once": once, "all": np.array_equal(found, pairs_of(x, 0.5))})
+    return Finding(f"{len(found)} contacts", {"once": once, "all": np.array_equal(found, overlapping(x, 0.5)[0])})
 
 
 @row(34, "4096 particles in one cell", "all pairs are there, and it is warned of")
@@ -92,7 +92,9 @@ def _grows() -> Finding:
         few = w.step(1 / 60).contacts
         w.position = tight
         found = len(w.contacts.pairs)
-        return Finding(f"{few}, then {found} contacts", {"none lost": found == len(pairs_of(tight, 0.3)), "few first": few == 0})
+        return Finding(
+            f"{few}, then {found} contacts", {"none lost": found == len(overlapping(tight, 0.3)[0]), "few first": few == 0}
+        )
 
 
 @row(43, "1e5 idle substeps of a resting column", "no creep (1e-6 of a radius), no energy")
