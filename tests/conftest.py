@@ -1,10 +1,14 @@
 """One Taichi for the whole run, of the architecture TIVERLET_ARCH (cpu); worlds are closed after each test."""
 
 import contextlib
+import functools
+import json
 import os
 import pathlib
 import subprocess
 import sys
+import tempfile
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +18,7 @@ from taichi.lang import ops
 import tiverlet as tv
 from tiverlet.device import thread_team
 from tiverlet.device.patches import source_cache
+from tiverlet.recording import reader, rrd, scene
 from tiverlet.report.accuracy.cases import entries, known
 from tiverlet.step import build
 
@@ -52,6 +57,9 @@ def taichi():
     home, source_cache.HOME = source_cache.HOME, source_cache.HOME + OURS
     yield
     ops.assign, source_cache.HOME, build.CROSSOVER = assign, home, CROSSOVER
+    if server.cache_info().currsize:
+        with server():  # which closes the pipes, so that it ends
+            pass
 
 
 @pytest.fixture
@@ -73,6 +81,44 @@ def world():
     yield build
     for w in made:
         w.close()
+
+
+@pytest.fixture
+def read_here(monkeypatch):
+    """Recordings are read in this process, not in one that is started for each: half a second of CPU time, see test_forgeries.py
+    and test_recordings.py for what that one is there for."""
+
+    def read(path, rows=False):
+        with open(path, "rb") as file, tempfile.TemporaryFile() as out:
+            found = reader.read(file, os.dup(out.fileno()), rows, limited=False)
+            if "foreign" in found:
+                raise ValueError(f"replay: {path} is not an .rrd file")
+            out.seek(0)
+            return rrd.Contents(json.loads(json.dumps(found)), out.read())
+
+    monkeypatch.setattr(rrd, "read", read)
+
+
+@pytest.fixture
+def built_once(monkeypatch):
+    """A scene of a recording that was built before is not built again: its world starts from another state."""
+    worlds = {}
+    made = scene.rebuild
+
+    def rebuild(data, arrays, given, turned):
+        key = json.dumps([data["particles"], data["features"], data["settings"]])
+        if key not in worlds:
+            worlds[key] = made(data, arrays, given, turned)
+            worlds[key].__dict__["close"] = lambda: None
+        for feature, told in zip(worlds[key].features, data["features"], strict=True):
+            scene.turn(feature, {name: scene.decode(value, arrays) for name, value in told["knobs"].items()})
+        return worlds[key]
+
+    monkeypatch.setattr(scene, "rebuild", rebuild)
+    yield
+    for world in worlds.values():
+        del world.__dict__["close"]
+        world.close()
 
 
 def case(name: str) -> dict:
@@ -121,17 +167,51 @@ def order(errors, factor: float = 2.0) -> float:
     return float(-np.polyfit(k, np.log(errors), 1)[0])
 
 
-def python(code: str, *, check: bool = True, timeout: float = 120.0, **env) -> subprocess.CompletedProcess:
-    """Run code in a fresh interpreter, from a file, since Taichi reads the source of kernels."""
-    import tempfile
+# Forks itself for each script that it is asked to run, so that importing Taichi is paid for once; it has not started Taichi.
+SERVER = """
+import json, os, runpy, signal, sys
+import tiverlet
+for line in sys.stdin:
+    path, timeout = json.loads(line)
+    child = os.fork()
+    if not child:
+        signal.alarm(timeout)
+        os.chdir(os.path.dirname(path))
+        for number, name in enumerate((os.devnull, "stdout", "stderr")):
+            os.dup2(os.open(name, os.O_RDWR | os.O_CREAT), number)
+        sys.argv = [path]
+        runpy.run_path(path, run_name="__main__")
+        break
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+"""
+STRICT = (sys.executable, "-W", "error", "-W", "ignore::DeprecationWarning")
 
+
+@functools.cache
+def server() -> subprocess.Popen:
+    """It ends when nobody can write to it any more."""
+    return subprocess.Popen([*STRICT, "-c", SERVER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+
+def python(code: str, *, check: bool = True, timeout: int = 120, fresh: bool = False, **env) -> subprocess.CompletedProcess:
+    """Run code in a process of its own, from a file, since Taichi reads the source of kernels.
+
+    fresh: in a new interpreter, as always with settings of the environment; else in one that has imported tiverlet before.
+    """
     with tempfile.TemporaryDirectory() as folder:
         path = pathlib.Path(folder) / "script.py"
         path.write_text(code)
-        done = subprocess.run(
-            [sys.executable, "-W", "error", "-W", "ignore::DeprecationWarning", str(path)],
-            capture_output=True, text=True, timeout=timeout, env={**os.environ, **env}, cwd=folder,
-        )  # fmt: skip
+        if fresh or env:
+            done = subprocess.run(
+                [*STRICT, str(path)], capture_output=True, text=True, timeout=timeout, env={**os.environ, **env}, cwd=folder
+            )
+        else:
+            pipes: Any = server()
+            pipes.stdin.write(json.dumps([str(path), timeout]) + "\n")
+            pipes.stdin.flush()
+            status = int(pipes.stdout.readline())
+            said = (path.with_name(name).read_text() for name in ("stdout", "stderr"))
+            done = subprocess.CompletedProcess([str(path)], status, *said)
     if check and done.returncode:
         raise AssertionError(f"exit status {done.returncode}\n{done.stdout}\n{done.stderr}")
     return done

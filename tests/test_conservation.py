@@ -8,6 +8,8 @@ from tiverlet.step import checkpoint
 
 from .test_links import net
 
+pytestmark = pytest.mark.usefixtures("read_here")
+
 
 @pytest.mark.parametrize("precision, limit", [("f64", 1e-12), ("f32", 1e-6)])
 def test_momentum_is_conserved_for_ten_thousand_steps(world, precision, limit):

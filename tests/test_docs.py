@@ -16,7 +16,7 @@ def blocks(page: pathlib.Path) -> list[str]:
 
 
 @pytest.mark.parametrize("page", [p for p in PAGES if blocks(p)], ids=str)
-def test_code_runs(page, tmp_path, monkeypatch):
+def test_code_runs(page, tmp_path, monkeypatch, capsys):
     # In the order in which it is read, each page in a file of its own, since Taichi reads the source of functions.
     script = tmp_path / "page.py"
     script.write_text("\n\n".join(blocks(page)))
@@ -28,6 +28,15 @@ def test_code_runs(page, tmp_path, monkeypatch):
     for value in vars(module).values():
         if hasattr(value, "close") and hasattr(value, "step"):
             value.close()
+    if page.parts == ("README.md",):
+        # It begins with demos/hello.py, which prints what its page says. The report's figures may differ between processors; what
+        # the scene is made of may not, but for the number of threads.
+        assert blocks(page)[0].strip() == (ROOT / "demos" / "hello.py").read_text().split('"""', 2)[2].strip()
+        shown = (ROOT / "demos" / "README.md").read_text().split("```\n")
+        shown = next(block for block in shown if block.startswith("StepReport("))
+        want, got = (re.sub(r"\d+ threads", "threads", text).strip().splitlines() for text in (shown, capsys.readouterr().out))
+        head = re.match(r"StepReport\(time=5.0, substeps=\d+, iterations=1, residual=0.0\d\d", want[0])
+        assert want[1:] == got[1 : len(want)] and head and got[0].startswith(head[0])
 
 
 @pytest.mark.parametrize("page", PAGES, ids=str)

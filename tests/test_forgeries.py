@@ -1,12 +1,10 @@
 """Forged recordings: whatever the viewer would show otherwise, verify() names, though all checksums are right."""
 
-import json
 import os
 import re
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 import urllib.error
 import urllib.request
@@ -17,7 +15,7 @@ import pytest
 import tiverlet as tv
 from tiverlet.__main__ import main
 from tiverlet.features import material
-from tiverlet.recording import reader, rrd, scene, viewer
+from tiverlet.recording import reader, viewer
 
 from . import forging, recordings_campaign
 from .forging import FORGERIES, Forgery
@@ -31,32 +29,8 @@ def original(tmp_path_factory):
 
 
 @pytest.fixture
-def quick(monkeypatch):
+def quick(read_here, built_once):
     """Read in this process, and compile a scene only once: what is looked at here is neither."""
-    worlds = {}
-
-    def read(path, rows=False):
-        with open(path, "rb") as file, tempfile.TemporaryFile() as out:
-            found = reader.read(file, os.dup(out.fileno()), rows, limited=False)
-            out.seek(0)
-            return rrd.Contents(json.loads(json.dumps(found)), out.read())
-
-    def rebuild(data, arrays, given, turned):
-        key = json.dumps([data["particles"], data["features"], data["settings"]])
-        if key not in worlds:
-            worlds[key] = made(data, arrays, given, turned)
-            worlds[key].__dict__["close"] = lambda: None
-        for feature, told in zip(worlds[key].features, data["features"], strict=True):
-            scene.turn(feature, {name: scene.decode(value, arrays) for name, value in told["knobs"].items()})
-        return worlds[key]
-
-    made = scene.rebuild
-    monkeypatch.setattr(rrd, "read", read)
-    monkeypatch.setattr(scene, "rebuild", rebuild)
-    yield
-    for world in worlds.values():
-        del world.__dict__["close"]
-        world.close()
 
 
 def test_forgeries_are_named(original, quick, tmp_path):

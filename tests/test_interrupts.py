@@ -12,6 +12,8 @@ import tiverlet as tv
 from tiverlet.device import interrupts
 from tiverlet.step import checkpoint
 
+pytestmark = pytest.mark.usefixtures("read_here")
+
 
 def frames_of(world, dt=1 / 60):
     """How many frames it has made."""

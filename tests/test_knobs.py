@@ -16,6 +16,8 @@ from tiverlet.features.arguments import knobs_of
 
 from .conftest import order
 
+pytestmark = pytest.mark.usefixtures("read_here")
+
 DT = 1 / 60
 LINK = np.array([[0.0, 0.3, 0.1], [0.5, -0.1, 0.3]])
 PATH = np.array([[-0.4, 0.3, 0.1], [0.1, -0.2, 0.0], [0.6, 0.4, 0.3]])

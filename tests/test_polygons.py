@@ -226,18 +226,26 @@ def test_bad_loops_are_named():
 
 
 def test_discs_beside_wide_bodies_list_what_they_may_touch(world):
-    # Two discs are near by their own radii, however long the edges of bodies elsewhere are.
+    # Two discs are near by their own radii, however long the edges of bodies elsewhere are; so are their cells and the skin. A
+    # disc is listed with both ends of an edge that is within its radius and the skin, and few others.
     discs = np.stack(np.divmod(np.arange(100), 10), axis=1) * 0.25 + [0.0, 1.5]
-    body = [[0.0, 0.0], [2.0, 0.0], [1.0, 1.0]]
-    start = tv.Particles([*body, *discs], radius=np.r_[np.zeros(3), np.full(100, 0.1)])
-    contact = tv.Polygons([[0, 1, 2]])
-    w = world(start, [contact])
+    body = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 1.46], [0.0, 1.46]])
+    start = tv.Particles([*body, *discs], radius=np.r_[np.zeros(4), np.full(100, 0.1)])
+    w = world(start, [tv.Polygons([range(4)])])
+    assert w._runner.grid.skin == pytest.approx(0.75 * 0.1) and w._runner.grid.finest == pytest.approx(2 * 0.1 + 0.075, rel=1e-3)
     w._runner.list_neighbours()
     pairs, _ = w._runner.grid.entries()
-    both = pairs[(pairs >= 3).all(axis=1)]
+    both = pairs[(pairs >= 4).all(axis=1)]
     apart = np.linalg.norm(start.position[both[:, 0]] - start.position[both[:, 1]], axis=1)
     assert (apart < 0.2 + w._runner.grid.skin).all()
-    assert len(pairs) > len(both)
+    listed, some = {tuple(p) for p in pairs.tolist()}, 0
+    for a in range(4):
+        b = (a + 1) % 4
+        t = np.clip((discs - body[a]) @ (body[b] - body[a]) / ((body[b] - body[a]) ** 2).sum(), 0, 1)
+        for k in np.flatnonzero(np.linalg.norm(discs - body[a] - t[:, None] * (body[b] - body[a]), axis=1) < 0.175):
+            assert {(k + 4, a), (k + 4, b), (a, k + 4), (b, k + 4)} <= listed
+            some += 1
+    assert 8 <= some and len(pairs) - len(both) < 12 * some, (some, len(pairs) - len(both))
 
 
 def sat(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray]:

@@ -12,6 +12,8 @@ from tiverlet.recording import messages
 from tiverlet.recording.lines import Lines, Sheet, trails
 from tiverlet.recording.strain import LEVELS, SCALE, levels
 
+pytestmark = pytest.mark.usefixtures("read_here")
+
 
 def read(path, entity: str, column: str):
     """All rows of a column of an entity, by frame (None for static data)."""

@@ -70,7 +70,7 @@ def test_what_was_recorded_reads_back(falling, tmp_path):
         recording.export("a.txt")
 
 
-def test_damage_is_named(falling, tmp_path):
+def test_damage_is_named(falling, tmp_path, read_here):
     whole = falling.read_bytes()
     path = tmp_path / "b.rrd"
 
@@ -286,7 +286,7 @@ recorder.close()
 """
     home = os.environ.pop("HOME")
     try:
-        assert "Taichi was started again" in python(code).stdout
+        assert "Taichi was started again" in python(code, fresh=True).stdout
     finally:
         os.environ["HOME"] = home
     assert list(tv.replay(tmp_path / "f.rrd").frames) == [0, 1]

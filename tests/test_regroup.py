@@ -8,6 +8,8 @@ import tiverlet as tv
 from tiverlet.features.feature import Batch
 from tiverlet.step import checkpoint
 
+pytestmark = pytest.mark.usefixtures("read_here")
+
 
 def half(x: float):
     """One of everything around (x, 0): positions, and the features on them as functions of the first number."""

@@ -7,6 +7,8 @@ import taichi as ti
 import tiverlet as tv
 from tiverlet.recording import journal, scene
 
+pytestmark = pytest.mark.usefixtures("read_here")
+
 S = tv.shapes
 
 
@@ -151,7 +153,7 @@ def test_every_feature_is_built_again_from_its_description():
 
 
 @pytest.mark.parametrize("build, precision", [(swing, "f32"), (race, "f32-compensated"), (race, "f64")])
-def test_round_trip(build, precision, tmp_path):
+def test_round_trip(build, precision, tmp_path, built_once):
     path = tmp_path / "a.rrd"
     with build(precision) as world, tv.Recorder(path, world) as recorder:
         drive(world, recorder)

@@ -132,7 +132,8 @@ w = tv.World(tv.Particles([[0.0, 0.0]]), [tv.Gravity()])
 w.step(0.1)
 assert ti.cfg.fast_math == 0 and ti.cfg.default_fp == ti.f32
 time.sleep(0.5)
-"""
+""",
+        fresh=True,
     )
     assert done.stdout == "" and done.stderr == ""
 

@@ -8,6 +8,8 @@ from ..neighbours.queries import Contacts
 from .contact import Contact
 
 SLACK = 1 / 512  # of an edge: as much further it goes at its ends, so that bodies of the same width stand on each other
+BEYOND = 1 / 4  # of an edge, how far beyond its end a contact may be
+REACH = 1.35  # of an edge, from one end to where a contact may be: (1 + BEYOND, 1 / 2)
 CLOSE = 1e-4  # edges whose distances differ by less are equally near: the first of them counts
 TINY = 1e-30
 DISCS = -1  # as a place on an edge: there is no edge, two discs touch
@@ -69,7 +71,7 @@ class Rim(Contact):
                         cross = t0 + height0 / (height0 - height) * (t - t0)
                         passed = -SLACK <= cross <= 1 + SLACK
             beside, tips = -SLACK <= cross <= 1 + SLACK, 0
-            if height < 0 and height >= -length / 2 and not passed:
+            if height < 0 and height >= -length / 2 and -BEYOND <= t <= 1 + BEYOND and not passed:
                 at_end = t > 0.5
                 tips = self.tips_cross(v, ti.select(at_end, b, a)) * ti.select(at_end, -1, 1)
             if tips == OVER_EDGE:
@@ -178,33 +180,56 @@ class Rim(Contact):
 
     @ti.func
     def look(self, i, moved: ti.template()):  # type: ignore[valid-type]
-        """Find the contacts that particle i is the vertex of, or the first of two discs: at most one with each near particle.
+        """Find the contacts that particle i is the vertex of, or one of two discs: at most one with each near particle; returns
+        how many there are.
 
         moved: in a substep, by how particles moved in it, and without the overlap that is allowed. Otherwise by where they are
         and the nearest edges: before the first substep after a start, d is the velocity.
         """
+        active = 0
         for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
             j = self.dev.grid.near[e]
-            overlap, n, t = 0 * self.dev.w.of(i) - 1, 0 * self.dev.state.x[i], 0 * self.dev.w.of(i)
-            front = self.corner(i, j)
-            if self.after(j) >= 0:
-                overlap, n, t = self.edge(i, j, front, moved)
-            if overlap <= 0 and i < j and front > 0:
+            if self.after(i) < 0 and self.after(j) < 0:
                 overlap, n = self.touch(i, j, self.dev.radius.of(i) + self.dev.radius.of(j))
-                if overlap > 0:
-                    if self.tips_cross(i, j) != 0:
-                        overlap = -overlap
                 if ti.static(moved):
-                    overlap -= self.dev.less[i]
-                if overlap > 0:
-                    t = 0 * t + DISCS
-                    if self.corner(j, i) <= 0:
-                        overlap = -overlap
-            self.dev.met.field[e] = ti.Vector([overlap, t, n[0], n[1]])
-            back = ti.Vector([self.find(j, i), -1])
-            if self.before(i) >= 0:
-                back[1] = self.find(j, self.before(i))
-            self.dev.back.field[e] = ti.cast(back, self.scene.real)
+                    overlap -= self.dev.less[ti.min(i, j)]
+                active += ti.cast(overlap > 0, ti.i32)
+                self.dev.met.field[e] = ti.Vector([overlap, ti.cast(DISCS, self.scene.real), n[0], n[1]])
+            else:
+                overlap, n, t = 0 * self.dev.w.of(i) - 1, 0 * self.dev.state.x[i], 0 * self.dev.w.of(i)
+                front = self.corner(i, j)
+                if self.after(j) >= 0:
+                    overlap, n, t = self.edge(i, j, front, moved)
+                if overlap <= 0 and front > 0 and self.tells(i, j):
+                    overlap, n = self.touch(i, j, self.dev.radius.of(i) + self.dev.radius.of(j))
+                    if overlap > 0:
+                        if self.tips_cross(i, j) != 0:
+                            overlap = -overlap
+                    if ti.static(moved):
+                        overlap -= self.dev.less[i]
+                    if overlap > 0:
+                        t = 0 * t + DISCS
+                        if self.corner(j, i) <= 0:
+                            overlap = -overlap
+                active += ti.cast(overlap > 0, ti.i32)
+                self.dev.met.field[e] = ti.Vector([overlap, t, n[0], n[1]])
+                if self.after(i) >= 0:
+                    self.dev.back.field[e] = ti.cast(ti.Vector([self.find(j, i), self.find(j, self.before(i))]), self.scene.real)
+        return active
+
+    @ti.func
+    def tells(self, i, j):
+        """Whether of two particles that touch as discs it is i that keeps the contact, as its vertex.
+
+        Particles in no loop are never the start or end of an edge: they keep all contacts that they are in. Two of them both keep
+        that of the pair; this tells then which of the two counts.
+        """
+        return (i < j) if (self.after(i) < 0) == (self.after(j) < 0) else self.after(i) < 0
+
+    @ti.func
+    def roles(self, i):
+        """How many roles particle i may have in a contact, of VERTEX, START and END."""
+        return ti.select(self.after(i) < 0, 1, 3)
 
     @ti.func
     def find(self, v, a):
@@ -265,7 +290,8 @@ class Rim(Contact):
         grid, r = self.dev.grid, self.scene.particles.radius
         pairs, at = grid.entries()
         met, push = grid.read(self.dev.met, at), grid.read(self.dev.given, at)
-        some = (met[:, 0] > 0) | (push > 0)
+        after = self.dev.ends[:, 0]
+        some = ((met[:, 0] > 0) | (push > 0)) & ((after[pairs] >= 0).any(axis=1) | (pairs[:, 0] < pairs[:, 1]))
         pairs, met, push = pairs[some], met[some], push[some]
         (i, j), overlap, t, n = pairs.T, met[:, 0], met[:, 1], met[:, 2:]
         parted, no_way = overlap <= 0, (n == 0).all(axis=1)
@@ -297,21 +323,36 @@ class Apart:
 
     def __init__(self, rim: Rim):
         self.table: Table = rim.table
-        self.loop = rim.dev.loop
-        self.radius = rim.dev.radius
+        self.loop, self.limit, self.skin = rim.dev.loop, rim.dev.limit, rim.dev.size
+        self.radius, self.state = rim.dev.radius, rim.scene.state
 
     @ti.func
     def reach(self, radius: ti.template(), i, j):  # type: ignore[valid-type]
-        """Two discs touch by their own radii, whatever the edges elsewhere are; `radius` has half an edge in it."""
-        far = radius.of(i) + radius.of(j)
-        if self.loop[i][2] < 0 and self.loop[j][2] < 0:
-            far = self.radius.of(i) + self.radius.of(j)
-        return far
+        """How far from each other particles i and j may take part in a contact."""
+        return radius.of(i) + radius.of(j) + ti.static(REACH) * ti.max(self.limit[i], self.limit[j])
 
     @ti.func
     def of(self, i, j):
-        """The row of the table, with 0 at its end for two particles of one body."""
+        """The row of the table, with 0 at its end for two particles of one body, or where no edge of one is near the other."""
         row = self.table.of(i, j)
-        if self.loop[i][2] >= 0 and self.loop[i][2] == self.loop[j][2]:
-            row[3] = 0
+        if self.loop[i][2] >= 0 or self.loop[j][2] >= 0:
+            if self.loop[i][2] == self.loop[j][2] or not (self.beside(i, j) or self.beside(j, i)):
+                row[3] = 0
         return row
+
+    @ti.func
+    def beside(self, v, c):
+        """Whether v is near one of the edges of c: within the skin or, behind it, not deeper than half of it."""
+        out = False
+        if self.loop[c][2] >= 0:
+            r, far = self.state.apart(v, c), self.radius.of(v) + ti.cast(self.skin, self.state.real)
+            for k in ti.static(range(2)):
+                other = self.loop[c][k]
+                u, size = self.state.apart(other, c), far + ti.max(self.radius.of(c), self.radius.of(other))
+                length = u.norm()
+                t, height = r.dot(u), r.cross(u) * (1 - 2 * k)
+                if height >= -(length / 2 + size) * length and height <= size * length:
+                    ends = (BEYOND * length + size) * length
+                    if t >= -ends and t <= length * length + ends:
+                        out = True
+        return out

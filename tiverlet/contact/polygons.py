@@ -1,8 +1,6 @@
 """Bodies made of loops of particles that do not overlap (2D)."""
 
 from collections.abc import Iterable
-from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,13 +10,14 @@ from ..device.thread_team import Team
 from ..features.feature import Batch, Scene
 from ..neighbours.neighbour_list import Luggage
 from ..neighbours.neighbour_search import Grid
-from ..particles import Particles, Radii
+from ..particles import Particles
 from ..tools import median
 from .contact import Contact
 from .loops import checked, laid, refuse_deep
-from .polygon_narrow_phase import DISCS, VERTEX, Apart, Rim
+from .polygon_narrow_phase import DISCS, REACH, VERTEX, Apart, Rim
 
 STRETCH = 1.25  # of an edge, beyond which a contact in its middle might not be listed
+SKIN = 0.15  # of the longer edge of a vertex
 
 
 class Polygons(Rim):
@@ -59,15 +58,14 @@ class Polygons(Rim):
         n, x = particles.count, particles.position
         self.dev.ends, self.dev.body, length = laid(self.loops, x)
         refuse_deep(self.loops, self.dev.body, x, 0)
-        # Two particles are listed when their reaches add up: a vertex with both ends of an edge that it is beside.
-        self.dev.length = length
-        far = 1.5 * STRETCH * length
-        share = median(far[far > 0]) / 2 if self.loops else 0.0
-        self.dev.cover = particles.radius + np.maximum(share, far - share)
+        # A vertex is listed with both ends of an edge that it is beside, or a quarter of it beyond, and behind by half of it.
+        self.dev.length, self.dev.reach = length, REACH * STRETCH * length
         loops = self.dev.body >= 0
-        self.dev.reach = float(length[loops].min(initial=np.inf)) / 4
-        self.dev.size = 0.15 * median(self.dev.cover) if self.skin == "auto" else float(self.skin)
-        self.dev.finest = float(self.dev.cover.min(initial=np.inf))
+        self.dev.step = float(length[loops].min(initial=np.inf)) / 4
+        sizes = np.where(loops, SKIN * length, 0.75 * particles.radius)
+        auto = median(sizes[sizes > 0]) if (sizes > 0).any() else 1.0
+        self.dev.size = auto if self.skin == "auto" else float(self.skin)
+        self.dev.finest = float((particles.radius + self.dev.reach / 2).min(initial=np.inf))
         self.table = self.wanted
         self.matters = n > 0 and bool(self.loops or (particles.radius > 0).any())
         if self.matters:
@@ -86,7 +84,7 @@ class Polygons(Rim):
 
     def join(self, scene: Scene, batches: list[Batch], team: Team) -> Grid:
         """Declare the fields, among them the grid's, which lists particles by their reach."""
-        n, p, add = scene.particles.count, scene.particles, scene.memory.field
+        n, add = scene.particles.count, scene.memory.field
         self.scene, self.dev.state, self.dev.radius, self.dev.w = scene, scene.state, scene.radius, scene.state.w
         self.dev.rubs, self.dev.bounces = self.rubs, self.bounces
         self.dev.eases, self.dev.store, self.dev.skips = True, None, False
@@ -105,8 +103,6 @@ class Polygons(Rim):
         self.dev.less = add("Polygons.allowed", n, state=True)
         self.dev.h = add("Polygons.substep", None)
         self.table.bind(scene, asked=True)
-        cover: Any = SimpleNamespace(count=n, dim=2, position=p.position, radius=self.dev.cover, group=p.group)
-        reach = replace(scene, particles=cover, radius=Radii(scene.memory, self.dev.cover))
         pairs = [f.partners(f.start) for f in batches]
         linked = np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=np.int32)
         # For each entry the contact of which its particle is the vertex: overlap, place on the edge (-1: discs), normal; where
@@ -117,7 +113,7 @@ class Polygons(Rim):
         luggage = [self.dev.met, self.dev.back, self.dev.given, *([self.dev.slip] if self.rubs else [])]
         luggage += [self.dev.aim] if self.bounces else []
         apart: Any = Apart(self)
-        self.dev.grid = Grid(reach, self.dev.size, linked, apart, luggage, team, self.dev.move)
+        self.dev.grid = Grid(scene, self.dev.size, linked, apart, luggage, team, self.dev.move, self.dev.reach)
         return self.dev.grid
 
     def ease(self) -> None:
@@ -129,8 +125,9 @@ class Polygons(Rim):
         self.look(i, False)
         less = ti.select(first > 0, self.dev.less[i], 0 * self.dev.w.of(i))
         for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
-            if ti.max(i, self.dev.grid.near[e]) >= first:
-                less = ti.max(less, self.dev.met.field[e][0])
+            j, met = self.dev.grid.near[e], self.dev.met.field[e]
+            if ti.max(i, j) >= first and (met[1] > DISCS or self.tells(i, j)):
+                less = ti.max(less, met[0])
         self.dev.less[i] = less
 
     @ti.func
@@ -143,15 +140,20 @@ class Polygons(Rim):
     @ti.func
     def overshoots(self, i):
         """1 if particle i crosses a quarter of an edge in one substep."""
-        d, limit = self.dev.state.d[i], ti.cast(self.dev.reach, self.scene.real)
+        d, limit = self.dev.state.d[i], ti.cast(self.dev.step, self.scene.real)
         if self.after(i) < 0:
             limit = ti.min(limit, self.dev.radius.stride(i) if ti.static(self.dev.radius.least > 0) else limit)
         return ti.select(d.dot(d) <= limit * limit, 0, 1)
 
     @ti.func
-    def measure(self, i):
+    def measure(self, i, first):
         """Find the contacts of particle i, see look(), and note an edge that is too long for the list."""
-        self.look(i, True)
+        if first != 0:
+            for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
+                self.dev.given.field[e] = 0
+                if ti.static(self.dev.bounces):
+                    self.dev.aim.field[e] = 0 * self.dev.aim.field[e]
+        self.dev.active[i] = self.look(i, True)
         after = self.after(i)
         if after >= 0:
             u = self.dev.state.apart(after, i)
@@ -171,27 +173,25 @@ class Polygons(Rim):
 
     @ti.func
     def count(self, begin, end):
-        """How many contacts some particles are in."""
+        """How many contacts some particles are in. What is in no loop knows them from look()."""
         for i in range(begin, end):
-            active = 0
-            for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
-                for role in range(3):
-                    at, _, _, _, _, _ = self.meeting(i, e, role)
-                    if at >= 0:
-                        if self.dev.met.field[at][0] > 0:
-                            active += 1
-            self.dev.active[i] = active
+            if self.after(i) >= 0:
+                active = 0
+                for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
+                    for role in range(3):
+                        at, _, _, _, _, _ = self.meeting(i, e, role)
+                        if at >= 0:
+                            if self.dev.met.field[at][0] > 0:
+                                active += 1
+                self.dev.active[i] = active
 
     @ti.func
     def relax(self, i, first, fresh, final):
         """What the contacts of particle i want of it."""
         total, lifts, bond = 0 * self.dev.state.x[i], 0 * self.dev.state.x[i], 0 * self.dev.state.x[i]
-        for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
-            if first != 0:
-                self.dev.given.field[e] = 0
-                if ti.static(self.dev.bounces):
-                    self.dev.aim.field[e] = 0 * self.dev.aim.field[e]
-            for role in range(3):
+        begin, roles = self.dev.grid.first[i], self.roles(i)
+        for e in range(begin, begin + ti.select(self.dev.active[i] > 0, self.dev.grid.number[i], 0)):
+            for role in range(roles):
                 at, v, a, b, t, part = self.meeting(i, e, role)
                 if at >= 0:
                     met = self.dev.met.field[at]
@@ -272,7 +272,7 @@ class Polygons(Rim):
         total = 0 * self.dev.state.x[i]
         if self.dev.struck[i] > 0:
             for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
-                for role in range(3):
+                for role in range(self.roles(i)):
                     at, v, a, b, t, part = self.meeting(i, e, role)
                     if at >= 0:
                         aim = self.dev.aim.field[at]
@@ -318,7 +318,7 @@ class Polygons(Rim):
         self.look(i, False)
         for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
             j, met = self.dev.grid.near[e], self.dev.met.field[e]
-            if met[0] > 0:
+            if met[0] > 0 and (met[1] > DISCS or self.tells(i, j)):
                 size = ti.min(self.dev.radius.of(i), self.dev.radius.of(j))
                 if met[1] > DISCS:
                     size = self.dev.state.apart(self.after(j), j).norm() / 2

@@ -6,8 +6,9 @@ once and every pair is seen once, however many far cells share a bucket; those a
 of a row stand side by side in memory. Counting sort; no cell has a capacity. On a GPU the counters are atomic, and the order
 within a cell is another one in every run: no result may depend on it.
 
-Particles whose radii differ by more than a factor of two stand in tables of their own, with cells of their size: level 0 holds
-the largest, each next level radii down to half of those before. A particle looks at its own level and at the coarser ones, where
+Particles whose sizes differ by more than a factor of two stand in tables of their own, with cells of their size: level 0 holds
+the largest, each next level sizes down to half of those before. The size of a particle is its radius, and half of how much
+further it has to be found. A particle looks at its own level and at the coarser ones, where
 its neighbours are in the 3^dim cells around it; of the finer ones it hears when they find it.
 """
 
@@ -25,9 +26,10 @@ LEVELS = 14  # the last one holds all that are smaller, down to points
 
 
 class Cells:
-    """The tables. radius: (n,) [m]. skin: what is added to the distance at which two touch [m]."""
+    """The tables. radius: (n,) [m]. reach: (n,) [m]. Pairs are looked for up to the sum of their radii, the longer of their
+    reaches, and the skin [m]."""
 
-    def __init__(self, scene: Scene, radius: np.ndarray, skin: float, team: Team, scratch: Any):
+    def __init__(self, scene: Scene, radius: np.ndarray, reach: np.ndarray, skin: float, team: Team, scratch: Any):
         self.team = team
         self.place = scratch  # of the particles as they are sorted, while a list is built: read one after the other
         self.memory = scene.memory
@@ -35,12 +37,14 @@ class Cells:
         self.n, self.dim, self.state, self.real = n, dim, scene.state, scene.real
         self.serial = not team.launched  # counting in order, on one thread, beats atomic counters in parallel on a CPU
         with np.errstate(divide="ignore"):
-            level = np.minimum(np.floor(np.log2(radius.max() / radius)), LEVELS - 1).astype(int)
+            size = radius + reach / 2
+            level = np.minimum(np.floor(np.log2(size.max() / size)), LEVELS - 1).astype(int)
         used, level, _ = distinct(level)
         self.levels = len(used)
-        largest = np.array([radius[level == m].max() for m in range(self.levels)])
+        own = np.array([radius[level == m].max() for m in range(self.levels)])
+        finer, longest = (np.array([v[level >= m].max() for m in range(self.levels)]) for v in (radius, reach))
         # Rounding of floor(x * scale) must not hide a neighbour.
-        self.sizes = (2 * largest + skin) * (1 + 2.0**-12)
+        self.sizes = (own + finer + longest + skin) * (1 + 2.0**-12)
         counts = np.bincount(level, minlength=self.levels)
         self.bits = np.maximum(2 * dim, np.ceil(np.log2(np.maximum(2 * counts, 1)))).astype(int)
         offsets = np.concatenate([[0], np.cumsum(1 << self.bits)])

@@ -31,10 +31,12 @@ class Grid(Pairs):
 
     skin: what is listed beyond touching [m]. linked: (m, 2) pairs that are never listed. table: which groups touch. luggage: what
     the entries of the list carry along when it is built anew. scratch: a field of vectors, (n,), to use while it is built.
+    reach: (n,) how much further than by its radius a particle has to be found [m], see Cells.
     """
 
     def __init__(
-        self, scene: Scene, skin: float, linked: np.ndarray, table: Table, luggage: list[Luggage], team: Team, scratch: Any
+        self, scene: Scene, skin: float, linked: np.ndarray, table: Table, luggage: list[Luggage], team: Team, scratch: Any,
+        reach: np.ndarray | None = None,
     ):  # fmt: skip
         n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
         self.sums = Sums(n, team, capped=True)
@@ -44,7 +46,8 @@ class Grid(Pairs):
         self.dim, self.state, self.radius = dim, scene.state, scene.radius
         self.table, self.skin = table, skin
         self._extent: Sequence[float] = [-1.0] * dim
-        self.cells = Cells(scene, scene.particles.radius, skin, team, scratch)
+        radius = scene.particles.radius
+        self.cells = Cells(scene, radius, 0 * radius if reach is None else reach, skin, team, scratch)
         self.several = self.cells.levels > 1
         self.counts = self.several or team.launched  # before it lists
         self.serial = not self.counts or (team.size == 1 and not team.launched)  # one thread makes a list, in order

@@ -24,7 +24,7 @@ class ContactPass:
         for c in ti.static(self.contacts):
             if ti.static(c.measures):
                 for i in range(self.team.low(self.n, now.thread), self.team.high(self.n, now.thread)):
-                    c.measure(i)
+                    c.measure(i, now.first)
                 self.team.wait()
             for k in range(self.team.deal(self.particles.pieces, 1, now.thread)):
                 begin, end = self.particles.piece(k, now.thread)

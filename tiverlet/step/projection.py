@@ -4,10 +4,10 @@ A pass holds a load F by a violation Z = D h^2 F, beside what its compliance tak
 A shorter substep h' makes that spring stiffer while it is stretched, and its energy (h / h')^2 times as large. So positions
 first go to where the same loads need the violations (h' / h)^2 Z, and velocities to where they do not change:
 
-    x += w J^T lam,  C(x) = C - (1 - (h' / h)^2) theta Z;     v += w J^T lam,  (J w J^T + mu) lam = -J v
+    x += w J^T lam,  C(x) = C - (1 - (h' / h)^2) Z;     v += w J^T lam,  (J w J^T + mu) lam = -J v
 
-Z = C + alpha lam / h^2 is what the last substep left of a constraint; theta says how rigid it is, see Scalar: springs that the
-substep resolves stay as they are. Positions move without velocities, as contacts do that an impact left overlapping.
+Z, C + alpha lam / h^2 for what is at rest, is what the last substep left of a constraint; springs that it resolves stay as they
+are. Positions move without velocities, as contacts do that an impact left overlapping.
 
 Where that lifts what hangs, motion pays for it as far as it can: a taut net has no direction to sag in, so velocities know
 nothing of its fall, and lifting it back at the end of each fall would be a pump. The energy that was gained is taken out of the
@@ -22,6 +22,8 @@ import numpy as np
 
 from ..constraints.core.scalar import Scalar
 from ..solvers.elimination import components
+from .block_matrix import BlockMatrix
+from .integrator import FREE
 
 if TYPE_CHECKING:
     from .runner import Runner
@@ -29,8 +31,8 @@ if TYPE_CHECKING:
 ENOUGH = 1e-3  # of its size: a violation that matters, over (r - 1)^2 / r with r = (h / h')^2: what one jump leaves to vibrate
 FIRM = 0.9  # theta of what velocities do not change
 FAR = 0.75  # of the longest: a substep in which what is small now has had its chance
-NEWTON = 20  # steps, at most
-BEGIN, HARDEST = 1e-3, 10.0  # mu of the first, and of the last try
+NEWTON = 40  # steps, at most
+BEGIN, HARDEST, LEAST = 1e-3, 10.0, 1e-9  # mu of the first, and of the last try; the least
 LEFT = 0.01  # of what violations store: what may be left of it in the shorter substep
 DONE = 1e-6  # of its size: a violation that is none
 STEPS = 200  # of conjugate gradients in each, at most
@@ -44,9 +46,7 @@ def project(runner: "Runner", h: float, longest: float) -> bool:
     """
     ratio = h / longest
     slots = runner.scene.slots
-    eliminated = slots and slots.system and not slots.system.steps  # holds loads without a violation
     batches = [b for b in runner.batches if isinstance(b, Scalar) and b.joins and b.count]
-    batches = [b for b in batches if not (eliminated and (slots.rows(b) >= 0).any())]
     w, state, memory = runner.scene.inv_mass, runner.scene.state, runner.memory
     if not batches:
         return True
@@ -58,14 +58,19 @@ def project(runner: "Runner", h: float, longest: float) -> bool:
     if float(np.abs(undone * start.close).max(initial=0.0)) * (1 - ratio**2) ** 2 <= ENOUGH * ratio**2:
         return ratio < FAR
     rows = start = start.towards(start.C - (1 - ratio**2) * undone)
-    mu, enough = BEGIN, LEFT * ratio**2 * rows.stored
+    mu, enough, far, first = BEGIN, LEFT * ratio**2, None, rows.stored
+    converges = slots.converges or slots.exact  # what they leave is moved at once in the next substep, and flies on
     for _ in range(NEWTON):
-        new = rows.at(x + rows.step(mu))
+        move = rows.step(mu)
+        work = float((_over(np.ones_like(w), w) @ (move**2)).sum())
+        far = work if far is None else far
+        new = rows.at(x + move)
         better = new.stored < rows.stored
-        mu = max(mu / 8, SOFT) if better else 8 * mu
+        mu = max(mu / 8, LEAST) if better else 8 * mu
         if better:
             x, rows = new.x, new
-        if rows.stored <= enough or rows.worst <= DONE or mu > HARDEST:
+        near = rows.stored <= enough * first and (not converges or work <= enough * far)
+        if near or rows.worst <= DONE or mu > HARDEST:
             break
     kept = memory.read(state.d)
     v = kept.astype(np.float64)
@@ -123,6 +128,7 @@ class Rows:
         self.close = self._each([b.closeness(b.start.position) for b in batches])
         first = (np.cumsum(arity) - arity)[arity == 2]
         self.pairs = self.row[first], self.who[first], self.who[first + 1]
+        self.arity = arity
         self._measure(x)
 
     def _each(self, values: list[np.ndarray]) -> np.ndarray:
@@ -142,6 +148,25 @@ class Rows:
         """C on the side on which constraints act."""
         return np.where(self.side == 0, C, np.maximum(self.side * C, 0.0) * self.side)
 
+    def _link(self) -> None:
+        """The matrix of step(), for what its rows and their tensions couple."""
+        last = np.cumsum(self.arity)
+        width = np.repeat(self.arity, self.arity)  # of the row of each corner
+        a = np.repeat(np.arange(len(self.who)), width)
+        b = np.repeat((last - self.arity)[self.row], width) + np.arange(len(a)) - np.repeat(np.cumsum(width) - width, width)
+        self.corners = a, b  # of each row, each with each
+        _, i, j = self.pairs
+        self.inside = np.unique(self.who[self.w[self.who] > 0])
+        number = np.full(self.n, -1)
+        number[self.inside] = every = np.arange(len(self.inside))
+        sides = [i, j, i, j], [i, j, j, i]  # of tensions across links
+        ends = np.stack([
+            np.concatenate([*(number[who] for who in (self.who[corner], *side)), every])
+            for corner, side in zip(self.corners, sides, strict=True)
+        ])  # fmt: skip
+        self.free = (ends >= 0).all(axis=0)
+        self.matrix = BlockMatrix(len(self.inside), self.dim, *ends[:, self.free])
+
     def at(self, x: np.ndarray) -> "Rows":
         """The same rows elsewhere."""
         new = copy.copy(self)
@@ -153,23 +178,25 @@ class Rows:
         new = copy.copy(self)
         new.goal = goal
         new._measure(self.x)
+        new._link()
         return new
 
     def undone(self, runner: Any) -> np.ndarray:
-        """Z, by what the last substep knew; and how rigid the rows are."""
+        """Z = theta C_(n+1) + (1 - theta) C_n + damping dC/dt + alpha lam / h^2, to second order; and how rigid the rows are."""
         read, h = runner.memory.read, runner.clock.h
         alpha, damping = (self._each([getattr(b, name) for b in self.batches]) for name in ("compliance", "damping"))
         split = read(runner.scene.slots.split)[: self.n].astype(np.float64)
         self.theta = self._rigid(alpha, self.diagonal * h * h)
         shared = np.bincount(self.row, split[self.who] * (self.J**2).sum(axis=1), minlength=self.m)
         self.weight = self._rigid(alpha, shared * h * h)
-        gamma = damping * alpha / h
-        A = self.theta + gamma if runner.clock.started else (1 + 3 * self.theta) / 4 + gamma * (1 + self.theta) / 2
-        known = [
-            (read(b.dev.spring.history) if b.dev.spring.soft else 0) + b.compliance * read(b.dev.lam)[: b.count] / runner.scene.hh
-            for b in self.batches
+        gamma = self.theta + damping * alpha / h
+        hh = h * h * (runner.clock.drag or FREE)[2 if runner.clock.started else 1]
+        springs = [b.dev.spring for b in self.batches]
+        before = [
+            read(s.last)[: b.count] - b.goal if s.soft else np.zeros(b.count) for b, s in zip(self.batches, springs, strict=True)
         ]
-        return self._bounded(np.where(alpha > 0, A, 1.0) * self.C + self._each(known))
+        borne = [b.compliance * read(b.dev.lam)[: b.count] / hh for b in self.batches]
+        return self._bounded(gamma * self.C + (1 - gamma) * self._bounded(self._each(before)) + self._each(borne))
 
     def _rigid(self, alpha: np.ndarray, reach: np.ndarray) -> np.ndarray:
         """theta, by what a force of 1 N moves in a substep."""
@@ -192,41 +219,21 @@ class Rows:
         """Moves p that minimize sum (C + J p)^2 / (2 D) + mu p^T M p / 2 + p^T K p / 2, with D the diagonal of J w J^T.
 
         K is what tensions C / D across links are: without it, those that are in one line have no direction to give way in, and
-        what would draw a taut rope straight throws it into a zigzag. Conjugate gradients with blocks of a particle.
+        what would draw a taut rope straight throws it into a zigzag.
         """
-        free, m = self.w > 0, _over(np.ones(self.n), self.w)
         stiff = _over(self.weight, self.diagonal)
         row, i, j = self.pairs
         across, length = self.x[i] - self.x[j], np.linalg.norm(self.x[i] - self.x[j], axis=1)
         across = across * _over(np.ones_like(length), length)[:, None]
         taut = _over(np.maximum(self.C[row], 0.0) * stiff[row], length)
-
-        one = np.eye(self.dim)
+        one, (a, b) = np.eye(self.dim), self.corners
         sides = taut[:, None, None] * (one - across[:, :, None] * across[:, None, :])
-        blocks = self._gathered((stiff[self.row, None] * self.J)[:, :, None] * self.J[:, None, :], self.who)
-        blocks += self._gathered(np.concatenate([sides, sides]), np.concatenate([i, j])) + (mu * m)[:, None, None] * one
-        inverse = np.linalg.inv(np.where(free[:, None, None], blocks, one)) * free[:, None, None]
-
-        def applied(p: np.ndarray) -> np.ndarray:
-            q = p[i] - p[j]
-            q = taut[:, None] * (q - across * (across * q).sum(axis=1)[:, None])
-            out = self._gathered(self.J * (stiff * self.rates(p))[self.row, None], self.who) + (mu * m)[:, None] * p
-            return out + self._gathered(np.concatenate([q, -q]), np.concatenate([i, j]))
-
-        r = -self._gathered(self.J * (stiff * self.C)[self.row, None], self.who) * free[:, None]
-        out = np.zeros_like(r)
-        z = np.einsum("iab,ib->ia", inverse, r)
-        p, now = z, float((r * z).sum())
-        least = 1e-4 * now
-        for _ in range(STEPS):
-            if now <= least:
-                break
-            q = applied(p) * free[:, None]
-            far = now / float((p * q).sum())
-            out, r = out + far * p, r - far * q
-            z = np.einsum("iab,ib->ia", inverse, r)
-            now, last = float((r * z).sum()), now
-            p = z + now / last * p
+        mass = mu / self.w[self.inside][:, None, None] * one
+        along = (stiff[self.row[a], None] * self.J[a])[:, :, None] * self.J[b][:, None, :]
+        right = self._gathered(self.J * (stiff * self.C)[self.row, None], self.who)
+        blocks = np.concatenate((along, sides, sides, -sides, -sides, mass))[self.free]
+        out = np.zeros_like(right)
+        out[self.inside] = self.matrix.solve(blocks, -right[self.inside])
         return out
 
     def solve(self, right: np.ndarray, some: np.ndarray, soft: float) -> np.ndarray:

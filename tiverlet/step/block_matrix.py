@@ -1,0 +1,111 @@
+"""Sparse symmetric systems of equations about particles: solved directly where they are narrow, by iterations where not.
+
+Ordered by levels of the graph they are block tridiagonal. A level is what is one step further from the first particle than the
+level before; neighbours are in the same level or in adjacent ones. A sheet of n x n has levels of about n particles, a chain of
+one.
+"""
+
+import numpy as np
+
+WIDEST = 1200  # rows of a level
+MOST = 20_000_000  # numbers in all blocks
+STEPS = 200  # of conjugate gradients, at most
+ENOUGH = 1e-4  # of r . z at their start: what they leave
+
+
+class BlockMatrix:
+    """A matrix that is the sum of dim x dim blocks, block k between the particles a[k] and b[k] of `count`; positive definite."""
+
+    def __init__(self, count: int, dim: int, a: np.ndarray, b: np.ndarray):
+        self.count, self.dim, self.a, self.b = count, dim, a, b
+        level, levels = ordered(count, a, b)
+        self.sizes = sizes = dim * np.bincount(level, minlength=levels)
+        after = np.append(sizes[1:], 0)
+        self.within = np.concatenate([[0], np.cumsum(sizes**2)])
+        self.between = self.within[-1] + np.concatenate([[0], np.cumsum(sizes * after)])
+        self.narrow = bool(sizes.max(initial=0) <= WIDEST and self.between[-1] <= MOST)
+        if not self.narrow:
+            return
+        order = np.argsort(level, kind="stable")
+        place = np.empty(count, dtype=np.int64)
+        place[order] = np.arange(count)
+        place -= np.searchsorted(level[order], np.arange(levels))[level]
+        self.rows = np.split((dim * order[:, None] + np.arange(dim)).ravel(), np.cumsum(sizes)[:-1])
+        self.some = level[b] >= level[a]  # the other half is the same
+        a, b = a[self.some], b[self.some]
+        same, axis = level[a] == level[b], np.arange(dim)
+        begin = np.where(same, self.within[level[a]], self.between[level[a]])
+        width = np.where(same, sizes[level[a]], after[level[a]])
+        i, j = dim * place[a][:, None] + axis, dim * place[b][:, None] + axis
+        self.address = (begin[:, None, None] + i[:, :, None] * width[:, None, None] + j[:, None, :]).ravel()
+
+    def solve(self, blocks: np.ndarray, right: np.ndarray) -> np.ndarray:
+        """x with A x = right, (count, dim), for A the sum of blocks, (pairs, dim, dim)."""
+        return self._eliminate(blocks, right) if self.narrow else self._iterate(blocks, right)
+
+    def _eliminate(self, blocks: np.ndarray, right: np.ndarray) -> np.ndarray:
+        """Level by level."""
+        A = np.bincount(self.address, blocks[self.some].ravel(), minlength=self.between[-1])
+        r, sizes, levels = right.ravel(), self.sizes, len(self.sizes)
+        held, out = [], np.zeros(right.size)
+        filled, known = np.zeros(()), np.zeros(())
+        for k in range(levels):
+            n, m = sizes[k], sizes[k + 1] if k + 1 < levels else 0
+            D = A[self.within[k] : self.within[k + 1]].reshape(n, n) - filled
+            U = A[self.between[k] : self.between[k + 1]].reshape(n, m)
+            X = np.linalg.solve(D, np.concatenate([U, (r[self.rows[k]] - known)[:, None]], axis=1))
+            held.append(X)
+            filled, known = U.T @ X[:, :-1], U.T @ X[:, -1]
+        last = np.zeros(0)
+        for k in reversed(range(levels)):
+            last = held[k][:, -1] - held[k][:, :-1] @ last
+            out[self.rows[k]] = last
+        return out.reshape(right.shape)
+
+    def _iterate(self, blocks: np.ndarray, right: np.ndarray) -> np.ndarray:
+        """Conjugate gradients, with the blocks of particles for a preconditioner."""
+        own = self.a == self.b
+        inverse = np.linalg.inv(self._summed(blocks[own], self.a[own]))
+        out, r = np.zeros_like(right), right
+        p = z = np.einsum("iab,ib->ia", inverse, r)
+        now = float((r * z).sum())
+        least = ENOUGH * now
+        for _ in range(STEPS):
+            if now <= least:
+                break
+            q = self._summed(np.einsum("kab,kb->ka", blocks, p[self.b]), self.a)
+            far = now / float((p * q).sum())
+            out, r = out + far * p, r - far * q
+            z = np.einsum("iab,ib->ia", inverse, r)
+            now, last = float((r * z).sum()), now
+            p = z + now / last * p
+        return out
+
+    def _summed(self, values: np.ndarray, who: np.ndarray) -> np.ndarray:
+        """The sums of values over the particles that they belong to."""
+        sums = [np.bincount(who, column, minlength=self.count) for column in values.reshape(len(values), -1).T]
+        return np.stack(sums, axis=1).reshape(self.count, *values.shape[1:])
+
+
+def ordered(count: int, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, int]:
+    """The level of each of `count` particles, and their number; those of one piece after those of the other."""
+    order = np.argsort(a, kind="stable")
+    b, begin = b[order], np.concatenate([[0], np.cumsum(np.bincount(a, minlength=count))])
+    level, last = np.full(count, -1), 0
+    for first in range(count):
+        if level[first] < 0:
+            far = spread(level, b, begin, first, last)[1]  # from one end of the piece to the other
+            level[level >= last] = -1
+            last = spread(level, b, begin, far, last)[0]
+    return level, last
+
+
+def spread(level: np.ndarray, b: np.ndarray, begin: np.ndarray, first: int, last: int) -> tuple[int, int]:
+    """Number what hangs together with `first`, from level `last` on; returns the next level, and one of the farthest."""
+    front = np.array([first])
+    while len(front):
+        level[front] = last
+        last, far = last + 1, int(front[0])
+        near = np.concatenate([b[begin[i] : begin[i + 1]] for i in front])
+        front = np.unique(near[level[near] < 0])
+    return last, far
