@@ -106,7 +106,7 @@ def test_a_large_pile_has_the_same_bits_on_all_paths_and_where_a_team_breaks_up(
         w = world(tv.Particles(x, radius=0.5), features, path=path, substeps=3)
         if patience:
             w._runner.step.team.patience = patience
-        alone = [w.step(1 / 60) and w._runner.sheet[step.HANDS] == 1 for _ in range(40)]
+        alone = [w.step(1 / 60) and w._runner.sheet[step.ACTIVE_THREADS] == 1 for _ in range(40)]
         assert not patience or w._runner.step.team.size == 1 or all(alone)
         assert w.last.contacts > 1000
         made.append(w.hash())

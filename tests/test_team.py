@@ -22,16 +22,16 @@ class Dealt:
         self.memory = memory
 
     @ti.kernel
-    def deal(self, hands: ti.i32):
+    def deal(self, active: ti.i32):
         """One thread after the other."""
-        self.team.hands[None] = hands
+        self.team.active_threads[None] = active
         for k in range(ti.static(len(DEALS) * 64)):
             self.times[k] = 0
         for _ in range(1):
-            for me in range(hands):
+            for me in range(active):
                 for row in ti.static(range(len(DEALS))):
-                    for k in range(self.team.deal(DEALS[row][0], DEALS[row][1], me)):
-                        at = row * 64 + self.team.turn(k, DEALS[row][1], me)
+                    for k in range(self.team.dealt_count(DEALS[row][0], DEALS[row][1], me)):
+                        at = row * 64 + self.team.dealt_index(k, DEALS[row][1], me)
                         self.who[at] = me
                         self.times[at] += 1
 
@@ -39,12 +39,12 @@ class Dealt:
 def test_all_is_dealt_out_once_there_and_back():
     # By units, 0 1 2 2 1 0 0 1 2 ... for three threads, whatever is left for the last turn.
     dealt = Dealt(5)
-    for hands in range(1, 6):
-        dealt.deal(hands)
+    for active in range(1, 6):
+        dealt.deal(active)
         who, times = (dealt.memory.read(field).reshape(len(DEALS), 64) for field in (dealt.who, dealt.times))
         for row, (n, unit) in enumerate(DEALS):
             units = np.arange(n) // unit
-            turn, place = units // hands, units % hands
-            assert (times[row, :n] == 1).all() and (times[row, n:] == 0).all(), (hands, n, unit)
-            assert (who[row, :n] == np.where(turn % 2 == 0, place, hands - 1 - place)).all(), (hands, n, unit)
+            turn, place = units // active, units % active
+            assert (times[row, :n] == 1).all() and (times[row, n:] == 0).all(), (active, n, unit)
+            assert (who[row, :n] == np.where(turn % 2 == 0, place, active - 1 - place)).all(), (active, n, unit)
     dealt.memory.destroy()

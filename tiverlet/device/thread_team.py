@@ -61,7 +61,7 @@ def block(b, begin, end):
 
 class Team:
     """size: the number of threads; 1 where there is nobody to wait for, because Taichi itself spreads loops over threads or
-    because there is one thread only. launched: which of the two; phase by phase, as on a GPU. A share of n is what thread `me`
+    because there is one thread only. launched: which of the two; phase by phase, as on a GPU. A share of n is what a thread
     does of it; what the shares are shows in no result. Particles are dealt out piece by piece, there and back, `pieces` in all:
     in a heap those below have more to do than those above, and one thread would wait for the other."""
 
@@ -74,53 +74,53 @@ class Team:
         self.memory = memory
         if size > 1:
             self.arrived = memory.field("team.arrived", 2 * LINE, kind=ti.i32)
-            self.hands = memory.field("team.hands", None, kind=ti.i32, values=size)  # how many of them are at work
+            self.active_threads = memory.field("team.active_threads", None, kind=ti.i32, values=size)  # at work
             self.late = memory.field("team.long_waits", None, kind=ti.i32)
             self.ends = memory.field("team.ends", None, kind=ti.i32)  # 1: in the next substep all but the first leave
 
-    def muster(self, hands: int) -> None:
-        """Before a frame: those who left some frames ago come back. hands: how many were at work in the last one."""
+    def rejoin(self, active: int) -> None:
+        """Before a frame: those who left some frames ago come back. active: how many were at work in the last one."""
         if self.size > 1:
             self._frames += 1
             if self._frames % SHIFT == 0:
                 self.memory.write(self.arrived, 0)
-            if self._alone == 0 and hands == 1:
+            if self._alone == 0 and active == 1:
                 self._alone = ALONE
             elif self._alone > 0:
                 self._alone -= 1
                 if self._alone == 0:
-                    self.memory.write(self.hands, self.size)
+                    self.memory.write(self.active_threads, self.size)
 
     @inline
-    def works(self, me):
-        """Whether thread `me` takes part in the coming substep; all must ask."""
-        return self._works(me) if self.size > 1 else True
+    def works(self, thread):
+        """Whether a thread takes part in the coming substep; all must ask."""
+        return self._works(thread) if self.size > 1 else True
 
     @inline
-    def low(self, n, me):
+    def chunk_begin(self, n, thread):
         """Where the share begins. That of a single thread begins at 0, which LLVM must not know: it would write out loops over
         few particles, one by one, and take half as long again for all."""
-        return self._share(n, me) if self.size > 1 else me * n
+        return self._share(n, thread) if self.size > 1 else thread * n
 
     @inline
-    def high(self, n, me):
+    def chunk_end(self, n, thread):
         """Where it ends."""
-        return self._share(n, me + 1) if self.size > 1 else n
+        return self._share(n, thread + 1) if self.size > 1 else n
 
     @inline
-    def deal(self, n, unit, me):
-        """How many of n things fall to thread `me` where they are dealt out in turn, `unit` at a time."""
-        return self._deal(n, unit, me) if self.size > 1 else n
+    def dealt_count(self, n, unit, thread):
+        """How many of n things fall to a thread where they are dealt out in turn, `unit` at a time."""
+        return self._dealt_count(n, unit, thread) if self.size > 1 else n
 
     @inline
-    def turn(self, k, unit, me):
+    def dealt_index(self, k, unit, thread):
         """Which of them is the k-th."""
-        return self._turn(k, unit, me) if self.size > 1 else me + k
+        return self._dealt_index(k, unit, thread) if self.size > 1 else thread + k
 
     @inline
-    def one(self, n, me):
+    def one(self, n, thread):
         """All of it for one of them, nothing for the others."""
-        return ti.select(me == 0, n, 0) if self.size > 1 else n
+        return ti.select(thread == 0, n, 0) if self.size > 1 else n
 
     @inline
     def wait(self):
@@ -128,59 +128,59 @@ class Team:
         return self._wait() if self.size > 1 else None
 
     @ti.func
-    def _works(self, me):
-        hands = self.hands[None]
-        out = me < hands
+    def _works(self, thread):
+        active = self.active_threads[None]
+        out = thread < active
         if out:
             if self.ends[None] != 0:
-                self.meet(hands)
-                if me == 0:
-                    self.hands[None], self.ends[None] = 1, 0
-                self.meet(hands)
-                out = me == 0
+                self.wait_for(active)
+                if thread == 0:
+                    self.active_threads[None], self.ends[None] = 1, 0
+                self.wait_for(active)
+                out = thread == 0
         return out
 
     @ti.func
-    def watch(self, me):
+    def watch(self, thread):
         """Once in a substep, between two waits, so that all know the same when they ask whether they take part in the next."""
         if ti.static(self.size > 1):
-            if me == 0 and self.late[None] >= LONG and self.hands[None] > 1:
+            if thread == 0 and self.late[None] >= LONG and self.active_threads[None] > 1:
                 self.ends[None] = 1
 
     @ti.func
     def _share(self, n: ti.template(), k):  # type: ignore[valid-type]
-        hands = self.hands[None]
-        return ti.min(k * ((n + hands - 1) // hands), n)
+        active = self.active_threads[None]
+        return ti.min(k * ((n + active - 1) // active), n)
 
     @ti.func
-    def _deal(self, n: ti.template(), unit: ti.template(), me):  # type: ignore[valid-type]
-        hands, units = self.hands[None], ti.static(-(-n // unit))
-        out = (units // hands + ti.cast(self._place(units // hands, me) < units % hands, ti.i32)) * unit
-        if self._place((units - 1) // hands, (units - 1) % hands) == me:
+    def _dealt_count(self, n: ti.template(), unit: ti.template(), thread):  # type: ignore[valid-type]
+        active, units = self.active_threads[None], ti.static(-(-n // unit))
+        out = (units // active + ti.cast(self._place(units // active, thread) < units % active, ti.i32)) * unit
+        if self._place((units - 1) // active, (units - 1) % active) == thread:
             out -= ti.static(-(-n // unit) * unit - n)
         return out
 
     @ti.func
-    def _turn(self, k, unit: ti.template(), me):  # type: ignore[valid-type]
+    def _dealt_index(self, k, unit: ti.template(), thread):  # type: ignore[valid-type]
         before = ti.cast(ti.cast(k, ti.u32) // ti.u32(unit), ti.i32)  # i32 would look at the sign
-        return k + (before * (self.hands[None] - 1) + self._place(before, me)) * unit
+        return k + (before * (self.active_threads[None] - 1) + self._place(before, thread)) * unit
 
     @ti.func
-    def _place(self, turn, me):
-        """The place of thread `me` in a turn: there and back, so that it goes on where it was, and none has always the busier."""
-        return ti.select(turn & 1 == 0, me, self.hands[None] - 1 - me)
+    def _place(self, turn, thread):
+        """The place of a thread in a turn: there and back, so that it goes on where it was, and none has always the busier."""
+        return ti.select(turn & 1 == 0, thread, self.active_threads[None] - 1 - thread)
 
     @ti.func
     def _wait(self):
-        self.meet(self.hands[None])
+        self.wait_for(self.active_threads[None])
 
     @ti.func
-    def meet(self, hands):
+    def wait_for(self, active):
         """Wait for so many. The last one says so in another place than where all arrive, whom those who look would hold up."""
-        if hands > 1:
+        if active > 1:
             before = ti.atomic_add(self.arrived[0], 1)
-            turn = before // hands + 1
-            if before + 1 == turn * hands:
+            turn = before // active + 1
+            if before + 1 == turn * active:
                 ti.atomic_add(self.arrived[LINE], 1)
             else:
                 looks = 0
@@ -190,7 +190,7 @@ class Team:
                     ti.atomic_add(self.late[None], 1)
 
     @ti.func
-    def forgive(self):
+    def reset_wait_count(self):
         """Count long waits from 0 again."""
         if ti.static(self.size > 1):
             self.late[None] = 0

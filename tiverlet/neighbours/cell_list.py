@@ -120,7 +120,7 @@ class Cells:
     @ti.func
     def sort(self, me):
         """Sort the particles into buckets."""
-        for b in range(self.team.low(self.buckets + 2, me), self.team.high(self.buckets + 2, me)):
+        for b in range(self.team.chunk_begin(self.buckets + 2, me), self.team.chunk_end(self.buckets + 2, me)):
             self.edge[b] = 0
         self.team.wait()
         ti.loop_config(serialize=self.serial)

@@ -149,7 +149,7 @@ class Pairs:
     def keep(self, me):
         """Put the list aside, unless one is there already, from a build that did not fit."""
         kept = self.kept[None]
-        for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
+        for i in range(self.team.chunk_begin(self.n, me), self.team.chunk_end(self.n, me)):
             if kept == 0:
                 self.pack(i)
         self.team.wait()

@@ -90,9 +90,9 @@ class Grid(Pairs):
         if ti.static(self.counts):
             self.pair_up(me)
         else:
-            for k in range(self.team.deal(self.blocks, 1, me)):
-                self.fill(self.team.turn(k, 1, me))
-        for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
+            for k in range(self.team.dealt_count(self.blocks, 1, me)):
+                self.fill(self.team.dealt_index(k, 1, me))
+        for i in range(self.team.chunk_begin(self.n, me), self.team.chunk_end(self.n, me)):
             self.origin[i] = self.state.x[i]
         self.team.wait()
         ti.loop_config(serialize=True)
@@ -121,13 +121,13 @@ class Grid(Pairs):
     def pair_up(self, me):
         """Count, then list: on a GPU, by a thread for each particle; and for several levels, each pair that one of the two finds
         with both. What does not fit is only counted."""
-        for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
+        for i in range(self.team.chunk_begin(self.n, me), self.team.chunk_end(self.n, me)):
             self.number[i] = 0
         self.team.wait()
-        for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
+        for i in range(self.team.chunk_begin(self.n, me), self.team.chunk_end(self.n, me)):
             raised(self.number, i, self.scan(i, COUNT, 0, 0), self.serial)
         self.team.wait()
-        for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
+        for i in range(self.team.chunk_begin(self.n, me), self.team.chunk_end(self.n, me)):
             self.first[i] = self.number[i]
         self.team.wait()
         self.sums.run(self.first, me)
@@ -135,17 +135,17 @@ class Grid(Pairs):
         for _ in range(self.team.one(1, me)):
             self.need[None] = self.first[self.n - 1]
         self.team.wait()
-        for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
+        for i in range(self.team.chunk_begin(self.n, me), self.team.chunk_end(self.n, me)):
             self.first[i] = self.first[i] - self.number[i]
             self.number[i] = 0
         self.team.wait()
-        for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
+        for i in range(self.team.chunk_begin(self.n, me), self.team.chunk_end(self.n, me)):
             if self.need[None] <= self.capacity:
                 used = self.scan(i, FILL, self.first[i], 0)
                 if ti.static(not self.several):
                     self.number[i] = used
         self.team.wait()
-        for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
+        for i in range(self.team.chunk_begin(self.n, me), self.team.chunk_end(self.n, me)):
             self.finish(i)
 
     @ti.func

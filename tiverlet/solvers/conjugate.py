@@ -130,7 +130,7 @@ class Krylov(System):
     @ti.func
     def open(self, me):
         """r . z of the first residual."""
-        for k in range(self.team.low(BLOCKS * self.spread, me), self.team.high(BLOCKS * self.spread, me)):
+        for k in range(self.team.chunk_begin(BLOCKS * self.spread, me), self.team.chunk_end(BLOCKS * self.spread, me)):
             if k % self.spread == 0:
                 b, total = k // self.spread, ti.cast(0, ti.f64)
                 for r in range(self.begin_of(b), ti.min(self.begin_of(b + 1), self.rows)):
@@ -155,7 +155,7 @@ class Krylov(System):
     @ti.func
     def go(self, me):
         """One step of conjugate gradients. One that needs a tension too large for the substep is taken back, and is the last."""
-        for i in range(self.team.low(self.n, me), self.team.high(self.n, me)):
+        for i in range(self.team.chunk_begin(self.n, me), self.team.chunk_end(self.n, me)):
             if self.w.of(i) > 0:
                 total = 0 * self.pull[i]
                 for s in range(self.begin[i], self.begin[i + 1]):
@@ -166,7 +166,7 @@ class Krylov(System):
                     total *= self.share[i]
                 self.pull[i] = total
         self.team.wait()
-        for k in range(self.team.low(BLOCKS * self.spread, me), self.team.high(BLOCKS * self.spread, me)):
+        for k in range(self.team.chunk_begin(BLOCKS * self.spread, me), self.team.chunk_end(BLOCKS * self.spread, me)):
             if k % self.spread == 0:
                 b, total = k // self.spread, ti.cast(0, ti.f64)
                 for r in range(self.begin_of(b), ti.min(self.begin_of(b + 1), self.rows)):
@@ -183,7 +183,7 @@ class Krylov(System):
             curve = self.summed()
             self.sums[None][1] = ti.select(curve > 0, self.sums[None][0] / curve, ti.cast(0, ti.f64))
         self.team.wait()
-        for k in range(self.team.low(BLOCKS * self.spread, me), self.team.high(BLOCKS * self.spread, me)):
+        for k in range(self.team.chunk_begin(BLOCKS * self.spread, me), self.team.chunk_end(BLOCKS * self.spread, me)):
             if k % self.spread == 0:
                 b, total, worst = k // self.spread, ti.cast(0, ti.f64), ti.cast(0, ti.f64)
                 far = self.sums[None][1]
@@ -207,7 +207,7 @@ class Krylov(System):
             first, worst = self.sums[None][3], ti.max(worst, self.sums[None][4])
             self.sums[None] = ti.Vector([now, ti.select(before > 0, now / before, 0 * now), back, first, worst], ti.f64)
         self.team.wait()
-        for r in range(self.team.low(self.rows, me), self.team.high(self.rows, me)):
+        for r in range(self.team.chunk_begin(self.rows, me), self.team.chunk_end(self.rows, me)):
             if self.sums[None][2] != 0:
                 self.step[r] = self.step[r] - self.sums[None][2] * self.ahead[r]
                 self.rest[r] = 0

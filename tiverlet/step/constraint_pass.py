@@ -26,7 +26,7 @@ class ConstraintPass:
     def reduce_blocks(self, thread, h, h2_effective, first, fresh, some: ti.template()):  # type: ignore[valid-type]
         """The sums of constraints on many particles, by blocks. some: for which; those of the residual, or all."""
         for f in ti.static([f for f in self.ragged if f.reweighs or some]):
-            for b in range(self.team.low(f.blocks, thread), self.team.high(f.blocks, thread)):
+            for b in range(self.team.chunk_begin(f.blocks, thread), self.team.chunk_end(f.blocks, thread)):
                 f.weigh(b, h, h2_effective, first, fresh)
             self.team.wait()
 
@@ -34,7 +34,7 @@ class ConstraintPass:
     def scatter_blocks(self, thread, h, h2_effective, first, fresh):
         """The moves of constraints on many particles."""
         for f in ti.static(self.ragged):
-            for e in range(self.team.low(f.corner_count, thread), self.team.high(f.corner_count, thread)):
+            for e in range(self.team.chunk_begin(f.corner_count, thread), self.team.chunk_end(f.corner_count, thread)):
                 f.spread(e, h, h2_effective, first, fresh)
             self.team.wait()
 
@@ -43,7 +43,7 @@ class ConstraintPass:
         """h^2 times what springs, at the present positions, accelerate: to the slots."""
         self.reduce_blocks(thread, h, h * h, -1, 0, True)
         for f in ti.static(self.batches):
-            for c in range(self.team.low(f.count, thread), self.team.high(f.count, thread)):
+            for c in range(self.team.chunk_begin(f.count, thread), self.team.chunk_end(f.count, thread)):
                 f.kick(c, h)
         self.team.wait()
         self.scatter_blocks(thread, h, h * h, -1, 0)
@@ -60,7 +60,7 @@ class ConstraintPass:
                 self.slots.hurry(now.first)
             self.team.wait()
         for f in ti.static(self.batches):
-            for c in range(self.team.low(f.count, now.thread), self.team.high(f.count, now.thread)):
+            for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
                 f.relax(c, now.h, h2_effective, now.frame_fraction, now.first, fresh)
         if ti.static(len(self.batches) > 0):
             self.team.wait()
@@ -75,7 +75,7 @@ class ConstraintPass:
                 for _ in range(system.steps):
                     system.go(thread)
             else:
-                for b in range(self.team.low(system.parts, thread), self.team.high(system.parts, thread)):
+                for b in range(self.team.chunk_begin(system.parts, thread), self.team.chunk_end(system.parts, thread)):
                     system.solve(b)
                 self.team.wait()
 
@@ -98,7 +98,7 @@ class ConstraintPass:
             if ti.static(system.steps > 0):
                 system.close(now.thread)
         for f in ti.static(self.told):
-            for c in range(self.team.low(f.count, now.thread), self.team.high(f.count, now.thread)):
+            for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
                 f.take(c, now.first)
         if ti.static(len(self.told) > 0):
             self.team.wait()

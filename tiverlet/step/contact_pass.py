@@ -23,16 +23,16 @@ class ContactPass:
         """Which contacts there are, and what they want of their particles."""
         for c in ti.static(self.contacts):
             if ti.static(c.measures):
-                for i in range(self.team.low(self.n, now.thread), self.team.high(self.n, now.thread)):
+                for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
                     c.measure(i, now.first)
                 self.team.wait()
-            for k in range(self.team.deal(self.particles.pieces, 1, now.thread)):
+            for k in range(self.team.dealt_count(self.particles.pieces, 1, now.thread)):
                 begin, end = self.particles.piece(k, now.thread)
                 for b in range(blocks(begin, end)):
                     low, high = block(b, begin, end)
                     c.count(low, high)
             self.team.wait()
-            for k in range(self.team.deal(self.particles.pieces, 1, now.thread)):
+            for k in range(self.team.dealt_count(self.particles.pieces, 1, now.thread)):
                 begin, end = self.particles.piece(k, now.thread)
                 for b in range(blocks(begin, end)):
                     low, high = block(b, begin, end)
@@ -64,10 +64,10 @@ class ContactPass:
                 for _ in range(self.team.one(1, thread)):
                     c.dev.hit[None] = 0
                 self.team.wait()
-                for i in range(self.team.low(self.n, thread), self.team.high(self.n, thread)):
+                for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
                     c.rebound(i)
                 self.team.wait()
-                for i in range(self.team.low(self.n, thread), self.team.high(self.n, thread)):
+                for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
                     c.part_ways(i)
                 self.team.wait()
 
@@ -76,7 +76,7 @@ class ContactPass:
         """Keep the slip of friction, and what was left of bounces."""
         for c in ti.static(self.contacts):
             if ti.static(c.rubs or c.bounces):
-                for i in range(self.team.low(self.n, thread), self.team.high(self.n, thread)):
+                for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
                     c.remember(i)
             self.team.wait()
             if ti.static(c.bounces):
@@ -88,16 +88,16 @@ class ContactPass:
     def project_velocities(self, thread, k):
         """Pass k of taking the sound out of loaded contacts."""
         for c in ti.static(self.contacts):
-            for p in range(self.team.deal(self.particles.pieces, 1, thread)):
+            for p in range(self.team.dealt_count(self.particles.pieces, 1, thread)):
                 begin, end = self.particles.piece(p, thread)
-                piece = self.team.turn(p, 1, thread)
+                piece = self.team.dealt_index(p, 1, thread)
                 if k == 0:
                     c.dev.calm.open(piece, begin, end)
                 for m in range(begin, begin + c.dev.calm.count[piece]):
                     c.dev.calm.want(c.dev.calm.loaded[m], k)
             self.team.wait()
-            for p in range(self.team.deal(self.particles.pieces, 1, thread)):
+            for p in range(self.team.dealt_count(self.particles.pieces, 1, thread)):
                 begin, end = self.particles.piece(p, thread)
-                for m in range(begin, begin + c.dev.calm.count[self.team.turn(p, 1, thread)]):
+                for m in range(begin, begin + c.dev.calm.count[self.team.dealt_index(p, 1, thread)]):
                     c.dev.calm.move(c.dev.calm.loaded[m])
             self.team.wait()

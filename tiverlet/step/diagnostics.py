@@ -158,7 +158,9 @@ class Diagnostics:
     @ti.func
     def sum_up(self, thread, h64, t64, came, sheet: ti.template()):  # type: ignore[valid-type]
         """By blocks, by blocks of these on a GPU, then by one thread."""
-        for k in range(self.team.low(self.blocks * self.stride, thread), self.team.high(self.blocks * self.stride, thread)):
+        for k in range(
+            self.team.chunk_begin(self.blocks * self.stride, thread), self.team.chunk_end(self.blocks * self.stride, thread)
+        ):
             if k % self.stride == 0:
                 h, t, b = ti.cast(h64, self.step.real), ti.cast(t64, self.step.real), k // self.stride
                 fresh, begin = ti.cast(came == STARTED, ti.i32), ti.cast(came == UNSTEPPED, ti.i32)

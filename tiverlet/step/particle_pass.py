@@ -34,13 +34,13 @@ class ParticlePass:
     @ti.func
     def piece(self, k, thread):
         """The particles of the k-th piece of a thread: the first, and where they end."""
-        first = self.team.turn(k, 1, thread) * self.team.piece
+        first = self.team.dealt_index(k, 1, thread) * self.team.piece
         return first, ti.min(first + self.team.piece, self.n)
 
     @ti.func
     def tile_of(self, k, thread):
         """Those of the k-th tile of a thread."""
-        tile = self.team.turn(k, self.each, thread)
+        tile = self.team.dealt_index(k, self.each, thread)
         piece, first = tile, tile * self.team.piece
         if ti.static(self.each > 1):
             piece = tile // self.each
@@ -50,7 +50,7 @@ class ParticlePass:
     @ti.func
     def integrate(self, now):
         """All particles."""
-        for k in range(self.team.deal(self.pieces * self.each, self.each, now.thread)):
+        for k in range(self.team.dealt_count(self.pieces * self.each, self.each, now.thread)):
             self.advance(k, now)
 
     @ti.func
@@ -86,7 +86,7 @@ class ParticlePass:
     def apply_constraints(self, thread):
         """Move particles as constraints want, before their contacts are solved; the list has to hear of it."""
         for c in ti.static(self.contacts):
-            for i in range(self.team.low(self.n, thread), self.team.high(self.n, thread)):
+            for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
                 self.slots.gather(i)
                 c.heed(self.grid.outrun(i), c.overshoots(i))
             self.team.wait()
@@ -95,7 +95,7 @@ class ParticlePass:
     def apply_corrections(self, now):
         """Move particles as constraints or contacts want, and walls after that."""
         if ti.static(self.acts):
-            for k in range(self.team.deal(self.pieces * self.each, self.each, now.thread)):
+            for k in range(self.team.dealt_count(self.pieces * self.each, self.each, now.thread)):
                 self.move(k, now)
         self.team.wait()
 

@@ -7,14 +7,14 @@ import numpy as np
 
 from ..contact.velocity_projection import EVERY
 from ..device.interrupts import whole
-from ..device.patches.compiler import Quick
+from ..device.patches.compiler import CachedLaunch
 from ..step_report import StepReport
 from . import high_order
 from .clock import Clock
 from .diagnostics import STARTED, STEPPED, UNSTEPPED
 from .integrator import FREE, decay
 from .projection import project
-from .step import CAME, END, GIVE, HALT, HANDS, H, Moment, Span, frame
+from .step import ACTIVE_THREADS, CAME, END, GIVE, HALT, H, Moment, Span, frame
 
 LONG = 10_000_000  # particles and constraints, times passes, in a launch: it takes about a second
 
@@ -42,8 +42,8 @@ class Runner:
     def _prepare(self) -> None:
         """The kernels that are launched in every frame."""
         self.sheet = self.diagnostics.sheet
-        self._fused = Quick(self.step, "fused", self.memory.compiler, self.sheet)
-        self._measure = Quick(self.diagnostics, "measure", self.memory.compiler, self.sheet)
+        self._fused = CachedLaunch(self.step, "fused", self.memory.compiler, self.sheet)
+        self._measure = CachedLaunch(self.diagnostics, "measure", self.memory.compiler, self.sheet)
         self._data, self._given = self.sheet.data, self.sheet.data[H:]
 
     def renew(self) -> None:
@@ -144,7 +144,7 @@ class Runner:
                 span.until, span.part = stages + 1, passes
                 frame(self.launcher, span)
             return
-        self.team.muster(self._data[HANDS])
+        self.team.rejoin(self._data[ACTIVE_THREADS])
         begin = half = resumed = 0
         until, part, some = stages + 1, passes, self.passes_at_once
         splits = self.integrator.stages == 1
@@ -157,7 +157,7 @@ class Runner:
             )  # fmt: skip
             self._fused()
             if self._data[HALT]:
-                resumed, begin, half = (int(v) for v in self._data[HALT:HANDS])
+                resumed, begin, half = (int(v) for v in self._data[HALT:ACTIVE_THREADS])
                 self.memory.write(self.step.halt, 0)
                 self.grow()
                 continue

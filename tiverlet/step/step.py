@@ -110,8 +110,8 @@ class Moment:
 # how it ended: whether, in which substep and before which half of a pass it stopped to have the list grown; how many threads of a
 # team were at work. Then what it is given, see Span, and the number of the first thread.
 FIGURES = 14
-HALT, HANDS = FIGURES, FIGURES + 3
-GIVEN = tuple(range(HANDS + 1, HANDS + 16))
+HALT, ACTIVE_THREADS = FIGURES, FIGURES + 3
+GIVEN = tuple(range(ACTIVE_THREADS + 1, ACTIVE_THREADS + 16))
 H, START, END, TICK, SINCE, FRESH, SUBSTEPS, ITERATIONS, BEGIN, HALF, RESUMED, FIRST, CAME, UNTIL, PART = GIVEN
 SHEET = PART + 1
 GIVE = Struct(f"{len(GIVEN)}d").pack_into  # in a third of the time of an assignment to an array
@@ -185,7 +185,7 @@ class Step:
                 for k in ti.static(range(3)):
                     sheet[HALT + k] = self.halt[None][k]
             if ti.static(self.team.size > 1):
-                sheet[HANDS] = self.team.hands[None]
+                sheet[ACTIVE_THREADS] = self.team.active_threads[None]
 
     @ti.kernel
     def phases(
@@ -275,7 +275,7 @@ class Step:
     def drive(self, now):
         """Driven particles go to where they are to be."""
         for f in ti.static(self.drivers):
-            for c in range(self.team.low(f.count, now.thread), self.team.high(f.count, now.thread)):
+            for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
                 f.drive(c, now.h, now.frame_fraction[1])
                 if ti.static(self.state.befores):  # at the velocity with which it is driven, others meet it
                     self.state.before[f.member(c, 0)] = self.state.d[f.member(c, 0)]
@@ -350,7 +350,7 @@ class Step:
         A rigid constraint may find a whole kick in a start that follows another step, so loads are never taken for half a kick.
         """
         for f in ti.static(self.breakers):
-            for c in range(self.team.low(f.count, now.thread), self.team.high(f.count, now.thread)):
+            for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
                 f.tear(c, self.integrator.reach(now.h, 0), now.tick)
         self.contact_pass.finish(now.thread)
         self.team.wait()
@@ -365,7 +365,7 @@ class Step:
         """What the frame came to."""
         self.diagnostics.reduce_blocks(now.thread, now.span.h64, now.span.came)
         self.diagnostics.sum_up(now.thread, now.span.h64, now.span.end, now.span.came, now.span.sheet)
-        self.team.forgive()
+        self.team.reset_wait_count()
 
     @ti.func
     def is_stale(self):

@@ -128,12 +128,12 @@ def record(kind: Any) -> Any:
     return inline(kind)
 
 
-class Quick:
+class CachedLaunch:
     """A kernel of one object, for many launches: after the first one, past the door at which Taichi looks at the object and at
     each argument anew, which takes 25 us.
 
     Its arguments are arrays, which stay where they are; what they hold may change from launch to launch. It returns nothing. What
-    Taichi freezes at the first compile is frozen, as ever: an object that has changed takes a new Quick.
+    Taichi freezes at the first compile is frozen, as ever: an object that has changed takes a new CachedLaunch.
     """
 
     def __init__(self, owner: Any, name: str, compiler: Compiler, *arrays: np.ndarray):

@@ -10,7 +10,7 @@ import taichi as ti
 from taichi.lang import common_ops, impl, kernel_impl
 from taichi.lang.ast.ast_transformer import ASTTransformer
 
-from .compiler import Quick
+from .compiler import CachedLaunch
 
 ATOMIC = (ti.atomic_add, ti.atomic_sub, ti.atomic_max, ti.atomic_min)
 
@@ -61,7 +61,7 @@ def launches(timed: bool = False) -> Iterator[Launches]:
 
     with replaced(
         (kernel_impl.Kernel, "launch_kernel", counted(kernel_impl.Kernel.launch_kernel, known_as)),
-        (Quick, "launch", counted(Quick.launch, lambda quick, _: quick.name)),
+        (CachedLaunch, "launch", counted(CachedLaunch.launch, lambda quick, _: quick.name)),
     ):
         yield count
 

@@ -13,7 +13,7 @@ import numpy as np
 from ...constraints import Distance
 from ...device import runtime, ti
 from ...device.memory import Memory
-from ...device.patches.compiler import Quick
+from ...device.patches.compiler import CachedLaunch
 from ...features.feature import Feature
 from ...forces import Drag, Gravity
 from ...particles import Particles
@@ -55,7 +55,7 @@ class Baseline:
         self.memory.place()
         self.pull[None] = self.g
         given: Any = np.zeros(5)
-        self.given, self.quick = given.data, Quick(self, "frame", self.memory.compiler, given)
+        self.given, self.quick = given.data, CachedLaunch(self, "frame", self.memory.compiler, given)
         self.restart()
 
     @classmethod
