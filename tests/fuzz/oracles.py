@@ -6,7 +6,6 @@ import numpy as np
 
 from tiverlet.constraints.bend import Angle
 from tiverlet.constraints.core.scalar import Scalar
-from tiverlet.constraints.core.variable_size import Ragged
 from tiverlet.features.feature import Batch
 from tiverlet.measure import overlapping
 
@@ -115,9 +114,9 @@ def rigid(features: list[Any], free: np.ndarray, x: np.ndarray) -> tuple[float, 
     for f in features:
         if not isinstance(f, Batch) or getattr(f, "drives", False) or not f.count:
             continue
-        if not isinstance(f, Scalar) or isinstance(f, Ragged) or f.collapses or (f.compliance > 0).any():
+        if not isinstance(f, Scalar) or not f.arity or f.collapses or (f.compliance > 0).any():
             whole = False
-        if not isinstance(f, Scalar) or isinstance(f, Ragged) or f.collapses:
+        if not isinstance(f, Scalar) or not f.arity or f.collapses:
             continue
         C = f.violation(x)
         C = np.maximum(f.side * C, 0) if f.side else np.abs(C)

@@ -4,13 +4,15 @@ import numpy as np
 
 from .. import checks
 from ..device import ti
-from ..features.feature import Knob
+from ..features.feature import Knob, Scene
+from ..features.members import FixedSize
 from ..particles import Particles
+from .core.enclosed import Enclosed
 from .core.scalar import Scalar
-from .core.variable_size import Content, rows
+from .core.variable_size import Corners, VariableSize, rows
 
 
-class Area(Scalar):
+class Area(Enclosed):
     """Triangles, or closed loops of any length in 2D, that keep their area: cells, soft bodies, cushions.
 
     C(x) = A(x) - pressure rest.
@@ -29,65 +31,61 @@ class Area(Scalar):
     """
 
     index_name = "loops"
-    each = (*Scalar.each, "pressure")
     collapses = 2
     rest = Knob(lambda f, v: checks.per_item("Area", "rest", v, f.count, least=0.0), "Area at pressure 1 [m^2].")
-    pressure = Knob(lambda f, v: checks.per_item("Area", "pressure", v, f.count, least=0.0), "Factor on the rest area.")
-
-    def __new__(cls, loops=(), *args, **kwargs):
-        """Triangles are simpler than loops, and have kernels of their own."""
-        loops = checks.rows("Area", "loops", loops, "a sequence of index sequences")
-        triangles = all(np.ndim(loop) == 1 and len(loop) == 3 for loop in loops)
-        return object.__new__(Triangles if triangles else Loops)
 
     def __init__(self, loops, rest=None, *, pressure=1.0, compliance=0.0, damping=0.0, break_at=None):
         self.setup(loops, rest, compliance, damping, break_at)
         self.pressure = pressure
 
-    def __repr__(self) -> str:
-        return "Area"
-
-    @property
-    def goal(self) -> np.ndarray:
-        """pressure rest."""
-        return self.pressure * self.rest
+    def function_of(self, indices) -> "Triangles | Loops":
+        """Triangles are simpler than loops, and have kernels of their own."""
+        loops = checks.rows("Area", "loops", indices, "a sequence of index sequences")
+        if all(np.ndim(loop) == 1 and len(loop) == 3 for loop in loops):
+            return Triangles(FixedSize("Area", checks.indices("Area", "loops", indices, checks.ANY, arity=3)))
+        return Loops(VariableSize("Area", rows("Area", "loops", indices, 3)))
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Go around each area so that it is positive at the start."""
+        if not self.arity and particles.dim != 2:
+            raise ValueError("Area: loops of more than 3 particles enclose no definite area in 3D; use triangles, or Volume.")
         self.fit(particles)
         if particles.dim == 2:
             self.reverse(self.rest_of(particles.position) < 0)
         Scalar.prepare(self, particles, inv_mass)
 
-    def reverse(self, which: np.ndarray) -> None:
-        """Go around these in the other sense."""
-        raise NotImplementedError
 
+class Triangles:
+    """Areas of triangles. See Enclosed for the methods."""
 
-class Triangles(Area):
-    """Areas of triangles."""
+    def __init__(self, members: FixedSize):
+        self.members = members
+        self.listing, self.pairs = members.listing, members.pairs
 
-    arity = 3
+    def reversed(self, which: np.ndarray) -> "Triangles":
+        """Two corners swapped."""
+        indices = self.members.indices
+        return Triangles(FixedSize("Area", np.where(which[:, None], indices[:, ::-1], indices)))
 
-    def reverse(self, which: np.ndarray) -> None:
-        """Swap two corners."""
-        self.indices = np.where(which[:, None], self.indices[:, ::-1], self.indices)
+    def remapped(self, some: np.ndarray, number: np.ndarray) -> "Triangles":
+        """Those in the mask."""
+        return Triangles(self.members.remapped(some, number))
 
-    def rest_of(self, position: np.ndarray) -> np.ndarray:
-        """Areas of the triangles."""
-        a, b, c = (position[k] for k in self.indices.T)
+    def values(self, members, position: np.ndarray) -> np.ndarray:
+        """Areas of the triangles; signed in 2D."""
+        a, b, c = (position[k] for k in members.indices.T)
         if position.shape[1] == 2:
             (ux, uy), (vx, vy) = (b - a).T, (c - a).T
             return (ux * vy - uy * vx) / 2
         return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
 
     @ti.func
-    def measure(self, c, q):
+    def measure(self, q):
         """Area, and its gradients."""
         a, b = q[1, :], q[2, :]
         f = 0 * a[0]
         u, v = 0 * a, 0 * b
-        if ti.static(self.dev.state.dim == 2):
+        if ti.static(q.m == 2):
             f = (a[0] * b[1] - a[1] * b[0]) / 2
             u, v = ti.Vector([b[1], -b[0]]) / 2, ti.Vector([-a[1], a[0]]) / 2
         else:
@@ -101,55 +99,65 @@ class Triangles(Area):
         return f, ti.Matrix.rows([-u - v, u, v])
 
 
-class Loops(Area, Content):
-    """Areas of closed loops in 2D."""
+class Loops:
+    """Areas of closed loops in 2D. See Enclosed for the methods."""
 
-    arity = 0
+    def __init__(self, members: VariableSize):
+        self.members = members
 
-    def lay(self, members) -> None:
-        """Keep the loops."""
-        self.layout(rows("Area", "loops", members, 3))
+    @property
+    def listing(self) -> list[np.ndarray]:
+        """The particles of each loop."""
+        return self.members.listing
 
-    def fit(self, particles: Particles) -> None:
-        """Loops enclose an area in 2D only."""
-        if particles.dim != 2:
-            raise ValueError("Area: loops of more than 3 particles enclose no definite area in 3D; use triangles, or Volume.")
-        self.known_particles(particles, "loops")
+    def reversed(self, which: np.ndarray) -> "Loops":
+        """Some of them the other way round."""
+        return Loops(VariableSize("Area", [self.members.row(k)[:: -1 if w else 1] for k, w in enumerate(which)]))
 
-    def reverse(self, which: np.ndarray) -> None:
-        """Turn the loops around."""
-        self.layout([self.members_of(k)[:: -1 if w else 1] for k, w in enumerate(which)])
+    def remapped(self, some: np.ndarray, number: np.ndarray) -> "Loops":
+        """Those in the mask."""
+        return Loops(self.members.remapped(some, number))
 
-    def rest_of(self, position: np.ndarray) -> np.ndarray:
+    def values(self, members, position: np.ndarray) -> np.ndarray:
         """Areas by the shoelace formula."""
-        if not self.count:
+        indices, starts = members.indices, members.starts
+        if not members.count:
             return np.zeros(0)
-        r = position[self.indices] - np.repeat(position[self.indices[self.starts[:-1]]], np.diff(self.starts), axis=0)
+        r = position[indices] - np.repeat(position[indices[starts[:-1]]], np.diff(starts), axis=0)
         s = r[self.after]
-        return np.add.reduceat(r[:, 0] * s[:, 1] - r[:, 1] * s[:, 0], self.starts[:-1]) / 2
+        return np.add.reduceat(r[:, 0] * s[:, 1] - r[:, 1] * s[:, 0], starts[:-1]) / 2
 
     @property
     def after(self) -> np.ndarray:
         """The corner that comes after each, around its loop."""
-        out = np.arange(1, len(self.indices) + 1)
-        out[self.starts[1:] - 1] = self.starts[:-1]
+        starts = self.members.starts
+        out = np.arange(1, len(self.members.indices) + 1)
+        out[starts[1:] - 1] = starts[:-1]
         return out
 
-    def partners(self, particles: Particles) -> np.ndarray:
-        """Neighbours along a loop may overlap."""
-        return np.stack([self.indices, self.indices[self.after]], axis=1)
+    def pairs(self) -> np.ndarray:
+        """Neighbours along a loop."""
+        indices = self.members.indices
+        return np.stack([indices, indices[self.after]], axis=1)
 
-    def bind(self, scene) -> None:
-        """Keep the neighbours of each corner."""
-        super().bind(scene)
+    def bind(self, scene: Scene, corners: Corners) -> "LoopGradients":
+        """Its gradients, on the device."""
         before = np.empty_like(self.after)
         before[self.after] = np.arange(len(before))
-        sides = np.stack([self.indices[before], self.indices[self.after]], axis=1)
-        self.dev.sides = scene.memory.field("Area.sides", self.corner_count, width=2, kind=ti.i32, values=sides)
+        indices = self.members.indices
+        return LoopGradients(scene, np.stack([indices[before], indices[self.after]], axis=1))
+
+
+class LoopGradients:
+    """Gradients of areas of loops on the device. sides: the neighbours of each corner, (total, 2)."""
+
+    def __init__(self, scene: Scene, sides: np.ndarray):
+        self.state = scene.state
+        self.sides = scene.memory.field("Area.sides", len(sides), width=2, kind=ti.i32, values=sides)
 
     @ti.func
     def slope(self, e, back):
         """Half the way from the corner before to the corner after, turned by -90 degrees."""
-        i, j = self.dev.sides[e]
-        r = self.dev.state.apart(j, i) - back * (self.dev.state.d[j] - self.dev.state.d[i])
+        i, j = self.sides[e]
+        r = self.state.apart(j, i) - back * (self.state.d[j] - self.state.d[i])
         return ti.Vector([r[1], -r[0]]) / 2

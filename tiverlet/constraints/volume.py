@@ -5,14 +5,16 @@ import numpy as np
 from .. import checks
 from ..device import ti
 from ..features.feature import Knob, Scene
+from ..features.members import FixedSize
 from ..particles import Particles
+from .core.enclosed import Enclosed
 from .core.scalar import Scalar
-from .core.variable_size import Content
+from .core.variable_size import Corners, VariableSize
 
 LARGEST = 1e9  # [m] the square of a volume's gradient, a length to the fourth, has to stay below 3e38
 
 
-class Volume(Scalar):
+class Volume(Enclosed):
     """Tetrahedra, or closed surfaces of triangles, that keep their volume: flesh, balloons.
 
     C(x) = V(x) - pressure rest,   V = sum over faces of a . (b x c) / 6,   grad_a V = sum over the faces at a of b x c / 6.
@@ -31,26 +33,18 @@ class Volume(Scalar):
     """
 
     index_name = "cells"
-    each = (*Scalar.each, "pressure")
     collapses, transcends = 3, True
     rest = Knob(lambda f, v: checks.per_item("Volume", "rest", v, f.count, least=0.0), "Volume at pressure 1 [m^3].")
-    pressure = Knob(lambda f, v: checks.per_item("Volume", "pressure", v, f.count, least=0.0), "Factor on the rest volume.")
-
-    def __new__(cls, cells=(), *args, **kwargs):
-        """Tetrahedra are simpler than meshes, and have kernels of their own."""
-        return object.__new__(Surfaces if np.ndim(cells) == 2 and np.shape(cells)[1] == 3 else Tetrahedra)
 
     def __init__(self, cells, rest=None, *, pressure=1.0, compliance=0.0, damping=0.0, break_at=None):
         self.setup(cells, rest, compliance, damping, break_at)
         self.pressure = pressure
 
-    def __repr__(self) -> str:
-        return "Volume"
-
-    @property
-    def goal(self) -> np.ndarray:
-        """pressure rest."""
-        return self.pressure * self.rest
+    def function_of(self, indices) -> "Tetrahedra | Surfaces":
+        """Tetrahedra are simpler than meshes, and have kernels of their own."""
+        if np.ndim(indices) == 2 and np.shape(indices)[1] == 3:
+            return Surfaces(*_oriented(checks.indices("Volume", "cells", indices, checks.ANY, arity=3)))
+        return Tetrahedra(FixedSize("Volume", checks.indices("Volume", "cells", indices, checks.ANY, arity=4)))
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Turn the corners so that volumes are positive at the start."""
@@ -60,10 +54,6 @@ class Volume(Scalar):
         self.reverse(self.rest_of(particles.position) < 0)
         Scalar.prepare(self, particles, inv_mass)
 
-    def reverse(self, which: np.ndarray) -> None:
-        """Turn these inside out."""
-        raise NotImplementedError
-
     def bind(self, scene: Scene) -> None:
         """Refuse what f32 cannot hold."""
         largest = float(np.cbrt(np.abs(self.goal).max(initial=0.0)))
@@ -72,87 +62,100 @@ class Volume(Scalar):
         super().bind(scene)
 
 
-class Tetrahedra(Volume):
-    """Volumes of tetrahedra."""
+class Tetrahedra:
+    """Volumes of tetrahedra. See Enclosed for the methods."""
 
-    arity = 4
+    def __init__(self, members: FixedSize):
+        self.members = members
+        self.listing, self.pairs = members.listing, members.pairs
 
-    def reverse(self, which: np.ndarray) -> None:
-        """Swap two corners of each."""
-        self.indices = np.where(which[:, None], self.indices[:, [0, 1, 3, 2]], self.indices)
+    def reversed(self, which: np.ndarray) -> "Tetrahedra":
+        """Two corners of some swapped."""
+        indices = self.members.indices
+        return Tetrahedra(FixedSize("Volume", np.where(which[:, None], indices[:, [0, 1, 3, 2]], indices)))
 
-    def rest_of(self, position: np.ndarray) -> np.ndarray:
+    def remapped(self, some: np.ndarray, number: np.ndarray) -> "Tetrahedra":
+        """Those in the mask."""
+        return Tetrahedra(self.members.remapped(some, number))
+
+    def values(self, members, position: np.ndarray) -> np.ndarray:
         """Signed volumes."""
-        a, b, c, d = (position[k] for k in self.indices.T)
+        a, b, c, d = (position[k] for k in members.indices.T)
         return np.einsum("ij,ij->i", b - a, np.cross(c - a, d - a)) / 6
 
     @ti.func
-    def measure(self, c, q):
+    def measure(self, q):
         """Volume, and its gradients."""
         a, b, e = q[1, :], q[2, :], q[3, :]
         u, v, w = b.cross(e) / 6, e.cross(a) / 6, a.cross(b) / 6
         return a.dot(u), ti.Matrix.rows([-u - v - w, u, v, w])
 
 
-class Surfaces(Volume, Content):
-    """Volumes inside closed surfaces."""
+class Surfaces:
+    """Volumes inside closed surfaces. See Enclosed for the methods.
 
-    arity = 0
+    faces: (k, 3), the two at each edge run along it in opposite senses. surface: the surface that each belongs to, (k,).
+    """
 
-    def lay(self, members) -> None:
-        """Find the surfaces, and turn the faces of each alike."""
-        faces = checks.indices("Volume", "cells", members, checks.ANY, arity=3)
-        self.faces, self._surface = _oriented(faces)
-        self.layout([np.unique(self.faces[self._surface == k]) for k in range(int(self._surface.max(initial=-1)) + 1)])
+    def __init__(self, faces: np.ndarray, surface: np.ndarray):
+        self.faces, self.surface = faces, surface
+        self.members = VariableSize("Volume", [np.unique(faces[surface == k]) for k in range(int(surface.max(initial=-1)) + 1)])
 
     @property
     def listing(self) -> np.ndarray:
         """The faces."""
         return self.faces
 
-    def select(self, some: np.ndarray, number: np.ndarray) -> None:
-        """Keep the faces of these surfaces too."""
-        Content.select(self, some, number)
-        self.faces = number[self.faces[some[self._surface]]].astype(np.int32)
-        self._surface = (np.cumsum(some) - 1)[self._surface[some[self._surface]]]
+    def reversed(self, which: np.ndarray) -> "Surfaces":
+        """The faces of some turned around."""
+        return Surfaces(np.where(which[self.surface][:, None], self.faces[:, ::-1], self.faces), self.surface)
 
-    def reverse(self, which: np.ndarray) -> None:
-        """Turn the faces of these around."""
-        self.faces = np.where(which[self._surface][:, None], self.faces[:, ::-1], self.faces)
+    def remapped(self, some: np.ndarray, number: np.ndarray) -> "Surfaces":
+        """Those in the mask."""
+        stays = some[self.surface]
+        return Surfaces(number[self.faces[stays]].astype(np.int32), (np.cumsum(some) - 1)[self.surface[stays]])
 
-    def rest_of(self, position: np.ndarray) -> np.ndarray:
+    def values(self, members, position: np.ndarray) -> np.ndarray:
         """Signed volumes, each seen from one of its own particles."""
-        eye = position[self.indices[self.starts[:-1]]][self._surface][:, None]
+        eye = position[members.indices[members.starts[:-1]]][self.surface][:, None]
         a, b, c = np.moveaxis(position[self.faces] - eye, 1, 0)
         parts = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6
-        return np.bincount(self._surface, weights=parts, minlength=self.count)
+        return np.bincount(self.surface, weights=parts, minlength=members.count)
 
-    def partners(self, particles: Particles) -> np.ndarray:
-        """The ends of an edge may overlap."""
+    def pairs(self) -> np.ndarray:
+        """The ends of each edge."""
         return np.unique(np.sort(_edges(self.faces)[:, :2], axis=1), axis=0)
 
-    def bind(self, scene) -> None:
-        """Keep the faces around each corner: the two other corners of each, in order."""
-        super().bind(scene)
-        key = self._surface[:, None].astype(np.int64) * (scene.particles.count + 1) + self.faces
-        own = self.owner.astype(np.int64) * (scene.particles.count + 1) + self.indices  # sorted, as np.unique made them
+    def bind(self, scene: Scene, corners: Corners) -> "SurfaceGradients":
+        """Its gradients, on the device: the faces around each corner, as the two other corners of each, in order."""
+        members, most = self.members, scene.particles.count + 1
+        key = self.surface[:, None].astype(np.int64) * most + self.faces
+        own = members.owner.astype(np.int64) * most + members.indices  # sorted, as np.unique made them
         corner = np.searchsorted(own, key).ravel()
         others = np.stack([self.faces[:, [1, 2, 0]].ravel(), self.faces[:, [2, 0, 1]].ravel()], axis=1)
         order = np.argsort(corner, kind="stable")
-        rings = np.concatenate([[0], np.cumsum(np.bincount(corner, minlength=self.corner_count))])
+        starts = np.concatenate([[0], np.cumsum(np.bincount(corner, minlength=len(members.indices)))])
+        return SurfaceGradients(scene, corners, starts, others[order])
+
+
+class SurfaceGradients:
+    """Gradients of volumes on the device. ring: the other two corners of the faces around each corner e, from starts[e] on."""
+
+    def __init__(self, scene: Scene, corners: Corners, starts: np.ndarray, ring: np.ndarray):
         add = scene.memory.field
-        self.dev.rings = add("Volume.rings", self.corner_count + 1, kind=ti.i32, values=rings)
-        self.dev.ring = add("Volume.ring", len(order), width=2, kind=ti.i32, values=others[order])
+        self.state, self.members = scene.state, corners.members
+        self.starts = add("Volume.rings", len(starts), kind=ti.i32, values=starts)
+        self.ring = add("Volume.ring", len(ring), width=2, kind=ti.i32, values=ring)
 
     @ti.func
     def slope(self, e, back):
         """Sum of b x c / 6 over the faces around a corner; b and c relative to it, which changes nothing in a closed ring."""
-        i = self.dev.members[e]
-        total = 0 * self.dev.state.d[i]
-        for k in range(self.dev.rings[e], self.dev.rings[e + 1]):
-            j, m = self.dev.ring[k]
-            b = self.dev.state.apart(j, i) - back * (self.dev.state.d[j] - self.dev.state.d[i])
-            c = self.dev.state.apart(m, i) - back * (self.dev.state.d[m] - self.dev.state.d[i])
+        i = self.members[e]
+        total = 0 * self.state.d[i]
+        for k in range(self.starts[e], self.starts[e + 1]):
+            j, m = self.ring[k]
+            b = self.state.apart(j, i) - back * (self.state.d[j] - self.state.d[i])
+            c = self.state.apart(m, i) - back * (self.state.d[m] - self.state.d[i])
             total += b.cross(c)
         return total / 6
 

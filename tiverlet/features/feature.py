@@ -166,21 +166,35 @@ class Batch(Feature):
     particles of constraint c are: self.members(c, k); where their moves go: self.push(c, k, move).
     """
 
-    arity = 0  # 0: as many as each needs, see variable_size.py
+    arity = 0  # 0: as many as each needs, see VariableSize
     reweighs = False  # miss() needs weigh()
-    blocks = corner_count = 0  # of ragged batches: how much there is for weigh() and for spread() to do
     soft = False  # has springs, which act at a start
     breaks = False  # has constraints that a load can break
     drives = False  # puts its particles in place instead of relaxing them
     transcends = False  # takes angles, cube roots or exponentials, which SPIR-V has for f32 only
-    indices: np.ndarray  # (m, arity)
+    members: Any  # FixedSize or VariableSize: the particles of each constraint
     each: tuple[str, ...] = ()  # its arrays with one row for each constraint, beside the indices
     index_name = "indices"  # the argument of __init__ that they are, as `listing` gives them
 
     @property
+    def indices(self) -> np.ndarray:
+        """The particles of each constraint, (m, arity); of constraints of any size all corners one after the other, (total,)."""
+        return self.members.indices
+
+    @property
     def count(self) -> int:
-        """The number of constraints."""
-        return len(self.indices)
+        """The number of constraints, m."""
+        return self.members.count
+
+    @property
+    def blocks(self) -> int:
+        """Of constraints of any size, how much there is for weigh() to do while it is bound; else 0."""
+        return self.dev.corners.blocks_in_all if "corners" in vars(self.dev) else 0
+
+    @property
+    def corner_count(self) -> int:
+        """Of constraints of any size, how much there is for spread() to do: corners; else 0."""
+        return self.dev.corners.count if "corners" in vars(self.dev) else 0
 
     @property
     def residual(self) -> np.ndarray:
@@ -194,7 +208,7 @@ class Batch(Feature):
     @property
     def acts(self) -> bool:
         """Whether it is in a world, and on the device: some of its particles can move, or it drives them."""
-        return self.scene is not None and "members" in vars(self.dev)
+        return self.scene is not None and "slots" in vars(self.dev)
 
     @property
     def broken(self) -> np.ndarray:
@@ -207,15 +221,15 @@ class Batch(Feature):
 
     def members_of(self, c: int) -> np.ndarray:
         """The particles of constraint c."""
-        return self.indices[c]
+        return self.members.row(c)
 
     def idle(self, inv_mass: np.ndarray) -> np.ndarray:
         """Whether each constraint has no particle that can move, (m,)."""
-        return (inv_mass[self.indices] == 0).all(axis=1)
+        return self.members.idle(inv_mass)
 
     def spared(self, number: np.ndarray) -> tuple[np.ndarray, ...]:
         """Constraints stay as long as all of their particles do."""
-        return (np.all(number[self.indices] >= 0, axis=1),)
+        return self.members.kept_mask(number)
 
     def renumber(self, number: np.ndarray, count: int) -> None:
         """Keep the rows of what stays."""
@@ -230,16 +244,15 @@ class Batch(Feature):
     @property
     def listing(self) -> Any:
         """The particles of each constraint, as the user gives them."""
-        return self.indices
+        return self.members.listing
 
     def select(self, some: np.ndarray, number: np.ndarray) -> None:
         """Keep the particles of these constraints, by their new numbers."""
-        self.indices = number[self.indices[some]].astype(np.int32)
+        self.members = self.members.remapped(some, number)
 
     def partners(self, particles: Particles) -> np.ndarray:
         """Pairs of particles that may overlap, (k, 2), because this batch says where they are to each other."""
-        pairs = [self.indices[:, [a, b]] for a in range(self.arity) for b in range(a)]
-        return np.concatenate([*pairs, np.zeros((0, 2), dtype=np.int32)])
+        return self.members.pairs()
 
     def bind(self, scene: Scene) -> None:
         """Declare the particles and slots of each constraint."""
@@ -247,11 +260,7 @@ class Batch(Feature):
         self.dev.state = scene.state
         self.dev.slots = scene.slots
         self.dev.w = scene.state.w
-        self.dev.members = scene.memory.field(f"{self!r}.members", self.count, width=self.arity, kind=ti.i32, values=self.indices)
-        if not self.drives:
-            self.dev.places = scene.memory.field(
-                f"{self!r}.slots", self.count, width=self.arity, kind=ti.i32, values=scene.slots.places(self)
-            )
+        self.members.bind(self, scene)
 
     @inline
     def member(self, c, k):

@@ -5,6 +5,7 @@ import numpy as np
 from ... import checks
 from ...device import ti
 from ...features.feature import Batch, Knob, Scene
+from ...features.members import FixedSize
 from ...particles import Particles
 from .spring import Spring, stiff
 
@@ -29,7 +30,7 @@ class Tether(Batch):
         if len(np.unique(rows)) < len(rows):
             values, counts = np.unique(rows, return_counts=True)
             raise ValueError(f"{who}: particle {values[counts > 1][0]} is named twice, and can have only one place.")
-        self.indices = rows[:, None]
+        self.members = FixedSize(type(self).__name__, rows[:, None])
         self.compliance, self.damping = compliance, damping
 
     def _compliance(self, value) -> np.ndarray:

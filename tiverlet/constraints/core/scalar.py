@@ -8,6 +8,7 @@ import numpy as np
 from ... import checks
 from ...device import ti
 from ...features.feature import FAR, Batch, Knob, Scene
+from ...features.members import FixedSize
 from ...particles import Particles
 from ...tools import distinct
 from .spring import Spring, stiff
@@ -60,12 +61,13 @@ class Scalar(Batch):
 
     def lay(self, indices) -> None:
         """Keep the particles of each constraint."""
-        self.indices = checks.indices(repr(self), self.index_name, indices, checks.ANY, arity=self.arity)
+        indices = checks.indices(repr(self), self.index_name, indices, checks.ANY, arity=self.arity)
+        self.members = FixedSize(type(self).__name__, indices)
         self._warn_duplicates()
 
     def fit(self, particles: Particles) -> None:
         """Check the particles of each constraint against those that there are."""
-        checks.indices(repr(self), self.index_name, self.indices, particles.count, arity=self.arity)
+        self.members.check(repr(self), self.index_name, particles.count)
 
     def _warn_duplicates(self) -> None:
         ordered = self.indices.copy()
@@ -96,7 +98,7 @@ class Scalar(Batch):
     def slopes(self, position: np.ndarray) -> np.ndarray:
         """grad_k f of every constraint, (m, arity, dim), by central differences: each constraint on particles of its own."""
         twin: Any = self.copy()
-        vars(twin)["indices"] = np.arange(self.indices.size).reshape(self.indices.shape)
+        vars(twin)["members"] = FixedSize(type(self).__name__, np.arange(self.indices.size).reshape(self.indices.shape))
         x = position[self.indices]
         step = 1e-6 * (float(np.ptp(x, axis=1).max(initial=0.0)) or 1.0)
         out = np.zeros_like(x)
