@@ -37,13 +37,13 @@ class Ball(Wall):
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the dimension, and that particles fit in."""
-        self.dim = particles.dim
+        self._keep(dim=particles.dim)
         self.center = self.center
         wide = particles.radius >= self.radius
         if self.inside and wide.any():
             i = int(np.argmax(wide))
             raise ValueError(f"Ball: particle {i} of radius {particles.radius[i]:g} m does not fit inside {self.radius:g} m.")
-        self.widest = float(particles.radius.max(initial=0.0))
+        self._keep(widest=float(particles.radius.max(initial=0.0)))
 
     def _size(self, value) -> float:
         value = checks.number("Ball", "radius", value, above=0.0)

@@ -54,8 +54,8 @@ class Box(Wall):
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the corners against the dimension and the widest particle."""
-        self.dim = particles.dim
-        self.widest = float(particles.radius.max(initial=0.0))
+        self._keep(dim=particles.dim)
+        self._keep(widest=float(particles.radius.max(initial=0.0)))
         self.lower, self.upper = self.lower, self.upper
 
     def review(self, particles: Particles, inv_mass: np.ndarray) -> None:

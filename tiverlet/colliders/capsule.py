@@ -39,7 +39,7 @@ class Capsule(Wall):
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the dimension."""
-        self.dim = particles.dim
+        self._keep(dim=particles.dim)
         self.a, self.b = self.a, self.b
 
     def bind(self, scene: Scene) -> None:

@@ -59,7 +59,7 @@ class Moving(Wall):
         """Check the dimension."""
         if self.dim and self.dim != particles.dim:
             raise ValueError(f"{self!r}: it is a wall for {self.dim}D, but the particles are in {particles.dim}D.")
-        self.dim = particles.dim
+        self._keep(dim=particles.dim)
         self.position, self.rotation = self.position, self.rotation
 
     def shape_on(self, scene: Scene) -> Shape:

@@ -63,7 +63,7 @@ class Pin(Tether):
         """Check indices and targets; driven particles cannot be moved by anything else."""
         super().prepare(particles, inv_mass)
         rows = self.indices[:, 0]
-        self.dim = particles.dim
+        self._keep(dim=particles.dim)
         self.target = self.__dict__.get("target", particles.position[rows])
         if self.drives:
             inv_mass[rows] = 0.0

@@ -125,8 +125,7 @@ class Contact(Splitting):
         auto = 0.75 * median(some) if len(some) else 1.0
         self.dev.size = auto if self.skin == "auto" else float(self.skin)
         self.dev.finest = float(radius.min(initial=np.inf))
-        self.matters = len(some) > 0
-        self.table = self.wanted
+        self._keep(matters=len(some) > 0, table=self.wanted)
         if self.matters:
             self.check_range(particles.position)
 

@@ -66,8 +66,8 @@ class Polygons(Rim):
         auto = median(sizes[sizes > 0]) if (sizes > 0).any() else 1.0
         self.dev.size = auto if self.skin == "auto" else float(self.skin)
         self.dev.finest = float((particles.radius + self.dev.reach / 2).min(initial=np.inf))
-        self.table = self.wanted
-        self.matters = n > 0 and bool(self.loops or (particles.radius > 0).any())
+        matters = n > 0 and bool(self.loops or (particles.radius > 0).any())
+        self._keep(matters=matters, table=self.wanted)
         if self.matters:
             self.check_range(x)
 
@@ -79,7 +79,7 @@ class Polygons(Rim):
     def renumber(self, number: np.ndarray, count: int) -> None:
         """Bodies stay as long as all of their particles do."""
         whole = [loop for loop in self.loops if (number[loop] >= 0).all()]
-        self.loops = [number[loop].astype(np.int32) for loop in whole]
+        self._keep(loops=[number[loop].astype(np.int32) for loop in whole])
         self.arguments = {**self.arguments, "loops": self.loops}
 
     def join(self, scene: Scene, batches: list[Batch], team: Team) -> Grid:

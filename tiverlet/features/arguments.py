@@ -3,7 +3,6 @@
 import difflib
 import functools
 import inspect
-import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from types import MappingProxyType
 from typing import Any
@@ -48,11 +47,12 @@ class Knob:
             feature.new_force = True
 
 
-class Noted:
+class RecordsArguments:
     """Objects whose class keeps the arguments of __init__ in `arguments`, by name, as they were then.
 
-    From outside, only knobs can be set: what else an object consists of is compiled into kernels. Its own methods set what they
-    like; arrays become read-only, since no kernel would see what is written to them.
+    Once __init__ is over only knobs can be set, and names that begin with an underscore: what else an object consists of is
+    compiled into kernels. Its own methods set such an attribute by self._keep(name=value). Arrays become read-only, since no
+    kernel would see what is written to them.
     """
 
     arguments: Mapping[str, Any] = MappingProxyType({})
@@ -61,14 +61,20 @@ class Noted:
     def __init_subclass__(cls, **kwargs) -> None:
         super().__init_subclass__(**kwargs)
         if "__init__" in vars(cls):
-            type.__setattr__(cls, "__init__", _noting(cls.__init__))
+            type.__setattr__(cls, "__init__", _recording(cls.__init__))
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if not name.startswith("_") and name not in self.kept_by_world and not isinstance(getattr(type(self), name, None), Knob):
-            if sys._getframe(1).f_locals.get("self") is not self:
-                raise AttributeError(self._refused(name))
-            value = handed_out(value, structure(type(self).__name__, name))
-        object.__setattr__(self, name, value)
+        if name.startswith("_") or name in self.kept_by_world or isinstance(getattr(type(self), name, None), Knob):
+            object.__setattr__(self, name, value)
+        elif "arguments" in self.__dict__:
+            raise AttributeError(self._refused(name))
+        else:
+            self._keep(**{name: value})
+
+    def _keep(self, **values: Any) -> None:
+        """Set attributes that cannot be set from outside."""
+        for name, value in values.items():
+            object.__setattr__(self, name, handed_out(value, structure(type(self).__name__, name)))
 
     def __delattr__(self, name: str) -> None:
         raise AttributeError(f"{self!r}.{name} cannot be deleted.")
@@ -96,16 +102,17 @@ def meant(name: str, names: Iterable[str]) -> str:
     return f"; did you mean {near[0]!r}?" if near else ""
 
 
-def _noting(init):
+def _recording(init):
     signature = inspect.signature(init)
 
     @functools.wraps(init)
-    def noted(self, *args, **kwargs):
+    def recorded(self, *args, **kwargs):
         args, kwargs = _frozen(args), _frozen(kwargs)
         init(self, *args, **kwargs)
-        self.arguments = dict(list(signature.bind(self, *args, **kwargs).arguments.items())[1:])
+        if type(self).__init__ is recorded:  # and not that of a base class, whose subclass is not done yet
+            self.arguments = dict(list(signature.bind(self, *args, **kwargs).arguments.items())[1:])
 
-    return noted
+    return recorded
 
 
 def _frozen(value: Any) -> Any:

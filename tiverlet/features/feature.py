@@ -1,21 +1,24 @@
-"""What acts on particles: the contract that every force, constraint and wall keeps, and the guide to writing one.
+"""What acts on particles: the contract that every force, constraint and collider keeps, and the guide to writing one.
 
-A feature is a batch of arrays and one small kernel function. It checks its arguments in Python, declares its own
-fields, and is absent from memory, from the kernels and from the clock when it is not in the scene. There are these
-kinds, told apart by what the substep asks of them:
+A feature is a batch of arrays and one small kernel function. It checks its arguments in Python, declares its own fields, and is
+absent from memory, from the kernels and from the clock when it is not in the scene. Its kinds are told apart by what a substep
+asks of them:
 
     Acceleration   acceleration(i, x, v, t) of one particle, and/or a linear drag rate
     Batch          relax(c, ...) of one constraint: reads its particles, writes the moves it wants into slots
-    Scalar         (scalar.py) a Batch whose constraint is one number: give measure(c, q) = f and its gradients, and
-                   C = f - rest gets compliance, damping, mass splitting, residual and load from there
-    Ragged         (variable_size.py) a Batch on any number of particles each, summed in blocks; Content, for such a Scalar
-    Tether         (anchored.py) a Batch of particles that are each drawn to a place of its own: give the vector to it
-    Wall           (collider.py) confine(i, ...) of one particle, with the last word
+    Scalar         (constraints/core/scalar.py) a Batch whose constraint is one number: give measure(c, q) = f and its gradients,
+                   and C = f - rest gets compliance, damping, mass splitting, residual and load from there
+    Tether         (constraints/core/anchored.py) a Batch of particles, each drawn to a place of its own: give the vector to it
+    Wall           (colliders/collider.py) confine(i, ...) of one particle, with the last word
+
+Which particles a Batch acts on is an object that it holds, `members`: FixedSize (members.py), or VariableSize
+(constraints/core/variable_size.py) for constraints on any number of particles each.
 
 A new constraint on k particles is one file with one Scalar subclass: `arity = k`, an __init__ that checks its arrays,
 `rest_of(position)` for a default rest value, and `measure`. See constraints/distance.py. Arrays of its own with a row for each
 constraint are named in `each`, and what depends on where particles were is taken from `self.start`, so that a world can be built
-anew around it (edit_scene.py).
+anew around it (step/edit_scene.py). What a method other than __init__ finds out is set by self._keep(name=value), or under a name
+that begins with an underscore: from outside only Knobs can be set.
 """
 
 import functools
@@ -29,7 +32,7 @@ from ..device import at, inline, ti
 from ..device.memory import Memory
 from ..particles import Particles, State
 from .arguments import Knob as Knob
-from .arguments import Noted, knobs_of
+from .arguments import RecordsArguments, knobs_of
 from .read_only import handed_out
 
 BENT, FAR = 1, 2  # how far a constraint turned in a substep: by more than 26 degrees, by more than 41
@@ -55,7 +58,7 @@ class Scene:
         return self.memory.real
 
 
-class Feature(Noted):
+class Feature(RecordsArguments):
     """Base of all. `arguments` are those that it was made with; `changed` says that a knob waits to be uploaded, `new_force`
     that it changes a force, `moving` that a target is under way."""
 
@@ -248,7 +251,7 @@ class Batch(Feature):
 
     def select(self, some: np.ndarray, number: np.ndarray) -> None:
         """Keep the particles of these constraints, by their new numbers."""
-        self.members = self.members.remapped(some, number)
+        self._keep(members=self.members.remapped(some, number))
 
     def partners(self, particles: Particles) -> np.ndarray:
         """Pairs of particles that may overlap, (k, 2), because this batch says where they are to each other."""
@@ -260,6 +263,7 @@ class Batch(Feature):
         self.dev.state = scene.state
         self.dev.slots = scene.slots
         self.dev.w = scene.state.w
+        self.dev.real = scene.real
         self.members.bind(self, scene)
 
     @inline

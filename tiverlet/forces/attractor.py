@@ -26,7 +26,7 @@ class Attractor(Acceleration):
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the vector's length."""
-        self.dim = particles.dim
+        self._keep(dim=particles.dim)
         self.center = self.center
 
     def bind(self, scene: Scene) -> None:

@@ -30,7 +30,7 @@ class Gravity(Acceleration):
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the vector's length."""
-        self.dim = particles.dim
+        self._keep(dim=particles.dim)
         self.g = self.g
 
     def bind(self, scene: Scene) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from .. import colliders, constraints, contact, forces, solvers
 from ..device import runtime
-from ..features.arguments import Noted, knobs_of
+from ..features.arguments import RecordsArguments, knobs_of
 from ..features.feature import Feature
 from ..particles import Particles
 from ..solvers.solver import Solver
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 PARTICLES = ("position", "velocity", "mass", "radius", "pinned", "group")
 PUBLIC = {
     name: kind for module in (colliders, constraints, contact, forces, solvers) for name, kind in vars(module).items()
-    if isinstance(kind, type) and issubclass(kind, Noted)
+    if isinstance(kind, type) and issubclass(kind, RecordsArguments)
 }  # fmt: skip
 Turned = tuple[int, dict[str, Any]]  # the number of a feature, and its knobs
 TAKES = {"Force": ("function",), "Constraint": ("function", "gradient"), "Sdf": ("function", "gradient")}  # functions

@@ -5,14 +5,14 @@ from typing import Any
 import numpy as np
 
 from ..constraints.core.scalar import Scalar
-from ..features.arguments import Noted
+from ..features.arguments import RecordsArguments
 from ..features.feature import Batch, Scene
 from .elimination import plan_of
 
 WIDTH = 16  # of the systems that Direct takes
 
 
-class Solver(Noted):
+class Solver(RecordsArguments):
     """How the constraints of a world are solved.
 
     A solver may take constraints out of the relaxation and solve them together: system() then returns an object of the kind of

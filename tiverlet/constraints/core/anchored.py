@@ -62,7 +62,7 @@ class Tether(Batch):
     def bind(self, scene: Scene) -> None:
         """For what is not driven its multiplier, and for springs their memory."""
         super().bind(scene)
-        self.dev.size, self.dev.real = self.start.size, scene.real
+        self.dev.size = self.start.size
         if not self.drives:
             self.dev.lam = scene.memory.field(f"{self!r}.multiplier", self.count, width=scene.particles.dim, state=True)
             compliance, damping = (self.compliance, self.damping) if self.soft else (None, None)

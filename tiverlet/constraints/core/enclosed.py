@@ -68,13 +68,13 @@ class Enclosed(Scalar):
 
     def select(self, some: np.ndarray, number: np.ndarray) -> None:
         """Keep these constraints, by the new numbers of their particles."""
-        self.function = self.function.remapped(some, number)
-        self.members = self.function.members
+        function = self.function.remapped(some, number)
+        self._keep(function=function, members=function.members)
 
     def reverse(self, which: np.ndarray) -> None:
         """Turn these inside out."""
-        self.function = self.function.reversed(which)
-        self.members = self.function.members
+        function = self.function.reversed(which)
+        self._keep(function=function, members=function.members)
 
     def partners(self, particles: Particles) -> np.ndarray:
         """Neighbours along an outline may overlap, and all corners of a simplex."""

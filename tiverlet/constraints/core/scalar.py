@@ -175,7 +175,6 @@ class Scalar(Batch):
     def bind(self, scene: Scene) -> None:
         """Declare rest values, multipliers, springs and strengths; and, for solvers, which rows of a system constraints are."""
         super().bind(scene)
-        self.dev.real = scene.real
         self.dev.sprung = bool(self.sprung(scene).any())
         start = self.rest_of(self.start.position) if self.count else np.zeros(0)
         self.dev.scale = self.unit or (float(np.abs(start).mean()) if np.any(start) else self.start.size)
