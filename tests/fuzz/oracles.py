@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from tiverlet.constraints.bend import Angle
+from tiverlet.constraints.core.angle import Angle
 from tiverlet.constraints.core.scalar import Scalar
 from tiverlet.features.feature import Batch
 from tiverlet.measure import overlapping

@@ -6,11 +6,11 @@ from .. import checks
 from ..device import ti
 from ..features.feature import Knob, Scene
 from ..particles import Particles
-from .bend import TURN, Turning
+from .core.angle import TURN, Angle, path_angle, path_angles, wrapped
 from .core.scalar import Scalar
 
 
-class AngleLimit(Turning):
+class AngleLimit(Angle):
     """Corners that are free between two angles: elbows, knees, doors.
 
     C(x) = |f(x) - (lower + upper) / 2| - (upper - lower) / 2 <= 0, with the angle f [rad] of Bend, taken within half a turn of
@@ -25,6 +25,9 @@ class AngleLimit(Turning):
     `load` is the moment at either stop [N m].
     """
 
+    arity = 3
+    index_name = "triples"
+    exchangeable = ((0, 2),)
     each = ("lower", "upper", "compliance", "damping", "break_at")
     side = 1
     lower = Knob(lambda f, v: f._bound("lower", v), "The smaller limit [rad].")
@@ -63,7 +66,7 @@ class AngleLimit(Turning):
 
     def rest_of(self, position: np.ndarray) -> np.ndarray:
         """How far the angles are from the middle."""
-        f = Turning.rest_of(self, position) - self.middle
+        f = path_angles(*(position[n] for n in self.indices.T)) - self.middle
         return np.abs(f - TURN * np.round(f / TURN))
 
     def violation(self, position: np.ndarray) -> np.ndarray:
@@ -73,21 +76,21 @@ class AngleLimit(Turning):
     def bind(self, scene: Scene) -> None:
         """The middle of each range."""
         self.dev.middle = scene.memory.field("AngleLimit.middle", self.count, values=self.middle)
-        Turning.bind(self, scene)
+        Angle.bind(self, scene)
 
     def upload(self) -> None:
         """Write new limits."""
-        Turning.upload(self)
+        Angle.upload(self)
         if self.acts:
             self.scene.memory.write(self.dev.middle, self.middle)
 
-    near, distinct = Scalar.near, Scalar.distinct  # a distance from the middle has one value, and acts on one side of straight
+    near = Scalar.near  # a distance from the middle has one value
 
     @ti.func
     def measure(self, c, q):
         """See the class."""
-        f, g = self.turning(c, q)
+        f, g = path_angle(q, 0 * q[0, :], False, self.faint())
         middle = self.dev.middle[c]
-        f = Turning.near(self, f, middle) - middle
+        f = wrapped(f, middle) - middle
         side = ti.select(f < 0, ti.cast(-1, self.dev.real), ti.cast(1, self.dev.real))
         return side * f, side * g

@@ -47,6 +47,7 @@ class Constraint(Scalar):
 
     index_name = "indices"
     exchangeable = ()
+    size = 0.0  # of the scene [m]
     rest = Knob(lambda f, v: checks.per_item(repr(f), "rest", v, f.count), "What function should be.")
 
     def __init__(

@@ -3,7 +3,7 @@
 import numpy as np
 
 from ..device import ti
-from .bend import SHORT, Angle
+from .core.angle import SHORT, Angle
 
 
 class Dihedral(Angle):

@@ -1,0 +1,87 @@
+"""What constraints on an angle share, and the angle of a path."""
+
+import numpy as np
+
+from ... import checks
+from ...device import ti
+from ...features.feature import Knob
+from .scalar import Scalar
+
+TURN = 2 * np.pi
+SHORT = 1e-24  # [m^2] squared length below which a link has no direction, in f32 and far below any in use
+
+
+class Angle(Scalar):
+    """What all constraints on an angle share: C is the wrapped difference, in (-pi, pi], and residuals are in radians."""
+
+    unit, transcends = 1.0, True
+    rest = Knob(lambda f, v: checks.per_item(repr(f), f.rest_name, v, f.count, least=-TURN, most=TURN), "Rest angle [rad].")
+
+    def violation(self, position: np.ndarray) -> np.ndarray:
+        """C at the given positions."""
+        C = self.rest_of(position) - self.rest
+        return C - TURN * np.round(C / TURN)
+
+    @ti.func
+    def near(self, f, other):
+        """f plus whole turns, within half a turn of `other`."""
+        return wrapped(f, other)
+
+    @ti.func
+    def faint(self):
+        """|u x v| of unit vectors below which their normal is lost in rounding."""
+        return ti.cast(ti.static(1e-13 if self.dev.state.double else 1e-6), self.dev.real)
+
+
+@ti.func
+def wrapped(f, other):
+    """f plus whole turns, within half a turn of `other`."""
+    return f - ti.static(TURN) * ti.round((f - other) * ti.static(1 / TURN))
+
+
+def path_angles(i: np.ndarray, j: np.ndarray, k: np.ndarray) -> np.ndarray:
+    """What path_angle() measures, of corners (m, dim) [m]: (m,) [rad]."""
+    a, b = j - i, k - j
+    dot = (a * b).sum(axis=1)
+    if i.shape[1] == 2:
+        return np.arctan2(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], dot)
+    return np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), dot)
+
+
+@ti.func
+def path_angle(q, axis, mirrored, faint):
+    """The angle by which a path of corners q = (i, j, k) turns at j, and its gradients: 0 where it is straight, pi where it folds
+    back; none where two corners coincide.
+
+    f(x) = atan2(|u x v|, u . v) with the unit vectors u of a = x_j - x_i and v of b = x_k - x_j; signed in 2D, positive to the
+    left. With the unit normal e of the plane (2D: out of the page),
+
+        grad_i f = e x u / |a|,   grad_k f = e x v / |b|,   grad_j f = -(grad_i f + grad_k f).
+
+    In 3D the normal of a straight or folded path is undefined; `axis` takes its place there, or any where that is 0.
+    mirrored: the angle is seen from the side of `axis`, so that it is negative where the normal points away from it.
+    faint: |u x v| below which the normal is lost in rounding.
+    """
+    a, b = q[1, :] - q[0, :], q[2, :] - q[1, :]
+    aa, bb = a.dot(a), b.dot(b)
+    f, g, k = ti.zero(aa), 0 * a, 0 * a
+    if aa > SHORT and bb > SHORT:
+        u, v = a / ti.sqrt(aa), b / ti.sqrt(bb)
+        if ti.static(q.m == 2):
+            f = ti.atan2(u[0] * v[1] - u[1] * v[0], u.dot(v))
+            g, k = ti.Vector([-u[1], u[0]]), ti.Vector([-v[1], v[0]])
+        else:
+            e, side = u.cross(v), 1 + ti.zero(aa)
+            if mirrored and axis.dot(e) < 0:
+                side = -side
+            if axis.dot(axis) == 0:  # any, away from u
+                if ti.abs(u[0]) < 0.6:
+                    axis[0] = 1
+                else:
+                    axis[1] = 1
+            n = side * e + faint * (axis - axis.dot(u) * u)
+            n /= ti.max(n.norm(), 1e-30)
+            f = ti.atan2(e.dot(n), u.dot(v))
+            g, k = n.cross(u), n.cross(v)
+        g, k = g / ti.sqrt(aa), k / ti.sqrt(bb)
+    return f, ti.Matrix.rows([g, -(g + k), k])
