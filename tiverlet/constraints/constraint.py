@@ -91,9 +91,10 @@ class Constraint(Scalar):
         checks.indices(repr(self), self.index_name, self.indices, particles.count, arity=self.arity)
         if self.origin is not None or self.arity == 1:
             origin = np.zeros(particles.dim) if self.origin is None else self.origin
-            self._keep(origin=checks.vector(repr(self), "origin", origin, particles.dim))
-            high = self.origin.astype(np.float32).astype(np.float64)  # two words: in f32 too, the origin is where it was put
-            self.dev.origin = [high.tolist(), (self.origin - high).tolist()]
+            origin = checks.vector(repr(self), "origin", origin, particles.dim)
+            self._keep(origin=origin)
+            high = origin.astype(np.float32).astype(np.float64)  # two words: in f32 too, the origin is where it was put
+            self.dev.origin = [high.tolist(), (origin - high).tolist()]
         self._keep(size=particles.size)
         self.dev.known: tuple[Any, Any, Any] = (None, None, None)
         self.dev.fixed = int(self.origin is None)
