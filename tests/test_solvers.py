@@ -4,9 +4,11 @@ import re
 
 import numpy as np
 import pytest
+import taichi as ti
 
 import tiverlet as tv
 from tiverlet.report.accuracy import points
+from tiverlet.solvers.solver import SemiIteration, Solver
 from tiverlet.solvers.spectrum import largest
 
 
@@ -107,6 +109,80 @@ def test_chebyshev_converges_as_the_square_root(world):
     assert left[tv.Chebyshev, 8] < left[tv.Jacobi, 8] / 4 and left[tv.Chebyshev, 24] < left[tv.Jacobi, 24] / 10
 
 
+class Damped(Solver):
+    """Jacobi with half of each correction: a solver in three lines."""
+
+    def relaxed_by(self, scene, batches, split):
+        return 0.5
+
+
+class HeavyBall(Solver):
+    """Jacobi with momentum (Polyak 1964): d_j = a z_j + b d_(j-1), for eigenvalues from 1 / kappa to 1."""
+
+    converges = True
+
+    def __init__(self, kappa=16.0):
+        root = kappa**-0.5
+        self.a, self.b = 4 / (1 + root) ** 2, ((1 - root) / (1 + root)) ** 2
+
+    def semi_iteration(self, scene):
+        return Ball(self.a, self.b)
+
+
+class Ball(SemiIteration):
+    def __init__(self, a, b):
+        self.a, self.b = a, b
+
+    @ti.func
+    def step(self, last, correction):
+        return self.a * correction + self.b * last
+
+
+def recursive(solver, eigenvalue, k):
+    """p_(j+1) = (1 + b - a lambda) p_j - b p_(j-1), p_0 = 1, p_1 = 1 - a lambda: what k heavy balls leave."""
+    before, now = 1.0, 1 - solver.a * eigenvalue
+    for _ in range(k - 1):
+        before, now = now, (1 + solver.b - solver.a * eigenvalue) * now - solver.b * before
+    return now
+
+
+def chebyshev(solver, eigenvalue, k):
+    """T_k((theta - lambda) / delta) / T_k(theta / delta) on 1 / kappa ... 1."""
+    low, T = 1 / solver.condition(k), np.polynomial.chebyshev.Chebyshev.basis(k)
+    return T((1 + low - 2 * eigenvalue) / (1 - low)) / T((1 + low) / (1 - low))
+
+
+# Every solver that relaxes, and the polynomial of the eigenvalue and of k by which k passes multiply a mode. A new one is a row.
+POLYNOMIALS = [
+    (tv.Jacobi(1.2), lambda solver, eigenvalue, k: (1 - solver.relaxation * eigenvalue) ** k),
+    (Damped(), lambda solver, eigenvalue, k: (1 - eigenvalue / 2) ** k),
+    (tv.Chebyshev(), chebyshev),
+    (tv.Chebyshev(kappa=5), chebyshev),
+    (HeavyBall(), recursive),
+]
+
+
+@pytest.mark.parametrize("solver, polynomial", POLYNOMIALS, ids=lambda v: type(v).__name__)
+def test_passes_leave_of_each_mode_what_their_polynomial_says(world, solver, polynomial):
+    # A straight chain of m links between two pins, moved along itself, where constraints are linear: k passes take C to
+    # p_k(A D^-1) C. Masses split by two give D = 4 w, 2 w at the pins, so that A D^-1 has the eigenvalues
+    # (1 - cos(pi j / (m - 1))) / 2, and the vectors cos(pi j i / (m - 1)), halved at the pins, for the links i.
+    m = 9
+    i, rest = np.arange(m), np.full(m, 1.0)
+    pairs = np.stack([i, i + 1], axis=1)
+    start = tv.Particles(np.stack([np.arange(m + 1.0), np.zeros(m + 1)], axis=1), pinned=[0, m])
+    w = world(start, [tv.Distance(pairs, rest)], solver=solver, precision="f64", substeps=1, iterations=4, path="fused")
+    for j, k in ((1, 4), (3, 4), (m - 1, 4), (2, 7), (5, 8)):
+        mode = np.cos(np.pi * j * i / (m - 1)) * np.where((i == 0) | (i == m - 1), 0.5, 1.0) * 1e-3
+        x = start.position.copy()
+        x[1:, 0] += np.cumsum(mode)
+        w.position, w.velocity, w.iterations = x, 0 * x, k
+        w.step(1 / 60)
+        left = np.diff(w.position[:, 0]) - rest
+        eigenvalue = (1 - np.cos(np.pi * j / (m - 1))) / 2
+        np.testing.assert_allclose(left, polynomial(solver, eigenvalue, k) * mode, rtol=0, atol=1e-14)
+
+
 def test_64_chebyshev_refuses_what_is_unstable(world):
     x, pairs = cloth(3)
     with pytest.raises(
@@ -181,7 +257,7 @@ def test_what_is_drawn_straight_between_pins_gains_no_energy(world, solver, prec
     # of which a thousandth is allowed for what a substep is off.
     x, pairs = cloth(12)
     start = tv.Particles(x, mass=1e-3, pinned=pins)
-    iterations = 4 if solver.accelerates else 1
+    iterations = 4 if isinstance(solver, tv.Chebyshev) else 1
     w = world(
         start, [tv.Gravity(9.81), tv.Distance(pairs)], solver=solver, precision=precision, iterations=iterations, path="fused"
     )

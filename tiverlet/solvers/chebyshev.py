@@ -3,7 +3,9 @@
 import numpy as np
 
 from .. import checks
-from .solver import Solver
+from ..device import ti
+from ..features.feature import Scene
+from .solver import SemiIteration, Solver
 
 LIMIT = 1.29  # kappa <= LIMIT k^2: T_k > 3, so that the residual polynomial stays above -1/3
 
@@ -23,7 +25,7 @@ class Chebyshev(Solver):
     Ropes, spacers and what is not one number are relaxed as by Jacobi beside it.
     """
 
-    accelerates = converges = True
+    converges = True
 
     def __init__(self, kappa: float | None = None):
         self.kappa = None if kappa is None else checks.number("Chebyshev", "kappa", kappa, above=1.0)
@@ -41,5 +43,39 @@ class Chebyshev(Solver):
         """The condition number that so many passes are made for."""
         return self.kappa or max(LIMIT / 2 * iterations**2, 1.1)
 
+    def semi_iteration(self, scene: Scene) -> "ChebyshevPasses":
+        """The weights on the device."""
+        return ChebyshevPasses(self, scene)
+
     def __repr__(self) -> str:
         return "Chebyshev()" if self.kappa is None else f"Chebyshev(kappa={self.kappa:g})"
+
+
+class ChebyshevPasses(SemiIteration):
+    """The weights of the coming pass, from those of the one before."""
+
+    def __init__(self, solver: Chebyshev, scene: Scene):
+        self.solver, self.memory, self.real = solver, scene.memory, scene.real
+        self.weights = scene.memory.field("chebyshev.weights", None, width=3, kind=ti.f64)  # of last, of correction; rho
+        self.kappa = scene.memory.field("chebyshev.condition", None, kind=ti.f64)
+
+    def prepare(self, iterations: int) -> None:
+        """Take the condition number."""
+        self.memory.write(self.kappa, self.solver.condition(iterations))
+
+    @ti.func
+    def begin(self, first):
+        """rho_j from rho_(j-1): T_(j+1) = 2 sigma T_j - T_(j-1)."""
+        delta = (1 - 1 / self.kappa[None]) / 2
+        sigma = (1 - delta) / delta
+        rho = self.weights[None][2]
+        if first != 0:
+            self.weights[None] = ti.Vector([0, 1 / (1 - delta), 1 / sigma], ti.f64)
+        else:
+            now = 1 / (2 * sigma - rho)
+            self.weights[None] = ti.Vector([now * rho, 2 * now / delta, now], ti.f64)
+
+    @ti.func
+    def step(self, last, correction):
+        """d_j."""
+        return ti.cast(self.weights[None][0], self.real) * last + ti.cast(self.weights[None][1], self.real) * correction

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ..constraints.core.scalar import Scalar
+from ..constraints.core.scalar import TENSEST, Scalar
 from ..device import ti
 from ..features.feature import BENT, FAR, Batch, Scene
 
@@ -36,10 +36,7 @@ class Slots:
         self.state = state
         self.move = memory.field("slots.move", self.total, width=state.dim)
         self.begin = memory.field("slots.begin", n + 1, kind=ti.i32, values=np.concatenate([[0], np.cumsum(degree)]))
-        self.accelerates = solver.accelerates
-        if self.accelerates:
-            self.pace = memory.field("slots.pace", None, width=3, kind=ti.f64)
-            self.kappa = memory.field("slots.kappa", None, kind=ti.f64)
+        self.semi_iteration = solver.semi_iteration(scene)
         self.converges = solver.converges
         if self.converges:
             self.tension = memory.field("slots.tension", None, kind=ti.f64)
@@ -64,21 +61,12 @@ class Slots:
         return self.system.row(batch) if self.system else np.full(batch.count, -1)
 
     @ti.func
-    def hurry(self, first):
-        """The Chebyshev weights of the coming pass: of the step before, of the correction; and rho. See Chebyshev."""
-        delta = (1 - 1 / self.kappa[None]) / 2
-        sigma = (1 - delta) / delta
-        rho = self.pace[None][2]
-        if first != 0:
-            self.pace[None] = ti.Vector([0, 1 / (1 - delta), 1 / sigma], ti.f64)
-        else:
-            now = 1 / (2 * sigma - rho)
-            self.pace[None] = ti.Vector([now * rho, 2 * now / delta, now], ti.f64)
-
-    @ti.func
-    def hurried(self, step, correction):
-        """The step of a multiplier, from its last one and the correction."""
-        return ti.cast(self.pace[None][0], self.state.real) * step + ti.cast(self.pace[None][1], self.state.real) * correction
+    def limited(self, wanted, lever):
+        """A multiplier without what the substep cannot stand: (omega h)^2 = lever |multiplier| beyond TENSEST. It is noted."""
+        most = TENSEST / lever
+        if ti.abs(wanted) >= most:
+            ti.atomic_max(self.tension[None], ti.cast(TENSEST * ti.abs(wanted) / most, ti.f64))
+        return ti.max(-most, ti.min(most, wanted))
 
     @ti.func
     def turn(self, along, sizes):

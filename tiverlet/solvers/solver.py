@@ -1,10 +1,11 @@
-"""What every solver answers, and the answers of one that does nothing special."""
+"""What a solver is asked, and the answers of one that does nothing special."""
 
 from typing import Any
 
 import numpy as np
 
 from ..constraints.core.scalar import Scalar
+from ..device import ti
 from ..features.arguments import RecordsArguments
 from ..features.feature import Batch, Scene
 from .elimination import plan_of
@@ -12,26 +13,44 @@ from .elimination import plan_of
 WIDTH = 16  # of the systems that Direct takes
 
 
+class SemiIteration:
+    """Passes over constraints that are relaxed by themselves, each of which knows the last step of its multiplier.
+
+    That is all that Chebyshev's semi-iteration, heavy balls and their like need. Sums over all constraints are for a System.
+    """
+
+    def prepare(self, iterations: int) -> None:
+        """Before a frame with so many passes in a substep."""
+
+    @ti.func
+    def begin(self, first):
+        """Before a pass, by one thread. first: 1 in the first pass of a substep."""
+
+    @ti.func
+    def step(self, last, correction):
+        """The step of a multiplier, from the last one (0 in the first pass) and the correction of Jacobi, which is times
+        relaxed_by()."""
+        return correction
+
+
 class Solver(RecordsArguments):
     """How the constraints of a world are solved.
 
-    A solver may take constraints out of the relaxation and solve them together: system() then returns an object of the kind of
-    direct.System. What is left is relaxed one by one, by the factor relaxed_by(), and is sped up over the passes of a substep
-    where `accelerates`.
+    A solver may take constraints out of the relaxation and solve them together, by a System. What is left is relaxed one by one,
+    by the factor relaxed_by(), and by a SemiIteration where it has one. A new solver is one file with one subclass, named in
+    solvers/__init__.py, and a row in tests/test_solvers.py.
     """
 
-    accelerates = False
     converges = False  # within a substep, so that tensions can be too large for it
 
     def check(self, iterations: int) -> None:
         """Raise ValueError where so many iterations make no sense."""
 
-    def condition(self, iterations: int) -> float:
-        """The condition number that the passes of a substep are made for, where they are accelerated."""
-        return 1.0
-
     def system(self, scene: Scene, batches: list[Batch], slots) -> Any:
-        """What is solved together, on the device; None for nothing."""
+        """The System of what is solved together; None for nothing."""
+
+    def semi_iteration(self, scene: Scene) -> SemiIteration | None:
+        """How passes follow one another; None for those of Jacobi. It asks for `converges`."""
 
     def relaxed_by(self, scene: Scene, batches: list[Batch], split: np.ndarray) -> float:
         """The factor on each correction of what is relaxed by itself."""

@@ -17,7 +17,7 @@ class ConstraintPass:
         self.steps = max([s.steps for s in self.systems], default=0)
         for system in self.systems:
             system.team, system.spread = team, stride
-        self.hurries = bool(scene.slots) and scene.slots.accelerates
+        self.semi_iterations = [scene.slots.semi_iteration] if scene.slots and scene.slots.semi_iteration else []
         self.told = [b for b in batches if isinstance(b, Scalar) and b.dev.told]
         self.ragged = [b for b in batches if b.blocks]
         self.springs = any(b.soft for b in batches)
@@ -54,10 +54,10 @@ class ConstraintPass:
         fresh = now.fresh if ti.static(self.integrator.half_kick) else 0
         h2_effective = self.integrator.reach(now.h, fresh)
         self.reduce_blocks(now.thread, now.h, h2_effective, now.first, fresh, True)
-        if ti.static(self.hurries):
+        for semi_iteration in ti.static(self.semi_iterations):
             ti.loop_config(serialize=True)
             for _ in range(self.team.one(1, now.thread)):
-                self.slots.hurry(now.first)
+                semi_iteration.begin(now.first)
             self.team.wait()
         for f in ti.static(self.batches):
             for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):

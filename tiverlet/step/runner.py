@@ -33,7 +33,7 @@ class Runner:
         # Asked in every frame, and Taichi looks at each attribute of what has kernels.
         step = self.step
         self.n, self.launched, self.team, self.integrator = step.n, step.launched, step.team, step.integrator
-        self.hurries, self.drags = step.constraints.hurries, step.integrator.forces.drags
+        self.semi_iterations, self.drags = step.constraints.semi_iterations, step.integrator.forces.drags
         self.probe = high_order.Probe(step) if self.scene.order > 2 else None
         self.passes_at_once = max(1, LONG // (1 + self.n + sum(b.count for b in self.batches)))  # in a launch
         self.launcher = Launcher(self)
@@ -82,9 +82,9 @@ class Runner:
 
     def advance(self, dt: float, substeps: int, iterations: int) -> StepReport:
         """One frame from where begin() left off."""
-        if self.hurries:
+        for semi_iteration in self.semi_iterations:
             with self.memory.compiler():
-                self.memory.write(self.scene.slots.kappa, self.solver.condition(iterations))
+                semi_iteration.prepare(iterations)
         clock = self.clock
         span, started = clock.counted(dt), clock.d_is_velocity and substeps == 1
         self.run(substeps if self.n else 0, iterations, span[0] + span[1] * span[2], STARTED if started else STEPPED)

@@ -190,11 +190,11 @@ class Scalar(Batch):
         if self.dev.told:
             self.dev.row = add(f"{name}.row", m, kind=ti.i32, values=rows)
         self.dev.cusp = self.cusp
-        self.dev.firm = self.joins and (self.dev.told or scene.slots.accelerates)
+        self.dev.firm = self.joins and (self.dev.told or bool(scene.slots.semi_iteration))
         if self.dev.firm:
             self.dev.close = add(f"{name}.close", m, values=self.closeness(self.start.position))
-        self.dev.hurries = self.dev.firm and scene.slots.accelerates and self.dev.alone and self.side == 0
-        if self.dev.hurries:
+        self.dev.steps = bool(self.dev.firm and scene.slots.semi_iteration and self.dev.alone and self.side == 0)
+        if self.dev.steps:
             self.dev.step = add(f"{name}.step", m)
 
     def upload(self) -> None:
@@ -400,16 +400,13 @@ class Scalar(Batch):
                         move += w * w * n[k, :].dot(n[k, :])
                     new = self.tempered(c, lam, new, self.corners(c, 0).norm_sqr(), move)
                 step = new - lam
-                if ti.static(self.dev.hurries):
+                if ti.static(self.dev.steps):
                     last = self.dev.step[c]
                     if first != 0:
                         last = 0
-                    most = TENSEST / self.lever(c, W / 2)  # split by two in a chain
-                    wanted = lam + self.dev.slots.hurried(last, step)
-                    step = ti.max(-most, ti.min(most, wanted)) - lam
+                    wanted = lam + self.dev.slots.semi_iteration.step(last, step)
+                    step = self.dev.slots.limited(wanted, self.lever(c, W / 2)) - lam  # split by two in a chain
                     self.dev.step[c] = step
-                    if ti.abs(wanted) >= most:
-                        ti.atomic_max(self.dev.slots.tension[None], ti.cast(TENSEST * ti.abs(wanted) / most, ti.f64))
                     new = lam + step
                 self.dev.lam[c] = new
         for k in ti.static(range(self.arity)):
