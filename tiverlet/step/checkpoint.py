@@ -25,8 +25,9 @@ class Kept:
 
     def digest(self) -> str:
         """SHA-256 of the exact state, the clock, and what the guard remembers."""
-        longer = [self.clock["_longest"]] if self.clock["_longest"] > self.clock["_h"] else []
-        out = hashlib.sha256(repr((*(self.clock[name] for name in HASHED), *longer, *self.guard)).encode())
+        later = [self.clock["_longest"]] if self.clock["_longest"] > self.clock["_h"] else []  # seen when h changes
+        later += ["softened"] if self.clock["_softened"] else []
+        out = hashlib.sha256(repr((*(self.clock[name] for name in HASHED), *later, *self.guard)).encode())
         for name, values in self._lasting().items():
             out.update(name.encode())
             out.update(values.tobytes())
@@ -119,7 +120,9 @@ def check(world: "World", kept: Kept, flagged: list[list[bool]]) -> None:
         raise ValueError("The state is not one of this scene: pairs in contact carry other numbers of values.")
     clock = kept.clock
     right = [type(clock[name]) is int and 0 <= clock[name] < 2**31 for name in ("_tick", "_since")]
-    right += [type(v) is bool for v in (clock["_fresh"], clock["_started"], *(b for pair in flagged for b in pair))]
+    right += [
+        type(v) is bool for v in (clock["_fresh"], clock["_started"], clock["_softened"], *(b for pair in flagged for b in pair))
+    ]
     numbers = [clock[name] for name in ("_time", "_h", "_longest")]
     right += [type(v) in (int, float) for v in (*numbers, *clock["_frame"], clock["_energy"] or 0)]
     right += [clock["_placed"] is None or 0 <= clock["_placed"] <= len(world.particles), len(flagged) == len(world.features)]

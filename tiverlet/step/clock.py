@@ -9,7 +9,7 @@ import numpy as np
 NAMES = {
     "_time": "time", "_tick": "tick", "_since": "since", "_h": "h", "_fresh": "d_is_velocity", "_longest": "longest",
     "_frame": "frame", "_drag": "drag", "_started": "started", "_owed": "owed", "_parted": "parted", "_placed": "first_moved",
-    "_energy": "energy",
+    "_energy": "energy", "_softened": "softened",
 }  # fmt: skip
 HASHED = tuple(NAMES)[:5]
 
@@ -24,7 +24,8 @@ class Clock:
     began [s], their length [s], their number. drag: what it makes of h, see integrator.decay(). owed: [s] of the kick by rigid
     constraints that the velocities at the last start lacked. parted: velocities, until the next step, where constraints were
     removed that have a part in them. first_moved: the first of the particles that the user placed and that were not looked at
-    yet. energy: at the end of the last frame [J]; None: not known.
+    yet. energy: at the end of the last frame [J]; None: not known. softened: whether loads had no direction in it, and were held
+    by violations.
     """
 
     time: float = 0.0
@@ -40,6 +41,7 @@ class Clock:
     parted: np.ndarray | None = None
     first_moved: int | None = 0
     energy: float | None = None
+    softened: bool = False
 
     def keep(self) -> dict[str, Any]:
         """A copy, by the names in recordings."""

@@ -48,10 +48,10 @@ def project(runner: "Runner", h: float, longest: float) -> bool:
     slots = runner.scene.slots
     batches = [b for b in runner.batches if isinstance(b, Scalar) and b.joins and b.count]
     w, state, memory = runner.scene.inv_mass, runner.scene.state, runner.memory
-    if not batches:
-        return True
     x = before = state.get(memory)
-    if not np.isfinite(x).all():
+    if slots and slots.system and not slots.system.steps and not runner.clock.softened:  # it holds loads without a violation
+        batches = [b for b in batches if (slots.rows(b) < 0).all()]
+    if not batches or not np.isfinite(x).all():
         return True
     start = Rows(batches, w, x)
     undone = start.undone(runner)

@@ -90,7 +90,9 @@ class Runner:
         self.run(substeps if self.n else 0, iterations, span[0] + span[1] * span[2], STARTED if started else STEPPED)
         clock.advance(substeps, span, started)
         self.scene.hh = clock.h**2 * self.integrator.reaches * (clock.drag or FREE)[2 if started else 1]
-        return self.report(substeps, iterations)
+        report = self.report(substeps, iterations)
+        clock.softened = "softened" in report.flags
+        return report
 
     def set_substep(self, h: float, drag: list[float] | None) -> None:
         """Take h, and what drag makes of it."""
