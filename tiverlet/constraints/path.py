@@ -243,7 +243,7 @@ class Path(Tether):
         k, r, bent = self.foot(k, r, x, t, True)
         if bent:
             k, r, lost = self.foot(self.dev.piece[c], self.dev.rest[c], x, t, False)
-            self.dev.slots.note(FAR)
+            self.dev.slots.note_turn(FAR)
         P, T = self.point(k, r)
         C = x - P
         ends = ti.static(not self.dev.closed) and ((k == 0 and r <= 0) or (k == self.dev.pieces - 1 and r >= self.dev.lengths[k]))

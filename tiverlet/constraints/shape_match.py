@@ -296,7 +296,7 @@ class ShapeMatch(Batch):
             pose = rotation.matrix(end)
             self.dev.turn[c], self.dev.place[c] = end, p - pose @ q
             self.keep(self.dev.pose, c, pose)
-            self.dev.slots.note(self.dev.slots.turn(cosine, 1.0))
+            self.dev.slots.note_turn(self.dev.slots.turn(cosine, 1.0))
             if ti.static(self.dev.spring.soft):
                 R = rotation.matrix(start)
                 if first > 0:  # in the frame of the body

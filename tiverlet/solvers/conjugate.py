@@ -44,10 +44,10 @@ class ConjugateGradient(Solver):
     def __init__(self, steps: int = 20):
         self.steps = checks.integer("ConjugateGradient", "steps", steps, least=1)
 
-    def system(self, scene: Scene, batches: list[Batch], slots: Slots) -> "Krylov | None":
+    def system(self, scene: Scene, batches: list[Batch], slots: Slots) -> "CGSystem | None":
         """The system of a scene on the device; None where there is none."""
         scalars = [b for b in batches if isinstance(b, Scalar) and b.joins and b.side == 0]
-        return Krylov(scene, batches, slots, scalars, self.steps) if scalars else None
+        return CGSystem(scene, batches, slots, scalars, self.steps) if scalars else None
 
     def remedy(self, batches: list[Batch], slots: Slots, inv_mass: np.ndarray) -> str:
         """More steps."""
@@ -55,15 +55,15 @@ class ConjugateGradient(Solver):
 
     def explain(self, batches: list[Batch], slots: Slots) -> str:
         """What is solved how."""
-        told = slots.system.rows if slots.system else 0
-        alone = slots.system.left_out(batches) if told else sum(b.count for b in batches)
-        return f"{self!r}: {told} constraints together" + (f"; {alone} relaxed as by Jacobi" if alone else "")
+        rows = slots.system.rows if slots.system else 0
+        alone = slots.system.left_out(batches) if rows else sum(b.count for b in batches)
+        return f"{self!r}: {rows} constraints together" + (f"; {alone} relaxed as by Jacobi" if alone else "")
 
     def __repr__(self) -> str:
         return f"ConjugateGradient(steps={self.steps})"
 
 
-class Krylov(System):
+class CGSystem(System):
     """The system of one world on the device. Row r is a constraint in its batch's order."""
 
     def __init__(self, scene: Scene, batches: list[Batch], slots: Slots, scalars: list[Scalar], steps: int):
@@ -71,7 +71,7 @@ class Krylov(System):
         rows = np.flatnonzero(np.concatenate([(p >= 0).any(axis=1) for p in places]))
         super().__init__(scene, batches, slots, scalars, rows)
         self.steps, self.n, self.begin, self.w = steps, scene.particles.count, slots.begin, scene.state.w
-        self.spread = 1  # launches for each block; Taichi gives each CPU thread at least 512 of them, see Phases
+        self.stride = 1  # launches for each block; Taichi gives each CPU thread at least 512 of them, see Step
         row = np.concatenate([np.repeat(self.row(b), b.arity) for b in scalars])
         slot, who = (np.concatenate([a.ravel() for a in arrays]) for arrays in (places, [b.indices for b in scalars]))
         free = slot >= 0
@@ -79,11 +79,11 @@ class Krylov(System):
         ends = np.concatenate([[0], np.cumsum(np.bincount(row[free], minlength=self.rows))])
         self.corner_begin = self.ints("corner_begin", ends)
         self.corner = self.ints("corner", np.stack([slot[free], who[free]], axis=1)[order], 2)
-        self.ahead, self.rest, self.applied = self.vector("ahead"), self.vector("rest"), self.vector("applied")
-        self.scaled, self.soft = self.vector("preconditioner"), self.vector("softness")
+        self.direction, self.residual, self.applied = self.vector("direction"), self.vector("residual"), self.vector("applied")
+        self.inverse_diagonal, self.shift = self.vector("preconditioner"), self.vector("shift")
         self.gradient = scene.memory.field("system.gradient", slots.total, width=self.dim)
-        self.pull = scene.memory.field("system.pull", self.n, width=self.dim)
-        self.part, self.worst = self.reals("part", BLOCKS), self.reals("worst", BLOCKS)
+        self.pulled = scene.memory.field("system.pulled", self.n, width=self.dim)
+        self.partial, self.worst = self.reals("partial_sums", BLOCKS), self.reals("worst", BLOCKS)
         # r . z, the coming weight, what is taken back; r . z at the start, and the worst tension since
         self.sums = scene.memory.field("system.sums", None, width=5, kind=ti.f64)
         self.least = 1.2 * largest(scene, scalars, self.blocks * scene.inv_mass, POWER) / steps**2
@@ -98,18 +98,18 @@ class Krylov(System):
         self.memory.write(self.floor, 0.0)
 
     @ti.func
-    def tell(self, r, violation, A, alpha, lam, W, lever):
+    def set_row(self, r, violation, A, alpha, lam, W, geometric_stiffness):
         """The right side, the preconditioner, and the first direction."""
-        System.tell(self, r, violation, A, alpha, lam, W, lever)
+        System.set_row(self, r, violation, A, alpha, lam, W, geometric_stiffness)
         zero = 0 * violation
         self.step[r] = 0
-        self.rest[r] = ti.select(W > 0, -violation / A, zero)
-        self.soft[r] = ti.select(W > 0, alpha / A + ti.cast(self.floor[None], self.real) * W, zero)
-        self.scaled[r] = ti.select(W > 0, 1 / (W + self.soft[r]), zero)
-        self.ahead[r] = self.scaled[r] * self.rest[r]
+        self.residual[r] = ti.select(W > 0, -violation / A, zero)
+        self.shift[r] = ti.select(W > 0, alpha / A + ti.cast(self.floor[None], self.real) * W, zero)
+        self.inverse_diagonal[r] = ti.select(W > 0, 1 / (W + self.shift[r]), zero)
+        self.direction[r] = self.inverse_diagonal[r] * self.residual[r]
 
     @ti.func
-    def lean(self, place, i, gradient):
+    def set_gradient(self, place, i, gradient):
         """The gradient at one corner, whose slot is `place` and particle i."""
         if place >= 0:
             self.gradient[place] = gradient
@@ -124,79 +124,79 @@ class Krylov(System):
         """The sum of the parts, in order."""
         out = ti.cast(0, ti.f64)
         for b in range(BLOCKS):
-            out += self.part[b]
+            out += self.partial[b]
         return out
 
     @ti.func
-    def open(self, me):
+    def start(self, thread):
         """r . z of the first residual."""
-        for k in range(self.team.chunk_begin(BLOCKS * self.spread, me), self.team.chunk_end(BLOCKS * self.spread, me)):
-            if k % self.spread == 0:
-                b, total = k // self.spread, ti.cast(0, ti.f64)
+        for k in range(self.team.chunk_begin(BLOCKS * self.stride, thread), self.team.chunk_end(BLOCKS * self.stride, thread)):
+            if k % self.stride == 0:
+                b, total = k // self.stride, ti.cast(0, ti.f64)
                 for r in range(self.begin_of(b), ti.min(self.begin_of(b + 1), self.rows)):
-                    total += ti.cast(self.rest[r], ti.f64) * self.ahead[r]
-                self.part[b] = total
+                    total += ti.cast(self.residual[r], ti.f64) * self.direction[r]
+                self.partial[b] = total
         self.team.wait()
         ti.loop_config(serialize=True)
-        for _ in range(self.team.one(1, me)):
+        for _ in range(self.team.one(1, thread)):
             now = self.summed()
             self.sums[None] = ti.Vector([now, 0, 0, now, 0], ti.f64)
         self.team.wait()
 
     @ti.func
-    def close(self, me):
+    def end(self, thread):
         """Raise the floor where the steps have not converged, or have come to a tension that is hard to stand."""
         ti.loop_config(serialize=True)
-        for _ in range(self.team.one(1, me)):
+        for _ in range(self.team.one(1, thread)):
             if self.sums[None][0] > CONVERGED * self.sums[None][3] or self.sums[None][4] > TENSEST / 2:
                 self.floor[None] = ti.max(self.least, ti.min(GROWTH * self.floor[None], HIGHEST))
         self.team.wait()
 
     @ti.func
-    def go(self, me):
+    def iterate(self, thread):
         """One step of conjugate gradients. One that needs a tension too large for the substep is taken back, and is the last."""
-        for i in range(self.team.chunk_begin(self.n, me), self.team.chunk_end(self.n, me)):
+        for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
             if self.w.of(i) > 0:
-                total = 0 * self.pull[i]
+                total = 0 * self.pulled[i]
                 for s in range(self.begin[i], self.begin[i + 1]):
                     r = self.row_of[s]
                     if r >= 0:
-                        total += self.ahead[r] * self.move[s]
+                        total += self.direction[r] * self.move[s]
                 if ti.static(self.shares):
                     total *= self.share[i]
-                self.pull[i] = total
+                self.pulled[i] = total
         self.team.wait()
-        for k in range(self.team.chunk_begin(BLOCKS * self.spread, me), self.team.chunk_end(BLOCKS * self.spread, me)):
-            if k % self.spread == 0:
-                b, total = k // self.spread, ti.cast(0, ti.f64)
+        for k in range(self.team.chunk_begin(BLOCKS * self.stride, thread), self.team.chunk_end(BLOCKS * self.stride, thread)):
+            if k % self.stride == 0:
+                b, total = k // self.stride, ti.cast(0, ti.f64)
                 for r in range(self.begin_of(b), ti.min(self.begin_of(b + 1), self.rows)):
-                    value = self.soft[r] * self.ahead[r]
+                    value = self.shift[r] * self.direction[r]
                     for c in range(self.corner_begin[r], self.corner_begin[r + 1]):
                         at = self.corner[c]
-                        value += self.gradient[at[0]].dot(self.pull[at[1]])
+                        value += self.gradient[at[0]].dot(self.pulled[at[1]])
                     self.applied[r] = value
-                    total += ti.cast(value, ti.f64) * self.ahead[r]
-                self.part[b] = total
+                    total += ti.cast(value, ti.f64) * self.direction[r]
+                self.partial[b] = total
         self.team.wait()
         ti.loop_config(serialize=True)
-        for _ in range(self.team.one(1, me)):
+        for _ in range(self.team.one(1, thread)):
             curve = self.summed()
             self.sums[None][1] = ti.select(curve > 0, self.sums[None][0] / curve, ti.cast(0, ti.f64))
         self.team.wait()
-        for k in range(self.team.chunk_begin(BLOCKS * self.spread, me), self.team.chunk_end(BLOCKS * self.spread, me)):
-            if k % self.spread == 0:
-                b, total, worst = k // self.spread, ti.cast(0, ti.f64), ti.cast(0, ti.f64)
+        for k in range(self.team.chunk_begin(BLOCKS * self.stride, thread), self.team.chunk_end(BLOCKS * self.stride, thread)):
+            if k % self.stride == 0:
+                b, total, worst = k // self.stride, ti.cast(0, ti.f64), ti.cast(0, ti.f64)
                 far = self.sums[None][1]
                 for r in range(self.begin_of(b), ti.min(self.begin_of(b + 1), self.rows)):
-                    self.step[r] = self.step[r] + far * self.ahead[r]
-                    rest = self.rest[r] - ti.cast(far, self.real) * self.applied[r]
-                    self.rest[r] = rest
-                    total += ti.cast(self.scaled[r] * rest, ti.f64) * rest
-                    worst = ti.max(worst, self.lever[r] * ti.abs(self.lam[r] + self.step[r]))
-                self.part[b], self.worst[b] = total, worst
+                    self.step[r] = self.step[r] + far * self.direction[r]
+                    left = self.residual[r] - ti.cast(far, self.real) * self.applied[r]
+                    self.residual[r] = left
+                    total += ti.cast(self.inverse_diagonal[r] * left, ti.f64) * left
+                    worst = ti.max(worst, self.geometric_stiffness[r] * ti.abs(self.lam[r] + self.step[r]))
+                self.partial[b], self.worst[b] = total, worst
         self.team.wait()
         ti.loop_config(serialize=True)
-        for _ in range(self.team.one(1, me)):
+        for _ in range(self.team.one(1, thread)):
             now, before, worst = self.summed(), self.sums[None][0], self.worst[0]
             for b in range(1, BLOCKS):
                 worst = ti.max(worst, self.worst[b])
@@ -207,9 +207,11 @@ class Krylov(System):
             first, worst = self.sums[None][3], ti.max(worst, self.sums[None][4])
             self.sums[None] = ti.Vector([now, ti.select(before > 0, now / before, 0 * now), back, first, worst], ti.f64)
         self.team.wait()
-        for r in range(self.team.chunk_begin(self.rows, me), self.team.chunk_end(self.rows, me)):
+        for r in range(self.team.chunk_begin(self.rows, thread), self.team.chunk_end(self.rows, thread)):
             if self.sums[None][2] != 0:
-                self.step[r] = self.step[r] - self.sums[None][2] * self.ahead[r]
-                self.rest[r] = 0
-            self.ahead[r] = self.scaled[r] * self.rest[r] + ti.cast(self.sums[None][1], self.real) * self.ahead[r]
+                self.step[r] = self.step[r] - self.sums[None][2] * self.direction[r]
+                self.residual[r] = 0
+            self.direction[r] = (
+                self.inverse_diagonal[r] * self.residual[r] + ti.cast(self.sums[None][1], self.real) * self.direction[r]
+            )
         self.team.wait()

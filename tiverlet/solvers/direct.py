@@ -121,17 +121,17 @@ class Elimination(System):
             self.side, self.active, self.left = ints("side", side), ints("active", 0 * side), reals("left")
 
     @ti.func
-    def tell(self, r, violation, A, alpha, lam, W, lever):
-        """What constraint r is about in this pass, but for what its corners tell. lever: see Scalar."""
-        System.tell(self, r, violation, A, alpha, lam, W, lever)
+    def set_row(self, r, violation, A, alpha, lam, W, geometric_stiffness):
+        """What constraint r is about in this pass, but for what its corners tell. geometric_stiffness: see Scalar."""
+        System.set_row(self, r, violation, A, alpha, lam, W, geometric_stiffness)
         if W > 0:
-            self.close[r] = lever / (2 * W)
+            self.close[r] = geometric_stiffness / (2 * W)
         if ti.static(self.one_sided):
             acts = self.side[r] == 0 or self.side[r] * violation > 0 or lam != 0
             self.active[r] = ti.cast(acts and W > 0, ti.i32)
 
     @ti.func
-    def lean(self, place, i, gradient):
+    def set_gradient(self, place, i, gradient):
         """The gradient at one corner, whose slot is `place` and particle i."""
         if place >= 0:
             if ti.static(self.shares):
@@ -283,11 +283,11 @@ class Elimination(System):
         worst, total = ti.cast(0, ti.f64), ti.cast(0, ti.f64)
         size, steps, most = ti.cast(0, ti.f64), ti.cast(0, ti.f64), ti.cast(0, ti.f64)
         for r in range(begin, end):
-            step, lever = self.step[r], self.lever[r]
+            step, geometric_stiffness = self.step[r], self.geometric_stiffness[r]
             if backward != 0:
-                lever /= self.longer(r)
-            worst = ti.max(worst, lever * ti.abs(self.lam[r] + step))
-            total += lever * (self.lam[r] + step)
+                geometric_stiffness /= self.longer(r)
+            worst = ti.max(worst, geometric_stiffness * ti.abs(self.lam[r] + step))
+            total += geometric_stiffness * (self.lam[r] + step)
             size += ti.abs(self.violation[r])
             steps += ti.abs(step)
             most = ti.max(most, self.weight[r])
@@ -305,8 +305,8 @@ class Elimination(System):
     def cut(self, begin, end):
         """No multiplier beyond what its tension may be."""
         for r in range(begin, end):
-            if self.lever[r] > 0:
-                most = BACKWARD * self.longer(r) / self.lever[r]
+            if self.geometric_stiffness[r] > 0:
+                most = BACKWARD * self.longer(r) / self.geometric_stiffness[r]
                 self.step[r] = ti.max(-most, ti.min(most, self.lam[r] + self.step[r])) - self.lam[r]
 
     @ti.func

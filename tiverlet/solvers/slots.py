@@ -44,7 +44,7 @@ class Slots:
         if any(b.breaks for b in batches):
             self.broken = memory.field("slots.broken", None, kind=ti.i32)
         self.system: Any = solver.system(scene, batches, self)
-        self.whole = bool(self.system)
+        self.has_system = bool(self.system)
         # Whether a substep fulfils constraints to rounding, which is then the error that is left.
         scalars = [b for b in batches if isinstance(b, Scalar) and b.joins]
         self.exact = bool(scalars) and (not self.system.steps if self.system else bool(degree.max(initial=0) <= 1))
@@ -61,9 +61,9 @@ class Slots:
         return self.system.row(batch) if self.system else np.full(batch.count, -1)
 
     @ti.func
-    def limited(self, wanted, lever):
-        """A multiplier without what the substep cannot stand: (omega h)^2 = lever |multiplier| beyond TENSEST. It is noted."""
-        most = TENSEST / lever
+    def limited(self, wanted, geometric_stiffness):
+        """A multiplier, at most what the substep can stand, (omega h)^2 = geometric_stiffness |multiplier| = TENSEST; noted."""
+        most = TENSEST / geometric_stiffness
         if ti.abs(wanted) >= most:
             ti.atomic_max(self.tension[None], ti.cast(TENSEST * ti.abs(wanted) / most, ti.f64))
         return ti.max(-most, ti.min(most, wanted))
@@ -79,7 +79,7 @@ class Slots:
         return out
 
     @ti.func
-    def note(self, turn):
+    def note_turn(self, turn):
         """Keep the worst turn. Threads that all write to the same place wait for each other, so they look first."""
         if turn > self.turned[None]:
             ti.atomic_max(self.turned[None], turn)
@@ -96,7 +96,7 @@ class Slots:
     def wanted(self, i):
         """What the constraints want of particle i: the sum of the moves, in f64 where large ones of a system cancel."""
         total = 0 * self.state.x[i]
-        if ti.static(self.whole):
+        if ti.static(self.has_system):
             total = self.system.total_of(i, self.begin[i], self.begin[i + 1])
         else:
             total = self.total_of(i)

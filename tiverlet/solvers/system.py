@@ -13,13 +13,16 @@ from .slots import Slots
 class System:
     """Rows of constraints, each with its violation, its weights and the step of its multiplier that a solver finds.
 
+    In every pass constraints set their rows and gradients. Then solve() finds the steps part by part, each by one thread; or all
+    threads go through start(), `steps` times iterate(), and end(). Particles move by the sum of step times move over their slots.
+
     scalars: the batches that take part, their constraints numbered through; rows: those numbers, in the order of the solver.
     """
 
     parts = 1  # systems that have nothing to do with each other
-    steps = 0  # of an iteration, by open() and go(); 0 for a solution by solve()
-    team: Any  # the threads that share the loops of open() and go(), given when the kernels are made
-    spread: int  # iterations of such a loop for each block of rows
+    steps = 0  # of an iteration, by start(), iterate() and end(); 0 for a solution by solve()
+    team: Any  # the threads that share the loops of start(), iterate() and end(), given when the kernels are made
+    stride: int  # iterations of such a loop for each block of rows
 
     def __init__(self, scene: Scene, batches: list[Batch], slots: Slots, scalars: list[Scalar], rows: np.ndarray):
         self.real, self.dim, self.move, self.tension = scene.real, scene.state.dim, slots.move, slots.tension
@@ -35,7 +38,8 @@ class System:
             of_slot[slot[slot >= 0]] = np.broadcast_to(self.row(b)[:, None], slot.shape)[slot >= 0]
         self.row_of = self.ints("row_of_slot", of_slot)
         self.step, self.violation, self.scale = self.reals("step"), self.reals("violation"), self.reals("scale")
-        self.alpha, self.lam, self.lever = self.reals("alpha"), self.reals("multiplier"), self.reals("lever")
+        self.alpha, self.lam = self.reals("alpha"), self.reals("multiplier")
+        self.geometric_stiffness = self.reals("geometric_stiffness")
         if self.shares:
             self.share = self.ints("share", self.blocks)
 
@@ -75,18 +79,30 @@ class System:
         """Particles were placed anew: what was found out on the way to where they were says nothing."""
 
     @ti.func
-    def tell(self, r, violation, A, alpha, lam, W, lever):
-        """What constraint r is about in this pass, but for what its corners tell. lever: see Scalar."""
-        self.violation[r], self.alpha[r], self.lam[r], self.lever[r] = violation, alpha, lam, lever
+    def set_row(self, r, violation, A, alpha, lam, W, geometric_stiffness):
+        """What constraint r is about in this pass, but for what its corners tell. geometric_stiffness: see Scalar."""
+        self.violation[r], self.alpha[r], self.lam[r], self.geometric_stiffness[r] = violation, alpha, lam, geometric_stiffness
         self.scale[r] = ti.select(W > 0, A, 0 * A)
 
     @ti.func
-    def lean(self, place, i, gradient):
+    def set_gradient(self, place, i, gradient):
         """The gradient at one corner, whose slot is `place` and particle i."""
 
     @ti.func
     def solve(self, b):
         """Part b: the step of every multiplier in it."""
+
+    @ti.func
+    def start(self, thread):
+        """Before the first of `steps` iterations."""
+
+    @ti.func
+    def iterate(self, thread):
+        """One of them."""
+
+    @ti.func
+    def end(self, thread):
+        """After the last."""
 
     @ti.func
     def total_of(self, i, begin, end):

@@ -16,9 +16,9 @@ class ConstraintPass:
         self.systems = [scene.slots.system] if scene.slots and scene.slots.system else []
         self.steps = max([s.steps for s in self.systems], default=0)
         for system in self.systems:
-            system.team, system.spread = team, stride
+            system.team, system.stride = team, stride
         self.semi_iterations = [scene.slots.semi_iteration] if scene.slots and scene.slots.semi_iteration else []
-        self.told = [b for b in batches if isinstance(b, Scalar) and b.dev.told]
+        self.in_systems = [b for b in batches if isinstance(b, Scalar) and b.dev.in_system]
         self.ragged = [b for b in batches if b.blocks]
         self.springs = any(b.soft for b in batches)
 
@@ -71,36 +71,36 @@ class ConstraintPass:
         """Find the steps of the multipliers of each system."""
         for system in ti.static(self.systems):
             if ti.static(system.steps > 0):
-                system.open(thread)
+                system.start(thread)
                 for _ in range(system.steps):
-                    system.go(thread)
+                    system.iterate(thread)
             else:
                 for b in range(self.team.chunk_begin(system.parts, thread), self.team.chunk_end(system.parts, thread)):
                     system.solve(b)
                 self.team.wait()
 
     @ti.func
-    def open_systems(self, thread):
+    def start_systems(self, thread):
         """The same in pieces: what comes before the steps of those that iterate."""
         for system in ti.static(self.systems):
-            system.open(thread)
+            system.start(thread)
 
     @ti.func
     def iterate_systems(self, thread):
         """One of their steps."""
         for system in ti.static(self.systems):
-            system.go(thread)
+            system.iterate(thread)
 
     @ti.func
     def update_multipliers(self, now):
         """What systems found goes to the multipliers."""
         for system in ti.static(self.systems):
             if ti.static(system.steps > 0):
-                system.close(now.thread)
-        for f in ti.static(self.told):
+                system.end(now.thread)
+        for f in ti.static(self.in_systems):
             for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
-                f.take(c, now.first)
-        if ti.static(len(self.told) > 0):
+                f.update_multiplier(c, now.first)
+        if ti.static(len(self.in_systems) > 0):
             self.team.wait()
 
     @ti.func

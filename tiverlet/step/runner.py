@@ -327,7 +327,7 @@ class Launcher:
 
     def solve_systems(self, now: Moment) -> None:
         """Steps of systems that iterate are launches of their own."""
-        self.put(now, "open_systems" if self.steps else "solve_systems", self.systems)
+        self.put(now, "start_systems" if self.steps else "solve_systems", self.systems)
         for _ in range(self.steps):
             self.flush()
             self.put(now, "iterate_systems")

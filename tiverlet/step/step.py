@@ -303,9 +303,9 @@ class Step:
         self.constraints.solve_systems(now.thread)
 
     @ti.func
-    def open_systems(self, now):
+    def start_systems(self, now):
         """The same in pieces: the start,"""
-        self.constraints.open_systems(now.thread)
+        self.constraints.start_systems(now.thread)
 
     @ti.func
     def iterate_systems(self, now):

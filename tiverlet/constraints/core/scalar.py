@@ -186,11 +186,11 @@ class Scalar(Batch):
         self.dev.strength = Strength(scene, name, self)
         self.changed = False
         rows = scene.slots.rows(self)
-        self.dev.told, self.dev.alone = bool((rows >= 0).any()), bool((rows < 0).any())
-        if self.dev.told:
+        self.dev.in_system, self.dev.alone = bool((rows >= 0).any()), bool((rows < 0).any())
+        if self.dev.in_system:
             self.dev.row = add(f"{name}.row", m, kind=ti.i32, values=rows)
         self.dev.cusp = self.cusp
-        self.dev.firm = self.joins and (self.dev.told or bool(scene.slots.semi_iteration))
+        self.dev.firm = self.joins and (self.dev.in_system or bool(scene.slots.semi_iteration))
         if self.dev.firm:
             self.dev.close = add(f"{name}.close", m, values=self.closeness(self.start.position))
         self.dev.steps = bool(self.dev.firm and scene.slots.semi_iteration and self.dev.alone and self.side == 0)
@@ -317,7 +317,7 @@ class Scalar(Batch):
         """What every solver knows of constraint c in a pass; of the state it writes nothing but the memory of soft constraints.
 
         Returns the violation A C + B + alpha' lam, A, alpha', lam, the mass-split weight W (0: no corner can move), directions n
-        and gradients g, both (arity, dim), and how far it turned, see Slots.note; n is g where it turned too far.
+        and gradients g, both (arity, dim), and how far it turned, see Slots.note_turn; n is g where it turned too far.
         """
         if first != 0:
             self.begin(c, fresh)
@@ -357,7 +357,7 @@ class Scalar(Batch):
                 new = -self.bounded(-new)
             size = ti.abs(new - lam) * (A * W + alpha) / self.dev.slots.relaxation
             if new != lam:
-                self.dev.slots.note(turn)
+                self.dev.slots.note_turn(turn)
         return new, size
 
     @ti.func
@@ -382,14 +382,14 @@ class Scalar(Batch):
         """Move each corner by w_j dlam grad_j C; a constraint that belongs to a system tells it what it knows."""
         violation, A, alpha, lam, W, n, g, turn = self.known(c, h, hh, first, fresh)
         step = ti.cast(1, self.dev.real)
-        if ti.static(self.dev.told):
+        if ti.static(self.dev.in_system):
             row = self.dev.row[c]
             if row >= 0:
-                self.dev.slots.system.tell(row, violation, A, alpha, lam, W, self.lever(c, W))
+                self.dev.slots.system.set_row(row, violation, A, alpha, lam, W, self.geometric_stiffness(c, W))
                 for k in ti.static(range(self.arity)):
-                    self.dev.slots.system.lean(self.dev.places[c][k], self.member(c, k), g[k, :])
+                    self.dev.slots.system.set_gradient(self.dev.places[c][k], self.member(c, k), g[k, :])
                 if violation != 0:
-                    self.dev.slots.note(turn)
+                    self.dev.slots.note_turn(turn)
         if ti.static(self.dev.alone):
             if self.relaxed_alone(c):
                 new, _ = self.answer(violation, A, alpha, lam, W, turn)
@@ -405,7 +405,7 @@ class Scalar(Batch):
                     if first != 0:
                         last = 0
                     wanted = lam + self.dev.slots.semi_iteration.step(last, step)
-                    step = self.dev.slots.limited(wanted, self.lever(c, W / 2)) - lam  # split by two in a chain
+                    step = self.dev.slots.limited(wanted, self.geometric_stiffness(c, W / 2)) - lam  # split by two in a chain
                     self.dev.step[c] = step
                     new = lam + step
                 self.dev.lam[c] = new
@@ -413,7 +413,7 @@ class Scalar(Batch):
             self.push(c, k, self.dev.w.of(self.member(c, k)) * step * n[k, :])
 
     @ti.func
-    def lever(self, c, W):
+    def geometric_stiffness(self, c, W):
         """(omega h)^2 of the fastest vibration across a tension, for a multiplier of 1: of a chain 4 w / l, where W = 2 w."""
         return 2 * W * self.dev.close[c]
 
@@ -421,14 +421,14 @@ class Scalar(Batch):
     def relaxed_alone(self, c):
         """Whether constraint c belongs to no system."""
         out = True
-        if ti.static(self.dev.told):
+        if ti.static(self.dev.in_system):
             out = self.dev.row[c] < 0
         return out
 
     @ti.func
-    def take(self, c, first):
+    def update_multiplier(self, c, first):
         """Add what the system has found to the multiplier."""
-        if ti.static(self.dev.told):
+        if ti.static(self.dev.in_system):
             row = self.dev.row[c]
             if row >= 0:
                 step = ti.cast(self.dev.slots.system.step[row], self.dev.real)
