@@ -7,6 +7,7 @@ import numpy as np
 
 import tiverlet as tv
 from tiverlet.contact.initial_overlap import overlapping
+from tiverlet.step import checkpoint
 
 
 def test_overlap_is_what_comparing_all_pairs_finds():
@@ -34,3 +35,10 @@ def test_only_scenes_that_start_with_overlap_have_the_field_for_it(world):
     ):
         w = world(tv.Particles(start, radius=0.1), features)
         assert ("Contact.shrunk" in w.fields) == want
+        if not want:  # where it was needed once, and is no more, nothing is left of it
+            begin, before = checkpoint.keep(w), w.hash()
+            w.position = 0.1 * x
+            w.step(1e-3)
+            assert "Contact.shrunk" in checkpoint.keep(w).values and w.hash() != before
+            checkpoint.put_back(w, begin)
+            assert "Contact.shrunk" in checkpoint.keep(w).values and w.hash() == before

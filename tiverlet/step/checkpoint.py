@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 CARRIED = ("Contact.push", "Contact.slip", "Contact.slack")  # by pairs, for the next substep
 TOLD = "Contact.given"  # by pairs, of the last substep, for reports
+LATE = {"Contact.shrunk"}  # made when it is needed
 
 
 @dataclass(frozen=True)
@@ -34,16 +35,17 @@ class Kept:
         return out.hexdigest()
 
     def _lasting(self) -> dict[str, np.ndarray]:
-        """Without what pairs carry for reports: a pair that has just bounced may be on the list or far off it, by the skin."""
-        if TOLD not in self.values:
-            return self.values
-        carried = [name for name in CARRIED if name in self.values]
-        some = np.zeros(len(self.values["Contact.pairs"]), dtype=bool)
+        """Without what pairs carry for reports: a pair that has just bounced may be on the list or far off it, by the skin. And
+        without a field that is made when it is needed, where nobody needs it."""
+        values = {name: v for name, v in self.values.items() if name not in LATE or v.any()}
+        if TOLD not in values:
+            return values
+        carried = [name for name in CARRIED if name in values]
+        some = np.zeros(len(values["Contact.pairs"]), dtype=bool)
         for name in carried:
-            values = self.values[name]
-            some |= values.any(axis=tuple(range(1, values.ndim)))
-        rows = {name: self.values[name][some] for name in ("Contact.pairs", *carried)}
-        return {name: rows.get(name, values) for name, values in self.values.items() if name != TOLD}
+            some |= values[name].any(axis=tuple(range(1, values[name].ndim)))
+        rows = {name: values[name][some] for name in ("Contact.pairs", *carried)}
+        return {name: rows.get(name, v) for name, v in values.items() if name != TOLD}
 
     def position(self, count: int) -> np.ndarray:
         """Positions [m] of `count` particles, in f64 where there is more than one word of f32."""
@@ -101,8 +103,7 @@ def install(world: "World", kept: Kept, flagged: list[list[bool]]) -> None:
 def check(world: "World", kept: Kept, flagged: list[list[bool]]) -> None:
     """Raise ValueError unless a state that came from elsewhere fits the world; above all what kernels take for indices."""
     present = keep(world)
-    late = {"Contact.shrunk"}  # a field that is made when it is needed
-    if set(present.values) - late != set(kept.values) - late or set(present.clock) != set(kept.clock):
+    if set(present.values) - LATE != set(kept.values) - LATE or set(present.clock) != set(kept.clock):
         raise ValueError("The state is not one of this scene: it has other fields.")
     pieces = {f"Contact.{piece.name}" for piece in world._runner.grid.lasting} if world._runner.grid else set()
     most = {"Contact.pairs": len(world.particles)}
