@@ -58,8 +58,8 @@ class World:
         starts = [None] * len(features)
         self._build(particles, features, starts, substeps, iterations, solver, precision, path, order)
         for contact in self._runner.step.contacts:
-            if not contact.dev.eases and contact.table.uniform and overlapping(self._runner.scene, self._runner.batches):
-                contact.ease()  # before anything is compiled: later, the frame would be compiled again
+            if not contact.shrinks and contact.table.uniform and overlapping(self._runner.scene, self._runner.batches):
+                contact.enable_shrink()  # before anything is compiled: later, the frame would be compiled again
 
     @staticmethod
     def _of(particles: Particles, features: tuple[Feature, ...], starts: Sequence[Particles | None], **settings) -> "World":
@@ -320,7 +320,7 @@ class World:
         contact = self._runner.step.contacts[0]
         with whole:
             self._runner.list_neighbours()
-            if contact.measures and self._runner.step.launched:
+            if contact.detects and self._runner.step.launched:
                 self._runner.look()  # which measures; elsewhere it makes the list, too
         return contact.found(self.position, self._clock.h or 1.0)
 

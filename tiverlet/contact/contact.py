@@ -1,29 +1,31 @@
 """Particles that do not overlap."""
 
-import warnings
 from typing import Any
 
 import numpy as np
 
-from .. import checks
 from ..device import ti
 from ..device.patches.compiler import FEW
-from ..device.thread_team import BLOCK, Team
+from ..device.thread_team import Team
 from ..features.feature import Batch, Knob, Scene
-from ..features.material import Table
 from ..neighbours.neighbour_list import WORD, Luggage, lowest
-from ..neighbours.neighbour_search import FARTHEST, Grid
+from ..neighbours.neighbour_search import Grid
 from ..particles import Particles
 from ..tools import median
-from .mass_splitting import Splitting, lesser
-from .velocity_projection import Calm
+from .force_share import ForceShare
+from .friction import Friction
+from .mass_splitting import MassSplitting, lesser
+from .narrow_phase import DiscGeometry
+from .pair_contact import PairContact
+from .restitution import Restitution
+from .velocity_projection import VelocityProjection
 
 RELAXATION = 1.25  # below 4/3, see Contact
 CARRY = 0.4  # of its last push that a pair keeps, at most; below 1/2
 UPTAKE = 1 / 8  # of the slack of a pair, what a substep takes back
 
 
-class Contact(Splitting):
+class Contact(PairContact):
     """Discs and spheres do not overlap.
 
     C(x) = |x_i - x_j| - (r_i + r_j) >= 0 for all pairs, grad_i C = n = (x_i - x_j) / |x_i - x_j|.
@@ -70,172 +72,82 @@ class Contact(Splitting):
         self.groups, self.restitution, self.friction = groups, restitution, friction
         self.skin, self.push_out = skin, push_out
 
-    friction = Knob(lambda f, v: f._surface("friction", v), "Of all pairs, or by pairs of groups.")
-    restitution = Knob(lambda f, v: f._surface("restitution", v), "Of all pairs, or by pairs of groups.")
     groups: Any = Knob(lambda f, v: f._surface("groups", v), "The pairs of groups that touch; None for all.", compiled=True)
-    skin = Knob(lambda f, v: _skin(v), "How far beyond touching pairs are listed [m].", compiled=True)
-    push_out = Knob(lambda f, v: checks.number("Contact", "push_out", v, least=0.0), "[m/s].", compiled=True)
-    compiled_for = ("rubs", "bounces", "uniform")
-    table: Table  # bound to one world
-    matters = True
-    room = 0  # entries of the list for each particle, at first, if that is more than discs have
-    measures = False  # looks at all contacts once in each pass, before they are counted
-    calms = True  # knows which of them bear a load, see velocity_projection.py
-
-    def _surface(self, name: str, value):
-        """Check what pairs are like, with what was said so far."""
-        if name == "groups" and value is not None:
-            value = checks.rows("Contact", name, value, "a list of pairs of groups, such as [(0, 1)],")
-        elif isinstance(value, list):
-            value = tuple(value)
-        given = {"friction": 0.0, "restitution": 0.0, "groups": None} | vars(self) | {name: value}
-        Table("Contact", given["friction"], given["restitution"], given["groups"])
-        return value
-
-    @property
-    def wanted(self) -> Table:
-        """What pairs are to be like."""
-        return Table("Contact", self.friction, self.restitution, self.groups)
-
-    @property
-    def uniform(self) -> bool:
-        """Whether all pairs are alike."""
-        return self.wanted.uniform
-
-    @property
-    def rubs(self) -> bool:
-        """Whether any pair has friction, or had when kernels were compiled."""
-        return self.wanted.rubs or vars(self.dev).get("rubs", False)
-
-    @property
-    def bounces(self) -> bool:
-        """Whether any pair has restitution, or had when kernels were compiled."""
-        return self.wanted.bounces or vars(self.dev).get("bounces", False)
-
-    def upload(self) -> None:
-        """Write friction and restitution."""
-        if self.scene:
-            self.table.upload(self.scene, self.wanted)
+    projects = True
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Choose the skin, and refuse positions too far out for cells to be told apart."""
-        self.dev.eases, self.dev.store = False, None
         radius = particles.radius
         some = radius[radius > 0]
         auto = 0.75 * median(some) if len(some) else 1.0
-        self.dev.size = auto if self.skin == "auto" else float(self.skin)
+        self.dev.skin = auto if self.skin == "auto" else float(self.skin)
         self.dev.finest = float(radius.min(initial=np.inf))
         self._keep(matters=len(some) > 0, table=self.wanted)
         if self.matters:
             self.check_range(particles.position)
 
-    def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Warn of particles that cannot touch."""
-        if not self.matters and particles.count:
-            warnings.warn(f"{self!r}: all radii are 0, so nothing touches; give tv.Particles a radius.", stacklevel=3)
-
-    def admit(self, particles: Particles, first: int) -> None:
-        """Refuse positions too far out."""
-        if self.matters:
-            self.check_range(particles.position)
-
-    def spared(self, number: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Its fields are those of the particles."""
-        return (number >= 0,)
-
-    def check_range(self, position: np.ndarray) -> None:
-        """Raise where coordinates are too large for the cells."""
-        cell = 2 * self.dev.finest + self.dev.size
-        far = np.abs(position) >= FARTHEST * cell
-        if far.any():
-            i, k = np.unravel_index(int(np.argmax(far)), far.shape)
-            raise ValueError(
-                f"Contact: position[{i}, {k}] = {position[i, k]:g} m is {abs(position[i, k]) / cell:.2g} cells of {cell:g} m "
-                f"from the origin, but f32 tells only {FARTHEST} apart. Shift the scene towards the origin."
-            )
-
     def join(self, scene: Scene, batches: list[Batch], team: Team) -> Grid:
-        """Declare the fields, among them the grid's."""
-        n, dim = scene.particles.count, scene.particles.dim
+        """Declare the fields, among them the neighbour list's, which is returned."""
+        n, dim, dev = scene.particles.count, scene.particles.dim, self.dev
         pairs = [b.partners(b.start) for b in batches]
         linked = np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=np.int32)
-        self.scene = scene
-        self.dev.state = scene.state
-        self.dev.radius = scene.radius
-        self.dev.move = scene.memory.field("Contact.move", n, width=dim)
-        self.dev.split = scene.memory.field("Contact.split_mass", n, state=True)
-        self.dev.press = scene.memory.field("Contact.press", n, width=dim, state=True)
-        self.dev.before = scene.memory.field("Contact.before", n, width=dim, state=True)
-        if self.rubs:
-            self.dev.bond = scene.memory.field("Contact.bond", n, width=dim, state=True)
-        self.dev.block = min(BLOCK, team.piece)
-        self.dev.skips = n >= FEW and not self.bounces  # in relax() what bounces forgets the last blow
-        if self.dev.skips:
-            self.dev.some = scene.memory.field("Contact.some_touch", -(-n // self.dev.block), kind=ti.i32)
-        self.dev.fast = scene.memory.field("Contact.fast", None, kind=ti.i32)
-        self.dev.rubs, self.dev.bounces = self.rubs, self.bounces
-        if self.bounces:
-            self.dev.struck = scene.memory.field("Contact.struck", n)
-            self.dev.kick = scene.memory.field("Contact.kick", n, width=dim)
-            self.dev.lift = scene.memory.field("Contact.lift", n, width=dim)
-            self.dev.left = scene.memory.field("Contact.left", n)
-            self.dev.partner = scene.memory.field("Contact.partner", n, kind=ti.i32)
-            self.dev.first = scene.memory.field("Contact.first", n, kind=ti.i32)
-            self.dev.hit = scene.memory.field("Contact.hit", None, kind=ti.i32)
+        self.scene, dev.state, dev.w, dev.rubs, dev.bounces = scene, scene.state, scene.state.w, self.rubs, self.bounces
+        dev.move = scene.memory.field("Contact.move", n, width=dim)
         self.table.bind(scene)
         # What parted the pair in the last substep, per inverse mass [kg m].
-        self.dev.push = Luggage("push", 0, lasting=True, marked=True)
-        self.dev.slip = Luggage("slip", dim, lasting=True)
-        self.dev.blow = Luggage("blow", 0, lasting=False)
-        luggage = [self.dev.push, *([self.dev.slip] if self.rubs else [])]
-        if self.bounces:
-            self.dev.slack = Luggage("slack", 0, lasting=True)  # of the overlap, what no push is for
-            self.dev.given = Luggage("given", 0, lasting=True)  # pushes and blows in the last substep [kg m]
-            luggage += [self.dev.slack, self.dev.blow, self.dev.given]
-        self.dev.grid = Grid(scene, self.dev.size, linked, self.table, luggage, team, self.dev.move)
-        self.dev.calm = Calm(self, -(-n // team.piece))
-        return self.dev.grid
+        dev.push = Luggage("push", 0, lasting=True, marked=True)
+        dev.slip = Luggage("slip", dim, lasting=True)
+        dev.slack = Luggage("slack", 0, lasting=True)  # of the overlap, what no push is for
+        dev.impulse = Luggage("given", 0, lasting=True)  # pushes and impacts in the last substep [kg m]
+        struck, bouncing = Luggage("blow", 0, lasting=False), [dev.slack] if dev.bounces else []
+        luggage = [dev.push, *([dev.slip] if dev.rubs else []), *([*bouncing, struck, dev.impulse] if dev.bounces else [])]
+        dev.grid = Grid(scene, dev.skin, linked, self.table, luggage, team, dev.move)
+        dev.geometry = DiscGeometry(scene, dev.grid, self.push_out, dev.impulse if dev.bounces else dev.push)
+        skips = n >= FEW and not dev.bounces  # in relax() what bounces forgets the last impact
+        dev.splitting = MassSplitting(scene, dev.geometry, dev.rubs, skips, [dev.push, *bouncing], team)
+        dev.press = scene.memory.field("Contact.press", n, width=dim, state=True)
+        dev.forces = ForceShare(scene, sums=dev.rubs, lasting=True)
+        dev.fast = scene.memory.field("Contact.fast", None, kind=ti.i32)
+        dev.friction = Friction(self.table)
+        dev.restitution = None
+        if dev.bounces:
+            dev.restitution = Restitution(scene, dev.geometry, self.table, struck, dev.slack, dev.impulse)
+            dev.hit = dev.restitution.hit
+        dev.projection = VelocityProjection(scene, dev.grid, dev.push, dev.splitting.weight, dev.restitution, dev.move, team)
+        return dev.grid
 
     @ti.func
-    def overshoots(self, i):
-        """1 if particle i crosses more than its own size in one substep."""
-        d, limit = self.dev.state.d[i], self.dev.radius.stride(i)
-        return ti.select(d.dot(d) <= limit * limit, 0, 1)
+    def count(self, begin, end):
+        """Which pairs of some particles touch, and how often their masses are split."""
+        self.dev.splitting.count(begin, end)
 
     @ti.func
-    def heed(self, stale, fast):
-        """Write down what was noticed; threads that all write to the same place would wait for each other."""
-        if stale != 0:
-            if self.dev.grid.stale[None] == 0:
-                self.dev.grid.stale[None] = 1
-        if fast != 0:
-            if self.dev.fast[None] == 0:
-                self.dev.fast[None] = 1
+    def busy(self, begin):
+        """0 if none of the particles that were counted together, from `begin` on, touches another."""
+        return self.dev.splitting.busy(begin)
 
     @ti.func
     def relax(self, i, first, fresh, final):
         """What the pairs of particle i want of it."""
-        total, w = ti.Vector.zero(self.scene.real, self.dev.state.dim), self.dev.state.w.of(i)
-        lift, bond = total, total
+        total, w = ti.Vector.zero(self.scene.real, self.dev.state.dim), self.dev.w.of(i)
+        lift, forced = total, total
         if ti.static(self.dev.bounces):
             if first != 0:
-                self.dev.struck[i] = self.dev.split[i]
-                for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
-                    self.dev.blow.field[e] = 0
-                    self.dev.given.field[e] = 0
-        if self.dev.split[i] > 0:
+                self.dev.restitution.clear(i, self.dev.splitting.weight[i])
+        if self.dev.splitting.weight[i] > 0:
             for word in range(self.dev.grid.words(i)):
-                bits = self.touching(i, word)
+                bits = self.dev.splitting.touching(i, word)
                 while bits != 0:
                     e = self.dev.grid.first[i] + word * WORD + lowest(bits)
                     bits &= bits - ti.u32(1)
                     j = self.dev.grid.near[e]
-                    shared, last = self.dev.split[i] + self.dev.split[j], self.dev.push.field[e]
-                    overlap, each, n = self.meet(i, j, self.far(i, j), shared)
+                    last = self.dev.push.field[e]
+                    shared = self.dev.splitting.weight[i] + self.dev.splitting.weight[j]
+                    overlap, each, n = self.dev.geometry.impact(i, j, self.dev.geometry.contact_distance(i, j), shared)
                     each *= ti.static(RELAXATION)
-                    paid, given, rests, alone = overlap, ti.zero(overlap), True, w + self.dev.state.w.of(j)
+                    paid, given, rests, alone = overlap, ti.zero(overlap), True, w + self.dev.w.of(j)
                     if ti.static(self.dev.bounces):
-                        given, slack, rests = self.bounce(i, j, n, overlap, self.dev.slack.field[e], last, first)
+                        given, slack, rests = self.dev.restitution.bounce(i, j, n, overlap, self.dev.slack.field[e], last, first)
                         if first != 0:
                             back = ti.static(UPTAKE) * ti.min(slack * each, slack / alone)
                             lift += w * back * n
@@ -249,34 +161,39 @@ class Contact(Splitting):
                     part = lesser(part, paid / alone)  # without a branch: it would be taken at random
                     if ti.static(self.dev.bounces):
                         if given > 0:
-                            self.dev.blow.field[e] = 1
+                            self.dev.restitution.struck.field[e] = 1
                             if self.dev.hit[None] == 0:
                                 self.dev.hit[None] = 1
                         if not rests:
                             part = ti.zero(part)
-                        self.dev.given.field[e] = self.dev.given.field[e] + part
+                        self.dev.impulse.field[e] = self.dev.impulse.field[e] + part
                     push += part
                     want = part * n
                     if ti.static(self.dev.rubs):
-                        want -= self.rub(i, j, n, part * shared + given, self.dev.slip.field[e]) / shared
+                        want -= self.held(i, j, n, part * shared + given, self.dev.slip.field[e]) / shared
                     total += w * want
                     if ti.static(self.dev.rubs):
                         if final != 0:
-                            came = -(self.dev.before[i] - self.dev.before[j]).dot(n)
-                            bond += self.steady(came, part * alone) * w * (want - part * n)
+                            approach = -(self.dev.forces.before[i] - self.dev.forces.before[j]).dot(n)
+                            forced += self.dev.forces.share(approach, part * alone) * w * (want - part * n)
                     self.dev.push.field[e] = push
         self.dev.move[i] = total
         if ti.static(self.dev.rubs):
             if final != 0:
-                self.sum_up(i, bond, first)
+                self.dev.forces.add(i, forced, first)
         if ti.static(self.dev.bounces):
-            self.dev.lift[i] = lift
+            self.dev.restitution.lift[i] = lift
 
     @ti.func
-    def push_bond(self, i):
+    def held(self, i, j, n, normal, slip):
+        """The part of a pair's slip, with the present displacements, that friction takes back for a normal displacement."""
+        return self.dev.friction.held(i, j, n, normal, slip + self.dev.state.d[i] - self.dev.state.d[j])
+
+    @ti.func
+    def sum_pushes(self, i):
         """Along the normals at the present places, where pushes have no moment. Friction is known from the passes."""
-        total, w = 0 * self.dev.press[i], self.dev.state.w.of(i)
-        if self.dev.split[i] > 0:
+        total, w = 0 * self.dev.press[i], self.dev.w.of(i)
+        if self.dev.splitting.weight[i] > 0:
             for word in range(self.dev.grid.words(i)):
                 bits = ti.select(word == 0, self.dev.grid.touching[i], self.dev.grid.whole(i, word))
                 while bits != 0:
@@ -287,125 +204,54 @@ class Contact(Splitting):
                     length = r.norm()
                     if push > 0 and length > 0:
                         n = r / length
-                        came = -(self.dev.before[i] - self.dev.before[j]).dot(n)
-                        total += self.steady(came, push * (w + self.dev.state.w.of(j))) * w * push * n
+                        approach = -(self.dev.forces.before[i] - self.dev.forces.before[j]).dot(n)
+                        total += self.dev.forces.share(approach, push * (w + self.dev.w.of(j))) * w * push * n
         self.dev.press[i] = total
 
     @ti.func
-    def bond(self, i):
-        """Pushes, and friction."""
+    def forced(self, i):
+        """What pushes and friction moved particle i by, as far as they are forces [m]."""
         total = self.dev.press[i]
         if ti.static(self.dev.rubs):
-            total += self.dev.bond[i]
+            total += self.dev.forces.sum[i]
         return total
 
     @ti.func
-    def bounce(self, i, j, n, overlap, slack, last, first):
-        """The displacement that takes a pair that was struck in this substep from coming together to leaving, 0 for others; its
-        slack; and whether it rests, so that it is pushed apart, as it was in the last substep."""
-        given, here, a = self.leap(i, j, n)
-        rests, e = True, self.table.of(i, j)[2]
-        if e > 0:
-            deep = ti.select(last > 0, overlap, ti.select(e < 1, slack, 0))  # nothing that is elastic rests where nothing pulls
-            if last == 0:
-                slack = ti.max(slack, overlap - ti.max(here, 0))
-            if a > 0:
-                rests = deep > 0 and (first == 0 or given <= deep)
-            elif a < 0:
-                rests = deep > 0 or overlap <= here
-        if rests or a < 0 or first == 0:
-            given = 0 * given
-        if not rests:
-            slack = ti.select(given > 0, ti.max(overlap - given, 0), 0)
-        return given, ti.min(slack, overlap), rests
+    def choose_impact(self, i):
+        """The first impact of particle i in a round."""
+        self.dev.restitution.choose(i)
 
     @ti.func
-    def leap(self, i, j, n):
-        """What takes a pair from coming together to leaving; how far it comes together in this substep, and without forces."""
-        a = -(self.dev.state.before[i] - self.dev.state.before[j]).dot(n)
-        here = -(self.dev.state.d[i] - self.dev.state.d[j]).dot(n)
-        return here + self.table.of(i, j)[2] * ti.max(a, 0), here, a
+    def apply_impact(self, i):
+        """Let particle i bounce, if the other of the pair chose the same impact."""
+        self.dev.restitution.apply(i)
 
     @ti.func
-    def rebound(self, i):
-        """The first of the pairs of particle i that were struck and still come together, and what it does to i."""
-        first, partner, most, w = -1, -1, 0 * self.dev.struck[i], self.dev.state.w.of(i)
-        if self.dev.struck[i] > 0:
-            for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
-                if self.dev.blow.field[e] > 0:
-                    j = self.dev.grid.near[e]
-                    overlap, _each, n = self.meet(i, j, self.far(i, j), self.dev.struck[i])
-                    given, here, a = self.leap(i, j, n)
-                    if overlap > 0 and a > 0 and given > 0:
-                        left = ti.select(overlap < here, overlap / here, 1)
-                        if left > most or (left == most and earlier(i, j, partner)):
-                            first, partner, most = e, j, left
-                            self.dev.kick[i] = w / (w + self.dev.state.w.of(j)) * given * n
-                            if self.dev.hit[None] == 0:
-                                self.dev.hit[None] = 1
-        self.dev.first[i] = first
-        self.dev.partner[i] = partner
-        self.dev.left[i] = most
-
-    @ti.func
-    def part_ways(self, i):
-        """Let particle i bounce off its partner, if it is the partner's partner."""
-        j = self.dev.partner[i]
-        if j >= 0:
-            if self.dev.partner[j] == i or self.dev.state.w.of(j) == 0:
-                e, kick = self.dev.first[i], self.dev.kick[i]
-                self.dev.given.field[e] = self.dev.given.field[e] + kick.norm() / self.dev.state.w.of(i)
-                self.dev.state.d[i] = self.dev.state.d[i] + kick
-                self.dev.state.before[i] = self.dev.state.before[i] + kick
-                self.dev.state.advance(i, self.dev.left[i] * kick)
-
-    @ti.func
-    def rub(self, i, j, n, normal, slip):
-        """The part of a pair's slip, with the present displacements, that friction takes back for a normal displacement."""
-        s = slip + self.dev.state.d[i] - self.dev.state.d[j]
-        s -= s.dot(n) * n
-        row, size = self.table.of(i, j), s.norm()
-        if size > row[0] * normal:
-            s *= row[1] * normal / size
-        return s
-
-    @ti.func
-    def gather(self, i, first):
+    def apply_corrections(self, i, first):
         """Move particle i as its pairs want."""
-        if self.dev.state.w.of(i) > 0:  # what touches nothing moves by 0, without a branch
+        if self.dev.w.of(i) > 0:  # what touches nothing moves by 0, without a branch
             self.dev.state.shift(i, self.dev.move[i])
             if ti.static(self.dev.bounces):
-                self.dev.state.advance(i, self.dev.lift[i])
+                self.dev.state.advance(i, self.dev.restitution.lift[i])
 
     @ti.func
-    def remember(self, i):
+    def finish_substep(self, i):
         """At the end of a substep: add to each pair's slip what it has moved, as far as friction can hold it; a pair that parted
         has no slack. What came to overlap after pairs were pushed, which a list with a narrow skin may not know yet, waits."""
         if ti.static(self.dev.rubs):
             for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
                 j = self.dev.grid.near[e]
-                overlap, n = self.touch(i, j, self.far(i, j))
+                overlap, n = self.dev.geometry.overlap(i, j, self.dev.geometry.contact_distance(i, j))
                 slip = 0 * self.dev.state.x[i]
                 if overlap > 0 and self.dev.push.field[e] > 0:
-                    pressed = self.dev.push.field[e] * (self.dev.split[i] + self.dev.split[j])
-                    slip = self.rub(i, j, n, ti.max(overlap, pressed), self.dev.slip.field[e])
+                    pressed = self.dev.push.field[e] * (self.dev.splitting.weight[i] + self.dev.splitting.weight[j])
+                    slip = self.held(i, j, n, ti.max(overlap, pressed), self.dev.slip.field[e])
                 self.dev.slip.field[e] = slip
         if ti.static(self.dev.bounces):
-            if self.dev.split[i] > 0:
+            if self.dev.splitting.weight[i] > 0:
                 for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
                     if self.dev.slack.field[e] > 0:
                         j = self.dev.grid.near[e]
-                        overlap, _n = self.touch(i, j, self.far(i, j))
+                        overlap, _n = self.dev.geometry.overlap(i, j, self.dev.geometry.contact_distance(i, j))
                         if overlap <= 0:
                             self.dev.slack.field[e] = 0
-
-
-def _skin(value):
-    return value if isinstance(value, str) and value == "auto" else checks.number("Contact", "skin", value, above=0.0)
-
-
-@ti.func
-def earlier(i, j, k):
-    """Whether (i, j) comes before (i, k) among pairs that are struck at the same time: an order of all pairs, whichever is i."""
-    a, b = ti.min(i, j), ti.min(i, k)
-    return a < b or (a == b and ti.max(i, j) < ti.max(i, k))

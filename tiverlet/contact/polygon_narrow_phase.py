@@ -1,13 +1,19 @@
 """Where vertices are to the edges of bodies made of loops of particles (2D)."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from ..device import ti
+from ..features.feature import Scene
 from ..features.material import Table
+from ..neighbours.neighbour_list import Luggage
+from ..neighbours.neighbour_search import Grid
 from ..neighbours.queries import Contacts
-from .contact import Contact
+from .narrow_phase import DiscGeometry
 
 SLACK = 1 / 512  # of an edge: as much further it goes at its ends, so that bodies of the same width stand on each other
+STRETCH = 1.25  # of an edge, beyond which a contact in its middle might not be listed
 BEYOND = 1 / 4  # of an edge, how far beyond its end a contact may be
 REACH = 1.35  # of an edge, from one end to where a contact may be: (1 + BEYOND, 1 / 2)
 CLOSE = 1e-4  # edges whose distances differ by less are equally near: the first of them counts
@@ -17,18 +23,63 @@ OVER_EDGE = 1  # what tips_cross() returns where the way out is over the edge of
 VERTEX, START, END = range(3)  # what a particle is in a contact with one that it is listed with
 
 
-class Rim(Contact):
-    """The geometry of Polygons: which vertex is beside, over or inside of which edge, and who takes part in that contact."""
+class Outline(NamedTuple):
+    """Bodies as arrays: of each particle the next and the one before around its body, (n, 2), and the number of the body, (n,),
+    or -1; and the length of the longer of its two edges, (n,) [m]."""
+
+    ends: np.ndarray
+    body: np.ndarray
+    length: np.ndarray
+
+    @property
+    def longest(self) -> np.ndarray:
+        """The length of the edges [m] up to which the list is complete."""
+        return STRETCH * self.length
+
+    @property
+    def reach(self) -> np.ndarray:
+        """How far from each particle a contact of its edges may be [m]."""
+        return REACH * self.longest
+
+
+class PolygonGeometry:
+    """Bodies made of loops of particles: which vertex is beside, over or inside of which edge, and who takes part in a contact.
+
+    C(x) = (x_v - (1 - t) x_a - t x_b) . n - (r_v + (1 - t) r_a + t r_b) of a vertex v and the edge from a to b of another body,
+    or C of two discs, see DiscGeometry, of which one may be a corner. push_out: at which speed what is inside goes out [m/s].
+    """
+
+    shrinks, store = True, None  # its field is there from the start
+
+    def __init__(self, scene: Scene, outline: Outline, push_out: float):
+        n, add = scene.particles.count, scene.memory.field
+        self.scene, self.state, self.radius, self.w, self.real = scene, scene.state, scene.radius, scene.state.w, scene.real
+        self.outline, self.push_out = outline, push_out
+        self.loop = add("Polygons.loop", n, width=3, kind=ti.i32, values=np.c_[outline.ends, outline.body])
+        self.longest = add("Polygons.longest_edge", n, values=outline.longest)
+        self.step = float(outline.length[outline.body >= 0].min(initial=np.inf)) / 4
+        self.allowed = add("Polygons.allowed", n, state=True)  # overlap [m]
+        self.in_state = {"allowed": self.allowed}
+        self.h = add("Polygons.substep", None)
+        # For each entry the contact of which its particle is the vertex: overlap, place on the edge (DISCS: there is none) and
+        # normal; where in the list of the other one those are in which it is the start, and the end, of the edge (-1: nowhere).
+        self.manifold, self.back = Luggage("met", 4, False, kept=False), Luggage("back", 2, False, kept=False)
+        self.impulse = Luggage("given", 0, lasting=True)  # pushes and impacts in the last substep [kg m]
+        self.carried = [self.manifold, self.back, self.impulse]
+
+    def bind(self, grid: Grid) -> None:
+        """Take the neighbour list, which asks for pairs by `Beside`."""
+        self.grid, self.discs = grid, DiscGeometry(self.scene, grid)
 
     @ti.func
     def after(self, i):
         """The next particle around the body of particle i; -1 if it has none."""
-        return self.dev.loop[i][0]
+        return self.loop[i][0]
 
     @ti.func
     def before(self, i):
         """The one before."""
-        return self.dev.loop[i][1]
+        return self.loop[i][1]
 
     @ti.func
     def corner(self, v, a):
@@ -38,7 +89,7 @@ class Rim(Contact):
         """
         out = 1
         if self.after(a) >= 0:
-            r, u, w = self.dev.state.apart(v, a), self.dev.state.apart(self.after(a), a), self.dev.state.apart(self.before(a), a)
+            r, u, w = self.state.apart(v, a), self.state.apart(self.after(a), a), self.state.apart(self.before(a), a)
             if r.dot(u) > 0 or r.dot(w) > 0:
                 out = 0
             elif u.cross(w) < 0:
@@ -50,10 +101,10 @@ class Rim(Contact):
         """How far v overlaps the edge from a to the next, negative where it does not, the normal, and where on the edge.
 
         What was in front at the start of the substep came in over this edge if it crossed it between its ends. What was behind
-        already goes out over the nearest one that faces its own body, at push_out. moved: as in look().
+        already goes out over the nearest one that faces its own body, at push_out. moved: as in detect().
         """
         b = self.after(a)
-        r, u = self.dev.state.apart(v, a), self.dev.state.apart(b, a)
+        r, u = self.state.apart(v, a), self.state.apart(b, a)
         uu, t = u.dot(u), 0 * r[0]
         overlap, n = t - 1, 0 * r
         if uu > 0:
@@ -63,8 +114,8 @@ class Rim(Contact):
             if height < 0:
                 came = height >= -SLACK * length
                 if ti.static(moved):
-                    d = self.dev.state.d[a]
-                    r0, u0 = r - (self.dev.state.d[v] - d), u - (self.dev.state.d[b] - d)
+                    d = self.state.d[a]
+                    r0, u0 = r - (self.state.d[v] - d), u - (self.state.d[b] - d)
                     height0, t0 = r0.dot(ti.Vector([u0[1], -u0[0]])) / length, r0.dot(u0) / ti.max(u0.dot(u0), uu * SLACK)
                     came = height0 >= -SLACK * length
                     if height0 > 0:
@@ -83,14 +134,14 @@ class Rim(Contact):
                         height, shared = -r.norm(), self.before(a)
                         n = r / ti.min(height, -uu * TINY)
                 t = ti.min(ti.max(t, 0), 1)
-            far = self.dev.radius.of(v) + (1 - t) * self.dev.radius.of(a) + t * self.dev.radius.of(b)
+            far = self.radius.of(v) + (1 - t) * self.radius.of(a) + t * self.radius.of(b)
             if beside and height < far and height >= -length / 2:
                 out, back = far - height, 0 * r
                 if ti.static(moved):
-                    out -= self.dev.less[v]
+                    out -= self.allowed[v]
                 if not came:
                     if ti.static(moved):
-                        out = ti.min(out, self.push_out * self.dev.h[None] - self.relative(self.dev.state.d, v, a, b, t).dot(n))
+                        out = ti.min(out, self.push_out * self.h[None] - self.relative(self.state.d, v, a, b, t).dot(n))
                         back = self.inward(v)
                     if tips == OVER_EDGE:
                         came = True
@@ -111,9 +162,9 @@ class Rim(Contact):
         """
         out = 0
         if self.after(v) >= 0 and self.after(c) >= 0:
-            r = self.dev.state.apart(v, c)
-            p, q = self.dev.state.apart(self.after(v), v), self.dev.state.apart(self.before(v), v)
-            a, b = self.dev.state.apart(self.after(c), c), self.dev.state.apart(self.before(c), c)
+            r = self.state.apart(v, c)
+            p, q = self.state.apart(self.after(v), v), self.state.apart(self.before(v), v)
+            a, b = self.state.apart(self.after(c), c), self.state.apart(self.before(c), c)
             # Heights, times the lengths of the edges: of v over those of c, and of c over those of v.
             over_a, over_b, over_p, over_q = r.cross(a), b.cross(r), p.cross(r), r.cross(q)
             if p.cross(q) > 0 and a.cross(b) > 0 and over_a * over_b < 0 and over_p * over_q < 0:
@@ -138,11 +189,11 @@ class Rim(Contact):
 
         What is behind one edge may be in front of the next, where they meet at less than 90 degrees.
         """
-        out, k, r = False, a, self.dev.state.apart(a, v)
+        out, k, r = False, a, self.state.apart(a, v)
         going = True
         while going:
             k = self.after(k)
-            s = self.dev.state.apart(k, v)
+            s = self.state.apart(k, v)
             up = s[1] > 0
             if (r[1] > 0) != up and (r.cross(s) > 0) == up:
                 out = not out
@@ -152,9 +203,9 @@ class Rim(Contact):
     @ti.func
     def inward(self, v):
         """The way from an outer corner v into its own body; 0 where there is none."""
-        out = 0 * self.dev.state.x[v]
+        out = 0 * self.state.x[v]
         if self.after(v) >= 0:
-            u, w = self.dev.state.apart(self.after(v), v), self.dev.state.apart(self.before(v), v)
+            u, w = self.state.apart(self.after(v), v), self.state.apart(self.before(v), v)
             if u.cross(w) > 0:
                 out = u * w.norm() + w * u.norm()
         return out
@@ -166,10 +217,10 @@ class Rim(Contact):
         Edges that face away from the body of v, which lies in the direction `back`, are no way out for it.
         """
         out = True
-        for e in range(self.dev.grid.first[v], self.dev.grid.first[v] + self.dev.grid.number[v]):
-            j = self.dev.grid.near[e]
-            if j != a and j != shared and self.dev.loop[j][2] == self.dev.loop[a][2]:
-                r, u = self.dev.state.apart(v, j), self.dev.state.apart(self.after(j), j)
+        for e in range(self.grid.first[v], self.grid.first[v] + self.grid.number[v]):
+            j = self.grid.near[e]
+            if j != a and j != shared and self.loop[j][2] == self.loop[a][2]:
+                r, u = self.state.apart(v, j), self.state.apart(self.after(j), j)
                 uu, faces = u.dot(u), u[1] * back[0] - u[0] * back[1] >= 0
                 if uu > 0:
                     r -= ti.min(ti.max(r.dot(u) / uu, 0), 1) * u
@@ -179,7 +230,7 @@ class Rim(Contact):
         return out
 
     @ti.func
-    def look(self, i, moved: ti.template()):  # type: ignore[valid-type]
+    def detect(self, i, moved: ti.template()):  # type: ignore[valid-type]
         """Find the contacts that particle i is the vertex of, or one of two discs: at most one with each near particle; returns
         how many there are.
 
@@ -187,38 +238,38 @@ class Rim(Contact):
         and the nearest edges: before the first substep after a start, d is the velocity.
         """
         active = 0
-        for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
-            j = self.dev.grid.near[e]
+        for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
+            j = self.grid.near[e]
             if self.after(i) < 0 and self.after(j) < 0:
-                overlap, n = self.touch(i, j, self.dev.radius.of(i) + self.dev.radius.of(j))
+                overlap, n = self.discs.overlap(i, j, self.radius.of(i) + self.radius.of(j))
                 if ti.static(moved):
-                    overlap -= self.dev.less[ti.min(i, j)]
+                    overlap -= self.allowed[ti.min(i, j)]
                 active += ti.cast(overlap > 0, ti.i32)
-                self.dev.met.field[e] = ti.Vector([overlap, ti.cast(DISCS, self.scene.real), n[0], n[1]])
+                self.manifold.field[e] = ti.Vector([overlap, ti.cast(DISCS, self.real), n[0], n[1]])
             else:
-                overlap, n, t = 0 * self.dev.w.of(i) - 1, 0 * self.dev.state.x[i], 0 * self.dev.w.of(i)
+                overlap, n, t = 0 * self.w.of(i) - 1, 0 * self.state.x[i], 0 * self.w.of(i)
                 front = self.corner(i, j)
                 if self.after(j) >= 0:
                     overlap, n, t = self.edge(i, j, front, moved)
-                if overlap <= 0 and front > 0 and self.tells(i, j):
-                    overlap, n = self.touch(i, j, self.dev.radius.of(i) + self.dev.radius.of(j))
+                if overlap <= 0 and front > 0 and self.keeps(i, j):
+                    overlap, n = self.discs.overlap(i, j, self.radius.of(i) + self.radius.of(j))
                     if overlap > 0:
                         if self.tips_cross(i, j) != 0:
                             overlap = -overlap
                     if ti.static(moved):
-                        overlap -= self.dev.less[i]
+                        overlap -= self.allowed[i]
                     if overlap > 0:
                         t = 0 * t + DISCS
                         if self.corner(j, i) <= 0:
                             overlap = -overlap
                 active += ti.cast(overlap > 0, ti.i32)
-                self.dev.met.field[e] = ti.Vector([overlap, t, n[0], n[1]])
+                self.manifold.field[e] = ti.Vector([overlap, t, n[0], n[1]])
                 if self.after(i) >= 0:
-                    self.dev.back.field[e] = ti.cast(ti.Vector([self.find(j, i), self.find(j, self.before(i))]), self.scene.real)
+                    self.back.field[e] = ti.cast(ti.Vector([self.find(j, i), self.find(j, self.before(i))]), self.real)
         return active
 
     @ti.func
-    def tells(self, i, j):
+    def keeps(self, i, j):
         """Whether of two particles that touch as discs it is i that keeps the contact, as its vertex.
 
         Particles in no loop are never the start or end of an edge: they keep all contacts that they are in. Two of them both keep
@@ -234,39 +285,39 @@ class Rim(Contact):
     @ti.func
     def find(self, v, a):
         """Where a is in the list of v, counted from its begin; -1 if it is not."""
-        low, end = self.dev.grid.first[v], self.dev.grid.first[v] + self.dev.grid.number[v]
+        low, end = self.grid.first[v], self.grid.first[v] + self.grid.number[v]
         high = end
         while low < high:
             middle = (low + high) // 2
-            if self.dev.grid.near[middle] < a:
+            if self.grid.near[middle] < a:
                 low = middle + 1
             else:
                 high = middle
         out = -1
         if low < end:
-            if self.dev.grid.near[low] == a:
-                out = low - self.dev.grid.first[v]
+            if self.grid.near[low] == a:
+                out = low - self.grid.first[v]
         return out
 
     @ti.func
-    def meeting(self, i, e, role):
+    def participants(self, i, e, role):
         """The contact in which particle i, with the one at entry e of its list, is in a role.
 
         Returns the entry that keeps it (-1: there is none), its particles v, a, b, where on the edge, and the part of its move
         that is that of i: 1, -(1 - t) or -t. Two discs are an edge of which only the start is touched.
         """
-        j = self.dev.grid.near[e]
+        j = self.grid.near[e]
         at, v, a = e, i, j
         if role != VERTEX:
-            back = self.dev.back.field[e]
+            back = self.back.field[e]
             v, a, at = j, i, ti.cast(back[0], ti.i32)
             if role == END:
                 a, at = self.before(i), ti.cast(back[1], ti.i32)
             if at >= 0:
-                at += self.dev.grid.first[j]
-        b, t, part = a, 0 * self.dev.w.of(i), 0 * self.dev.w.of(i) + 1
+                at += self.grid.first[j]
+        b, t, part = a, 0 * self.w.of(i), 0 * self.w.of(i) + 1
         if at >= 0:
-            t = self.dev.met.field[at][1]
+            t = self.manifold.field[at][1]
             if t > DISCS:
                 b = self.after(a)
             elif role == END:
@@ -285,18 +336,88 @@ class Rim(Contact):
         """The displacement of v relative to the point t of the edge from a to b."""
         return d[v] - (1 - t) * d[a] - t * d[b]
 
+    @ti.func
+    def inverse_mass(self, v, a, b, t):
+        """That of a contact which is the only one."""
+        return self.w.of(v) + (1 - t) * (1 - t) * self.w.of(a) + t * t * self.w.of(b)
+
+    @ti.func
+    def split_mass(self, count: ti.template(), v, a, b, t):  # type: ignore[valid-type]
+        """The same where the mass of each particle is split by the number of contacts that it is in."""
+        at_a, at_b = (1 - t) * (1 - t) * count[a] * self.w.of(a), t * t * count[b] * self.w.of(b)
+        return count[v] * self.w.of(v) + at_a + at_b
+
+    @ti.func
+    def too_long(self, i):
+        """1 if the edge that begins at particle i is too long for the list."""
+        after, out = self.after(i), 0
+        if after >= 0:
+            u = self.state.apart(after, i)
+            if u.dot(u) > self.longest[i] ** 2:
+                out = 1
+        return out
+
+    @ti.func
+    def overshoots(self, i):
+        """1 if particle i crosses a quarter of an edge in one substep."""
+        d, limit = self.state.d[i], ti.cast(self.step, self.real)
+        if self.after(i) < 0:
+            limit = ti.min(limit, self.radius.stride(i) if ti.static(self.radius.least > 0) else limit)
+        return ti.select(d.dot(d) <= limit * limit, 0, 1)
+
+    def enable_shrink(self) -> None:
+        """The field is there from the start."""
+
+    @ti.func
+    def shrink(self, i, first):
+        """Allow particle i the overlap that it has as a vertex, as far as particles from number `first` on have to do with it."""
+        self.detect(i, False)
+        allowed = ti.select(first > 0, self.allowed[i], 0 * self.w.of(i))
+        for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
+            j, found = self.grid.near[e], self.manifold.field[e]
+            if ti.max(i, j) >= first and (found[1] > DISCS or self.keeps(i, j)):
+                allowed = ti.max(allowed, found[0])
+        self.allowed[i] = allowed
+
+    @ti.func
+    def restore(self, i, h):
+        """Allow particle i less, and keep the length of the substep at hand."""
+        if i == 0:
+            self.h[None] = h
+        self.allowed[i] = ti.max(self.allowed[i] - self.push_out * h, 0)
+
+    @ti.func
+    def worst_overlap(self, i):
+        """For the report: contacts that particle i is the vertex of, or the first disc, and the worst overlap.
+
+        It is relative to half of the edge, or to the radius of the smaller disc.
+        """
+        touching, worst = 0, ti.cast(0, ti.f64)
+        self.detect(i, False)
+        for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
+            j, found = self.grid.near[e], self.manifold.field[e]
+            if found[0] > 0 and (found[1] > DISCS or self.keeps(i, j)):
+                size = ti.min(self.radius.of(i), self.radius.of(j))
+                if found[1] > DISCS:
+                    size = self.state.apart(self.after(j), j).norm() / 2
+                elif size == 0:
+                    size = ti.max(self.radius.of(i), self.radius.of(j))
+                worst = ti.max(worst, found[0] / size)
+                touching += 1
+        return touching, worst
+
     def found(self, x: np.ndarray, h: float) -> Contacts:
-        """Vertices and edges, and pairs of discs, by what look() found last; also those that were pushed apart since."""
-        grid, r = self.dev.grid, self.scene.particles.radius
+        """Vertices and edges, and pairs of discs, by what detect() found last; also those that were pushed apart since."""
+        grid, r = self.grid, self.scene.particles.radius
         pairs, at = grid.entries()
-        met, push = grid.read(self.dev.met, at), grid.read(self.dev.given, at)
-        after = self.dev.ends[:, 0]
-        some = ((met[:, 0] > 0) | (push > 0)) & ((after[pairs] >= 0).any(axis=1) | (pairs[:, 0] < pairs[:, 1]))
-        pairs, met, push = pairs[some], met[some], push[some]
-        (i, j), overlap, t, n = pairs.T, met[:, 0], met[:, 1], met[:, 2:]
+        found, push = grid.read(self.manifold, at), grid.read(self.impulse, at)
+        after = self.outline.ends[:, 0]
+        some = ((found[:, 0] > 0) | (push > 0)) & ((after[pairs] >= 0).any(axis=1) | (pairs[:, 0] < pairs[:, 1]))
+        pairs, found, push = pairs[some], found[some], push[some]
+        (i, j), overlap, t, n = pairs.T, found[:, 0], found[:, 1], found[:, 2:]
         parted, no_way = overlap <= 0, (n == 0).all(axis=1)
         discs = (t <= DISCS) | (no_way & (r[i] + r[j] > 0))
-        ends, t = np.where(discs, j, self.dev.ends[j, 0]), np.where(discs, 0.0, t)
+        ends, t = np.where(discs, j, after[j]), np.where(discs, 0.0, t)
         edge, apart = x[ends] - x[j], x[i] - (1 - t)[:, None] * x[j] - t[:, None] * x[ends]
         straight = np.where(discs[:, None], apart, np.stack([edge[:, 1], -edge[:, 0]], axis=1))
         n = np.where(no_way[:, None], straight / np.linalg.norm(straight, axis=1)[:, None], n)
@@ -316,20 +437,19 @@ def meets(r, s, q):
     return d > 0 and 0 <= at_s <= d and 0 <= at_q <= d
 
 
-class Apart:
-    """What the grid asks which pairs may touch: those of different bodies, as far as their groups do."""
+class Beside:
+    """What the neighbour search asks which pairs to list: those of different bodies, as far as their groups touch."""
 
     uniform = False
 
-    def __init__(self, rim: Rim):
-        self.table: Table = rim.table
-        self.loop, self.limit, self.skin = rim.dev.loop, rim.dev.limit, rim.dev.size
-        self.radius, self.state = rim.dev.radius, rim.scene.state
+    def __init__(self, geometry: PolygonGeometry, table: Table, skin: float):
+        self.table, self.skin = table, skin
+        self.loop, self.longest, self.radius, self.state = geometry.loop, geometry.longest, geometry.radius, geometry.state
 
     @ti.func
     def reach(self, radius: ti.template(), i, j):  # type: ignore[valid-type]
         """How far from each other particles i and j may take part in a contact."""
-        return radius.of(i) + radius.of(j) + ti.static(REACH) * ti.max(self.limit[i], self.limit[j])
+        return radius.of(i) + radius.of(j) + ti.static(REACH) * ti.max(self.longest[i], self.longest[j])
 
     @ti.func
     def of(self, i, j):

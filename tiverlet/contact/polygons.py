@@ -8,19 +8,21 @@ import numpy as np
 from ..device import ti
 from ..device.thread_team import Team
 from ..features.feature import Batch, Scene
+from ..features.material import Table
 from ..neighbours.neighbour_list import Luggage
 from ..neighbours.neighbour_search import Grid
 from ..particles import Particles
 from ..tools import median
-from .contact import Contact
+from .force_share import ForceShare
+from .friction import Friction
 from .loops import checked, laid, refuse_deep
-from .polygon_narrow_phase import DISCS, REACH, VERTEX, Apart, Rim
+from .pair_contact import PairContact
+from .polygon_narrow_phase import VERTEX, Beside, Outline, PolygonGeometry
 
-STRETCH = 1.25  # of an edge, beyond which a contact in its middle might not be listed
 SKIN = 0.15  # of the longer edge of a vertex
 
 
-class Polygons(Rim):
+class Polygons(PairContact):
     """Bodies made of particle loops do not overlap each other, nor other particles: vertex against edge, disc against disc (2D).
 
     C(x) = (x_v - (1 - t) x_a - t x_b) . n - (r_v + (1 - t) r_a + t r_b) >= 0 for a vertex v and the edge from a to b of another
@@ -43,30 +45,25 @@ class Polygons(Rim):
     between two of them.
     """
 
-    measures, calms = True, False
+    detects = True
     room = 64  # the particles of near bodies
-    groups: Any = None  # all touch
 
     def __init__(self, loops: Iterable, friction=0.0, restitution=0.0, *, skin="auto", push_out=1.0):
-        Contact.__init__(self, friction, restitution, skin=skin, push_out=push_out)
+        self.restitution, self.friction, self.skin, self.push_out = restitution, friction, skin, push_out
         self.loops = checked(loops)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Turn all loops counterclockwise, and measure them; refuse flat ones, and particles deep inside of others."""
         if particles.dim != 2:
             raise ValueError("Polygons: bodies of particle loops are for 2D worlds; these particles are in 3D.")
-        n, x = particles.count, particles.position
-        self.dev.ends, self.dev.body, length = laid(self.loops, x)
-        refuse_deep(self.loops, self.dev.body, x, 0)
-        # A vertex is listed with both ends of an edge that it is beside, or a quarter of it beyond, and behind by half of it.
-        self.dev.length, self.dev.reach = length, REACH * STRETCH * length
-        loops = self.dev.body >= 0
-        self.dev.step = float(length[loops].min(initial=np.inf)) / 4
-        sizes = np.where(loops, SKIN * length, 0.75 * particles.radius)
+        x = particles.position
+        self.dev.outline = Outline(*laid(self.loops, x))
+        refuse_deep(self.loops, self.dev.outline.body, x, 0)
+        sizes = np.where(self.dev.outline.body >= 0, SKIN * self.dev.outline.length, 0.75 * particles.radius)
         auto = median(sizes[sizes > 0]) if (sizes > 0).any() else 1.0
-        self.dev.size = auto if self.skin == "auto" else float(self.skin)
-        self.dev.finest = float((particles.radius + self.dev.reach / 2).min(initial=np.inf))
-        matters = n > 0 and bool(self.loops or (particles.radius > 0).any())
+        self.dev.skin = auto if self.skin == "auto" else float(self.skin)
+        self.dev.finest = float((particles.radius + self.dev.outline.reach / 2).min(initial=np.inf))
+        matters = particles.count > 0 and bool(self.loops or (particles.radius > 0).any())
         self._keep(matters=matters, table=self.wanted)
         if self.matters:
             self.check_range(x)
@@ -74,7 +71,7 @@ class Polygons(Rim):
     def admit(self, particles: Particles, first: int) -> None:
         """Refuse positions too far out, or inside of bodies."""
         super().admit(particles, first)
-        refuse_deep(self.loops, self.dev.body, particles.position, first)
+        refuse_deep(self.loops, self.dev.outline.body, particles.position, first)
 
     def renumber(self, number: np.ndarray, count: int) -> None:
         """Bodies stay as long as all of their particles do."""
@@ -83,172 +80,146 @@ class Polygons(Rim):
         self.arguments = {**self.arguments, "loops": self.loops}
 
     def join(self, scene: Scene, batches: list[Batch], team: Team) -> Grid:
-        """Declare the fields, among them the grid's, which lists particles by their reach."""
-        n, add = scene.particles.count, scene.memory.field
-        self.scene, self.dev.state, self.dev.radius, self.dev.w = scene, scene.state, scene.radius, scene.state.w
-        self.dev.rubs, self.dev.bounces = self.rubs, self.bounces
-        self.dev.eases, self.dev.store, self.dev.skips = True, None, False
-        self.dev.move = add("Contact.move", n, width=2)
-        self.dev.active = add("Contact.active", n, kind=ti.i32)
-        self.dev.bond = add("Contact.bond", n, width=2, state=True)
-        self.dev.before = add("Contact.before", n, width=2)
-        self.dev.fast = add("Contact.fast", None, kind=ti.i32)
-        if self.bounces:
-            self.dev.struck = add("Contact.struck", n, kind=ti.i32)
-            self.dev.kick = add("Contact.kick", n, width=2)
-            self.dev.lift = add("Contact.lift", n, width=2)
-            self.dev.hit = add("Contact.hit", None, kind=ti.i32)
-        self.dev.loop = add("Polygons.loop", n, width=3, kind=ti.i32, values=np.c_[self.dev.ends, self.dev.body])
-        self.dev.limit = add("Polygons.longest_edge", n, values=STRETCH * self.dev.length)
-        self.dev.less = add("Polygons.allowed", n, state=True)
-        self.dev.h = add("Polygons.substep", None)
+        """Declare the fields, among them the neighbour list's, which is returned."""
+        n, add, dev = scene.particles.count, scene.memory.field, self.dev
+        self.scene, dev.state, dev.w, dev.rubs, dev.bounces = scene, scene.state, scene.state.w, self.rubs, self.bounces
+        dev.forces = ForceShare(scene, sums=True, lasting=False)
+        dev.geometry = PolygonGeometry(scene, dev.outline, self.push_out)
+        dev.move = add("Contact.move", n, width=2)
+        dev.active = add("Contact.active", n, kind=ti.i32)  # contacts that each particle is in
+        dev.fast = add("Contact.fast", None, kind=ti.i32)
         self.table.bind(scene, asked=True)
+        dev.friction, dev.slip = Friction(self.table), Luggage("slip", 2, lasting=True)
+        if dev.bounces:
+            dev.restitution = PolygonRestitution(scene, dev.geometry, self.table)
+            dev.hit = dev.restitution.hit
         pairs = [f.partners(f.start) for f in batches]
         linked = np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=np.int32)
-        # For each entry the contact of which its particle is the vertex: overlap, place on the edge (-1: discs), normal; where
-        # in the list of the other particle those are in which it is the start, and the end, of the edge (-1: nowhere).
-        self.dev.met, self.dev.back = Luggage("met", 4, False, kept=False), Luggage("back", 2, False, kept=False)
-        self.dev.slip, self.dev.aim = Luggage("slip", 2, lasting=True), Luggage("aim", 2, lasting=False)
-        self.dev.given = Luggage("given", 0, lasting=True)  # pushes and blows in the last substep [kg m]
-        luggage = [self.dev.met, self.dev.back, self.dev.given, *([self.dev.slip] if self.rubs else [])]
-        luggage += [self.dev.aim] if self.bounces else []
-        apart: Any = Apart(self)
-        self.dev.grid = Grid(scene, self.dev.size, linked, apart, luggage, team, self.dev.move, self.dev.reach)
-        return self.dev.grid
-
-    def ease(self) -> None:
-        """The field is there from the start."""
+        luggage = [*dev.geometry.carried, *([dev.slip] if dev.rubs else []), *([dev.restitution.aim] if dev.bounces else [])]
+        beside: Any = Beside(dev.geometry, self.table, dev.skin)
+        dev.grid = Grid(scene, dev.skin, linked, beside, luggage, team, dev.move, dev.outline.reach)
+        dev.geometry.bind(dev.grid)
+        return dev.grid
 
     @ti.func
-    def shrink(self, i, first):
-        """Allow particle i the overlap that it has as a vertex, as far as particles from number `first` on have to do with it."""
-        self.look(i, False)
-        less = ti.select(first > 0, self.dev.less[i], 0 * self.dev.w.of(i))
-        for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
-            j, met = self.dev.grid.near[e], self.dev.met.field[e]
-            if ti.max(i, j) >= first and (met[1] > DISCS or self.tells(i, j)):
-                less = ti.max(less, met[0])
-        self.dev.less[i] = less
-
-    @ti.func
-    def grow(self, i, h):
-        """Allow particle i less, and keep the length of the substep at hand."""
-        if i == 0:
-            self.dev.h[None] = h
-        self.dev.less[i] = ti.max(self.dev.less[i] - self.push_out * h, 0)
-
-    @ti.func
-    def overshoots(self, i):
-        """1 if particle i crosses a quarter of an edge in one substep."""
-        d, limit = self.dev.state.d[i], ti.cast(self.dev.step, self.scene.real)
-        if self.after(i) < 0:
-            limit = ti.min(limit, self.dev.radius.stride(i) if ti.static(self.dev.radius.least > 0) else limit)
-        return ti.select(d.dot(d) <= limit * limit, 0, 1)
-
-    @ti.func
-    def measure(self, i, first):
-        """Find the contacts of particle i, see look(), and note an edge that is too long for the list."""
+    def detect(self, i, first):
+        """Find the contacts of particle i, and note an edge that is too long for the list."""
         if first != 0:
             for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
-                self.dev.given.field[e] = 0
+                self.dev.geometry.impulse.field[e] = 0
                 if ti.static(self.dev.bounces):
-                    self.dev.aim.field[e] = 0 * self.dev.aim.field[e]
-        self.dev.active[i] = self.look(i, True)
-        after = self.after(i)
-        if after >= 0:
-            u = self.dev.state.apart(after, i)
-            if u.dot(u) > self.dev.limit[i] ** 2:
-                self.heed(0, 1)
-
-    @ti.func
-    def split(self, count: ti.template(), v, a, b, t):  # type: ignore[valid-type]
-        """The mass-split weight of a contact."""
-        at_a, at_b = (1 - t) * (1 - t) * count[a] * self.dev.w.of(a), t * t * count[b] * self.dev.w.of(b)
-        return count[v] * self.dev.w.of(v) + at_a + at_b
-
-    @ti.func
-    def alone(self, v, a, b, t):
-        """The weight of a contact that is the only one."""
-        return self.dev.w.of(v) + (1 - t) * (1 - t) * self.dev.w.of(a) + t * t * self.dev.w.of(b)
+                    self.dev.restitution.aim.field[e] = 0 * self.dev.restitution.aim.field[e]
+        self.dev.active[i] = self.dev.geometry.detect(i, True)
+        self.note_motion(0, self.dev.geometry.too_long(i))
 
     @ti.func
     def count(self, begin, end):
-        """How many contacts some particles are in. What is in no loop knows them from look()."""
+        """How many contacts some particles are in. What is in no loop knows them from detect()."""
         for i in range(begin, end):
-            if self.after(i) >= 0:
+            if self.dev.geometry.after(i) >= 0:
                 active = 0
                 for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
                     for role in range(3):
-                        at, _, _, _, _, _ = self.meeting(i, e, role)
+                        at, _, _, _, _, _ = self.dev.geometry.participants(i, e, role)
                         if at >= 0:
-                            if self.dev.met.field[at][0] > 0:
+                            if self.dev.geometry.manifold.field[at][0] > 0:
                                 active += 1
                 self.dev.active[i] = active
 
     @ti.func
     def relax(self, i, first, fresh, final):
         """What the contacts of particle i want of it."""
-        total, lifts, bond = 0 * self.dev.state.x[i], 0 * self.dev.state.x[i], 0 * self.dev.state.x[i]
-        begin, roles = self.dev.grid.first[i], self.roles(i)
+        total, lifts, forced = 0 * self.dev.state.x[i], 0 * self.dev.state.x[i], 0 * self.dev.state.x[i]
+        begin, roles = self.dev.grid.first[i], self.dev.geometry.roles(i)
         for e in range(begin, begin + ti.select(self.dev.active[i] > 0, self.dev.grid.number[i], 0)):
             for role in range(roles):
-                at, v, a, b, t, part = self.meeting(i, e, role)
+                at, v, a, b, t, part = self.dev.geometry.participants(i, e, role)
                 if at >= 0:
-                    met = self.dev.met.field[at]
-                    overlap, n = met[0], ti.Vector([met[2], met[3]])
+                    found = self.dev.geometry.manifold.field[at]
+                    overlap, n = found[0], ti.Vector([found[2], found[3]])
                     if overlap > 0:
-                        d, shared = self.relative(self.dev.state.d, v, a, b, t), self.split(self.dev.active, v, a, b, t)
+                        d = self.dev.geometry.relative(self.dev.state.d, v, a, b, t)
+                        shared = self.dev.geometry.split_mass(self.dev.active, v, a, b, t)
                         share, kick = part * self.dev.w.of(i) / shared, 0 * overlap
                         back = overlap  # what is taken back of the position and of the displacement
                         if ti.static(self.dev.bounces):
                             if first != 0:
-                                aim, kick, lift = self.leap(v, a, b, t, n, overlap, d.dot(n))
+                                aim, kick, lift = self.dev.restitution.target(v, a, b, t, n, overlap, d.dot(n))
                                 if kick > 0:
                                     lifts += share * (overlap + lift) * n
                                     back = 0 * overlap
                                     self.dev.hit[None] = 1
                                     if role == VERTEX:
-                                        self.dev.aim.field[e] = aim * n
+                                        self.dev.restitution.aim.field[e] = aim * n
                         if role == VERTEX:
-                            self.dev.given.field[e] = self.dev.given.field[e] + back / shared
+                            self.dev.geometry.impulse.field[e] = self.dev.geometry.impulse.field[e] + back / shared
                         want = back * n
                         if ti.static(self.dev.rubs):
-                            want -= self.held(v, a, n, overlap + kick, self.dev.slip.field[at] + d)
+                            want -= self.dev.friction.held(v, a, n, overlap + kick, self.dev.slip.field[at] + d)
                         total += share * want
                         if final != 0:
-                            came = -self.relative(self.dev.before, v, a, b, t).dot(n)
-                            bond += self.steady(came, overlap * self.alone(v, a, b, t) / shared) * share * want
+                            approach = -self.dev.geometry.relative(self.dev.forces.before, v, a, b, t).dot(n)
+                            pushed = overlap * self.dev.geometry.inverse_mass(v, a, b, t) / shared
+                            forced += self.dev.forces.share(approach, pushed) * share * want
         self.dev.move[i] = total
         if final != 0:
-            self.sum_up(i, bond, first)
+            self.dev.forces.add(i, forced, first)
         if ti.static(self.dev.bounces):
             if first != 0:
-                self.dev.lift[i] = lifts
-                self.dev.struck[i] = self.dev.active[i]
+                self.dev.restitution.lift[i] = lifts
+                self.dev.restitution.active[i] = self.dev.active[i]
 
     @ti.func
-    def push_bond(self, i):
-        """Nothing is left for the end of a frame: all of it is known from the passes."""
-
-    @ti.func
-    def bond(self, i):
-        """Pushes, and friction."""
-        return self.dev.bond[i]
-
-    @ti.func
-    def gather(self, i, first):
+    def apply_corrections(self, i, first):
         """Move particle i as its contacts want; what bounced goes where it is at the end of the substep."""
         if self.dev.w.of(i) > 0:
             if self.dev.active[i] > 0:
                 self.dev.state.shift(i, self.dev.move[i])
             if ti.static(self.dev.bounces):
                 if first != 0:
-                    self.dev.state.advance(i, self.dev.lift[i])
+                    self.dev.state.advance(i, self.dev.restitution.lift[i])
 
     @ti.func
-    def leap(self, v, a, b, t, n, overlap, leaving):
-        """Contact.bounce, for a vertex and an edge."""
-        before = self.dev.state.before[v] - (1 - t) * self.dev.state.before[a] - t * self.dev.state.before[b]
+    def choose_impact(self, i):
+        """What impacts lack of the velocities that contacts of particle i leave with."""
+        self.dev.restitution.choose(i)
+
+    @ti.func
+    def apply_impact(self, i):
+        """Change the displacement of particle i by it."""
+        self.dev.restitution.apply(i)
+
+    @ti.func
+    def finish_substep(self, i):
+        """At the end of a substep: add to the slip of each contact what it has moved, as far as friction can hold it."""
+        if ti.static(self.dev.rubs):
+            for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
+                slip = 0 * self.dev.state.x[i]
+                at, v, a, b, t, _ = self.dev.geometry.participants(i, e, VERTEX)
+                if at >= 0:
+                    found = self.dev.geometry.manifold.field[at]
+                    if found[0] > 0:
+                        n, d = ti.Vector([found[2], found[3]]), self.dev.geometry.relative(self.dev.state.d, v, a, b, t)
+                        slip = self.dev.friction.held(v, a, n, found[0], self.dev.slip.field[e] + d)
+                self.dev.slip.field[e] = slip
+
+
+class PolygonRestitution:
+    """Contacts of vertices and edges leave with -e times the normal velocity that they had before the substep."""
+
+    def __init__(self, scene: Scene, geometry: PolygonGeometry, table: Table):
+        n, add = scene.particles.count, scene.memory.field
+        self.geometry, self.table, self.state = geometry, table, scene.state
+        self.active = add("Contact.struck", n, kind=ti.i32)  # contacts that each particle was in in the first pass
+        self.kick = add("Contact.kick", n, width=2)
+        self.lift = add("Contact.lift", n, width=2)  # moves the position alone
+        self.hit = add("Contact.hit", None, kind=ti.i32)
+        self.aim = Luggage("aim", 2, lasting=False)  # with which displacement each contact is to leave, along its normal
+
+    @ti.func
+    def target(self, v, a, b, t, n, overlap, leaving):
+        """The displacement with which a contact is to leave; what it lacks of it; and how far it gets until the substep ends."""
+        before = self.state.before[v] - (1 - t) * self.state.before[a] - t * self.state.before[b]
         approach, restitution = -before.dot(n), self.table.of(v, a)[2]
         aim, kick, lift = restitution * ti.max(approach, 0), 0 * overlap, 0 * overlap
         if approach > 0:
@@ -258,72 +229,30 @@ class Polygons(Rim):
         return aim, kick, lift
 
     @ti.func
-    def held(self, v, a, n, normal, slip):
-        """The part of a slip that friction takes back for a normal displacement."""
-        s, row = slip - slip.dot(n) * n, self.table.of(v, a)
-        size = s.norm()
-        if size > row[0] * normal:
-            s *= row[1] * normal / size
-        return s
-
-    @ti.func
-    def rebound(self, i):
+    def choose(self, i):
         """One Jacobi pass over displacements alone: what the contacts of particle i that bounce lack."""
-        total = 0 * self.dev.state.x[i]
-        if self.dev.struck[i] > 0:
-            for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
-                for role in range(self.roles(i)):
-                    at, v, a, b, t, part = self.meeting(i, e, role)
+        total = 0 * self.state.x[i]
+        if self.active[i] > 0:
+            begin = self.geometry.grid.first[i]
+            for e in range(begin, begin + self.geometry.grid.number[i]):
+                for role in range(self.geometry.roles(i)):
+                    at, v, a, b, t, part = self.geometry.participants(i, e, role)
                     if at >= 0:
-                        aim = self.dev.aim.field[at]
+                        aim = self.aim.field[at]
                         size = aim.norm()
                         if size > 0:
                             n = aim / size
-                            lack = size - self.relative(self.dev.state.d, v, a, b, t).dot(n)
+                            lack = size - self.geometry.relative(self.state.d, v, a, b, t).dot(n)
                             if lack > 0:
-                                shared = self.split(self.dev.struck, v, a, b, t)
-                                self.dev.hit[None] = 1
-                                total += part * self.dev.w.of(i) * lack / shared * n
+                                shared = self.geometry.split_mass(self.active, v, a, b, t)
+                                self.hit[None] = 1
+                                total += part * self.state.w.of(i) * lack / shared * n
                                 if role == VERTEX:
-                                    self.dev.given.field[e] = self.dev.given.field[e] + lack / shared
-        self.dev.kick[i] = total
+                                    self.geometry.impulse.field[e] = self.geometry.impulse.field[e] + lack / shared
+        self.kick[i] = total
 
     @ti.func
-    def part_ways(self, i):
+    def apply(self, i):
         """Change the displacement of particle i, and the one before the substep with it."""
-        self.dev.state.d[i] = self.dev.state.d[i] + self.dev.kick[i]
-        self.dev.state.before[i] = self.dev.state.before[i] + self.dev.kick[i]
-
-    @ti.func
-    def remember(self, i):
-        """At the end of a substep: add to the slip of each contact what it has moved, as far as friction can hold it."""
-        if ti.static(self.dev.rubs):
-            for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
-                slip = 0 * self.dev.state.x[i]
-                at, v, a, b, t, _ = self.meeting(i, e, VERTEX)
-                if at >= 0:
-                    met = self.dev.met.field[at]
-                    if met[0] > 0:
-                        n = ti.Vector([met[2], met[3]])
-                        slip = self.held(v, a, n, met[0], self.dev.slip.field[e] + self.relative(self.dev.state.d, v, a, b, t))
-                self.dev.slip.field[e] = slip
-
-    @ti.func
-    def overlaps(self, i):
-        """For the report: contacts that particle i is the vertex of, or the first disc, and the worst overlap.
-
-        It is relative to half of the edge, or to the radius of the smaller disc.
-        """
-        touching, worst = 0, ti.cast(0, ti.f64)
-        self.look(i, False)
-        for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
-            j, met = self.dev.grid.near[e], self.dev.met.field[e]
-            if met[0] > 0 and (met[1] > DISCS or self.tells(i, j)):
-                size = ti.min(self.dev.radius.of(i), self.dev.radius.of(j))
-                if met[1] > DISCS:
-                    size = self.dev.state.apart(self.after(j), j).norm() / 2
-                elif size == 0:
-                    size = ti.max(self.dev.radius.of(i), self.dev.radius.of(j))
-                worst = ti.max(worst, met[0] / size)
-                touching += 1
-        return touching, worst
+        self.state.d[i] = self.state.d[i] + self.kick[i]
+        self.state.before[i] = self.state.before[i] + self.kick[i]

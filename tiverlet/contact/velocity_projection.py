@@ -5,14 +5,17 @@ from typing import Any
 import numpy as np
 
 from ..device import ti
-from ..neighbours.neighbour_list import WORD, lowest
+from ..device.thread_team import Team
+from ..features.feature import Scene
+from ..neighbours.neighbour_list import WORD, Luggage, lowest
+from ..neighbours.neighbour_search import Grid
 
 EVERY = 32  # substeps from one projection to the next
 PASSES = 32
 CONDITION = 400.0  # modes with an eigenvalue of at least 1 / CONDITION keep 1 / T(PASSES) = 8 % of their velocity
 
 
-class Calm:
+class VelocityProjection:
     """Pairs that bear a load move neither towards nor away from each other.
 
     With one pass per substep loaded contacts are springs, and sound in them decays by a third of its eigenvalue L per substep,
@@ -22,33 +25,38 @@ class Calm:
     energy is made; moves come in pairs, so momentum is conserved. Particles that lean on a wall do not move into it or off it.
 
     It is what inelastic rigid discs do: there is no sound in them. Pairs that bounce (restitution) are left out.
+
+    push: what each pair got in the last substep. weight: m_i w_i of each particle. restitution: theirs, or None.
+    change: a field of vectors, (n,), to use.
     """
 
-    def __init__(self, contact: Any, pieces: int):
-        scene = contact.scene
-        self.contact, self.grid, self.state = contact, contact.dev.grid, scene.state
-        self.change = contact.dev.move  # is free at the end of a substep
-        # So is what is put aside while lists are built: here for the loaded pairs of each particle, how many they are, and for
-        # those who have any, piece by piece.
+    def __init__(
+        self, scene: Scene, grid: Grid, push: Luggage, weight: Any, restitution: Any, change: Any, team: Team
+    ):  # fmt: skip
+        self.grid, self.push, self.weight, self.restitution = grid, push, weight, restitution
+        self.state, self.change, self.bounces = scene.state, change, restitution is not None
+        # The fields of the old list, which is needed only while lists are built, are free: here they hold the loaded pairs of
+        # each particle, how many they are, and the particles that have any, piece by piece.
         self.number, self.loaded = self.grid.old_number, self.grid.old_first
+        pieces = -(-scene.particles.count // team.piece)
         self.count = scene.memory.field("Contact.loaded", pieces, kind=ti.i32)
         self.factors = scene.memory.field("Contact.chebyshev", PASSES, values=chebyshev(PASSES, CONDITION))
 
     @ti.func
     def bears(self, i, e):
         """Whether entry e in the list of particle i is a pair that bears a load."""
-        out = self.contact.dev.push.field[e] > 0
-        if ti.static(self.contact.dev.bounces):
-            if self.contact.dev.struck[i] > 0:
-                out = out and self.contact.dev.blow.field[e] == 0
+        out = self.push.field[e] > 0
+        if ti.static(self.bounces):
+            if self.restitution.weight[i] > 0:
+                out = out and self.restitution.struck.field[e] == 0
         return out
 
     @ti.func
-    def find(self, i):
-        """Put aside the loaded pairs of particle i, each with what all passes multiply by; returns how many there are."""
+    def list_loaded(self, i):
+        """List the loaded pairs of particle i, each with what all passes multiply by; returns how many there are."""
         first, w = self.grid.first[i], self.state.w.of(i)
         at = first
-        if self.contact.dev.split[i] > 0:
+        if self.weight[i] > 0:
             for word in range(self.grid.words(i)):
                 # Not touches(): the pair may have parted in this pass, and both of it have to agree.
                 bits = ti.select(word == 0, self.grid.touching[i], self.grid.whole(i, word))
@@ -60,18 +68,18 @@ class Calm:
                         r = self.state.apart(i, j)
                         rr = r.dot(r)
                         if rr > 0:
-                            shared = self.contact.dev.split[i] + self.contact.dev.split[j]
+                            shared = self.weight[i] + self.weight[j]
                             self.grid.aside[at] = j
-                            self.contact.dev.push.aside[at] = w / (rr * shared)
+                            self.push.aside[at] = w / (rr * shared)
                             at += 1
         return at - first
 
     @ti.func
-    def open(self, piece, begin, end):
+    def begin(self, piece, begin, end):
         """The loaded pairs of a piece of the particles. They move in no pass, so what depends on positions is worked out once."""
         count = 0
         for i in range(begin, end):
-            number = self.find(i)
+            number = self.list_loaded(i)
             self.number[i] = number
             if number > 0:
                 self.loaded[begin + count] = i
@@ -79,13 +87,13 @@ class Calm:
         self.count[piece] = count
 
     @ti.func
-    def want(self, i, k):
+    def relax(self, i, k):
         """Pass k for particle i: what changes d. change' = (factor - 1) change + factor 2 / (1 + 1 / CONDITION) want."""
         want, first = 0 * self.state.d[i], self.grid.first[i]
         for e in range(first, first + self.number[i]):
             j = self.grid.aside[e]
             r = self.state.apart(i, j)
-            want -= self.contact.dev.push.aside[e] * (self.state.d[i] - self.state.d[j]).dot(r) * r
+            want -= self.push.aside[e] * (self.state.d[i] - self.state.d[j]).dot(r) * r
         if ti.static(self.state.leans):
             lean = self.state.lean[i]
             size = lean.dot(lean)
@@ -98,7 +106,7 @@ class Calm:
         self.change[i] = want
 
     @ti.func
-    def move(self, i):
+    def apply(self, i):
         """Change d."""
         self.state.d[i] = self.state.d[i] + self.change[i]
 

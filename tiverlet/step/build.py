@@ -9,7 +9,7 @@ import numpy as np
 from ..colliders.collider import Wall
 from ..constraints.core.anchored import Tether
 from ..constraints.core.scalar import LOST, Scalar
-from ..contact.contact import Contact
+from ..contact.pair_contact import PairContact
 from ..device import runtime, ti
 from ..device.memory import Memory
 from ..device.thread_team import PIECES, Team, size_of
@@ -99,7 +99,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     accelerations, walls = of(Acceleration), of(Wall)
     drivers = [f for f in of(Batch) if f.drives and f.count]
     batches = [f for f in of(Batch) if not f.drives and (scene.inv_mass[f.indices] > 0).any()]
-    contact = next((c for c in of(Contact) if c.matters), None)
+    contact = next((c for c in of(PairContact) if c.matters), None)
     if contact or walls:
         scene.radius = Radii(memory, particles.radius)
     surfaces = [*walls, *([contact] if contact else [])]
@@ -145,7 +145,7 @@ def checked_features(features: Iterable[Feature]) -> tuple[Feature, ...]:
             )
     if len({id(f) for f in features}) < len(features):
         raise ValueError("World: the same feature is listed twice.")
-    if sum(isinstance(f, Contact) for f in features) > 1:
+    if sum(isinstance(f, PairContact) for f in features) > 1:
         raise ValueError("World: more than one Contact; one covers all particles.")
     return features
 

@@ -82,7 +82,7 @@ def put_back(world: "World", kept: Kept) -> None:
     world._runner.set_substep(kept.clock["_h"], kept.clock["_drag"])
     grid, stores = world._runner.grid, list(map(id, world._runner.memories))
     if "Contact.shrunk" in kept.values:
-        world._runner.step.contacts[0].ease()
+        world._runner.step.contacts[0].enable_shrink()
     for memory in world._runner.memories:
         memory.restore(kept.values)
     if grid:

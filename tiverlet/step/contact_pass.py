@@ -16,15 +16,15 @@ class ContactPass:
         self.n, self.real, self.dim = particles.n, scene.real, scene.particles.dim
         self.bounces = bool(contact) and contact.bounces
         self.remembers = bool(contact) and (contact.rubs or contact.bounces)
-        self.calms = bool(contact) and contact.calms
+        self.calms = bool(contact) and contact.projects
 
     @ti.func
     def solve(self, now):
         """Which contacts there are, and what they want of their particles."""
         for c in ti.static(self.contacts):
-            if ti.static(c.measures):
+            if ti.static(c.detects):
                 for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
-                    c.measure(i, now.first)
+                    c.detect(i, now.first)
                 self.team.wait()
             for k in range(self.team.dealt_count(self.particles.pieces, 1, now.thread)):
                 begin, end = self.particles.piece(k, now.thread)
@@ -42,7 +42,7 @@ class ContactPass:
                     elif now.final != 0:
                         if ti.static(c.rubs):
                             for i in range(low, high):
-                                c.sum_up(i, ti.Vector.zero(self.real, self.dim), now.first)
+                                c.dev.forces.add(i, ti.Vector.zero(self.real, self.dim), now.first)
             self.team.wait()
 
     @ti.func
@@ -65,10 +65,10 @@ class ContactPass:
                     c.dev.hit[None] = 0
                 self.team.wait()
                 for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
-                    c.rebound(i)
+                    c.choose_impact(i)
                 self.team.wait()
                 for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
-                    c.part_ways(i)
+                    c.apply_impact(i)
                 self.team.wait()
 
     @ti.func
@@ -77,7 +77,7 @@ class ContactPass:
         for c in ti.static(self.contacts):
             if ti.static(c.rubs or c.bounces):
                 for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
-                    c.remember(i)
+                    c.finish_substep(i)
             self.team.wait()
             if ti.static(c.bounces):
                 ti.loop_config(serialize=True)
@@ -92,12 +92,12 @@ class ContactPass:
                 begin, end = self.particles.piece(p, thread)
                 piece = self.team.dealt_index(p, 1, thread)
                 if k == 0:
-                    c.dev.calm.open(piece, begin, end)
-                for m in range(begin, begin + c.dev.calm.count[piece]):
-                    c.dev.calm.want(c.dev.calm.loaded[m], k)
+                    c.dev.projection.begin(piece, begin, end)
+                for m in range(begin, begin + c.dev.projection.count[piece]):
+                    c.dev.projection.relax(c.dev.projection.loaded[m], k)
             self.team.wait()
             for p in range(self.team.dealt_count(self.particles.pieces, 1, thread)):
                 begin, end = self.particles.piece(p, thread)
-                for m in range(begin, begin + c.dev.calm.count[self.team.dealt_index(p, 1, thread)]):
-                    c.dev.calm.move(c.dev.calm.loaded[m])
+                for m in range(begin, begin + c.dev.projection.count[self.team.dealt_index(p, 1, thread)]):
+                    c.dev.projection.apply(c.dev.projection.loaded[m])
             self.team.wait()

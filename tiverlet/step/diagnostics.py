@@ -126,11 +126,11 @@ class Diagnostics:
                     if begin == 0:
                         figures[3] = ti.max(figures[3], self.stiffness(i, x, h, t))
                 for c in ti.static(self.contacts):
-                    touching, worst = c.overlaps(i)
+                    touching, worst = c.worst_overlap(i)
                     figures[2] = ti.max(figures[2], worst)
                     figures[4] += touching
                     if begin == 0:
-                        c.push_bond(i)
+                        c.sum_pushes(i)
         for f in ti.static(self.batches):
             part = (f.count + self.blocks - 1) // self.blocks
             for c in range(b * part, ti.min((b + 1) * part, f.count)):

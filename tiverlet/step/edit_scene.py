@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from .. import checks
-from ..contact.contact import Contact
+from ..contact.pair_contact import PairContact
 from ..device.memory import Memory
 from ..features.feature import Acceleration, Batch, Feature
 from ..particles import Particles
@@ -58,7 +58,7 @@ def add(world: Any, particles: Particles | None, features: Iterable[Feature]) ->
         if particles.dim != world.particles.dim:
             raise ValueError(f"World.add: particles are in {particles.dim}D, but the world is in {world.particles.dim}D.")
     checked_features(late)
-    if sum(isinstance(f, Contact) for f in (*world.features, *late)) > 1:
+    if sum(isinstance(f, PairContact) for f in (*world.features, *late)) > 1:
         raise ValueError("World.add: more than one Contact; one covers all particles.")
     check_settings(world._precision, world._requested[1], world._order, (*world.features, *late))
     n, count = len(world.particles), 0 if particles is None else len(particles)
@@ -152,7 +152,7 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
     for one in list(world._handles):
         one.follow(number)
     world._clock.energy = None
-    if any(isinstance(f, Contact) for f in came):
+    if any(isinstance(f, PairContact) for f in came):
         world._clock.first_moved = 0
     elif world._clock.first_moved is not None:
         world._clock.first_moved = int(some[: world._clock.first_moved].sum())
@@ -208,11 +208,11 @@ def _fields(attributes: dict[str, Any], names: dict[int, str]) -> dict[tuple[str
     return {key: names[id(field)] for key, field in fields.items() if id(field) in names}
 
 
-def _give_contacts(world: Any, contact: Contact, old: dict, number: np.ndarray, some: np.ndarray) -> None:
+def _give_contacts(world: Any, contact: PairContact, old: dict, number: np.ndarray, some: np.ndarray) -> None:
     """What pairs in contact remember, and how much smaller particles are than they will be."""
     if "Contact.shrunk" in old:
-        contact.ease()
-        less: Any = contact.dev.store
+        contact.enable_shrink()
+        less: Any = contact.store
         values = less.state()
         values["Contact.shrunk"][: some.sum()] = old["Contact.shrunk"][some]
         less.restore(values)

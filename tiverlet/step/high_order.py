@@ -16,7 +16,7 @@ import numpy as np
 
 from ..colliders.collider import Wall
 from ..constraints.core.scalar import Scalar
-from ..contact.contact import Contact
+from ..contact.pair_contact import PairContact
 from ..device import ti
 from ..device.memory import Memory
 from ..features.feature import Acceleration, Batch, Feature, Scene
@@ -57,7 +57,7 @@ def refuse(order: int, features: tuple[Feature, ...], precision: str, path: str)
         raise ValueError(f'{who} runs in one launch and one thread only. Use path="auto".')
     for f in features:
         why = ""
-        if isinstance(f, (Contact, Wall)):
+        if isinstance(f, (PairContact, Wall)):
             why = "is one-sided: where it starts to act, motion has no derivatives of that order"
         elif isinstance(f, Acceleration) and (f.decays or f.uses_velocity):
             why = "depends on velocities, so that the substep is not reversible"

@@ -61,7 +61,7 @@ class ParticlePass:
             if now.final != 0:
                 scale = ti.select(now.fresh != 0, now.h, ti.cast(1, self.real))
                 for i in range(first, end):
-                    c.set_out(i, scale)
+                    c.start_last_substep(i, scale)
         if ti.static(self.state.starts):
             for i in range(first, end):
                 self.state.x0[i] = self.state.x[i]
@@ -75,12 +75,12 @@ class ParticlePass:
         for c in ti.static(self.contacts):
             stale, fast = 0, 0
             for i in range(first, end):
-                c.grow(i, now.h)
+                c.restore(i, now.h)
             for i in range(first, end):
                 stale |= self.grid.outrun(i)
             for i in range(first, end):
                 fast |= c.overshoots(i)
-            c.heed(stale, fast)
+            c.note_motion(stale, fast)
 
     @ti.func
     def apply_constraints(self, thread):
@@ -88,7 +88,7 @@ class ParticlePass:
         for c in ti.static(self.contacts):
             for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
                 self.slots.gather(i)
-                c.heed(self.grid.outrun(i), c.overshoots(i))
+                c.note_motion(self.grid.outrun(i), c.overshoots(i))
             self.team.wait()
 
     @ti.func
@@ -111,7 +111,7 @@ class ParticlePass:
                 low, high = block(b, begin, end)
                 if c.busy(low) != 0:
                     for i in range(low, high):
-                        c.gather(i, now.first)
+                        c.apply_corrections(i, now.first)
         if ti.static(len(self.walls) > 0):
             if now.final != 0:
                 for i in range(begin, end):
@@ -137,7 +137,7 @@ class ParticlePass:
                 stale = 0
                 for i in range(begin, end):
                     stale |= self.grid.outrun(i)
-                c.heed(stale, 0)
+                c.note_motion(stale, 0)
         if ti.static(len(self.walls) > 0):
             if now.final != 0:
                 for i in range(begin, end):
@@ -188,7 +188,7 @@ class ParticlePass:
         if ti.static(self.held):
             bond = self.slots.total_of(i)
         for c in ti.static(self.contacts):
-            bond += firm * c.bond(i)
+            bond += firm * c.forced(i)
         if ti.static(len(self.walls) > 0):
             push = firm * self.wall_push[i]
             v = self.state.d[i] / h

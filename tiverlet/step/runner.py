@@ -205,8 +205,8 @@ class Runner:
     def ease(self, first: int) -> None:
         """Let particles part gently that the user put into each other, from number `first` on."""
         contact = self.step.contacts[0]
-        if not contact.dev.eases:
-            contact.ease()
+        if not contact.shrinks:
+            contact.enable_shrink()
             self.renew()
         self.step.shrunk(first)
 
@@ -228,7 +228,7 @@ class Runner:
     @property
     def memories(self) -> list[Any]:
         """The trees of fields: one from the start, others where a list or a need has grown."""
-        grown = [self.grid.store if self.grid else None, *(c.dev.store for c in self.step.contacts)]
+        grown = [self.grid.store if self.grid else None, *(c.store for c in self.step.contacts)]
         return [self.memory, *(m for m in grown if m)]
 
 

@@ -1,0 +1,20 @@
+"""Coulomb friction of contacts, whatever their geometry."""
+
+from ..device import ti
+from ..features.material import Table
+
+
+class Friction:
+    """Slip is taken back up to friction times the overlap (Cundall and Strack 1979). table: has the coefficients of pairs."""
+
+    def __init__(self, table: Table):
+        self.table = table
+
+    @ti.func
+    def held(self, i, j, n, normal, slip):
+        """The part of a slip [m] of particles i and j that friction takes back, for a normal displacement along n [m]."""
+        s, row = slip - slip.dot(n) * n, self.table.of(i, j)
+        size = s.norm()
+        if size > row[0] * normal:
+            s *= row[1] * normal / size
+        return s

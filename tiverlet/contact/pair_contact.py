@@ -1,0 +1,201 @@
+"""What all contact features have in common: their settings, and what a step asks of them."""
+
+import warnings
+from typing import Any, Protocol
+
+import numpy as np
+
+from .. import checks
+from ..device import ti
+from ..device.thread_team import Team
+from ..features.feature import Batch, Feature, Knob, Scene
+from ..features.material import Table
+from ..neighbours.neighbour_search import FARTHEST, Grid
+from ..neighbours.queries import Contacts
+from ..particles import Particles
+
+
+class Geometry(Protocol):
+    """What can touch, for one world: who takes part in a contact, how deep it is, in which direction, and how much each moves.
+
+    DiscGeometry and PolygonGeometry also tell their feature the overlap, the normal and the inverse masses of each contact, and
+    the neighbour list how far from each other two particles may take part in one.
+    """
+
+    shrinks: bool  # whether particles may be smaller than they are, or are allowed to overlap
+    store: Any  # the Memory of a field that is made when it is needed, or None
+
+    def overshoots(self, i) -> Any:
+        """1 if particle i moves so far in one substep that a contact may be missed."""
+
+    def enable_shrink(self) -> None:
+        """From now on overlap may be allowed for a while."""
+
+    def shrink(self, i, first) -> None:
+        """Allow the overlap that particle i has with particles from number `first` on."""
+
+    def restore(self, i, h) -> None:
+        """Allow less overlap, at push_out."""
+
+    def worst_overlap(self, i) -> Any:
+        """For the report: contacts that particle i counts, and the worst overlap, relative to its size."""
+
+    def found(self, x: np.ndarray, h: float) -> Contacts:
+        """The contacts of particles at x (n, dim) [m] after a substep h [s], for world.contacts."""
+        ...
+
+
+class PairContact(Feature):
+    """Particles that do not overlap. A world has at most one.
+
+    A subclass gives prepare() and join(), which makes `dev.geometry` and `dev.forces`, and for a pass of a substep, in this
+    order: detect(i, first), where it `detects`; count(begin, end) and busy(begin), by blocks of particles; relax(i, first, fresh,
+    final); choose_impact(i) and apply_impact(i), in rounds while `dev.hit` is set, where any pair has restitution;
+    apply_corrections(i, first); and at the end of a substep finish_substep(i).
+    """
+
+    friction = Knob(lambda f, v: f._surface("friction", v), "Of all pairs, or by pairs of groups.")
+    restitution = Knob(lambda f, v: f._surface("restitution", v), "Of all pairs, or by pairs of groups.")
+    skin = Knob(lambda f, v: _skin(v), "How far beyond touching pairs are listed [m].", compiled=True)
+    push_out = Knob(lambda f, v: checks.number("Contact", "push_out", v, least=0.0), "[m/s].", compiled=True)
+    compiled_for = ("rubs", "bounces", "uniform")
+    table: Table  # bound to one world
+    matters = True
+    room = 0  # entries of the list for each particle, at first, if that is more than discs have
+    detects = False  # looks for all contacts once in each pass, before they are counted
+    projects = False  # knows which pairs bear a load, see velocity_projection.py
+
+    def _surface(self, name: str, value):
+        """Check what pairs are like, with what was said so far."""
+        if name == "groups" and value is not None:
+            value = checks.rows("Contact", name, value, "a list of pairs of groups, such as [(0, 1)],")
+        elif isinstance(value, list):
+            value = tuple(value)
+        given = {"friction": 0.0, "restitution": 0.0, "groups": None} | vars(self) | {name: value}
+        Table("Contact", given["friction"], given["restitution"], given["groups"])
+        return value
+
+    @property
+    def wanted(self) -> Table:
+        """What pairs are to be like."""
+        return Table("Contact", self.friction, self.restitution, vars(self).get("groups"))
+
+    @property
+    def uniform(self) -> bool:
+        """Whether all pairs are alike."""
+        return self.wanted.uniform
+
+    @property
+    def rubs(self) -> bool:
+        """Whether any pair has friction, or had when kernels were compiled."""
+        return self.wanted.rubs or vars(self.dev).get("rubs", False)
+
+    @property
+    def bounces(self) -> bool:
+        """Whether any pair has restitution, or had when kernels were compiled."""
+        return self.wanted.bounces or vars(self.dev).get("bounces", False)
+
+    @property
+    def shrinks(self) -> bool:
+        """Whether particles can be smaller than they are, in the kernels as they are."""
+        return self.dev.geometry.shrinks
+
+    @property
+    def store(self) -> Any:
+        """The Memory of what was made when it was needed, or None."""
+        return self.dev.geometry.store if "geometry" in vars(self.dev) else None
+
+    def join(self, scene: Scene, batches: list[Batch], team: Team) -> Grid:
+        """Declare the fields, among them the neighbour list's, which is returned."""
+        raise NotImplementedError
+
+    def upload(self) -> None:
+        """Write friction and restitution."""
+        if self.scene:
+            self.table.upload(self.scene, self.wanted)
+
+    def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Warn of particles that cannot touch."""
+        if not self.matters and particles.count:
+            warnings.warn(f"{self!r}: all radii are 0, so nothing touches; give tv.Particles a radius.", stacklevel=3)
+
+    def admit(self, particles: Particles, first: int) -> None:
+        """Refuse positions too far out."""
+        if self.matters:
+            self.check_range(particles.position)
+
+    def spared(self, number: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Its fields are those of the particles."""
+        return (number >= 0,)
+
+    def check_range(self, position: np.ndarray) -> None:
+        """Raise where coordinates are too large for the cells."""
+        cell = 2 * self.dev.finest + self.dev.skin
+        far = np.abs(position) >= FARTHEST * cell
+        if far.any():
+            i, k = np.unravel_index(int(np.argmax(far)), far.shape)
+            raise ValueError(
+                f"Contact: position[{i}, {k}] = {position[i, k]:g} m is {abs(position[i, k]) / cell:.2g} cells of {cell:g} m "
+                f"from the origin, but f32 tells only {FARTHEST} apart. Shift the scene towards the origin."
+            )
+
+    def enable_shrink(self) -> None:
+        """From now on particles may be smaller than they are."""
+        self.dev.geometry.enable_shrink()
+
+    def found(self, x: np.ndarray, h: float) -> Contacts:
+        """The contacts of particles at x (n, dim) [m] after a substep h [s], for world.contacts."""
+        return self.dev.geometry.found(x, h)
+
+    @ti.func
+    def overshoots(self, i):
+        """1 if particle i moves so far in one substep that a contact may be missed."""
+        return self.dev.geometry.overshoots(i)
+
+    @ti.func
+    def note_motion(self, stale, fast):
+        """Write down what was noticed; threads that all write to the same place would wait for each other."""
+        if stale != 0:
+            if self.dev.grid.stale[None] == 0:
+                self.dev.grid.stale[None] = 1
+        if fast != 0:
+            if self.dev.fast[None] == 0:
+                self.dev.fast[None] = 1
+
+    @ti.func
+    def shrink(self, i, first):
+        """Allow the overlap that particle i has with particles from number `first` on."""
+        self.dev.geometry.shrink(i, first)
+
+    @ti.func
+    def restore(self, i, h):
+        """Allow less of it, after a substep."""
+        self.dev.geometry.restore(i, h)
+
+    @ti.func
+    def worst_overlap(self, i):
+        """For the report: contacts that particle i counts, and the worst overlap, relative to its size."""
+        return self.dev.geometry.worst_overlap(i)
+
+    @ti.func
+    def start_last_substep(self, i, scale):
+        """At the start of the last substep of a frame: keep what shows later which pushes are forces."""
+        self.dev.forces.start(i, scale)
+
+    @ti.func
+    def sum_pushes(self, i):
+        """At the end of a frame: what pushes that are forces moved particle i by, where that is not known from the passes."""
+
+    @ti.func
+    def forced(self, i):
+        """What forces of contacts moved particle i by in the last substep of a frame [m]."""
+        return self.dev.forces.sum[i]
+
+    @ti.func
+    def busy(self, begin):
+        """0 if there is nothing to do for particles that were counted together, from `begin` on."""
+        return 1
+
+
+def _skin(value):
+    return value if isinstance(value, str) and value == "auto" else checks.number("Contact", "skin", value, above=0.0)

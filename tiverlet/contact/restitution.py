@@ -1,0 +1,102 @@
+"""Restitution of pairs of discs or spheres: impacts, one after the other."""
+
+from ..device import ti
+from ..features.feature import Scene
+from ..features.material import Table
+from ..neighbours.neighbour_list import Luggage
+from .narrow_phase import DiscGeometry
+
+
+class Restitution:
+    """A pair leaves with -e times the normal velocity that it had before the substep, from the time of impact on, see Contact.
+
+    struck: of its pairs, those that are struck in this substep. slack: of their overlap, what no push is for. impulse: pushes
+    and impacts of the last substep [kg m].
+    """
+
+    def __init__(self, scene: Scene, geometry: DiscGeometry, table: Table, struck: Luggage, slack: Luggage, impulse: Luggage):
+        n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
+        self.geometry, self.grid, self.table, self.state = geometry, geometry.grid, table, scene.state
+        self.struck, self.slack, self.impulse = struck, slack, impulse
+        self.weight = add("Contact.struck", n)  # the split mass of the first pass, 0 where nothing touched
+        self.kick = add("Contact.kick", n, width=dim)
+        self.lift = add("Contact.lift", n, width=dim)  # moves the position alone
+        self.left = add("Contact.left", n)  # of the substep after the impact, as a fraction
+        self.partner = add("Contact.partner", n, kind=ti.i32)
+        self.first = add("Contact.first", n, kind=ti.i32)
+        self.hit = add("Contact.hit", None, kind=ti.i32)
+
+    @ti.func
+    def clear(self, i, weight):
+        """Before the first pass: no pair of particle i has been struck."""
+        self.weight[i] = weight
+        for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
+            self.struck.field[e] = 0
+            self.impulse.field[e] = 0
+
+    @ti.func
+    def bounce(self, i, j, n, overlap, slack, last, first):
+        """The displacement that takes a pair that was struck in this substep from coming together to leaving, 0 for others; its
+        slack; and whether it rests, so that it is pushed apart, as it was in the last substep."""
+        given, here, a = self.target(i, j, n)
+        rests, e = True, self.table.of(i, j)[2]
+        if e > 0:
+            deep = ti.select(last > 0, overlap, ti.select(e < 1, slack, 0))  # nothing that is elastic rests where nothing pulls
+            if last == 0:
+                slack = ti.max(slack, overlap - ti.max(here, 0))
+            if a > 0:
+                rests = deep > 0 and (first == 0 or given <= deep)
+            elif a < 0:
+                rests = deep > 0 or overlap <= here
+        if rests or a < 0 or first == 0:
+            given = 0 * given
+        if not rests:
+            slack = ti.select(given > 0, ti.max(overlap - given, 0), 0)
+        return given, ti.min(slack, overlap), rests
+
+    @ti.func
+    def target(self, i, j, n):
+        """What takes a pair from coming together to leaving; how far it comes together in this substep, and without forces."""
+        a = -(self.state.before[i] - self.state.before[j]).dot(n)
+        here = -(self.state.d[i] - self.state.d[j]).dot(n)
+        return here + self.table.of(i, j)[2] * ti.max(a, 0), here, a
+
+    @ti.func
+    def choose(self, i):
+        """The first of the pairs of particle i that were struck and still come together, and what it does to i."""
+        first, partner, most, w = -1, -1, 0 * self.weight[i], self.state.w.of(i)
+        if self.weight[i] > 0:
+            for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
+                if self.struck.field[e] > 0:
+                    j = self.grid.near[e]
+                    overlap, _each, n = self.geometry.impact(i, j, self.geometry.contact_distance(i, j), self.weight[i])
+                    given, here, a = self.target(i, j, n)
+                    if overlap > 0 and a > 0 and given > 0:
+                        left = ti.select(overlap < here, overlap / here, 1)
+                        if left > most or (left == most and earlier(i, j, partner)):
+                            first, partner, most = e, j, left
+                            self.kick[i] = w / (w + self.state.w.of(j)) * given * n
+                            if self.hit[None] == 0:
+                                self.hit[None] = 1
+        self.first[i] = first
+        self.partner[i] = partner
+        self.left[i] = most
+
+    @ti.func
+    def apply(self, i):
+        """Let particle i bounce off its partner, if it is the partner's partner."""
+        j = self.partner[i]
+        if j >= 0:
+            if self.partner[j] == i or self.state.w.of(j) == 0:
+                e, kick = self.first[i], self.kick[i]
+                self.impulse.field[e] = self.impulse.field[e] + kick.norm() / self.state.w.of(i)
+                self.state.d[i] = self.state.d[i] + kick
+                self.state.before[i] = self.state.before[i] + kick
+                self.state.advance(i, self.left[i] * kick)
+
+
+@ti.func
+def earlier(i, j, k):
+    """Whether (i, j) comes before (i, k) among pairs that are struck at the same time: an order of all pairs, whichever is i."""
+    a, b = ti.min(i, j), ti.min(i, k)
+    return a < b or (a == b and ti.max(i, j) < ti.max(i, k))
