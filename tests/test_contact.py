@@ -285,9 +285,10 @@ def test_the_skin_changes_no_bits_of_what_links_move(world):
 
 def test_what_a_link_draws_through_another_disc_is_flagged(world):
     # Row 82: in one substep from 0 to 2.3, through one that is pinned at 1.15; a link of its length draws nothing.
-    for rest, flagged in ((0.7, True), (3.0, False)):
-        start = tv.Particles([[0.0, 0], [3.0, 0], [1.15, 0.0]], radius=0.3, pinned=[1, 2])
-        w = world(start, [tv.Distance([[0, 1]], rest), tv.Contact()], substeps=1)
+    start = tv.Particles([[0.0, 0], [3.0, 0], [1.15, 0.0]], radius=0.3, pinned=[1, 2])
+    link = tv.Distance([[0, 1]], 3.0)
+    w = world(start, [link, tv.Contact()], substeps=1)
+    for link.rest, flagged in ((3.0, False), (0.7, True)):
         assert ("tunnelling-risk" in w.step(1 / 60).flags) == flagged
 
 

@@ -6,7 +6,7 @@ import taichi as ti
 
 import tiverlet as tv
 
-from .conftest import case, order
+from .conftest import case, order, rerun
 
 
 @pytest.mark.parametrize("name", ["R01_free_fall_dt0.01", "R01_free_fall_dt0.001"])
@@ -184,14 +184,9 @@ def test_forces_that_read_velocities_are_second_order(world):
     t, a = 2.0, -0.5 - 3.0j
     exact = (np.exp(a * t) - 1) / a  # z' = a z, z'(0) = 1, z = x + i y
     errors = []
+    w = world(tv.Particles([[0.0, 0.0]], velocity=(1, 0)), [tv.Force(lorentz)], precision="f64")
     for substeps in (4, 8, 16, 32):
-        w = world(
-            tv.Particles([[0.0, 0.0]], velocity=(1, 0)),
-            [tv.Force(lorentz)],
-            substeps=substeps,
-            precision="f64",
-        )
-        w.run(t, dt=1 / 16)
+        rerun(w, t, dt=1 / 16, substeps=substeps)
         errors.append(abs(complex(*w.position[0]) - exact))
     assert 1.9 <= order(errors) <= 2.1 and errors[-1] < 2e-5
 
