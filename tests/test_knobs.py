@@ -170,7 +170,7 @@ class Scene:
         self.place = {name: k * BLOCK[:dim] for k, name in enumerate(rows)}
         self.x = np.concatenate(points)
         self.v = np.random.default_rng(2).normal(size=self.x.shape) * 0.7
-        walls = [name for name in rows if issubclass(getattr(tv, name.split(",")[0]), colliders.collider.Wall)]
+        walls = [name for name in rows if issubclass(getattr(tv, name.split(",")[0]), colliders.collider.Collider)]
         for name in walls:  # they come in, with a slant
             self.v[self.indices[name]] = 4.0
             self.v[self.indices[name], 1:] = np.array([-3.0, 1.0])[: self.x.shape[1] - 1] * (-1 if name == "Box" else 1)

@@ -170,7 +170,7 @@ def test_bodies_go_whole_and_numbers_follow():
     polygons = tv.Polygons([[0, 1, 2], [8, 9, 10]])
     shape = tv.ShapeMatch([[0, 3, 2], [4, 6, 7]], rest=np.arange(24.0).reshape(12, 2), compliance=[1.0, 2.0])
     for f in (volume, limit, polygons, shape):
-        f.renumber(number, 11)
+        f.remap_indices(number, 11)
     assert volume.count == 1 and volume.pressure.tolist() == [2.0] and volume.indices.tolist() == [6, 7, 8, 9]
     np.testing.assert_array_equal(np.sort(volume.function.faces, axis=1), np.sort(four + 6, axis=1))
     assert volume.function.surface.tolist() == [0, 0, 0, 0]

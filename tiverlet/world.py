@@ -179,7 +179,7 @@ class World:
         for feature in self._features:
             if feature.moving:
                 feature.moving = False
-                feature.settle()
+                feature.end_motion()
             if feature.changed:
                 feature.changed = feature.new_force = False
                 feature.upload()

@@ -80,7 +80,7 @@ def excluded(features: list[Any], particles: Any) -> set[tuple[int, int]]:
     out = set()
     for f in features:
         if isinstance(f, Batch) and not f.drives and f.count and (particles.inv_mass[f.indices] > 0).any():
-            out |= {(min(a, b), max(a, b)) for a, b in f.partners(particles).tolist()}
+            out |= {(min(a, b), max(a, b)) for a, b in f.excluded_pairs(particles).tolist()}
     return out
 
 

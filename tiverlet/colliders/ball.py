@@ -6,18 +6,18 @@ from .. import checks
 from ..device import ti
 from ..features.feature import Knob, Scene
 from ..particles import Particles
-from .collider import TOUCH, Wall
+from .collider import TOUCH, Collider
 from .track import Track
 
 
-class Ball(Wall):
+class Ball(Collider):
     """Particles stay outside of a disc or ball, or inside.
 
     C(x) = |x - center| - (R + r) >= 0 outside, R - r - |x - center| >= 0 inside; grad C = +- (x - center) / |x - center|.
 
     center: (dim,) [m], live: assign to it between frames, and the ball moves there during the next frame. radius: R [m], live: it
     changes at once, and what is inside then goes out at push_out. inside: keep particles in. friction, restitution, push_out: see
-    Wall.
+    Collider.
 
     What passes through in one substep is caught on the way in: the moment when it met the surface is solved for, as for pairs.
     Nothing passes at any speed, nor can anything draw it through.
@@ -58,21 +58,21 @@ class Ball(Wall):
 
     def bind(self, scene: Scene) -> None:
         """The center at the start and the end of a frame."""
-        Wall.bind(self, scene)
+        Collider.bind(self, scene)
         self.dev.center = Track(scene.memory, "Ball.center", self.center)
         self.dev.size = scene.memory.field("Ball.radius", None, values=self.radius)
         self.changed = False
 
     def upload(self) -> None:
         """Move to the new center."""
-        Wall.upload(self)
+        Collider.upload(self)
         self.scene.memory.write(self.dev.size, self.radius)
         self.dev.center.aim(self.center)
         self.moving = True
 
-    def settle(self) -> None:
+    def end_motion(self) -> None:
         """Stay."""
-        self.dev.center.settle()
+        self.dev.center.end_motion()
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
         """A circle in 2D, three in 3D."""

@@ -8,7 +8,7 @@ from .. import checks
 from ..device import ti
 from ..features.feature import Knob, Scene
 from ..particles import Particles
-from .collider import Wall
+from .collider import Collider
 
 
 def _corner(name: str):
@@ -29,14 +29,14 @@ def _corner(name: str):
     return check
 
 
-class Box(Wall):
+class Box(Collider):
     """Particles stay inside: lower + radius <= x <= upper - radius along every axis.
 
     C(x) = x_k - lower_k - radius >= 0 and upper_k - x_k - radius >= 0, with unit gradients along axis k.
 
     lower, upper: (dim,) [m]; -inf and inf leave a side open. Live: assign to .lower or .upper between frames, and the walls move
     there during the next frame (to or from an open side they jump). friction, restitution, push_out:
-    see Wall.
+    see Collider.
 
     One-sided: a particle cannot leave at any speed, nor can anything draw it out.
     """
@@ -78,7 +78,7 @@ class Box(Wall):
 
     def bind(self, scene: Scene) -> None:
         """Corners at the start and the end of a frame."""
-        Wall.bind(self, scene)
+        Collider.bind(self, scene)
         sides = np.concatenate([self.lower, self.upper])
         self.dev.sides = scene.memory.field("Box.sides", len(sides), width=2, values=np.stack([sides, sides], 1), state=True)
         self.dev.now = scene.memory.field("Box.sides_now", len(sides), width=2)  # the plane, and how far it goes in the substep
@@ -86,13 +86,13 @@ class Box(Wall):
 
     def upload(self) -> None:
         """Move from the last corners to the new ones."""
-        Wall.upload(self)
+        Collider.upload(self)
         old, new = self.scene.memory.read(self.dev.sides)[:, 1], np.concatenate([self.lower, self.upper])
         jump = np.isinf(old) | np.isinf(new)
         self.scene.memory.write(self.dev.sides, np.stack([np.where(jump, new, old), new], axis=1))
         self.moving = True
 
-    def settle(self) -> None:
+    def end_motion(self) -> None:
         """Stay."""
         sides = self.scene.memory.read(self.dev.sides)[:, 1]
         self.scene.memory.write(self.dev.sides, np.stack([sides, sides], axis=1))
@@ -100,7 +100,7 @@ class Box(Wall):
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
         """The edges, if all sides are closed."""
         if not (np.isfinite(self.lower).all() and np.isfinite(self.upper).all()):
-            return Wall.outline(self, low, high)
+            return Collider.outline(self, low, high)
         bits = np.array([[(c >> k) & 1 for k in range(self.dim)] for c in range(2**self.dim)])
         corners = np.where(bits, self.upper, self.lower)
         edges = [(a, b) for a in range(len(bits)) for b in range(a) if np.abs(bits[a] - bits[b]).sum() == 1]
@@ -117,7 +117,7 @@ class Box(Wall):
             self.dev.now[side] = ti.Vector([at, shift])
 
     @ti.func
-    def near(self, i, radius):
+    def may_touch(self, i, radius):
         """1 if there may be something to press()."""
         out, x, close = 0, self.dev.state.place(i), self.dev.state.digits(i)
         for k in ti.static(range(self.dim)):
@@ -128,7 +128,7 @@ class Box(Wall):
     @ti.func
     def confine(self, i, radius, h, when, turn):
         """Two planes per axis, lower ones first."""
-        if self.near(i, radius) != 0:
+        if self.may_touch(i, radius) != 0:
             for side in range(ti.static(2 * self.dim)):
                 wall, shift, x = self.dev.now[side][0], self.dev.now[side][1], self.dev.state.place(i)
                 n, moved, depth = ti.zero(x), ti.zero(x), ti.zero(wall)

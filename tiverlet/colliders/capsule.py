@@ -6,7 +6,7 @@ from .. import checks
 from ..device import ti
 from ..features.feature import Knob, Scene
 from ..particles import Particles
-from .collider import TOUCH, Wall
+from .collider import TOUCH, Collider
 from .track import Track
 
 MARCH = 32  # steps along a path; what only grazes is then within 1e-6 of its way
@@ -16,13 +16,13 @@ def _end(name: str) -> Knob:
     return Knob(lambda f, v: checks.vector("Capsule", name, v, f.dim or len(np.atleast_1d(v))), "End of the axis [m].")
 
 
-class Capsule(Wall):
+class Capsule(Collider):
     """Particles stay outside of all points within `radius` of the segment from a to b: a rod, a peg, a thin wall.
 
     C(x) = |x - q| - (R + r) >= 0 with q the nearest point of the segment; grad C = (x - q) / |x - q|.
 
     a, b: (dim,) [m], live: the ends move to what is assigned during the next frame. radius: R [m], above 0,
-    live: it changes at once. friction, restitution, push_out: see Wall.
+    live: it changes at once. friction, restitution, push_out: see Collider.
 
     What passes through in one substep is caught on the way in, however thin the rod: the path, as seen from the rod, is followed
     to where it meets the surface (sphere tracing, Hart 1996). Nothing can be drawn through either.
@@ -44,23 +44,23 @@ class Capsule(Wall):
 
     def bind(self, scene: Scene) -> None:
         """The ends at the start and the end of a frame."""
-        Wall.bind(self, scene)
+        Collider.bind(self, scene)
         self.dev.size = scene.memory.field("Capsule.radius", None, values=self.radius)
         self.dev.a, self.dev.b = Track(scene.memory, "Capsule.a", self.a), Track(scene.memory, "Capsule.b", self.b)
         self.changed = False
 
     def upload(self) -> None:
         """Move to the new ends."""
-        Wall.upload(self)
+        Collider.upload(self)
         self.scene.memory.write(self.dev.size, self.radius)
         self.dev.a.aim(self.a)
         self.dev.b.aim(self.b)
         self.moving = True
 
-    def settle(self) -> None:
+    def end_motion(self) -> None:
         """Stay."""
-        self.dev.a.settle()
-        self.dev.b.settle()
+        self.dev.a.end_motion()
+        self.dev.b.end_motion()
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
         """The axis, as thick as the rod."""

@@ -15,7 +15,7 @@ ROUNDS = 32  # more of them, without friction and bounces
 TOUCH = 2.0**-20  # of the size of a wall: a start that is no deeper inside than this counts as on the surface
 
 
-class Wall(Feature):
+class Collider(Feature):
     """Each particle by itself is kept on one side, with the last word in every iteration.
 
     A wall's confine() finds how deep a particle is, and calls dev.surface.press(). One-sided: what entered in this substep is
@@ -73,7 +73,7 @@ class Wall(Feature):
         return np.zeros((0, 2, len(low))), 0.0
 
     @ti.func
-    def near(self, i, radius):
+    def may_touch(self, i, radius):
         """0 where confine() has nothing to do for particle i, if that can be told without a branch, for several at once."""
         return 1
 
@@ -82,6 +82,6 @@ class Wall(Feature):
         """Move particle i out of the wall, with self.dev.surface.press(). turn: FIRST, AGAIN or GENTLY."""
 
 
-def _friction(wall: Wall, value: Any) -> Any:
+def _friction(wall: Collider, value: Any) -> Any:
     friction_of(repr(wall), "friction", value)
     return tuple(float(v) for v in value) if isinstance(value, (tuple, list)) else float(value)

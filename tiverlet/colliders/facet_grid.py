@@ -7,7 +7,7 @@ ENTRIES = 256  # of lists for each facet, at most; then cells are made larger
 CHUNK = 1 << 22  # pairs of a facet and a cell that are looked at together
 
 
-class Buckets:
+class FacetGrid:
     """Cells around facets, corners (m, k, dim) [m], which may be touched from as far as `far` [m].
 
     Every facet closer than `reach` to a cell is in the list of that cell: list[begin[b] : begin[b + 1]] with b = bucket[cell],

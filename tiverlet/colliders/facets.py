@@ -8,7 +8,7 @@ from ..device import ti
 from ..features.feature import Scene
 from ..particles import Particles
 from .collider import TOUCH
-from .facet_grid import Buckets
+from .facet_grid import FacetGrid
 from .shape import Shape
 
 NEWTON = 16  # steps to the moment of a touch; only what grazes needs more than 3
@@ -72,7 +72,7 @@ class FacetShape(Shape):
         self.close = size * (2.0**-21 if scene.real == ti.f32 else 2.0**-50)
         self.touch = TOUCH * size
         self.tilt, self.slight = (2.0**-18, 2.0**-20) if scene.real == ti.f32 else (2.0**-40, 2.0**-48)
-        buckets = Buckets(corners, float(scene.particles.radius.max(initial=0.0)) + radius, self.closed)
+        buckets = FacetGrid(corners, float(scene.particles.radius.max(initial=0.0)) + radius, self.closed)
         self.reach, self.cell, self.shape = buckets.reach, buckets.cell, buckets.shape.tolist()
         self.low, self.high = corners.min(axis=(0, 1)).tolist(), corners.max(axis=(0, 1)).tolist()
         self.pieces = 4 * int(buckets.shape.sum()) + 64

@@ -6,16 +6,16 @@ from .. import checks
 from ..device import ti
 from ..features.feature import Knob, Scene
 from ..particles import Particles
-from .collider import Wall
+from .collider import Collider
 
 
-class HalfSpace(Wall):
+class HalfSpace(Collider):
     """Particles stay on the side of a plane to which the normal points: a floor, a slope.
 
     C(x) = n . x - offset - radius >= 0, grad C = n.
 
     normal: (dim,), any length above 0; offset: [m] along the unit normal, from the origin. offset is live: assign to it between
-    frames, and the plane moves there during the next frame. friction, restitution, push_out: see Wall.
+    frames, and the plane moves there during the next frame. friction, restitution, push_out: see Collider.
 
     One-sided: a particle cannot pass at any speed, nor can anything draw it through.
     """
@@ -39,19 +39,19 @@ class HalfSpace(Wall):
 
     def bind(self, scene: Scene) -> None:
         """Normal, and the offsets at the start and the end of a frame."""
-        Wall.bind(self, scene)
+        Collider.bind(self, scene)
         self.dev.normal = scene.memory.field("HalfSpace.normal", None, width=len(self.normal), values=self.normal)
         self.dev.offset = scene.memory.field("HalfSpace.offset", None, width=2, values=[self.offset] * 2, state=True)
         self.changed = False
 
     def upload(self) -> None:
         """Move from the last offset to the new one."""
-        Wall.upload(self)
+        Collider.upload(self)
         memory = self.scene.memory
         memory.write(self.dev.offset, [memory.read(self.dev.offset)[0, 1], self.offset])
         self.moving = True
 
-    def settle(self) -> None:
+    def end_motion(self) -> None:
         """Stay."""
         memory = self.scene.memory
         memory.write(self.dev.offset, memory.read(self.dev.offset)[0, 1])

@@ -20,7 +20,7 @@ class Mesh(Moving):
     vertices: (m, 3) [m]. faces: (k, 3) vertices of each triangle, either way round: they are turned alike here, and outwards.
     inside: keep particles in. closed: False for a sheet, a thin wall with two sides. radius: R [m], what the faces are thickened
     by; a sheet that points (particles of radius 0) meet needs some. position, rotation: where the vertices are put (see Moving);
-    live. friction, restitution, push_out: see Wall.
+    live. friction, restitution, push_out: see Collider.
 
     Nothing passes, at any speed of the particle or of the wall. The cost for a particle grows with the faces around it, not with
     those of the mesh. Raises ValueError for faces of no area, and for a closed mesh with an edge that does not have two faces.

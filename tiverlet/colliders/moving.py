@@ -8,7 +8,7 @@ from .. import checks
 from ..device import ti
 from ..features.feature import Knob, Scene
 from ..particles import Particles
-from .collider import Wall
+from .collider import Collider
 from .pose import Pose, rotation_matrix
 from .shape import Shape
 
@@ -29,7 +29,7 @@ def _rotation(wall: "Moving", value):
     return checks.vector(repr(wall), "rotation", value, 3)
 
 
-class Moving(Wall):
+class Moving(Collider):
     """A wall that is described in a frame of its own: its point p is at position + R p in the world.
 
     position: (dim,) [m]. rotation: an angle [rad] in 2D, counterclockwise; a rotation vector, axis times angle [rad], in 3D. Both
@@ -68,20 +68,20 @@ class Moving(Wall):
 
     def bind(self, scene: Scene) -> None:
         """The pose at the ends of a frame and of the substep that is under way, and the shape."""
-        Wall.bind(self, scene)
+        Collider.bind(self, scene)
         self.dev.pose = Pose(scene, repr(self), self.position, self.rotation)
         self.dev.shape = self.shape_on(scene)
         self.changed = False
 
     def upload(self) -> None:
         """Move and turn to the new place."""
-        Wall.upload(self)
+        Collider.upload(self)
         self.dev.pose.aim(self.position, self.rotation)
         self.moving = True
 
-    def settle(self) -> None:
+    def end_motion(self) -> None:
         """Stay."""
-        self.dev.pose.settle()
+        self.dev.pose.end_motion()
 
     def placed(self, points: np.ndarray) -> np.ndarray:
         """Where points (..., dim) of the wall's frame are in the world, for pictures."""

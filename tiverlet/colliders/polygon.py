@@ -20,7 +20,7 @@ class Polygon(Moving):
     vertices: (m, 2) [m], in order, either way round; concave outlines are fine. inside: keep particles in. closed: False for a
     line from the first vertex to the last, a thin wall with two sides. radius: R [m], what the outline is thickened by; a line
     that points (particles of radius 0) meet needs some. position, rotation: where the vertices are put (see Moving); live.
-    friction, restitution, push_out: see Wall.
+    friction, restitution, push_out: see Collider.
 
     Nothing passes, at any speed of the particle or of the wall. Raises ValueError for edges of no length, and for a closed
     outline that has no area or meets itself.

@@ -29,10 +29,10 @@ class Pose:
         self.position.aim(position)
         self.rotation.aim(np.atleast_1d(rotation))
 
-    def settle(self) -> None:
+    def end_motion(self) -> None:
         """Stay where the last frame ended."""
-        self.position.settle()
-        self.rotation.settle()
+        self.position.end_motion()
+        self.rotation.end_motion()
 
     @ti.func
     def update(self, when):

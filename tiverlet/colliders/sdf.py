@@ -28,7 +28,7 @@ class Sdf(Moving):
     function: a ti.func that takes a position [m] and returns the signed distance to the surface [m], negative inside of the
     solid. Its literals have the world's precision. gradient: a ti.func of the position that returns the gradient; None for
     central differences. radius: R [m], what the shape is thickened by. position, rotation: where the shape is put (see Moving);
-    live. friction, restitution, push_out: see Wall.
+    live. friction, restitution, push_out: see Collider.
 
         @ti.func
         def torus(p):

@@ -8,7 +8,7 @@ FIRST, AGAIN, GENTLY = range(3)
 
 
 class Surface:
-    """How the surface of one collider answers on the device: friction, restitution, push_out; see Wall for what they mean.
+    """How the surface of one collider answers on the device: friction, restitution, push_out; see Collider for what they mean.
 
     friction: (static, dynamic), or None for a surface without. restitution: 0 to 1, or None. push_out: [m/s].
     """

@@ -21,7 +21,7 @@ class Track:
         """Go to `value` during the next frame."""
         self._memory.write(self.ends, [self._memory.read(self.ends)[1], value])
 
-    def settle(self) -> None:
+    def end_motion(self) -> None:
         """Stay where the last frame ended."""
         self._memory.write(self.ends, [self._memory.read(self.ends)[1]] * 2)
 

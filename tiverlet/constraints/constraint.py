@@ -10,7 +10,7 @@ from ..device import ti
 from ..features.feature import Knob
 from ..particles import Particles
 from ..tools import golden
-from .core.finite_differences import Slopes
+from .core.finite_differences import NumericGradient
 from .core.scalar import Scalar
 
 WRONG = 1e-4  # relative difference between a gradient and differences of the function that is not rounding
@@ -98,7 +98,7 @@ class Constraint(Scalar):
         self._keep(size=particles.size)
         self.dev.known: tuple[Any, Any, Any] = (None, None, None)
         self.dev.fixed = int(self.origin is None)
-        self.dev.slopes = Slopes(self.function, self.gradient, self.arity, particles.dim, self.dev.fixed, self.size)
+        self.dev.slopes = NumericGradient(self.function, self.gradient, self.arity, particles.dim, self.dev.fixed, self.size)
         Scalar.prepare(self, particles, inv_mass)
         values, slopes = np.zeros(0), np.zeros((0, self.arity, particles.dim))
         if self.count:

@@ -8,13 +8,13 @@ from .. import checks
 from ..device import ti
 from ..features.feature import FAR, Knob, Scene
 from ..particles import Particles
-from .core.anchored import Tether
+from .core.anchored import Anchored
 from .core.curve import Curve
 
 WALK = 64  # steps along the pieces of a path, at most, that a search takes
 
 
-class Path(Tether):
+class Path(Anchored):
     """Particles on a curve: free to slide without friction, or driven along it.
 
     C(x) = x - P(s), a vector across the curve. Free, s is where the plane across the curve at the start of the substep, through
@@ -142,7 +142,7 @@ class Path(Tether):
             self.scene.memory.write(self.dev.target, self.speed if self.dev.moves else self.at)
             self.moving = not self.dev.moves
 
-    def settle(self) -> None:
+    def end_motion(self) -> None:
         """The next frame starts from where this one went."""
         if self.acts:
             self.scene.memory.write(self.dev.source, self.scene.memory.read(self.dev.target)[: self.count])
@@ -252,7 +252,7 @@ class Path(Tether):
         return C, C0
 
     @ti.func
-    def present(self, c, back):
+    def offset_now(self, c, back):
         """From the nearest point."""
         i = self.member(c, 0)
         x = self.dev.state.place(i) - back * self.dev.state.d[i]
@@ -261,7 +261,7 @@ class Path(Tether):
         return x - P
 
     @ti.func
-    def change(self, c):
+    def offset_change(self, c):
         """What of the motion is across the curve."""
         d, t = self.dev.state.d[self.member(c, 0)], self.dev.tangent[c]
         return d - d.dot(t) * t

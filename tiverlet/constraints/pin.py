@@ -6,7 +6,7 @@ from .. import checks
 from ..device import ti
 from ..features.feature import Knob, Scene
 from ..particles import Particles, in_range
-from .core.anchored import Tether
+from .core.anchored import Anchored
 
 
 def _targets(pin: "Pin", target):
@@ -18,7 +18,7 @@ def _targets(pin: "Pin", target):
     return target
 
 
-class Pin(Tether):
+class Pin(Anchored):
     """Particles held at targets that may move: an anchor, a hand, a mouse.
 
     C(x) = x - target (a vector), with unit gradients.
@@ -84,7 +84,7 @@ class Pin(Tether):
             self.scene.memory.write(self.dev.target, self.target)
             self.moving = True
 
-    def settle(self) -> None:
+    def end_motion(self) -> None:
         """The next frame starts from the target."""
         if self.acts:
             self.scene.memory.write(self.dev.source, self.scene.memory.read(self.dev.target)[: self.count])
@@ -109,7 +109,7 @@ class Pin(Tether):
         return x - self.aim(c, when[1]), x - self.dev.state.d[self.member(c, 0)] - self.aim(c, when[0])
 
     @ti.func
-    def present(self, c, back):
+    def offset_now(self, c, back):
         """x - target at the end of the frame, where it is at rest."""
         i = self.member(c, 0)
         return self.dev.state.place(i) - back * self.dev.state.d[i] - self.dev.target[c]

@@ -116,16 +116,16 @@ class ShapeMatch(Batch):
         square = np.bincount(self.members.owner, weights=m * (self._shape**2).sum(axis=1), minlength=self.count)
         self._radius = np.sqrt(square / total)
 
-    def renumber(self, number: np.ndarray, count: int) -> None:
+    def remap_indices(self, number: np.ndarray, count: int) -> None:
         """Particles that come later have a place in the shape of all, which no cluster uses."""
-        super().renumber(number, count)
+        super().remap_indices(number, count)
         if self._rest is not None:
             rest = np.zeros((count, self._rest.shape[1]))
             rest[number[number >= 0]] = self._rest[number >= 0]
             self._rest = rest
             self.arguments = {**self.arguments, "rest": rest}
 
-    def partners(self, particles: Particles) -> np.ndarray:
+    def excluded_pairs(self, particles: Particles) -> np.ndarray:
         """Particles of a cluster that are near each other may overlap; the rest cannot meet unless it is soft."""
         near = [_near(self.members_of(c), particles) for c in range(self.count)]
         return np.concatenate([*near, np.zeros((0, 2), dtype=np.int32)])
@@ -220,7 +220,7 @@ class ShapeMatch(Batch):
         return mu
 
     @ti.func
-    def weigh(self, b, h, hh, first, fresh):
+    def reduce_block(self, b, h, hh, first, fresh):
         """The moments of a block about the places s at the start: of shapes q, predicted places p, and of what else pulls."""
         begin, end, c = self.dev.corners.block[b]
         i0 = self.dev.corners.hub(c)
@@ -306,7 +306,7 @@ class ShapeMatch(Batch):
 
     @ti.func
     def kick(self, c, h):
-        """Find where the cluster is; spread() then adds h^2 times what its springs do now."""
+        """Find where the cluster is; scatter_corner() then adds h^2 times what its springs do now."""
         if self.dev.mass[c] > 0:
             total, p, q, s, K, X = self.moments(c)
             R = rotation.matrix(rotation.fit(K, self.dev.turn[c], LEAST))
@@ -348,7 +348,7 @@ class ShapeMatch(Batch):
         return self.arm(e, self.dev.corners.hub(c), 0) - self.dev.place[c] - self.kept(self.dev.pose, c) @ self.dev.shape[e]
 
     @ti.func
-    def spread(self, e, h, hh, first, fresh):
+    def scatter_corner(self, e, h, hh, first, fresh):
         """Move corner e towards its place."""
         c, i = self.dev.corners.owner[e], self.dev.corners.members[e]
         w, relaxation = self.dev.w.of(i), self.dev.slots.relaxation
@@ -406,7 +406,7 @@ class ShapeMatch(Batch):
         return out
 
     @ti.func
-    def tear(self, c, hh, tick):
+    def break_overloaded(self, c, hh, tick):
         """Let cluster c fall apart if the force on one of its particles was too large."""
         if self.dev.strength.holds(c):
             most = ti.cast(0, self.dev.real)

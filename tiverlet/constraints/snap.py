@@ -6,10 +6,10 @@ from .. import checks
 from ..device import ti
 from ..features.feature import Scene
 from ..particles import Particles
-from .core.anchored import Tether
+from .core.anchored import Anchored
 
 
-class Snap(Tether):
+class Snap(Anchored):
     """Particles drawn to the nearest node of a grid, as by a spring.
 
     C(x) = x - node(x_n), the node nearest to the particle at the start of the substep; unit gradients. The energy
@@ -90,7 +90,7 @@ class Snap(Tether):
         return C, start - node
 
     @ti.func
-    def present(self, c, back):
+    def offset_now(self, c, back):
         """x - node."""
         i = self.member(c, 0)
         x = self.dev.state.place(i) - back * self.dev.state.d[i]

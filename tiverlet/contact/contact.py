@@ -89,7 +89,7 @@ class Contact(PairContact):
     def join(self, scene: Scene, batches: list[Batch], team: Team) -> Grid:
         """Declare the fields, among them the neighbour list's, which is returned."""
         n, dim, dev = scene.particles.count, scene.particles.dim, self.dev
-        pairs = [b.partners(b.start) for b in batches]
+        pairs = [b.excluded_pairs(b.start) for b in batches]
         linked = np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=np.int32)
         self.scene, dev.state, dev.w, dev.rubs, dev.bounces = scene, scene.state, scene.state.w, self.rubs, self.bounces
         dev.move = scene.memory.field("Contact.move", n, width=dim)

@@ -39,6 +39,6 @@ def overlapping(scene: Scene, batches: list[Batch]) -> bool:
     pairs = np.concatenate(found)
     if not len(pairs):
         return False
-    linked = np.concatenate([*(b.partners(b.start) for b in batches), pairs[:0]])
+    linked = np.concatenate([*(b.excluded_pairs(b.start) for b in batches), pairs[:0]])
     some, without = (np.sort(p, axis=1).astype(np.int64) @ [len(x), 1] for p in (pairs, linked))
     return not np.isin(some, without).all()

@@ -119,12 +119,12 @@ class PairContact(Feature):
         if not self.matters and particles.count:
             warnings.warn(f"{self!r}: all radii are 0, so nothing touches; give tv.Particles a radius.", stacklevel=3)
 
-    def admit(self, particles: Particles, first: int) -> None:
+    def check_added(self, particles: Particles, first: int) -> None:
         """Refuse positions too far out."""
         if self.matters:
             self.check_range(particles.position)
 
-    def spared(self, number: np.ndarray) -> tuple[np.ndarray, ...]:
+    def kept_mask(self, number: np.ndarray) -> tuple[np.ndarray, ...]:
         """Its fields are those of the particles."""
         return (number >= 0,)
 

@@ -68,12 +68,12 @@ class Polygons(PairContact):
         if self.matters:
             self.check_range(x)
 
-    def admit(self, particles: Particles, first: int) -> None:
+    def check_added(self, particles: Particles, first: int) -> None:
         """Refuse positions too far out, or inside of bodies."""
-        super().admit(particles, first)
+        super().check_added(particles, first)
         refuse_deep(self.loops, self.dev.outline.body, particles.position, first)
 
-    def renumber(self, number: np.ndarray, count: int) -> None:
+    def remap_indices(self, number: np.ndarray, count: int) -> None:
         """Bodies stay as long as all of their particles do."""
         whole = [loop for loop in self.loops if (number[loop] >= 0).all()]
         self._keep(loops=[number[loop].astype(np.int32) for loop in whole])
@@ -93,7 +93,7 @@ class Polygons(PairContact):
         if dev.bounces:
             dev.restitution = PolygonRestitution(scene, dev.geometry, self.table)
             dev.hit = dev.restitution.hit
-        pairs = [f.partners(f.start) for f in batches]
+        pairs = [f.excluded_pairs(f.start) for f in batches]
         linked = np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=np.int32)
         luggage = [*dev.geometry.carried, *([dev.slip] if dev.rubs else []), *([dev.restitution.aim] if dev.bounces else [])]
         beside: Any = Beside(dev.geometry, self.table, dev.skin)

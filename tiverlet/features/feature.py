@@ -8,8 +8,8 @@ asks of them:
     Batch          relax(c, ...) of one constraint: reads its particles, writes the moves it wants into slots
     Scalar         (constraints/core/scalar.py) a Batch whose constraint is one number: give measure(c, q) = f and its gradients,
                    and C = f - rest gets compliance, damping, mass splitting, residual and load from there
-    Tether         (constraints/core/anchored.py) a Batch of particles, each drawn to a place of its own: give the vector to it
-    Wall           (colliders/collider.py) confine(i, ...) of one particle, with the last word
+    Anchored         (constraints/core/anchored.py) a Batch of particles, each drawn to a place of its own: give the vector to it
+    Collider           (colliders/collider.py) confine(i, ...) of one particle, with the last word
 
 Which particles a Batch acts on is an object that it holds, `members`: FixedSize (members.py), or VariableSize
 (constraints/core/variable_size.py) for constraints on any number of particles each.
@@ -80,7 +80,7 @@ class Feature(RecordsArguments):
     def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Warn of what makes no sense, once it is settled which particles can move."""
 
-    def admit(self, particles: Particles, first: int) -> None:
+    def check_added(self, particles: Particles, first: int) -> None:
         """Check particles that come later, from number `first` on."""
 
     def bind(self, scene: Scene) -> None:
@@ -89,7 +89,7 @@ class Feature(RecordsArguments):
     def upload(self) -> None:
         """Write changed knobs to the device. Called before a frame when `changed`."""
 
-    def settle(self) -> None:
+    def end_motion(self) -> None:
         """End a motion: what was the target of the last frame is where the next one starts. Called when `moving`."""
 
     def compiled(self) -> dict[str, Any]:
@@ -122,11 +122,11 @@ class Feature(RecordsArguments):
         for name in ("scene", "start", "changed", "moving", "new_force", "dev"):
             self.__dict__.pop(name, None)
 
-    def spared(self, number: np.ndarray) -> tuple[np.ndarray, ...]:
+    def kept_mask(self, number: np.ndarray) -> tuple[np.ndarray, ...]:
         """When particles get new numbers, -1 for those that go: masks of what stays, for its fields of as many rows."""
         return ()
 
-    def renumber(self, number: np.ndarray, count: int) -> None:
+    def remap_indices(self, number: np.ndarray, count: int) -> None:
         """Take the new numbers of its particles, of which there are `count` now, and leave out what had one that goes."""
 
     def __repr__(self) -> str:
@@ -170,7 +170,7 @@ class Batch(Feature):
     """
 
     arity = 0  # 0: as many as each needs, see VariableSize
-    reweighs = False  # miss() needs weigh()
+    reweighs = False  # miss() needs reduce_block()
     soft = False  # has springs, which act at a start
     breaks = False  # has constraints that a load can break
     drives = False  # puts its particles in place instead of relaxing them
@@ -191,12 +191,12 @@ class Batch(Feature):
 
     @property
     def blocks(self) -> int:
-        """Of constraints of any size, how much there is for weigh() to do while it is bound; else 0."""
+        """Of constraints of any size, how much there is for reduce_block() to do while it is bound; else 0."""
         return self.dev.corners.blocks_in_all if "corners" in vars(self.dev) else 0
 
     @property
     def corner_count(self) -> int:
-        """Of constraints of any size, how much there is for spread() to do: corners; else 0."""
+        """Of constraints of any size, how much there is for scatter_corner() to do: corners; else 0."""
         return self.dev.corners.count if "corners" in vars(self.dev) else 0
 
     @property
@@ -230,13 +230,13 @@ class Batch(Feature):
         """Whether each constraint has no particle that can move, (m,)."""
         return self.members.idle(inv_mass)
 
-    def spared(self, number: np.ndarray) -> tuple[np.ndarray, ...]:
+    def kept_mask(self, number: np.ndarray) -> tuple[np.ndarray, ...]:
         """Constraints stay as long as all of their particles do."""
         return self.members.kept_mask(number)
 
-    def renumber(self, number: np.ndarray, count: int) -> None:
+    def remap_indices(self, number: np.ndarray, count: int) -> None:
         """Keep the rows of what stays."""
-        some = self.spared(number)[0]
+        some = self.kept_mask(number)[0]
         self.select(some, number)
         for name in self.each:
             if isinstance(rows := self.__dict__.get(name), np.ndarray):
@@ -253,7 +253,7 @@ class Batch(Feature):
         """Keep the particles of these constraints, by their new numbers."""
         self._keep(members=self.members.remapped(some, number))
 
-    def partners(self, particles: Particles) -> np.ndarray:
+    def excluded_pairs(self, particles: Particles) -> np.ndarray:
         """Pairs of particles that may overlap, (k, 2), because this batch says where they are to each other."""
         return self.members.pairs()
 
@@ -297,11 +297,11 @@ class Batch(Feature):
         it has no moment. firm, soft: h^2 over what its multiplier stands for, where it is rigid and where not."""
 
     @ti.func
-    def weigh(self, b, h, hh, first, fresh):
+    def reduce_block(self, b, h, hh, first, fresh):
         """Before relax() and kick() sum over block b of a ragged batch. first: -1 before kick()."""
 
     @ti.func
-    def spread(self, e, h, hh, first, fresh):
+    def scatter_corner(self, e, h, hh, first, fresh):
         """After relax() and kick(): push the move of corner e of a ragged batch."""
 
     @ti.func

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..colliders import Box, Mesh, Polygon
-from ..colliders.collider import Wall
+from ..colliders.collider import Collider
 from ..constraints import Path
 from ..constraints.distance import Link
 from ..features.feature import Batch
@@ -145,7 +145,7 @@ class Drawing:
     def _wall(self, k: int) -> None:
         """A wall or a path, where it is now."""
         wall = self.world.features[k]
-        if isinstance(wall, (Wall, Path)):
+        if isinstance(wall, (Collider, Path)):
             strips, thickness = wall.outline(*self._extent)
             radius = thickness if thickness else -1.5  # half the width in the scene, or pixels
             self._log(f"{self._root}/walls/{k}", self._strips(strips, colors=[[120, 125, 140]], radii=[radius]))

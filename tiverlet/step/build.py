@@ -6,8 +6,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ..colliders.collider import Wall
-from ..constraints.core.anchored import Tether
+from ..colliders.collider import Collider
+from ..constraints.core.anchored import Anchored
 from ..constraints.core.scalar import LOST, Scalar
 from ..contact.pair_contact import PairContact
 from ..device import runtime, ti
@@ -75,7 +75,7 @@ def assemble(
         if start is None:
             feature.review(particles, inv_mass)
         else:
-            feature.admit(particles, first)
+            feature.check_added(particles, first)
     runtime.ensure_started()
     check_architecture(precision, features)
     path = _chosen(path, particles, features) if order == 2 else "fused"
@@ -96,7 +96,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     def of(kind: type[T]) -> list[T]:
         return [f for f in features if isinstance(f, kind)]
 
-    accelerations, walls = of(Acceleration), of(Wall)
+    accelerations, walls = of(Acceleration), of(Collider)
     drivers = [f for f in of(Batch) if f.drives and f.count]
     batches = [f for f in of(Batch) if not f.drives and (scene.inv_mass[f.indices] > 0).any()]
     contact = next((c for c in of(PairContact) if c.matters), None)
@@ -160,7 +160,7 @@ def listed(who: str, features: Any) -> tuple[Feature, ...]:
 def refuse_held_twice(particles: Particles, features: tuple[Feature, ...]) -> None:
     """A particle has one place: refuse pins and driven paths on one that is pinned, or that another one holds."""
     holder = np.full(len(particles), -1)
-    tethers = [(k, f) for k, f in enumerate(features) if isinstance(f, Tether) and f.exclusive]
+    tethers = [(k, f) for k, f in enumerate(features) if isinstance(f, Anchored) and f.exclusive]
     for k, f in sorted(tethers, key=lambda item: not item[1].drives):  # springs are lost on what is driven
         rows = f.indices[:, 0]
         wrong = particles.pinned[rows] | (holder[rows] >= 0)

@@ -27,7 +27,7 @@ class ConstraintPass:
         """The sums of constraints on many particles, by blocks. some: for which; those of the residual, or all."""
         for f in ti.static([f for f in self.ragged if f.reweighs or some]):
             for b in range(self.team.chunk_begin(f.blocks, thread), self.team.chunk_end(f.blocks, thread)):
-                f.weigh(b, h, h2_effective, first, fresh)
+                f.reduce_block(b, h, h2_effective, first, fresh)
             self.team.wait()
 
     @ti.func
@@ -35,7 +35,7 @@ class ConstraintPass:
         """The moves of constraints on many particles."""
         for f in ti.static(self.ragged):
             for e in range(self.team.chunk_begin(f.corner_count, thread), self.team.chunk_end(f.corner_count, thread)):
-                f.spread(e, h, h2_effective, first, fresh)
+                f.scatter_corner(e, h, h2_effective, first, fresh)
             self.team.wait()
 
     @ti.func

@@ -117,10 +117,10 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
             with world._runner.memory.compiler():
                 world._runner.restart(world.iterations)
         old = checkpoint.state(world) if turned else kept.values
-        masks = {f: f.spared(number) for f in before}
+        masks = {f: f.kept_mask(number) for f in before}
         for f in before:
             f.release()
-            f.renumber(number, n + m)
+            f.remap_indices(number, n + m)
         parts = assemble(now, features, starts, n, *world._build_options)
         state = _carried(world, parts.memory, old, attributes, masks, some)
     except BaseException:
@@ -169,13 +169,13 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
 def _drives(feature: Feature, number: np.ndarray) -> bool:
     """Whether a feature that comes or goes changes the force on particles that stay."""
     if isinstance(feature, Batch):
-        return feature.soft and bool(feature.spared(number)[0].any()) if feature.scene else feature.soft
+        return feature.soft and bool(feature.kept_mask(number)[0].any()) if feature.scene else feature.soft
     return isinstance(feature, Acceleration)
 
 
 def _loses(feature: Feature, number: np.ndarray, features: tuple[Feature, ...]) -> bool:
     """Whether constraints go."""
-    return isinstance(feature, Batch) and (feature not in features or not feature.spared(number)[0].all())
+    return isinstance(feature, Batch) and (feature not in features or not feature.kept_mask(number)[0].all())
 
 
 def _carried(

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..colliders.collider import Wall
+from ..colliders.collider import Collider
 from ..device import runtime
 from ..features.feature import Acceleration, Batch
 from ..shapes.shape import morton
@@ -79,7 +79,7 @@ def _present(world: "World") -> list[str]:
             out.append(f"{f!r}: {f.count} {'driven particles' if f.drives else 'constraints'}{note}")
         elif isinstance(f, Acceleration):
             out.append(f"{f!r}: in the loop over particles")
-        elif isinstance(f, Wall):
+        elif isinstance(f, Collider):
             out.append(f"{f!r}: in the loop over particles, last")
         elif world._runner.grid:
             grid = world._runner.grid

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ..colliders.collider import Wall
+from ..colliders.collider import Collider
 from ..constraints.core.scalar import Scalar
 from ..contact.pair_contact import PairContact
 from ..device import ti
@@ -57,7 +57,7 @@ def refuse(order: int, features: tuple[Feature, ...], precision: str, path: str)
         raise ValueError(f'{who} runs in one launch and one thread only. Use path="auto".')
     for f in features:
         why = ""
-        if isinstance(f, (PairContact, Wall)):
+        if isinstance(f, (PairContact, Collider)):
             why = "is one-sided: where it starts to act, motion has no derivatives of that order"
         elif isinstance(f, Acceleration) and (f.decays or f.uses_velocity):
             why = "depends on velocities, so that the substep is not reversible"

@@ -3,7 +3,7 @@ once."""
 
 from typing import Any
 
-from ..colliders.collider import ROUNDS, SWEEPS, Wall
+from ..colliders.collider import ROUNDS, SWEEPS, Collider
 from ..colliders.surface import AGAIN, FIRST, GENTLY
 from ..device import ti
 from ..device.patches.compiler import FEW
@@ -16,7 +16,7 @@ TILE = 256  # particles that a thread takes at a time, through several loops: th
 class ParticlePass:
     """The motion of particles, and what they gather of constraints, contacts and walls. contact and grid may be None."""
 
-    def __init__(self, scene: Scene, integrator: Any, batches: list[Batch], contact, grid, walls: list[Wall], team: Team):
+    def __init__(self, scene: Scene, integrator: Any, batches: list[Batch], contact, grid, walls: list[Collider], team: Team):
         self.integrator, self.forces, self.team = integrator, integrator.forces, team
         self.state, self.n, self.real = scene.state, scene.particles.count, scene.real
         self.pieces = -(-self.n // team.piece)
@@ -128,7 +128,7 @@ class ParticlePass:
                 near = 0
                 for i in range(low, high):
                     for f in ti.static(self.walls):
-                        near |= f.near(i, self.radius.of(i))
+                        near |= f.may_touch(i, self.radius.of(i))
                 if near != 0:
                     for i in range(low, high):
                         self.confine(i, now.h, now.frame_fraction)
@@ -145,7 +145,7 @@ class ParticlePass:
 
     @ti.func
     def confine(self, i, h, frame_fraction):
-        """The walls, which have the last word; they take turns until they agree, see Wall."""
+        """The walls, which have the last word; they take turns until they agree, see Collider."""
         if self.state.w.of(i) > 0:
             if ti.static(len(self.walls) == 1 and not self.walls[0].repeats):
                 for f in ti.static(self.walls):

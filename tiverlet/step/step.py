@@ -8,7 +8,7 @@ as on a GPU, Python runs the same lines, and `do` is a Launcher (runner.py). Hig
 from struct import Struct
 from typing import Any
 
-from ..colliders.collider import Wall
+from ..colliders.collider import Collider
 from ..contact.velocity_projection import EVERY, PASSES
 from ..device import at, inline, record, runtime, ti
 from ..device.thread_team import LEAST, Team
@@ -135,7 +135,7 @@ class Step:
 
     def __init__(
         self, scene: Scene, integrator: Any, batches: list[Batch], drivers: list[Batch], contact: Any, grid: Any,
-        walls: list[Wall], team: Team,
+        walls: list[Collider], team: Team,
     ):  # fmt: skip
         self.scene, self.state, self.slots, self.team = scene, scene.state, scene.slots, team
         self.n, self.dim, self.real = scene.particles.count, scene.particles.dim, scene.real
@@ -351,7 +351,7 @@ class Step:
         """
         for f in ti.static(self.breakers):
             for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
-                f.tear(c, self.integrator.reach(now.h, 0), now.tick)
+                f.break_overloaded(c, self.integrator.reach(now.h, 0), now.tick)
         self.contact_pass.finish(now.thread)
         self.team.wait()
 

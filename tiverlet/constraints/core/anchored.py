@@ -10,7 +10,7 @@ from ...particles import Particles
 from .spring import Spring, stiff
 
 
-class Tether(Batch):
+class Anchored(Batch):
     """One particle each, with the vector C(x) = x - place, from soft to rigid: give offsets() and present().
 
     The formula of Scalar for each axis alike; the gradients are unit vectors.
@@ -89,12 +89,12 @@ class Tether(Batch):
         return zero, zero
 
     @ti.func
-    def present(self, c, back):
+    def offset_now(self, c, back):
         """C at x - back d."""
         return 0 * self.dev.state.d[0]
 
     @ti.func
-    def change(self, c):
+    def offset_change(self, c):
         """How far C changed in the last substep, by the motion of the particle."""
         return self.dev.state.d[self.member(c, 0)]
 
@@ -135,8 +135,8 @@ class Tether(Batch):
         if ti.static(self.dev.spring.soft):
             w, alpha = self.dev.w.of(self.member(c, 0)), self.dev.spring.alpha[c]
             if w > 0 and alpha > 0:
-                C = self.present(c, 0)
-                rate = self.change(c) / h
+                C = self.offset_now(c, 0)
+                rate = self.offset_change(c) / h
                 move = -h * h * w * (1 - stiff(alpha, h, w)) * (C / alpha + self.dev.spring.damping[c] * rate)
         self.push(c, 0, move)
 
@@ -161,6 +161,6 @@ class Tether(Batch):
         if ti.static(self.dev.spring.soft):
             alpha = self.dev.spring.alpha[c]
             if alpha > 0:
-                C = self.present(c, back)
+                C = self.offset_now(c, back)
                 out = ti.cast(C.dot(C) / (2 * alpha), ti.f64)
         return out

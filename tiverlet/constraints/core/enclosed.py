@@ -76,7 +76,7 @@ class Enclosed(Scalar):
         function = self.function.reversed(which)
         self._keep(function=function, members=function.members)
 
-    def partners(self, particles: Particles) -> np.ndarray:
+    def excluded_pairs(self, particles: Particles) -> np.ndarray:
         """Neighbours along an outline may overlap, and all corners of a simplex."""
         return self.function.pairs()
 
@@ -97,7 +97,7 @@ class Enclosed(Scalar):
         return self.function.measure(q)
 
     @ti.func
-    def weigh(self, b, h, hh, first, fresh):
+    def reduce_block(self, b, h, hh, first, fresh):
         """Of a block: f and f0, w |grad|^2; mass-split along both, current, start; its squared size, and of what it moves."""
         begin, end, c = self.dev.corners.block[b]
         i0 = self.dev.corners.hub(c)
@@ -141,7 +141,7 @@ class Enclosed(Scalar):
             self.dev.lam[c], self.dev.change[c], self.dev.astray[c] = new, new - lam, turn == FAR
 
     @ti.func
-    def spread(self, e, h, hh, first, fresh):
+    def scatter_corner(self, e, h, hh, first, fresh):
         """Move each corner by w_j dlam grad_j C."""
         c = self.dev.corners.owner[e]
         n = self.dev.start[e]
@@ -151,7 +151,7 @@ class Enclosed(Scalar):
 
     @ti.func
     def kick(self, c, h):
-        """As in Scalar; of outlines, spread() pushes what is found here."""
+        """As in Scalar; of outlines, scatter_corner() pushes what is found here."""
         if ti.static(self.arity > 0):
             Scalar.kick(self, c, h)
         else:

@@ -11,7 +11,7 @@ STEP = 2.0**-20  # of central differences, relative to the distance between corn
 
 
 @ti.data_oriented
-class Slopes:
+class NumericGradient:
     """function(x_0, x_1, ...) of `arity` corners in `dim` dimensions, and its gradient: given, or by central differences.
 
     function, gradient: a Taichi function, and whether it takes the number of the constraint after the corners.

@@ -480,7 +480,7 @@ class Scalar(Batch):
             self.push(c, k, self.dev.w.of(self.member(c, k)) * pull * g[k, :])
 
     @ti.func
-    def tear(self, c, hh, tick):
+    def break_overloaded(self, c, hh, tick):
         """Break constraint c if its load in this substep was too large; it acts no more from the next one on."""
         self.dev.strength.test(c, ti.abs(self.dev.lam[c]), hh, tick)
 

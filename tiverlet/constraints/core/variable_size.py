@@ -97,11 +97,11 @@ class Corners:
 
     A pass has three loops, so that one constraint on a hundred thousand particles is as parallel as many small ones:
 
-        weigh(b)   sums over at most BLOCK corners of one constraint: block[b] = first corner, last + 1, constraint
+        reduce_block(b)   sums over at most BLOCK corners of one constraint: block[b] = first corner, last + 1, constraint
         relax(c)   adds up its blocks, blocks[c] to blocks[c + 1], in order, and solves
-        spread(e)  gives corner e its move, with give(e, move)
+        scatter_corner(e)  gives corner e its move, with give(e, move)
 
-    The same loops run before kick(), and weigh() before miss() where the batch `reweighs`.
+    The same loops run before kick(), and reduce_block() before miss() where the batch `reweighs`.
     members, owner: the particle and the constraint of each corner. starts: the first corner of each constraint.
     """
 
