@@ -244,8 +244,8 @@ def test_both_of_a_pair_agree_that_they_touch(world):
 
 
 def test_what_a_failed_frame_left_behind_is_gone(world):
-    # A frame that ended in NaN is undone, as the guard does it. What pairs of the new list carry is what they carried then, or 0:
-    # not 0 times what the failed frame left in its place, which is NaN.
+    # A frame that ended in NaN is undone, as the controller does it. What pairs of the new list carry is what they carried then,
+    # or 0: not 0 times what the failed frame left in its place, which is NaN.
     k = np.stack(np.divmod(np.arange(150), 10), axis=1)[:, ::-1]
     x = 0.21 * k + 0.01 * np.sin(7.0 * k[:, ::-1]) + 0.2
     w = world(tv.Particles(x, radius=0.1), [tv.Gravity(9.81), tv.Box((0, 0), (2.4, 9)), tv.Contact(friction=0.3)])

@@ -5,16 +5,16 @@ import pytest
 
 import tiverlet as tv
 from tiverlet.step import block_matrix
-from tiverlet.step.adaptive import Guard
+from tiverlet.step.adaptive import StepController
 
 from .chains import Scene, hung
 from .conftest import rerun
 
 
 def test_whip_and_mass_ratios_from_one_substep(world):
-    # Rows 12 and 18. A chain of 100 and heavy ends of 1e4, 1e5 and 1e6 times the links, each with a guard of its own. The
+    # Rows 12 and 18. A chain of 100 and heavy ends of 1e4, 1e5 and 1e6 times the links, each with a controller of its own. The
     # prototypes reached, from 1 or 8 substeps and without a failure, 2.2e-4 m for the whip and 4.4e-5, 6.7e-6, 7.2e-7 m for the
-    # heavy ends at t = 1 s. Where the guard leaves the substeps alone, these are wrong by more than a link.
+    # heavy ends at t = 1 s. Where the controller leaves the substeps alone, these are wrong by more than a link.
     scene, prefix = Scene(), "D07_massratio_1"
     for name, aim in (
         ("D06_chain100", 2.2e-4),
@@ -23,7 +23,7 @@ def test_whip_and_mass_ratios_from_one_substep(world):
         (f"{prefix}000000", 7.2e-7),
     ):
         w = hung(world, name, substeps="auto")
-        w._guard.substeps = 1
+        w._controller.substeps = 1
         scene.begin[name] = 0
         report = w.run(1.0)
         assert report.clean and report.turn == 0 and report.residual <= 1e-2 and report.tension <= 2.0
@@ -58,7 +58,7 @@ def test_undoing_a_frame_leaves_no_trace(world):
         return world(tv.Particles(x, radius=0.09), features, substeps=substeps, path=path), pin
 
     (a, b), pins = zip(*(scene(*what) for what in (("auto", "parallel"), (4, "fused"))), strict=True)
-    a._guard.substeps = 1
+    a._controller.substeps = 1
     used = []
     for frame in range(40):
         for pin in pins:
@@ -95,11 +95,11 @@ def test_tolerance_is_met_with_less_where_less_is_needed(world):
 def test_a_tolerance_is_one_of_the_motion(world):
     # Rods that are solved leave no residual, but what turns by phi in a substep does so by phi^2 / 24 too fast or too slowly.
     # That error is relative: in the 2 s of the double pendulum D01 it becomes some ten times as much in metres, whatever is
-    # asked. Left to itself, the guard takes one substep a frame, and 4e-3 m.
+    # asked. Left to itself, the controller takes one substep a frame, and 4e-3 m.
     name, scene = "D01_double_pendulum", Scene()
     w, scene.begin[name] = hung(world, name, substeps="auto"), 0
     for tolerance in (1e-4, 1e-5, 2e-6):
-        w.position, w.velocity, w._guard = w.particles.position, w.particles.velocity, Guard()
+        w.position, w.velocity, w._controller = w.particles.position, w.particles.velocity, StepController()
         assert w.run(2.0, tolerance=tolerance).clean
         assert 3 * tolerance < scene.error(w, name, 2.0) < 15 * tolerance
 
@@ -147,7 +147,7 @@ def test_no_change_of_the_substep_brings_in_energy(world):
     down = [round(20 * 1.2**-f) for f in range(12)]
     for link.compliance in (1e-3, 0.0):
         for plan in (["auto"] * 40, [2] * 12 + [200] * 6, 2 * (down + down[::-1])):
-            w.position, w.velocity, w._guard = sheet.position, 0 * sheet.position, Guard()
+            w.position, w.velocity, w._controller = sheet.position, 0 * sheet.position, StepController()
             for w.substeps in plan:
                 report = w.step(1 / 60)
                 assert report.energy <= 1e-3 * m * 9.81 * n**2, (link.compliance[0], plan[-1], report)

@@ -81,7 +81,7 @@ def test_pairs_equal_brute_force(world, path, name, radius, several):
             assert ((in_bucket > 0).sum(), in_bucket.max()) == filled
         w._runner.look()
         touching = w._runner.report()
-        reach, *extent = w._runner.diagnostics.figures[[7, *range(11, 11 + w.particles.dim)]]
+        reach, *extent = w._runner.diagnostics.report.figures[[7, *range(11, 11 + w.particles.dim)]]
         assert reach == np.abs(position).max() and extent == np.ptp(position, axis=0).tolist()
         brute, depth = tv.measure.overlapping(position, radius)
         assert touching.contacts == len(brute)

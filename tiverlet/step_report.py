@@ -16,7 +16,7 @@ class StepReport:
     index of the first particle whose state is not finite, or None. broken: number of constraints that broke; world.broken has
     them. turn: 26 or 41 where a constraint turned by more than so many degrees in a substep, else 0. tension: (omega h)^2 of
     the fastest vibration across a tension that a solver converged to; 4 is the limit of stability. tries: how often the frame
-    was made, see Guard. seconds: what the frame took.
+    was made, see StepController. seconds: what the frame took.
 
     flags: words for what the user should know; notes: one sentence for each, with the cause and a remedy.
         "non-finite"        a position or displacement is NaN or infinite
@@ -26,7 +26,7 @@ class StepReport:
         "softened"          a system was made to give way, because its tension is too large for the substep
         "unconverged"       the residual is above 0.1: a link is off by a tenth of its length, an angle by a tenth of a radian
         "turned"            a constraint turned by more than 41 degrees in a substep and lost its second order there
-        "substeps-capped"   the guard would have taken more substeps, but they are at most 4096, or the budget was spent
+        "substeps-capped"   the controller would have taken more substeps, but they are at most 4096, or the budget was spent
         "stuck"             neither more substeps nor more iterations bring the residual or the overlap to the tolerance
     """
 

@@ -19,7 +19,7 @@ from .neighbours.queries import Contacts, Search, near_by_all, nearest
 from .particles import Particles, in_range
 from .solvers.solver import Solver
 from .step import checkpoint, edit_scene
-from .step.adaptive import Guard
+from .step.adaptive import StepController
 from .step.build import Assembly, assemble, check_settings, checked_features, checked_solver
 from .step.clock import Clock
 from .step.edit_scene import Handle
@@ -32,8 +32,8 @@ class World:
     """Particles and what acts on them.
 
     particles: Particles. features: what acts, in any order; at most one Contact. What is not in the list costs nothing.
-    substeps: substeps of a frame, or "auto" for as many as it needs (see Guard). iterations: passes over the constraints in each.
-    Both may change at any time, at no compile cost.
+    substeps: substeps of a frame, or "auto" for as many as it needs (see StepController). iterations: passes over the constraints
+    in each. Both may change at any time, at no compile cost.
     solver: how constraints are solved: Direct for chains, trees and loops, Jacobi, Chebyshev or ConjugateGradient for cloth. None
     takes Direct for what hangs together like chains, ConjugateGradient(5) for many stiff links that hang together more closely,
     and Jacobi for the rest; explain() says what was chosen, and why.
@@ -73,7 +73,7 @@ class World:
         check_settings(precision, path, order, features)
         self._requested = checked_solver(solver), path  # None where the solver is to be chosen
         self._solver, self._precision, self._order = self._requested[0] or Solver(), precision, order
-        self._guard = Guard()
+        self._controller = StepController()
         self.substeps, self.iterations = substeps, iterations
         self._clock = Clock()
         parts = assemble(particles, features, starts, len(particles), self._requested[0], precision, path, order)
@@ -118,16 +118,16 @@ class World:
                 watcher.before()
             clock = perf_counter()
             try:
-                guarded = self._guard.auto or tolerance is not None or budget is not None
+                guarded = self._controller.auto or tolerance is not None or budget is not None
                 if guarded or self._substeps * self._iterations > self._runner.passes_at_once:
                     self._undo = checkpoint.keep(self), checkpoint.flags(self)
                 self._upload_parameters()
                 self._runner.interruptible = self._undo is not None
                 if guarded:
                     with self._runner.memory.compiler():
-                        report = self._guard.advance(self, dt, tolerance, budget)
+                        report = self._controller.advance(self, dt, tolerance, budget)
                 else:
-                    self._begin(dt / self._substeps * self._runner.integrator.first)
+                    self._runner.begin(dt / self._substeps, self._iterations)
                     report = self._runner.advance(dt, self._substeps, self._iterations)
             except BaseException:
                 self._broken_off()
@@ -183,10 +183,6 @@ class World:
             if feature.changed:
                 feature.changed = feature.new_force = False
                 feature.upload()
-
-    def _begin(self, h: float) -> None:
-        """Take h for the substep."""
-        self._runner.begin(h, self._iterations)
 
     def run(
         self, seconds: float, dt: float = 1 / 60, recorder=None, progress: bool = False, *, tolerance: float | None = None,
@@ -375,14 +371,14 @@ class World:
     @property
     def substeps(self) -> int:
         """Substeps of a frame; of the next one where they are chosen. Assign a number, or "auto"."""
-        return self._guard.substeps if self._guard.auto else self._substeps
+        return self._controller.substeps if self._controller.auto else self._substeps
 
     @substeps.setter
     def substeps(self, value: int | str) -> None:
         if isinstance(value, str) and value != "auto":
             raise ValueError(f'World: substeps = {value!r}, but it must be an integer of at least 1, or "auto".')
-        self._guard.auto = value == "auto"
-        if not self._guard.auto:
+        self._controller.auto = value == "auto"
+        if not self._controller.auto:
             self._substeps = checks.integer("World", "substeps", value, least=1)
 
     @property
@@ -440,7 +436,7 @@ class World:
     @property
     def settings(self) -> dict[str, Any]:
         """How it is computed: substeps, iterations, solver, precision, path and order, as __init__ takes them."""
-        out: dict[str, Any] = {"substeps": "auto" if self._guard.auto else self.substeps, "iterations": self.iterations}
+        out: dict[str, Any] = {"substeps": "auto" if self._controller.auto else self.substeps, "iterations": self.iterations}
         return out | {"solver": self._solver, "precision": self._precision, "path": self._runner.path, "order": self._order}
 
     def clone(self, **changes) -> "World":
@@ -500,41 +496,3 @@ class World:
     def __repr__(self) -> str:
         names = ", ".join(map(repr, self._features))
         return f"World({self._particles!r}, [{names}], substeps={self.substeps}, iterations={self.iterations})"
-
-    # What step/projection.py, step/adaptive.py and tests ask for.
-
-    @property
-    def _memory(self) -> Any:
-        return self._runner.memory
-
-    @property
-    def _scene(self) -> Any:
-        return self._runner.scene
-
-    @property
-    def _batches(self) -> Any:
-        return self._runner.batches
-
-    @property
-    def _sub(self) -> Any:
-        return self._runner.step
-
-    @property
-    def _grid(self) -> Any:
-        return self._runner.grid
-
-    @property
-    def _h(self) -> float:
-        return self._clock.h
-
-    def _list(self) -> None:
-        self._runner.list_neighbours()
-
-    def _look(self) -> None:
-        self._runner.look()
-
-    def _report(self) -> StepReport:
-        return self._runner.report()
-
-    def _advance(self, dt: float, substeps: int, iterations: int) -> StepReport:
-        return self._runner.advance(dt, substeps, iterations)

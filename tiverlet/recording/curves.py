@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..step.checkpoint import Kept
+from ..step.checkpoint import Checkpoint
 from ..step_report import StepReport
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ class Curves:
         p = world.particles
         self._mass = np.where(p.inv_mass > 0, p.mass, 0.0)
 
-    def add(self, frame: int, report: StepReport, now: Kept) -> None:
+    def add(self, frame: int, report: StepReport, now: Checkpoint) -> None:
         """The figures of a frame. The momentum is that of the displacements, half a substep ago, as the energy is."""
         scale = 1.0 if now.clock["_fresh"] else 1 / now.clock["_h"]
         momentum = scale * (self._mass @ now.values["displacement"][: len(self._mass)])

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from ..world import World
 
 FORMAT = 3
-GUARD = {"stuck", "substeps-capped"}  # flags that do not follow from the steps: the Guard knows what it tried in vain
+GUARD = {"stuck", "substeps-capped"}  # flags that do not follow from the steps: the StepController knows what it tried in vain
 JOURNAL = "tiverlet/journal"
 SCENE = "world/scene"
 PARTICLES = "particles"  # the end of the entities that have the positions of frames
@@ -52,7 +52,7 @@ class Changed(ValueError):
 class Entry:
     """What happened, after `steps`: rows of dt [s], substeps, iterations, and how many such steps.
 
-    data["now"]: substeps, iterations and the memory of the guard after it, where they are not those of the entry before.
+    data["now"]: substeps, iterations and the memory of the controller after it, where they are not those of the entry before.
     """
 
     kind: str
@@ -150,9 +150,9 @@ class Journal:
         self.stirred.clear()
 
     def _now(self) -> list:
-        """What the user has set for the next step, and what the guard remembers."""
+        """What the user has set for the next step, and what the controller remembers."""
         settings = self.world.settings
-        return [settings["substeps"], settings["iterations"], list(self.world._guard.memory)]
+        return [settings["substeps"], settings["iterations"], list(self.world._controller.memory)]
 
     def state(self, kind: str = "state") -> int:
         """Write the exact state; returns the size of the entry [bytes]."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..step.checkpoint import Kept
+from ..step.checkpoint import Checkpoint
 from ..step_report import StepReport
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ class Picture:
         self._stream.set_time("time", duration=self.world.time)
 
     def frame(
-        self, number: int, now: Kept, x: np.ndarray, x32: np.ndarray, report: StepReport | None, scenes: int,
+        self, number: int, now: Checkpoint, x: np.ndarray, x32: np.ndarray, report: StepReport | None, scenes: int,
         stirred: Iterable[int],
     ) -> None:  # fmt: skip
         """Draw a frame. now: its state. x, x32: positions, (n, dim), and rounded to f32. report: the worst of the steps since the

@@ -16,7 +16,7 @@ from .picture import Picture, layout
 from .rrd import Contents
 
 if TYPE_CHECKING:
-    from ..step.checkpoint import Kept
+    from ..step.checkpoint import Checkpoint
     from ..world import World
 
 NOTHING = hashlib.blake2b(digest_size=16).digest()  # of a row without components: the time at which the file was begun
@@ -148,7 +148,7 @@ class Redraw:
         """The rows that have to be in the file."""
         return self.rows if self.stride == 1 else self._thinned(found)
 
-    def frame(self, entry: Entry, now: "Kept", x: np.ndarray, x32: np.ndarray) -> str | None:
+    def frame(self, entry: Entry, now: "Checkpoint", x: np.ndarray, x32: np.ndarray) -> str | None:
         """Draw a frame; what is wrong with what the journal says of it, if anything."""
         assert self._picture
         report = self._recent

@@ -323,12 +323,12 @@ def replay(path, given: Iterable[Any] | Mapping[str, Any] = ()) -> Replay:
 
 
 def _settle(world: "World", settings: list) -> None:
-    """Set what the user had set, and what the guard remembered."""
-    world.substeps, world.iterations, world._guard.memory = *settings[:2], tuple(settings[2])
+    """Set what the user had set, and what the controller remembered."""
+    world.substeps, world.iterations, world._controller.memory = *settings[:2], tuple(settings[2])
 
 
-def _kept(entry: Entry, world: "World") -> checkpoint.Kept:
-    kept = checkpoint.Kept(entry.arrays, entry.data["clock"], world._guard.memory)
+def _kept(entry: Entry, world: "World") -> checkpoint.Checkpoint:
+    kept = checkpoint.Checkpoint(entry.arrays, entry.data["clock"], world._controller.memory)
     checkpoint.check(world, kept, entry.data["flags"])
     return kept
 

@@ -31,7 +31,7 @@ NOTHING: Figures = (1.0,) * 4
 WORST: Figures = (float("inf"),) * 4
 
 
-class Guard:
+class StepController:
     """Chooses the substeps of a frame.
 
     A frame is undone, and made again with twice the substeps, when in one of them a constraint turned by more than 26 degrees
@@ -75,13 +75,13 @@ class Guard:
         self.prepare(world.iterations, dt, tolerance, budget)
         n, k, stuck = self.substeps, self.iterations, self.stuck
         before, flags = world._undo  # type: ignore[misc]  # of the step; where nothing was uploaded since, it is the state now
-        kept = checkpoint.keep(world) if any(map(any, flags)) else replace(before, guard=self.memory)
+        kept = checkpoint.keep(world) if any(map(any, flags)) else replace(before, controller=self.memory)
         tries, best, idle, kind = 0, WORST, 0, "substeps"
         known: dict[tuple[int, int], Figures] = {}  # of the tries without a risk
-        world._begin(dt / n * world._sub.first)
+        world._runner.begin(dt / n, world.iterations)
         while True:
             tries, begun = tries + 1, perf_counter()
-            report = world._advance(dt, n, k)
+            report = world._runner.advance(dt, n, k)
             took = perf_counter() - begun
             self.learn(took / (n * k))
             figures, risks = judge(report, tolerance, turned(world) if tolerance else 0.0)
@@ -104,7 +104,7 @@ class Guard:
                         if (n, k) == last:
                             break
                         checkpoint.put_back(world, kept)
-                        world._begin(dt / n * world._sub.first)
+                        world._runner.begin(dt / n, world.iterations)
                         continue
                     kind, idle = "iterations", 0
             if n >= MOST or perf_counter() + 2 * took > end:
@@ -112,7 +112,7 @@ class Guard:
                 break
             n, k = (min(2 * n, MOST), k) if kind == "substeps" else (n, 2 * k)
             checkpoint.put_back(world, kept)
-            world._begin(dt / n * world._sub.first)
+            world._runner.begin(dt / n, world.iterations)
         self.substeps, self.iterations, self.stuck = n, k, stuck  # and the next frames do not try in vain
         self.look_ahead(world.iterations, report, max(figures), verdict, tries)
         return told(report, max(figures), risks, verdict, tries)
@@ -197,7 +197,7 @@ def cheapest(known: dict[tuple[int, int], Figures], stuck: Figures) -> tuple[int
 
 
 def told(report: StepReport, figure: float, risks: set[str], verdict: str, tries: int) -> StepReport:
-    """The report with what the guard has to say."""
+    """The report with what the controller has to say."""
     if verdict == "good":
         return replace(report, tries=tries)
     wrong = sorted(risks) or [f"a figure is {figure:.3g} times what is asked"]

@@ -17,18 +17,18 @@ LATE = {"Contact.shrunk"}  # made when it is needed
 
 
 @dataclass(frozen=True)
-class Kept:
+class Checkpoint:
     """The state at one time: of every field that the future depends on, and of the clock."""
 
     values: dict[str, np.ndarray]
     clock: dict[str, Any]
-    guard: tuple
+    controller: tuple
 
     def digest(self) -> str:
-        """SHA-256 of the exact state, the clock, and what the guard remembers."""
+        """SHA-256 of the exact state, the clock, and what the controller remembers."""
         later = [self.clock["_longest"]] if self.clock["_longest"] > self.clock["_h"] else []  # seen when h changes
         later += ["softened"] if self.clock["_softened"] else []
-        out = hashlib.sha256(repr((*(self.clock[name] for name in HASHED), *later, *self.guard)).encode())
+        out = hashlib.sha256(repr((*(self.clock[name] for name in HASHED), *later, *self.controller)).encode())
         for name, values in self._lasting().items():
             out.update(name.encode())
             out.update(values.tobytes())
@@ -67,9 +67,9 @@ def state(world: "World", pairs: bool = True) -> dict[str, np.ndarray]:
     return out
 
 
-def keep(world: "World", pairs: bool = True) -> Kept:
+def keep(world: "World", pairs: bool = True) -> Checkpoint:
     """A copy of the exact state."""
-    return Kept(state(world, pairs), world._clock.keep(), world._guard.memory)
+    return Checkpoint(state(world, pairs), world._clock.keep(), world._controller.memory)
 
 
 def flags(world: "World") -> list[list[bool]]:
@@ -77,7 +77,7 @@ def flags(world: "World") -> list[list[bool]]:
     return [[f.changed, f.moving] for f in world.features]
 
 
-def put_back(world: "World", kept: Kept) -> None:
+def put_back(world: "World", kept: Checkpoint) -> None:
     """Return to an earlier state, bit for bit."""
     world._runner.set_substep(kept.clock["_h"], kept.clock["_drag"])
     grid, stores = world._runner.grid, list(map(id, world._runner.memories))
@@ -91,16 +91,16 @@ def put_back(world: "World", kept: Kept) -> None:
     if list(map(id, world._runner.memories)) != stores:
         world._runner.renew()  # there are new fields
     world._clock.put_back(kept.clock)
-    world._guard.memory = kept.guard
+    world._controller.memory = kept.controller
 
 
-def install(world: "World", kept: Kept, flagged: list[list[bool]]) -> None:
+def install(world: "World", kept: Checkpoint, flagged: list[list[bool]]) -> None:
     """Give a world that was just built the state of another one of the same scene, knobs and precision, bit for bit."""
     world._upload()
     undo(world, kept, flagged)
 
 
-def check(world: "World", kept: Kept, flagged: list[list[bool]]) -> None:
+def check(world: "World", kept: Checkpoint, flagged: list[list[bool]]) -> None:
     """Raise ValueError unless a state that came from elsewhere fits the world; above all what kernels take for indices."""
     present = keep(world)
     if set(present.values) - LATE != set(kept.values) - LATE or set(present.clock) != set(kept.clock):
@@ -132,7 +132,7 @@ def check(world: "World", kept: Kept, flagged: list[list[bool]]) -> None:
         raise ValueError("The state is not one of this scene: its clock is none.")
 
 
-def undo(world: "World", kept: Kept, flagged: list[list[bool]]) -> None:
+def undo(world: "World", kept: Checkpoint, flagged: list[list[bool]]) -> None:
     """Return to the state before a step that was not finished; what it uploaded is uploaded again in the next one."""
     put_back(world, kept)
     for feature, (changed, moving) in zip(world.features, flagged, strict=True):
@@ -147,7 +147,7 @@ def transfer(old: "World", new: "World") -> None:
         return
     ours, theirs = new._clock, old._clock
     ours.time, ours.tick, ours.since, ours.frame = theirs.time, theirs.tick, theirs.since, theirs.frame
-    new._guard.memory = kept.guard
+    new._controller.memory = kept.controller
     new.position, new.velocity = old.position, old.velocity
     for broke, breaks in zip(old._runner.step.breakers, new._runner.step.breakers, strict=True):
         new._runner.memory.write(breaks.dev.strength.stamp, broke.stamps())

@@ -13,7 +13,7 @@ from ..neighbours.neighbour_search import FARTHEST
 from ..particles import LARGEST
 from ..solvers.solver import Solver
 from ..step_report import UNCONVERGED, StepReport
-from .step import CAME, END, FIGURES, SHEET, H, Step, integer
+from .step import END, FIGURES, ORIGIN, SHEET, H, Step, integer
 
 BLOCKS = 64  # partial sums: their number is fixed, so the total has the same bits on any number of threads; squared on a GPU
 TURNS = (0, 26, 41)  # degrees, for nothing, BENT and FAR
@@ -26,23 +26,17 @@ STEPPED, STARTED, UNSTEPPED = range(3)  # how a state came about: by a substep, 
 class Diagnostics:
     """The figures behind a StepReport, on the sheet of a frame in the order in which report() reads them.
 
-    came: how the state came about. A frame that is one launch ends with them; where it is launched phase by phase, measure() is
-    the last one.
+    state_origin: how the state came about. A frame that is one launch ends with them; where it is launched phase by phase,
+    measure() is the last one.
     """
 
     def __init__(self, step: Step, solver: Solver):
         self.step: Any = step
-        self.solver = solver
-        self.remedy: str | None = None  # the setting that meets constraints better, known once it is asked for
         self.team = step.team
         self.n, self.dim, self.state = step.n, step.dim, step.state
         self.batches = step.batches
         self.contacts = step.contacts
-        self.fastest = step.integrator.fastest
         self.single = step.real == ti.f32
-        self.farthest = LARGEST
-        if step.grid:
-            self.farthest = min(LARGEST, step.grid.finest * FARTHEST)
         self.probes = [f for f in step.integrator.forces.all if not f.uniform]
         self.stride = step.stride
         add = step.scene.memory.field
@@ -52,7 +46,7 @@ class Diagnostics:
         self.high = add("survey.high", self.blocks, width=self.dim, kind=ti.f64)
         self.details: dict[int, Residuals] = {}  # compiled when asked for
         self.sheet: Any = np.zeros(SHEET)
-        self.figures = self.sheet[: 11 + self.dim]
+        self.report = Reporter(step, solver, self.sheet)
         step.diagnostics = self
 
     def of(self, step: Step) -> "Diagnostics":
@@ -134,36 +128,36 @@ class Diagnostics:
         for f in ti.static(self.batches):
             part = (f.count + self.blocks - 1) // self.blocks
             for c in range(b * part, ti.min((b + 1) * part, f.count)):
-                hh, miss = 0 * h, 0 * h
+                h2_effective, miss = 0 * h, 0 * h
                 if begin == 0:
-                    hh = self.step.integrator.reach(h, fresh)
-                    miss = f.miss(c, h, hh, when, fresh)
+                    h2_effective = self.step.integrator.reach(h, fresh)
+                    miss = f.miss(c, h, h2_effective, when, fresh)
                     figures[1] = ti.max(figures[1], ti.cast(miss, ti.f64))
-                figures[0] += f.energy(c, back, hh, miss)
+                figures[0] += f.energy(c, back, h2_effective, miss)
         return figures, low, high
 
     @ti.func
-    def reduce_blocks(self, thread, h64, came):
+    def reduce_blocks(self, thread, h64, state_origin):
         """The sums behind residuals."""
-        h, fresh = ti.cast(h64, self.step.real), ti.cast(came == STARTED, ti.i32)
+        h, fresh = ti.cast(h64, self.step.real), ti.cast(state_origin == STARTED, ti.i32)
         self.step.constraints.reduce_blocks(thread, h, self.step.integrator.reach(h, fresh), 0, fresh, False)
 
     @ti.kernel
     def measure(self, sheet: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
         """All figures."""
-        h64, t64, came = sheet[H], sheet[END], integer(sheet, CAME)
-        self.reduce_blocks(0, h64, came)
-        self.sum_up(0, h64, t64, came, sheet)
+        h64, t64, state_origin = sheet[H], sheet[END], integer(sheet, ORIGIN)
+        self.reduce_blocks(0, h64, state_origin)
+        self.sum_up(0, h64, t64, state_origin, sheet)
 
     @ti.func
-    def sum_up(self, thread, h64, t64, came, sheet: ti.template()):  # type: ignore[valid-type]
+    def sum_up(self, thread, h64, t64, state_origin, sheet: ti.template()):  # type: ignore[valid-type]
         """By blocks, by blocks of these on a GPU, then by one thread."""
         for k in range(
             self.team.chunk_begin(self.blocks * self.stride, thread), self.team.chunk_end(self.blocks * self.stride, thread)
         ):
             if k % self.stride == 0:
                 h, t, b = ti.cast(h64, self.step.real), ti.cast(t64, self.step.real), k // self.stride
-                fresh, begin = ti.cast(came == STARTED, ti.i32), ti.cast(came == UNSTEPPED, ti.i32)
+                fresh, begin = ti.cast(state_origin == STARTED, ti.i32), ti.cast(state_origin == UNSTEPPED, ti.i32)
                 fraction = self.step.integrator.frame_fraction(0, 1)
                 self.parts[b], self.low[b], self.high[b] = self.block(b, h, t, fraction, fresh, begin)
         self.team.wait()
@@ -217,22 +211,54 @@ class Diagnostics:
         self.details[id(batch)].measure(h, int(fresh), out)
         return out[: batch.count]
 
-    def report(
+
+@ti.data_oriented
+class Residuals:
+    """The kernel behind the residual of one batch."""
+
+    def __init__(self, diagnostics: Diagnostics, batch):
+        self.diagnostics, self.step, self.batch = diagnostics, diagnostics.step, batch
+
+    @ti.kernel
+    def measure(self, h64: ti.f64, fresh: ti.i32, out: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
+        """Of every constraint."""
+        if ti.static(self.step.team.size == 1):
+            self.diagnostics.reduce_blocks(0, h64, fresh)
+        elif ti.static(len(self.step.constraints.ragged) > 0):
+            for thread in range(self.step.team.spread):
+                if thread % LEAST == 0:
+                    self.diagnostics.reduce_blocks(thread // LEAST, h64, fresh)
+        for c in range(self.batch.count):
+            h = ti.cast(h64, self.step.real)
+            fraction = self.step.integrator.frame_fraction(0, 1)
+            out[c] = self.batch.miss(c, h, self.step.integrator.reach(h, fresh), fraction, fresh)
+
+
+class Reporter:
+    """Makes a StepReport of the figures on the sheet."""
+
+    def __init__(self, step: Step, solver: Solver, sheet: np.ndarray):
+        self.solver, self.scene, self.batches, self.n = solver, step.scene, step.batches, step.n
+        self.remedy: str | None = None  # the setting that meets constraints better, known once it is asked for
+        self.fastest = step.integrator.fastest
+        self.farthest = min(LARGEST, step.grid.finest * FARTHEST) if step.grid else LARGEST
+        self.figures = sheet[: 11 + step.dim]
+
+    def __call__(
         self, time: float, h: float, substeps: int, iterations: int, before: float | None
     ) -> tuple[StepReport, list[float]]:
         """The report of a frame, and the size of the bounding box [m]. before: the energy one frame ago [J]."""
-        mine = vars(self)  # whose attributes Taichi looks at in Python, one by one
-        energy, residual, overlap, stiff, contacts, bad, fast, reach, broken, tension, turned, *extent = mine["figures"].tolist()
-        stiff = max(stiff, mine["fastest"] * h * h)
+        energy, residual, overlap, stiff, contacts, bad, fast, reach, broken, tension, turned, *extent = self.figures.tolist()
+        stiff = max(stiff, self.fastest * h * h)
         notes = {}
-        first = int(bad) if bad < mine["n"] else None
+        first = int(bad) if bad < self.n else None
         if first is not None:
             notes["non-finite"] = (
                 f"The state of particle {first} is not finite (the first of them); go back and use a smaller step."
             )
-        if reach >= mine["farthest"]:
+        if reach >= self.farthest:
             notes["out-of-range"] = (
-                f"A coordinate is out of range: it reached {reach:g} m, and beyond {mine['farthest']:g} m the precision fails."
+                f"A coordinate is out of range: it reached {reach:g} m, and beyond {self.farthest:g} m the precision fails."
             )
         if fast > 0:
             notes["tunnelling-risk"] = (
@@ -260,8 +286,7 @@ class Diagnostics:
         if residual > UNCONVERGED:
             need = int(np.ceil(substeps * residual / UNCONVERGED))  # of order h^2 under loads, h after impacts
             if self.remedy is None:
-                scene = self.step.scene
-                self.remedy = self.solver.remedy(self.batches, scene.slots, scene.inv_mass)
+                self.remedy = self.solver.remedy(self.batches, self.scene.slots, self.scene.inv_mass)
             other = f", or {self.remedy}" if self.remedy else ""
             notes["unconverged"] = (
                 f"Constraints are not met: the worst is off by {100 * residual:.3g} % of its size. "
@@ -288,25 +313,3 @@ class Diagnostics:
             }
         )
         return report, extent
-
-
-@ti.data_oriented
-class Residuals:
-    """The kernel behind the residual of one batch."""
-
-    def __init__(self, diagnostics: Diagnostics, batch):
-        self.diagnostics, self.step, self.batch = diagnostics, diagnostics.step, batch
-
-    @ti.kernel
-    def measure(self, h64: ti.f64, fresh: ti.i32, out: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
-        """Of every constraint."""
-        if ti.static(self.step.team.size == 1):
-            self.diagnostics.reduce_blocks(0, h64, fresh)
-        elif ti.static(len(self.step.constraints.ragged) > 0):
-            for thread in range(self.step.team.spread):
-                if thread % LEAST == 0:
-                    self.diagnostics.reduce_blocks(thread // LEAST, h64, fresh)
-        for c in range(self.batch.count):
-            h = ti.cast(h64, self.step.real)
-            fraction = self.step.integrator.frame_fraction(0, 1)
-            out[c] = self.batch.miss(c, h, self.step.integrator.reach(h, fresh), fraction, fresh)

@@ -24,7 +24,7 @@ def explain(world: "World") -> str:
     lines = [
         f"{len(p)} particles in {p.dim}D, {int((p.inv_mass == 0).sum())} static; {world.precision} on "
         f"{runtime.architecture()}, {runtime.threads()} threads",
-        f"{'auto, now ' * world._guard.auto}{world.substeps} substeps x {world.iterations} iterations, path {world.path}: "
+        f"{'auto, now ' * world._controller.auto}{world.substeps} substeps x {world.iterations} iterations, path {world.path}: "
         f"{_launches(world)}" + (f"; order {world.order}, {step.integrator.stages} stages in a substep" * (world.order > 2)),
         "In the kernels:",
         *(f"    {line}" for line in _present(world)),

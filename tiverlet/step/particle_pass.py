@@ -133,7 +133,7 @@ class ParticlePass:
                     for i in range(low, high):
                         self.confine(i, now.h, now.frame_fraction)
         for c in ti.static(self.contacts):
-            if now.looks != 0:
+            if now.checks_list != 0:
                 stale = 0
                 for i in range(begin, end):
                     stale |= self.grid.outrun(i)

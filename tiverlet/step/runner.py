@@ -14,7 +14,7 @@ from .clock import Clock
 from .diagnostics import STARTED, STEPPED, UNSTEPPED
 from .integrator import FREE, decay
 from .projection import project
-from .step import ACTIVE_THREADS, CAME, END, GIVE, HALT, H, Moment, Span, frame
+from .step import ACTIVE_THREADS, END, GIVE, HALT, ORIGIN, H, Moment, Span, frame
 
 LONG = 10_000_000  # particles and constraints, times passes, in a launch: it takes about a second
 
@@ -44,7 +44,7 @@ class Runner:
         self.sheet = self.diagnostics.sheet
         self._fused = CachedLaunch(self.step, "fused", self.memory.compiler, self.sheet)
         self._measure = CachedLaunch(self.diagnostics, "measure", self.memory.compiler, self.sheet)
-        self._data, self._given = self.sheet.data, self.sheet.data[H:]
+        self._data, self._given, self._reporter = self.sheet.data, self.sheet.data[H:], self.diagnostics.report
 
     def renew(self) -> None:
         """Kernels that know of a new field; Taichi compiles them for each Step anew."""
@@ -54,9 +54,10 @@ class Runner:
 
     # Frames.
 
-    def begin(self, h: float, iterations: int) -> None:
-        """Take h for the substep; with another one than before, displacements mean something else: start anew from velocities."""
-        clock = self.clock
+    def begin(self, substep: float, iterations: int) -> None:
+        """Take a length [s] for the substep; with another one than before, displacements mean something else: start anew from
+        velocities."""
+        h, clock = substep * self.integrator.first, self.clock
         drag = decay(sum(f.rate for f in self.drags), h) if self.drags else None
         known = clock.energy is not None and clock.first_moved is None
         if h == clock.h and drag == clock.drag and not clock.d_is_velocity and known:
@@ -136,13 +137,13 @@ class Runner:
 
     # Launches.
 
-    def run(self, substeps: int, iterations: int, end: float, came: int) -> None:
+    def run(self, substeps: int, iterations: int, end: float, state_origin: int) -> None:
         """All substeps of a frame, and the diagnostics."""
         clock, stages = self.clock, self.integrator.stages * substeps
         passes = self.integrator.passes(iterations)
         if self.launched:
             with self.memory.compiler():
-                span = Span(clock.h, clock.time, end, clock.tick, clock.since, clock.d_is_velocity, came, stages, passes)
+                span = Span(clock.h, clock.time, end, clock.tick, clock.since, clock.d_is_velocity, state_origin, stages, passes)
                 span.until, span.part = stages + 1, passes
                 frame(self.launcher, span)
             return
@@ -155,7 +156,7 @@ class Runner:
         while True:
             GIVE(
                 self._given, 0, clock.h, clock.time, end, clock.tick, clock.since, clock.d_is_velocity, stages, passes,
-                begin, half, resumed, 0, came, until, part,
+                begin, half, resumed, 0, state_origin, until, part,
             )  # fmt: skip
             self._fused()
             if self._data[HALT]:
@@ -172,9 +173,9 @@ class Runner:
                 until = min(stages + 1, until + max(1, some // passes))
             self.heed_signals()
 
-    def measure(self, end: float, came: int) -> None:
+    def measure(self, end: float, state_origin: int) -> None:
         """Launch the diagnostics alone."""
-        self._data[H], self._data[END], self._data[CAME] = self.clock.h, end, came
+        self._data[H], self._data[END], self._data[ORIGIN] = self.clock.h, end, state_origin
         self._measure()
 
     def heed_signals(self) -> None:
@@ -212,7 +213,7 @@ class Runner:
 
     def report(self, substeps: int = 1, iterations: int = 1) -> StepReport:
         """What the diagnostics found."""
-        report, extent = self.diagnostics.report(self.clock.time, self.clock.h, substeps, iterations, self.clock.energy)
+        report, extent = self._reporter(self.clock.time, self.clock.h, substeps, iterations, self.clock.energy)
         if self.grid:
             self.grid.fit(extent)
         return report
@@ -374,4 +375,4 @@ class Launcher:
     def diagnose(self, now: Moment) -> None:
         """The last launch of a frame."""
         self.flush()
-        self.runner.measure(now.span.end, now.span.came)
+        self.runner.measure(now.span.end, now.span.state_origin)

@@ -67,17 +67,17 @@ class Span:
     """What a launch is to do.
 
     h64: the substep (of orders above 2: its first stage) [s]. start, end: of the frame [s]. tick, since: substeps so far, and
-    since the last start. fresh: whether displacements are velocities. came: how the state came about, see Diagnostics. substeps,
-    iterations: of the frame. begin, until: substeps of it that this launch makes. part: iterations of the last of these.
-    resumed: 1 where `begin` was interrupted before its `half`-th half of a pass.
+    since the last start. fresh: whether displacements are velocities. state_origin: how the state that it leaves came about, see
+    Diagnostics. substeps, iterations: of the frame. begin, until: substeps of it that this launch makes. part: iterations of the
+    last of these. resumed: 1 where `begin` was interrupted before its `half`-th half of a pass.
     """
 
     def __init__(
-        self, h64, start, end, tick, since, fresh, came, substeps, iterations, begin=0, half=0, resumed=0, until=1, part=1,
-        thread=0, sheet=None,
+        self, h64, start, end, tick, since, fresh, state_origin, substeps, iterations, begin=0, half=0, resumed=0, until=1,
+        part=1, thread=0, sheet=None,
     ):  # fmt: skip
-        self.h64, self.start, self.end, self.tick, self.since, self.fresh, self.came = h64, start, end, tick, since, fresh, came
-        self.substeps, self.iterations, self.begin, self.half = substeps, iterations, begin, half
+        self.h64, self.start, self.end, self.tick, self.since, self.fresh = h64, start, end, tick, since, fresh
+        self.state_origin, self.substeps, self.iterations, self.begin, self.half = state_origin, substeps, iterations, begin, half
         self.resumed, self.until, self.part, self.thread, self.sheet = resumed, until, part, thread, sheet
 
 
@@ -87,22 +87,24 @@ class Moment:
 
     s, h, last, time: number, length, length of the one before, start [s]. frame_fraction: where it starts and ends in the frame.
     fresh: whether it is a start. damps: whether sound is taken out after it. final: whether it is the last of the frame.
-    it: the pass. first: whether it is the first one. looks: whether the list is asked for after it; the next substep does, too.
+    it: the pass. first: whether it is the first one. checks_list: whether it is checked after it if the list is stale; the next
+    substep does so, too.
     """
 
     def __init__(
-        self, span, s, h=0.0, last=0.0, time=0.0, tick=0, frame_fraction=None, fresh=0, damps=0, final=0, it=0, first=0, looks=0
+        self, span, s, h=0.0, last=0.0, time=0.0, tick=0, frame_fraction=None, fresh=0, damps=0, final=0, it=0, first=0,
+        checks_list=0,
     ):  # fmt: skip
         self.span, self.thread, self.s, self.h, self.last, self.time, self.tick = span, span.thread, s, h, last, time, tick
         self.frame_fraction, self.fresh, self.damps, self.final = frame_fraction, fresh, damps, final
-        self.it, self.first, self.looks = it, first, looks
+        self.it, self.first, self.checks_list = it, first, checks_list
 
     @inline
-    def of(self, it, first=0, looks=0):
+    def of(self, it, first=0, checks_list=0):
         """The same, in a pass."""
         return Moment(
             self.span, self.s, self.h, self.last, self.time, self.tick, self.frame_fraction, self.fresh, self.damps, self.final,
-            it, first, looks,
+            it, first, checks_list,
         )  # fmt: skip
 
 
@@ -112,7 +114,7 @@ class Moment:
 FIGURES = 14
 HALT, ACTIVE_THREADS = FIGURES, FIGURES + 3
 GIVEN = tuple(range(ACTIVE_THREADS + 1, ACTIVE_THREADS + 16))
-H, START, END, TICK, SINCE, FRESH, SUBSTEPS, ITERATIONS, BEGIN, HALF, RESUMED, FIRST, CAME, UNTIL, PART = GIVEN
+H, START, END, TICK, SINCE, FRESH, SUBSTEPS, ITERATIONS, BEGIN, HALF, RESUMED, FIRST, ORIGIN, UNTIL, PART = GIVEN
 SHEET = PART + 1
 GIVE = Struct(f"{len(GIVEN)}d").pack_into  # in a third of the time of an assignment to an array
 
@@ -140,7 +142,6 @@ class Step:
         self.scene, self.state, self.slots, self.team = scene, scene.state, scene.slots, team
         self.n, self.dim, self.real = scene.particles.count, scene.particles.dim, scene.real
         self.integrator, self.grid, self.walls, self.drivers, self.batches = integrator, grid, walls, drivers, batches
-        self.first = integrator.first  # of adaptive.py
         self.posed = [w for w in walls if w.poses]
         self.breakers: list[Any] = [b for b in batches if b.breaks]
         self.launched = team.launched
@@ -170,16 +171,16 @@ class Step:
         """What a thread does of a frame. All threads of a team take the same branches, for what they depend on is written only
         where the others wait."""
         h64, start, end = sheet[H], sheet[START], sheet[END]
-        tick, since, fresh, came = integer(sheet, TICK), integer(sheet, SINCE), integer(sheet, FRESH), integer(sheet, CAME)
+        tick, since, fresh = integer(sheet, TICK), integer(sheet, SINCE), integer(sheet, FRESH)
+        state_origin = integer(sheet, ORIGIN)
         substeps, iterations = integer(sheet, SUBSTEPS), integer(sheet, ITERATIONS)
         begin, half, resumed = integer(sheet, BEGIN), integer(sheet, HALF), integer(sheet, RESUMED)
         until, part = integer(sheet, UNTIL), integer(sheet, PART)
-        frame(
-            self,
-            Span(
-                h64, start, end, tick, since, fresh, came, substeps, iterations, begin, half, resumed, until, part, thread, sheet
-            ),
-        )
+        span = Span(
+            h64, start, end, tick, since, fresh, state_origin, substeps, iterations, begin, half, resumed, until, part, thread,
+            sheet,
+        )  # fmt: skip
+        frame(self, span)
         if thread == 0:
             if ti.static(self.hashes):
                 for k in ti.static(range(3)):
@@ -215,8 +216,8 @@ class Step:
         """A pass over the constraints, by its first or second half."""
         it = half // self.halves
         first = ti.cast(it == 0, ti.i32)
-        looks = ti.cast(now.final != 0 or it + 1 < now.span.iterations, ti.i32)
-        return now.of(it, first, looks)
+        checks_list = ti.cast(now.final != 0 or it + 1 < now.span.iterations, ti.i32)
+        return now.of(it, first, checks_list)
 
     @ti.func
     def works(self, now):
@@ -363,8 +364,8 @@ class Step:
     @ti.func
     def diagnose(self, now):
         """What the frame came to."""
-        self.diagnostics.reduce_blocks(now.thread, now.span.h64, now.span.came)
-        self.diagnostics.sum_up(now.thread, now.span.h64, now.span.end, now.span.came, now.span.sheet)
+        self.diagnostics.reduce_blocks(now.thread, now.span.h64, now.span.state_origin)
+        self.diagnostics.sum_up(now.thread, now.span.h64, now.span.end, now.span.state_origin, now.span.sheet)
         self.team.reset_wait_count()
 
     @ti.func

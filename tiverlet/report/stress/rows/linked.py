@@ -39,7 +39,7 @@ def _ratio() -> Finding:
 @row(
     2,
     "mass ratio of 1:1e6",
-    "as accurate with enough substeps, by hand or by the guard (1e-6 m); with too few bounded and flagged",
+    "as accurate with enough substeps, by hand or by the controller (1e-6 m); with too few bounded and flagged",
 )
 def _million() -> Finding:
     want = known("D07_massratio_1000000")["values"]["t0.5"]["heavy_xy"]

@@ -8,7 +8,7 @@ from ....forces import Gravity, Wind
 from ....particles import Particles
 from ....shapes import cloth, net
 from ....solvers import Chebyshev, ConjugateGradient, Jacobi
-from ....step.adaptive import Guard
+from ....step.adaptive import StepController
 from ....step_report import UNCONVERGED
 from .row import Finding, finite, row, world
 
@@ -34,7 +34,7 @@ def _taut() -> Finding:
         passes = 4 if isinstance(solver, Chebyshev) else 1
         with world(start, [Gravity(G), Distance(pairs)], solver=solver, precision=precision, iterations=passes) as w:
             for substeps in (2, 20, 200, "auto"):
-                w.position, w.velocity, w._guard = x, 0 * x, Guard()
+                w.position, w.velocity, w._controller = x, 0 * x, StepController()
                 w.substeps = substeps
                 gain = max(w.step(1 / 60).energy for _ in range(20)) / supply
                 most = max(most, gain)

@@ -12,7 +12,7 @@ from ....features.feature import Feature
 from ....forces import Gravity
 from ....particles import Particles
 from ....solvers import Chebyshev, ConjugateGradient, Direct, Jacobi
-from ....step.adaptive import Guard
+from ....step.adaptive import StepController
 from ...accuracy.cases.case import links
 from .row import Finding, row, world
 
@@ -40,7 +40,7 @@ class Watch:
         settings = {"precision": "f32", **settings}
         with world(particles, features, **settings) as w:
             for n in steps:
-                w.position, w.velocity, w._guard = x, particles.velocity, Guard()
+                w.position, w.velocity, w._controller = x, particles.velocity, StepController()
                 w.substeps = n
                 start, gain, fastest, lowest, silent = None, -np.inf, 0.0, x[:, 1].min(), False
                 for _ in range(round(60 * (min(seconds, 0.2) if n == 200 else seconds))):
