@@ -1,4 +1,4 @@
-"""Surroundings: what every wall shares, from the first touch to the bounce."""
+"""The contract of all colliders: what particles stay outside of, or inside."""
 
 from typing import Any
 
@@ -16,11 +16,12 @@ TOUCH = 2.0**-20  # of the size of a wall: a start that is no deeper inside than
 
 
 class Collider(Feature):
-    """Each particle by itself is kept on one side, with the last word in every iteration.
+    """Keeps each particle by itself on one side of a wall, with the last word in every iteration.
 
-    A wall's confine() finds how deep a particle is, and calls dev.surface.press(). One-sided: what entered in this substep is
-    taken back whole, at any speed, whether it flew in or constraints, contacts, friction or a bounce off another wall took it
-    there. Depth from before (a bad start) is left at `push_out` [m/s], and gives no more velocity than that.
+    Subclasses give confine(), which finds how deep a particle is and calls dev.surface.press(): that of the Surface that each
+    holds. One-sided: what entered in this substep is taken back whole, at any speed, whether it flew in or constraints, contacts,
+    friction or a bounce off another wall took it there. Depth from before (a bad start) is left at `push_out` [m/s], and gives no
+    more velocity than that.
 
     Where one correction may lead into a wall again (several walls, a box in whose corners particles bounce), corrections take
     turns until none changes anything: SWEEPS rounds as they come, then ROUNDS without friction and bounces, which are projections

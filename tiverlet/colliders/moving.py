@@ -30,7 +30,7 @@ def _rotation(wall: "Moving", value):
 
 
 class Moving(Collider):
-    """A wall that is described in a frame of its own: its point p is at position + R p in the world.
+    """A collider that is described in a frame of its own: its point p is at position + R p in the world.
 
     position: (dim,) [m]. rotation: an angle [rad] in 2D, counterclockwise; a rotation vector, axis times angle [rad], in 3D. Both
     are live: assign between frames, and the wall goes there during the next frame, along the straight line between the old value

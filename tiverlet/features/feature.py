@@ -78,7 +78,7 @@ class Feature(RecordsArguments):
         """Check the arguments against the particles; set inv_mass to 0 for those that this feature holds."""
 
     def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Warn of what makes no sense, once it is settled which particles can move."""
+        """Warn of what makes no sense; called when all features have said which particles can move."""
 
     def check_added(self, particles: Particles, first: int) -> None:
         """Check particles that come later, from number `first` on."""

@@ -11,9 +11,11 @@ from .spring import Spring, stiff
 
 
 class Anchored(Batch):
-    """One particle each, with the vector C(x) = x - place, from soft to rigid: give offsets() and present().
+    """Constraints C(x) = x - place on one particle each, a vector, from soft to rigid: the formula of Scalar for each axis alike,
+    with unit vectors for gradients.
 
-    The formula of Scalar for each axis alike; the gradients are unit vectors.
+    Subclasses give, on the device, offsets(): C at the end and at the start of a substep, and offset_now(): C at present; where
+    they drive their particles instead (`drives`), drive(c, h, when) puts particle c in its place.
     """
 
     arity = 1
