@@ -63,3 +63,20 @@ class Clock:
         self.tick, self.since = (self.tick + substeps) % 2**31, (self.since + substeps) % 2**31
         self.started, self.d_is_velocity, self.parted = started, False, None
         self.frame, self.time = frame, frame[0] + frame[1] * frame[2]
+
+
+def hashed(kept: dict[str, Any]) -> list[Any]:
+    """Of what keep() returned, what the future depends on and the past does not tell."""
+    later = [kept["_longest"]] if kept["_longest"] > kept["_h"] else []  # seen when h changes
+    later += ["softened"] if kept["_softened"] else []
+    return [*(kept[name] for name in HASHED), *later]
+
+
+def sound(kept: dict[str, Any], particles: int) -> bool:
+    """Whether it can be that of a world of so many particles."""
+    right = [type(kept[name]) is int and 0 <= kept[name] < 2**31 for name in ("_tick", "_since")]
+    right += [type(kept[name]) is bool for name in ("_fresh", "_started", "_softened")]
+    numbers = [kept["_time"], kept["_h"], kept["_longest"], *kept["_frame"], kept["_energy"] or 0]
+    right += [type(v) in (int, float) for v in numbers]
+    right += [kept["_placed"] is None or 0 <= kept["_placed"] <= particles, len(kept["_frame"]) == 3]
+    return all(right) and (kept["_drag"] is None or [type(v) for v in kept["_drag"]] == [float] * 5)
