@@ -48,7 +48,7 @@ def _taut() -> Finding:
     "no energy, and flagged where it stretches",
 )
 def _wide() -> Finding:
-    n, mass, gale, speed = 16, 0.2, 3.0, 1.0
+    n, mass, gale, speed = 60, 0.2, 3.0, 1.0
     sheet = cloth((0, 0, 0), (1, 0, 0), (0, 0, 1), (n, n))
     pairs = np.concatenate([sheet.links, sheet.braces])
     supplied = 0.5 * mass * (gale + speed) ** 2  # by wind and ball: no more than what brings all to their speed

@@ -19,6 +19,7 @@ from .row import Finding, row, world
 G, MASS = 9.81, 0.01
 STEPS = (2, 20, 200, "auto")
 RULE = "energy never above what it was plus 1e-3 of m g times the size, no speed above free fall, what is not met is flagged"
+SECONDS = 10
 WHIP = 2.0  # a chain that swings beats free fall, by less than this
 
 
@@ -29,11 +30,12 @@ class Watch:
         self.gain, self.speed, self.holds, self.flags = -np.inf, 0.0, {}, set()
 
     def run(
-        self, name: str, particles: Particles, features: Sequence[Feature], seconds: float = 0.5, most: float = 1e-2, steps=STEPS,
+        self, name: str, particles: Particles, features: Sequence[Feature], most: float = 1e-2, room: float = 1e-3, steps=STEPS,
         **settings,
     ) -> None:  # fmt: skip
-        """most: the residual from where on a frame has to have a flag. steps: the numbers of substeps."""
-        free = np.setdiff1d(np.arange(particles.count), particles.pinned)
+        """most: the residual from where on a frame has to have a flag. room: how much more energy there may be, of m g L, where
+        it is flagged "unconverged"; 1e-3 where not. steps: the numbers of substeps."""
+        free = np.flatnonzero(~particles.pinned)
         x = particles.position
         size = float(np.ptp(x, axis=0).max())
         supply = MASS * G * len(free) * size
@@ -42,18 +44,19 @@ class Watch:
             for n in steps:
                 w.position, w.velocity, w._controller = x, particles.velocity, StepController()
                 w.substeps = n
-                start, gain, fastest, lowest, silent = None, -np.inf, 0.0, x[:, 1].min(), False
-                for _ in range(round(60 * (min(seconds, 0.2) if n == 200 else seconds))):
+                start, gain, fastest, lowest, silent, flags = None, -np.inf, 0.0, x[:, 1].min(), False, set()
+                for _ in range(SECONDS * 60):
                     report = w.step(1 / 60)
                     start = report.energy - report.energy_change if start is None else start
                     gain = max(gain, (report.energy - start) / supply)
                     fastest = max(fastest, float(np.linalg.norm(w.velocity, axis=1).max()))
                     lowest = min(lowest, w.position[:, 1].min())
                     silent |= n == "auto" and report.residual > most and report.clean
-                    self.flags |= report.flags
+                    flags |= report.flags
+                self.flags |= flags
                 fastest /= np.sqrt(2 * G * max(size, x[:, 1].max() - lowest))
                 where = f"{name}, {settings['precision']}, {w._solver!r}, {n}"
-                self.holds[f"{where}: energy {gain:+.1e}"] = bool(gain <= 1e-3)
+                self.holds[f"{where}: energy {gain:+.1e}"] = bool(gain <= (room if "unconverged" in flags else 1e-3))
                 self.holds[f"{where}: speed {fastest:.2g} of free fall"] = bool(fastest <= WHIP)
                 self.holds[f"{where}: nothing silent"] = not silent
                 self.gain, self.speed = max(self.gain, gain), max(self.speed, fastest)
@@ -92,12 +95,13 @@ def complete(n: int) -> np.ndarray:
 LEVEL = [(1.0, 0.0)]
 
 
-@row(71, "straight ropes of 2 to 400 points between two pins", RULE)
+@row(71, "straight ropes of 2 to 400 points between two pins", f"{RULE}; 2e-2 where 400 points are flagged unconverged")
 def _taut() -> Finding:
     watch = Watch()
     for precision in ("f32", "f64"):
-        particles, pairs, _ = ropes((2, 5, 40, 400), LEVEL * 4)
-        watch.run("Distance", particles, [Gravity(G), Distance(pairs)], 0.3, precision=precision)
+        for counts, room in (((2, 5, 40), 1e-3), ((400,), 2e-2)):  # the longest hangs through by 0.9 of its length
+            particles, pairs, _ = ropes(counts, LEVEL * len(counts))
+            watch.run("Distance", particles, [Gravity(G), Distance(pairs)], precision=precision, room=room)
     particles, pairs, _ = ropes((5, 40), LEVEL * 2)
     for solver, passes in ((Jacobi(), 1), (Chebyshev(), 4), (ConjugateGradient(8), 1)):
         watch.run("Distance", particles, [Gravity(G), Distance(pairs)], solver=solver, iterations=passes)
@@ -109,7 +113,7 @@ def _short() -> Finding:
     watch = Watch()
     for rest in (1.0, 0.999, 0.9):
         particles, pairs, length = ropes((40, 20, 20), [(1.0, 0.0), (0.0, 1.0), (0.7, 0.7)], rest)
-        watch.run(f"Rope {rest:g}", particles, [Gravity(G), Rope(pairs, length)], 0.3, solver=Direct(), most=0.2)
+        watch.run(f"Rope {rest:g}", particles, [Gravity(G), Rope(pairs, length)], solver=Direct(), most=0.2)
     return watch.finding(flagged="softened" in watch.flags)
 
 
@@ -183,14 +187,14 @@ def _clusters() -> Finding:
     return watch.finding()
 
 
-@row(78, "a bridge of ropes under 100 discs", "energy as above; nothing flies, every disc stays in the box")
+@row(78, "a bridge of ropes under 500 discs", "energy as above; nothing flies, every disc stays in the box")
 def _bridge() -> Finding:
     watch, rng = Watch(), np.random.default_rng(3)
     particles, pairs, _ = ropes((30, 30), LEVEL * 2)
     bridge = particles.position[:, :2] + np.repeat([[0.0, 0.0], [0.0, 0.3]], 30, axis=0)
-    k = np.arange(100)
-    discs = np.stack([0.08 + 0.085 * (k % 10), 2.45 + 0.085 * (k // 10)], axis=1) + rng.uniform(-0.01, 0.01, (100, 2))
-    x, radius = np.vstack([bridge, discs]), np.r_[np.full(60, 0.012), np.full(100, 0.03)]
-    scene: list[Any] = [Gravity(G), Distance(pairs), Contact(), Box((-0.5, 0.0), (1.5, 4.0))]
+    k = np.arange(500)
+    discs = np.stack([0.08 + 0.085 * (k % 10), 2.45 + 0.085 * (k // 10)], axis=1) + rng.uniform(-0.01, 0.01, (500, 2))
+    x, radius = np.vstack([bridge, discs]), np.r_[np.full(60, 0.012), np.full(500, 0.03)]
+    scene: list[Any] = [Gravity(G), Distance(pairs), Contact(), Box((-0.5, 0.0), (1.5, 8.0))]
     watch.run("bridge", Particles(x, mass=MASS, radius=radius, pinned=[0, 29, 30, 59]), scene, most=0.1)
     return watch.finding()
