@@ -254,7 +254,7 @@ def test_what_a_failed_frame_left_behind_is_gone(world):
     ends = []
     for failed in (False, True):
         if failed:
-            for piece in w._runner.grid.luggage:
+            for piece in w._runner.grid.pair_data:
                 piece.field.fill(np.nan)
         checkpoint.put_back(w, kept)
         w.run(0.2)

@@ -84,7 +84,7 @@ class Again:
 def lists(w) -> tuple[np.ndarray, np.ndarray]:
     """How many neighbours each particle has, and all of them, one list after the other."""
     _, at = w._runner.grid._entries(w._runner.grid.first, w._runner.grid.number)
-    return w._runner.memory.read(w._runner.grid.number), w._runner.grid.store.read(w._runner.grid.near)[at]
+    return w._runner.memory.read(w._runner.grid.number), w._runner.grid.store.read(w._runner.grid.neighbour)[at]
 
 
 def shuffle(w, rng) -> None:
@@ -116,7 +116,7 @@ def test_lists_of_a_gpu_are_those_of_one_thread(world, dim, sizes):
     start = tv.Particles(x, radius=radius, pinned=static, group=group)
     w = world(start, features, precision="f64", path="launched")
     w._runner.grid.allocate(1)
-    w._renew()
+    w._runner.renew()
     w._runner.list_neighbours()
     far = radius[:, None] + radius + w._runner.grid.skin
     near = ((x[:, None] - x) ** 2).sum(axis=2) < far**2
@@ -150,7 +150,7 @@ def test_what_pairs_carry_goes_with_them(world):
         w = world(tv.Particles(x, radius=radius, mass=radius**2), features, path=path)
         if path == "launched":
             w._runner.grid.allocate(1)
-            w._renew()
+            w._runner.renew()
         w.run(0.2)
         made.append((w.hash(), w._runner.grid.need[None]))
         assert w._runner.grid.cells.levels > 3

@@ -12,7 +12,7 @@ from .conftest import CROSSOVER
 def roomy(w: tv.World, entries: int) -> None:
     """Give the list of near pairs room before anything compiles; a list that grows makes all compile anew."""
     w._runner.grid.allocate(entries)
-    w._renew()
+    w._runner.renew()
 
 
 SKIN = 0.03
@@ -99,7 +99,7 @@ def test_many_particles(world, monkeypatch):
     assert w.path == ("parallel" if tv.runtime.cores() > 1 else "fused")
     w._runner.list_neighbours()
     first, number = w._runner.grid.first.to_numpy(), w._runner.grid.number.to_numpy()
-    near = w._runner.grid.store.read(w._runner.grid.near)
+    near = w._runner.grid.store.read(w._runner.grid.neighbour)
     i = np.repeat(np.arange(len(position)), number)
     j = near[np.repeat(first, number) + np.arange(len(i)) - np.repeat(np.cumsum(number) - number, number)]
     assert (np.diff(j)[np.diff(i) == 0] > 0).all()  # sorted, no pair twice

@@ -15,7 +15,7 @@ from .device.interrupts import whole
 from .features.arguments import meant
 from .features.feature import Acceleration, Feature
 from .features.read_only import assign_whole, read_only
-from .neighbours.queries import Contacts, Search, near_by_all, nearest
+from .neighbours.queries import Contacts, PointSearch, near_by_all, nearest
 from .particles import Particles, in_range
 from .solvers.solver import Solver
 from .step import checkpoint, edit_scene
@@ -93,7 +93,7 @@ class World:
         """Take these for the parts of the world."""
         self._particles, self._features = particles, features
         self._runner, self._solver = Runner(parts, self._clock), parts.solver
-        self._search: Search | None = None  # compiled when it is first asked
+        self._search: PointSearch | None = None  # compiled when it is first asked
         parts.scene.residuals = self._runner.residuals
 
     # The step.
@@ -252,7 +252,7 @@ class World:
                 self._runner.scene.state.put(self._runner.memory, value)
             self._clock.energy, self._clock.first_moved = None, 0
             if self._runner.grid:
-                self._runner.grid.age()
+                self._runner.grid.invalidate()
 
     @property
     def velocity(self) -> np.ndarray:
@@ -291,7 +291,7 @@ class World:
         with whole:
             self._runner.list_neighbours()
             with self._runner.memory.compiler():
-                self._search = self._search or Search(self._runner.grid)
+                self._search = self._search or PointSearch(self._runner.grid)
                 return self._search.near(points, radius)
 
     def nearest(self, points) -> tuple[np.ndarray, np.ndarray]:

@@ -8,8 +8,8 @@ from ..device import ti
 from ..device.patches.compiler import FEW
 from ..device.thread_team import Team
 from ..features.feature import Batch, Knob, Scene
-from ..neighbours.neighbour_list import WORD, Luggage, lowest
-from ..neighbours.neighbour_search import Grid
+from ..neighbours.neighbour_list import WORD, PairData, lowest_bit
+from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
 from ..tools import median
 from .force_share import ForceShare
@@ -86,7 +86,7 @@ class Contact(PairContact):
         if self.matters:
             self.check_range(particles.position)
 
-    def join(self, scene: Scene, batches: list[Batch], team: Team) -> Grid:
+    def join(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
         """Declare the fields, among them the neighbour list's, which is returned."""
         n, dim, dev = scene.particles.count, scene.particles.dim, self.dev
         pairs = [b.excluded_pairs(b.start) for b in batches]
@@ -95,13 +95,13 @@ class Contact(PairContact):
         dev.move = scene.memory.field("Contact.move", n, width=dim)
         self.table.bind(scene)
         # What parted the pair in the last substep, per inverse mass [kg m].
-        dev.push = Luggage("push", 0, lasting=True, marked=True)
-        dev.slip = Luggage("slip", dim, lasting=True)
-        dev.slack = Luggage("slack", 0, lasting=True)  # of the overlap, what no push is for
-        dev.impulse = Luggage("given", 0, lasting=True)  # pushes and impacts in the last substep [kg m]
-        struck, bouncing = Luggage("blow", 0, lasting=False), [dev.slack] if dev.bounces else []
-        luggage = [dev.push, *([dev.slip] if dev.rubs else []), *([*bouncing, struck, dev.impulse] if dev.bounces else [])]
-        dev.grid = Grid(scene, dev.skin, linked, self.table, luggage, team, dev.move)
+        dev.push = PairData("push", 0, lasting=True, marked=True)
+        dev.slip = PairData("slip", dim, lasting=True)
+        dev.slack = PairData("slack", 0, lasting=True)  # of the overlap, what no push is for
+        dev.impulse = PairData("given", 0, lasting=True)  # pushes and impacts in the last substep [kg m]
+        struck, bouncing = PairData("blow", 0, lasting=False), [dev.slack] if dev.bounces else []
+        pair_data = [dev.push, *([dev.slip] if dev.rubs else []), *([*bouncing, struck, dev.impulse] if dev.bounces else [])]
+        dev.grid = NeighbourSearch(scene, dev.skin, linked, self.table, pair_data, team, dev.move)
         dev.geometry = DiscGeometry(scene, dev.grid, self.push_out, dev.impulse if dev.bounces else dev.push)
         skips = n >= FEW and not dev.bounces  # in relax() what bounces forgets the last impact
         dev.splitting = MassSplitting(scene, dev.geometry, dev.rubs, skips, [dev.push, *bouncing], team)
@@ -138,9 +138,9 @@ class Contact(PairContact):
             for word in range(self.dev.grid.words(i)):
                 bits = self.dev.splitting.touching(i, word)
                 while bits != 0:
-                    e = self.dev.grid.first[i] + word * WORD + lowest(bits)
+                    e = self.dev.grid.first[i] + word * WORD + lowest_bit(bits)
                     bits &= bits - ti.u32(1)
-                    j = self.dev.grid.near[e]
+                    j = self.dev.grid.neighbour[e]
                     last = self.dev.push.field[e]
                     shared = self.dev.splitting.weight[i] + self.dev.splitting.weight[j]
                     overlap, each, n = self.dev.geometry.impact(i, j, self.dev.geometry.contact_distance(i, j), shared)
@@ -195,11 +195,11 @@ class Contact(PairContact):
         total, w = 0 * self.dev.press[i], self.dev.w.of(i)
         if self.dev.splitting.weight[i] > 0:
             for word in range(self.dev.grid.words(i)):
-                bits = ti.select(word == 0, self.dev.grid.touching[i], self.dev.grid.whole(i, word))
+                bits = ti.select(word == 0, self.dev.grid.touching[i], self.dev.grid.all_bits(i, word))
                 while bits != 0:
-                    e = self.dev.grid.first[i] + word * WORD + lowest(bits)
+                    e = self.dev.grid.first[i] + word * WORD + lowest_bit(bits)
                     bits &= bits - ti.u32(1)
-                    j, push = self.dev.grid.near[e], self.dev.push.field[e]
+                    j, push = self.dev.grid.neighbour[e], self.dev.push.field[e]
                     r = self.dev.state.apart(i, j)
                     length = r.norm()
                     if push > 0 and length > 0:
@@ -240,7 +240,7 @@ class Contact(PairContact):
         has no slack. What came to overlap after pairs were pushed, which a list with a narrow skin may not know yet, waits."""
         if ti.static(self.dev.rubs):
             for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
-                j = self.dev.grid.near[e]
+                j = self.dev.grid.neighbour[e]
                 overlap, n = self.dev.geometry.overlap(i, j, self.dev.geometry.contact_distance(i, j))
                 slip = 0 * self.dev.state.x[i]
                 if overlap > 0 and self.dev.push.field[e] > 0:
@@ -251,7 +251,7 @@ class Contact(PairContact):
             if self.dev.splitting.weight[i] > 0:
                 for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
                     if self.dev.slack.field[e] > 0:
-                        j = self.dev.grid.near[e]
+                        j = self.dev.grid.neighbour[e]
                         overlap, _n = self.dev.geometry.overlap(i, j, self.dev.geometry.contact_distance(i, j))
                         if overlap <= 0:
                             self.dev.slack.field[e] = 0

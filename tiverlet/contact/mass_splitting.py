@@ -4,7 +4,7 @@ from ..device import ti
 from ..device.patches.compiler import FEW
 from ..device.thread_team import BLOCK, Team
 from ..features.feature import Scene
-from ..neighbours.neighbour_list import WORD, Luggage, lowest
+from ..neighbours.neighbour_list import WORD, PairData, lowest_bit
 from .narrow_phase import DiscGeometry
 
 FADE = 31 / 32  # of how much more often than needed a mass was split, what is left a pass later
@@ -17,7 +17,7 @@ class MassSplitting:
     carry only while they touch. in_state: its fields that are part of the state.
     """
 
-    def __init__(self, scene: Scene, geometry: DiscGeometry, rubs: bool, skips: bool, ended: list[Luggage], team: Team):
+    def __init__(self, scene: Scene, geometry: DiscGeometry, rubs: bool, skips: bool, ended: list[PairData], team: Team):
         n = scene.particles.count
         self.geometry, self.grid, self.ended, self.rubs, self.skips = geometry, geometry.grid, ended, rubs, skips
         self.state, self.real, self.few = scene.state, scene.real, n < FEW
@@ -32,7 +32,7 @@ class MassSplitting:
         """Bits for the entries of particle i that the word is for: which touch, as in overlap(), to the last digit."""
         out, begin = ti.u32(0), self.grid.first[i] + word * WORD
         for k in range(ti.min(self.grid.number[i] - word * WORD, WORD)):
-            j = self.grid.near[begin + k]
+            j = self.grid.neighbour[begin + k]
             r, far = self.state.apart(i, j), self.geometry.contact_distance(i, j)
             out |= ti.cast(r.dot(r) < far * far, ti.u32) << ti.cast(k, ti.u32)  # no branch: it would be taken at random
         return out
@@ -79,7 +79,7 @@ class MassSplitting:
         same = ti.static(self.geometry.radius.uniform and not self.geometry.shrinks)
         gap, begin = ti.cast(ti.math.inf, self.real), self.grid.first[i]
         for e in range(begin, begin + self.grid.number[i]):
-            j = self.grid.near[e]
+            j = self.grid.neighbour[e]
             r = self.state.apart(i, j)
             rr = r.dot(r)
             if ti.static(not same):
@@ -99,7 +99,7 @@ class MassSplitting:
         for word in range(1, self.grid.words(i)):
             bits = self.touches(i, word)
             pairs += ti.math.popcnt(bits)
-            self.clear(i, word, self.grid.whole(i, word) & ~bits)
+            self.clear(i, word, self.grid.all_bits(i, word) & ~bits)
         split = ti.cast(pairs, self.real)
         if ti.static(not self.rubs):
             if pairs > 2:
@@ -108,7 +108,7 @@ class MassSplitting:
                 for word in range(self.grid.words(i)):
                     bits = self.touching(i, word)
                     while bits != 0:
-                        j = self.grid.near[self.grid.first[i] + word * WORD + lowest(bits)]
+                        j = self.grid.neighbour[self.grid.first[i] + word * WORD + lowest_bit(bits)]
                         bits &= bits - ti.u32(1)
                         r, far = self.state.apart(i, j), self.geometry.contact_distance(i, j)
                         scale = 1 / (far * far)
@@ -124,7 +124,7 @@ class MassSplitting:
     def clear(self, i, word, gone):
         """Some pairs do not touch any more."""
         while gone != 0:
-            e = self.grid.first[i] + word * WORD + lowest(gone)
+            e = self.grid.first[i] + word * WORD + lowest_bit(gone)
             for piece in ti.static(self.ended):
                 piece.field[e] = 0
             gone &= gone - ti.u32(1)

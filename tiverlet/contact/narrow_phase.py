@@ -5,8 +5,8 @@ import numpy as np
 from ..device import ti
 from ..device.memory import Memory
 from ..features.feature import Scene
-from ..neighbours.neighbour_list import Luggage
-from ..neighbours.neighbour_search import Grid
+from ..neighbours.neighbour_list import PairData
+from ..neighbours.neighbour_search import NeighbourSearch
 from ..neighbours.queries import Contacts
 
 SAME_PLACE = 2.0**-80  # two particles are in the same place: their distance over that at which they touch, squared
@@ -19,7 +19,7 @@ class DiscGeometry:
     grid: has the pairs listed. impulse: what the pairs of the list got in the last substep [kg m].
     """
 
-    def __init__(self, scene: Scene, grid: Grid, push_out: float = 0.0, impulse: Luggage | None = None):
+    def __init__(self, scene: Scene, grid: NeighbourSearch, push_out: float = 0.0, impulse: PairData | None = None):
         self.scene, self.grid, self.push_out, self.impulse = scene, grid, push_out, impulse
         self.state, self.radius, self.real = scene.state, scene.radius, scene.real
         self.shrinks, self.store = False, None
@@ -135,7 +135,7 @@ class DiscGeometry:
         the radii."""
         less = ti.select(first > 0, self.shrunk[i], ti.cast(0, self.real))
         for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
-            j = self.grid.near[e]
+            j = self.grid.neighbour[e]
             if ti.max(i, j) >= first:
                 far = self.radius.of(i) + self.radius.of(j)
                 overlap, _ = self.overlap(i, j, far)
@@ -155,7 +155,7 @@ class DiscGeometry:
         number = self.grid.number[i]
         last = self.grid.first[i] + number - 1
         for k in range(number):
-            j = self.grid.near[last - k]
+            j = self.grid.neighbour[last - k]
             if j < i:  # and so are the rest
                 break
             a, b = self.radius.of(i), self.radius.of(j)
@@ -175,7 +175,7 @@ class DiscGeometry:
         pairs, at = self.grid.entries()
         push = self.grid.read(self.impulse, at)
         low = pairs[:, 0] < pairs[:, 1]
-        if self.grid.still:  # what is static does not keep what it gives: the other one of the pair does
+        if self.grid.has_static:  # what is static does not keep what it gives: the other one of the pair does
             back = np.lexsort(pairs[~low].T)  # (j, i) in the order of (i, j)
             push[low] = np.maximum(push[low], push[~low][back])
         pairs, push = pairs[low], push[low]

@@ -10,7 +10,7 @@ from ..device import ti
 from ..device.thread_team import Team
 from ..features.feature import Batch, Feature, Knob, Scene
 from ..features.material import Table
-from ..neighbours.neighbour_search import FARTHEST, Grid
+from ..neighbours.neighbour_search import FARTHEST, NeighbourSearch
 from ..neighbours.queries import Contacts
 from ..particles import Particles
 
@@ -105,7 +105,7 @@ class PairContact(Feature):
         """The Memory of what was made when it was needed, or None."""
         return self.dev.geometry.store if "geometry" in vars(self.dev) else None
 
-    def join(self, scene: Scene, batches: list[Batch], team: Team) -> Grid:
+    def join(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
         """Declare the fields, among them the neighbour list's, which is returned."""
         raise NotImplementedError
 

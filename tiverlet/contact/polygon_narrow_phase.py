@@ -7,8 +7,8 @@ import numpy as np
 from ..device import ti
 from ..features.feature import Scene
 from ..features.material import Table
-from ..neighbours.neighbour_list import Luggage
-from ..neighbours.neighbour_search import Grid
+from ..neighbours.neighbour_list import PairData
+from ..neighbours.neighbour_search import NeighbourSearch
 from ..neighbours.queries import Contacts
 from .narrow_phase import DiscGeometry
 
@@ -63,11 +63,11 @@ class PolygonGeometry:
         self.h = add("Polygons.substep", None)
         # For each entry the contact of which its particle is the vertex: overlap, place on the edge (DISCS: there is none) and
         # normal; where in the list of the other one those are in which it is the start, and the end, of the edge (-1: nowhere).
-        self.manifold, self.back = Luggage("met", 4, False, kept=False), Luggage("back", 2, False, kept=False)
-        self.impulse = Luggage("given", 0, lasting=True)  # pushes and impacts in the last substep [kg m]
+        self.manifold, self.back = PairData("met", 4, False, kept=False), PairData("back", 2, False, kept=False)
+        self.impulse = PairData("given", 0, lasting=True)  # pushes and impacts in the last substep [kg m]
         self.carried = [self.manifold, self.back, self.impulse]
 
-    def bind(self, grid: Grid) -> None:
+    def bind(self, grid: NeighbourSearch) -> None:
         """Take the neighbour list, which asks for pairs by `Beside`."""
         self.grid, self.discs = grid, DiscGeometry(self.scene, grid)
 
@@ -218,7 +218,7 @@ class PolygonGeometry:
         """
         out = True
         for e in range(self.grid.first[v], self.grid.first[v] + self.grid.number[v]):
-            j = self.grid.near[e]
+            j = self.grid.neighbour[e]
             if j != a and j != shared and self.loop[j][2] == self.loop[a][2]:
                 r, u = self.state.apart(v, j), self.state.apart(self.after(j), j)
                 uu, faces = u.dot(u), u[1] * back[0] - u[0] * back[1] >= 0
@@ -239,7 +239,7 @@ class PolygonGeometry:
         """
         active = 0
         for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
-            j = self.grid.near[e]
+            j = self.grid.neighbour[e]
             if self.after(i) < 0 and self.after(j) < 0:
                 overlap, n = self.discs.overlap(i, j, self.radius.of(i) + self.radius.of(j))
                 if ti.static(moved):
@@ -289,13 +289,13 @@ class PolygonGeometry:
         high = end
         while low < high:
             middle = (low + high) // 2
-            if self.grid.near[middle] < a:
+            if self.grid.neighbour[middle] < a:
                 low = middle + 1
             else:
                 high = middle
         out = -1
         if low < end:
-            if self.grid.near[low] == a:
+            if self.grid.neighbour[low] == a:
                 out = low - self.grid.first[v]
         return out
 
@@ -306,7 +306,7 @@ class PolygonGeometry:
         Returns the entry that keeps it (-1: there is none), its particles v, a, b, where on the edge, and the part of its move
         that is that of i: 1, -(1 - t) or -t. Two discs are an edge of which only the start is touched.
         """
-        j = self.grid.near[e]
+        j = self.grid.neighbour[e]
         at, v, a = e, i, j
         if role != VERTEX:
             back = self.back.field[e]
@@ -374,7 +374,7 @@ class PolygonGeometry:
         self.detect(i, False)
         allowed = ti.select(first > 0, self.allowed[i], 0 * self.w.of(i))
         for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
-            j, found = self.grid.near[e], self.manifold.field[e]
+            j, found = self.grid.neighbour[e], self.manifold.field[e]
             if ti.max(i, j) >= first and (found[1] > DISCS or self.keeps(i, j)):
                 allowed = ti.max(allowed, found[0])
         self.allowed[i] = allowed
@@ -395,7 +395,7 @@ class PolygonGeometry:
         touching, worst = 0, ti.cast(0, ti.f64)
         self.detect(i, False)
         for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
-            j, found = self.grid.near[e], self.manifold.field[e]
+            j, found = self.grid.neighbour[e], self.manifold.field[e]
             if found[0] > 0 and (found[1] > DISCS or self.keeps(i, j)):
                 size = ti.min(self.radius.of(i), self.radius.of(j))
                 if found[1] > DISCS:

@@ -9,8 +9,8 @@ from ..device import ti
 from ..device.thread_team import Team
 from ..features.feature import Batch, Scene
 from ..features.material import Table
-from ..neighbours.neighbour_list import Luggage
-from ..neighbours.neighbour_search import Grid
+from ..neighbours.neighbour_list import PairData
+from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
 from ..tools import median
 from .force_share import ForceShare
@@ -79,7 +79,7 @@ class Polygons(PairContact):
         self._keep(loops=[number[loop].astype(np.int32) for loop in whole])
         self.arguments = {**self.arguments, "loops": self.loops}
 
-    def join(self, scene: Scene, batches: list[Batch], team: Team) -> Grid:
+    def join(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
         """Declare the fields, among them the neighbour list's, which is returned."""
         n, add, dev = scene.particles.count, scene.memory.field, self.dev
         self.scene, dev.state, dev.w, dev.rubs, dev.bounces = scene, scene.state, scene.state.w, self.rubs, self.bounces
@@ -89,15 +89,15 @@ class Polygons(PairContact):
         dev.active = add("Contact.active", n, kind=ti.i32)  # contacts that each particle is in
         dev.fast = add("Contact.fast", None, kind=ti.i32)
         self.table.bind(scene, asked=True)
-        dev.friction, dev.slip = Friction(self.table), Luggage("slip", 2, lasting=True)
+        dev.friction, dev.slip = Friction(self.table), PairData("slip", 2, lasting=True)
         if dev.bounces:
             dev.restitution = PolygonRestitution(scene, dev.geometry, self.table)
             dev.hit = dev.restitution.hit
         pairs = [f.excluded_pairs(f.start) for f in batches]
         linked = np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=np.int32)
-        luggage = [*dev.geometry.carried, *([dev.slip] if dev.rubs else []), *([dev.restitution.aim] if dev.bounces else [])]
+        pair_data = [*dev.geometry.carried, *([dev.slip] if dev.rubs else []), *([dev.restitution.aim] if dev.bounces else [])]
         beside: Any = Beside(dev.geometry, self.table, dev.skin)
-        dev.grid = Grid(scene, dev.skin, linked, beside, luggage, team, dev.move, dev.outline.reach)
+        dev.grid = NeighbourSearch(scene, dev.skin, linked, beside, pair_data, team, dev.move, dev.outline.reach)
         dev.geometry.bind(dev.grid)
         return dev.grid
 
@@ -214,7 +214,7 @@ class PolygonRestitution:
         self.kick = add("Contact.kick", n, width=2)
         self.lift = add("Contact.lift", n, width=2)  # moves the position alone
         self.hit = add("Contact.hit", None, kind=ti.i32)
-        self.aim = Luggage("aim", 2, lasting=False)  # with which displacement each contact is to leave, along its normal
+        self.aim = PairData("aim", 2, lasting=False)  # with which displacement each contact is to leave, along its normal
 
     @ti.func
     def target(self, v, a, b, t, n, overlap, leaving):

@@ -3,7 +3,7 @@
 from ..device import ti
 from ..features.feature import Scene
 from ..features.material import Table
-from ..neighbours.neighbour_list import Luggage
+from ..neighbours.neighbour_list import PairData
 from .narrow_phase import DiscGeometry
 
 
@@ -14,7 +14,7 @@ class Restitution:
     and impacts of the last substep [kg m].
     """
 
-    def __init__(self, scene: Scene, geometry: DiscGeometry, table: Table, struck: Luggage, slack: Luggage, impulse: Luggage):
+    def __init__(self, scene: Scene, geometry: DiscGeometry, table: Table, struck: PairData, slack: PairData, impulse: PairData):
         n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
         self.geometry, self.grid, self.table, self.state = geometry, geometry.grid, table, scene.state
         self.struck, self.slack, self.impulse = struck, slack, impulse
@@ -68,7 +68,7 @@ class Restitution:
         if self.weight[i] > 0:
             for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
                 if self.struck.field[e] > 0:
-                    j = self.grid.near[e]
+                    j = self.grid.neighbour[e]
                     overlap, _each, n = self.geometry.impact(i, j, self.geometry.contact_distance(i, j), self.weight[i])
                     given, here, a = self.target(i, j, n)
                     if overlap > 0 and a > 0 and given > 0:

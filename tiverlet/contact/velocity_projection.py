@@ -7,8 +7,8 @@ import numpy as np
 from ..device import ti
 from ..device.thread_team import Team
 from ..features.feature import Scene
-from ..neighbours.neighbour_list import WORD, Luggage, lowest
-from ..neighbours.neighbour_search import Grid
+from ..neighbours.neighbour_list import WORD, PairData, lowest_bit
+from ..neighbours.neighbour_search import NeighbourSearch
 
 EVERY = 32  # substeps from one projection to the next
 PASSES = 32
@@ -31,7 +31,7 @@ class VelocityProjection:
     """
 
     def __init__(
-        self, scene: Scene, grid: Grid, push: Luggage, weight: Any, restitution: Any, change: Any, team: Team
+        self, scene: Scene, grid: NeighbourSearch, push: PairData, weight: Any, restitution: Any, change: Any, team: Team
     ):  # fmt: skip
         self.grid, self.push, self.weight, self.restitution = grid, push, weight, restitution
         self.state, self.change, self.bounces = scene.state, change, restitution is not None
@@ -59,18 +59,18 @@ class VelocityProjection:
         if self.weight[i] > 0:
             for word in range(self.grid.words(i)):
                 # Not touches(): the pair may have parted in this pass, and both of it have to agree.
-                bits = ti.select(word == 0, self.grid.touching[i], self.grid.whole(i, word))
+                bits = ti.select(word == 0, self.grid.touching[i], self.grid.all_bits(i, word))
                 while bits != 0:
-                    e = first + word * WORD + lowest(bits)
+                    e = first + word * WORD + lowest_bit(bits)
                     bits &= bits - ti.u32(1)
                     if self.bears(i, e):
-                        j = self.grid.near[e]
+                        j = self.grid.neighbour[e]
                         r = self.state.apart(i, j)
                         rr = r.dot(r)
                         if rr > 0:
                             shared = self.weight[i] + self.weight[j]
-                            self.grid.aside[at] = j
-                            self.push.aside[at] = w / (rr * shared)
+                            self.grid.old_neighbour[at] = j
+                            self.push.old[at] = w / (rr * shared)
                             at += 1
         return at - first
 
@@ -91,9 +91,9 @@ class VelocityProjection:
         """Pass k for particle i: what changes d. change' = (factor - 1) change + factor 2 / (1 + 1 / CONDITION) want."""
         want, first = 0 * self.state.d[i], self.grid.first[i]
         for e in range(first, first + self.number[i]):
-            j = self.grid.aside[e]
+            j = self.grid.old_neighbour[e]
             r = self.state.apart(i, j)
-            want -= self.push.aside[e] * (self.state.d[i] - self.state.d[j]).dot(r) * r
+            want -= self.push.old[e] * (self.state.d[i] - self.state.d[j]).dot(r) * r
         if ti.static(self.state.leans):
             lean = self.state.lean[i]
             size = lean.dot(lean)

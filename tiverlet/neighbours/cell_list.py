@@ -2,7 +2,7 @@
 
 The hash folds space onto a torus of cells, cell (a, b, ...) to bucket (a mod A, b mod B, ...) with A, B powers of two
 of at least 4. The three cells around a particle along each axis thus fall into different buckets, so every bucket is read
-once and every pair is seen once, however many far cells share a bucket; those are told apart by the distance itself. Cells
+once and every pair is seen once, however many far cells share a bucket; those are told apart by the distance itself. CellList
 of a row stand side by side in memory. Counting sort; no cell has a capacity. On a GPU the counters are atomic, and the order
 within a cell is another one in every run: no result may depend on it.
 
@@ -25,7 +25,7 @@ from ..tools import distinct
 LEVELS = 14  # the last one holds all that are smaller, down to points
 
 
-class Cells:
+class CellList:
     """The tables. radius: (n,) [m]. reach: (n,) [m]. Pairs are looked for up to the sum of their radii, the longer of their
     reaches, and the skin [m]."""
 
@@ -88,13 +88,13 @@ class Cells:
         return m
 
     @ti.func
-    def home(self, i, m):
+    def cell_of(self, i, m):
         """The cell of particle i at level m."""
         return ti.floor(self.state.x[i] * self.scale(m), ti.i32)
 
     @ti.func
     def scale(self, m):
-        """Cells per meter at level m."""
+        """CellList per meter at level m."""
         scale = ti.cast(1 / self.sizes[0], self.real)
         if ti.static(self.levels > 1):
             scale = self.per_meter[m]
@@ -112,27 +112,27 @@ class Cells:
         return b
 
     @ti.func
-    def where(self, i):
+    def bucket_of(self, i):
         """The bucket of particle i."""
         m = self.level_of(i)
-        return self.bucket(self.home(i, m), m)
+        return self.bucket(self.cell_of(i, m), m)
 
     @ti.func
-    def sort(self, me):
+    def sort(self, thread):
         """Sort the particles into buckets."""
-        for b in range(self.team.chunk_begin(self.buckets + 2, me), self.team.chunk_end(self.buckets + 2, me)):
+        for b in range(self.team.chunk_begin(self.buckets + 2, thread), self.team.chunk_end(self.buckets + 2, thread)):
             self.edge[b] = 0
         self.team.wait()
         ti.loop_config(serialize=self.serial)
-        for i in range(self.team.one(self.n, me)):
-            raised(self.edge, self.where(i) + 1, 1, self.serial)
-        self.sums.run(self.edge, me)
+        for i in range(self.team.one(self.n, thread)):
+            add_to(self.edge, self.bucket_of(i) + 1, 1, self.serial)
+        self.sums.run(self.edge, thread)
         ti.loop_config(serialize=self.serial)
-        for back in range(self.team.one(self.n, me)):
+        for back in range(self.team.one(self.n, thread)):
             # Filling a bucket from its end turns the end of each into its begin, and the next one's begin is its end. From the
             # last particle on, so that each bucket comes out in order (on one thread) and leaves little to sort.
             i = self.n - 1 - back
-            k = raised(self.edge, self.where(i) + 1, -1, self.serial) - 1
+            k = add_to(self.edge, self.bucket_of(i) + 1, -1, self.serial) - 1
             self.sorted[k] = i
             self.place[k] = self.state.x[i]
             if ti.static(self.state.compensated):
@@ -164,7 +164,7 @@ class Cells:
 
 
 @ti.func
-def raised(field: ti.template(), at, by, serial: ti.template()):  # type: ignore[valid-type]
+def add_to(field: ti.template(), at, by, serial: ti.template()):  # type: ignore[valid-type]
     """Add to a counter; returns what it was. serial: one thread counts, without atomic operations, which take longer."""
     old = field[at]
     if ti.static(serial):

@@ -1,4 +1,4 @@
-"""The list of near pairs: where it is kept, and what pairs carry from one list to the next."""
+"""The neighbour list: where it is stored, and what pairs remember from one list to the next."""
 
 import warnings
 from typing import Any
@@ -13,33 +13,34 @@ CROWDED = 300  # near pairs per particle beyond which the user is told
 WORD, FULL = 32, 2**32 - 1  # entries that one word of bits is for
 
 
-class Luggage:
-    """What each pair carries along: a number, or a vector of `width`.
+class PairData:
+    """What each pair remembers: a number, or a vector of `width`.
 
-    lasting: it is part of the state, beyond a substep. kept: it goes from list to list; what is not has to be worked out anew.
-    marked: only pairs whose bit in Grid.touching is set have other than 0.
+    lasting: it is part of the state, beyond a substep. kept: it is transferred to the next list; what is not is computed anew.
+    marked: only pairs whose bit in NeighbourList.touching is set have other than 0. field, old: the data of the list, and of the
+    old one while a new one is built.
     """
 
     field: Any
-    aside: Any
+    old: Any
 
     def __init__(self, name: str, width: int, lasting: bool, kept: bool = True, marked: bool = False):
         self.name, self.width, self.lasting, self.kept, self.marked = name, width, lasting, kept, marked
 
 
-class Pairs:
+class NeighbourList:
     """For each particle, the entries of the list that are its own: `number` of them from `first` on, sorted by index.
 
-    n: particles. luggage: what the entries carry along when the list is built anew. short: entries of room after each block.
+    n: particles. pair_data: what each pair remembers. short: entries of room after each block.
     """
 
     blocks: int  # parts of the list, each filled by one thread
 
-    def __init__(self, memory: Memory, n: int, rooms: int, luggage: list[Luggage], team: Team, short: int):
+    def __init__(self, memory: Memory, n: int, rooms: int, pair_data: list[PairData], team: Team, short: int):
         self.team, self.n, self.memory, self.real, self.short = team, n, memory, memory.real, short
-        self.luggage = luggage
-        self.lasting, self.bags = [p for p in luggage if p.lasting], [p for p in luggage if p.kept]
-        self.marked = all(p.marked for p in self.bags)
+        self.pair_data = pair_data
+        self.lasting, self.transferred = [p for p in pair_data if p.lasting], [p for p in pair_data if p.kept]
+        self.marked = all(p.marked for p in self.transferred)
         add = memory.field
         self.first = add("grid.first", rooms, kind=ti.i32)
         self.number = add("grid.number", n, kind=ti.i32)
@@ -48,9 +49,9 @@ class Pairs:
         self.touching = add("grid.touching", n, kind=ti.u32)  # bits: which of the first entries touch, when last looked at
         self.old_first = add("grid.old_first", n, kind=ti.i32)
         self.old_number = add("grid.old_number", n, kind=ti.i32)
-        self.kept = add("grid.kept", None, kind=ti.i32)  # 1: the old list is put aside for the one that is being built
-        self.near: Any = None
-        self.aside: Any = None  # those of the old list that carry something, while a new one is built
+        self.old_saved = add("grid.kept", None, kind=ti.i32)  # 1: the old list is saved for the one that is being built
+        self.neighbour: Any = None
+        self.old_neighbour: Any = None  # of the old list, pairs with data other than 0, while a new one is built
         self.store: Memory | None = None
 
     def allocate(self, capacity: int) -> None:
@@ -63,12 +64,12 @@ class Pairs:
         self.pitch = self.capacity + self.short  # from one block to the next
         self.room = self.pitch * self.blocks  # of one list
         self.store = Memory(self.real)
-        self.near = self.store.field("grid.near", self.room, kind=ti.i32)
-        self.aside = self.store.field("grid.aside", self.room, kind=ti.i32)
-        for piece in self.luggage:
+        self.neighbour = self.store.field("grid.near", self.room, kind=ti.i32)
+        self.old_neighbour = self.store.field("grid.aside", self.room, kind=ti.i32)
+        for piece in self.pair_data:
             piece.field = self.store.field(f"grid.{piece.name}", self.room, width=piece.width)
             if piece.kept:
-                piece.aside = self.store.field(f"grid.{piece.name}_aside", self.room, width=piece.width)
+                piece.old = self.store.field(f"grid.{piece.name}_aside", self.room, width=piece.width)
         self.store.place()
 
     def grow(self) -> None:
@@ -85,19 +86,19 @@ class Pairs:
         kept = [self.store.read(field) for field in self._fields()]
         self.allocate(int(need * 1.25 + 16) * self.blocks)
         for field, values in zip(self._fields(), kept, strict=True):
-            self._aside(field, values)
-        self.age()
+            self._write_old(field, values)
+        self.invalidate()
 
     def _fields(self) -> list:
-        return [self.aside, *(piece.aside for piece in self.bags)]
+        return [self.old_neighbour, *(piece.old for piece in self.transferred)]
 
-    def _aside(self, field, values: np.ndarray) -> None:
-        """Write what was put aside."""
+    def _write_old(self, field, values: np.ndarray) -> None:
+        """Write a field of the old list."""
         room = np.zeros((self.room, *values.shape[1:]), dtype=values.dtype)
         room[: len(values)] = values
         self.store.write(field, room)  # type: ignore[union-attr]
 
-    def age(self) -> None:
+    def invalidate(self) -> None:
         """Have a new list built in the next frame."""
         self.memory.write(self.stale, 1)  # Taichi would compile a kernel for stale[None] = 1
 
@@ -105,10 +106,10 @@ class Pairs:
         """The listed pairs (m, 2) either way round, in order, and where they are in the list."""
         assert self.store
         i, at = self._entries(self.first, self.number)
-        return np.stack([i, self.store.read(self.near)[at]], axis=1).astype(np.int64), at
+        return np.stack([i, self.store.read(self.neighbour)[at]], axis=1).astype(np.int64), at
 
-    def read(self, piece: Luggage, at: np.ndarray) -> np.ndarray:
-        """What some entries of the list carry."""
+    def read(self, piece: PairData, at: np.ndarray) -> np.ndarray:
+        """The data of some entries of the list."""
         assert self.store
         return self.store.read(piece.field)[at].astype(np.float64)
 
@@ -118,64 +119,63 @@ class Pairs:
         i = np.repeat(np.arange(self.n), number)
         return i, np.repeat(first, number) + np.arange(len(i)) - np.repeat(np.cumsum(number) - number, number)
 
-    def carried(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Every listed pair (i, j) that carries something lasting other than 0, in order, and what: the same whatever the list's
-        layout."""
+    def lasting_data(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Every listed pair (i, j) with lasting data other than 0, in order, and its data, whatever the list's layout."""
         assert self.store
-        aside = bool(self.memory.read(self.kept)[0])  # given by restore(), and not built into a list yet
+        aside = bool(self.memory.read(self.old_saved)[0])  # given by restore(), and not built into a list yet
         first, number = (self.old_first, self.old_number) if aside else (self.first, self.number)
         i, at = self._entries(first, number)
-        near = self.store.read(self.aside if aside else self.near)[at]
-        values = {piece.name: self.store.read(piece.aside if aside else piece.field)[at] for piece in self.lasting}
+        near = self.store.read(self.old_neighbour if aside else self.neighbour)[at]
+        values = {piece.name: self.store.read(piece.old if aside else piece.field)[at] for piece in self.lasting}
         some = np.zeros(len(i), dtype=bool)
         for value in values.values():
             some |= (value != 0) if value.ndim == 1 else (value != 0).any(axis=1)
         return np.stack([i[some], near[some]], axis=1), {name: value[some] for name, value in values.items()}
 
     def restore(self, pairs: np.ndarray, values: dict[str, np.ndarray]) -> None:
-        """Give what carried() returned to the next list that is built."""
+        """Give what lasting_data() returned to the next list that is built."""
         if len(pairs) > self.room:
             self.allocate(len(pairs))
-        self._aside(self.aside, pairs[:, 1].astype(np.int32))
-        for piece in self.bags:
-            self._aside(piece.aside, values[piece.name] if piece.lasting else np.zeros((1, *[piece.width] * (piece.width > 0))))
+        self._write_old(self.old_neighbour, pairs[:, 1].astype(np.int32))
+        for piece in self.transferred:
+            self._write_old(piece.old, values[piece.name] if piece.lasting else np.zeros((1, *[piece.width] * (piece.width > 0))))
         counts = np.bincount(pairs[:, 0], minlength=max(1, self.n))
         self.memory.write(self.old_first, np.cumsum(counts) - counts)
         self.memory.write(self.old_number, counts)
-        self.memory.write(self.kept, 1)
-        self.age()
+        self.memory.write(self.old_saved, 1)
+        self.invalidate()
 
     @ti.func
-    def keep(self, me):
-        """Put the list aside, unless one is there already, from a build that did not fit."""
-        kept = self.kept[None]
-        for i in range(self.team.chunk_begin(self.n, me), self.team.chunk_end(self.n, me)):
+    def save_old_list(self, thread):
+        """Save the list as the old one, unless one is there already, from a build that did not fit."""
+        kept = self.old_saved[None]
+        for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
             if kept == 0:
-                self.pack(i)
+                self.save_pairs(i)
         self.team.wait()
         ti.loop_config(serialize=True)
-        for _ in range(self.team.one(1, me)):
-            self.kept[None] = 1
+        for _ in range(self.team.one(1, thread)):
+            self.old_saved[None] = 1
             self.need[None] = 0
 
     @ti.func
-    def pack(self, i):
-        """Put aside what carries something."""
+    def save_pairs(self, i):
+        """Save the pairs of particle i with data other than 0."""
         first = self.first[i]
         at = first
         for word in range(self.words(i)):
-            bits = self.whole(i, word)
+            bits = self.all_bits(i, word)
             if ti.static(self.marked):
                 if word == 0:
                     bits = self.touching[i]
             while bits != 0:
-                e = first + word * WORD + lowest(bits)
+                e = first + word * WORD + lowest_bit(bits)
                 bits &= bits - ti.u32(1)
                 some = 0
-                self.aside[at] = self.near[e]
-                for piece in ti.static(self.bags):
+                self.old_neighbour[at] = self.neighbour[e]
+                for piece in ti.static(self.transferred):
                     value = piece.field[e]
-                    piece.aside[at] = value
+                    piece.old[at] = value
                     if ti.static(piece.width == 0):
                         some |= ti.cast(value != 0, ti.i32)
                     else:
@@ -185,11 +185,11 @@ class Pairs:
         self.old_first[i], self.old_number[i] = first, at - first
 
     @ti.func
-    def carry(self, i):
-        """Give each neighbour of particle i what it carried in the old list; both are sorted. Returns bits for those that got
-        something, among the first."""
+    def transfer_pair_data(self, i):
+        """Give each pair of particle i its data from the old list; both are sorted. Returns bits for those that got some, among
+        the first entries."""
         first, number = self.first[i], self.number[i]
-        for piece in ti.static(self.luggage):
+        for piece in ti.static(self.pair_data):
             for e in range(first, first + number):
                 if ti.static(piece.width == 0):
                     piece.field[e] = 0
@@ -198,12 +198,12 @@ class Pairs:
                         piece.field[e][k] = 0
         bits, at = ti.u32(0), 0
         for old in range(self.old_first[i], self.old_first[i] + self.old_number[i]):
-            while at < number and self.near[first + at] < self.aside[old]:
+            while at < number and self.neighbour[first + at] < self.old_neighbour[old]:
                 at += 1
             if at < number:
-                if self.near[first + at] == self.aside[old]:
-                    for piece in ti.static(self.bags):
-                        piece.field[first + at] = piece.aside[old]
+                if self.neighbour[first + at] == self.old_neighbour[old]:
+                    for piece in ti.static(self.transferred):
+                        piece.field[first + at] = piece.old[old]
                     if at < WORD:
                         bits |= ti.u32(1) << ti.cast(at, ti.u32)
         return bits
@@ -214,13 +214,13 @@ class Pairs:
         return (self.number[i] + (WORD - 1)) >> 5  # a division by WORD would look at the sign
 
     @ti.func
-    def whole(self, i, word):
+    def all_bits(self, i, word):
         """Bits of all entries that the word is for."""
         left = self.number[i] - word * WORD
         return ti.select(left < WORD, (ti.u32(1) << ti.cast(left & (WORD - 1), ti.u32)) - ti.u32(1), ti.u32(FULL))
 
 
 @ti.func
-def lowest(bits):
+def lowest_bit(bits):
     """The number of the lowest bit that is set."""
     return ti.math.popcnt((bits - ti.u32(1)) & ~bits)

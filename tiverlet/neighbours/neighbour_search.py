@@ -1,7 +1,7 @@
 """Neighbours: how the list of near pairs is built.
 
-It holds, for each particle, all others closer than the sum of radii plus a skin, sorted by index, and those with which it has
-something to carry along, wherever they are: what touched in the last substep may do so in the next, although a list was built
+It holds, for each particle, all others closer than the sum of radii plus a skin, sorted by index, and those with which it shares
+pair data other than 0, wherever they are: what touched in the last substep may do so in the next, although a list was built
 in between. It stays valid until something has moved by half the skin, and no sum over it depends on when it was built, on the
 hash, or on the skin.
 """
@@ -19,48 +19,48 @@ from ..device.thread_team import Team
 from ..features.feature import Scene
 from ..features.material import Table
 from ..tools import distinct
-from .cell_list import Cells, raised
-from .neighbour_list import Luggage, Pairs
+from .cell_list import CellList, add_to
+from .neighbour_list import NeighbourList, PairData
 
 FARTHEST = 1 << 22  # cells from the origin: beyond it, f32 cannot tell a cell from the next
 APPEND, COUNT, FILL = range(3)  # what a scan of the cells around a particle does with the neighbours that it finds
 
 
-class Grid(Pairs):
+class NeighbourSearch(NeighbourList):
     """The list of near pairs, from a hash of cells.
 
-    skin: what is listed beyond touching [m]. linked: (m, 2) pairs that are never listed. table: which groups touch. luggage: what
-    the entries of the list carry along when it is built anew. scratch: a field of vectors, (n,), to use while it is built.
-    reach: (n,) how much further than by its radius a particle has to be found [m], see Cells.
+    skin: what is listed beyond touching [m]. linked: (m, 2) pairs that are never listed. table: which groups touch. pair_data:
+    what each pair remembers. scratch: a field of vectors, (n,), to use while the list is built. reach: (n,) how much further than
+    by its radius a particle has to be found [m], see CellList.
     """
 
     def __init__(
-        self, scene: Scene, skin: float, linked: np.ndarray, table: Table, luggage: list[Luggage], team: Team, scratch: Any,
+        self, scene: Scene, skin: float, linked: np.ndarray, table: Table, pair_data: list[PairData], team: Team, scratch: Any,
         reach: np.ndarray | None = None,
     ):  # fmt: skip
         n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
         self.sums = Sums(n, team, capped=True)
         # Entries of a list that is sorted without branches; to compile that takes an eighth of all.
-        super().__init__(scene.memory, n, self.sums.room, luggage, team, 1 if n < FEW else 8 if dim == 2 else 16)
+        super().__init__(scene.memory, n, self.sums.room, pair_data, team, 1 if n < FEW else 8 if dim == 2 else 16)
         self.network = sorting_network(self.short)
         self.dim, self.state, self.radius = dim, scene.state, scene.radius
         self.table, self.skin = table, skin
         self._extent: Sequence[float] = [-1.0] * dim
         radius = scene.particles.radius
-        self.cells = Cells(scene, radius, 0 * radius if reach is None else reach, skin, team, scratch)
-        self.several = self.cells.levels > 1
-        self.counts = self.several or team.launched  # before it lists
+        self.cells = CellList(scene, radius, 0 * radius if reach is None else reach, skin, team, scratch)
+        self.several_levels = self.cells.levels > 1
+        self.counts = self.several_levels or team.launched  # before it lists
         self.serial = not self.counts or (team.size == 1 and not team.launched)  # one thread makes a list, in order
         self.blocks = max(1, -(-n // team.piece)) if team.size > 1 and not self.counts else 1
         self.origin = add("grid.built_at", n, width=dim)
-        self.still = bool((scene.inv_mass == 0).any())  # whether there are pairs that cannot move
+        self.has_static = bool((scene.inv_mass == 0).any())  # whether there are pairs that cannot move
         self.linked = len(linked) > 0
         if self.linked:
             both = np.concatenate([linked, linked[:, ::-1]])
             both = distinct(both)[0]
             begin = np.searchsorted(both[:, 0], np.arange(n + 1))
-            self.mates = add("grid.linked", len(both), kind=ti.i32, values=both[:, 1])
-            self.mates_begin = add("grid.linked_begin", n + 1, kind=ti.i32, values=begin)
+            self.excluded = add("grid.linked", len(both), kind=ti.i32, values=both[:, 1])
+            self.excluded_begin = add("grid.linked_begin", n + 1, kind=ti.i32, values=begin)
 
     @property
     def finest(self) -> float:
@@ -73,33 +73,33 @@ class Grid(Pairs):
             if not abs(new - old) <= old / 8:
                 self._extent = extent
                 if self.cells.fit(np.asarray(extent)):
-                    self.age()
+                    self.invalidate()
                 return
 
     @ti.func
-    def outrun(self, i):
+    def moved_too_far(self, i):
         """1 if the list is stale: once a particle has moved by half the skin."""
         r = self.state.x[i] - self.origin[i]
         return ti.select(r.dot(r) <= ti.cast((0.49 * self.skin) ** 2, self.real), 0, 1)  # 1 for NaN
 
     @ti.func
-    def build(self, me):
-        """Sort the particles into cells, then list the near ones of each. `me`: see Team."""
-        self.keep(me)
-        self.cells.sort(me)
+    def build(self, thread):
+        """Sort the particles into cells, then list the near ones of each. `thread`: see Team."""
+        self.save_old_list(thread)
+        self.cells.sort(thread)
         if ti.static(self.counts):
-            self.pair_up(me)
+            self.pair_up(thread)
         else:
-            for k in range(self.team.dealt_count(self.blocks, 1, me)):
-                self.fill(self.team.dealt_index(k, 1, me))
-        for i in range(self.team.chunk_begin(self.n, me), self.team.chunk_end(self.n, me)):
+            for k in range(self.team.dealt_count(self.blocks, 1, thread)):
+                self.fill(self.team.dealt_index(k, 1, thread))
+        for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
             self.origin[i] = self.state.x[i]
         self.team.wait()
         ti.loop_config(serialize=True)
-        for _ in range(self.team.one(1, me)):
+        for _ in range(self.team.one(1, thread)):
             self.stale[None] = 0
             if self.need[None] <= self.capacity:
-                self.kept[None] = 0
+                self.old_saved[None] = 0
         self.team.wait()
 
     @ti.func
@@ -118,41 +118,41 @@ class Grid(Pairs):
         ti.atomic_max(self.need[None], used)
 
     @ti.func
-    def pair_up(self, me):
+    def pair_up(self, thread):
         """Count, then list: on a GPU, by a thread for each particle; and for several levels, each pair that one of the two finds
         with both. What does not fit is only counted."""
-        for i in range(self.team.chunk_begin(self.n, me), self.team.chunk_end(self.n, me)):
+        for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
             self.number[i] = 0
         self.team.wait()
-        for i in range(self.team.chunk_begin(self.n, me), self.team.chunk_end(self.n, me)):
-            raised(self.number, i, self.scan(i, COUNT, 0, 0), self.serial)
+        for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
+            add_to(self.number, i, self.scan(i, COUNT, 0, 0), self.serial)
         self.team.wait()
-        for i in range(self.team.chunk_begin(self.n, me), self.team.chunk_end(self.n, me)):
+        for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
             self.first[i] = self.number[i]
         self.team.wait()
-        self.sums.run(self.first, me)
+        self.sums.run(self.first, thread)
         ti.loop_config(serialize=True)
-        for _ in range(self.team.one(1, me)):
+        for _ in range(self.team.one(1, thread)):
             self.need[None] = self.first[self.n - 1]
         self.team.wait()
-        for i in range(self.team.chunk_begin(self.n, me), self.team.chunk_end(self.n, me)):
+        for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
             self.first[i] = self.first[i] - self.number[i]
             self.number[i] = 0
         self.team.wait()
-        for i in range(self.team.chunk_begin(self.n, me), self.team.chunk_end(self.n, me)):
+        for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
             if self.need[None] <= self.capacity:
                 used = self.scan(i, FILL, self.first[i], 0)
-                if ti.static(not self.several):
+                if ti.static(not self.several_levels):
                     self.number[i] = used
         self.team.wait()
-        for i in range(self.team.chunk_begin(self.n, me), self.team.chunk_end(self.n, me)):
+        for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
             self.finish(i)
 
     @ti.func
     def finish(self, i):
         """Put the list of particle i in order."""
         self.order(self.first[i], self.number[i])
-        self.touching[i] = self.carry(i)
+        self.touching[i] = self.transfer_pair_data(i)
 
     @ti.func
     def scan(self, i, what: ti.template(), start, used):  # type: ignore[valid-type]
@@ -160,7 +160,7 @@ class Grid(Pairs):
         and has `used` entries; returns how many it has then."""
         own = self.cells.level_of(i)
         for m in range(own + 1):
-            cell = self.cells.home(i, m)
+            cell = self.cells.cell_of(i, m)
             for r in range(ti.static(3 ** (self.dim - 1))):
                 base, low, mask, span = self.cells.row(cell, m, r)
                 for part in range(3 // span):
@@ -170,31 +170,31 @@ class Grid(Pairs):
                         listed = self.listed(i, j, self.cells.apart(i, e))
                         if ti.static(what == APPEND):
                             # No branch: it would be taken at random. What is not listed is written over by the next.
-                            self.near[start + ti.min(used, self.capacity)] = j
+                            self.neighbour[start + ti.min(used, self.capacity)] = j
                             used += listed
                         elif ti.static(what == COUNT):
                             used += listed
-                            if ti.static(self.several):
+                            if ti.static(self.several_levels):
                                 if m < own and listed != 0:
-                                    raised(self.number, j, 1, self.serial)
+                                    add_to(self.number, j, 1, self.serial)
                         elif listed != 0:
                             at = used
-                            if ti.static(self.several):  # others write to this list, too
-                                at = raised(self.number, i, 1, self.serial)
+                            if ti.static(self.several_levels):  # others write to this list, too
+                                at = add_to(self.number, i, 1, self.serial)
                                 if m < own:
-                                    self.near[self.first[j] + raised(self.number, j, 1, self.serial)] = i
-                            self.near[start + at] = j
+                                    self.neighbour[self.first[j] + add_to(self.number, j, 1, self.serial)] = i
+                            self.neighbour[start + at] = j
                             used += 1
         for old in range(self.old_first[i], self.old_first[i] + self.old_number[i]):
-            j = self.aside[old]
+            j = self.old_neighbour[old]
             if self.listed(i, j, self.state.apart(i, j)) == 0:
                 if ti.static(what == APPEND):
-                    self.near[start + ti.min(used, self.capacity)] = j
+                    self.neighbour[start + ti.min(used, self.capacity)] = j
                 elif ti.static(what == FILL):
                     at = used
-                    if ti.static(self.several):
-                        at = raised(self.number, i, 1, self.serial)
-                    self.near[start + at] = j
+                    if ti.static(self.several_levels):
+                        at = add_to(self.number, i, 1, self.serial)
+                    self.neighbour[start + at] = j
                 used += 1
         return used
 
@@ -203,7 +203,7 @@ class Grid(Pairs):
         """1 if a pair, apart by r, belongs on the list: near, not both immovable, not linked."""
         far = self.table.reach(self.radius, i, j) + ti.cast(self.skin, self.real)
         yes = ti.cast(r.dot(r) < far * far, ti.i32) & ti.cast(i != j, ti.i32)
-        if ti.static(self.still):
+        if ti.static(self.has_static):
             if yes != 0:
                 yes = ti.cast(self.state.w.of(i) + self.state.w.of(j) > 0, ti.i32)
         if ti.static(not self.table.uniform):
@@ -211,18 +211,18 @@ class Grid(Pairs):
                 yes = ti.cast(self.table.of(i, j)[3] > 0, ti.i32)
         if ti.static(self.linked):
             if yes != 0:
-                for e in range(self.mates_begin[i], self.mates_begin[i + 1]):
-                    if self.mates[e] == j:
+                for e in range(self.excluded_begin[i], self.excluded_begin[i + 1]):
+                    if self.excluded[e] == j:
                         yes = 0
         return yes
 
     @ti.func
     def order(self, begin, count):
         """Sort by index, which makes every sum over the list independent of the table."""
-        if ti.static(self.several or self.short == 1):
-            sort(self.near, begin, count, self.serial)
+        if ti.static(self.several_levels or self.short == 1):
+            sort(self.neighbour, begin, count, self.serial)
         elif count > ti.static(self.short):
-            sort(self.near, begin, count, self.serial)
+            sort(self.neighbour, begin, count, self.serial)
         else:
             # Where neighbours in space are neighbours in number too, they are in order as they come.
-            exchange(self.near, begin, count, self.network, self.short)
+            exchange(self.neighbour, begin, count, self.network, self.short)

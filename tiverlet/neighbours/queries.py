@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..device import ti
-from .neighbour_search import Grid
+from .neighbour_search import NeighbourSearch
 
 
 @dataclass(frozen=True)
@@ -33,10 +33,10 @@ class Contacts:
 
 
 @ti.data_oriented
-class Search:
+class PointSearch:
     """Particles within a distance of points, by the cells of the contact grid, which has to be sorted."""
 
-    def __init__(self, grid: Grid):
+    def __init__(self, grid: NeighbourSearch):
         self.cells, self.state, self.dim, self.levels = grid.cells, grid.state, grid.dim, grid.cells.levels
         self.real = grid.real
 

@@ -14,7 +14,7 @@ from ..device import runtime, ti
 from ..device.memory import Memory
 from ..device.thread_team import PIECES, Team, size_of
 from ..features.feature import Acceleration, Batch, Feature, Scene
-from ..neighbours.neighbour_search import Grid
+from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles, Radii, State
 from ..solvers.conjugate import ConjugateGradient
 from ..solvers.direct import Direct
@@ -52,7 +52,7 @@ class Assembly:
     memory: Memory
     scene: Scene
     batches: list[Batch]
-    grid: Grid | None
+    grid: NeighbourSearch | None
     step: Step
     diagnostics: Diagnostics
 

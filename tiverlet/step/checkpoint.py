@@ -60,7 +60,7 @@ def state(world: "World", pairs: bool = True) -> dict[str, np.ndarray]:
     """
     out = {name: values for memory in world._runner.memories for name, values in memory.state().items()}
     if world._runner.grid and pairs:
-        out["Contact.pairs"], carried = world._runner.grid.carried()
+        out["Contact.pairs"], carried = world._runner.grid.lasting_data()
         out.update((f"Contact.{name}", values) for name, values in carried.items())
     return out
 

@@ -77,7 +77,7 @@ class ParticlePass:
             for i in range(first, end):
                 c.restore(i, now.h)
             for i in range(first, end):
-                stale |= self.grid.outrun(i)
+                stale |= self.grid.moved_too_far(i)
             for i in range(first, end):
                 fast |= c.overshoots(i)
             c.note_motion(stale, fast)
@@ -88,7 +88,7 @@ class ParticlePass:
         for c in ti.static(self.contacts):
             for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
                 self.slots.gather(i)
-                c.note_motion(self.grid.outrun(i), c.overshoots(i))
+                c.note_motion(self.grid.moved_too_far(i), c.overshoots(i))
             self.team.wait()
 
     @ti.func
@@ -136,7 +136,7 @@ class ParticlePass:
             if now.checks_list != 0:
                 stale = 0
                 for i in range(begin, end):
-                    stale |= self.grid.outrun(i)
+                    stale |= self.grid.moved_too_far(i)
                 c.note_motion(stale, 0)
         if ti.static(len(self.walls) > 0):
             if now.final != 0:

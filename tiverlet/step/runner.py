@@ -191,7 +191,7 @@ class Runner:
     def list_neighbours(self) -> None:
         """Build the list, growing it until everything fits."""
         if not self.launched:
-            self.grid.age()
+            self.grid.invalidate()
             self.look()  # whose kernel is there anyway, and lists
             return
         with self.memory.compiler():

@@ -281,7 +281,7 @@ class Step:
                 if ti.static(self.state.befores):  # at the velocity with which it is driven, others meet it
                     self.state.before[f.member(c, 0)] = self.state.d[f.member(c, 0)]
                 for k in ti.static(self.contacts):
-                    k.note_motion(self.grid.outrun(f.member(c, 0)), k.overshoots(f.member(c, 0)))
+                    k.note_motion(self.grid.moved_too_far(f.member(c, 0)), k.overshoots(f.member(c, 0)))
             self.team.wait()
 
     @ti.func
