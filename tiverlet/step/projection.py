@@ -46,7 +46,7 @@ def project(runner: "Runner", h: float, longest: float) -> bool:
     """
     ratio = h / longest
     slots = runner.scene.slots
-    batches = [b for b in runner.batches if isinstance(b, Scalar) and b.joins and b.count]
+    batches = [b for b in runner.batches if isinstance(b, Scalar) and b.arity and b.count]
     w, state, memory = runner.scene.inv_mass, runner.scene.state, runner.memory
     x = before = state.get(memory)
     if slots and slots.system and not slots.system.steps and not runner.clock.softened:  # it holds loads without a violation

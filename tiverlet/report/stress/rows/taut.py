@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ....colliders import Box
-from ....constraints import Distance, Rope, ShapeMatch
+from ....constraints import Area, Distance, Rope, ShapeMatch
 from ....contact import Contact
 from ....features.feature import Feature
 from ....forces import Gravity
@@ -117,7 +117,7 @@ def _short() -> Finding:
     return watch.finding(flagged="softened" in watch.flags)
 
 
-@row(74, "cantilever and plate with both diagonals", RULE)
+@row(74, "cantilever and plate with both diagonals, or of triangles that keep their areas", RULE)
 def _braced() -> Finding:
     watch = Watch()
     for (nx, ny), solver, iterations in (
@@ -126,6 +126,12 @@ def _braced() -> Finding:
         x, pairs = grid(nx, ny)
         particles = Particles(x, mass=MASS, pinned=np.arange(ny))
         watch.run(f"{nx} x {ny}", particles, [Gravity(G), Distance(pairs)], solver=solver, iterations=iterations)
+    x, pairs = grid(8, 3, braced=False)
+    k = np.arange(24).reshape(8, 3)
+    below, above = (k[:-1, :-1], k[1:, :-1], k[:-1, 1:]), (k[1:, :-1], k[1:, 1:], k[:-1, 1:])
+    triangles = np.concatenate([np.stack([corner.ravel() for corner in half], axis=1) for half in (below, above)])
+    particles = Particles(x, mass=MASS, pinned=np.arange(3))
+    watch.run("areas", particles, [Gravity(G), Distance(pairs, compliance=1e-3), Area(triangles)], solver=Jacobi())
     return watch.finding()
 
 
