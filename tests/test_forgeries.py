@@ -104,7 +104,7 @@ def test_what_a_file_asks_for_is_bounded(original, tmp_path):
 
     def count(e):
         if e["kind"] == "assigned" or e["kind"] == "turned":
-            e.update(kind="assigned", data={"name": "_memory"}, arrays=[])
+            e.update(kind="assigned", data={"name": "_runner"}, arrays=[])
 
     for change in (shape, count, lambda e: e.update(steps=[[1 / 60, "auto", 1, 1]]), lambda e: e.update(frame=[[[]]])):
         with pytest.raises(ValueError, match="^replay: |^The state|shape"):

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from taichi.lang import _wrap_inspect, impl
 
-from .source_cache import active, forget, patched
+from .source_cache import active, patched
 
 HOSTS = ("Arch.x64", "Arch.arm64")  # whose kernels LLVM makes as fast without it; measured on x64
 # No variables for what loops read and write at one address: Taichi does not see that another address may be the same place, such
@@ -70,7 +70,6 @@ class Compiler:
             runtime.set_default_fp(self.real)
             _set(config, self.lean if str(config.arch) in HOSTS and not self.thorough else SAFE)
             active.append(self)
-            forget()
             self._thread = threading.get_ident()
             collects = gc.isenabled()
             gc.disable()  # trees are many small objects, none of them garbage
@@ -85,7 +84,6 @@ class Compiler:
                 active.pop()
                 runtime.set_default_fp(literals)
                 _set(config, before)
-                forget()
                 if collects:
                     gc.enable()
 

@@ -1,8 +1,8 @@
-"""How Taichi's Python reads our functions: in half of the time that it takes by itself, into the same statements.
+"""How Taichi's Python reads our functions: in less time than it takes by itself, into the same statements.
 
-Taichi expands every call of a ti.func, and each time looks for its source, parses it, and draws pictures of its lines for errors
-that do not happen. Here all this is done once, or not at all, while a kernel of ours compiles, and only then: what the user
-compiles in the same process is compiled as ever.
+Taichi expands every call of a ti.func, and each time looks for its source and draws pictures of its lines for errors that do not
+happen. Here this is done once, or not at all, while a kernel of ours compiles, and only then: what the user compiles in the same
+process is compiled as ever.
 
 Everything here knows the inside of Taichi 1.7.4; with another one, functions are read as Taichi does.
 """
@@ -15,29 +15,19 @@ import pathlib
 import sys
 import textwrap
 import weakref
-from functools import cache
 from types import CodeType, SimpleNamespace
 from typing import Any
 
 import taichi as ti
-from taichi.lang import expr, impl, kernel_impl, matrix, snode
+from taichi.lang import impl, kernel_impl, matrix, snode
 from taichi.lang.ast import ASTTransformerContext
 
 # Where functions come from that are known to be safe.
 HOME = OURS, TAICHI = tuple(str(p) + os.sep for p in (pathlib.Path(__file__).parents[2], pathlib.Path(ti.__file__).parent))
 CLOSING = (")", "]", "}")  # what the last lines of a function may begin with that are not in its code
 NOTHING = 8  # bytes of code of a function that has nothing but a docstring
-ROOM = 70_000  # words on the stack of a frame, which with it gets 1 MB, of which half is left
-CONSTANT = ("_check_in_range", "_clamp_unsigned_to_range", "to_numpy_type")  # what Taichi works out for every whole number
 active: list[Any] = []  # Compilers whose kernels are being compiled or launched, the innermost last
 _lines: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()  # of functions, as inspect finds them
-_files: dict[str, Any] = {}
-_read: dict[Any, tuple[Any, Any]] = {}  # of functions that are not being compiled, the tree and what it was compiled in
-
-
-def forget() -> None:
-    """Before and after kernels are compiled: nodes of trees keep what they stood for, such as worlds."""
-    _read.clear()
 
 
 def _lines_of(function) -> tuple[list[str], int]:
@@ -76,14 +66,6 @@ def _end(code: CodeType) -> int:
     return max([code.co_firstlineno, *inside, *(end for _, end, _, _ in code.co_positions() if end)])
 
 
-def _file_of(function) -> str:
-    """The file that it is in, found once."""
-    name = function.__code__.co_filename
-    if name not in _files:
-        _files[name] = _find_file(function)
-    return _files[name]
-
-
 def _filled(line: str, tabsize: int, width: int) -> str:
     """A line without tabs and the like, and without space at its end."""
     if line[:-1].isprintable() and len(line) < width:
@@ -99,47 +81,14 @@ def _dedented(text: str) -> str:
     return textwrap.dedent(text)
 
 
-def _reread(self: Any, is_kernel: bool = True, args: Any = None, ast_builder: Any = None, **options) -> tuple[Any, Any]:
-    """The tree of a function and what to compile it in; of one that has been called before, the same tree again."""
-    tree, old = _read.pop(self.func, (None, None))
-    if tree is None:
-        return _read_it(self, is_kernel=is_kernel, args=args, ast_builder=ast_builder, **options)
-    return tree, ASTTransformerContext(
-        is_kernel=False, func=self, global_vars=old.global_vars, argument_data=args, file=old.file, src=old.src,
-        start_lineno=old.lineno_offset + 1, ast_builder=ast_builder,
-    )  # fmt: skip
-
-
-def _grown(tree: Any, ctx: Any) -> Any:
-    """Compile the tree of a function, and keep it for the next call."""
-    out = _grow(tree, ctx)
-    if active and not ctx.is_kernel and not ctx.is_real_function:
-        _read[ctx.func.func] = tree, ctx
-    return out
-
-
-def _roomy(function: Any) -> Any:
-    """The same, with room for all that it calls: Python gives frames memory in pieces, and takes back at once what is free.
-
-    Compiling goes up and down, across the end of a piece, tens of thousands of times, each of them two calls of the system: a
-    tenth of the time. A frame that asks for much gets a piece that is large.
-    """
-
-    def call(*args, **kwargs):
-        return function(*args, **kwargs)
-
-    call.__code__ = call.__code__.replace(co_stacksize=ROOM)
-    return call
-
-
 def _place_of(self: Any, node: Any) -> str:
     """Where a node is, without the picture of it that Taichi draws for every node; errors still get it."""
     if not active or self.raised:
         return _draw(self, node)
-    if node.lineno == self.line:
-        return self.place
-    line, name = self.src[node.lineno - 1], self.func.func.__name__
-    return f'File "{self.file}", line {node.lineno + self.lineno_offset}, in {name}:\n{line}\n'
+    if node.lineno != self.line:
+        line, name = self.src[node.lineno - 1], self.func.func.__name__
+        self.line, self.place = node.lineno, f'File "{self.file}", line {node.lineno + self.lineno_offset}, in {name}:\n{line}\n'
+    return self.place
 
 
 def _in_class(level_of_class_stackframe: int) -> bool:
@@ -161,31 +110,23 @@ def _trace(stacklevel: int = 1) -> str:
 
 def _patch() -> bool:
     """Put these in the place of what Taichi calls, if it is the Taichi that they are made for and TIVERLET_PATCHES is not 0."""
-    names = ("getsourcelines", "getsourcefile", "textwrap", "_inside_class", "_get_tree_and_ctx", "transform_tree")
+    names = ("getsourcelines", "textwrap", "_inside_class")
     if (
         os.environ.get("TIVERLET_PATCHES") == "0"
         or ti.__version__ != (1, 7, 4)
         or not all(hasattr(kernel_impl, name) for name in names)
-        or not all(hasattr(expr, name) for name in CONSTANT)
     ):
         return False
-    kernel_impl.getsourcelines, kernel_impl.getsourcefile, kernel_impl._inside_class = _lines_of, _file_of, _in_class
+    kernel_impl.getsourcelines, kernel_impl._inside_class = _lines_of, _in_class
     kernel_impl.textwrap = SimpleNamespace(fill=_filled, dedent=_dedented)
-    kernel_impl._get_tree_and_ctx, kernel_impl.transform_tree = _reread, _grown
-    kernel_impl.Kernel.materialize = _roomy(kernel_impl.Kernel.materialize)
     context: Any = ASTTransformerContext
     context.get_pos_info, context.line, context.place = _place_of, 0, ""
-    for name in CONSTANT:
-        setattr(expr, name, cache(getattr(expr, name)))
     impl.get_traceback = matrix.get_traceback = snode.get_traceback = _trace
     return True
 
 
 _find_lines: Any = getattr(kernel_impl, "getsourcelines", None)
-_find_file: Any = getattr(kernel_impl, "getsourcefile", None)
 _look_around: Any = getattr(kernel_impl, "_inside_class", None)
 _draw: Any = getattr(ASTTransformerContext, "get_pos_info", None)
-_read_it: Any = getattr(kernel_impl, "_get_tree_and_ctx", None)
-_grow: Any = getattr(kernel_impl, "transform_tree", None)
 _who: Any = getattr(snode, "get_traceback", None)
 patched = _patch()

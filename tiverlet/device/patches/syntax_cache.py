@@ -71,11 +71,8 @@ def _visited(self: Any, ctx: Any, node: Any) -> Any:
                 return node.ptr
     if kind is ast.Attribute:
         node.__dict__.pop("caller", None)  # from the last time
-    line = getattr(node, "lineno", ctx.line)
-    if line != ctx.line:
-        ctx.line, ctx.place = line, ctx.get_pos_info(node)
     places = impl.pytaichi.src_info_stack
-    places.append(ctx.place)
+    places.append(ctx.get_pos_info(node) if hasattr(node, "lineno") else ctx.place)
     try:
         return method(ctx, node)
     except Exception as e:
