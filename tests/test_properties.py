@@ -11,6 +11,7 @@ import pytest
 import tiverlet as tv
 from tiverlet import constraints
 
+from .bad_starts import BadStart
 from .conftest import order, rms
 from .rows import OTHERS, ROWS, Row
 
@@ -240,3 +241,23 @@ def test_nothing_explodes_where_a_constraint_has_no_direction(world, name):
             size += np.ptp(x, axis=1).max(axis=1) + (0 if feature.unit else abs(rest)) + 1e-6 * np.abs(x).max(axis=(1, 2))
             moved = np.abs(w.position.reshape(x.shape) - x).max(axis=(1, 2))
             assert (moved <= 5 * size).all(), (np.argmax(moved / (size + 1e-300)), np.c_[moved, size])
+
+
+@pytest.mark.parametrize(
+    ("dim", "solver"),
+    [(2, tv.Jacobi()), (2, tv.Chebyshev()), (2, tv.Direct()), (2, tv.ConjugateGradient()), (3, tv.Direct())],
+    ids=str,
+)
+def test_no_bad_start_flies(world, dim, solver):
+    # Rigid constraints that nothing in the scene pulled apart have no energy to give, at no number of substeps: what they do not
+    # give up before the first one they give up at a third of their size in a frame: 2 sizes in 6 frames, after the 2 that it
+    # takes to where they are met. Passes as such would move bodies by their size in a substep: 1 200 sizes at 200.
+    bad = BadStart(dim)
+    start = tv.Particles(bad.position, pinned=bad.pinned, mass=0.1)
+    w = world(start, bad.features, precision="f64", solver=solver, iterations=8 if isinstance(solver, tv.Chebyshev) else 1)
+    for substeps in (1, 20, 200):
+        w.position, w.velocity, w.substeps = bad.position, np.zeros_like(bad.position), substeps
+        for _ in range(6):
+            report = w.step(1 / 60)
+            assert (bad.far(w.position) < 4).all()
+        assert "unconverged" in report.flags  # some contradict each other

@@ -31,7 +31,7 @@ class Area(Enclosed):
     """
 
     index_name = "loops"
-    collapses = 2
+    collapses, curved = 2, True
     rest = Knob(lambda f, v: checks.per_item("Area", "rest", v, f.count, least=0.0), "Area at pressure 1 [m^2].")
 
     def __init__(self, loops, rest=None, *, pressure=1.0, compliance=0.0, damping=0.0, break_at=None):
@@ -126,6 +126,14 @@ class Loops:
         r = position[indices] - np.repeat(position[indices[starts[:-1]]], np.diff(starts), axis=0)
         s = r[self.after]
         return np.add.reduceat(r[:, 0] * s[:, 1] - r[:, 1] * s[:, 0], starts[:-1]) / 2
+
+    def slopes(self, position: np.ndarray) -> np.ndarray:
+        """Their gradients by each corner, (total, 2)."""
+        before = np.empty_like(self.after)
+        before[self.after] = np.arange(len(before))
+        x = position[self.members.indices]
+        across = x[self.after] - x[before]
+        return np.stack([across[:, 1], -across[:, 0]], axis=1) / 2
 
     @property
     def after(self) -> np.ndarray:

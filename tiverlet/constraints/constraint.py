@@ -142,8 +142,11 @@ class Constraint(Scalar):
         return self.dev.slopes(self._corners(position))[0] if self.count else np.zeros(0)
 
     def slopes(self, position: np.ndarray) -> np.ndarray:
-        """The gradients at the positions that a world starts with."""
-        return self.dev.known[2]
+        """The gradients of function."""
+        known, _, slopes = self.dev.known
+        if position is known:
+            return slopes
+        return self.dev.slopes(self._corners(position))[1] if self.count else np.zeros((0, self.arity, position.shape[1]))
 
     @ti.func
     def corners(self, c, back):

@@ -45,6 +45,11 @@ class Dihedral(Angle):
         return np.arctan2((e * np.cross(p, q)).sum(axis=1), -(p * q).sum(axis=1))
 
     @ti.func
+    def reach(self, c, q):
+        """The shortest way from an end of the edge to another corner."""
+        return ti.min(q[1, :].norm(), ti.min(q[2, :].norm(), q[3, :].norm()))
+
+    @ti.func
     def measure(self, c, q):
         """See the class."""
         edge, a, b = q[1, :], q[2, :], q[3, :]

@@ -33,7 +33,7 @@ class Volume(Enclosed):
     """
 
     index_name = "cells"
-    collapses, transcends = 3, True
+    collapses, transcends, curved = 3, True, True
     rest = Knob(lambda f, v: checks.per_item("Volume", "rest", v, f.count, least=0.0), "Volume at pressure 1 [m^3].")
 
     def __init__(self, cells, rest=None, *, pressure=1.0, compliance=0.0, damping=0.0, break_at=None):
@@ -122,16 +122,29 @@ class Surfaces:
         parts = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6
         return np.bincount(self.surface, weights=parts, minlength=members.count)
 
+    def slopes(self, position: np.ndarray) -> np.ndarray:
+        """Their gradients by each corner, (total, 3)."""
+        members, corner = self.members, self._corner
+        eye = position[members.indices[members.starts[:-1]]][self.surface][:, None]
+        a, b, c = np.moveaxis(position[self.faces] - eye, 1, 0)
+        parts = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1).reshape(-1, 3) / 6
+        return np.stack([np.bincount(corner, part, minlength=len(members.indices)) for part in parts.T], axis=1)
+
+    @property
+    def _corner(self) -> np.ndarray:
+        """The place among the members of each corner of a face, (3 faces,)."""
+        members = self.members
+        most = 1 + int(members.indices.max(initial=0))
+        own = members.owner.astype(np.int64) * most + members.indices  # sorted, as np.unique made them
+        return np.searchsorted(own, self.surface[:, None].astype(np.int64) * most + self.faces).ravel()
+
     def pairs(self) -> np.ndarray:
         """The ends of each edge."""
         return np.unique(np.sort(_edges(self.faces)[:, :2], axis=1), axis=0)
 
     def bind(self, scene: Scene, corners: Corners) -> "SurfaceGradients":
         """Its gradients, on the device: the faces around each corner, as the two other corners of each, in order."""
-        members, most = self.members, scene.particles.count + 1
-        key = self.surface[:, None].astype(np.int64) * most + self.faces
-        own = members.owner.astype(np.int64) * most + members.indices  # sorted, as np.unique made them
-        corner = np.searchsorted(own, key).ravel()
+        members, corner = self.members, self._corner
         others = np.stack([self.faces[:, [1, 2, 0]].ravel(), self.faces[:, [2, 0, 1]].ravel()], axis=1)
         order = np.argsort(corner, kind="stable")
         starts = np.concatenate([[0], np.cumsum(np.bincount(corner, minlength=len(members.indices)))])

@@ -222,6 +222,11 @@ class Batch(Feature):
         """When each constraint broke, (m,): the number of the substep from 1 on, see Strength; 0 where it holds."""
         return self.dev.strength.stamps() if self.breaks and self.acts else np.zeros(self.count, dtype=np.int32)
 
+    @property
+    def owner(self) -> np.ndarray:
+        """The constraint of each corner, (total,)."""
+        return self.members.owner
+
     def members_of(self, c: int) -> np.ndarray:
         """The particles of constraint c."""
         return self.members.row(c)

@@ -9,7 +9,7 @@ from ..features.feature import Batch, Scene
 from .slots import Slots
 from .solver import Solver
 from .spectrum import largest
-from .system import System
+from .system import SLACK, System
 
 POWER = 30  # rounds of power iteration for lambda_max
 GROWTH, HIGHEST = 1.1, 1.0  # of the floor, by which it grows, and up to where, a link gives way as much as by itself
@@ -84,6 +84,8 @@ class CGSystem(System):
         self.gradient = scene.memory.field("system.gradient", slots.total, width=self.dim)
         self.pulled = scene.memory.field("system.pulled", self.n, width=self.dim)
         self.partial, self.worst = self.reals("partial_sums", BLOCKS), self.reals("worst", BLOCKS)
+        if self.guarded:
+            self.gain, self.over = self.reals("gain", BLOCKS), self.reals("over", BLOCKS)
         # r . z, the coming weight, what is taken back; r . z at the start, and the worst tension since
         self.sums = scene.memory.field("system.sums", None, width=5, kind=ti.f64)
         self.least = 1.2 * largest(scene, scalars, self.blocks * scene.inv_mass, POWER) / steps**2
@@ -102,7 +104,7 @@ class CGSystem(System):
         """The right side, the preconditioner, and the first direction."""
         System.set_row(self, r, violation, A, alpha, lam, W, geometric_stiffness)
         zero = 0 * violation
-        self.step[r] = 0
+        self.step[r] = ti.select(W > 0, ti.cast(0, ti.f64), -ti.cast(lam, ti.f64))
         self.residual[r] = ti.select(W > 0, -violation / A, zero)
         self.shift[r] = ti.select(W > 0, alpha / A + ti.cast(self.floor[None], self.real) * W, zero)
         self.inverse_diagonal[r] = ti.select(W > 0, 1 / (W + self.shift[r]), zero)
@@ -186,14 +188,23 @@ class CGSystem(System):
         for k in range(self.team.chunk_begin(BLOCKS * self.stride, thread), self.team.chunk_end(BLOCKS * self.stride, thread)):
             if k % self.stride == 0:
                 b, total, worst = k // self.stride, ti.cast(0, ti.f64), ti.cast(0, ti.f64)
-                far = self.sums[None][1]
+                far, gain, over = self.sums[None][1], ti.cast(0, ti.f64), ti.cast(0, ti.f64)
                 for r in range(self.begin_of(b), ti.min(self.begin_of(b + 1), self.rows)):
                     self.step[r] = self.step[r] + far * self.direction[r]
                     left = self.residual[r] - ti.cast(far, self.real) * self.applied[r]
                     self.residual[r] = left
                     total += ti.cast(self.inverse_diagonal[r] * left, ti.f64) * left
                     worst = ti.max(worst, self.geometric_stiffness[r] * ti.abs(self.lam[r] + self.step[r]))
+                    if ti.static(self.guarded):
+                        if self.scale[r] != 0:
+                            change = self.violation[r] + self.scale[r] * (left + self.shift[r] * self.step[r])
+                            gain += self.step[r] * (self.toward[r] - change / 2) - self.spare[r]
+                            gain -= SLACK * ti.abs(self.step[r] * self.violation[r])
+                            if ti.abs(self.step[r]) > self.most[r]:
+                                over = 1.0
                 self.partial[b], self.worst[b] = total, worst
+                if ti.static(self.guarded):
+                    self.gain[b], self.over[b] = gain, over
         self.team.wait()
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread)):
@@ -201,6 +212,13 @@ class CGSystem(System):
             for b in range(1, BLOCKS):
                 worst = ti.max(worst, self.worst[b])
             ti.atomic_max(self.tension[None], worst)
+            if ti.static(self.guarded):
+                gain, over = self.gain[0], self.over[0]
+                for b in range(1, BLOCKS):
+                    gain += self.gain[b]
+                    over += self.over[b]
+                if gain > 0 and over > 0:  # as Elimination.hold; such a step is taken back, too
+                    worst = 2 * TENSEST
             back = ti.select(worst > TENSEST, self.sums[None][1], 0 * now)
             if worst > TENSEST:
                 now = 0

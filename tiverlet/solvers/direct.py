@@ -9,7 +9,7 @@ from ..features.feature import Batch, Scene
 from .elimination import Plan, plan
 from .slots import Slots
 from .solver import WIDTH, Solver
-from .system import System
+from .system import SLACK, System
 
 REDUNDANT = 1e-12  # of its diagonal: a pivot this small belongs to a constraint that others imply
 ODD = 1e-6  # of its violation: what others leave of such a constraint without contradicting it
@@ -269,6 +269,25 @@ class Elimination(System):
         return hard
 
     @ti.func
+    def hold(self, begin, end):
+        """Whether steps leave where gradients are trusted and bring in energy, sum step (u + A step / 2), A step = -violation.
+
+        Then the rows of which f is curved take the step that they would by themselves, and the others have to follow.
+        """
+        gain, spare, far, found = ti.cast(0, ti.f64), ti.cast(0, ti.f64), False, 0
+        for r in range(begin, end):
+            gain += self.step[r] * (self.toward[r] - self.violation[r] / 2)
+            spare += self.spare[r] + SLACK * ti.abs(self.step[r] * self.violation[r])
+            far = far or (self.scale[r] != 0 and ti.abs(self.step[r]) > self.most[r])
+        if far and gain > spare:
+            for r in range(begin, end):
+                if self.most[r] < ti.math.inf and self.scale[r] != 0:
+                    self.scale[r], self.lam[r], self.geometric_stiffness[r], found = 0, self.instead[r], 0, 1
+                    if ti.static(self.one_sided):
+                        self.active[r] = 0
+        return found
+
+    @ti.func
     def longer(self, r):
         """The length of constraint r, relative to that at rest: a longer one vibrates less."""
         out = ti.cast(1, ti.f64)
@@ -326,6 +345,9 @@ class Elimination(System):
         while stage != DONE:
             hard = self.find(begin, end, soft, ti.cast(stage >= COMPARE, ti.i32))
             tension, total, stiffness, most = self.tensest(begin, end, ti.cast(stage >= COMPARE, ti.i32))
+            if ti.static(self.guarded):
+                if stage <= FORWARD and self.hold(begin, end) != 0:
+                    continue
             if stage <= AGAIN:
                 if (hard == 0 and tension <= TENSEST) or stage == AGAIN:
                     ti.atomic_max(self.tension[None], tension)

@@ -9,6 +9,8 @@ from ..device import ti
 from ..features.feature import Batch, Scene
 from .slots import Slots
 
+SLACK = 0.1  # of |step violation|: how much energy steps may bring in by their own curvature
+
 
 class System:
     """Rows of constraints, each with its violation, its weights and the step of its multiplier that a solver finds.
@@ -40,6 +42,10 @@ class System:
         self.step, self.violation, self.scale = self.reals("step"), self.reals("violation"), self.reals("scale")
         self.alpha, self.lam = self.reals("alpha"), self.reals("multiplier")
         self.geometric_stiffness = self.reals("geometric_stiffness")
+        self.guarded = any(b.limited for b in scalars) and scene.order == 2
+        if self.guarded:
+            self.toward, self.spare, self.instead = self.reals("toward"), self.reals("spare"), self.reals("instead")
+            self.most = self.reals("most")
         if self.shares:
             self.share = self.ints("share", self.blocks)
 
@@ -83,6 +89,12 @@ class System:
         """What constraint r is about in this pass, but for what its corners tell. geometric_stiffness: see Scalar."""
         self.violation[r], self.alpha[r], self.lam[r], self.geometric_stiffness[r] = violation, alpha, lam, geometric_stiffness
         self.scale[r] = ti.select(W > 0, A, 0 * A)
+
+    @ti.func
+    def guard(self, r, toward, spare, most, instead):
+        """Where steps are limited, see Scalar: the motion along row r in this substep, the energy that it may bring in, the step
+        up to which its gradient is trusted, and minus the step that it takes where the others' brings in energy."""
+        self.toward[r], self.spare[r], self.most[r], self.instead[r] = toward, spare, most, instead
 
     @ti.func
     def set_gradient(self, place, i, gradient):

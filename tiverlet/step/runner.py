@@ -9,7 +9,7 @@ from ..contact.velocity_projection import EVERY
 from ..device.interrupts import whole
 from ..device.patches.compiler import CachedLaunch
 from ..step_report import StepReport
-from . import high_order
+from . import high_order, initial_violation
 from .clock import Clock
 from .diagnostics import STARTED, STEPPED, UNSTEPPED
 from .integrator import FREE, decay
@@ -70,8 +70,10 @@ class Runner:
                     clock.longest = h
             if clock.d_is_velocity:
                 clock.since = 0
-            if clock.first_moved is not None and self.scene.slots and self.scene.slots.system:
-                self.scene.slots.system.forget()
+            if clock.first_moved is not None and self.scene.slots:
+                initial_violation.remove(self.scene, self.batches, clock.first_moved)
+                if self.scene.slots.system:
+                    self.scene.slots.system.forget()
             self.set_substep(h, drag)
             if clock.energy is None:
                 self.look()

@@ -14,7 +14,7 @@ SHORT = 1e-24  # [m^2] squared length below which a link has no direction, in f3
 class Angle(Scalar):
     """What all constraints on an angle share: C is the wrapped difference, in (-pi, pi], and residuals are in radians."""
 
-    unit, transcends = 1.0, True
+    unit, transcends, curved = 1.0, True, True
     rest = Knob(lambda f, v: checks.per_item(repr(f), f.rest_name, v, f.count, least=-TURN, most=TURN), "Rest angle [rad].")
 
     def violation(self, position: np.ndarray) -> np.ndarray:
@@ -26,6 +26,11 @@ class Angle(Scalar):
     def near(self, f, other):
         """f plus whole turns, within half a turn of `other`."""
         return wrapped(f, other)
+
+    @ti.func
+    def reach(self, c, q):
+        """The shorter of the two legs of a path."""
+        return ti.min((q[1, :] - q[0, :]).norm(), (q[2, :] - q[1, :]).norm())
 
     @ti.func
     def faint(self):

@@ -22,6 +22,7 @@ class Enclosed(Scalar):
         reversed(mask)  the function with these constraints turned inside out
         remapped(mask, number)  the function of what stays, by the new numbers of the particles
         measure(q)      of simplices: f and its gradients at corners q
+        slopes(x)       of outlines: grad_e f at NumPy positions, of each corner, (total, dim)
         bind(scene, corners)  of outlines: an object with slope(e, back) = grad_e f of corner e
 
     f is a polynomial of degree dim in the corners and the same after a translation. So dim f = sum_e (x_e - x_0) . grad_e f
@@ -61,6 +62,19 @@ class Enclosed(Scalar):
         """f at the given positions."""
         return self.function.values(self.members, position)
 
+    def slopes(self, position: np.ndarray) -> np.ndarray:
+        """grad f at the given positions: of simplices (m, arity, dim), of outlines (total, dim)."""
+        return self.function.slopes(position) if self.arity == 0 else super().slopes(position)
+
+    def closeness(self, position: np.ndarray) -> np.ndarray:
+        """What makes C a share of the size of its constraint, (m,); 0 for what has collapsed."""
+        if self.arity or not self.count:
+            return super().closeness(position) if self.count else np.zeros(0)
+        x, starts, owner = position[self.indices], self.members.starts, self.owner
+        size = np.maximum.reduceat(np.linalg.norm(x - x[starts[owner]], axis=1), starts[:-1])
+        size *= np.sqrt(np.bincount(owner, (self.slopes(position) ** 2).sum(axis=1), minlength=self.count) / 2)
+        return np.divide(1, size, out=np.zeros(self.count), where=size > 0)
+
     @property
     def listing(self) -> Any:
         """As the user gives them."""
@@ -90,6 +104,11 @@ class Enclosed(Scalar):
             self.dev.change = add(f"{name}.change", self.count)
             self.dev.astray = add(f"{name}.turned", self.count, kind=ti.i32)
             self.dev.outline = self.function.bind(scene, self.dev.corners)
+
+    @ti.func
+    def reach(self, c, q):
+        """The size of a simplex."""
+        return q.norm()
 
     @ti.func
     def measure(self, c, q):
@@ -136,6 +155,8 @@ class Enclosed(Scalar):
         else:
             f, f0, w, W, turn, extent, move = self.total(c)
             violation, A, alpha, lam, W = self.equation(c, f, f0, w, W, h, hh, first, fresh)
+            if ti.static(self.dev.limited):
+                violation -= A * self.postpone(c, f0, W, when[1] - when[0], first)
             new, left = self.answer(violation, A, alpha, lam, W, turn)
             new = self.tempered(c, lam, new, extent, move)
             self.dev.lam[c], self.dev.change[c], self.dev.astray[c] = new, new - lam, turn == FAR

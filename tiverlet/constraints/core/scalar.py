@@ -16,6 +16,12 @@ from .strength import Strength, strength_of
 
 # Where constraints converge within a substep, SHAKE is an explicit method for what is across them, with its limits:
 TENSEST = 4.0  # (omega h)^2 of a vibration across a tension, beyond which Verlet diverges
+
+# Where f is curved, Newton's step is an explicit method for large violations, with limits too:
+APPROACH = 1 / 3  # of its size (1 rad for angles), in a frame: how fast a constraint gives up a violation that no load explains
+BORNE = 0.25  # of its size: an angle that is off by more than this is off by more than a load explains
+TRUST = 0.5  # of its reach, by which a pass moves a corner: beyond, f is not what its gradient says
+
 LOST = 0.015  # violation at the start of a substep, relative to the size, from where on its direction would bring in energy
 
 
@@ -35,6 +41,19 @@ class Scalar(Batch):
     In the first substep after a start (`fresh`) the force acts for half a kick, alpha' = alpha / (h^2 / 2), and C* is made of
     C_(n+1) and C_n.
     With drag, alpha' = alpha / (phi h^2) with the factor phi that the exact solution gives every other acceleration.
+
+    A rigid constraint takes out its whole violation in one substep, with the energy C^2 / (2 W h^2), as the spring would that one
+    pass of relaxation is. Under a load that is right: C = W |lam| h^2-wise is what bears it. But C may come from elsewhere: a
+    rest value that was changed in a jump, or a goal that others keep it from. Where f is `curved` (angles, areas, volumes), W
+    falls as corners go away (from afar an angle between two pins L apart has the gradient L / r^2), and that spring is a pump. So
+    what exceeds the multiplier of the last substep, |C_n| - W |lam|, is given up by at most APPROACH of its size in a frame. And
+    where a violation is postponed so, or a pass would move a corner by more than TRUST of its reach, angles only take out motion:
+    with u = sum_j grad_j C . d_j, the motion along the constraint in this substep,
+
+        |u + W dlam| <= max(|u|, pace)
+
+    where `pace` is APPROACH of a frame, and 0 where corners are faster than twice that. With mass-split W, in which every
+    constraint has particles of its own, kinetic energy then never grows by more than what the pace is.
     """
 
     index_name = "pairs"
@@ -44,13 +63,14 @@ class Scalar(Batch):
     compliance = Knob(lambda f, v: checks.per_item(repr(f), "compliance", v, f.count, least=0.0), "Of springs.", force=True)
     damping = Knob(lambda f, v: checks.per_item(repr(f), "damping", v, f.count, least=0.0), "Of the dashpot.", force=True)
     break_at = Knob(strength_of, "Load beyond which a constraint breaks, (m,); None for never.")
-    compiled_for = ("soft", "damped", "breaks", "_strictly")
+    compiled_for = ("soft", "damped", "breaks", "limited", "_strictly")
 
     each = ("rest", "compliance", "damping", "break_at")
     rest_name = "rest"
     unit: float | None = None  # what residuals are relative to; None: the rest value
     precise = False  # whether exactly() measures to all the digits that positions have
     cusp = False  # whether any goal is f = 0, where gradients end: no direction at the start of the step means anything there
+    curved = False  # whether f is so curved that Newton's step from afar means nothing
     collapses = 0  # the power of a length that f is, where gradients vanish with the size of the body; else 0
 
     def setup(self, indices, rest, compliance, damping, break_at=None) -> None:
@@ -168,6 +188,11 @@ class Scalar(Batch):
         return (self.compliance > 0) & (scene.order > 2)
 
     @property
+    def limited(self) -> bool:
+        """Whether steps of the batch have to be limited, or had to be when kernels were compiled: f is curved, and some rigid."""
+        return self.curved and bool((self.compliance == 0).any()) or bool(vars(self.dev).get("limited", False))
+
+    @property
     def joins(self) -> bool:
         """Whether constraints of the batch can be solved together with others: few corners, and a direction everywhere."""
         return self.arity > 0 and not self.collapses
@@ -186,6 +211,13 @@ class Scalar(Batch):
         self.dev.strength = Strength(scene, name, self)
         self.changed = False
         rows = scene.slots.rows(self)
+        self.dev.limited = self.limited and scene.order == 2
+        if self.dev.limited:
+            self.dev.postponed = add(f"{name}.postponed", m)
+            if self.arity:
+                corner = self.start.position[self.indices]
+                span = np.linalg.norm(corner - corner[:, :1], axis=2).max(axis=1, initial=0.0)
+                self.dev.span = add(f"{name}.span", m, values=np.where(span > 0, span, self.start.size))
         self.dev.in_system, self.dev.alone = bool((rows >= 0).any()), bool((rows < 0).any())
         if self.dev.in_system:
             self.dev.row = add(f"{name}.row", m, kind=ti.i32, values=rows)
@@ -313,11 +345,28 @@ class Scalar(Batch):
         return A * C + B + alpha * lam, A, alpha, lam, W
 
     @ti.func
-    def known(self, c, h, hh, first, fresh):
+    def postpone(self, c, f0, W, share, first):
+        """What of the violation is left for later substeps, see the class. share: of the frame, that the substep is; 0: none."""
+        out = ti.cast(0, self.dev.real)
+        if first != 0:
+            C = self.bounded(f0 - self.dev.rest[c])
+            borne = W * ti.abs(self.dev.lam[c])
+            if ti.static(not self.collapses):
+                borne = ti.min(borne, BORNE * self.extent(c))
+            over = ti.abs(C) - borne - APPROACH * share * self.extent(c)
+            if over > 0 and self.dev.spring.is_rigid(c):
+                out = ti.select(C > 0, over, -over)
+            self.dev.postponed[c] = out
+        elif share > 0:
+            out = self.dev.postponed[c]
+        return out
+
+    @ti.func
+    def known(self, c, h, hh, share, first, fresh):
         """What every solver knows of constraint c in a pass; of the state it writes nothing but the memory of soft constraints.
 
         Returns the violation A C + B + alpha' lam, A, alpha', lam, the mass-split weight W (0: no corner can move), directions n
-        and gradients g, both (arity, dim), and how far it turned, see Slots.note_turn; n is g where it turned too far.
+        and gradients g, both (arity, dim), how far it turned, see Slots.note_turn (n is g where too far), and C_(n+1) - C_n.
         """
         if first != 0:
             self.begin(c, fresh)
@@ -345,7 +394,9 @@ class Scalar(Batch):
         if lost:
             n, both = g, here
         violation, A, alpha, lam, W = self.equation(c, f, f0, w, both, h, hh, first, fresh)
-        return violation, A, alpha, lam, W, n, g, turn * ti.cast(self.distinct(f, f0), ti.i32)
+        if ti.static(self.dev.limited):
+            violation -= A * self.postpone(c, f0, W, share, first)
+        return violation, A, alpha, lam, W, n, g, turn * ti.cast(self.distinct(f, f0), ti.i32), f - f0
 
     @ti.func
     def answer(self, violation, A, alpha, lam, W, turn):
@@ -378,14 +429,72 @@ class Scalar(Batch):
         return new
 
     @ti.func
+    def reach(self, c, q):
+        """How far a corner may move before f is no longer what its gradient says, with corners q: about the size of the body."""
+        return ti.cast(1, self.dev.real)
+
+    @ti.func
+    def motion(self, c, n, together):
+        """The motion u along n in this substep, its weight W, the largest move by a multiplier of 1, the largest move squared.
+
+        together: 1 where the mass is split between all constraints, though some are solved together.
+        """
+        u, W, longest, fastest = (
+            ti.cast(0, self.dev.real),
+            ti.cast(0, self.dev.real),
+            ti.cast(0, self.dev.real),
+            ti.cast(0, self.dev.real),
+        )
+        for k in ti.static(range(self.arity)):
+            i = self.member(c, k)
+            move, split = self.dev.state.d[i] - self.dev.state.d[self.member(c, 0)], self.dev.slots.split[i]
+            if together != 0:
+                split = self.dev.w.of(i) * (self.dev.slots.begin[i + 1] - self.dev.slots.begin[i])
+            u += n[k, :].dot(move)
+            W += split * n[k, :].dot(n[k, :])
+            longest = ti.max(longest, self.dev.w.of(i) * n[k, :].norm())
+            fastest = ti.max(fastest, move.norm_sqr())
+        return u, W, longest, fastest
+
+    @ti.func
+    def limit_step(self, c, lam, new, n, share, together):
+        """The multiplier `new`, or where Newton's step means nothing, one that takes out motion; and whether it is that."""
+        far = False
+        if self.dev.spring.is_rigid(c):
+            u, W, longest, fastest = self.motion(c, n, together)
+            reach = self.reach(c, self.corners(c, 0))
+            if W > 0 and (self.dev.postponed[c] != 0 or ti.abs(new - lam) * longest > TRUST * reach):
+                pace = APPROACH * share * ti.min(self.extent(c), W * ti.min(reach, self.dev.span[c]) / longest)
+                if fastest * W * W > (2 * pace * longest) ** 2:
+                    pace *= 0
+                most = ti.max(ti.abs(u), pace)
+                new, far = lam + ti.max((-u - most) / W, ti.min(new - lam, (most - u) / W)), True
+        return new, far
+
+    @ti.func
     def relax(self, c, h, hh, when, first, fresh):
         """Move each corner by w_j dlam grad_j C; a constraint that belongs to a system tells it what it knows."""
-        violation, A, alpha, lam, W, n, g, turn = self.known(c, h, hh, first, fresh)
+        violation, A, alpha, lam, W, n, g, turn, moved = self.known(c, h, hh, when[1] - when[0], first, fresh)
         step = ti.cast(1, self.dev.real)
         if ti.static(self.dev.in_system):
             row = self.dev.row[c]
             if row >= 0:
-                self.dev.slots.system.set_row(row, violation, A, alpha, lam, W, self.geometric_stiffness(c, W))
+                start, weight, new = lam, W, lam
+                if ti.static(self.dev.limited):
+                    if W > 0:
+                        new, _ = self.answer(violation, A, alpha, lam, W, 0)
+                        new, far = self.limit_step(c, lam, new, n, when[1] - when[0], 1)
+                        if far:  # the others follow: a row without a weight goes back by its multiplier
+                            start, weight = lam - new, 0 * W
+                self.dev.slots.system.set_row(row, violation, A, alpha, start, weight, self.geometric_stiffness(c, weight))
+                if ti.static(self.dev.slots.system.guarded):
+                    u, split, longest, _ = self.motion(c, n, 0)
+                    spare, most = ti.math.inf + 0 * u, ti.math.inf + 0 * u
+                    if split > 0 and self.dev.spring.is_rigid(c):
+                        spare = 2 * (violation - moved) ** 2 / split
+                        if ti.static(self.dev.limited):
+                            most = TRUST * self.reach(c, self.corners(c, 0)) / longest
+                    self.dev.slots.system.guard(row, u, spare, most, lam - new)
                 for k in ti.static(range(self.arity)):
                     self.dev.slots.system.set_gradient(self.dev.places[c][k], self.member(c, k), g[k, :])
                 if violation != 0:
@@ -406,8 +515,13 @@ class Scalar(Batch):
                         last = 0
                     wanted = lam + self.dev.slots.semi_iteration.step(last, step)
                     step = self.dev.slots.limited(wanted, self.geometric_stiffness(c, W / 2)) - lam  # split by two in a chain
-                    self.dev.step[c] = step
                     new = lam + step
+                if ti.static(self.dev.limited):
+                    if W > 0:
+                        new, _ = self.limit_step(c, lam, new, n, when[1] - when[0], 0)
+                        step = new - lam
+                if ti.static(self.dev.steps):
+                    self.dev.step[c] = step
                 self.dev.lam[c] = new
         for k in ti.static(range(self.arity)):
             self.push(c, k, self.dev.w.of(self.member(c, k)) * step * n[k, :])
@@ -487,7 +601,7 @@ class Scalar(Batch):
     @ti.func
     def miss(self, c, h, hh, when, fresh):
         """The violation that is left, relative to the rest value (to the batch's mean f where that is 0)."""
-        violation, A, alpha, lam, W, _, _, _ = self.known(c, h, hh, 0, fresh)
+        violation, A, alpha, lam, W, _, _, _, _ = self.known(c, h, hh, 0 * h, 0, fresh)
         _, left = self.answer(violation, A, alpha, lam, W, 0)
         if ti.static(self.collapses > 0):
             f, g = self.measure(c, self.corners(c, 0))
