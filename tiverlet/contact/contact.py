@@ -40,8 +40,8 @@ class Contact(PairContact):
     momentum. A particle has its mass split m times, where m bounds the eigenvalues of S, the sum of n n^T over its overlapping
     pairs: then sum w J J^T <= diag(sum w m) for the rows J of its pairs, and no eigenvalue of a pass exceeds 1. m is 3 for a disc
     among six neighbours (counting pairs gives 6) and 4 for a sphere among twelve. With friction tangents are taken back too;
-    n n^T and t t^T sum up to the count, which is taken then, and for up to two pairs. m grows at once, and falls slowly: if it
-    followed pairs that just touch, the stiffness of what is around them would jump whenever they part, and keep them going.
+    n n^T and t t^T sum up to the count, which is taken then, and for up to two pairs. m rises at once and decays by
+    1/32 of its excess per pass; otherwise the stiffness would jump whenever a contact opens, and keep pairs moving.
 
     Pushes are over-relaxed by r = 5/4, and a pair that overlapped in the last substep keeps a part of what it got. With M =
     m_i w_i + m_j w_j, p = r C / M + c p_last, but no more than what parts the pair alone, C / (w_i + w_j). For a mode with
@@ -58,14 +58,14 @@ class Contact(PairContact):
     that it had before the substep, from the moment on when it met. Neither depends on h. Particles do not spin.
 
     What is struck by several in one substep bounces off one after the other. Of the pairs that were struck, those take their turn
-    that come first for both of their particles; then the next ones, on the new ways. Each blow is between two, so it keeps
+    that come first for both of their particles; then the next ones, on the new ways. Each impact is between two, so it keeps
     momentum, and energy if e = 1, however many there are.
 
-    Pushes act like springs, which give back what they took. So among pairs that bounce they are only for overlap that came to be
-    while they acted, or in the substep in which the pair comes to rest. What a blow leaves of an overlap is slack: a third one
-    threw the pair together while no spring was there, and to push it out would make energy. Slack is taken back of the positions
-    alone, an eighth in each substep. A pair with slack rests unless it is thrown together by more than that in a substep, or e is
-    1; otherwise it bounces again, or is let go on its way out.
+    Overlap left after an impact is slack: it is not pushed out, which would add energy, because pushes act like springs and no
+    spring was there when the pair was thrown together. It is removed from positions only, an eighth per substep. Other overlap of
+    pairs that bounce is pushed out: what came to be while pushes acted, or in the substep in which the pair comes to rest. A pair
+    with slack rests unless it is thrown together by more than that in a substep, or e is 1; otherwise it bounces again, or is let
+    go on its way out.
     """
 
     def __init__(self, friction=0.0, restitution=0.0, *, skin: float | str = "auto", groups=None, push_out=1.0):
@@ -99,7 +99,7 @@ class Contact(PairContact):
         dev.slip = PairData("slip", dim, lasting=True)
         dev.slack = PairData("slack", 0, lasting=True)  # of the overlap, what no push is for
         dev.impulse = PairData("given", 0, lasting=True)  # pushes and impacts in the last substep [kg m]
-        struck, bouncing = PairData("blow", 0, lasting=False), [dev.slack] if dev.bounces else []
+        struck, bouncing = PairData("struck", 0, lasting=False), [dev.slack] if dev.bounces else []
         pair_data = [dev.push, *([dev.slip] if dev.rubs else []), *([*bouncing, struck, dev.impulse] if dev.bounces else [])]
         dev.grid = NeighbourSearch(scene, dev.skin, linked, self.table, pair_data, team, dev.move)
         dev.geometry = DiscGeometry(scene, dev.grid, self.push_out, dev.impulse if dev.bounces else dev.push)

@@ -177,7 +177,12 @@ class PolygonGeometry:
                 # Both corners leave over the edge that the other one is behind, and the edges in front are crossed.
                 leaves = side * p.cross(behind) >= 0 and side * q.cross(behind) >= 0
                 leaves = leaves and turn * a.cross(own) >= 0 and turn * b.cross(own) >= 0
-                if leaves and meets(r, other, front) and meets(r, own, front) and meets(r, other, behind):
+                if (
+                    leaves
+                    and segments_cross(r, other, front)
+                    and segments_cross(r, own, front)
+                    and segments_cross(r, other, behind)
+                ):
                     deep, deep_v = ti.min(over_a, over_b), ti.min(over_p, over_q)
                     shorter = deep_v * deep_v * behind.dot(behind) < deep * deep * own.dot(own)
                     out = ti.select(shorter, 2 * side, side)
@@ -428,7 +433,7 @@ class PolygonGeometry:
 
 
 @ti.func
-def meets(r, s, q):
+def segments_cross(r, s, q):
     """Whether the line from r to r + s crosses that from 0 to q."""
     d = s.cross(q)
     at_s, at_q = q.cross(r), s.cross(r)

@@ -122,11 +122,11 @@ class NeighbourList:
     def lasting_data(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Every listed pair (i, j) with lasting data other than 0, in order, and its data, whatever the list's layout."""
         assert self.store
-        aside = bool(self.memory.read(self.old_saved)[0])  # given by restore(), and not built into a list yet
-        first, number = (self.old_first, self.old_number) if aside else (self.first, self.number)
+        saved = bool(self.memory.read(self.old_saved)[0])  # given by restore(), and not built into a list yet
+        first, number = (self.old_first, self.old_number) if saved else (self.first, self.number)
         i, at = self._entries(first, number)
-        near = self.store.read(self.old_neighbour if aside else self.neighbour)[at]
-        values = {piece.name: self.store.read(piece.old if aside else piece.field)[at] for piece in self.lasting}
+        near = self.store.read(self.old_neighbour if saved else self.neighbour)[at]
+        values = {piece.name: self.store.read(piece.old if saved else piece.field)[at] for piece in self.lasting}
         some = np.zeros(len(i), dtype=bool)
         for value in values.values():
             some |= (value != 0) if value.ndim == 1 else (value != 0).any(axis=1)
