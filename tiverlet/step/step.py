@@ -216,7 +216,7 @@ class Step:
         """A pass over the constraints, by its first or second half."""
         it = half // self.halves
         first = ti.cast(it == 0, ti.i32)
-        checks_list = ti.cast(now.final != 0 or it + 1 < now.span.iterations, ti.i32)
+        checks_list = ti.select(it + 1 < now.span.iterations, 1, now.final)
         return now.of(it, first, checks_list)
 
     @ti.func
