@@ -84,7 +84,7 @@ class AngleLimit(Angle):
         if self.acts:
             self.scene.memory.write(self.dev.middle, self.middle)
 
-    near = Scalar.near  # a distance from the middle has one value
+    unwrap = Scalar.unwrap  # a distance from the middle has one value
 
     @ti.func
     def measure(self, c, q):

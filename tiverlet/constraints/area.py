@@ -49,7 +49,7 @@ class Area(Enclosed):
         """Go around each area so that it is positive at the start."""
         if not self.arity and particles.dim != 2:
             raise ValueError("Area: loops of more than 3 particles enclose no definite area in 3D; use triangles, or Volume.")
-        self.fit(particles)
+        self.check_indices(particles)
         if particles.dim == 2:
             self.reverse(self.rest_of(particles.position) < 0)
         Scalar.prepare(self, particles, inv_mass)
@@ -127,7 +127,7 @@ class Loops:
         s = r[self.after]
         return np.add.reduceat(r[:, 0] * s[:, 1] - r[:, 1] * s[:, 0], starts[:-1]) / 2
 
-    def slopes(self, position: np.ndarray) -> np.ndarray:
+    def gradients(self, position: np.ndarray) -> np.ndarray:
         """Their gradients by each corner, (total, 2)."""
         before = np.empty_like(self.after)
         before[self.after] = np.arange(len(before))

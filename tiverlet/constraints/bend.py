@@ -55,7 +55,7 @@ class Bend(Angle):
         return self.dev.rest[c] == 0
 
     @ti.func
-    def distinct(self, f, f0):
+    def direction_reliable(self, f, f0):
         """In 3D, the plane of a nearly straight path turns at the least motion."""
         out = True
         if ti.static(self.dev.state.dim == 3):
@@ -63,7 +63,7 @@ class Bend(Angle):
         return out
 
     @ti.func
-    def begin(self, c, fresh):
+    def start_substep(self, c, fresh):
         """Remember the normal, that of the end where the start is straight, and from which side it is seen."""
         if ti.static(self.dev.state.dim == 3):
             if fresh != 0:

@@ -98,11 +98,11 @@ class Constraint(Scalar):
         self._keep(size=particles.size)
         self.dev.known: tuple[Any, Any, Any] = (None, None, None)
         self.dev.fixed = int(self.origin is None)
-        self.dev.slopes = NumericGradient(self.function, self.gradient, self.arity, particles.dim, self.dev.fixed, self.size)
+        self.dev.gradient = NumericGradient(self.function, self.gradient, self.arity, particles.dim, self.dev.fixed, self.size)
         Scalar.prepare(self, particles, inv_mass)
         values, slopes = np.zeros(0), np.zeros((0, self.arity, particles.dim))
         if self.count:
-            values, slopes, _ = self.dev.slopes(self._corners(particles.position))
+            values, slopes, _ = self.dev.gradient(self._corners(particles.position))
         self.dev.known = (particles.position, values, slopes)
         if not np.isfinite(values).all():
             i = int(np.argmin(np.isfinite(values)))
@@ -116,7 +116,7 @@ class Constraint(Scalar):
         for k in range(4):
             q = self._corners(position)
             q = q + k * 0.01 * self.size * (golden(np.arange(1, q.size + 1) + 1000 * k).reshape(q.shape) - 0.5)
-            _, given, differences = self.dev.slopes(q)
+            _, given, differences = self.dev.gradient(q)
             size = np.abs(differences).max(axis=(1, 2), keepdims=True)
             off = ~(np.abs(given - differences) <= WRONG * size + 1e-9 * np.abs(given))
             wrong += off & np.isfinite(differences)
@@ -139,14 +139,14 @@ class Constraint(Scalar):
         known, values, _ = self.dev.known
         if position is known:  # while the world's fields are being declared, Taichi cannot launch kernels
             return values
-        return self.dev.slopes(self._corners(position))[0] if self.count else np.zeros(0)
+        return self.dev.gradient(self._corners(position))[0] if self.count else np.zeros(0)
 
-    def slopes(self, position: np.ndarray) -> np.ndarray:
+    def gradients(self, position: np.ndarray) -> np.ndarray:
         """The gradients of function."""
         known, _, slopes = self.dev.known
         if position is known:
             return slopes
-        return self.dev.slopes(self._corners(position))[1] if self.count else np.zeros((0, self.arity, position.shape[1]))
+        return self.dev.gradient(self._corners(position))[1] if self.count else np.zeros((0, self.arity, position.shape[1]))
 
     @ti.func
     def corners(self, c, back):
@@ -168,14 +168,14 @@ class Constraint(Scalar):
         return q
 
     @ti.func
-    def ends(self, c):
+    def corners_now_and_start(self, c):
         """Corners now and at the start."""
         return self.corners(c, 0), self.corners(c, 1)
 
     @ti.func
     def measure(self, c, q):
         """The function and its gradient; nothing where they are not finite."""
-        f, g = self.dev.slopes.both(c, ti.cast(q, ti.f64))
+        f, g = self.dev.gradient.both(c, ti.cast(q, ti.f64))
         total = f
         for k, a in ti.static(ti.ndrange(self.arity, self.dev.state.dim)):
             total += g[k, a] * g[k, a]

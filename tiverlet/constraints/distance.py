@@ -29,7 +29,7 @@ class Link(Scalar):
         """Whether any rest length is 0, or was when kernels were compiled."""
         return bool((self.goal == 0).any()) or vars(self.dev).get("cusp", False)
 
-    def slopes(self, position: np.ndarray) -> np.ndarray:
+    def gradients(self, position: np.ndarray) -> np.ndarray:
         """As in measure()."""
         i, j = self.indices.T
         r = position[i] - position[j]

@@ -105,7 +105,7 @@ class Path(Anchored):
                 stacklevel=3,
             )
 
-    def begin(self, position: np.ndarray) -> np.ndarray:
+    def start_offset(self, position: np.ndarray) -> np.ndarray:
         """C at the start."""
         return position[self.indices[:, 0]] - self.curve.at(self._start)
 

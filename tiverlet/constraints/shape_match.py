@@ -417,7 +417,7 @@ class ShapeMatch(Batch):
             self.dev.strength.test(c, most, hh, tick)
 
     @ti.func
-    def miss(self, c, h, hh, when, fresh):
+    def residual_of(self, c, h, hh, when, fresh):
         """The largest violation that is left, by where the last pass turned the cluster, relative to its radius."""
         worst, total, mean, holds = ti.cast(0, ti.f64), ti.cast(0, ti.f64), 0 * self.dev.place[c], self.dev.strength.holds(c)
         rigid, soft, now, last, give = self.law(c, h, hh, fresh)

@@ -46,7 +46,7 @@ class Snap(Anchored):
         step = np.where(free, 1.0, self._spacing)
         return np.where(free, position, self._origin + np.floor((position - self._origin) / step + 0.5) * step)
 
-    def begin(self, position: np.ndarray) -> np.ndarray:
+    def start_offset(self, position: np.ndarray) -> np.ndarray:
         """C at the start."""
         x = position[self.indices[:, 0]]
         return x - self.node(x)

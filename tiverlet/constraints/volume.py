@@ -50,7 +50,7 @@ class Volume(Enclosed):
         """Turn the corners so that volumes are positive at the start."""
         if particles.dim != 3:
             raise ValueError("Volume: there are no volumes in a 2D world; use Area.")
-        self.fit(particles)
+        self.check_indices(particles)
         self.reverse(self.rest_of(particles.position) < 0)
         Scalar.prepare(self, particles, inv_mass)
 
@@ -122,7 +122,7 @@ class Surfaces:
         parts = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6
         return np.bincount(self.surface, weights=parts, minlength=members.count)
 
-    def slopes(self, position: np.ndarray) -> np.ndarray:
+    def gradients(self, position: np.ndarray) -> np.ndarray:
         """Their gradients by each corner, (total, 3)."""
         members, corner = self.members, self._corner
         eye = position[members.indices[members.starts[:-1]]][self.surface][:, None]

@@ -170,7 +170,7 @@ class Batch(Feature):
     """
 
     arity = 0  # 0: as many as each needs, see VariableSize
-    reweighs = False  # miss() needs reduce_block()
+    reweighs = False  # residual_of() needs reduce_block()
     soft = False  # has springs, which act at a start
     breaks = False  # has constraints that a load can break
     drives = False  # puts its particles in place instead of relaxing them
@@ -310,11 +310,12 @@ class Batch(Feature):
         """After relax() and kick(): push the move of corner e of a ragged batch."""
 
     @ti.func
-    def miss(self, c, h, hh, when, fresh):
+    def residual_of(self, c, h, hh, when, fresh):
         """How far constraint c is from fulfilled, relative to its size."""
         return 0.0
 
     @ti.func
     def energy(self, c, back, hh, miss):
-        """Elastic energy [J] of constraint c at x - back d. hh: as in relax(), 0 where there was no substep yet. miss: miss()."""
+        """Elastic energy [J] of constraint c at x - back d. miss: of residual_of(). hh: as in relax(), 0 where there was no
+        substep yet."""
         return 0.0

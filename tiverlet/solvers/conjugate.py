@@ -46,7 +46,7 @@ class ConjugateGradient(Solver):
 
     def system(self, scene: Scene, batches: list[Batch], slots: Slots) -> "CGSystem | None":
         """The system of a scene on the device; None where there is none."""
-        scalars = [b for b in batches if isinstance(b, Scalar) and b.joins and b.side == 0]
+        scalars = [b for b in batches if isinstance(b, Scalar) and b.solvable_together and b.side == 0]
         return CGSystem(scene, batches, slots, scalars, self.steps) if scalars else None
 
     def remedy(self, batches: list[Batch], slots: Slots, inv_mass: np.ndarray) -> str:

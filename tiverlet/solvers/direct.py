@@ -60,14 +60,14 @@ class Direct(Solver):
 
     def system(self, scene: Scene, batches: list[Batch], slots: Slots) -> "Elimination | None":
         """The systems of a scene on the device; None where there are none."""
-        scalars = [b for b in batches if isinstance(b, Scalar) and b.joins]
+        scalars = [b for b in batches if isinstance(b, Scalar) and b.solvable_together]
         if not scalars:
             return None
         slot = np.concatenate([slots.places(b).ravel() for b in scalars])
         item = np.concatenate([b.indices.ravel() for b in scalars])
         arity = np.repeat([b.arity for b in scalars], [b.count for b in scalars])
         owner = np.repeat(np.arange(len(arity)), arity)
-        free = (slot >= 0) & ~np.concatenate([b.sprung(scene) for b in scalars])[owner]
+        free = (slot >= 0) & ~np.concatenate([b.acts_as_force(scene) for b in scalars])[owner]
         found = plan(len(arity), owner[free], item[free], self.width)
         return Elimination(scene, batches, slots, scalars, found, slot[free], item[free]) if found.parts else None
 
@@ -108,7 +108,7 @@ class Elimination(System):
         who[slot] = item
         self.who, self.w, self.close = ints("who", who), scene.state.w, reals("close")
         self.digit = float(np.finfo(np.float32 if scene.real == ti.f32 else np.float64).eps)
-        parts = [scene.inv_mass[b.indices] * (b.slopes(b.start.position) ** 2).sum(axis=2) for b in scalars]
+        parts = [scene.inv_mass[b.indices] * (b.gradients(b.start.position) ** 2).sum(axis=2) for b in scalars]
         least = np.concatenate([np.where(p > 0, p, np.inf).min(axis=1, initial=np.inf) for p in parts])[found.rows]
         small = np.where(np.isfinite(least), SMALL * least, 0.0)
         self.small = scene.memory.field("system.small", self.rows, kind=ti.f64, values=small)

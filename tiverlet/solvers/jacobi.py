@@ -31,7 +31,7 @@ class Jacobi(Solver):
         """The factor in this scene; ValueError where stepping would be unstable."""
         if self.relaxation != "auto" and self.relaxation < 4 / 3:
             return float(self.relaxation)
-        scalars = [b for b in batches if isinstance(b, Scalar) and b.joins and not b.soft]
+        scalars = [b for b in batches if isinstance(b, Scalar) and b.solvable_together and not b.soft]
         if len(scalars) < len(batches):
             if self.relaxation == "auto":
                 return 1.0

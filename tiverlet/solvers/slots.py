@@ -46,7 +46,7 @@ class Slots:
         self.system: Any = solver.system(scene, batches, self)
         self.has_system = bool(self.system)
         # Whether a substep fulfils constraints to rounding, which is then the error that is left.
-        scalars = [b for b in batches if isinstance(b, Scalar) and b.joins]
+        scalars = [b for b in batches if isinstance(b, Scalar) and b.solvable_together]
         self.exact = bool(scalars) and (not self.system.steps if self.system else bool(degree.max(initial=0) <= 1))
         blocks = self.system.blocks if self.system else degree
         self.split = memory.field("slots.split_mass", n, values=blocks * inv_mass)

@@ -63,8 +63,8 @@ class System:
         inside, alone = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64)
         for b in batches:
             row = self.row(b)
-            if isinstance(b, Scalar) and b.sprung(scene).any():
-                row = np.where(b.sprung(scene), 0, row)  # forces take no share of the mass
+            if isinstance(b, Scalar) and b.acts_as_force(scene).any():
+                row = np.where(b.acts_as_force(scene), 0, row)  # forces take no share of the mass
             if (row >= 0).any():
                 inside[b.indices[row >= 0]] = True
                 alone += np.bincount(b.indices[row < 0].ravel(), minlength=n)

@@ -183,13 +183,13 @@ def by_structure(batches: list[Batch], inv_mass: np.ndarray) -> Solver:
     on more than two particles, which contacts can lock in a shape that Newton's method does not leave; and for scenes that start
     with violated constraints, which may contradict each other: relaxed, they settle on a compromise.
     """
-    links = [b for b in batches if isinstance(b, Scalar) and b.joins]
+    links = [b for b in batches if isinstance(b, Scalar) and b.solvable_together]
     angles = [b for b in links if b.arity > 2]
     if not links or any((b.compliance == 0).any() for b in angles):
         return Jacobi()
     for b in links:
         C = b.violation(b.start.position)
-        if (np.where(b.side, np.maximum(b.side * C, 0), np.abs(C)) * b.closeness(b.start.position) > LOST).any():
+        if (np.where(b.side, np.maximum(b.side * C, 0), np.abs(C)) * b.inverse_size(b.start.position) > LOST).any():
             return Jacobi()
     if not angles and len(plan_of(links, inv_mass, WIDTH).column):
         return Direct(WIDTH)

@@ -131,7 +131,7 @@ class Diagnostics:
                 h2_effective, miss = 0 * h, 0 * h
                 if begin == 0:
                     h2_effective = self.step.integrator.reach(h, fresh)
-                    miss = f.miss(c, h, h2_effective, when, fresh)
+                    miss = f.residual_of(c, h, h2_effective, when, fresh)
                     figures[1] = ti.max(figures[1], ti.cast(miss, ti.f64))
                 figures[0] += f.energy(c, back, h2_effective, miss)
         return figures, low, high
@@ -231,7 +231,7 @@ class Residuals:
         for c in range(self.batch.count):
             h = ti.cast(h64, self.step.real)
             fraction = self.step.integrator.frame_fraction(0, 1)
-            out[c] = self.batch.miss(c, h, self.step.integrator.reach(h, fresh), fraction, fresh)
+            out[c] = self.batch.residual_of(c, h, self.step.integrator.reach(h, fresh), fraction, fresh)
 
 
 class Reporter:

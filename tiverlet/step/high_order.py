@@ -80,7 +80,7 @@ def check_solved(batches: list[Batch], scene: Scene, solver: Solver) -> None:
     """Raise ValueError where a rigid constraint would be relaxed instead of solved."""
     for b in batches:
         assert isinstance(b, Scalar)
-        left = ~b.sprung(scene) & (scene.slots.rows(b) < 0) & ~b.idle(scene.inv_mass)
+        left = ~b.acts_as_force(scene) & (scene.slots.rows(b) < 0) & ~b.idle(scene.inv_mass)
         if left.any():
             raise ValueError(
                 f"World: order = {scene.order} needs rigid constraints to be solved to the end, but {solver!r} relaxes {b!r} ("
@@ -183,7 +183,7 @@ def fastest(batches: list[Any], scene: Scene) -> float:
     for b in batches:
         soft = b.compliance > 0
         w = (degree * scene.inv_mass)[b.indices][:, :, None]
-        squares = (w * b.slopes(b.start.position) ** 2).sum(axis=(1, 2))
+        squares = (w * b.gradients(b.start.position) ** 2).sum(axis=(1, 2))
         worst = max(worst, float((squares[soft] / b.compliance[soft]).max(initial=0.0)))
     return worst
 

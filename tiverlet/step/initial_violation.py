@@ -152,7 +152,7 @@ class Rows:
 
     def __init__(self, batches: list[Scalar], x: np.ndarray, w: np.ndarray, sizes: list[np.ndarray] | None = None):
         self.x, self.w, (self.n, self.dim), self.batches = x, w, x.shape, batches
-        self.sizes = [b.closeness(b.start.position) for b in batches] if sizes is None else sizes
+        self.sizes = [b.inverse_size(b.start.position) for b in batches] if sizes is None else sizes
         found = [b.violation(x) for b in batches]
         active = [
             (b.compliance == 0) & ((C * b.side > 0) if b.side else True) & ~b.idle(w) for b, C in zip(batches, found, strict=True)
@@ -172,7 +172,7 @@ class Rows:
     @functools.cached_property
     def J(self) -> np.ndarray:
         """(corners, dim)."""
-        gradients = [b.slopes(self.x).reshape(-1, self.dim) for b in self.batches]
+        gradients = [b.gradients(self.x).reshape(-1, self.dim) for b in self.batches]
         return np.concatenate([g[some] for g, some in zip(gradients, self.corners, strict=True)])
 
     @property

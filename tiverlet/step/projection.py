@@ -125,7 +125,7 @@ class Rows:
         self.m = len(self.side)
         self.who = np.concatenate([b.indices[some].ravel() for b, some in zip(batches, self.some, strict=True)])
         self.row = np.repeat(np.arange(self.m), arity)
-        self.close = self._each([b.closeness(b.start.position) for b in batches])
+        self.close = self._each([b.inverse_size(b.start.position) for b in batches])
         first = (np.cumsum(arity) - arity)[arity == 2]
         self.pairs = self.row[first], self.who[first], self.who[first + 1]
         self.arity = arity
@@ -138,7 +138,7 @@ class Rows:
     def _measure(self, x: np.ndarray) -> None:
         self.x, self.C = x, self._bounded(self._each([b.violation(x) for b in self.batches]) - self.goal)
         self.J = np.concatenate(
-            [b.slopes(x)[some].reshape(-1, self.dim) for b, some in zip(self.batches, self.some, strict=True)]
+            [b.gradients(x)[some].reshape(-1, self.dim) for b, some in zip(self.batches, self.some, strict=True)]
         )
         self.diagonal = np.bincount(self.row, self.w[self.who] * (self.J**2).sum(axis=1), minlength=self.m)
         self.worst = float(np.abs(self.C * self.close).max(initial=0.0))

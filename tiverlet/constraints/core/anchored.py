@@ -57,7 +57,7 @@ class Anchored(Batch):
         """Check that the particles exist."""
         checks.indices(repr(self), "indices", self.indices[:, 0], particles.count)
 
-    def begin(self, position: np.ndarray) -> np.ndarray:
+    def start_offset(self, position: np.ndarray) -> np.ndarray:
         """C at the start, (m, dim)."""
         return np.zeros((self.count, position.shape[1]))
 
@@ -68,7 +68,7 @@ class Anchored(Batch):
         if not self.drives:
             self.dev.lam = scene.memory.field(f"{self!r}.multiplier", self.count, width=scene.particles.dim, state=True)
             compliance, damping = (self.compliance, self.damping) if self.soft else (None, None)
-            self.dev.spring = Spring(scene, repr(self), compliance, damping, self.begin(self.start.position))
+            self.dev.spring = Spring(scene, repr(self), compliance, damping, self.start_offset(self.start.position))
 
     @property
     def load(self) -> np.ndarray:
@@ -151,7 +151,7 @@ class Anchored(Batch):
         self.push(c, 0, scale * self.dev.w.of(self.member(c, 0)) * self.dev.lam[c])
 
     @ti.func
-    def miss(self, c, h, hh, when, fresh):
+    def residual_of(self, c, h, hh, when, fresh):
         """What is left, relative to the size of the scene."""
         _, _, size = self.solve(c, h, hh, when, 0, fresh)
         return size / self.dev.size

@@ -23,7 +23,7 @@ class Angle(Scalar):
         return C - TURN * np.round(C / TURN)
 
     @ti.func
-    def near(self, f, other):
+    def unwrap(self, f, other):
         """f plus whole turns, within half a turn of `other`."""
         return wrapped(f, other)
 

@@ -40,7 +40,7 @@ class Enclosed(Scalar):
         """The function on these particles, as the user gives them."""
         raise NotImplementedError
 
-    def lay(self, indices) -> None:
+    def keep_indices(self, indices) -> None:
         """Keep the particles of each constraint."""
         self.function = self.function_of(indices)
         self.members = self.function.members
@@ -62,17 +62,17 @@ class Enclosed(Scalar):
         """f at the given positions."""
         return self.function.values(self.members, position)
 
-    def slopes(self, position: np.ndarray) -> np.ndarray:
+    def gradients(self, position: np.ndarray) -> np.ndarray:
         """grad f at the given positions: of simplices (m, arity, dim), of outlines (total, dim)."""
-        return self.function.slopes(position) if self.arity == 0 else super().slopes(position)
+        return self.function.gradients(position) if self.arity == 0 else super().gradients(position)
 
-    def closeness(self, position: np.ndarray) -> np.ndarray:
+    def inverse_size(self, position: np.ndarray) -> np.ndarray:
         """What makes C a share of the size of its constraint, (m,); 0 for what has collapsed."""
         if self.arity or not self.count:
-            return super().closeness(position) if self.count else np.zeros(0)
+            return super().inverse_size(position) if self.count else np.zeros(0)
         x, starts, owner = position[self.indices], self.members.starts, self.owner
         size = np.maximum.reduceat(np.linalg.norm(x - x[starts[owner]], axis=1), starts[:-1])
-        size *= np.sqrt(np.bincount(owner, (self.slopes(position) ** 2).sum(axis=1), minlength=self.count) / 2)
+        size *= np.sqrt(np.bincount(owner, (self.gradients(position) ** 2).sum(axis=1), minlength=self.count) / 2)
         return np.divide(1, size, out=np.zeros(self.count), where=size > 0)
 
     @property
@@ -157,8 +157,8 @@ class Enclosed(Scalar):
             violation, A, alpha, lam, W = self.equation(c, f, f0, w, W, h, hh, first, fresh)
             if ti.static(self.dev.limited):
                 violation -= A * self.postpone(c, f0, W, when[1] - when[0], first)
-            new, left = self.answer(violation, A, alpha, lam, W, turn)
-            new = self.tempered(c, lam, new, extent, move)
+            new, left = self.jacobi_update(violation, A, alpha, lam, W, turn)
+            new = self.limit_collapse(c, lam, new, extent, move)
             self.dev.lam[c], self.dev.change[c], self.dev.astray[c] = new, new - lam, turn == FAR
 
     @ti.func
@@ -190,19 +190,19 @@ class Enclosed(Scalar):
                 self.dev.corners.give(e, self.dev.w.of(self.dev.corners.members[e]) * pull * self.dev.outline.slope(e, 0))
 
     @ti.func
-    def miss(self, c, h, hh, when, fresh):
+    def residual_of(self, c, h, hh, when, fresh):
         """The violation that is left, relative to the rest value."""
         if ti.static(self.arity > 0):
-            return Scalar.miss(self, c, h, hh, when, fresh)
+            return Scalar.residual_of(self, c, h, hh, when, fresh)
         else:
             f, f0, w, W, turn, extent, move = self.total(c)
             violation, A, alpha, lam, W = self.equation(c, f, f0, w, W, h, hh, 0, fresh)
-            new, left = self.answer(violation, A, alpha, lam, W, turn)
+            new, left = self.jacobi_update(violation, A, alpha, lam, W, turn)
             if w == 0:  # collapsed, or static
                 for e in range(self.dev.corners.starts[c], self.dev.corners.starts[c + 1]):
                     if self.dev.w.of(self.dev.corners.members[e]) > 0 and self.dev.strength.holds(c):
                         left = ti.abs(f - self.dev.rest[c])
-            return left / self.extent(c)
+            return left / self.residual_scale(c)
 
     @ti.func
     def value(self, c, back):

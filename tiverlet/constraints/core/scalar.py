@@ -75,17 +75,17 @@ class Scalar(Batch):
 
     def setup(self, indices, rest, compliance, damping, break_at=None) -> None:
         """Keep the arguments of __init__; what depends on the particles is checked in prepare()."""
-        self.lay(indices)
+        self.keep_indices(indices)
         self._rest_given = rest
         self.break_at, self.compliance, self.damping = break_at, compliance, damping
 
-    def lay(self, indices) -> None:
+    def keep_indices(self, indices) -> None:
         """Keep the particles of each constraint."""
         indices = checks.indices(repr(self), self.index_name, indices, checks.ANY, arity=self.arity)
         self.members = FixedSize(type(self).__name__, indices)
         self._warn_duplicates()
 
-    def fit(self, particles: Particles) -> None:
+    def check_indices(self, particles: Particles) -> None:
         """Check the particles of each constraint against those that there are."""
         self.members.check(repr(self), self.index_name, particles.count)
 
@@ -115,7 +115,7 @@ class Scalar(Batch):
         """C at the given positions, (m,)."""
         return self.rest_of(position) - self.goal
 
-    def slopes(self, position: np.ndarray) -> np.ndarray:
+    def gradients(self, position: np.ndarray) -> np.ndarray:
         """grad_k f of every constraint, (m, arity, dim), by central differences: each constraint on particles of its own."""
         twin: Any = self.copy()
         vars(twin)["members"] = FixedSize(type(self).__name__, np.arange(self.indices.size).reshape(self.indices.shape))
@@ -130,16 +130,16 @@ class Scalar(Batch):
                 out[:, k, a] = (up - down) / (2 * step)
         return out
 
-    def closeness(self, position: np.ndarray) -> np.ndarray:
+    def inverse_size(self, position: np.ndarray) -> np.ndarray:
         """What makes C a share of the size of its constraint, (m,): 1 / length for links, 0 for what has no extent."""
         x = position[self.indices]
         size = np.linalg.norm(x - x[:, :1], axis=2).max(axis=1, initial=0.0)
-        size *= np.sqrt((self.slopes(position) ** 2).sum(axis=(1, 2)) / 2)
+        size *= np.sqrt((self.gradients(position) ** 2).sum(axis=(1, 2)) / 2)
         return np.divide(1, size, out=np.zeros(self.count), where=size > 0)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check indices against the number of particles and settle the rest values."""
-        self.fit(particles)
+        self.check_indices(particles)
         if "rest" not in self.__dict__:
             if self._rest_given is None:
                 self.__dict__["rest"] = self.rest_of(particles.position)
@@ -183,7 +183,7 @@ class Scalar(Batch):
         """The compliances, where a world of higher order is made for these."""
         return self.compliance.tobytes() if self.scene and self.scene.order > 2 else None
 
-    def sprung(self, scene: Scene) -> np.ndarray:
+    def acts_as_force(self, scene: Scene) -> np.ndarray:
         """Which constraints act as forces, (m,): soft ones in substeps of an order above 2. See high_order.py."""
         return (self.compliance > 0) & (scene.order > 2)
 
@@ -193,14 +193,14 @@ class Scalar(Batch):
         return self.curved and bool((self.compliance == 0).any()) or bool(vars(self.dev).get("limited", False))
 
     @property
-    def joins(self) -> bool:
+    def solvable_together(self) -> bool:
         """Whether constraints of the batch can be solved together with others: few corners, and a direction everywhere."""
         return self.arity > 0 and not self.collapses
 
     def bind(self, scene: Scene) -> None:
         """Declare rest values, multipliers, springs and strengths; and, for solvers, which rows of a system constraints are."""
         super().bind(scene)
-        self.dev.sprung = bool(self.sprung(scene).any())
+        self.dev.forces = bool(self.acts_as_force(scene).any())
         start = self.rest_of(self.start.position) if self.count else np.zeros(0)
         self.dev.scale = self.unit or (float(np.abs(start).mean()) if np.any(start) else self.start.size)
         name, m, add = repr(self), self.count, scene.memory.field
@@ -218,14 +218,14 @@ class Scalar(Batch):
                 corner = self.start.position[self.indices]
                 span = np.linalg.norm(corner - corner[:, :1], axis=2).max(axis=1, initial=0.0)
                 self.dev.span = add(f"{name}.span", m, values=np.where(span > 0, span, self.start.size))
-        self.dev.in_system, self.dev.alone = bool((rows >= 0).any()), bool((rows < 0).any())
+        self.dev.in_system, self.dev.outside = bool((rows >= 0).any()), bool((rows < 0).any())
         if self.dev.in_system:
             self.dev.row = add(f"{name}.row", m, kind=ti.i32, values=rows)
         self.dev.cusp = self.cusp
-        self.dev.firm = self.joins and (self.dev.in_system or bool(scene.slots.semi_iteration))
-        if self.dev.firm:
-            self.dev.close = add(f"{name}.close", m, values=self.closeness(self.start.position))
-        self.dev.steps = bool(self.dev.firm and scene.slots.semi_iteration and self.dev.alone and self.side == 0)
+        self.dev.converges = self.solvable_together and (self.dev.in_system or bool(scene.slots.semi_iteration))
+        if self.dev.converges:
+            self.dev.inverse_size = add(f"{name}.close", m, values=self.inverse_size(self.start.position))
+        self.dev.steps = bool(self.dev.converges and scene.slots.semi_iteration and self.dev.outside and self.side == 0)
         if self.dev.steps:
             self.dev.step = add(f"{name}.step", m)
 
@@ -258,7 +258,7 @@ class Scalar(Batch):
         return 0.0, q
 
     @ti.func
-    def near(self, f, other):
+    def unwrap(self, f, other):
         """Of the values that mean the same as f, the one nearest to `other`; more than one only for angles."""
         return f
 
@@ -268,12 +268,12 @@ class Scalar(Batch):
         return f - rest
 
     @ti.func
-    def distinct(self, f, f0):
+    def direction_reliable(self, f, f0):
         """Whether the direction is clear enough at f and f0, now and at the start, for a turn of 41 degrees to mean something."""
         return True
 
     @ti.func
-    def begin(self, c, fresh):
+    def start_substep(self, c, fresh):
         """Before the first pass of a substep: what `measure` has to remember of its start."""
 
     @ti.func
@@ -289,7 +289,7 @@ class Scalar(Batch):
         return q
 
     @ti.func
-    def ends(self, c):
+    def corners_now_and_start(self, c):
         """Corners of constraint c, as above, now and at the start of the substep."""
         i = self.member(c, 0)
         now = ti.Matrix.zero(self.dev.real, self.arity, self.dev.state.dim)
@@ -320,7 +320,7 @@ class Scalar(Batch):
         if ti.static(self.dev.strength.breaks):
             if not self.dev.strength.holds(c):
                 W = 0
-        if ti.static(self.dev.sprung):
+        if ti.static(self.dev.forces):
             if not self.dev.spring.is_rigid(c):
                 W = 0
         C, A = self.excess(c, f, self.dev.rest[c]), ti.cast(1, self.dev.real)
@@ -334,7 +334,7 @@ class Scalar(Batch):
                 alpha = self.dev.spring.alpha[c] / hh
                 if first != 0:
                     rest = self.dev.rest[c]
-                    B = now * self.bounded(f0 - rest) + last * self.bounded(self.near(self.dev.spring.last[c], f0) - rest)
+                    B = now * self.bounded(f0 - rest) + last * self.bounded(self.unwrap(self.dev.spring.last[c], f0) - rest)
                     self.dev.spring.history[c] = B
                     self.dev.spring.last[c] = f0
                 else:
@@ -352,8 +352,8 @@ class Scalar(Batch):
             C = self.bounded(f0 - self.dev.rest[c])
             borne = W * ti.abs(self.dev.lam[c])
             if ti.static(not self.collapses):
-                borne = ti.min(borne, BORNE * self.extent(c))
-            over = ti.abs(C) - borne - APPROACH * share * self.extent(c)
+                borne = ti.min(borne, BORNE * self.residual_scale(c))
+            over = ti.abs(C) - borne - APPROACH * share * self.residual_scale(c)
             if over > 0 and self.dev.spring.is_rigid(c):
                 out = ti.select(C > 0, over, -over)
             self.dev.postponed[c] = out
@@ -362,19 +362,19 @@ class Scalar(Batch):
         return out
 
     @ti.func
-    def known(self, c, h, hh, share, first, fresh):
+    def linearise(self, c, h, hh, share, first, fresh):
         """What every solver knows of constraint c in a pass; of the state it writes nothing but the memory of soft constraints.
 
         Returns the violation A C + B + alpha' lam, A, alpha', lam, the mass-split weight W (0: no corner can move), directions n
         and gradients g, both (arity, dim), how far it turned, see Slots.note_turn (n is g where too far), and C_(n+1) - C_n.
         """
         if first != 0:
-            self.begin(c, fresh)
-        now, start = self.ends(c)
+            self.start_substep(c, fresh)
+        now, start = self.corners_now_and_start(c)
         f, g = self.measure(c, now)
         f0, n = self.measure(c, start)
-        f0 = self.near(f0, self.dev.rest[c])
-        f = self.near(f, f0)
+        f0 = self.unwrap(f0, self.dev.rest[c])
+        f = self.unwrap(f, f0)
         w = ti.cast(0, self.dev.real)  # sum of w |grad|^2, then mass-split: along both, current, start
         both, here, there = ti.cast(0, self.dev.real), ti.cast(0, self.dev.real), ti.cast(0, self.dev.real)
         for k in ti.static(range(self.arity)):
@@ -388,18 +388,18 @@ class Scalar(Batch):
         lost = turn == FAR
         if ti.static(self.dev.cusp):
             lost = lost or (self.dev.rest[c] == 0 and self.dev.spring.is_rigid(c))
-        if ti.static(self.dev.firm):
+        if ti.static(self.dev.converges):
             if self.dev.spring.is_rigid(c):
-                lost = lost or ti.abs(self.bounded(f0 - self.dev.rest[c])) * self.dev.close[c] > LOST
+                lost = lost or ti.abs(self.bounded(f0 - self.dev.rest[c])) * self.dev.inverse_size[c] > LOST
         if lost:
             n, both = g, here
         violation, A, alpha, lam, W = self.equation(c, f, f0, w, both, h, hh, first, fresh)
         if ti.static(self.dev.limited):
             violation -= A * self.postpone(c, f0, W, share, first)
-        return violation, A, alpha, lam, W, n, g, turn * ti.cast(self.distinct(f, f0), ti.i32), f - f0
+        return violation, A, alpha, lam, W, n, g, turn * ti.cast(self.direction_reliable(f, f0), ti.i32), f - f0
 
     @ti.func
-    def answer(self, violation, A, alpha, lam, W, turn):
+    def jacobi_update(self, violation, A, alpha, lam, W, turn):
         """The multiplier of a Jacobi pass, and the size of the violation that it removes."""
         new, size = lam, ti.cast(0, self.dev.real)
         if W > 0:
@@ -412,7 +412,7 @@ class Scalar(Batch):
         return new, size
 
     @ti.func
-    def tempered(self, c, lam, new, extent, move):
+    def limit_collapse(self, c, lam, new, extent, move):
         """Next to where it has no direction, f is curved: no pass moves corners further than they are, or are to be, apart.
 
         extent: squared size of the body. move: squared size of what a multiplier of 1 moves.
@@ -464,7 +464,7 @@ class Scalar(Batch):
             u, W, longest, fastest = self.motion(c, n, together)
             reach = self.reach(c, self.corners(c, 0))
             if W > 0 and (self.dev.postponed[c] != 0 or ti.abs(new - lam) * longest > TRUST * reach):
-                pace = APPROACH * share * ti.min(self.extent(c), W * ti.min(reach, self.dev.span[c]) / longest)
+                pace = APPROACH * share * ti.min(self.residual_scale(c), W * ti.min(reach, self.dev.span[c]) / longest)
                 if fastest * W * W > (2 * pace * longest) ** 2:
                     pace *= 0
                 most = ti.max(ti.abs(u), pace)
@@ -474,7 +474,7 @@ class Scalar(Batch):
     @ti.func
     def relax(self, c, h, hh, when, first, fresh):
         """Move each corner by w_j dlam grad_j C; a constraint that belongs to a system tells it what it knows."""
-        violation, A, alpha, lam, W, n, g, turn, moved = self.known(c, h, hh, when[1] - when[0], first, fresh)
+        violation, A, alpha, lam, W, n, g, turn, moved = self.linearise(c, h, hh, when[1] - when[0], first, fresh)
         step = ti.cast(1, self.dev.real)
         if ti.static(self.dev.in_system):
             row = self.dev.row[c]
@@ -482,7 +482,7 @@ class Scalar(Batch):
                 start, weight, new = lam, W, lam
                 if ti.static(self.dev.limited):
                     if W > 0:
-                        new, _ = self.answer(violation, A, alpha, lam, W, 0)
+                        new, _ = self.jacobi_update(violation, A, alpha, lam, W, 0)
                         new, far = self.limit_step(c, lam, new, n, when[1] - when[0], 1)
                         if far:  # the others follow: a row without a weight goes back by its multiplier
                             start, weight = lam - new, 0 * W
@@ -499,15 +499,15 @@ class Scalar(Batch):
                     self.dev.slots.system.set_gradient(self.dev.places[c][k], self.member(c, k), g[k, :])
                 if violation != 0:
                     self.dev.slots.note_turn(turn)
-        if ti.static(self.dev.alone):
-            if self.relaxed_alone(c):
-                new, _ = self.answer(violation, A, alpha, lam, W, turn)
+        if ti.static(self.dev.outside):
+            if self.outside_systems(c):
+                new, _ = self.jacobi_update(violation, A, alpha, lam, W, turn)
                 if ti.static(self.collapses > 0):
                     move = ti.cast(0, self.dev.real)
                     for k in ti.static(range(self.arity)):
                         w = self.dev.w.of(self.member(c, k))
                         move += w * w * n[k, :].dot(n[k, :])
-                    new = self.tempered(c, lam, new, self.corners(c, 0).norm_sqr(), move)
+                    new = self.limit_collapse(c, lam, new, self.corners(c, 0).norm_sqr(), move)
                 step = new - lam
                 if ti.static(self.dev.steps):
                     last = self.dev.step[c]
@@ -529,10 +529,10 @@ class Scalar(Batch):
     @ti.func
     def geometric_stiffness(self, c, W):
         """(omega h)^2 of the fastest vibration across a tension, for a multiplier of 1: of a chain 4 w / l, where W = 2 w."""
-        return 2 * W * self.dev.close[c]
+        return 2 * W * self.dev.inverse_size[c]
 
     @ti.func
-    def relaxed_alone(self, c):
+    def outside_systems(self, c):
         """Whether constraint c belongs to no system."""
         out = True
         if ti.static(self.dev.in_system):
@@ -558,13 +558,13 @@ class Scalar(Batch):
         Rigid links find their force in the next substep.
         """
         f, g = self.measure(c, self.corners(c, 0))
-        f = self.near(f, self.dev.rest[c])
+        f = self.unwrap(f, self.dev.rest[c])
         f0, w = f, ti.cast(0, self.dev.real)
         if ti.static(self.dev.spring.damped):
             f0, _ = self.measure(c, self.corners(c, 1))
         for k in ti.static(range(self.arity)):
             w += self.dev.w.of(self.member(c, k)) * g[k, :].dot(g[k, :])
-        force = self.force(c, f, self.near(f0, f), w, h)
+        force = self.force(c, f, self.unwrap(f0, f), w, h)
         for k in ti.static(range(self.arity)):
             self.push(c, k, h * h * self.dev.w.of(self.member(c, k)) * force * g[k, :])
 
@@ -576,7 +576,7 @@ class Scalar(Batch):
             alpha = self.dev.spring.alpha[c]
             if w > 0 and alpha > 0 and self.dev.strength.holds(c):
                 resolved = ti.cast(1, self.dev.real)
-                if ti.static(not self.dev.sprung):
+                if ti.static(not self.dev.forces):
                     resolved -= stiff(alpha, h, w)
                 C = self.bounded(f - self.dev.rest[c])
                 force = -resolved * C / alpha
@@ -599,15 +599,15 @@ class Scalar(Batch):
         self.dev.strength.test(c, ti.abs(self.dev.lam[c]), hh, tick)
 
     @ti.func
-    def miss(self, c, h, hh, when, fresh):
+    def residual_of(self, c, h, hh, when, fresh):
         """The violation that is left, relative to the rest value (to the batch's mean f where that is 0)."""
-        violation, A, alpha, lam, W, _, _, _, _ = self.known(c, h, hh, 0 * h, 0, fresh)
-        _, left = self.answer(violation, A, alpha, lam, W, 0)
+        violation, A, alpha, lam, W, _, _, _, _ = self.linearise(c, h, hh, 0 * h, 0, fresh)
+        _, left = self.jacobi_update(violation, A, alpha, lam, W, 0)
         if ti.static(self.collapses > 0):
             f, g = self.measure(c, self.corners(c, 0))
             if g.norm_sqr() == 0 and self.dev.strength.holds(c):
                 left = ti.abs(self.bounded(f - self.dev.rest[c]))
-        return left / self.extent(c)
+        return left / self.residual_scale(c)
 
     @ti.func
     def energy(self, c, back, hh, miss):
@@ -620,16 +620,16 @@ class Scalar(Batch):
         if ti.static(self.dev.spring.soft):
             alpha = self.dev.spring.alpha[c]
             if alpha > 0 and self.dev.strength.holds(c):
-                C = self.bounded(self.near(self.value(c, back), self.dev.rest[c]) - self.dev.rest[c])
+                C = self.bounded(self.unwrap(self.value(c, back), self.dev.rest[c]) - self.dev.rest[c])
                 out = ti.cast(C, ti.f64) * C / (2 * alpha)
-                if ti.static(not self.dev.sprung):
+                if ti.static(not self.dev.forces):
                     if hh > 0 and miss > 0:
                         borne = ti.abs(self.dev.lam[c]) * alpha / hh
-                        out *= borne / (borne + miss * self.extent(c))
+                        out *= borne / (borne + miss * self.residual_scale(c))
         return out
 
     @ti.func
-    def extent(self, c):
+    def residual_scale(self, c):
         """What the residual of constraint c is relative to."""
         size = ti.cast(self.dev.scale, self.dev.real)
         if ti.static(not self.unit):

@@ -261,7 +261,7 @@ def solvers_of(world: World) -> list[Any]:
     own = world._solver
     if world.order > 2:
         return [own]
-    scalars = [f for f in world.features if isinstance(f, Scalar) and f.joins and f.count]
+    scalars = [f for f in world.features if isinstance(f, Scalar) and f.solvable_together and f.count]
     other = Direct() if isinstance(own, Jacobi) else Jacobi()
     return [own, other] if scalars and type(other) is not type(own) else [own]
 
