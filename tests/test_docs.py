@@ -1,12 +1,16 @@
-"""The pages that people read: their code runs, their links lead somewhere, and the first of them is short."""
+"""The pages that people read: their code runs, their links lead somewhere, and the first of them is short. And docstrings."""
 
+import ast
 import importlib.util
+import inspect
 import pathlib
 import re
 
 import pytest
 
+import tiverlet as tv
 from tiverlet.device.patches import source_cache
+from tiverlet.features.arguments import knobs_of
 
 ROOT = pathlib.Path(__file__).parent.parent
 PAGES = [p.relative_to(ROOT) for p in (ROOT / "README.md", *ROOT.glob("demos/*.md"), *ROOT.glob("tiverlet/**/*.md"))]
@@ -62,3 +66,29 @@ def test_the_first_page_is_short_and_leads_to_all_others():
     text = (ROOT / "README.md").read_text()
     assert len(text.encode()) <= 8192
     assert all(str(page) in text for page in PAGES[1:])
+
+
+def undocumented(body: list[ast.stmt], within: str) -> list[str]:
+    """Public names in a body without a docstring; not what a setter is for, which its property says."""
+    out = []
+    for node in body:
+        if not isinstance(node, ast.FunctionDef | ast.ClassDef) or node.name.startswith("_"):
+            continue
+        if any(isinstance(d, ast.Attribute) and d.attr == "setter" for d in node.decorator_list):
+            continue
+        out += [] if ast.get_docstring(node) else [f"{within}{node.name}"]
+        out += undocumented(node.body, f"{within}{node.name}.") if isinstance(node, ast.ClassDef) else []
+    return out
+
+
+def test_every_public_name_says_what_it_is():
+    # Modules, classes, functions, methods and properties of the package; and live settings, which say it when they are made.
+    missing = []
+    for path in ROOT.glob("tiverlet/**/*.py"):
+        tree = ast.parse(path.read_text())
+        name = str(path.relative_to(ROOT))
+        missing += [] if ast.get_docstring(tree) else [name]
+        missing += undocumented(tree.body, f"{name}: ")
+    kinds = [kind for kind in vars(tv).values() if inspect.isclass(kind)]
+    missing += [f"{kind.__name__}.{knob}" for kind in kinds for knob in knobs_of(kind) if not getattr(kind, knob).__doc__]
+    assert not missing
