@@ -132,7 +132,7 @@ def test_what_is_stripped_runs_and_has_the_same_fields(report):
 def test_a_copy_lacks_what_is_not_needed(tmp_path):
     bare = pathlib.Path(stripped.copy(str(tmp_path), frozenset({"gravity", "distance"}))) / "tiverlet"
     there = {f.stem for part in stripped.FOLDERS for f in (bare / part).glob("*.py")} - {"__init__"}
-    assert {"gravity", "distance", "contact"} <= there and not there & {"drag", "wind", "sdf", "mesh", "shape_match", "bend"}
+    assert {"gravity", "distance"} <= there and not there & {"contact", "drag", "wind", "sdf", "mesh", "shape_match", "bend"}
 
 
 def test_quality_of_peers():

@@ -1,13 +1,17 @@
 """Discs and spheres: which of them touch, how deep and in which direction."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..device import ti
 from ..device.memory import Memory
 from ..features.feature import Scene
 from ..neighbours.neighbour_list import PairData
-from ..neighbours.neighbour_search import NeighbourSearch
 from ..neighbours.queries import Contacts
+
+if TYPE_CHECKING:
+    from ..neighbours.neighbour_search import NeighbourSearch
 
 SAME_PLACE = 2.0**-80  # two particles are in the same place: their distance over that at which they touch, squared
 
@@ -19,7 +23,7 @@ class DiscGeometry:
     grid: has the pairs listed. impulse: what the pairs of the list got in the last substep [kg m].
     """
 
-    def __init__(self, scene: Scene, grid: NeighbourSearch, push_out: float = 0.0, impulse: PairData | None = None):
+    def __init__(self, scene: Scene, grid: "NeighbourSearch", push_out: float = 0.0, impulse: PairData | None = None):
         self.scene, self.grid, self.push_out, self.impulse = scene, grid, push_out, impulse
         self.state, self.radius, self.real = scene.state, scene.radius, scene.real
         self.shrinks, self.store = False, None

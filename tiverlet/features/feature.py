@@ -24,16 +24,18 @@ that begins with an underscore: from outside only Knobs can be set.
 import functools
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..device import at, inline, ti
 from ..device.memory import Memory
-from ..particles import Particles, State
 from .arguments import Knob as Knob
 from .arguments import RecordsArguments, knobs_of
 from .read_only import handed_out
+
+if TYPE_CHECKING:
+    from ..particles import Particles, State
 
 BENT, FAR = 1, 2  # how far a constraint turned in a substep: by more than 26 degrees, by more than 41
 
@@ -43,8 +45,8 @@ class Scene:
     """What a feature is bound to: the memory to declare fields in, and the particles they act on."""
 
     memory: Memory
-    state: State
-    particles: Particles
+    state: "State"
+    particles: "Particles"
     inv_mass: np.ndarray  # (n,) after pins: 0 means that constraints cannot move it
     radius: Any = None  # where something asks for radii
     slots: Any = None  # where constraints leave their moves
@@ -74,13 +76,13 @@ class Feature(RecordsArguments):
         """What it has on the device while it is bound: fields, and constants of the kernels."""
         return SimpleNamespace()
 
-    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+    def prepare(self, particles: "Particles", inv_mass: np.ndarray) -> None:
         """Check the arguments against the particles; set inv_mass to 0 for those that this feature holds."""
 
-    def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
+    def review(self, particles: "Particles", inv_mass: np.ndarray) -> None:
         """Warn of what makes no sense; called when all features have said which particles can move."""
 
-    def check_added(self, particles: Particles, first: int) -> None:
+    def check_added(self, particles: "Particles", first: int) -> None:
         """Check particles that come later, from number `first` on."""
 
     def bind(self, scene: Scene) -> None:
@@ -258,7 +260,7 @@ class Batch(Feature):
         """Keep the particles of these constraints, by their new numbers."""
         self._keep(members=self.members.remapped(some, number))
 
-    def excluded_pairs(self, particles: Particles) -> np.ndarray:
+    def excluded_pairs(self, particles: "Particles") -> np.ndarray:
         """Pairs of particles that may overlap, (k, 2), because this batch says where they are to each other."""
         return self.members.pairs()
 

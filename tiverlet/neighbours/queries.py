@@ -1,11 +1,14 @@
 """Questions about where particles are: near points, nearest to points, touching each other."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..device import ti
-from .neighbour_search import NeighbourSearch
+
+if TYPE_CHECKING:
+    from .neighbour_search import NeighbourSearch
 
 
 @dataclass(frozen=True)
@@ -36,7 +39,7 @@ class Contacts:
 class PointSearch:
     """Particles within a distance of points, by the cells of the contact grid, which has to be sorted."""
 
-    def __init__(self, grid: NeighbourSearch):
+    def __init__(self, grid: "NeighbourSearch"):
         self.cells, self.state, self.dim, self.levels = grid.cells, grid.state, grid.dim, grid.cells.levels
         self.real = grid.real
 

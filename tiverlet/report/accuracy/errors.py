@@ -3,6 +3,7 @@
 import json
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
@@ -10,7 +11,9 @@ from rich.table import Table
 
 from .. import output
 from .cases import CASES, Case
-from .points import Point
+
+if TYPE_CHECKING:
+    from .points import Point
 
 RESOLVED = 0.02  # of the size of the motion: below it an error says something about the order
 FLOOR = 10.0  # times what the answer is trusted to: above it too
@@ -61,17 +64,17 @@ class ErrorReport:
 
     every_column = False
 
-    def __init__(self, cases: list[str], points: list[Point], missing: list[Missing], omissions: list[str], machine: str):
+    def __init__(self, cases: list[str], points: "list[Point]", missing: list[Missing], omissions: list[str], machine: str):
         self.cases, self.points, self.missing, self.machine = cases, points, missing, machine
         lost = [f"{p.case}, {p.method}, {p.precision}, {p.substeps} substeps: diverged" for p in points if p.diverged]
         self.omissions = omissions + lost
 
-    def curve(self, case: str, method: str, precision: str = "f64") -> list[Point]:
+    def curve(self, case: str, method: str, precision: str = "f64") -> "list[Point]":
         """The points of one curve, by substeps."""
         found = [p for p in self.points if (p.case, p.method, p.precision) == (case, method, precision)]
         return sorted(found, key=lambda p: p.substeps)
 
-    def curves(self, case: str) -> list[list[Point]]:
+    def curves(self, case: str) -> "list[list[Point]]":
         """All curves of a case."""
         keys = dict.fromkeys((p.method, p.precision) for p in self.points if p.case == case)
         return [self.curve(case, *key) for key in keys]
@@ -114,7 +117,7 @@ class ErrorReport:
             tuple(self.faults(case, method, best)),
         )  # fmt: skip
 
-    def faults(self, case: Case, method: str, best: Point) -> list[str]:
+    def faults(self, case: Case, method: str, best: "Point") -> list[str]:
         """What is wrong with a case, in words."""
         out = []
         if best.diverged:
@@ -238,7 +241,7 @@ COLUMNS = (
 )
 
 
-def fitted(case: Case, points: list[Point]) -> float | None:
+def fitted(case: Case, points: "list[Point]") -> float | None:
     """The order by least squares over the points that show one: those whose error is below that of a bad guess, and above what
     the answer is trusted to."""
     some = [
@@ -250,7 +253,7 @@ def fitted(case: Case, points: list[Point]) -> float | None:
     return -float(np.polyfit(np.log([p.substeps for p in some]), np.log([p.error for p in some]), 1)[0])
 
 
-def front(points: list[Point], cost: str) -> np.ndarray:
+def front(points: "list[Point]", cost: str) -> np.ndarray:
     """The logarithms of a cost, and of the best error within it, (k, 2)."""
     good = [p for p in points if np.isfinite(p.error) and p.error > 0 and getattr(p, cost) > 0]
     if len(good) < 3:
@@ -271,7 +274,7 @@ def cells(s: Summary) -> tuple[str, ...]:
     )  # fmt: skip
 
 
-def entry(p: Point) -> tuple[str, ...]:
+def entry(p: "Point") -> tuple[str, ...]:
     """A line of all points."""
     error = "diverged" if p.diverged else f"{p.error:.2e}"
     return (

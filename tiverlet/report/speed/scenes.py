@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 
-import tiverlet as tv
-
 
 @dataclass(frozen=True)
 class SpeedScene:
@@ -39,6 +37,8 @@ def scattered(k: np.ndarray) -> np.ndarray:
 
 def pile(n: int, dim: int = 2):
     """Discs or spheres that fall from a loose lattice into a box 1.3 times as wide and twice as high, as in pile.c."""
+    import tiverlet as tv
+
     side = ceil(round(n ** (1 / dim), 9))
     i = np.arange(n)
     at = [i % side, i // side] if dim == 2 else [i % side, i // side**2, i // side % side]
@@ -50,6 +50,8 @@ def pile(n: int, dim: int = 2):
 
 def cloth(n: int):
     """A square awning, inextensible along its threads and soft across them, held at every 16th particle of every 16th thread."""
+    import tiverlet as tv
+
     side = max(3, round(n**0.5))
     wide = 0.03 * (side - 1)
     sheet = tv.shapes.cloth((0, 0, 0), (wide, 0, 0), (0, 0, wide), (side, side))
@@ -60,6 +62,8 @@ def cloth(n: int):
 
 def ropes(n: int):
     """Ropes of 1 m and 41 particles, a hundred of them at n = 4100, that swing from one end."""
+    import tiverlet as tv
+
     count, points = max(1, n // LINE), min(n, LINE)
     one = tv.shapes.rope((0, 0), (1, 0), points=points)
     k = np.arange(count)
@@ -71,12 +75,16 @@ def ropes(n: int):
 
 def rope(n: int):
     """One rope of 1 m that swings from one end."""
+    import tiverlet as tv
+
     one = tv.shapes.rope((0, 0), (1, 0), points=n)
     return tv.Particles(one.position, mass=0.01, pinned=[0]), [tv.Gravity(9.81), tv.Distance(one.links)]
 
 
 def mixed(n: int):
     """Discs, ropes of 20 and soft balls of 61 fall on each other in a box, with friction."""
+    import tiverlet as tv
+
     ball = tv.shapes.ball((5.5, 5.5), 4.6, rings=4)
     balls, ropes = max(1, n // 4 // len(ball)), max(1, n // 80)
     discs = max(1, n - balls * len(ball) - 20 * ropes)

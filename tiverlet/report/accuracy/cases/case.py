@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,7 +14,9 @@ from ....measure import angular_momentum
 from ....particles import Particles
 from ....solvers import Chebyshev, ConjugateGradient, Direct, Jacobi
 from ....step_report import StepReport
-from ....world import World
+
+if TYPE_CHECKING:
+    from ....world import World
 
 FRAME = 1 / 60
 EFFORTS = (5, 10, 20, 40, 80, 160, 320, 640)  # substeps of a frame
@@ -49,7 +52,7 @@ def entries() -> list[str]:
 class Run:
     """What a run leaves for its error measure."""
 
-    world: World
+    world: "World"
     times: list[float] = field(default_factory=list)  # of the ends of frames [s]
     seen: list[np.ndarray] = field(default_factory=list)  # what the case watches, after each frame
     reports: list[StepReport] = field(default_factory=list)
@@ -80,7 +83,7 @@ class Case:
     size: float = 1.0
     unit: str = "m"
     frame: float = FRAME
-    watch: Callable[[World], np.ndarray] | None = None
+    watch: "Callable[[World], np.ndarray] | None" = None
     methods: tuple[str, ...] = ("Jacobi",)
     efforts: tuple[int, ...] = EFFORTS
     fit: tuple[int, ...] = ()
@@ -88,7 +91,7 @@ class Case:
     order: float | None = 2.0
     trusted: float = 1e-12
     single: float = 3e-4
-    momentum: Callable[[World], tuple[np.ndarray, float]] | None = None
+    momentum: "Callable[[World], tuple[np.ndarray, float]] | None" = None
     conserves: bool = True
 
     @property
@@ -108,20 +111,20 @@ def ends_at(index, reference) -> Callable[[Run], float]:
     return lambda run: rms(run.world.position[index][..., : want.shape[-1]], want)
 
 
-def spin(world: World) -> tuple[np.ndarray, float]:
+def spin(world: "World") -> tuple[np.ndarray, float]:
     """Angular momentum about the origin, and sum m |x| |v|."""
     m = np.where(world.particles.inv_mass > 0, world.particles.mass, 0.0)
     size = m @ (np.linalg.norm(world.position, axis=1) * np.linalg.norm(world.velocity, axis=1))
     return angular_momentum(world), float(size)
 
 
-def upright(world: World) -> tuple[np.ndarray, float]:
+def upright(world: "World") -> tuple[np.ndarray, float]:
     """Angular momentum about the vertical through the origin, which gravity does not change."""
     p, size = spin(world)
     return p[1:2], size
 
 
-def sideways(world: World) -> tuple[np.ndarray, float]:
+def sideways(world: "World") -> tuple[np.ndarray, float]:
     """Horizontal momentum, which gravity does not change, and sum m |v|."""
     m = world.particles.mass
     return m @ np.delete(world.velocity, 1, axis=1), float(m @ np.linalg.norm(world.velocity, axis=1))
