@@ -7,7 +7,7 @@ one.
 
 import numpy as np
 
-WIDEST = 1200  # rows of a level
+WIDEST = 60  # rows of a level: LAPACK takes one thread for them, and with more its bits depend on how many there are
 MOST = 20_000_000  # numbers in all blocks
 STEPS = 200  # of conjugate gradients, at most
 ENOUGH = 1e-4  # of r . z at their start: what they leave
