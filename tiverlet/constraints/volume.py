@@ -46,6 +46,13 @@ class Volume(Enclosed):
             return Surfaces(*_oriented(checks.indices("Volume", "cells", indices, checks.ANY, arity=3)))
         return Tetrahedra(FixedSize("Volume", checks.indices("Volume", "cells", indices, checks.ANY, arity=4)))
 
+    @property
+    def faces(self) -> np.ndarray:
+        """Faces of closed surfaces, (k, 3), as seen from outside. Raises AttributeError where there are tetrahedra."""
+        if self.arity:
+            raise AttributeError(f"{self!r} has tetrahedra and no faces; their particles are in .indices.")
+        return self.listing
+
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Turn the corners so that volumes are positive at the start."""
         if particles.dim != 3:
