@@ -135,7 +135,7 @@ def test_too_few_substeps_are_bounded_and_said(world, iterations):
     # Rows 2, 12 and 18: heavy ends and the whip, from one substep per frame, where SHAKE diverges. In one pass no chain ever has
     # more energy than it started with and m g L, what gravity can supply in a swing; and a tenth of it from 4 substeps on (worst
     # of ten starts that differ by 1e-9: 0.083). Three passes meet the links more closely, so that the whip of the folded chain
-    # turns by more in a substep: what it gains depends on bits, up to 2.1 m g L in ten such starts. It is flagged; no law bounds it.
+    # turns by more in a substep: what it gains depends on bits, up to 2.1 m g L in ten such starts. It is flagged.
     scene = Scene()
     w = world(scene.particles, [tv.Gravity(9.81), tv.Distance(scene.pairs)], precision="f64", solver=tv.Direct())
     mass, name = scene.particles.mass, list(scene.begin)
