@@ -14,7 +14,7 @@ from .chains import beyond
 from .conftest import ARCH, CASES, case, figures, pendulums, rerun, rms
 
 DOORS = (10, 13, 19, 20, 28, 38, 59, 60, 63, 65, 66)
-MOTION = (2, 4, 6, 7, 11, 15, 17, 18, 22, 29, 37, 45, 48, 50, 51, 52, 55, 61, 62, 67)
+MOTION = (2, 4, 6, 7, 11, 15, 17, 18, 22, 29, 37, 45, 48, 50, 51, 52, 55, 61, 62, 67, 82)
 
 
 @pytest.mark.parametrize("number", DOORS + MOTION)

@@ -30,28 +30,32 @@ LEAST = 1e-2  # part of a step: where even less does not help, nothing does
 BETTER = 0.99  # of its square: a violation that falls by less in a step contradicts others
 
 
-def remove(scene: Scene, batches: list[Batch], placed: int) -> None:
+def remove(scene: Scene, batches: list[Batch], placed: int) -> np.ndarray | None:
     """Move bodies to where their rigid constraints are met, or as near to it as they get; those that are there stay.
 
-    placed: the first of the particles that were placed anew; bodies without any stay as they are.
+    placed: the first of the particles that were placed anew; bodies without any stay as they are. Returns how far each particle
+    went [m], (n,); None where nothing moved.
     """
     w, state, memory = scene.inv_mass, scene.state, scene.memory
     rigid = [b for b in batches if isinstance(b, Scalar) and b.count and (b.compliance == 0).any() and not b.broken.any()]
     if not rigid:
-        return
+        return None
     x = state.get(memory)
     if not np.isfinite(x).all() or not any(_off(b, x) for b in rigid):
-        return
+        return None
     body, bodies = _bodies(rigid, w)
     going = np.bincount(body[placed:], minlength=bodies) > 0
     rows = Rows(rigid, x, w)
     going &= _violation(rows, body, bodies)[0] > ENOUGH
     if going.any():
-        state.put(memory, met(rows, body, going))
+        new = met(rows, body, going)
+        state.put(memory, new)
         for b in rigid:
             lam = memory.read(b.dev.lam)[: b.count]
             here = np.logical_or.reduceat(going[body[b.indices.ravel()]], np.searchsorted(b.owner, np.arange(b.count)))
             memory.write(b.dev.lam, np.where(here, 0.0, lam))  # they bear nothing there yet
+        return np.linalg.norm(new - x, axis=1)
+    return None
 
 
 def _off(batch: Scalar, x: np.ndarray) -> bool:

@@ -70,8 +70,11 @@ class Runner:
                     clock.longest = h
             if clock.d_is_velocity:
                 clock.since = 0
+            moved = None
             if clock.first_moved is not None and self.scene.slots:
-                initial_violation.remove(self.scene, self.batches, clock.first_moved)
+                moved = initial_violation.remove(self.scene, self.batches, clock.first_moved)
+                if moved is not None and self.grid:
+                    self.grid.invalidate()
                 if self.scene.slots.system:
                     self.scene.slots.system.forget()
             self.set_substep(h, drag)
@@ -81,6 +84,9 @@ class Runner:
                 clock.energy = report.energy
                 if report.overlap > 0 and clock.first_moved is not None:
                     self.ease(clock.first_moved)
+            if moved is not None and (moved > self.scene.particles.radius).any():
+                for contact in self.step.contacts:  # for the report of the frame: others may have been passed
+                    self.memory.write(contact.dev.fast, 1)
             clock.first_moved = None
 
     def advance(self, dt: float, substeps: int, iterations: int) -> StepReport:
