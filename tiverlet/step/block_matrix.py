@@ -5,6 +5,8 @@ level before; neighbours are in the same level or in adjacent ones. A sheet of n
 one.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
 WIDEST = 60  # rows of a level: LAPACK takes one thread for them, and with more its bits depend on how many there are
@@ -66,25 +68,39 @@ class BlockMatrix:
         """Conjugate gradients, with the blocks of particles for a preconditioner."""
         own = self.a == self.b
         inverse = np.linalg.inv(self._summed(blocks[own], self.a[own]))
-        out, r = np.zeros_like(right), right
-        p = z = np.einsum("iab,ib->ia", inverse, r)
-        now = float((r * z).sum())
-        least = ENOUGH * now
-        for _ in range(STEPS):
-            if now <= least:
-                break
-            q = self._summed(np.einsum("kab,kb->ka", blocks, p[self.b]), self.a)
-            far = now / float((p * q).sum())
-            out, r = out + far * p, r - far * q
-            z = np.einsum("iab,ib->ia", inverse, r)
-            now, last = float((r * z).sum()), now
-            p = z + now / last * p
-        return out
+        return conjugate_gradients(
+            lambda p: self._summed(np.einsum("kab,kb->ka", blocks, p[self.b]), self.a),
+            lambda r: np.einsum("iab,ib->ia", inverse, r),
+            right,
+            ENOUGH,
+        )
 
     def _summed(self, values: np.ndarray, who: np.ndarray) -> np.ndarray:
         """The sums of values over the particles that they belong to."""
         sums = [np.bincount(who, column, minlength=self.count) for column in values.reshape(len(values), -1).T]
         return np.stack(sums, axis=1).reshape(self.count, *values.shape[1:])
+
+
+def conjugate_gradients(
+    apply: Callable[[np.ndarray], np.ndarray], precondition: Callable[[np.ndarray], np.ndarray], right: np.ndarray, enough: float
+) -> np.ndarray:
+    """x with A x = right, preconditioned (Hestenes and Stiefel 1952). enough: of r . z at the start, what may be left.
+
+    Sums are NumPy's: bits of BLAS depend on how many threads it has.
+    """
+    x, r = np.zeros_like(right), right
+    p = z = precondition(r)
+    now = first = float((r * z).sum())
+    for _ in range(STEPS):
+        if now <= enough * first:
+            break
+        q = apply(p)
+        step = now / float((p * q).sum())
+        x, r = x + step * p, r - step * q
+        z = precondition(r)
+        now, last = float((r * z).sum()), now
+        p = z + now / last * p
+    return x
 
 
 def ordered(count: int, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, int]:

@@ -13,18 +13,14 @@ or into one of the pins. Where constraints contradict each other, the violation 
 links that do stay where they are, for their passes find the compromise between them.
 """
 
-import functools
-
 import numpy as np
 
 from ..constraints.core.scalar import Scalar
 from ..features.feature import Batch, Scene
-from ..solvers.elimination import components
+from .jacobian import Jacobian, bodies_of
 
 ENOUGH = 0.2  # of its size: a violation from where on it is taken out before the first substep
 DONE = 1e-6  # of its size: a violation that is none
-SOFT = 1e-6  # of the diagonal: what has hardly a direction to move in stays
-STEPS = 200  # of conjugate gradients, at most
 NEWTON = 60  # steps at most
 LEAST = 1e-2  # part of a step: where even less does not help, nothing does
 BETTER = 0.99  # of its square: a violation that falls by less in a step contradicts others
@@ -99,11 +95,7 @@ def _bodies(batches: list[Scalar], w: np.ndarray) -> tuple[np.ndarray, int]:
     ends = np.cumsum([0] + [b.count for b in batches])
     owner = np.concatenate([b.owner + end for b, end in zip(batches, ends[:-1], strict=True)])
     who = np.concatenate([b.indices.ravel() for b in batches])
-    free = w[who] > 0
-    label = components(int(ends[-1]), owner[free], who[free])
-    body = np.full(len(w), ends[-1])
-    body[who[free]] = label[owner[free]]
-    return body, int(ends[-1]) + 1
+    return bodies_of(int(ends[-1]), owner, who, w)[1], int(ends[-1]) + 1
 
 
 def _violation(rows: "Rows", body: np.ndarray, bodies: int) -> tuple[np.ndarray, np.ndarray]:
@@ -149,13 +141,13 @@ def _of(rows: "Rows", body: np.ndarray, bodies: int) -> np.ndarray:
 
 
 class Rows:
-    """The rigid constraints that act at positions x: their violations C, and their gradients J by corners, worked out when asked.
+    """The rigid constraints that act at positions x, and their violations C.
 
     Corner k belongs to row[k] and is particle who[k]. sizes: of each batch, what makes violations shares of its constraints.
     """
 
     def __init__(self, batches: list[Scalar], x: np.ndarray, w: np.ndarray, sizes: list[np.ndarray] | None = None):
-        self.x, self.w, (self.n, self.dim), self.batches = x, w, x.shape, batches
+        self.x, self.w, self.dim, self.batches = x, w, x.shape[1], batches
         self.sizes = [b.inverse_size(b.start.position) for b in batches] if sizes is None else sizes
         found = [b.violation(x) for b in batches]
         active = [
@@ -173,12 +165,6 @@ class Rows:
         """Those that act at other positions."""
         return Rows(self.batches, x, self.w, self.sizes)
 
-    @functools.cached_property
-    def J(self) -> np.ndarray:
-        """(corners, dim)."""
-        gradients = [b.gradients(self.x).reshape(-1, self.dim) for b in self.batches]
-        return np.concatenate([g[some] for g, some in zip(gradients, self.corners, strict=True)])
-
     @property
     def legs(self) -> np.ndarray:
         """The corners of angles from which a leg leads to the next."""
@@ -187,30 +173,8 @@ class Rows:
         ])  # fmt: skip
         return np.flatnonzero(angle[:-1] & (self.row[:-1] == self.row[1:]))
 
-    def _rates(self, v: np.ndarray) -> np.ndarray:
-        """J v."""
-        return np.bincount(self.row, (self.J * v[self.who]).sum(axis=1), minlength=len(self.C))
-
-    def _moves(self, lam: np.ndarray) -> np.ndarray:
-        """w J^T lam."""
-        pull = self.J * lam[self.row][:, None]
-        return np.stack([self.w * np.bincount(self.who, pull[:, a], minlength=self.n) for a in range(self.dim)], axis=1)
-
     def newton(self) -> np.ndarray:
-        """w J^T lam with (J w J^T + mu) lam = -C, by conjugate gradients with the diagonal for a preconditioner."""
-        diagonal = np.bincount(self.row, self.w[self.who] * (self.J**2).sum(axis=1), minlength=len(self.C))
-        mu = SOFT * diagonal
-        scale = np.divide(1, diagonal + mu, out=np.zeros_like(mu), where=diagonal > 0)
-        lam, r = np.zeros_like(self.C), -self.C
-        p = scale * r
-        now = first = float(r @ p)
-        for _ in range(STEPS):
-            if now <= 1e-12 * first:
-                break
-            q = self._rates(self._moves(p)) + mu * p
-            step = now / float(p @ q)
-            lam, r = lam + step * p, r - step * q
-            z = scale * r
-            now, last = float(r @ z), now
-            p = z + now / last * p
-        return self._moves(lam)
+        """The least moves that take C to 0, as far as it is linear."""
+        gradients = [b.gradients(self.x).reshape(-1, self.dim) for b in self.batches]
+        J = np.concatenate([g[some] for g, some in zip(gradients, self.corners, strict=True)])
+        return Jacobian(len(self.C), self.row, self.who, self.w, J).solve(-self.C)

@@ -21,9 +21,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..constraints.core.scalar import Scalar
-from ..solvers.elimination import components
 from .block_matrix import BlockMatrix
 from .integrator import FREE
+from .jacobian import Jacobian, bodies_of
 
 if TYPE_CHECKING:
     from .runner import Runner
@@ -35,8 +35,6 @@ NEWTON = 40  # steps, at most
 BEGIN, HARDEST, LEAST = 1e-3, 10.0, 1e-9  # mu of the first, and of the last try; the least
 LEFT = 0.01  # of what violations store: what may be left of it in the shorter substep
 DONE = 1e-6  # of its size: a violation that is none
-STEPS = 200  # of conjugate gradients in each, at most
-SOFT = 1e-6  # of the diagonal: what has hardly a direction to move in stays
 
 
 def project(runner: "Runner", h: float, longest: float) -> bool:
@@ -62,7 +60,7 @@ def project(runner: "Runner", h: float, longest: float) -> bool:
     converges = slots.converges or slots.exact  # what they leave is moved at once in the next substep, and flies on
     for _ in range(NEWTON):
         move = rows.step(mu)
-        work = float((_over(np.ones_like(w), w) @ (move**2)).sum())
+        work = float((_over(np.ones_like(w), w)[:, None] * move**2).sum())
         far = work if far is None else far
         new = rows.at(x + move)
         better = new.stored < rows.stored
@@ -76,7 +74,7 @@ def project(runner: "Runner", h: float, longest: float) -> bool:
     v = kept.astype(np.float64)
     n = len(x)
     still = (undone != 0) & (start.theta > FIRM)
-    v[:n] += rows.solve(-rows.rates(v[:n]) * still, still, SOFT)
+    v[:n] += rows.jacobian.solve(-rows.jacobian.rates(v[:n]) * still, still)
     energy, overlap = _seen(runner)
     known = runner.clock.energy
     if known is not None:  # by the loads of the last substep: what springs of its violations would hold is not there
@@ -137,10 +135,9 @@ class Rows:
 
     def _measure(self, x: np.ndarray) -> None:
         self.x, self.C = x, self._bounded(self._each([b.violation(x) for b in self.batches]) - self.goal)
-        self.J = np.concatenate(
-            [b.gradients(x)[some].reshape(-1, self.dim) for b, some in zip(self.batches, self.some, strict=True)]
-        )
-        self.diagonal = np.bincount(self.row, self.w[self.who] * (self.J**2).sum(axis=1), minlength=self.m)
+        J = [b.gradients(x)[some].reshape(-1, self.dim) for b, some in zip(self.batches, self.some, strict=True)]
+        self.jacobian = Jacobian(self.m, self.row, self.who, self.w, np.concatenate(J))
+        self.J, self.diagonal = self.jacobian.J, self.jacobian.diagonal
         self.worst = float(np.abs(self.C * self.close).max(initial=0.0))
         self.stored = float(_over(self.weight * self.C * self.C, self.diagonal).sum())
 
@@ -202,19 +199,6 @@ class Rows:
         """theta, by what a force of 1 N moves in a substep."""
         return _over(reach * reach, reach * reach + alpha * alpha)
 
-    def rates(self, v: np.ndarray) -> np.ndarray:
-        """J v."""
-        return np.bincount(self.row, (self.J * v[self.who]).sum(axis=1), minlength=self.m)
-
-    def moves(self, lam: np.ndarray) -> np.ndarray:
-        """w J^T lam."""
-        return self.w[:, None] * self._gathered(self.J * lam[self.row][:, None], self.who)
-
-    def _gathered(self, values: np.ndarray, who: np.ndarray) -> np.ndarray:
-        """The sums of values over the particles that they belong to."""
-        sums = [np.bincount(who, column, minlength=self.n) for column in values.reshape(len(values), -1).T]
-        return np.stack(sums, axis=1).reshape(self.n, *values.shape[1:])
-
     def step(self, mu: float) -> np.ndarray:
         """Moves p that minimize sum (C + J p)^2 / (2 D) + mu p^T M p / 2 + p^T K p / 2, with D the diagonal of J w J^T.
 
@@ -230,32 +214,11 @@ class Rows:
         sides = taut[:, None, None] * (one - across[:, :, None] * across[:, None, :])
         mass = mu / self.w[self.inside][:, None, None] * one
         along = (stiff[self.row[a], None] * self.J[a])[:, :, None] * self.J[b][:, None, :]
-        right = self._gathered(self.J * (stiff * self.C)[self.row, None], self.who)
+        right = self.jacobian.gathered(self.J * (stiff * self.C)[self.row, None])
         blocks = np.concatenate((along, sides, sides, -sides, -sides, mass))[self.free]
         out = np.zeros_like(right)
         out[self.inside] = self.matrix.solve(blocks, -right[self.inside])
         return out
-
-    def solve(self, right: np.ndarray, some: np.ndarray, soft: float) -> np.ndarray:
-        """w J^T lam with (J w J^T + mu) lam = right, for some rows: conjugate gradients.
-
-        mu: `soft` of the diagonal.
-        """
-        mu = soft * self.diagonal
-        scale = np.divide(1, self.diagonal + mu, out=np.zeros_like(mu), where=self.diagonal > 0)
-        lam, r = np.zeros_like(right), right
-        p = scale * r
-        now = first = float(r @ p)
-        for _ in range(STEPS):
-            if now <= 1e-12 * first:
-                break
-            q = some * self.rates(self.moves(p)) + mu * p
-            step = now / float(p @ q)
-            lam, r = lam + step * p, r - step * q
-            z = scale * r
-            now, last = float(r @ z), now
-            p = z + now / last * p
-        return self.moves(lam)
 
     def paid(self, v: np.ndarray, moves: np.ndarray, energy: float) -> np.ndarray:
         """Velocities without the energy [J] that moves added: of their part along them first, then of what is anchored.
@@ -263,10 +226,7 @@ class Rows:
         Each body pays by the mass that it has lifted, up to all it has.
         """
         m = np.divide(1, self.w, out=np.zeros_like(self.w), where=self.w > 0)
-        free = self.w[self.who] > 0
-        label, rows = components(self.m, self.row[free], self.who[free]), self.m
-        body = np.full(self.n, rows)  # the last one: what no row holds
-        body[self.who[free]] = label[self.row[free]]
+        rows, (label, body) = self.m, bodies_of(self.m, self.row, self.who, self.w)
 
         def summed(values: np.ndarray) -> np.ndarray:
             return np.bincount(body, m * values, minlength=rows + 1)
@@ -276,7 +236,7 @@ class Rows:
         part = _over(along, size)
         due, left = _settled(due, part * along / 2)
         v = v - ((1 - left) * part)[body][:, None] * moves
-        held = np.bincount(label[self.row[~free]], minlength=rows + 1) > 0
+        held = np.bincount(label[self.row[self.w[self.who] == 0]], minlength=rows + 1) > 0
         _, left = _settled(np.where(held, due, 0.0), summed((v**2).sum(axis=1)) / 2)
         return v * left[body][:, None]
 

@@ -1,0 +1,48 @@
+"""Gradients of constraints by their corners: the least moves along them, in the metric of the masses, and the bodies they tie."""
+
+import numpy as np
+
+from ..solvers.elimination import components
+from .block_matrix import conjugate_gradients
+
+SOFT = 1e-6  # of the diagonal: what has hardly a direction to move in stays
+DONE = 1e-12  # of r . z at the start of conjugate gradients: what is left
+
+
+class Jacobian:
+    """J of m constraints between n particles.
+
+    Corner k belongs to row[k] and is particle who[k], with the gradient J[k], (corners, dim). w: inverse masses, (n,).
+    """
+
+    def __init__(self, m: int, row: np.ndarray, who: np.ndarray, w: np.ndarray, J: np.ndarray):
+        self.m, self.row, self.who, self.w, self.J = m, row, who, w, J
+        self.diagonal = np.bincount(row, w[who] * (J**2).sum(axis=1), minlength=m)  # of J w J^T
+
+    def rates(self, v: np.ndarray) -> np.ndarray:
+        """J v."""
+        return np.bincount(self.row, (self.J * v[self.who]).sum(axis=1), minlength=self.m)
+
+    def gathered(self, values: np.ndarray) -> np.ndarray:
+        """The sums of values of corners over the particles that they belong to, (n, dim)."""
+        return np.stack([np.bincount(self.who, column, minlength=len(self.w)) for column in values.T], axis=1)
+
+    def moves(self, lam: np.ndarray) -> np.ndarray:
+        """w J^T lam."""
+        return self.w[:, None] * self.gathered(self.J * lam[self.row][:, None])
+
+    def solve(self, right: np.ndarray, some: np.ndarray | float = 1.0) -> np.ndarray:
+        """w J^T lam with (J w J^T + mu) lam = right, for some rows; conjugate gradients, preconditioned by the diagonal."""
+        mu = SOFT * self.diagonal
+        scale = np.divide(1, self.diagonal + mu, out=np.zeros_like(mu), where=self.diagonal > 0)
+        lam = conjugate_gradients(lambda p: some * self.rates(self.moves(p)) + mu * p, lambda r: scale * r, right, DONE)
+        return self.moves(lam)
+
+
+def bodies_of(m: int, row: np.ndarray, who: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which of m constraints and of the particles hang together by what can move: labels, (m,) and (n,); m: no row moves it."""
+    free = w[who] > 0
+    label = components(m, row[free], who[free])
+    body = np.full(len(w), m)
+    body[who[free]] = label[row[free]]
+    return label, body
