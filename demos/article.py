@@ -6,6 +6,7 @@ What to look for: nothing overlaps, nothing leaves the box, the chain keeps its 
 exponential smoothing, through all the others. Watch the recording with `rerun article.rrd`.
 """
 
+import functools
 import sys
 from dataclasses import dataclass
 
@@ -64,6 +65,13 @@ def build(discs: int = 360, **settings) -> Scene:
     return Scene(tv.World(particles, features, **{"substeps": 20, "iterations": 2, **settings}), hand, links[50:])
 
 
+def play() -> tv.World:
+    """For `tiverlet play article`: without the hand, since the mouse is one."""
+    scene = build()
+    scene.world.remove(features=[scene.hand])
+    return scene.world
+
+
 def _path(time: float) -> np.ndarray:
     """Where the hand is drawn to at a given time: a figure of eight through the heap."""
     return np.array([WIDTH / 2 + 2.9 * np.sin(0.8 * time), 2.4 + 1.3 * np.sin(1.6 * time)])
@@ -87,27 +95,26 @@ def check(scene: Scene, worst: tv.StepReport) -> None:
 def main(path: str = "article.rrd") -> None:
     """Simulate, record, and say how it went."""
     scene = build()
-    world, worst, first, times, stretch = scene.world, None, None, [], 0.0
+    world, reports, stretch = scene.world, [], 0.0
     rest = np.linalg.norm(np.diff(world.position[scene.chain], axis=1)[:, 0], axis=1)
     with tv.Recorder(path, world, overwrite=True) as recorder:
         for _ in track(range(round(SECONDS / DT)), description=f"{len(world.particles)} particles"):
             lead(scene)
-            report = world.step(DT)
+            reports.append(world.step(DT))
             recorder.log()
-            worst = report if worst is None else worst.worse(report)
-            first = report.energy - report.energy_change if first is None else first
-            times.append(report.seconds)
             stretch = max(stretch, float(np.abs(tv.measure.strain(world, scene.chain, rest)).max()))
+    first, last, worst = reports[0], reports[-1], functools.reduce(tv.StepReport.worse, reports)
+    gain = last.energy - (first.energy - first.energy_change)
     check(scene, worst)
     table = Table(title=f"{path}: {len(world.particles)} particles, {world.substeps} substeps x {world.iterations} iterations")
     table.add_column("figure")
     table.add_column("value", justify="right")
-    table.add_row("frames", str(len(times)))
-    table.add_row("time per frame, median (ms)", f"{1e3 * float(np.median(times)):.2f}")
+    table.add_row("frames", str(len(reports)))
+    table.add_row("time per frame, median (ms)", f"{1e3 * float(np.median([report.seconds for report in reports])):.2f}")
     table.add_row("worst overlap (radii of the smaller disc)", f"{worst.overlap:.3f}")
-    table.add_row("overlap at the end (radii)", f"{world.last.overlap:.4f}")
+    table.add_row("overlap at the end (radii)", f"{last.overlap:.4f}")
     table.add_row("worst stretch of the chain", f"{stretch:.2%}")
-    table.add_row("energy drift (J): lost in contacts and drag, added by the hand", f"{world.last.energy - first:.1f}")
+    table.add_row("energy drift (J): lost in contacts and drag, added by the hand", f"{gain:.1f}")
     table.add_row("flags", ", ".join(sorted(worst.flags)) or "none")
     Console().print(table)
     for note in worst.notes:

@@ -28,7 +28,7 @@ def build(points: int = 31) -> tuple[tv.World, tv.shapes.Shape]:
     return tv.World(tv.Particles(sheet.position, mass=0.3 / points**2, radius=0.012), features, substeps=20), sheet
 
 
-def main(path: str = "cloth.rrd", seconds: float = 3.0) -> None:
+def main(path: str = "cloth.rrd", *, seconds: float = 3.0) -> None:
     """Fall, record, and measure."""
     world, sheet = build()
     with tv.Recorder(path, world, every=2, overwrite=True) as recorder:
@@ -37,7 +37,7 @@ def main(path: str = "cloth.rrd", seconds: float = 3.0) -> None:
     stretch = tv.measure.strain(world, sheet.links, rest)
     depth = RADIUS + 0.012 - np.linalg.norm(world.position - CENTER, axis=1)
     print(f"{path}: threads stretched by {stretch.max():.1%} at most, {1e3 * max(0, depth.max()):.3f} mm deep in the ball,")
-    print(f"{1e3 * world.last.seconds:.1f} ms for the last frame, flags: {', '.join(sorted(report.flags)) or 'none'}")
+    print(f"{1e3 * (world.last or report).seconds:.1f} ms for the last frame, flags: {', '.join(sorted(report.flags)) or 'none'}")
     if stretch.max() > 0.05 or depth.max() > 1e-4 or world.position[:, 1].min() < 0.0:
         raise SystemExit("the cloth is torn or pierced")
 

@@ -43,7 +43,7 @@ def check(world: tv.World) -> None:
         raise SystemExit("the grains are stuck in the neck")
 
 
-def main(path: str = "hourglass.rrd", seconds: float = 6.0) -> None:
+def main(path: str = "hourglass.rrd", *, seconds: float = 6.0) -> None:
     """Run, record, and say how it went."""
     world = build()
     with tv.Recorder(path, world, every=2, overwrite=True) as recorder:
@@ -51,7 +51,7 @@ def main(path: str = "hourglass.rrd", seconds: float = 6.0) -> None:
     check(world)
     fallen = float((world.position[:, 1] < 0).mean())
     print(f"{path}: {len(world.particles)} grains, {fallen:.0%} through the neck, worst overlap {report.overlap:.2f} radii,")
-    print(f"{1e3 * world.last.seconds:.1f} ms for the last frame, flags: {', '.join(sorted(report.flags)) or 'none'}")
+    print(f"{1e3 * (world.last or report).seconds:.1f} ms for the last frame, flags: {', '.join(sorted(report.flags)) or 'none'}")
 
 
 if __name__ == "__main__":

@@ -47,7 +47,7 @@ def build() -> tuple[tv.World, tv.Path]:
     return tv.World(start, features, substeps=40, iterations=20, precision="f64"), rail
 
 
-def main(path: str = "machine.rrd", seconds: float = 3.0) -> None:
+def main(path: str = "machine.rrd", *, seconds: float = 3.0) -> None:
     """Turn, and compare the stamp and its rail with the formulas."""
     world, rail = build()
     off, force = 0.0, []

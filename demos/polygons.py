@@ -58,7 +58,7 @@ def deepest(world: tv.World) -> float:
     return worst
 
 
-def main(path: str = "polygons.rrd", seconds: float = 8.0) -> None:
+def main(path: str = "polygons.rrd", *, seconds: float = 8.0) -> None:
     """Run, record, and say how it went."""
     world = build()
     drum = next(f for f in world.features if isinstance(f, tv.Polygon))

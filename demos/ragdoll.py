@@ -30,7 +30,7 @@ def build() -> tuple[tv.World, tv.AngleLimit, tv.Distance]:
     return tv.World(start, features, substeps=30, iterations=2, solver=tv.ConjugateGradient(5)), joints, bones
 
 
-def main(path: str = "ragdoll.rrd", seconds: float = 5.0) -> None:
+def main(path: str = "ragdoll.rrd", *, seconds: float = 5.0) -> None:
     """Fall, record, and look at every joint."""
     world, joints, bones = build()
     with tv.Recorder(path, world, overwrite=True) as recorder:

@@ -34,7 +34,7 @@ def build() -> tuple[tv.World, tv.Area, list[slice]]:
     return tv.World(tv.Particles(body.position, mass=0.02, radius=0.04), features, substeps=20), area, parts
 
 
-def main(path: str = "soft.rrd", seconds: float = 4.0) -> None:
+def main(path: str = "soft.rrd", *, seconds: float = 4.0) -> None:
     """Run, record, and check what is to be kept."""
     world, area, parts = build()
     with tv.Recorder(path, world, overwrite=True) as recorder:

@@ -12,12 +12,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-import taichi as ti
-from taichi.lang import ops
 
 import tiverlet as tv
-from tiverlet.device import thread_team
-from tiverlet.device.patches import source_cache
+from tiverlet.device import thread_team, ti
+from tiverlet.device.patches import patched
 from tiverlet.recording import reader, rrd, scene
 from tiverlet.report.accuracy.cases import entries, known
 from tiverlet.step import build
@@ -36,13 +34,16 @@ CASES = {name: known(name) for name in entries()}
 CROSSOVER = build.CROSSOVER  # particles and constraints from which a world has a team of threads by default
 
 
-@pytest.fixture(scope="session", autouse=True)
-def taichi():
-    tv.init(arch=ARCH)
+@contextlib.contextmanager
+def checked_assignments():
+    """Refuse, in our own kernels, what compiles only with Taichi's analysis; without it LLVM ends the process."""
+    from taichi.lang import ops  # noqa: PLC0415
+
+    from tiverlet.device.patches import source_cache  # noqa: PLC0415
+
     assign = ops.assign
 
     def checked(to, value):
-        """Refuse, in our own kernels, what compiles only with Taichi's analysis; without it LLVM ends the process."""
         whole = not to.ptr.is_tensor() and value.ptr.is_tensor()
         truth = to.ptr.get_rvalue_type() == ti.u1 and value.ptr.get_rvalue_type() != ti.u1
         if (whole or truth) and any(place in ops.stack_info() for place in (SOURCES, *OURS)):
@@ -50,13 +51,21 @@ def taichi():
         return assign(to, value)
 
     ops.assign = checked
+    home, source_cache.HOME = source_cache.HOME, source_cache.HOME + OURS
+    yield
+    ops.assign, source_cache.HOME = assign, home
+
+
+@pytest.fixture(scope="session", autouse=True)
+def taichi():
+    tv.init(arch=ARCH)
     if int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) > 1:
         # The cores are all taken by workers: threads of one team would wait for those of another, for three times as long as one
         # takes for all. The bits are the same; who wants a team asks for path="parallel".
         build.CROSSOVER = sys.maxsize
-    home, source_cache.HOME = source_cache.HOME, source_cache.HOME + OURS
-    yield
-    ops.assign, source_cache.HOME, build.CROSSOVER = assign, home, CROSSOVER
+    with checked_assignments() if patched else contextlib.nullcontext():
+        yield
+    build.CROSSOVER = CROSSOVER
     if server.cache_info().currsize:
         with server():  # which closes the pipes, so that it ends
             pass

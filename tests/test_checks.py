@@ -4,9 +4,9 @@ import pickle
 
 import numpy as np
 import pytest
-import taichi as ti
 
 import tiverlet as tv
+from tiverlet.device import ti
 
 from .conftest import python
 

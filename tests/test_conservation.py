@@ -194,6 +194,7 @@ def test_clones_go_on_alike(world, precision, radius):
     w.run(0.2)
     twin = w.clone()
     assert twin.hash() == w.hash()
+    np.testing.assert_array_equal(twin.velocity, w.velocity)
     w.run(0.3)
     twin.run(0.3)
     assert twin.hash() == w.hash()

@@ -46,7 +46,7 @@ def test_the_articles_scene_has_the_same_bits_on_1_and_8_threads():
     code = f"""
 import sys
 sys.path.insert(0, {str(DEMOS)!r})
-import taichi as ti
+from tiverlet.device import ti
 import tiverlet as tv
 import article
 def results(path):
@@ -68,7 +68,7 @@ def test_every_solver_has_the_same_bits_on_1_and_8_threads():
     code = """
 import numpy as np
 import pytest
-import taichi as ti
+from tiverlet.device import ti
 import tiverlet as tv
 k = np.arange(900).reshape(30, 30)
 net = np.vstack([np.stack([k[:, :-1].ravel(), k[:, 1:].ravel()], 1), np.stack([k[:-1].ravel(), k[1:].ravel()], 1)])
@@ -105,7 +105,7 @@ def test_a_large_pile_has_the_same_bits_on_all_paths_and_where_a_team_breaks_up(
         features = [tv.Gravity(9.81), tv.Box((0, 0), (31, 60)), tv.Contact()]
         w = world(tv.Particles(x, radius=0.5), features, path=path, substeps=3)
         if patience:
-            w._runner.step.team.patience = patience
+            w._runner.step.team.patience_number.set(patience)
         alone = [w.step(1 / 60) and w._runner.sheet[step.ACTIVE_THREADS] == 1 for _ in range(40)]
         assert not patience or w._runner.step.team.size == 1 or all(alone)
         assert w.last.contacts > 1000
@@ -139,11 +139,11 @@ def test_all_paths_have_the_same_bits(world):
 
 @pytest.mark.filterwarnings("ignore:Contact. all radii are 0")
 def test_what_is_absent_has_no_field_and_no_kernel(world):
-    # A point in free flight: position, displacement, and the survey. Each feature adds its own fields and nothing else; a mass
-    # for each particle is needed where one has another than the rest, as what is pinned has.
+    # A point in free flight: position, displacement, counts, and the survey. Each feature adds its own fields and nothing else; a
+    # mass for each particle is needed where one has another than the rest, as what is pinned has.
     plain = world(tv.Particles(np.zeros((10, 2))), [])
     names = {name.split(".")[0] for name in plain.fields}
-    assert names == {"position", "displacement", "survey"}
+    assert names == {"position", "displacement", "numbers", "survey"}
     adds = {
         "Gravity": ([tv.Gravity(1.0)], {"Gravity"}),
         "Drag": ([tv.Drag(1.0)], {"decay"}),

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-import taichi as ti
 
 import tiverlet as tv
+from tiverlet.device import ti
 from tiverlet.device.memory import Memory
 from tiverlet.device.prefix_sum import MOST, RADIX, Sums
 from tiverlet.device.sorting import LONG, sort
@@ -24,7 +24,7 @@ class Bench:
         self.memory = Memory(ti.f32)
         team = Team(self.memory, 1, 0, launched, pieces=1)
         self.sums = [Sums(length, team, capped=True) for length in LENGTHS]
-        self.fields = [self.memory.field(f"sums {s.lengths[0]}", s.room, kind=ti.i32) for s in self.sums]
+        self.fields = [self.memory.field(f"sums {n}", s.room, kind=ti.i32) for n, s in zip(LENGTHS, self.sums, strict=True)]
         self.list = self.memory.field("list", 4 * LONG + 2, kind=ti.i32)
         self.memory.place()
 
@@ -47,7 +47,7 @@ def test_running_sums():
         for top in (10, 2**20, MOST):  # the last two beyond what an i32 holds
             values = [rng.integers(0, top, length, endpoint=True) for length in LENGTHS]
             for field, a in zip(bench.fields, values, strict=True):
-                bench.memory.write(field, np.resize(np.append(a, [7]), max(1, field.shape[0])))
+                bench.memory.write(field, np.resize(np.append(a, [7]), len(bench.memory.read(field))))
             bench.add()
             for field, a in zip(bench.fields, values, strict=True):
                 np.testing.assert_array_equal(bench.memory.read(field)[: len(a)], np.minimum(np.cumsum(a), MOST))

@@ -166,6 +166,24 @@ def test_no_change_of_the_substep_brings_in_energy(world):
                 assert report.energy <= 1e-3 * m * 9.81 * n**2, (link.compliance[0], plan[-1], report)
 
 
+def test_no_change_of_the_substep_brings_in_energy_of_bodies(world):
+    # Cantilevers of loops of four corners that keep their areas, beside rigid links, and of rigid clusters that share corners:
+    # what passes leave undone was 2.4 and 0.5 m g L with auto, without a flag, and 120 and 310 from 2 to 100 substeps.
+    k = np.arange(16).reshape(8, 2)
+    x = np.stack(np.meshgrid(np.arange(8), np.arange(2), indexing="ij"), axis=2).reshape(-1, 2) * 0.1
+    loops = np.stack([k[:-1, 0], k[1:, 0], k[1:, 1], k[:-1, 1]], axis=1)
+    pairs = np.concatenate([loops[:, [0, 1]], loops[:, [1, 2]], loops[:, [3, 2]]])
+    features = [tv.Gravity(9.81), tv.Area(list(loops)), tv.Distance(pairs), tv.ShapeMatch(loops + 16)]
+    start = tv.Particles(np.concatenate([x, x + [2.0, 0]]), mass=0.01, pinned=[0, 1, 16, 17])
+    w = world(start, features, solver=tv.Jacobi())
+    energy = 0.01 * 9.81 * start.position[~start.pinned, 1].sum()
+    for plan in (["auto"] * 150, [2] * 40 + [100] * 10):
+        w.position, w.velocity, w._controller = start.position, 0 * start.position, StepController()
+        for w.substeps in plan:
+            report = w.step(1 / 60)
+            assert report.energy <= energy + 1e-3 * 0.01 * 9.81 * 14 * 0.7, (plan[-1], report)
+
+
 def test_systems_of_particles_are_solved(monkeypatch):
     # Against a dense solution: a sheet, two ropes and a lone particle, by levels of the graph, and where these are too wide.
     rng = np.random.default_rng(0)

@@ -8,10 +8,10 @@ import inspect
 
 import numpy as np
 import pytest
-import taichi as ti
 
 import tiverlet as tv
 from tiverlet import colliders, constraints, contact, forces
+from tiverlet.device import ti
 from tiverlet.features.arguments import knobs_of
 
 from .conftest import order
@@ -60,6 +60,10 @@ ROWS3 = {
     "Wind": (lambda i, x, **k: tv.Wind(**k), PATH, {"velocity": (1, 0, 0), "rate": 0.2}, {"velocity": (0, 2, 0), "rate": 1.0}),
     "Attractor": (
         lambda i, x, **k: tv.Attractor(**k), PATH, {"center": (0, 1, 0), "strength": 3.0}, {"center": (1, 0, 2), "strength": -3.0}
+    ),
+    "Hand": (  # one of its own particles, which come after those of four others
+        lambda i, x, **k: tv.Hand(**k), PATH, {"target": (0, 1, 0), "particle": 4 * len(PATH), "rate": 5.0},
+        {"target": (1, 0, 2), "particle": 4 * len(PATH) + 1, "rate": 9.0},
     ),
     "Force": (lambda i, x: tv.Force(pull), PATH, {}, {}),
     "Distance": (lambda i, x, **k: tv.Distance([i], **k), LINK, ANGLE | SPRING, {"rest": 0.7} | SPRINGS),
@@ -189,7 +193,7 @@ class Scene:
 
     def values(self, name: str, new: bool) -> dict:
         """Settings, old or new."""
-        local = name != "Attractor"
+        local = name not in ("Attractor", "Hand")
         return {k: np.add(v, self.place[name]) if k in LOCAL and local else v for k, v in self.rows[name][2 + new].items()}
 
     def assign(self, new: bool, names=None) -> None:
@@ -211,7 +215,7 @@ class Scene:
 
 
 GROUPED = {
-    "forces": ["Gravity", "Drag", "Wind", "Attractor"],
+    "forces": ["Gravity", "Drag", "Wind", "Attractor", "Hand"],
     "links": ["Distance", "Bend", "AngleLimit"],
     "bodies": ["Area", "ShapeMatch"],
     "tethers": ["Pin", "Pin, driven", "Snap", "Path", "Path, at", "Path, speed"],

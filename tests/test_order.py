@@ -4,9 +4,9 @@ import re
 
 import numpy as np
 import pytest
-import taichi as ti
 
 import tiverlet as tv
+from tiverlet.device import ti
 
 from .conftest import case, order, pendulums, rerun, rms
 

@@ -98,7 +98,7 @@ def test_many_particles(world, monkeypatch):
     w = world(tv.Particles(position, radius=radius), [tv.Contact(skin=0.05)], precision="f64")
     assert w.path == ("parallel" if tv.runtime.cores() > 1 else "fused")
     w._runner.list_neighbours()
-    first, number = w._runner.grid.first.to_numpy(), w._runner.grid.number.to_numpy()
+    first, number = (w._runner.memory.read(field) for field in (w._runner.grid.first, w._runner.grid.number))
     near = w._runner.grid.store.read(w._runner.grid.neighbour)
     i = np.repeat(np.arange(len(position)), number)
     j = near[np.repeat(first, number) + np.arange(len(i)) - np.repeat(np.cumsum(number) - number, number)]

@@ -9,8 +9,9 @@ import rerun as rr
 
 import tiverlet as tv
 from tiverlet.recording import messages
-from tiverlet.recording.lines import Lines, Sheet, trails
-from tiverlet.recording.strain import LEVELS, SCALE, levels
+from tiverlet.recording.lines import Lines, cells, trails
+from tiverlet.recording.strain import LEVELS, LONGER, SCALE, SHORTER, levels
+from tiverlet.recording.surfaces import DARKEST, Surface, triangles
 
 pytestmark = pytest.mark.usefixtures("read_here")
 
@@ -66,8 +67,8 @@ def test_every_frame_reads_back(world, tmp_path, dim):
     assert list(radii) == [None] and radii[None][0] < 0 and radii[None][1] == np.float32(0.02)
     assert len(strips[12]) < 29 or len(set(hues[12])) > 1  # neighbours of one colour are one strip
     hues = np.array(read(path, "/world/scene/particles", f"Points{kind}:colors")[None], dtype=np.uint32) >> 8  # RGBA
-    red, green, blue = tv.golden_colors(30).astype(np.uint32).T
-    np.testing.assert_array_equal(hues[1:], (red << 16 | green << 8 | blue)[1:])
+    red, green, blue = tv.golden_colors(1)[0].tolist()  # a rope is one body
+    assert (hues[1:] == red << 16 | green << 8 | blue).all() and hues[0] == 140 << 16 | 140 << 8 | 150
     for end, names in {"energy": ["energy"], "violation": ["residual", "overlap"], "substeps": ["substeps"]}.items():
         curve = read(path, f"/figures/{end}", "Scalars:scalars")
         assert [curve[k + 1] for k in range(12)] == [[getattr(report, name) for name in names] for report in reports]
@@ -129,29 +130,40 @@ def test_each_link_is_in_one_strip(count, links):
     assert sorted(drawn) == sorted((*sorted(p), SCALE[v]) for p, v in zip(pairs.tolist(), level, strict=True) if v >= 0)
 
 
-def test_a_rope_is_one_strip_and_a_sheet_is_one_mesh():
+def test_a_rope_is_one_strip_and_a_sheet_is_one_mesh(world):
     rope = tv.shapes.rope((0, 0), (1, 0), 40)
     particles, link = trails(rope.links)
     assert particles.tolist() == list(range(40)) and link.tolist() == [*range(39), -1]
 
     sheet = tv.shapes.cloth((0, 0, 0), (1, 0, 0), (0, 0, 1), (6, 5))
     pairs = np.concatenate([sheet.links, sheet.braces])
-    mesh = Sheet(pairs, sheet.position)
-    assert mesh.used.all()  # threads, diagonals, and what lies on two threads
-    corners = sheet.position[mesh.triangles.astype(int)]
+    assert cells(pairs, sheet.position)[0].all()  # threads, diagonals, and what lies on two threads
+    w = world(tv.Particles(sheet.position), [tv.Distance(pairs)])
+    faces = triangles(w)
+    corners = sheet.position[faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
     assert len(area) == 2 * 5 * 4 and area.sum() == pytest.approx(1.0)  # no cell is left out, and none is there twice
-    for triangle in mesh.spots[mesh.triangles.astype(int)]:
-        assert len({*map(tuple, triangle.tolist())}) == 3  # three corners of the texture
-    level = np.full(len(pairs), LEVELS)
-    level[0] += 3  # longer, and one beside it a little shorter
-    level[1] -= 1
-    hues = mesh.colors(level)
-    assert (hues[pairs[0]] == SCALE[LEVELS + 3]).all() and set(hues) == {SCALE[LEVELS + 3], SCALE[LEVELS - 1], SCALE[LEVELS]}
+    # Its colour: that of the body, in light by |n . l|, and where links are strained, red or blue by the worst of them.
+    up, body = np.array([0.0, 1.0, 0.0]), np.array([200.0, 100.0, 40.0])
+    mesh, level = Surface(faces, np.tile(body, (30, 1)), pairs, up), np.full(len(pairs), LEVELS)
+    level[0], level[1] = 2 * LEVELS, 0
+
+    def rgb(x):
+        words = mesh.colors(x, level)
+        assert (words & 255 == 255).all()
+        return np.stack([words >> 24, words >> 16 & 255, words >> 8 & 255], axis=1).astype(float)
+
+    light = np.array([0.45, 1.35, 0.82])
+    for x, n in ((sheet.position, up), (sheet.position[:, [1, 0, 2]], up[[1, 0, 2]])):
+        shade = DARKEST + (1 - DARKEST) * abs(n @ light) / np.linalg.norm(light)
+        seen = rgb(x)
+        np.testing.assert_allclose(seen[-1], body * shade, atol=0.5 + 200 / 30)  # of 15 shades
+        np.testing.assert_allclose(seen[pairs[0]], np.tile(LONGER * shade, (2, 1)), atol=0.5 + 255 / 30)
+        assert pairs[1][0] in pairs[0] or np.allclose(seen[pairs[1][0]], SHORTER * shade, atol=0.5 + 255 / 30)
 
     tetrahedron = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float)
-    mesh = Sheet(np.stack(np.triu_indices(4, 1), axis=1), tetrahedron)
-    assert not len(mesh.triangles) and not mesh.used.any()  # six links, but not flat
+    used, four = cells(np.stack(np.triu_indices(4, 1), axis=1), tetrahedron)
+    assert not len(four) and not used.any()  # six links, but not flat
 
 
 def test_bytes_of_positions_take_most_of_the_file(world, tmp_path):

@@ -64,9 +64,14 @@ def test_what_was_recorded_reads_back(falling, tmp_path):
     table = (tmp_path / "a.csv").read_text().splitlines()
     assert table[0] == "frame,time,particle,x,y,z" and len(table) == 34
     assert [np.float32(v) for v in table[-1].split(",")[3:]] == recording.position(20)[2].tolist()
+    recording.export(str(tmp_path / "a.xyz"))
+    lines = (tmp_path / "a.xyz").read_text().splitlines()
+    assert len(lines) == 11 * 5 and lines[50] == "3"
+    assert lines[51] == f'Properties=species:S:1:pos:R:3:radius:R:1 Time={float(recording.times[-1])!r} Frame=20 pbc="F F F"'
+    assert [[np.float32(v) for v in line.split()[1:4]] for line in lines[52:]] == recording.position(20).tolist()
     with pytest.raises(ValueError, match="no frame 3; the nearest is"):
         recording.world(3)
-    with pytest.raises(ValueError, match="csv can be written"):
+    with pytest.raises(ValueError, match="xyz can be written"):
         recording.export("a.txt")
 
 
@@ -260,7 +265,7 @@ def test_what_ends_other_programs_is_an_error(tmp_path):
 import os, sys
 assert "HOME" not in os.environ
 import tiverlet as tv
-import taichi as ti
+from tiverlet.device import ti
 world = tv.World(tv.Particles([[0.0, 0.0]]), [tv.Gravity()])
 recorder = tv.Recorder({str(tmp_path / "f.rrd")!r}, world)
 pid = os.fork()
@@ -356,7 +361,7 @@ def test_command_line(falling, tmp_path, monkeypatch, capsys):
     # A script that records nothing itself, and whose function has to be given to verify().
     (tmp_path / "mine.py").write_text("""
 import sys
-import taichi as ti
+from tiverlet.device import ti
 import tiverlet as tv
 
 @ti.func

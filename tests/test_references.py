@@ -5,9 +5,9 @@ Where one Jacobi pass cannot hold a long rigid rope, its law is tested: a pass i
 
 import numpy as np
 import pytest
-import taichi as ti
 
 import tiverlet as tv
+from tiverlet.device import ti
 
 from .conftest import case, figures, pendulums, rerun, rms
 

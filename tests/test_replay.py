@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-import taichi as ti
 
 import tiverlet as tv
+from tiverlet.device import ti
 from tiverlet.recording import journal, scene
 
 pytestmark = pytest.mark.usefixtures("read_here")
@@ -39,7 +39,8 @@ def flat(precision="f32", **settings):
     more = np.array([[-1.5, 0.3], [-1.4, 0.3], [-1.2, 0.35], [-1.0, 0.3], [-0.8, 0.3], [-0.6, 0.32], [-0.4, 0.3], [-0.2, 0.31]])
     position, n = np.concatenate([body.position, more]), len(body)
     features = [
-        tv.Gravity(9.81), tv.Drag(0.1), tv.Wind((0.3, 0.0), 0.2), tv.Attractor((0.0, 3.0), 0.5), tv.Force(swirl),
+        tv.Gravity(9.81), tv.Drag(0.1), tv.Wind((0.3, 0.0), 0.2), tv.Attractor((0.0, 3.0), 0.5), tv.Hand((0.5, 2.0), 3),
+        tv.Force(swirl),
         tv.Distance(rope.links[:3], compliance=1e-4, damping=0.01, break_at=50.0), tv.Rope(rope.links[3:], length=0.21),
         tv.Distance(blob.links + b.start), tv.Bend(blob.bends[:2] + b.start, compliance=0.1), tv.Spacer([(n, n + 1)], 0.05),
         tv.AngleLimit([(n + 1, n + 2, n + 3)], -0.5, 0.5), tv.Area([i.tolist() for i in ball.loops], pressure=1.1),

@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-import taichi as ti
 
 import tiverlet as tv
+from tiverlet.device import layout, runtime, ti
 from tiverlet.device import memory as fields
-from tiverlet.device import runtime
 from tiverlet.device.host_copy import chain
 from tiverlet.device.memory import Memory
 from tiverlet.step import build
@@ -58,6 +57,7 @@ def test_the_host_sees_the_fields_as_kernels_do():
 def test_f64_fields_can_stand_apart(monkeypatch):
     # As on Vulkan: in a tree of their own, which shows in nothing else. Lengths that would put an f64 between two multiples of 8.
     monkeypatch.setattr(fields, "aligned", lambda: False)
+    monkeypatch.setattr(layout, "_alone", True)
     alive, rng = runtime.trees, np.random.default_rng(0)
     plans = {
         "two": [(ti.i32, 3, 0), (ti.f64, 4, 0), (ti.f32, 5, 3), (ti.f64, None, 2), (ti.u32, 1, 0), (ti.i32, None, 0)],
@@ -91,8 +91,8 @@ def test_f64_fields_can_stand_apart(monkeypatch):
         given_up = Memory(ti.f32)
         for k, (kind, length, width) in enumerate(plan):
             given_up.field(f"f{k}", length, width=width, kind=kind)
-        given_up.abandon()
-    Memory(ti.f32).abandon()
+        given_up.destroy()
+    Memory(ti.f32).destroy()
     after = Memory(ti.f64)  # nothing was poisoned
     last = after.field("last", 2, values=[1.5, 2.5])
     after.place()
@@ -124,7 +124,7 @@ def refused(*a, **k):
     os._exit(7)
 socket.socket.connect = socket.create_connection = socket.getaddrinfo = refused
 import tiverlet as tv
-import taichi as ti
+from tiverlet.device import ti
 assert ti.cfg is None, "started at import"
 assert "matplotlib" not in sys.modules
 assert not any(n.startswith("rerun") for n in sys.modules)
@@ -142,7 +142,7 @@ def test_a_second_start_is_an_error_not_a_crash():
     python(
         START
         + """
-import taichi as ti
+from tiverlet.device import ti
 w = world()
 w.step(0.1)
 expect(RuntimeError, "already runs", lambda: tv.init(threads=1))
@@ -166,7 +166,7 @@ def test_reset_and_close():
     python(
         START
         + """
-import taichi as ti
+from tiverlet.device import ti
 w = world()
 with world() as other:
     other.step(0.1)
@@ -185,7 +185,7 @@ def test_a_users_own_start_is_used_as_it_is():
     python(
         START
         + """
-import taichi as ti
+from tiverlet.device import ti
 ti.init(arch=ti.cpu, default_fp=ti.f64, fast_math=True, log_level=ti.ERROR)
 w = world(precision="f64")
 w.run(1.0)
@@ -200,12 +200,13 @@ def test_worlds_are_capped_and_freed():
     python(
         START
         + """
-from tiverlet.device import memory
+from tiverlet.device import layout
 tv.init()
 point = tv.Particles([[0.0, 0.0]])
-memory.MAX_TREES = 12  # the rule, without the minutes that 400 worlds take
-many = [tv.World(point) for _ in range(12)]
-expect(RuntimeError, "worlds are alive", lambda: tv.World(point))
+layout.MAX_TREES = 12  # the rule, without the minutes that 400 worlds take
+with layout.unshared():
+    many = [tv.World(point) for _ in range(12)]
+    expect(RuntimeError, "worlds are alive", lambda: tv.World(point))
 for w in many:
     w.close()
 class Broken(tv.Gravity):
@@ -242,7 +243,7 @@ assert peak[-1] - peak[4] < 60, peak
 def test_missing_architectures_are_errors_by_name():
     done = python(
         """
-import taichi as ti
+from tiverlet.device import ti
 import tiverlet as tv
 for arch in ("cuda", "metal", "vulkan"):
     try:

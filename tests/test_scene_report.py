@@ -4,9 +4,9 @@ import json
 
 import numpy as np
 import pytest
-import taichi as ti
 
 import tiverlet as tv
+from tiverlet.device import ti
 from tiverlet.report.stress import robustness
 from tiverlet.step import checkpoint
 

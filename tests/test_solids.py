@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-import taichi as ti
 
 import tiverlet as tv
+from tiverlet.device import ti
 
 from .conftest import case
 from .outlines import CUBE, CUBE_FACES, SQUARE

@@ -1,8 +1,8 @@
 """What falls to each thread of a team."""
 
 import numpy as np
-import taichi as ti
 
+from tiverlet.device import ti
 from tiverlet.device.memory import Memory
 from tiverlet.device.thread_team import Team
 

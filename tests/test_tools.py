@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-import taichi as ti
 
 import tiverlet as tv
 from tiverlet.colliders.angle import cos_sin
+from tiverlet.device import ti
 from tiverlet.tools import distinct, median
 
 

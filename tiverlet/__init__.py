@@ -1,6 +1,6 @@
 """tiverlet: a particle engine on Taichi. Position Verlet, a spatial hash, and Jacobi constraints from soft to rigid."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from .device import runtime  # first: it sets what Taichi reads when it is imported  # isort: skip
 from . import measure, shapes
@@ -8,7 +8,7 @@ from .colliders import Ball, Box, Capsule, HalfSpace, Mesh, Polygon, Sdf
 from .constraints import AngleLimit, Area, Bend, Constraint, Dihedral, Distance, Path, Pin, Rope, ShapeMatch, Snap, Spacer, Volume
 from .contact import Contact, Polygons
 from .device.runtime import init
-from .forces import Attractor, Drag, Force, Gravity, Wind
+from .forces import Attractor, Drag, Force, Gravity, Hand, Wind
 from .particles import Particles
 from .recording import Recorder, replay
 from .solvers import Chebyshev, ConjugateGradient, Direct, Jacobi
@@ -16,19 +16,32 @@ from .step_report import StepReport
 from .tools import approach, clamp, golden, golden_colors, golden_index, mix, smoothstep
 from .world import World
 
+if TYPE_CHECKING:
+    from .live import play
+
 __all__ = [
     "AngleLimit", "Area", "Attractor", "Ball", "Bend", "Box", "Capsule", "Chebyshev", "ConjugateGradient", "Constraint",
-    "Contact", "Dihedral", "Direct", "Distance", "Drag", "Force", "Gravity", "HalfSpace", "Jacobi", "Mesh", "Particles",
+    "Contact", "Dihedral", "Direct", "Distance", "Drag", "Force", "Gravity", "HalfSpace", "Hand", "Jacobi", "Mesh", "Particles",
     "Path", "Pin", "Polygon", "Polygons", "Recorder", "Rope", "Sdf", "ShapeMatch", "Snap", "Spacer", "StepReport", "Volume",
-    "Wind", "World", "approach", "clamp", "golden", "golden_colors", "golden_index", "init", "measure", "mix", "replay",
+    "Wind", "World", "approach", "clamp", "golden", "golden_colors", "golden_index", "init", "measure", "mix", "play", "replay",
     "runtime", "shapes", "smoothstep",
 ]  # fmt: skip
+__version__ = "0.1.0"  # the only place that says it
+
+
+def __dir__() -> list[str]:
+    """What is public, for tab completion."""
+    return sorted([*__all__, "__version__", "report"])
 
 
 def __getattr__(name: str) -> Any:
-    """tv.report is imported when it is first asked for: scenes need none of it."""
+    """tv.report and tv.play are imported when they are first asked for: scenes need none of them, nor of rerun."""
     if name == "report":
         import importlib
 
         return importlib.import_module(".report", __name__)
+    if name == "play":
+        from .live import play
+
+        return play
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,17 +1,28 @@
-"""The command line: python -m tiverlet run | replay | report | report speed | stress | info."""
+"""The command line: python -m tiverlet run | play | replay | report | report speed | stress | demos | info."""
 
 import argparse
 import sys
 
-from .commands import info, replay, report, run, speed, stress
+from . import __version__
+from .commands import demos, info, play, replay, report, run, speed, stress
 
 # Each has ABOUT (a line), add(parser) for its arguments, and main(args) -> exit status. A name may be of two words.
-COMMANDS = {"run": run, "replay": replay, "report": report, "report speed": speed, "stress": stress, "info": info}
+COMMANDS = {
+    "run": run,
+    "play": play,
+    "replay": replay,
+    "report": report,
+    "report speed": speed,
+    "stress": stress,
+    "demos": demos,
+    "info": info,
+}
 
 
 def main(words: list[str] | None = None) -> int:
     """Run one command; returns the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m tiverlet", description="A particle engine on Taichi.")
+    parser = argparse.ArgumentParser(prog="tiverlet", description="A particle engine on Taichi.")
+    parser.add_argument("--version", action="version", version=f"tiverlet {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="command")
     for name, command in COMMANDS.items():
         command.add(commands.add_parser(name, help=command.ABOUT, description=command.__doc__))

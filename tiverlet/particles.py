@@ -1,11 +1,14 @@
 """Particles: what the user gives (plain arrays), and the state that a world keeps of them on the device."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from . import checks
 from .device import at, inline, ti
 from .device.memory import Memory
+from .device.number import OnDevice
 from .features.arguments import meant
 from .features.read_only import read_only, structure
 
@@ -25,6 +28,8 @@ class Particles:
     Raises ValueError or TypeError naming the first offending index. The arrays are read-only: mass, radius and links are
     structure, fixed when a world is built. To move particles, assign to world.position and world.velocity.
     """
+
+    kernels_read = ("dim",)
 
     def __init__(
         self, position: ArrayLike, *, velocity: ArrayLike = 0.0, mass: ArrayLike = 1.0, radius: ArrayLike = 0.0,
@@ -133,12 +138,14 @@ class State:
     So `low` is there with either of them, but what only reads x does without where it is not `compensated`.
     """
 
+    host_only = ("count",)
+
     def __init__(self, memory: Memory, particles: Particles, inv_mass: np.ndarray, compensated: bool):
         n, dim = particles.count, particles.dim
         self.compensated = compensated
         self.real, self.double = memory.real, memory.real == ti.f64
         self.count, self.dim = n, dim
-        self.starts = self.befores = self.leans = self.carries = False
+        self.starts = self.befores = self.keeps_wall_push = self.carries = False
         self.x = memory.field("position", n, width=dim, values=particles.position, state=True)
         self.d = memory.field("displacement", n, width=dim, values=particles.velocity, state=True)
         self.w = Shared(memory, "inv_mass", inv_mass)
@@ -201,12 +208,12 @@ class State:
             x += self.low0[i]
         return x
 
-    def remember(self, memory: Memory, start: bool, before: bool, lean: bool) -> None:
+    def remember(self, memory: Memory, start: bool, before: bool, wall_push: bool) -> None:
         """Declare what friction, swept walls and bounces need, position and displacement at the start of the substep, and how far
         walls have pushed since then."""
-        self.starts, self.befores, self.leans = start, before, lean
-        if lean:
-            self.lean = memory.field("lean", self.count, width=self.dim)
+        self.starts, self.befores, self.keeps_wall_push = start, before, wall_push
+        if wall_push:
+            self.wall_push = memory.field("wall_push", self.count, width=self.dim)
         if start:
             self.x0 = memory.field("position_at_start", self.count, width=self.dim)
             if self.sums:
@@ -263,12 +270,15 @@ class State:
 
 
 class Shared:
-    """A number for each particle: a constant of the kernel where all are equal, a field otherwise."""
+    """A number for each particle: a single one where all are equal, a field otherwise."""
+
+    constant: Any = OnDevice()
 
     def __init__(self, memory: Memory, name: str, values: np.ndarray):
         self.real = memory.real
         self.uniform = bool(len(values) == 0 or (values == values[0]).all())
-        self.constant = float(values[0]) if len(values) else 0.0
+        self.all_positive = self.uniform and bool(len(values) and values[0] > 0)
+        self.constant = memory.number(float(values[0]) if len(values) else 0.0, memory.real)
         if not self.uniform:
             self.field = memory.field(name, len(values), values=values)
 
@@ -277,15 +287,22 @@ class Shared:
         """That of particle i."""
         return ti.cast(self.constant, self.real) if self.uniform else at(self.field, i)
 
+    @inline
+    def positive(self, i):
+        """Whether it is above 0 for particle i; where it is for all, no branch is left."""
+        return ti.cast(1, ti.i32) > 0 if self.all_positive else self.of(i) > 0
+
 
 class Radii(Shared):
     """Radii on the device."""
 
+    least: Any = OnDevice()
+
     def __init__(self, memory: Memory, radius: np.ndarray):
         super().__init__(memory, "radius", radius)
         positive = radius[radius > 0]
-        self.least = float(positive.min()) if len(positive) else 0.0
-        self.points = bool((radius == 0).any())
+        self.least = memory.number(float(positive.min()) if len(positive) else 0.0, memory.real)
+        self.points, self.discs = bool((radius == 0).any()), bool(len(positive))
 
     @ti.func
     def stride(self, i):

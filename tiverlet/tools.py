@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from .device import ti
-from .device.patches import inside
+from .device.language import callable_in_kernels, inside_kernel
 
 # x**(d + 1) = x + 1 has one positive root, the golden ratio of dimension d (Roberts 2018, the R_d sequence). Its
 # inverse powers are the steps along each axis. As odd 32-bit integers, i * step mod 2**32 visits every value once,
@@ -50,12 +50,9 @@ def _both(kernel: Callable) -> Callable[[Callable], Callable]:
     def decorate(python: Callable) -> Callable:
         @functools.wraps(python)
         def chosen(*args, **kwargs):
-            return kernel(*args, **kwargs) if inside.inside_kernel() else python(*args, **kwargs)
+            return kernel(*args, **kwargs) if inside_kernel() else python(*args, **kwargs)
 
-        # Taichi asks for these two before it calls a function from a kernel without a warning.
-        chosen._is_taichi_function = True  # type: ignore[attr-defined]
-        chosen.func = kernel.func  # type: ignore[attr-defined]
-        return chosen
+        return callable_in_kernels(chosen)
 
     return decorate
 

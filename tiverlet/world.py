@@ -406,7 +406,9 @@ class World:
 
         What was there goes on to the bit: time, positions, velocities, multipliers, the history of springs, what pairs in contact
         remember. Where a force or a spring is added, displacements are first turned into velocities, as when a force changes.
-        It costs what building a world costs, some seconds of compiling for a large scene: add many things at once.
+        On a CPU it takes milliseconds where the world has room for them, and nothing is compiled: small worlds have it up to the
+        next power of four, large ones for a sixteenth to an eighth more. Beyond, or with features or masses of another kind, it
+        costs the compiling that a new world costs, once; all worlds share what was compiled.
 
         Raises as World() does; the world is then as before.
         """

@@ -1,7 +1,8 @@
 """The user's own functions of random scenes: Taichi reads their source, so they stand in a file."""
 
 import numpy as np
-import taichi as ti
+
+from tiverlet.device import ti
 
 
 @ti.func

@@ -109,14 +109,14 @@ def shapeless(f: Any, x: np.ndarray) -> np.ndarray:
 
 
 def rigid(features: list[Any], free: np.ndarray, x: np.ndarray) -> tuple[float, bool]:
-    """The worst violation of rigid constraints that are one number, relative to their size, and whether these are all of them."""
+    """The worst violation of rigid constraints that are one number, relative to their size, and whether it is all."""
     worst, whole = 0.0, True
     for f in features:
         if not isinstance(f, Batch) or getattr(f, "drives", False) or not f.count:
             continue
         if not isinstance(f, Scalar) or not f.arity or f.collapses or (f.compliance > 0).any():
             whole = False
-        if not isinstance(f, Scalar) or not f.arity or f.collapses:
+        if not isinstance(f, Scalar):
             continue
         C = f.violation(x)
         C = np.maximum(f.side * C, 0) if f.side else np.abs(C)
@@ -139,6 +139,41 @@ def closed(structure: Structure) -> bool:
     mass = structure.particles.args.get("mass", 1.0)
     held = "pinned" in structure.particles.args or np.isinf(mass).any()
     return not held and not any(f.name in (*PULLS, *WALLS, *TETHERS) for f in structure.features)
+
+
+INNER = ("Distance", "Rope", "Spacer", "Bend", "AngleLimit", "Dihedral", "Area", "Volume", "ShapeMatch")
+
+
+def central(structure: Structure) -> bool:
+    """Whether what acts in it has no moment about the origin, at the start of a substep nor at its end; contacts may have."""
+    return closed(structure) and all(f.name in INNER for f in structure.features)
+
+
+def spin(m: np.ndarray, x: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Angular momentum, by pairs of axes."""
+    a, b = np.triu_indices(x.shape[1], 1)
+    return m @ (x[:, a] * v[:, b] - x[:, b] * v[:, a])
+
+
+def unfit(f: Any, inv_mass: np.ndarray, x: np.ndarray) -> float:
+    """The largest distance of a particle that can move from its place in a rigid cluster that is turned as fits best (Kabsch
+    1976), relative to the radius of the cluster."""
+    worst = 0.0
+    for c in range(f.count):
+        who = f.members_of(c)
+        w = inv_mass[who]
+        if f.compliance[c] > 0 or f.broken[c] or not (w > 0).any():
+            continue
+        heavy = 1e6 * (1 / w[w > 0]).sum()
+        m = np.where(w > 0, 1 / np.where(w > 0, w, 1.0), heavy)
+        q, p = f.shape_of(c), x[who]
+        q, p = (a - m @ a / m.sum() for a in (q, p))
+        u, s, vt = np.linalg.svd((m[:, None] * p).T @ q)
+        if s[-2] < 1e-6 * s[0]:  # turned freely
+            continue
+        u[:, -1] *= np.sign(np.linalg.det(u @ vt))
+        worst = max(worst, float(np.linalg.norm(p - q @ (u @ vt).T, axis=1)[w > 0].max()) / f._radius[c])
+    return worst
 
 
 def feasible(features: list[Any], particles: Any, free: np.ndarray, x: np.ndarray, eps: float) -> bool:

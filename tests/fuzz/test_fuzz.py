@@ -7,14 +7,15 @@ from .finds import FINDS
 from .trials import Trial
 
 # Kinds that are still being mended are left to campaigns.
-HARD = {"error", "nan", "bits", "overlap", "residual", "momentum", "twin", "wall"}
+HARD = {"error", "nan", "bits", "overlap", "residual", "momentum", "spin", "twin", "wall"}
 
 
-@pytest.mark.parametrize("begin", range(0, 16, 8))
+@pytest.mark.parametrize("begin", (0, 4))
 def test_random_scenes_keep_their_promises(taichi, begin):
-    # Passive energy, brute force, momentum, walls, the same bits: see trials.py. The scenes are the same in every run.
-    for k in range(begin, begin + 8):
-        searcher = search(1, k, 3, HARD)
+    # Passive energy, brute force, momentum, walls, the same bits: see trials.py. The scenes are the same in every run; each of
+    # twins.WAYS is gone at least once.
+    for k in range(begin, begin + 4):
+        searcher = search(1, k, 5, HARD)
         assert not searcher.found, searcher.says()
 
 

@@ -120,6 +120,7 @@ class Judge:
         self.steps = 0
         self.watched = True
         self.safe = self.inside()
+        self.exact = False  # whether the scene began where its constraints are met
 
     def inside(self) -> dict[int, np.ndarray]:
         """Of each wall, the particles that are not in it."""
@@ -142,9 +143,11 @@ class Judge:
         elif isinstance(event, Step) and self.steps == 0:
             self.x = self.w.position
             self.safe = self.inside()
-            self.passive = self.passive and oracles.feasible(self.t.features, self.p, self.t.free, self.x, self.t.eps)
+            self.exact = oracles.feasible(self.t.features, self.p, self.t.free, self.x, self.t.eps)
+            self.passive = self.passive and self.exact
             if self.closed:
                 self.v = self.w.velocity
+                self.spin = oracles.spin(self.p.mass, self.x, self.v)
         elif isinstance(event, Step) and not self.safe:
             self.safe = self.inside()
 
@@ -218,6 +221,11 @@ class Judge:
             if report.residual < worst - near:
                 raise Find("residual", f"reported {report.residual:.6g}, rigid ones by brute force {worst:.6g}, {report}")
         for f in t.features:
+            if type(f).__name__ == "ShapeMatch" and f.acts and report.residual < 0.1 and blur < 1e-3:
+                # It was turned by the last pass, before others moved its particles: by no more than what these left.
+                worst = oracles.unfit(f, t.free, x)
+                if worst > 2 * report.residual + 1e-3 + blur:
+                    raise Find("residual", f"reported {report.residual:.6g}, cluster by brute force {worst:.6g}, {report}")
             if type(f).__name__ == "Contact" and p.radius.any():
                 count, worst = oracles.overlap(f, t.features, p, t.free, x)
                 some = p.radius[p.radius > 0].min()
@@ -260,3 +268,8 @@ class Judge:
             raise Find(
                 "momentum", f"of velocities {m @ self.v}, of positions {m @ way}, allowed {near + blur:.3g}, {self.w.last}"
             )
+        # Directions are those at the start, but where they are lost: by a turn, a start off the constraints, or a collapse.
+        sure = not self.flags & RISKS and oracles.central(self.t.structure) and self.w.last.turn < 41 and self.exact
+        turned = np.abs(oracles.spin(m, x, v) - self.spin).max()
+        if sure and turned > near * reach + 1e-9 * size * reach:
+            raise Find("spin", f"{self.spin} -> {oracles.spin(m, x, v)}, allowed {near * reach:.3g}, {self.w.last}")

@@ -46,6 +46,19 @@ def by_path(trial: Trial, events: list[Event]) -> None:
         other.close()
 
 
+def by_threads(trial: Trial, events: list[Event]) -> None:
+    """One thread, or a team of them."""
+    settings = trial.structure.settings
+    if settings.get("order", 2) > 2:
+        return
+    path = "parallel" if settings["path"] != "parallel" else "fused"
+    other = Trial(Structure(trial.structure.particles, trial.structure.features, settings | {"path": path}))
+    try:
+        same(f'path="{path}"', trial.replay(events), other.replay(events))
+    finally:
+        other.close()
+
+
 def by_clone(trial: Trial, events: list[Event]) -> None:
     """A clone goes on alike."""
     half = len(events) // 2 + 1
@@ -135,4 +148,4 @@ def by_questions(trial: Trial, events: list[Event]) -> None:
         raise Find("twin", f"near {near.tolist()}, nearest {index.tolist()} of {points.tolist()} within {radius}")
 
 
-WAYS = (by_path, by_clone, by_recording, by_company, by_questions)
+WAYS = (by_path, by_threads, by_clone, by_recording, by_company, by_questions)

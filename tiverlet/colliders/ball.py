@@ -1,12 +1,14 @@
 """A ball with particles outside, or inside."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .. import checks
 from ..device import ti
 from ..features.feature import Knob, Scene
 from ..particles import Particles
 from .collider import TOUCH, Collider
+from .round import rounded
 from .track import Track
 
 
@@ -29,7 +31,10 @@ class Ball(Collider):
     radius = Knob(lambda f, v: f._size(v), "Of the ball [m].", device="size")
     widest = 0.0  # radius of a particle [m]
 
-    def __init__(self, center, radius, inside=False, *, friction=0.0, restitution=0.0, push_out=1.0):
+    def __init__(
+        self, center, radius, inside: bool = False, *, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float =
+        1.0,
+    ):  # fmt: skip
         self.center = center
         self.inside = bool(inside)
         self.radius = radius
@@ -54,7 +59,7 @@ class Ball(Collider):
     @property
     def repeats(self) -> bool:
         """Inside, the way along the surface leads out, and a bounce may lead to the other end."""
-        return self.inside and (self.dev.surface.rubs or self.dev.surface.bounces)
+        return self.inside and (self.dev.surface.has_friction or self.dev.surface.has_restitution)
 
     def bind(self, scene: Scene) -> None:
         """The center at the start and the end of a frame."""
@@ -86,21 +91,27 @@ class Ball(Collider):
                 circles.append(circle)
         return np.array(circles), 0.0
 
+    def solid(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The ball, unless the scene is inside of it."""
+        if self.dim != 3 or self.inside:
+            return Collider.solid(self, low, high)
+        return rounded(self.center, self.center, self.radius)
+
     @ti.func
-    def confine(self, i, radius, h, when, turn):
+    def confine(self, i, radius, h, frame_fraction, turn):
         """The surface where it was met, or where it is nearest."""
-        center, moved = self.dev.center.at(when[1]), self.dev.center.step(when)
+        center, moved = self.dev.center.at(frame_fraction[1]), self.dev.center.step(frame_fraction)
         r = self.dev.state.place(i) - center
-        far = ti.cast(self.radius, self.dev.real)
-        depth, n = self.nearest(r, far, radius)
+        own = ti.cast(self.radius, self.dev.real)
+        depth, n = self.nearest(r, own, radius)
         d = self.dev.surface.path(i, moved)
         start = r - d
-        start_depth, _n = self.nearest(start, far, radius)
+        start_depth, _n = self.nearest(start, own, radius)
         if ti.static(not self.inside):
-            far += radius
-            c, b, a = start.dot(start) - far * far, start.dot(d), d.dot(d)
+            contact_distance = own + radius
+            c, b, a = start.dot(start) - contact_distance * contact_distance, start.dot(d), d.dot(d)
             root = b * b - a * c
-            if c > -TOUCH * far * far and b < 0 and root > 0:
+            if c > -TOUCH * contact_distance * contact_distance and b < 0 and root > 0:
                 s = ti.max(c, 0) / (ti.sqrt(root) - b)
                 if s < 1:
                     n = (start + s * d).normalized()
@@ -108,13 +119,13 @@ class Ball(Collider):
         self.dev.surface.press(i, depth, start_depth, n, moved, h, turn)
 
     @ti.func
-    def nearest(self, r, far, radius):
+    def nearest(self, r, own, radius):
         """Depth in the surface and its normal at r from the middle; a particle right there goes along +x."""
         length, n = r.norm(), 0 * r
         n[0] = 1
         if length > 0:
             n = r / length
-        depth = far + radius - length
+        depth = own + radius - length
         if ti.static(self.inside):
-            depth, n = length + radius - far, -n
+            depth, n = length + radius - own, -n
         return depth, n

@@ -3,6 +3,7 @@
 import warnings
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .. import checks
 from ..device import ti
@@ -47,7 +48,7 @@ class Box(Collider):
     lower = Knob(_corner("lower"), "Lower corner [m].")
     upper = Knob(_corner("upper"), "Upper corner [m].")
 
-    def __init__(self, lower, upper, *, friction=0.0, restitution=0.0, push_out=1.0):
+    def __init__(self, lower, upper, *, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float = 1.0):
         self.lower = lower
         self.upper = upper
         self.surface(friction, restitution, push_out)
@@ -74,7 +75,7 @@ class Box(Collider):
     @property
     def repeats(self) -> bool:
         """In a corner friction on one side may lead into another, and a bounce may lead to the other end."""
-        return self.dev.surface.rubs or self.dev.surface.bounces
+        return self.dev.surface.has_friction or self.dev.surface.has_restitution
 
     def bind(self, scene: Scene) -> None:
         """Corners at the start and the end of a frame."""
@@ -98,22 +99,27 @@ class Box(Collider):
         self.scene.memory.write(self.dev.sides, np.stack([sides, sides], axis=1))
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
-        """The edges, if all sides are closed."""
-        if not (np.isfinite(self.lower).all() and np.isfinite(self.upper).all()):
-            return Collider.outline(self, low, high)
+        """The edges of its sides; a side at infinity is open, and what leads to it ends with the scene."""
         bits = np.array([[(c >> k) & 1 for k in range(self.dim)] for c in range(2**self.dim)])
-        corners = np.where(bits, self.upper, self.lower)
-        edges = [(a, b) for a in range(len(bits)) for b in range(a) if np.abs(bits[a] - bits[b]).sum() == 1]
+        open_ends = np.where(bits, np.isinf(self.upper), np.isinf(self.lower))
+        corners = np.where(open_ends, np.where(bits, high, low), np.where(bits, self.upper, self.lower))
+        beside = [(a, b, int(np.argmax(bits[a] != bits[b]))) for a in range(len(bits)) for b in range(a)]
+        edges = [
+            (a, b) for a, b, k in beside
+            if np.abs(bits[a] - bits[b]).sum() == 1 and open_ends[a, np.arange(self.dim) != k].sum() < 1
+        ]  # fmt: skip
+        if not edges:
+            return Collider.outline(self, low, high)
         return corners[np.array(edges)], 0.0
 
     @ti.func
-    def pose(self, when):
+    def pose(self, frame_fraction):
         """Where the planes are; what stands is where it stands, to the bit, and at infinity too."""
         for side in range(ti.static(2 * self.dim)):
             a, b = self.dev.sides[side][0], self.dev.sides[side][1]
             at, shift = b, ti.zero(b)
             if a != b:
-                at, shift = a * (1 - when[1]) + b * when[1], (b - a) * (when[1] - when[0])
+                at, shift = a * (1 - frame_fraction[1]) + b * frame_fraction[1], (b - a) * (frame_fraction[1] - frame_fraction[0])
             self.dev.now[side] = ti.Vector([at, shift])
 
     @ti.func
@@ -126,7 +132,7 @@ class Box(Collider):
         return out
 
     @ti.func
-    def confine(self, i, radius, h, when, turn):
+    def confine(self, i, radius, h, frame_fraction, turn):
         """Two planes per axis, lower ones first."""
         if self.may_touch(i, radius) != 0:
             for side in range(ti.static(2 * self.dim)):

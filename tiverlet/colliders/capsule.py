@@ -1,12 +1,14 @@
 """A rod with round ends."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .. import checks
 from ..device import ti
 from ..features.feature import Knob, Scene
 from ..particles import Particles
 from .collider import TOUCH, Collider
+from .round import rounded
 from .track import Track
 
 MARCH = 32  # steps along a path; what only grazes is then within 1e-6 of its way
@@ -32,7 +34,7 @@ class Capsule(Collider):
     a, b = _end("a"), _end("b")
     radius = Knob(lambda f, v: checks.number("Capsule", "radius", v, above=0.0), "Of the rod [m].", device="size")
 
-    def __init__(self, a, b, radius, *, friction=0.0, restitution=0.0, push_out=1.0):
+    def __init__(self, a, b, radius, *, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float = 1.0):
         self.a, self.b = a, b
         self.radius = radius
         self.surface(friction, restitution, push_out)
@@ -66,6 +68,10 @@ class Capsule(Collider):
         """The axis, as thick as the rod."""
         return np.array([[self.a, self.b]]), self.radius
 
+    def solid(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The rod."""
+        return rounded(self.a, self.b, self.radius) if len(self.a) == 3 else Collider.solid(self, low, high)
+
     @ti.func
     def nearest(self, x, a, b):
         """Where on the axis, from 0 at a to 1 at b, the point nearest to x is, the distance to it, and the direction from it."""
@@ -82,37 +88,37 @@ class Capsule(Collider):
         return t, length, n
 
     @ti.func
-    def along(self, x, a, b, when):
+    def along(self, x, a, b, frame_fraction):
         """Where a point at x, at the start of the substep, would be if the rod took it along as it turns: beside the same place
         on the axis, which ends between a and b, and as far from it."""
-        t, length, n = self.nearest(x, self.dev.a.at(when[0]), self.dev.b.at(when[0]))
+        t, length, n = self.nearest(x, self.dev.a.at(frame_fraction[0]), self.dev.b.at(frame_fraction[0]))
         axis = b - a
         if 0 < t < 1:
             n -= axis * (n.dot(axis) / axis.dot(axis))
         return a * (1 - t) + b * t + n * (length / ti.max(n.norm(), TOUCH))
 
     @ti.func
-    def confine(self, i, radius, h, when, turn):
+    def confine(self, i, radius, h, frame_fraction, turn):
         """The surface where it was met, or where it is nearest."""
-        a, b = self.dev.a.at(when[1]), self.dev.b.at(when[1])
-        x, far = self.dev.state.place(i), ti.cast(self.radius, self.dev.real) + radius
+        a, b = self.dev.a.at(frame_fraction[1]), self.dev.b.at(frame_fraction[1])
+        x, contact_distance = self.dev.state.place(i), ti.cast(self.radius, self.dev.real) + radius
         t, length, n = self.nearest(x, a, b)
-        depth = far - length
-        moved = self.dev.a.step(when) * (1 - t) + self.dev.b.step(when) * t
+        depth = contact_distance - length
+        moved = self.dev.a.step(frame_fraction) * (1 - t) + self.dev.b.step(frame_fraction) * t
         d = self.dev.surface.path(i, moved)
-        if (self.dev.a.step(when) != self.dev.b.step(when)).any():
-            d = x - self.along(x - self.dev.surface.path(i, 0 * x), a, b, when)
+        if (self.dev.a.step(frame_fraction) != self.dev.b.step(frame_fraction)).any():
+            d = x - self.along(x - self.dev.surface.path(i, 0 * x), a, b, frame_fraction)
         way = d.norm()
         _t, gap, _n = self.nearest(x - d, a, b)  # not twice the same name: Taichi would assign a vector to a number
-        gap -= far
+        gap -= contact_distance
         start_depth = -gap
         # It was outside, or touched, and may have come in: walk along the path, never further than the surface is away.
-        if gap > -TOUCH * far and gap < way:
+        if gap > -TOUCH * contact_distance and gap < way:
             s = ti.max(gap, 0) / way
             for k in range(MARCH):
                 if s < 1:
                     _t, gap, _n = self.nearest(x - (1 - s) * d, a, b)
-                    s += ti.max(gap - far, 0) / way
+                    s += ti.max(gap - contact_distance, 0) / way
             depth = 0 * depth
             if s < 1:
                 _t, _gap, n = self.nearest(x - (1 - s) * d, a, b)

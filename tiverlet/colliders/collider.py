@@ -38,7 +38,8 @@ class Collider(Feature):
     friction = Knob(lambda f, v: _friction(f, v), "A number, or (static, dynamic).")
     restitution = Knob(lambda f, v: restitution_of(repr(f), "restitution", v), "0 to 1.")
     push_out = Knob(lambda f, v: checks.number(repr(f), "push_out", v, least=0.0), "[m/s].", compiled=True)
-    compiled_for = ("rubs", "bounces")
+    compiled_for = ("has_friction", "has_restitution")
+    host_only = ("widest",)
     sweeps = False  # needs the exact position at the start of the substep
     repeats = False  # one confine() may leave a particle that rubs or bounces where it has to be confined again
     poses = False  # has a pose(when) to be worked out once for each substep, before any confine()
@@ -48,22 +49,22 @@ class Collider(Feature):
         self.friction, self.restitution, self.push_out = friction, restitution, push_out
 
     @property
-    def rubs(self) -> bool:
+    def has_friction(self) -> bool:
         """Whether there is friction, or was when kernels were compiled."""
-        return friction_of(repr(self), "friction", self.friction)[0] > 0 or self._built("surface", "rubs")
+        return friction_of(repr(self), "friction", self.friction)[0] > 0 or self._built("surface", "has_friction")
 
     @property
-    def bounces(self) -> bool:
+    def has_restitution(self) -> bool:
         """Whether there is restitution, or was when kernels were compiled."""
-        return self.restitution > 0 or self._built("surface", "bounces")
+        return self.restitution > 0 or self._built("surface", "has_restitution")
 
     def bind(self, scene: Scene) -> None:
         """Keep the state at hand, and make the surface."""
         self.scene = scene
         self.dev.state = scene.state
         self.dev.real = scene.real
-        both = friction_of(repr(self), "friction", self.friction) if self.rubs else None
-        self.dev.surface = Surface(scene, repr(self), both, self.restitution if self.bounces else None, self.push_out)
+        both = friction_of(repr(self), "friction", self.friction) if self.has_friction else None
+        self.dev.surface = Surface(scene, repr(self), both, self.restitution if self.has_restitution else None, self.push_out)
 
     def upload(self) -> None:
         """Write friction and restitution."""
@@ -73,13 +74,17 @@ class Collider(Feature):
         """For pictures of a scene between two corners: line strips (m, k, dim), and half their width [m], 0 for a thin line."""
         return np.zeros((0, 2, len(low))), 0.0
 
+    def solid(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """For pictures of a 3D scene between two corners: vertices (v, 3) and triangles (t, 3); none where lines say more."""
+        return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
+
     @ti.func
     def may_touch(self, i, radius):
         """0 where confine() has nothing to do for particle i, if that can be told without a branch, for several at once."""
         return 1
 
     @ti.func
-    def confine(self, i, radius, h, when, turn):
+    def confine(self, i, radius, h, frame_fraction, turn):
         """Move particle i out of the wall, with self.dev.surface.press(). turn: FIRST, AGAIN or GENTLY."""
 
 

@@ -8,20 +8,20 @@ CHUNK = 1 << 22  # pairs of a facet and a cell that are looked at together
 
 
 class FacetGrid:
-    """Cells around facets, corners (m, k, dim) [m], which may be touched from as far as `far` [m].
+    """Cells around facets, corners (m, k, dim) [m], which may be touched from `most_distance` [m] away.
 
     Every facet closer than `reach` to a cell is in the list of that cell: list[begin[b] : begin[b + 1]] with b = bucket[cell],
     axis 0 fastest. Cells that are further away have b = -1 - rings instead, with `rings` cells and reach between them and any
     facet. Those deep inside a closed shape have the last b, whose list holds all facets.
     """
 
-    def __init__(self, corners: np.ndarray, far: float, closed: bool):
+    def __init__(self, corners: np.ndarray, most_distance: float, closed: bool):
         low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
         m, _, dim = corners.shape
         extent = float((high - low).max())
-        self.cell = max(far / 3, extent / max(CELLS, 8 * m) ** (1 / dim))
+        self.cell = max(most_distance / 3, extent / max(CELLS, 8 * m) ** (1 / dim))
         while True:
-            self.reach = (far + self.cell / 2) * (1 + 1e-3)
+            self.reach = (most_distance + self.cell / 2) * (1 + 1e-3)
             self.shape = np.ceil((high - low + 2 * self.reach) / self.cell).astype(int)
             span = ((np.ptp(corners, axis=1) + 2 * self.reach) / self.cell + 1).prod(axis=1)
             if self.shape.prod() <= 8 * max(CELLS, 8 * m) and span.sum() <= ENTRIES * max(CELLS, m):

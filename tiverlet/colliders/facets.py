@@ -167,15 +167,15 @@ class FacetShape(Shape):
         return ti.cast(self.close, self.real)
 
     @ti.func
-    def strike(self, a, e, far, close, limit):
+    def strike(self, a, e, contact_distance, close, limit):
         """The first touch of any facet on the way. Where the start is inside of a closed shape, the nearest facet lets it out."""
-        way, s, piece = e.norm(), 0 * far, 0
-        best, depth, normal = 0 * far + 2, 0 * far, 0 * e
-        least, outside, exit = far + way + 1, 0 * far + 1, 0 * e
+        way, s, piece = e.norm(), 0 * contact_distance, 0
+        best, depth, normal = 0 * contact_distance + 2, 0 * contact_distance, 0 * e
+        least, outside, exit = contact_distance + way + 1, 0 * contact_distance + 1, 0 * e
         while s < 1 and s < best and piece < self.pieces:
             begin, end, clear = self.around(a + s * e)
             for place in range(begin, end):
-                f, t, going = self.list[place], 0 * far, True
+                f, t, going = self.list[place], 0 * contact_distance, True
                 for k in range(NEWTON):
                     if going:
                         distance, n, at = self.nearest(f, a + t * e)
@@ -189,7 +189,7 @@ class FacetShape(Shape):
                             if distance <= self.touch:
                                 # On the surface itself, each facet that is touched there has its own direction.
                                 distance, n, at = ti.select(side < 0, -distance, distance), self.normal[f], -1
-                        gap, slope = distance - far, e.dot(n)
+                        gap, slope = distance - contact_distance, e.dot(n)
                         if gap <= close or k == NEWTON - 1:
                             going = False
                             below = -(gap + (1 - t) * slope)
@@ -208,14 +208,14 @@ class FacetShape(Shape):
                             going = t <= 1
                         else:
                             going = False
-            s += (clear - far) / way
+            s += (clear - contact_distance) / way
             piece += 1
         if ti.static(self.closed):
             if outside < 0 and least > self.touch:
-                below = far + least - e.dot(exit)
-                best = 0 * far + 2
+                below = contact_distance + least - e.dot(exit)
+                best = 0 * contact_distance + 2
                 if ti.min(below, limit - e.dot(exit)) > 2 * close:
-                    best, depth, normal = 0 * far, below, exit
+                    best, depth, normal = 0 * contact_distance, below, exit
         return best, depth, normal
 
     @ti.func

@@ -1,6 +1,7 @@
 """A plane with particles on one side."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .. import checks
 from ..device import ti
@@ -22,7 +23,9 @@ class HalfSpace(Collider):
 
     offset = Knob(lambda f, v: checks.number("HalfSpace", "offset", v), "Of the plane along its normal [m].")
 
-    def __init__(self, normal, offset=0.0, *, friction=0.0, restitution=0.0, push_out=1.0):
+    def __init__(
+        self, normal, offset: ArrayLike = 0.0, *, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float = 1.0,
+    ):  # fmt: skip
         normal = np.asarray(normal, dtype=np.float64)
         normal = checks.vector("HalfSpace", "normal", normal, normal.size)
         length = float(np.linalg.norm(normal))
@@ -63,13 +66,21 @@ class HalfSpace(Collider):
         across = np.linalg.svd(self.normal[None])[2][1:]  # an orthonormal basis of the plane
         return np.stack([foot - reach * across, foot + reach * across], axis=1), 0.0
 
+    def solid(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A square of the plane, as wide as the scene."""
+        if len(low) != 3:
+            return Collider.solid(self, low, high)
+        ends = self.outline(low, high)[0]
+        corners = np.array([ends[0, 0], ends[1, 0], ends[0, 1], ends[1, 1]])
+        return corners, np.array([[0, 1, 2], [0, 2, 3]])
+
     @ti.func
-    def confine(self, i, radius, h, when, turn):
+    def confine(self, i, radius, h, frame_fraction, turn):
         """One plane."""
         n, offset = self.dev.normal[None], self.dev.offset[None]
         before, now = (
-            offset[0] * (1 - when[0]) + offset[1] * when[0],
-            offset[0] * (1 - when[1]) + offset[1] * when[1],
+            offset[0] * (1 - frame_fraction[0]) + offset[1] * frame_fraction[0],
+            offset[0] * (1 - frame_fraction[1]) + offset[1] * frame_fraction[1],
         )
         depth, moved = now + radius - n.dot(self.dev.state.place(i)), (now - before) * n
         self.dev.surface.press(i, depth, depth + self.dev.surface.path(i, moved).dot(n), n, moved, h, turn)

@@ -1,10 +1,12 @@
 """A wall along a triangle mesh."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .. import checks
 from ..features.feature import Scene
 from ..particles import Particles
+from .collider import Collider
 from .facets import Facets, FacetShape, facet_normals
 from .moving import Moving
 from .shape import Shape
@@ -29,8 +31,8 @@ class Mesh(Moving):
     dim = 3
 
     def __init__(
-        self, vertices, faces, inside=False, *, closed=True, radius=0.0, position=0.0, rotation=0.0, friction=0.0,
-        restitution=0.0, push_out=1.0,
+        self, vertices, faces, inside: bool = False, *, closed: bool = True, radius: float = 0.0, position: ArrayLike = 0.0,
+        rotation: ArrayLike = 0.0, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float = 1.0,
     ):  # fmt: skip
         vertices = checks.points("Mesh", "vertices", vertices, dim=3)
         faces = checks.indices("Mesh", "faces", faces, len(vertices), arity=3).astype(int)
@@ -130,6 +132,10 @@ class Mesh(Moving):
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
         """The edges where the mesh bends."""
         return self.placed(self.vertices[self.edges[self.creases]]), self.radius
+
+    def solid(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Its faces, unless the scene is inside of it."""
+        return Collider.solid(self, low, high) if self.inside else (self.placed(self.vertices), np.asarray(self.faces))
 
 
 def _turned(count: int, first: np.ndarray, second: np.ndarray, same: np.ndarray) -> np.ndarray:

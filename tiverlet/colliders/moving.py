@@ -88,17 +88,17 @@ class Moving(Collider):
         return points @ rotation_matrix(self.rotation).T + self.position
 
     @ti.func
-    def pose(self, when):
+    def pose(self, frame_fraction):
         """Where the wall is in a substep."""
-        self.dev.pose.update(when)
+        self.dev.pose.update(frame_fraction)
 
     @ti.func
-    def confine(self, i, radius, h, when, turn):
+    def confine(self, i, radius, h, frame_fraction, turn):
         """Touch by touch along the way.
 
         The wall moves by what its point under the start of the particle moves, so what sticks rides along and does not creep.
         """
-        start, far = self.dev.state.begin(i), radius + ti.cast(self.radius, self.dev.real)
+        start, contact_distance = self.dev.state.begin(i), radius + ti.cast(self.radius, self.dev.real)
         first = self.dev.pose.inward(0, start - self.dev.pose.place[0])
         moved = self.dev.pose.place[2] + self.dev.pose.outward(2, first)
         e = self.dev.pose.inward(1, self.dev.state.d[i] - moved)
@@ -111,7 +111,7 @@ class Moving(Collider):
         a, going, touched = first, True, False
         for k in range(TOUCHES + 1):
             if going:
-                s, depth, n = self.dev.shape.strike(a, e, far, close, self.push_out * h)
+                s, depth, n = self.dev.shape.strike(a, e, contact_distance, close, self.push_out * h)
                 if s > 1:
                     going = False
                 elif k < TOUCHES:
@@ -121,9 +121,9 @@ class Moving(Collider):
                     a += s * e
                     e += self.dev.pose.inward(1, shift) - s * e
         if ti.static(self.dev.shape.guesses):
-            if touched and not self.dev.shape.astray(first, far - 8 * close, close):
-                going = going or self.dev.shape.astray(a + e, far, close)
-                if going and self.dev.shape.astray(a, far, close):
+            if touched and not self.dev.shape.astray(first, contact_distance - 8 * close, close):
+                going = going or self.dev.shape.astray(a + e, contact_distance, close)
+                if going and self.dev.shape.astray(a, contact_distance, close):
                     a = first
         if going:
             # There with no more speed than it had.

@@ -1,6 +1,7 @@
 """A wall along a polygon."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .. import checks
 from ..features.feature import Scene
@@ -29,8 +30,8 @@ class Polygon(Moving):
     dim = 2
 
     def __init__(
-        self, vertices, inside=False, *, closed=True, radius=0.0, position=0.0, rotation=0.0, friction=0.0, restitution=0.0,
-        push_out=1.0,
+        self, vertices, inside: bool = False, *, closed: bool = True, radius: float = 0.0, position: ArrayLike = 0.0, rotation:
+        ArrayLike = 0.0, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float = 1.0,
     ):  # fmt: skip
         vertices = checks.points("Polygon", "vertices", vertices, dim=2)
         self.closed, self.inside = bool(closed), bool(inside)

@@ -35,17 +35,17 @@ class Pose:
         self.rotation.end_motion()
 
     @ti.func
-    def update(self, when):
+    def update(self, frame_fraction):
         """Work out where it is at the start and the end of a substep, and how it moves in between, by differences in f64."""
         before = ti.Matrix.zero(ti.f64, self.dim, self.dim)
         for k in range(2):
-            turn = self.matrix(self.rotation.at(ti.cast(ti.select(k == 0, when[0], when[1]), ti.f64)))
+            turn = self.matrix(self.rotation.at(ti.cast(ti.select(k == 0, frame_fraction[0], frame_fraction[1]), ti.f64)))
             for a in ti.static(range(self.dim)):
                 self.turn[k * self.dim + a] = ti.cast(turn[a, :], self.real)
                 self.turn[2 * self.dim + a] = ti.cast(turn[a, :] - before[a, :], self.real)
             before = turn
-        self.place[0], self.place[1] = self.position.at(when[0]), self.position.at(when[1])
-        self.place[2] = self.position.step(when)
+        self.place[0], self.place[1] = self.position.at(frame_fraction[0]), self.position.at(frame_fraction[1])
+        self.place[2] = self.position.step(frame_fraction)
 
     @ti.func
     def matrix(self, rotation):

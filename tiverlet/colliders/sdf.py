@@ -4,8 +4,10 @@ import inspect
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..device import runtime, ti
+from ..device.language import is_kernel_function, undecorated
 from ..device.patches.compiler import Compiler
 from ..features.feature import Scene
 from ..particles import Particles
@@ -43,7 +45,8 @@ class Sdf(Moving):
     """
 
     def __init__(
-        self, function, gradient=None, *, radius=0.0, position=0.0, rotation=0.0, friction=0.0, restitution=0.0, push_out=1.0
+        self, function, gradient=None, *, radius: float = 0.0, position: ArrayLike = 0.0, rotation: ArrayLike = 0.0, friction:
+        ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float = 1.0,
     ):  # fmt: skip
         self.function: Any = _taken("function", function)
         self.gradient: Any = gradient and _taken("gradient", gradient)
@@ -122,9 +125,9 @@ class FunctionShape(Shape):
         self.step = 2.0**-6 if single else 2.0**-16
 
     @ti.func
-    def astray(self, q, far, close):
+    def astray(self, q, contact_distance, close):
         """By more than rounding."""
-        return self.function(q) < far - close
+        return self.function(q) < contact_distance - close
 
     @ti.func
     def rounding(self, q):
@@ -132,9 +135,9 @@ class FunctionShape(Shape):
         return q.norm() * ti.cast(self.digits, self.real)
 
     @ti.func
-    def normal(self, q, far):
+    def normal(self, q, contact_distance):
         """The direction of the gradient; +x where there is none."""
-        g = self.slope(q, far)
+        g = self.slope(q, contact_distance)
         size, n = g.norm(), 0 * q
         n[0] = 1
         if size > 0:
@@ -142,14 +145,14 @@ class FunctionShape(Shape):
         return n
 
     @ti.func
-    def slope(self, q, far):
-        """The gradient, the user's or by central differences; these know of what touches at a distance `far` and of where it is,
-        and of nothing else in the scene."""
+    def slope(self, q, contact_distance):
+        """The gradient, the user's or by central differences; these know of what touches at `contact_distance` and of where it
+        is, and of nothing else in the scene."""
         out = 0 * q
         if ti.static(bool(self.gradient)):
             out = self.gradient(q)
         else:
-            step = ti.max(far, q.norm() / 100) * ti.cast(self.step, self.real)
+            step = ti.max(contact_distance, q.norm() / 100) * ti.cast(self.step, self.real)
             for k in range(self.dim):
                 ahead, behind = q, q
                 for a in ti.static(range(self.dim)):
@@ -163,26 +166,26 @@ class FunctionShape(Shape):
         return out
 
     @ti.func
-    def strike(self, a, e, far, close, limit):
+    def strike(self, a, e, contact_distance, close, limit):
         """The first touch on the way.
 
         What starts close to the surface is first held above the tangent plane there. Then the way is followed at FINE * 4 of its
         length above that plane, so that steps do not shrink to nothing; at last its end is looked at: in a hollow, it is below.
         """
         way = e.norm()
-        best, depth, normal = 0 * far + 2, 0 * far, 0 * e
-        fine, lift, s, going = way * FINE + close, 0 * e, 0 * far, True
+        best, depth, normal = 0 * contact_distance + 2, 0 * contact_distance, 0 * e
+        fine, lift, s, going = way * FINE + close, 0 * e, 0 * contact_distance, True
         for k in range(MARCH + 2):
             if going:
                 ends = s >= 1
                 q = a + s * e + lift
                 if ends:
                     q = a + e
-                gap = self.function(q) - far
+                gap = self.function(q) - contact_distance
                 if k == 0 and gap > way + close:
                     going = False
                 elif k == 0 or gap <= fine or ends or k == MARCH:
-                    n = self.normal(q, far)
+                    n = self.normal(q, contact_distance)
                     slope = e.dot(n)
                     toward = slope < -ti.cast(self.slight, self.real) * way
                     if k == 0:
@@ -198,7 +201,7 @@ class FunctionShape(Shape):
                     elif ends:
                         going = False
                         if ti.min(-gap, limit - slope) > 2 * close:
-                            best, depth, normal = 0 * far, -gap, n
+                            best, depth, normal = 0 * contact_distance, -gap, n
                     else:
                         below = -(gap - lift.dot(n) + (1 - s) * slope)
                         if toward and below > 0:
@@ -277,12 +280,12 @@ def contour(grid: np.ndarray, value: np.ndarray) -> np.ndarray:
 
 def _taken(name: str, function):
     """A ti.func of one argument."""
-    if not getattr(function, "_is_taichi_function", False):
+    if not is_kernel_function(function):
         raise TypeError(
             f"Sdf: {name} = {function!r} is not a Taichi function. Put the decorator @ti.func above its def "
             "(import taichi as ti), in a file: Taichi reads its source."
         )
-    names = list(inspect.signature(function.func.func).parameters)
+    names = list(inspect.signature(undecorated(function)).parameters)
     if len(names) != 1:
         raise TypeError(f"Sdf: {name} takes {names}, but it must take one position.")
     return function

@@ -12,13 +12,13 @@ class Shape:
     guesses = False
 
     @ti.func
-    def strike(self, a, e, far, close, limit):
-        """The first touch of a particle, whose center must stay at least `far` from the shape, on its way from a to a + e.
+    def strike(self, a, e, contact_distance, close, limit):
+        """The first touch of a particle, whose center must stay at `contact_distance` from the shape, on its way from a to a + e.
 
         close: what rounding amounts to. limit: how far a start that is inside may be pushed out.
         Returns the fraction of the way (2 for none), the depth at a + e below the plane that touches there, and its normal.
         """
-        return 0 * far + 2, 0 * far, 0 * e
+        return 0 * contact_distance + 2, 0 * contact_distance, 0 * e
 
     @ti.func
     def rounding(self, q):
@@ -26,6 +26,6 @@ class Shape:
         return 0 * q[0]
 
     @ti.func
-    def astray(self, q, far, close):
+    def astray(self, q, contact_distance, close):
         """Whether a particle with its center at q, in the shape's frame, is inside of it."""
         return False

@@ -1,7 +1,11 @@
 """What happens to a particle that is inside of a collider: it is taken out, with friction and restitution."""
 
+from typing import TYPE_CHECKING
+
 from ..device import at, inline, ti
-from ..features.feature import Scene
+
+if TYPE_CHECKING:
+    from ..features.feature import Scene
 
 # How a collider confines: as it comes; only what is further out than rounding; of that, without friction and bounces.
 FIRST, AGAIN, GENTLY = range(3)
@@ -13,19 +17,21 @@ class Surface:
     friction: (static, dynamic), or None for a surface without. restitution: 0 to 1, or None. push_out: [m/s].
     """
 
-    def __init__(self, scene: Scene, name: str, friction: tuple[float, float] | None, restitution: float | None, push_out: float):
+    def __init__(
+        self, scene: "Scene", name: str, friction: tuple[float, float] | None, restitution: float | None, push_out: float
+    ):
         self._memory, self.state, self.push_out = scene.memory, scene.state, push_out
-        self.rubs, self.bounces = friction is not None, restitution is not None
-        if self.rubs:
+        self.has_friction, self.has_restitution = friction is not None, restitution is not None
+        if self.has_friction:
             self.friction = scene.memory.field(f"{name}.friction", None, width=2, values=friction)
-        if self.bounces:
+        if self.has_restitution:
             self.restitution = scene.memory.field(f"{name}.restitution", None, values=restitution)
 
     def upload(self, friction: tuple[float, float], restitution: float) -> None:
         """Write both to the device, as far as kernels read them."""
-        if self.rubs:
+        if self.has_friction:
             self._memory.write(self.friction, friction)
-        if self.bounces:
+        if self.has_restitution:
             self._memory.write(self.restitution, restitution)
 
     @inline
@@ -75,17 +81,17 @@ class Surface:
             # Normal displacement after the substep; what has bounced may be moved further than that is to tell.
             after = ti.min(leaving + move, ti.max(ti.abs(leaving), self.push_out * h))
             rise = 0 * depth
-            if ti.static(self.bounces):
+            if ti.static(self.has_restitution):
                 # Where the last bounce has put it back on a straight way, that way began at a height of `gap`.
                 gap = -depth - leaving
                 if gap >= 0 and leaving < 0 and turn != GENTLY:
                     rise, after = self.bounce(gap, leaving, (self.state.before[i] - moved).dot(n), after)
             change = (after - leaving) * n
-            if ti.static(self.state.leans):
-                self.state.lean[i] = self.state.lean[i] + change
+            if ti.static(self.state.keeps_wall_push):
+                self.state.wall_push[i] = self.state.wall_push[i] + change
             shift = (move + rise) * n
             stuck = False
-            if ti.static(self.rubs):
+            if ti.static(self.has_friction):
                 if turn != GENTLY:
                     slip = d - leaving * n
                     size, support = slip.norm(), after - leaving
@@ -102,7 +108,7 @@ class Surface:
                 if rise == 0:
                     impact -= (after - leaving) * n
                 self.state.before[i] = self.state.before[i] + impact
-            if ti.static(self.rubs):
+            if ti.static(self.has_friction):
                 if stuck:
                     self.state.restart(i)
             if not stuck:

@@ -26,12 +26,12 @@ class Track:
         self._memory.write(self.ends, [self._memory.read(self.ends)[1]] * 2)
 
     @ti.func
-    def at(self, when):
+    def at(self, frame_fraction):
         """Where it is at the fraction `when` of the frame; what stands is where it stands, to the bit."""
         a, b = self.ends[0], self.ends[1]
-        return ti.select(a == b, a, a * (1 - when) + b * when)
+        return ti.select(a == b, a, a * (1 - frame_fraction) + b * frame_fraction)
 
     @ti.func
-    def step(self, when):
+    def step(self, frame_fraction):
         """How far it goes in a substep."""
-        return (self.ends[1] - self.ends[0]) * (when[1] - when[0])
+        return (self.ends[1] - self.ends[0]) * (frame_fraction[1] - frame_fraction[0])

@@ -5,6 +5,8 @@ import os
 import runpy
 from typing import Any
 
+from ..device.language import is_kernel_function
+
 ABOUT = "view, verify, picture or export a recording"
 
 
@@ -20,7 +22,9 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
     what.add_argument("--web", action="store_true", help="serve the viewer to browsers, on 127.0.0.1 only")
     what.add_argument("--png", metavar="OUT.png", help="save a picture, without a window; needs a Vulkan driver, in software too")
-    what.add_argument("--export", choices=("npz", "csv"), help="write positions (npz: and curves) beside the file")
+    what.add_argument(
+        "--export", choices=("npz", "csv", "xyz"), help="write positions (npz: and curves; xyz: for OVITO) beside the file"
+    )
     parser.add_argument("--frame", type=int, action="append", help="of --png; several with a %%d in the name; default the last")
     parser.add_argument("--scene", action="store_true", help="of --png: the scene alone, without curves and text")
     parser.add_argument("--port", type=int, default=9090, help="of --web; default 9090")
@@ -75,7 +79,7 @@ def functions(script: str, names: dict[str, str]) -> dict[str, Any]:
     found = runpy.run_path(script, run_name="given")
     out = {name: found[name.partition(" #")[0]] for name in names if name.partition(" #")[0] in found}
     for name, thing in out.items():
-        if not getattr(thing, "_is_taichi_function", False):
+        if not is_kernel_function(thing):
             raise ValueError(
                 f"--given {script}: {plain(name)} is a {type(thing).__name__}, but only functions with @ti.func are taken from "
                 "a script. Give others in Python: tv.replay(path, given=[...])."

@@ -10,7 +10,8 @@ from collections.abc import Iterator
 from typing import Any
 
 ABOUT = "run a demo or script, and record it"
-DEMOS = pathlib.Path(__file__).parents[2] / "demos"
+# Beside the package in a checkout, in the package where it was installed.
+DEMOS = next((p / "demos" for p in pathlib.Path(__file__).parents[1:3] if (p / "demos").is_dir()), pathlib.Path("demos"))
 
 
 def add(parser: argparse.ArgumentParser) -> None:

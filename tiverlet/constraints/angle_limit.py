@@ -1,6 +1,7 @@
 """Limbs and hinges: corners that turn only so far."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .. import checks
 from ..device import ti
@@ -33,7 +34,7 @@ class AngleLimit(Angle):
     lower = Knob(lambda f, v: f._bound("lower", v), "The smaller limit [rad].")
     upper = Knob(lambda f, v: f._bound("upper", v), "The larger limit [rad].")
 
-    def __init__(self, triples, lower, upper, *, compliance=0.0, damping=0.0, break_at=None):
+    def __init__(self, triples, lower, upper, *, compliance: ArrayLike = 0.0, damping: ArrayLike = 0.0, break_at=None):
         self.setup(triples, None, compliance, damping, break_at)
         self.lower, self.upper = lower, upper
 

@@ -1,6 +1,7 @@
 """Areas of triangles and of closed loops."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .. import checks
 from ..device import ti
@@ -34,7 +35,10 @@ class Area(Enclosed):
     collapses, curved = 2, True
     rest = Knob(lambda f, v: checks.per_item("Area", "rest", v, f.count, least=0.0), "Area at pressure 1 [m^2].")
 
-    def __init__(self, loops, rest=None, *, pressure=1.0, compliance=0.0, damping=0.0, break_at=None):
+    def __init__(
+        self, loops, rest=None, *, pressure: ArrayLike = 1.0, compliance: ArrayLike = 0.0, damping: ArrayLike = 0.0,
+        break_at=None,
+    ):  # fmt: skip
         self.setup(loops, rest, compliance, damping, break_at)
         self.pressure = pressure
 

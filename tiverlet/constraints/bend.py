@@ -1,6 +1,7 @@
 """Angles between links."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..device import ti
 from ..features.feature import Scene
@@ -28,7 +29,7 @@ class Bend(Angle):
     index_name = "triples"
     exchangeable = ((0, 2),)
 
-    def __init__(self, triples, rest=None, *, compliance=0.0, damping=0.0, break_at=None):
+    def __init__(self, triples, rest=None, *, compliance: ArrayLike = 0.0, damping: ArrayLike = 0.0, break_at=None):
         self.setup(triples, rest, compliance, damping, break_at)
 
     def rest_of(self, position: np.ndarray) -> np.ndarray:

@@ -4,9 +4,11 @@ import inspect
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .. import checks
 from ..device import ti
+from ..device.language import undecorated
 from ..features.feature import Knob
 from ..particles import Particles
 from ..tools import golden
@@ -51,8 +53,8 @@ class Constraint(Scalar):
     rest = Knob(lambda f, v: checks.per_item(repr(f), "rest", v, f.count), "What function should be.")
 
     def __init__(
-        self, function, indices, rest=0.0, *, gradient=None, side=0, origin=None, unit=None, compliance=0.0, damping=0.0,
-        break_at=None,
+        self, function, indices, rest: ArrayLike = 0.0, *, gradient=None, side: int = 0, origin=None, unit=None, compliance:
+        ArrayLike = 0.0, damping: ArrayLike = 0.0, break_at=None,
     ):  # fmt: skip
         self.name = getattr(function, "__name__", "?")
         indices = np.asarray(indices)
@@ -75,7 +77,7 @@ class Constraint(Scalar):
         """The function for kernels, and whether it takes the number of the constraint."""
         if not callable(function):
             raise TypeError(f"Constraint: {name} = {function!r} is not a function.")
-        plain = function.func.func if getattr(function, "_is_taichi_function", False) else function
+        plain = undecorated(function)
         names = list(inspect.signature(plain).parameters)
         if self.arity and len(names) not in (self.arity, self.arity + 1):
             raise TypeError(

@@ -1,6 +1,7 @@
 """Angles between triangles."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..device import ti
 from .core.angle import SHORT, Angle
@@ -27,7 +28,7 @@ class Dihedral(Angle):
     index_name = "quads"
     exchangeable = ((0, 1), (2, 3))
 
-    def __init__(self, quads, rest=None, *, compliance=0.0, damping=0.0, break_at=None):
+    def __init__(self, quads, rest=None, *, compliance: ArrayLike = 0.0, damping: ArrayLike = 0.0, break_at=None):
         self.setup(quads, rest, compliance, damping, break_at)
 
     def prepare(self, particles, inv_mass: np.ndarray) -> None:

@@ -1,6 +1,7 @@
 """Links of given length."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .. import checks
 from ..device import ti
@@ -81,5 +82,5 @@ class Distance(Link):
     Second order in h, without artificial damping, for every compliance (see Scalar). `load` is the tension of each link [N].
     """
 
-    def __init__(self, pairs, rest=None, *, compliance=0.0, damping=0.0, break_at=None):
+    def __init__(self, pairs, rest=None, *, compliance: ArrayLike = 0.0, damping: ArrayLike = 0.0, break_at=None):
         self.setup(pairs, rest, compliance, damping, break_at)

@@ -3,6 +3,7 @@
 import warnings
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .. import checks
 from ..device import ti
@@ -36,7 +37,8 @@ class Path(Anchored):
     at = Knob(lambda f, v: f._drive("at", v), "Arc length at the end of the next frame [m].")
 
     def __init__(
-        self, indices, points, *, closed=False, smooth=True, speed=None, at=None, compliance=0.0, damping=0.0
+        self, indices, points, *, closed: bool = False, smooth: bool = True, speed=None, at=None, compliance: ArrayLike = 0.0,
+        damping: ArrayLike = 0.0,
     ):  # fmt: skip
         self.driver = "speed" if speed is not None else "at" if at is not None else ""
         self.setup(indices, compliance, damping)
@@ -154,14 +156,14 @@ class Path(Anchored):
         return self.dev.a[k] + r * (b + r * (c + r * d)), b + r * (2 * c + 3 * r * d)
 
     @ti.func
-    def drive(self, c, h, when):
+    def drive(self, c, h, frame_fraction):
         """Put the particle where it is to be."""
         s, length = self.dev.source[c], self.dev.begin[self.dev.pieces]
         if ti.static(self.dev.moves):
             s += self.dev.target[c] * h
             self.dev.source[c] = s
         else:
-            s = s * (1 - when) + self.dev.target[c] * when
+            s = s * (1 - frame_fraction) + self.dev.target[c] * frame_fraction
         if ti.static(self.dev.closed):
             s -= ti.floor(s / length) * length
         else:
@@ -226,7 +228,7 @@ class Path(Anchored):
         return k, r, bent or going
 
     @ti.func
-    def offsets(self, c, when, first, fresh):
+    def offsets(self, c, frame_fraction, first, fresh):
         """Across the curve, from where the plane across it meets it; at an end or a bend, from the nearest point."""
         i = self.member(c, 0)
         x, t, C0 = self.dev.state.place(i), self.dev.tangent[c], 0 * self.dev.tangent[c]

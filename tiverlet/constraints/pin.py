@@ -1,6 +1,7 @@
 """Particles held at targets."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .. import checks
 from ..device import ti
@@ -36,7 +37,7 @@ class Pin(Anchored):
     exclusive = True
     target = Knob(_targets, "Where the particles are held, (m, dim) [m].")
 
-    def __init__(self, indices, target=None, *, compliance=0.0, damping=0.0):
+    def __init__(self, indices, target=None, *, compliance: ArrayLike = 0.0, damping: ArrayLike = 0.0):
         self.setup(indices, compliance, damping)
         if target is not None:
             self.target = target
@@ -90,23 +91,23 @@ class Pin(Anchored):
             self.scene.memory.write(self.dev.source, self.scene.memory.read(self.dev.target)[: self.count])
 
     @ti.func
-    def aim(self, c, when):
+    def aim(self, c, frame_fraction):
         """The target at the fraction `when` of the frame."""
-        return self.dev.source[c] * (1 - when) + self.dev.target[c] * when
+        return self.dev.source[c] * (1 - frame_fraction) + self.dev.target[c] * frame_fraction
 
     @ti.func
-    def drive(self, c, h, when):
+    def drive(self, c, h, frame_fraction):
         """Put the particle on the target."""
         i = self.member(c, 0)
-        d = self.aim(c, when) - self.dev.state.place(i)
+        d = self.aim(c, frame_fraction) - self.dev.state.place(i)
         self.dev.state.d[i] = d
         self.dev.state.advance(i, d)
 
     @ti.func
-    def offsets(self, c, when, first, fresh):
+    def offsets(self, c, frame_fraction, first, fresh):
         """x - target."""
         x = self.dev.state.place(self.member(c, 0))
-        return x - self.aim(c, when[1]), x - self.dev.state.d[self.member(c, 0)] - self.aim(c, when[0])
+        return x - self.aim(c, frame_fraction[1]), x - self.dev.state.d[self.member(c, 0)] - self.aim(c, frame_fraction[0])
 
     @ti.func
     def offset_now(self, c, back):

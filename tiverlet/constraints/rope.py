@@ -1,5 +1,7 @@
 """Links that pull and do not push."""
 
+from numpy.typing import ArrayLike
+
 from .distance import Link
 
 
@@ -16,5 +18,5 @@ class Rope(Link):
     side = 1
     rest_name = "length"
 
-    def __init__(self, pairs, length=None, *, compliance=0.0, damping=0.0, break_at=None):
+    def __init__(self, pairs, length=None, *, compliance: ArrayLike = 0.0, damping: ArrayLike = 0.0, break_at=None):
         self.setup(pairs, length, compliance, damping, break_at)

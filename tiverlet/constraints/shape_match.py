@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .. import checks
 from ..device import ti
@@ -59,7 +60,8 @@ class ShapeMatch(Batch):
     compiled_for = ("soft", "transcends", "breaks")
 
     def __init__(
-        self, clusters, rest=None, *, compliance=0.0, damping=0.0, creep=0.0, yield_strain=0.0, break_at=None
+        self, clusters, rest=None, *, compliance: ArrayLike = 0.0, damping: ArrayLike = 0.0, creep: ArrayLike = 0.0, yield_strain:
+        ArrayLike = 0.0, break_at=None,
     ):  # fmt: skip
         self.members = VariableSize("ShapeMatch", rows("ShapeMatch", "clusters", clusters, 1))
         self._rest = None if rest is None else checks.points("ShapeMatch", "rest", rest)
@@ -115,6 +117,10 @@ class ShapeMatch(Batch):
         self._shape = q - center[self.members.owner]
         square = np.bincount(self.members.owner, weights=m * (self._shape**2).sum(axis=1), minlength=self.count)
         self._radius = np.sqrt(square / total)
+
+    def shape_of(self, c: int) -> np.ndarray:
+        """The shape at rest of cluster c, about its center, (k, dim)."""
+        return self._shape[self.members.starts[c] : self.members.starts[c + 1]]
 
     def remap_indices(self, number: np.ndarray, count: int) -> None:
         """Particles that come later have a place in the shape of all, which no cluster uses."""
@@ -175,7 +181,7 @@ class ShapeMatch(Batch):
         if not self.acts:
             return np.zeros(self.count)
         w = self.scene.inv_mass[self.indices]
-        scale = np.divide(1, w * self.scene.hh, out=np.zeros_like(w), where=w * self.scene.hh > 0)
+        scale = np.divide(1, w * self.scene.h2_effective, out=np.zeros_like(w), where=w * self.scene.h2_effective > 0)
         pull = self.scene.memory.read(self.dev.pull).astype(np.float64)
         return np.maximum.reduceat(scale * np.linalg.norm(pull, axis=1), self.members.starts[:-1])
 
@@ -187,7 +193,7 @@ class ShapeMatch(Batch):
         return ti.cast(self.dev.state.apart(i, i0), ti.f64) - back * move
 
     @ti.func
-    def law(self, c, h, hh, fresh):
+    def law(self, c, h, h2_effective, fresh):
         """The coefficients of C_(n+1) (the rigid part and the rest), C_n and C_(n-1), and alpha M / h^2: alpha' of a move."""
         rigid, soft = ti.cast(1, self.dev.real), ti.cast(0, self.dev.real)
         now, last, give = 0 * soft, 0 * soft, 0 * soft
@@ -199,7 +205,7 @@ class ShapeMatch(Batch):
                     soft, now = ti.cast(1 / 64, self.dev.real), now + soft - 1 / 64
                 rigid = ti.min(stiff(alpha, h, 1 / mass), soft)
                 soft -= rigid
-                give = alpha * mass / hh
+                give = alpha * mass / h2_effective
         return rigid, soft, now, last, give
 
     @ti.func
@@ -220,11 +226,11 @@ class ShapeMatch(Batch):
         return mu
 
     @ti.func
-    def reduce_block(self, b, h, hh, first, fresh):
+    def reduce_block(self, b, h, h2_effective, first, fresh):
         """The moments of a block about the places s at the start: of shapes q, predicted places p, and of what else pulls."""
         begin, end, c = self.dev.corners.block[b]
         i0 = self.dev.corners.hub(c)
-        rigid, soft, now, last, give = self.law(c, h, hh, fresh)
+        rigid, soft, now, last, give = self.law(c, h, h2_effective, fresh)
         total, p1, q1, s1 = ti.cast(0, ti.f64), 0 * self.dev.place[0], 0 * self.dev.place[0], 0 * self.dev.place[0]
         K = p1.outer_product(p1)
         X, v1, U = 0 * K, 0 * p1, 0 * K
@@ -281,11 +287,11 @@ class ShapeMatch(Batch):
         return ti.Matrix([[field[c][dim * j + k] for k in ti.static(range(dim))] for j in ti.static(range(dim))])
 
     @ti.func
-    def relax(self, c, h, hh, when, first, fresh):
+    def relax(self, c, h, h2_effective, frame_fraction, first, fresh):
         """Find where the cluster goes."""
         if self.dev.mass[c] > 0:
             total, p, q, s, K, X = self.moments(c)
-            rigid, soft, now, last, give = self.law(c, h, hh, fresh)
+            rigid, soft, now, last, give = self.law(c, h, h2_effective, fresh)
             mean, U = 0 * p, 0 * K
             if ti.static(self.dev.spring.soft):
                 for b in range(self.dev.corners.blocks[c], self.dev.corners.blocks[c + 1]):
@@ -305,7 +311,7 @@ class ShapeMatch(Batch):
                 self.keep(self.dev.fit, c, R)
 
     @ti.func
-    def kick(self, c, h):
+    def push_spring_force(self, c, h):
         """Find where the cluster is; scatter_corner() then adds h^2 times what its springs do now."""
         if self.dev.mass[c] > 0:
             total, p, q, s, K, X = self.moments(c)
@@ -314,7 +320,7 @@ class ShapeMatch(Batch):
             self.keep(self.dev.pose, c, R)
 
     @ti.func
-    def bond(self, c, firm, soft):
+    def push_reaction(self, c, firm, soft):
         """What moved each corner, less its moment about the present places: as what turns the cluster, of least sum m move^2.
 
         Moves have no moment about the places at the start. Where something cannot move, forces from outside have one.
@@ -348,7 +354,7 @@ class ShapeMatch(Batch):
         return self.arm(e, self.dev.corners.hub(c), 0) - self.dev.place[c] - self.kept(self.dev.pose, c) @ self.dev.shape[e]
 
     @ti.func
-    def scatter_corner(self, e, h, hh, first, fresh):
+    def scatter_corner(self, e, h, h2_effective, first, fresh):
         """Move corner e towards its place."""
         c, i = self.dev.corners.owner[e], self.dev.corners.members[e]
         w, relaxation = self.dev.w.of(i), self.dev.slots.relaxation
@@ -366,7 +372,7 @@ class ShapeMatch(Batch):
             elif first < 0:
                 self.dev.corners.give(e, ti.cast(self.spring(e, c, C, h), self.dev.real))
             else:
-                rigid, soft, now, last, give = self.law(c, h, hh, fresh)
+                rigid, soft, now, last, give = self.law(c, h, h2_effective, fresh)
                 if first > 0:
                     self.look_back(e, c, h, now, last)
                 C = self.wrong(e, c, C, rigid, soft, give)
@@ -406,7 +412,7 @@ class ShapeMatch(Batch):
         return out
 
     @ti.func
-    def break_overloaded(self, c, hh, tick):
+    def break_overloaded(self, c, h2_effective, tick):
         """Let cluster c fall apart if the force on one of its particles was too large."""
         if self.dev.strength.holds(c):
             most = ti.cast(0, self.dev.real)
@@ -414,13 +420,13 @@ class ShapeMatch(Batch):
                 w = self.dev.w.of(self.dev.corners.members[e])
                 if w > 0:
                     most = ti.max(most, self.dev.pull[e].norm() / w)
-            self.dev.strength.test(c, most, hh, tick)
+            self.dev.strength.test(c, most, h2_effective, tick)
 
     @ti.func
-    def residual_of(self, c, h, hh, when, fresh):
+    def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
         """The largest violation that is left, by where the last pass turned the cluster, relative to its radius."""
         worst, total, mean, holds = ti.cast(0, ti.f64), ti.cast(0, ti.f64), 0 * self.dev.place[c], self.dev.strength.holds(c)
-        rigid, soft, now, last, give = self.law(c, h, hh, fresh)
+        rigid, soft, now, last, give = self.law(c, h, h2_effective, fresh)
         for e in range(self.dev.corners.starts[c], self.dev.corners.starts[c + 1]):
             total += self.weight(e, c)
             mean += self.weight(e, c) * self.off(e, c)
@@ -433,8 +439,8 @@ class ShapeMatch(Batch):
         return ti.cast(worst / self.dev.size[c], self.dev.real)
 
     @ti.func
-    def energy(self, c, back, hh, miss):
-        """Sum of m |C|^2 / (2 alpha M) at x - back d, about the best fit there."""
+    def energy(self, c, back, h2_effective, residual):
+        """Sum of m |C|^2 / (2 alpha M) at x - back d, about the best fit there, of what bears loads: see Spring.solved()."""
         out = ti.cast(0, ti.f64)
         if ti.static(self.dev.spring.soft):
             alpha, mass, i0 = self.dev.spring.alpha[c], self.dev.mass[c], self.dev.corners.hub(c)
@@ -451,10 +457,13 @@ class ShapeMatch(Batch):
                     K += mu * self.dev.shape[e].outer_product(x)
                 s, q = s / total, q / total
                 R = rotation.matrix(rotation.fit(K - total * q.outer_product(s), self.dev.turn[c], LEAST))
+                most = ti.cast(0, self.dev.real)
                 for e in range(self.dev.corners.starts[c], self.dev.corners.starts[c + 1]):
                     C = self.arm(e, i0, back) - s - R @ (self.dev.shape[e] - q)
                     if self.dev.w.of(self.dev.corners.members[e]) > 0:
                         out += C.dot(C) / (2 * alpha * mass * self.dev.w.of(self.dev.corners.members[e]))
+                        most = ti.max(most, self.dev.pull[e].norm())
+                out *= self.dev.spring.solved(most * alpha * mass, h2_effective, residual * self.dev.size[c])
         return out
 
 

@@ -1,6 +1,7 @@
 """A tidy grid."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .. import checks
 from ..device import ti
@@ -22,7 +23,7 @@ class Snap(Anchored):
     `load` is the force on each particle [N].
     """
 
-    def __init__(self, indices, spacing, origin=0.0, *, compliance, damping=0.0):
+    def __init__(self, indices, spacing, origin: ArrayLike = 0.0, *, compliance: ArrayLike, damping: ArrayLike = 0.0):
         self.setup(indices, compliance, damping)
         self.spacing, self.origin = spacing, origin
 
@@ -71,7 +72,7 @@ class Snap(Anchored):
         return node
 
     @ti.func
-    def offsets(self, c, when, first, fresh):
+    def offsets(self, c, frame_fraction, first, fresh):
         """x - node; what is remembered of the substep before is put in terms of the same node."""
         i = self.member(c, 0)
         x, start = self.dev.state.place(i), self.dev.state.place(i) - self.dev.state.d[i]

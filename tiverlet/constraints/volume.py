@@ -1,6 +1,7 @@
 """Volumes of tetrahedra and of closed meshes."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .. import checks
 from ..device import ti
@@ -36,7 +37,10 @@ class Volume(Enclosed):
     collapses, transcends, curved = 3, True, True
     rest = Knob(lambda f, v: checks.per_item("Volume", "rest", v, f.count, least=0.0), "Volume at pressure 1 [m^3].")
 
-    def __init__(self, cells, rest=None, *, pressure=1.0, compliance=0.0, damping=0.0, break_at=None):
+    def __init__(
+        self, cells, rest=None, *, pressure: ArrayLike = 1.0, compliance: ArrayLike = 0.0, damping: ArrayLike = 0.0,
+        break_at=None,
+    ):  # fmt: skip
         self.setup(cells, rest, compliance, damping, break_at)
         self.pressure = pressure
 

@@ -1,8 +1,10 @@
 """Particles that do not overlap."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..device import ti
 from ..device.patches.compiler import FEW
@@ -68,7 +70,10 @@ class Contact(PairContact):
     go on its way out.
     """
 
-    def __init__(self, friction=0.0, restitution=0.0, *, skin: float | str = "auto", groups=None, push_out=1.0):
+    def __init__(
+        self, friction: ArrayLike | Mapping = 0.0, restitution: ArrayLike | Mapping = 0.0, *, skin: float | str = "auto",
+        groups=None, push_out: float = 1.0,
+    ):  # fmt: skip
         self.groups, self.restitution, self.friction = groups, restitution, friction
         self.skin, self.push_out = skin, push_out
 
@@ -80,8 +85,8 @@ class Contact(PairContact):
         radius = particles.radius
         some = radius[radius > 0]
         auto = 0.75 * median(some) if len(some) else 1.0
-        self.dev.skin = auto if self.skin == "auto" else float(self.skin)
-        self.dev.finest = float(radius.min(initial=np.inf))
+        self._listed = auto if self.skin == "auto" else float(self.skin)
+        self._finest = float(radius.min(initial=np.inf))
         self._keep(matters=len(some) > 0, table=self.wanted)
         if self.matters:
             self.check_range(particles.position)
@@ -91,7 +96,13 @@ class Contact(PairContact):
         n, dim, dev = scene.particles.count, scene.particles.dim, self.dev
         pairs = [b.excluded_pairs(b.start) for b in batches]
         linked = np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=np.int32)
-        self.scene, dev.state, dev.w, dev.rubs, dev.bounces = scene, scene.state, scene.state.w, self.rubs, self.bounces
+        self.scene, dev.state, dev.w, dev.has_friction, dev.has_restitution = (
+            scene,
+            scene.state,
+            scene.state.w,
+            self.has_friction,
+            self.has_restitution,
+        )
         dev.move = scene.memory.field("Contact.move", n, width=dim)
         self.table.bind(scene)
         # What parted the pair in the last substep, per inverse mass [kg m].
@@ -99,18 +110,21 @@ class Contact(PairContact):
         dev.slip = PairData("slip", dim, lasting=True)
         dev.slack = PairData("slack", 0, lasting=True)  # of the overlap, what no push is for
         dev.impulse = PairData("given", 0, lasting=True)  # pushes and impacts in the last substep [kg m]
-        struck, bouncing = PairData("struck", 0, lasting=False), [dev.slack] if dev.bounces else []
-        pair_data = [dev.push, *([dev.slip] if dev.rubs else []), *([*bouncing, struck, dev.impulse] if dev.bounces else [])]
-        dev.grid = NeighbourSearch(scene, dev.skin, linked, self.table, pair_data, team, dev.move)
-        dev.geometry = DiscGeometry(scene, dev.grid, self.push_out, dev.impulse if dev.bounces else dev.push)
-        skips = n >= FEW and not dev.bounces  # in relax() what bounces forgets the last impact
-        dev.splitting = MassSplitting(scene, dev.geometry, dev.rubs, skips, [dev.push, *bouncing], team)
-        dev.press = scene.memory.field("Contact.press", n, width=dim, state=True)
-        dev.forces = ForceShare(scene, sums=dev.rubs, lasting=True)
+        struck, bouncing = PairData("struck", 0, lasting=False), [dev.slack] if dev.has_restitution else []
+        pair_data = [
+            dev.push,
+            *([dev.slip] if dev.has_friction else []),
+            *([*bouncing, struck, dev.impulse] if dev.has_restitution else []),
+        ]
+        dev.grid = NeighbourSearch(scene, self._listed, linked, self.table, pair_data, team, dev.move)
+        dev.geometry = DiscGeometry(scene, dev.grid, self.push_out, dev.impulse if dev.has_restitution else dev.push)
+        skips = n >= FEW and not dev.has_restitution  # in relax() what bounces forgets the last impact
+        dev.splitting = MassSplitting(scene, dev.geometry, dev.has_friction, skips, [dev.push, *bouncing], team)
+        dev.forces = ForceShare(scene, sums=dev.has_friction, lasting=True)
         dev.fast = scene.memory.field("Contact.fast", None, kind=ti.i32)
         dev.friction = Friction(self.table)
         dev.restitution = None
-        if dev.bounces:
+        if dev.has_restitution:
             dev.restitution = Restitution(scene, dev.geometry, self.table, struck, dev.slack, dev.impulse)
             dev.hit = dev.restitution.hit
         dev.projection = VelocityProjection(scene, dev.grid, dev.push, dev.splitting.weight, dev.restitution, dev.move, team)
@@ -131,7 +145,7 @@ class Contact(PairContact):
         """What the pairs of particle i want of it."""
         total, w = ti.Vector.zero(self.scene.real, self.dev.state.dim), self.dev.w.of(i)
         lift, forced = total, total
-        if ti.static(self.dev.bounces):
+        if ti.static(self.dev.has_restitution):
             if first != 0:
                 self.dev.restitution.clear(i, self.dev.splitting.weight[i])
         if self.dev.splitting.weight[i] > 0:
@@ -146,7 +160,7 @@ class Contact(PairContact):
                     overlap, each, n = self.dev.geometry.impact(i, j, self.dev.geometry.contact_distance(i, j), shared)
                     each *= ti.static(RELAXATION)
                     paid, given, rests, alone = overlap, ti.zero(overlap), True, w + self.dev.w.of(j)
-                    if ti.static(self.dev.bounces):
+                    if ti.static(self.dev.has_restitution):
                         given, slack, rests = self.dev.restitution.bounce(i, j, n, overlap, self.dev.slack.field[e], last, first)
                         if first != 0:
                             back = ti.static(UPTAKE) * ti.min(slack * each, slack / alone)
@@ -159,7 +173,7 @@ class Contact(PairContact):
                     elif fresh == 0:
                         part += ti.max(ti.min(1 - alone * each, ti.static(CARRY)), 0) * last
                     part = lesser(part, paid / alone)  # without a branch: it would be taken at random
-                    if ti.static(self.dev.bounces):
+                    if ti.static(self.dev.has_restitution):
                         if given > 0:
                             self.dev.restitution.struck.field[e] = 1
                             if self.dev.hit[None] == 0:
@@ -169,19 +183,19 @@ class Contact(PairContact):
                         self.dev.impulse.field[e] = self.dev.impulse.field[e] + part
                     push += part
                     want = part * n
-                    if ti.static(self.dev.rubs):
+                    if ti.static(self.dev.has_friction):
                         want -= self.held(i, j, n, part * shared + given, self.dev.slip.field[e]) / shared
                     total += w * want
-                    if ti.static(self.dev.rubs):
+                    if ti.static(self.dev.has_friction):
                         if final != 0:
                             approach = -(self.dev.forces.before[i] - self.dev.forces.before[j]).dot(n)
                             forced += self.dev.forces.share(approach, part * alone) * w * (want - part * n)
                     self.dev.push.field[e] = push
         self.dev.move[i] = total
-        if ti.static(self.dev.rubs):
+        if ti.static(self.dev.has_friction):
             if final != 0:
                 self.dev.forces.add(i, forced, first)
-        if ti.static(self.dev.bounces):
+        if ti.static(self.dev.has_restitution):
             self.dev.restitution.lift[i] = lift
 
     @ti.func
@@ -190,9 +204,9 @@ class Contact(PairContact):
         return self.dev.friction.held(i, j, n, normal, slip + self.dev.state.d[i] - self.dev.state.d[j])
 
     @ti.func
-    def sum_pushes(self, i):
-        """Along the normals at the present places, where pushes have no moment. Friction is known from the passes."""
-        total, w = 0 * self.dev.press[i], self.dev.w.of(i)
+    def reaction(self, i):
+        """Pushes along the normals at the present places, where they have no moment, and friction, known from the passes."""
+        total, w = 0 * self.dev.state.d[i], self.dev.w.of(i)
         if self.dev.splitting.weight[i] > 0:
             for word in range(self.dev.grid.words(i)):
                 bits = ti.select(word == 0, self.dev.grid.touching[i], self.dev.grid.all_bits(i, word))
@@ -206,13 +220,7 @@ class Contact(PairContact):
                         n = r / length
                         approach = -(self.dev.forces.before[i] - self.dev.forces.before[j]).dot(n)
                         total += self.dev.forces.share(approach, push * (w + self.dev.w.of(j))) * w * push * n
-        self.dev.press[i] = total
-
-    @ti.func
-    def forced(self, i):
-        """What pushes and friction moved particle i by, as far as they are forces [m]."""
-        total = self.dev.press[i]
-        if ti.static(self.dev.rubs):
+        if ti.static(self.dev.has_friction):
             total += self.dev.forces.sum[i]
         return total
 
@@ -231,14 +239,14 @@ class Contact(PairContact):
         """Move particle i as its pairs want."""
         if self.dev.w.of(i) > 0:  # what touches nothing moves by 0, without a branch
             self.dev.state.shift(i, self.dev.move[i])
-            if ti.static(self.dev.bounces):
+            if ti.static(self.dev.has_restitution):
                 self.dev.state.advance(i, self.dev.restitution.lift[i])
 
     @ti.func
     def finish_substep(self, i):
         """At the end of a substep: add to each pair's slip what it has moved, as far as friction can hold it; a pair that parted
         has no slack. What came to overlap after pairs were pushed, which a list with a narrow skin may not know yet, waits."""
-        if ti.static(self.dev.rubs):
+        if ti.static(self.dev.has_friction):
             for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
                 j = self.dev.grid.neighbour[e]
                 overlap, n = self.dev.geometry.overlap(i, j, self.dev.geometry.contact_distance(i, j))
@@ -247,7 +255,7 @@ class Contact(PairContact):
                     pressed = self.dev.push.field[e] * (self.dev.splitting.weight[i] + self.dev.splitting.weight[j])
                     slip = self.held(i, j, n, ti.max(overlap, pressed), self.dev.slip.field[e])
                 self.dev.slip.field[e] = slip
-        if ti.static(self.dev.bounces):
+        if ti.static(self.dev.has_restitution):
             if self.dev.splitting.weight[i] > 0:
                 for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
                     if self.dev.slack.field[e] > 0:

@@ -13,17 +13,17 @@ FADE = 31 / 32  # of how much more often than needed a mass was split, what is l
 class MassSplitting:
     """A disc or sphere i has its mass split m_i times, see Contact; `weight` is m_i w_i, 0 where it touches nothing.
 
-    rubs: whether pairs have friction. skips: whether blocks of particles in which nothing touches are skipped. ended: what pairs
+    has_friction: whether pairs have it. skips: whether blocks of particles without contact are skipped. ended: what pairs
     carry only while they touch. in_state: its fields that are part of the state.
     """
 
-    def __init__(self, scene: Scene, geometry: DiscGeometry, rubs: bool, skips: bool, ended: list[PairData], team: Team):
+    def __init__(self, scene: Scene, geometry: DiscGeometry, has_friction: bool, skips: bool, ended: list[PairData], team: Team):
         n = scene.particles.count
-        self.geometry, self.grid, self.ended, self.rubs, self.skips = geometry, geometry.grid, ended, rubs, skips
+        self.geometry, self.grid, self.ended, self.has_friction, self.skips = geometry, geometry.grid, ended, has_friction, skips
         self.state, self.real, self.few = scene.state, scene.real, n < FEW
         self.weight = scene.memory.field("Contact.split_mass", n, state=True)
         self.in_state = {"weight": self.weight}
-        self.block = min(BLOCK, team.piece)
+        self.block = min(BLOCK, team.piece) if skips else BLOCK
         if skips:
             self.some = scene.memory.field("Contact.some_touch", -(-n // self.block), kind=ti.i32)
 
@@ -33,8 +33,10 @@ class MassSplitting:
         out, begin = ti.u32(0), self.grid.first[i] + word * WORD
         for k in range(ti.min(self.grid.number[i] - word * WORD, WORD)):
             j = self.grid.neighbour[begin + k]
-            r, far = self.state.apart(i, j), self.geometry.contact_distance(i, j)
-            out |= ti.cast(r.dot(r) < far * far, ti.u32) << ti.cast(k, ti.u32)  # no branch: it would be taken at random
+            r, contact_distance = self.state.apart(i, j), self.geometry.contact_distance(i, j)
+            out |= ti.cast(r.dot(r) < contact_distance * contact_distance, ti.u32) << ti.cast(
+                k, ti.u32
+            )  # no branch: it would be taken at random
         return out
 
     @ti.func
@@ -101,7 +103,7 @@ class MassSplitting:
             pairs += ti.math.popcnt(bits)
             self.clear(i, word, self.grid.all_bits(i, word) & ~bits)
         split = ti.cast(pairs, self.real)
-        if ti.static(not self.rubs):
+        if ti.static(not self.has_friction):
             if pairs > 2:
                 tensor = ti.Matrix.zero(self.real, self.state.dim, self.state.dim)
                 deepest = ti.cast(1, self.real)
@@ -110,8 +112,8 @@ class MassSplitting:
                     while bits != 0:
                         j = self.grid.neighbour[self.grid.first[i] + word * WORD + lowest_bit(bits)]
                         bits &= bits - ti.u32(1)
-                        r, far = self.state.apart(i, j), self.geometry.contact_distance(i, j)
-                        scale = 1 / (far * far)
+                        r, contact_distance = self.state.apart(i, j), self.geometry.contact_distance(i, j)
+                        scale = 1 / (contact_distance * contact_distance)
                         tensor += scale * r.outer_product(r)
                         deepest = lesser(r.dot(r) * scale, deepest)
                 if deepest > 0.25:

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..device import ti
-from ..device.memory import Memory
 from ..features.feature import Scene
 from ..neighbours.neighbour_list import PairData
 from ..neighbours.queries import Contacts
@@ -31,63 +30,63 @@ class DiscGeometry:
     @ti.func
     def contact_distance(self, i, j):
         """The distance at which particles i and j touch."""
-        far = self.radius.of(i) + self.radius.of(j)
+        contact_distance = self.radius.of(i) + self.radius.of(j)
         if ti.static(self.shrinks):
-            far -= self.shrunk[i] + self.shrunk[j]
-        return far
+            contact_distance -= self.shrunk[i] + self.shrunk[j]
+        return contact_distance
 
     @ti.func
-    def depth(self, i, j, far):
+    def depth(self, i, j, contact_distance):
         """The overlap alone."""
         r = self.state.apart(i, j)
         rr = r.dot(r)
-        overlap = 0 * far - 1
-        if rr < far * far:
-            overlap = far
-            if rr > far * far * ti.static(SAME_PLACE):
-                overlap = far - ti.sqrt(rr)
+        overlap = 0 * contact_distance - 1
+        if rr < contact_distance * contact_distance:
+            overlap = contact_distance
+            if rr > contact_distance * contact_distance * ti.static(SAME_PLACE):
+                overlap = contact_distance - ti.sqrt(rr)
         return overlap
 
     @ti.func
-    def overlap(self, i, j, far):
-        """Overlap [m] of a pair that touches at a distance `far` (negative where apart), and its normal."""
+    def overlap(self, i, j, contact_distance):
+        """Overlap [m] of a pair that touches at `contact_distance` (negative where apart), and its normal."""
         r = self.state.apart(i, j)
         rr = r.dot(r)
-        overlap, n = 0 * far - 1, 0 * r
-        if rr < far * far:
-            if rr > far * far * ti.static(SAME_PLACE):
+        overlap, n = 0 * contact_distance - 1, 0 * r
+        if rr < contact_distance * contact_distance:
+            if rr > contact_distance * contact_distance * ti.static(SAME_PLACE):
                 length = ti.sqrt(rr)
-                overlap, n = far - length, r / length
+                overlap, n = contact_distance - length, r / length
             else:
-                overlap, n = far, self.fallback_normal(i, j, r)
+                overlap, n = contact_distance, self.fallback_normal(i, j, r)
         return overlap, n
 
     @ti.func
-    def impact(self, i, j, far, shared):
+    def impact(self, i, j, contact_distance, shared):
         """Overlap, 1 / shared, and normal, as in overlap(), of a pair that touches.
 
-        A pair that came together in this substep has the normal that it had at the time of impact: |r0 + s d| = far, with r0 at
-        the start and d the relative displacement; what is left of d along n is the overlap. This is exact for free flight, where
-        the normal at the end is off by the way that a pair slides past each other.
+        A pair that came together in this substep has the normal that it had at the time of impact: |r0 + s d| = contact_distance,
+        with r0 at the start and d the relative displacement; what is left of d along n is the overlap. This is exact for free
+        flight, where the normal at the end is off by the way that a pair slides past each other.
         """
         r = self.state.apart(i, j)
         rr = r.dot(r)
         length = ti.sqrt(rr)
         per = 1 / (shared * length)  # of all that takes time, divisions take most
-        overlap = far - length
+        overlap = contact_distance - length
         each, n = per * length, (per * shared) * r
-        if rr <= far * far * ti.static(SAME_PLACE):
-            overlap, n = far, self.fallback_normal(i, j, r)
+        if rr <= contact_distance * contact_distance * ti.static(SAME_PLACE):
+            overlap, n = contact_distance, self.fallback_normal(i, j, r)
             each = 1 / shared
         d = self.state.d[i] - self.state.d[j]
         r -= d
-        c = r.dot(r) - far * far
+        c = r.dot(r) - contact_distance * contact_distance
         if c > 0:
             a, b = d.dot(d), r.dot(d)
             root = ti.sqrt(ti.max(b * b - a * c, 0)) - b
             if b < 0 and root > 0:
                 s = ti.min(c / root, 1)
-                n = (r + s * d) / far
+                n = (r + s * d) / contact_distance
                 overlap = ti.max((s - 1) * d.dot(n), 0)
         return overlap, each, n
 
@@ -128,7 +127,7 @@ class DiscGeometry:
     def enable_shrink(self) -> None:
         """From now on particles may be smaller than they are; the field for it exists only once it is needed."""
         if not self.shrinks:
-            self.store = Memory(self.real)
+            self.store = self.scene.memory.more()
             self.shrunk = self.store.field("Contact.shrunk", self.scene.particles.count, state=True)
             self.store.place()
             self.shrinks = True
@@ -141,9 +140,9 @@ class DiscGeometry:
         for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
             j = self.grid.neighbour[e]
             if ti.max(i, j) >= first:
-                far = self.radius.of(i) + self.radius.of(j)
-                overlap, _ = self.overlap(i, j, far)
-                less = ti.max(less, overlap * self.radius.of(i) / far)
+                contact_distance = self.radius.of(i) + self.radius.of(j)
+                overlap, _ = self.overlap(i, j, contact_distance)
+                less = ti.max(less, overlap * self.radius.of(i) / contact_distance)
         self.shrunk[i] = less
 
     @ti.func
@@ -188,8 +187,8 @@ class DiscGeometry:
         overlap = r[pairs].sum(axis=1) - length
         some = (overlap > 0) | (push > 0)
         pairs, overlap, j = pairs[some], overlap[some], pairs[some, 1]
-        far, d, length = r[pairs].sum(axis=1), d[some], length[some]
-        same = length**2 <= far**2 * SAME_PLACE
+        contact_distance, d, length = r[pairs].sum(axis=1), d[some], length[some]
+        same = length**2 <= contact_distance**2 * SAME_PLACE
         normal = d / np.where(same, 1.0, length)[:, None]
         normal[same] = fallback_normals(pairs[same], d.shape[1])
         point = x[j] + (r[j] - overlap / 2)[:, None] * normal

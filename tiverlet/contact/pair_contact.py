@@ -58,7 +58,8 @@ class PairContact(Feature):
     restitution = Knob(lambda f, v: f._surface("restitution", v), "Of all pairs, or by pairs of groups.")
     skin = Knob(lambda f, v: _skin(v), "How far beyond touching pairs are listed [m].", compiled=True)
     push_out = Knob(lambda f, v: checks.number("Contact", "push_out", v, least=0.0), "[m/s].", compiled=True)
-    compiled_for = ("rubs", "bounces", "uniform")
+    compiled_for = ("has_friction", "has_restitution", "uniform")
+    _finest = _listed = 0.0  # the smallest radius, and how far beyond touching pairs are listed now [m]
     table: Table  # bound to one world
     matters = True
     room = 0  # entries of the list for each particle, at first, if that is more than discs have
@@ -86,14 +87,14 @@ class PairContact(Feature):
         return self.wanted.uniform
 
     @property
-    def rubs(self) -> bool:
+    def has_friction(self) -> bool:
         """Whether any pair has friction, or had when kernels were compiled."""
-        return self.wanted.rubs or vars(self.dev).get("rubs", False)
+        return self.wanted.has_friction or vars(self.dev).get("has_friction", False)
 
     @property
-    def bounces(self) -> bool:
+    def has_restitution(self) -> bool:
         """Whether any pair has restitution, or had when kernels were compiled."""
-        return self.wanted.bounces or vars(self.dev).get("bounces", False)
+        return self.wanted.has_restitution or vars(self.dev).get("has_restitution", False)
 
     @property
     def shrinks(self) -> bool:
@@ -130,7 +131,7 @@ class PairContact(Feature):
 
     def check_range(self, position: np.ndarray) -> None:
         """Raise where coordinates are too large for the cells."""
-        cell = 2 * self.dev.finest + self.dev.skin
+        cell = 2 * self._finest + self._listed
         far = np.abs(position) >= FARTHEST * cell
         if far.any():
             i, k = np.unravel_index(int(np.argmax(far)), far.shape)
@@ -183,12 +184,8 @@ class PairContact(Feature):
         self.dev.forces.start(i, scale)
 
     @ti.func
-    def sum_pushes(self, i):
-        """At the end of a frame: what pushes that are forces moved particle i by, where that is not known from the passes."""
-
-    @ti.func
-    def forced(self, i):
-        """What forces of contacts moved particle i by in the last substep of a frame [m]."""
+    def reaction(self, i):
+        """What forces of contacts moved particle i by in the last substep of a frame [m]; asked with a list of neighbours."""
         return self.dev.forces.sum[i]
 
     @ti.func

@@ -134,9 +134,9 @@ class PolygonGeometry:
                         height, shared = -r.norm(), self.before(a)
                         n = r / ti.min(height, -uu * TINY)
                 t = ti.min(ti.max(t, 0), 1)
-            far = self.radius.of(v) + (1 - t) * self.radius.of(a) + t * self.radius.of(b)
-            if beside and height < far and height >= -length / 2:
-                out, back = far - height, 0 * r
+            contact_distance = self.radius.of(v) + (1 - t) * self.radius.of(a) + t * self.radius.of(b)
+            if beside and height < contact_distance and height >= -length / 2:
+                out, back = contact_distance - height, 0 * r
                 if ti.static(moved):
                     out -= self.allowed[v]
                 if not came:
@@ -367,7 +367,7 @@ class PolygonGeometry:
         """1 if particle i crosses a quarter of an edge in one substep."""
         d, limit = self.state.d[i], ti.cast(self.step, self.real)
         if self.after(i) < 0:
-            limit = ti.min(limit, self.radius.stride(i) if ti.static(self.radius.least > 0) else limit)
+            limit = ti.min(limit, self.radius.stride(i) if ti.static(self.radius.discs) else limit)
         return ti.select(d.dot(d) <= limit * limit, 0, 1)
 
     def enable_shrink(self) -> None:
@@ -426,9 +426,9 @@ class PolygonGeometry:
         edge, apart = x[ends] - x[j], x[i] - (1 - t)[:, None] * x[j] - t[:, None] * x[ends]
         straight = np.where(discs[:, None], apart, np.stack([edge[:, 1], -edge[:, 0]], axis=1))
         n = np.where(no_way[:, None], straight / np.linalg.norm(straight, axis=1)[:, None], n)
-        far = (1 - t) * r[j] + t * r[ends]
-        overlap = np.where(parted, r[i] + far - (apart * n).sum(axis=1), overlap)
-        point = x[i] - apart + (far - overlap / 2)[:, None] * n
+        edge_radius = (1 - t) * r[j] + t * r[ends]
+        overlap = np.where(parted, r[i] + edge_radius - (apart * n).sum(axis=1), overlap)
+        point = x[i] - apart + (edge_radius - overlap / 2)[:, None] * n
         return Contacts(pairs, ends, t, overlap, n, point, push / h)
 
 
@@ -470,10 +470,10 @@ class Beside:
         """Whether v is near one of the edges of c: within the skin or, behind it, not deeper than half of it."""
         out = False
         if self.loop[c][2] >= 0:
-            r, far = self.state.apart(v, c), self.radius.of(v) + ti.cast(self.skin, self.state.real)
+            r, reach = self.state.apart(v, c), self.radius.of(v) + ti.cast(self.skin, self.state.real)
             for k in ti.static(range(2)):
                 other = self.loop[c][k]
-                u, size = self.state.apart(other, c), far + ti.max(self.radius.of(c), self.radius.of(other))
+                u, size = self.state.apart(other, c), reach + ti.max(self.radius.of(c), self.radius.of(other))
                 length = u.norm()
                 t, height = r.dot(u), r.cross(u) * (1 - 2 * k)
                 if height >= -(length / 2 + size) * length and height <= size * length:

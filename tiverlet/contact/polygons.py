@@ -1,9 +1,10 @@
 """Bodies made of loops of particles that do not overlap (2D)."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..device import ti
 from ..device.thread_team import Team
@@ -48,7 +49,10 @@ class Polygons(PairContact):
     detects = True
     room = 64  # the particles of near bodies
 
-    def __init__(self, loops: Iterable, friction=0.0, restitution=0.0, *, skin="auto", push_out=1.0):
+    def __init__(
+        self, loops: Iterable, friction: ArrayLike | Mapping = 0.0, restitution: ArrayLike | Mapping = 0.0, *, skin: float | str =
+        "auto", push_out: float = 1.0,
+    ):  # fmt: skip
         self.restitution, self.friction, self.skin, self.push_out = restitution, friction, skin, push_out
         self.loops = checked(loops)
 
@@ -61,8 +65,8 @@ class Polygons(PairContact):
         refuse_deep(self.loops, self.dev.outline.body, x, 0)
         sizes = np.where(self.dev.outline.body >= 0, SKIN * self.dev.outline.length, 0.75 * particles.radius)
         auto = median(sizes[sizes > 0]) if (sizes > 0).any() else 1.0
-        self.dev.skin = auto if self.skin == "auto" else float(self.skin)
-        self.dev.finest = float((particles.radius + self.dev.outline.reach / 2).min(initial=np.inf))
+        self._listed = auto if self.skin == "auto" else float(self.skin)
+        self._finest = float((particles.radius + self.dev.outline.reach / 2).min(initial=np.inf))
         matters = particles.count > 0 and bool(self.loops or (particles.radius > 0).any())
         self._keep(matters=matters, table=self.wanted)
         if self.matters:
@@ -82,7 +86,13 @@ class Polygons(PairContact):
     def join(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
         """Declare the fields, among them the neighbour list's, which is returned."""
         n, add, dev = scene.particles.count, scene.memory.field, self.dev
-        self.scene, dev.state, dev.w, dev.rubs, dev.bounces = scene, scene.state, scene.state.w, self.rubs, self.bounces
+        self.scene, dev.state, dev.w, dev.has_friction, dev.has_restitution = (
+            scene,
+            scene.state,
+            scene.state.w,
+            self.has_friction,
+            self.has_restitution,
+        )
         dev.forces = ForceShare(scene, sums=True, lasting=False)
         dev.geometry = PolygonGeometry(scene, dev.outline, self.push_out)
         dev.move = add("Contact.move", n, width=2)
@@ -90,14 +100,18 @@ class Polygons(PairContact):
         dev.fast = add("Contact.fast", None, kind=ti.i32)
         self.table.bind(scene, asked=True)
         dev.friction, dev.slip = Friction(self.table), PairData("slip", 2, lasting=True)
-        if dev.bounces:
+        if dev.has_restitution:
             dev.restitution = PolygonRestitution(scene, dev.geometry, self.table)
             dev.hit = dev.restitution.hit
         pairs = [f.excluded_pairs(f.start) for f in batches]
         linked = np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=np.int32)
-        pair_data = [*dev.geometry.carried, *([dev.slip] if dev.rubs else []), *([dev.restitution.aim] if dev.bounces else [])]
-        beside: Any = Beside(dev.geometry, self.table, dev.skin)
-        dev.grid = NeighbourSearch(scene, dev.skin, linked, beside, pair_data, team, dev.move, dev.outline.reach)
+        pair_data = [
+            *dev.geometry.carried,
+            *([dev.slip] if dev.has_friction else []),
+            *([dev.restitution.aim] if dev.has_restitution else []),
+        ]
+        beside: Any = Beside(dev.geometry, self.table, self._listed)
+        dev.grid = NeighbourSearch(scene, self._listed, linked, beside, pair_data, team, dev.move, dev.outline.reach)
         dev.geometry.bind(dev.grid)
         return dev.grid
 
@@ -107,7 +121,7 @@ class Polygons(PairContact):
         if first != 0:
             for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
                 self.dev.geometry.impulse.field[e] = 0
-                if ti.static(self.dev.bounces):
+                if ti.static(self.dev.has_restitution):
                     self.dev.restitution.aim.field[e] = 0 * self.dev.restitution.aim.field[e]
         self.dev.active[i] = self.dev.geometry.detect(i, True)
         self.note_motion(0, self.dev.geometry.too_long(i))
@@ -140,12 +154,12 @@ class Polygons(PairContact):
                     if overlap > 0:
                         d = self.dev.geometry.relative(self.dev.state.d, v, a, b, t)
                         shared = self.dev.geometry.split_mass(self.dev.active, v, a, b, t)
-                        share, kick = part * self.dev.w.of(i) / shared, 0 * overlap
+                        share, missing = part * self.dev.w.of(i) / shared, 0 * overlap
                         back = overlap  # what is taken back of the position and of the displacement
-                        if ti.static(self.dev.bounces):
+                        if ti.static(self.dev.has_restitution):
                             if first != 0:
-                                aim, kick, lift = self.dev.restitution.target(v, a, b, t, n, overlap, d.dot(n))
-                                if kick > 0:
+                                aim, missing, lift = self.dev.restitution.target(v, a, b, t, n, overlap, d.dot(n))
+                                if missing > 0:
                                     lifts += share * (overlap + lift) * n
                                     back = 0 * overlap
                                     self.dev.hit[None] = 1
@@ -154,8 +168,8 @@ class Polygons(PairContact):
                         if role == VERTEX:
                             self.dev.geometry.impulse.field[e] = self.dev.geometry.impulse.field[e] + back / shared
                         want = back * n
-                        if ti.static(self.dev.rubs):
-                            want -= self.dev.friction.held(v, a, n, overlap + kick, self.dev.slip.field[at] + d)
+                        if ti.static(self.dev.has_friction):
+                            want -= self.dev.friction.held(v, a, n, overlap + missing, self.dev.slip.field[at] + d)
                         total += share * want
                         if final != 0:
                             approach = -self.dev.geometry.relative(self.dev.forces.before, v, a, b, t).dot(n)
@@ -164,7 +178,7 @@ class Polygons(PairContact):
         self.dev.move[i] = total
         if final != 0:
             self.dev.forces.add(i, forced, first)
-        if ti.static(self.dev.bounces):
+        if ti.static(self.dev.has_restitution):
             if first != 0:
                 self.dev.restitution.lift[i] = lifts
                 self.dev.restitution.active[i] = self.dev.active[i]
@@ -175,7 +189,7 @@ class Polygons(PairContact):
         if self.dev.w.of(i) > 0:
             if self.dev.active[i] > 0:
                 self.dev.state.shift(i, self.dev.move[i])
-            if ti.static(self.dev.bounces):
+            if ti.static(self.dev.has_restitution):
                 if first != 0:
                     self.dev.state.advance(i, self.dev.restitution.lift[i])
 
@@ -192,7 +206,7 @@ class Polygons(PairContact):
     @ti.func
     def finish_substep(self, i):
         """At the end of a substep: add to the slip of each contact what it has moved, as far as friction can hold it."""
-        if ti.static(self.dev.rubs):
+        if ti.static(self.dev.has_friction):
             for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
                 slip = 0 * self.dev.state.x[i]
                 at, v, a, b, t, _ = self.dev.geometry.participants(i, e, VERTEX)
@@ -211,7 +225,7 @@ class PolygonRestitution:
         n, add = scene.particles.count, scene.memory.field
         self.geometry, self.table, self.state = geometry, table, scene.state
         self.active = add("Contact.struck", n, kind=ti.i32)  # contacts that each particle was in in the first pass
-        self.kick = add("Contact.kick", n, width=2)
+        self.d_change = add("Contact.d_change", n, width=2)
         self.lift = add("Contact.lift", n, width=2)  # moves the position alone
         self.hit = add("Contact.hit", None, kind=ti.i32)
         self.aim = PairData("aim", 2, lasting=False)  # with which displacement each contact is to leave, along its normal
@@ -221,12 +235,12 @@ class PolygonRestitution:
         """The displacement with which a contact is to leave; what it lacks of it; and how far it gets until the substep ends."""
         before = self.state.before[v] - (1 - t) * self.state.before[a] - t * self.state.before[b]
         approach, restitution = -before.dot(n), self.table.of(v, a)[2]
-        aim, kick, lift = restitution * ti.max(approach, 0), 0 * overlap, 0 * overlap
+        aim, missing, lift = restitution * ti.max(approach, 0), 0 * overlap, 0 * overlap
         if approach > 0:
-            kick = ti.max(aim - (overlap + leaving), 0)
+            missing = ti.max(aim - (overlap + leaving), 0)
             if overlap <= -leaving:
                 lift = restitution * overlap
-        return aim, kick, lift
+        return aim, missing, lift
 
     @ti.func
     def choose(self, i):
@@ -249,10 +263,10 @@ class PolygonRestitution:
                                 total += part * self.state.w.of(i) * lack / shared * n
                                 if role == VERTEX:
                                     self.geometry.impulse.field[e] = self.geometry.impulse.field[e] + lack / shared
-        self.kick[i] = total
+        self.d_change[i] = total
 
     @ti.func
     def apply(self, i):
         """Change the displacement of particle i, and the one before the substep with it."""
-        self.state.d[i] = self.state.d[i] + self.kick[i]
-        self.state.before[i] = self.state.before[i] + self.kick[i]
+        self.state.d[i] = self.state.d[i] + self.d_change[i]
+        self.state.before[i] = self.state.before[i] + self.d_change[i]

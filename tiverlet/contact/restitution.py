@@ -19,7 +19,7 @@ class Restitution:
         self.geometry, self.grid, self.table, self.state = geometry, geometry.grid, table, scene.state
         self.struck, self.slack, self.impulse = struck, slack, impulse
         self.weight = add("Contact.struck", n)  # the split mass of the first pass, 0 where nothing touched
-        self.kick = add("Contact.kick", n, width=dim)
+        self.d_change = add("Contact.d_change", n, width=dim)
         self.lift = add("Contact.lift", n, width=dim)  # moves the position alone
         self.left = add("Contact.left", n)  # of the substep after the impact, as a fraction
         self.partner = add("Contact.partner", n, kind=ti.i32)
@@ -75,7 +75,7 @@ class Restitution:
                         left = ti.select(overlap < here, overlap / here, 1)
                         if left > most or (left == most and earlier(i, j, partner)):
                             first, partner, most = e, j, left
-                            self.kick[i] = w / (w + self.state.w.of(j)) * given * n
+                            self.d_change[i] = w / (w + self.state.w.of(j)) * given * n
                             if self.hit[None] == 0:
                                 self.hit[None] = 1
         self.first[i] = first
@@ -88,11 +88,11 @@ class Restitution:
         j = self.partner[i]
         if j >= 0:
             if self.partner[j] == i or self.state.w.of(j) == 0:
-                e, kick = self.first[i], self.kick[i]
-                self.impulse.field[e] = self.impulse.field[e] + kick.norm() / self.state.w.of(i)
-                self.state.d[i] = self.state.d[i] + kick
-                self.state.before[i] = self.state.before[i] + kick
-                self.state.advance(i, self.left[i] * kick)
+                e, d_change = self.first[i], self.d_change[i]
+                self.impulse.field[e] = self.impulse.field[e] + d_change.norm() / self.state.w.of(i)
+                self.state.d[i] = self.state.d[i] + d_change
+                self.state.before[i] = self.state.before[i] + d_change
+                self.state.advance(i, self.left[i] * d_change)
 
 
 @ti.func

@@ -1,14 +1,17 @@
 """Quiet piles: what takes the sound out of loaded contacts."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..device import ti
-from ..device.thread_team import Team
-from ..features.feature import Scene
-from ..neighbours.neighbour_list import WORD, PairData, lowest_bit
-from ..neighbours.neighbour_search import NeighbourSearch
+from ..neighbours.neighbour_list import WORD, lowest_bit
+
+if TYPE_CHECKING:
+    from ..device.thread_team import Team
+    from ..features.feature import Scene
+    from ..neighbours.neighbour_list import PairData
+    from ..neighbours.neighbour_search import NeighbourSearch
 
 EVERY = 32  # substeps from one projection to the next
 PASSES = 32
@@ -31,10 +34,10 @@ class VelocityProjection:
     """
 
     def __init__(
-        self, scene: Scene, grid: NeighbourSearch, push: PairData, weight: Any, restitution: Any, change: Any, team: Team
+        self, scene: "Scene", grid: "NeighbourSearch", push: "PairData", weight: Any, restitution: Any, change: Any, team: "Team"
     ):  # fmt: skip
         self.grid, self.push, self.weight, self.restitution = grid, push, weight, restitution
-        self.state, self.change, self.bounces = scene.state, change, restitution is not None
+        self.state, self.change, self.has_restitution = scene.state, change, restitution is not None
         # The fields of the old list, which is needed only while lists are built, are free: here they hold the loaded pairs of
         # each particle, how many they are, and the particles that have any, piece by piece.
         self.number, self.loaded = self.grid.old_number, self.grid.old_first
@@ -46,7 +49,7 @@ class VelocityProjection:
     def bears(self, i, e):
         """Whether entry e in the list of particle i is a pair that bears a load."""
         out = self.push.field[e] > 0
-        if ti.static(self.bounces):
+        if ti.static(self.has_restitution):
             if self.restitution.weight[i] > 0:
                 out = out and self.restitution.struck.field[e] == 0
         return out
@@ -94,11 +97,11 @@ class VelocityProjection:
             j = self.grid.old_neighbour[e]
             r = self.state.apart(i, j)
             want -= self.push.old[e] * (self.state.d[i] - self.state.d[j]).dot(r) * r
-        if ti.static(self.state.leans):
-            lean = self.state.lean[i]
-            size = lean.dot(lean)
+        if ti.static(self.state.keeps_wall_push):
+            wall_push = self.state.wall_push[i]
+            size = wall_push.dot(wall_push)
             if size > 0:
-                want -= want.dot(lean) / size * lean
+                want -= want.dot(wall_push) / size * wall_push
         factor = self.factors[k]
         want *= factor * ti.static(2 / (1 + 1 / CONDITION))
         if k > 0:

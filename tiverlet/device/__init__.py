@@ -1,7 +1,14 @@
 """The door to Taichi: starting it, memory, threads. All other modules import Taichi from here."""
 
-from .runtime import ti  # first: it sets what Taichi reads when it is imported  # isort: skip
-from .patches.compiler import inline, record  # next: what comes after it is imported in half the time  # isort: skip
-from .patches.syntax_cache import at
+from .language import at, ti
+from .patches import patched
+
+if patched:
+    from .patches import sharing, source_cache, syntax_cache
+
+    source_cache.apply()  # before what comes next, which is imported in half the time
+    syntax_cache.apply()
+    sharing.apply()
+from .patches.compiler import inline, record
 
 __all__ = ["at", "inline", "record", "ti"]

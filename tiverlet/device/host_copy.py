@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import taichi as ti
 
 from . import runtime
+from .language import ti
 
 SMALL = 300_000  # numbers that one thread copies in a millisecond
 
@@ -46,16 +46,15 @@ def chain(field) -> tuple[list[int], Any]:
 
 @ti.data_oriented
 class Places:
-    """Where fields are."""
+    """Where a field is."""
 
-    def __init__(self, entries: list[Entry]):
-        self.plan = [(k, e.field, [0] if e.length else []) for k, e in enumerate(entries)]
+    def __init__(self, field: Any):
+        self.field, self.first = field, [0] * len(field.shape)
 
     @ti.kernel
     def find(self, out: ti.types.ndarray(ti.u64, 1)):  # type: ignore[valid-type]
-        """The addresses of their first elements."""
-        for k, field, at in ti.static(self.plan):
-            out[k] = ti.get_addr(field, ti.static(at))
+        """The address of its first element."""
+        out[0] = ti.get_addr(self.field, ti.static(self.first))
 
 
 @ti.data_oriented

@@ -55,7 +55,7 @@ class Whole:
             while self._noted:
                 interrupt_main(self._noted.pop())  # type: ignore[arg-type]  # as if it came now
 
-    def heed(self) -> None:
+    def raise_pending(self) -> None:
         """In a block: call the handlers of signals that have come. The caller undoes what it has done if one of them raises."""
         if get_ident() == self._main:
             while self._noted:

@@ -1,24 +1,24 @@
 """Fields: declared together, placed in one tree, or two, freed together.
 
 Taichi 1.7.4 ends the process, without an exception, when a field outlives its runtime, when 512 trees of fields are
-alive, when a field has no elements or when a child made by fork launches a kernel. The checks here turn each of
+alive, when a field has no elements or when a child made by fork launches a kernel. The checks here and in layout.py turn each of
 these into an error that says what to do, so that no other module has to know.
 """
 
-import ctypes
 import weakref
 from typing import Any
 
 import numpy as np
-import taichi as ti
 
-from . import runtime
-from .host_copy import Entry, Places, Transfer, chain
-from .patches import inside
+from . import language, layout, runtime
+from .host_copy import Entry, Transfer
+from .language import ti
+from .layout import Declared, Layout
+from .number import Number
+from .patches import patched
 from .patches.compiler import FEW, Compiler
 
 GROUP = 16  # fields that one transfer kernel serves; Taichi unrolls the loop over them
-MAX_TREES = 400  # Taichi holds at most 511 trees of fields and does not check; the rest is left to the user's own fields.
 
 
 class Memory:
@@ -28,113 +28,109 @@ class Memory:
     that they still exist.
     """
 
-    def __init__(self, real, particles: int = FEW):
-        if runtime.trees >= MAX_TREES:
-            raise RuntimeError(
-                f"So many worlds are alive that they have {runtime.trees} trees of fields, and Taichi crashes near 512. "
-                "Close worlds that you no longer need: world.close(), or `with tv.World(...) as world:`."
-            )
+    kernels_read = ("real",)
+
+    def __init__(self, real, particles: int = FEW, compiler: Compiler | None = None):
         self.real = real
-        self.compiler = Compiler(real, particles)
+        self.compiler = compiler or Compiler(real, particles)
         self.entries: list[Entry] = []
         self._later: list[tuple[Entry, np.ndarray]] = []
+        self._declared: list[Declared] = []
+        self._numbers: dict[Any, tuple[Any, list[Number]]] = {}  # by kind: the field, and what it holds
         self._apart = not aligned()
-        self._builders: dict[bool, Any] = {}  # of the trees, by whether what they hold stands apart
-        self._trees: list = []
-        self._runtime = inside.current()
+        self._layout: Layout | None = None
+        self._runtime = language.current()
         self._transfers: dict[tuple, Transfer] = {}  # compiled once, since that costs more than running them
-        self._views: dict[int, np.ndarray] | None = None  # see _seen()
-        self._address = 0  # of the first element of the first field
+        self._views: dict[int, np.ndarray] = {}  # see _seen()
+        self._address = 0  # of the bytes
+        self._room: Any = None  # the bytes, where they are not Taichi's own
+        self._ends: Any = None  # frees it
+
+    def more(self) -> "Memory":
+        """For more fields of the same world, which come and go by themselves."""
+        return Memory(self.real, compiler=self.compiler)
 
     def field(self, name: str, length: int | None, *, width: int = 0, kind=None, values=None, state: bool = False) -> Any:
         """Declare a field of `length` elements (None: a single one, of 0 dimensions) and give it its first values."""
         kind = self.real if kind is None else kind
-        made = ti.Vector.field(width, kind) if width else ti.field(kind)
-        apart = self._apart and kind == ti.f64
-        if apart not in self._builders:
-            self._builders[apart] = ti.FieldsBuilder()
-        if length is None:
-            self._builders[apart].place(made)
-        else:
-            self._builders[apart].dense(ti.i, max(1, length)).place(made)  # a field of 0 elements poisons the runtime
+        length = 0 if length is None else max(1, length)  # a field of 0 elements poisons the runtime
+        made = layout.field(kind, width)
+        self._declare(name, made, length, width, kind, state)
+        if values is not None and np.size(values):
+            self._later.append((self.entries[-1], np.asarray(values, dtype=np.float64)))
+        return made
+
+    def _declare(self, name: str, made: Any, length: int, width: int, kind: Any, state: bool) -> None:
+        self._declared.append(Declared(kind, width, length, self._apart and kind == ti.f64))
         same = sum(e.name == name or e.name.startswith(f"{name} #") for e in self.entries)
         name = f"{name} #{same + 1}" if same else name  # two batches of a kind
-        entry = Entry(name, made, width, 0 if length is None else max(1, length), np.dtype(_NUMPY[kind]), state)
-        self.entries.append(entry)
-        if values is not None and np.size(values):
-            self._later.append((entry, np.asarray(values, dtype=np.float64)))
-        return made
+        self.entries.append(Entry(name, made, width, length, np.dtype(_NUMPY[kind]), state))
+
+    def number(self, value: float, kind=None) -> Number:
+        """A number that kernels find in a field, so that others share them: an integer, unless `kind` says so."""
+        kind = ti.i32 if kind is None else kind
+        if kind not in self._numbers:
+            self._numbers[kind] = layout.field(kind, 0), []
+        field, known = self._numbers[kind]
+        known.append(Number(self, field, len(known), value))
+        return known[-1]
+
+    def set_number(self, number: Number) -> None:
+        """Write it, where it is on the device already."""
+        if self._layout:
+            self.write(number.field, [one._value for one in next(all for f, all in self._numbers.values() if f is number.field)])
 
     def place(self) -> None:
         """Allocate what was declared and write the first values (everything else is zero)."""
-        self._finish()
+        for kind, (field, known) in self._numbers.items():
+            self._declare(f"numbers.{np.dtype(_NUMPY[kind]).name}", field, len(known), 0, kind, False)
+            self._later.append((self.entries[-1], np.array([number._value for number in known], dtype=np.float64)))
+        with self.compiler():
+            declared = layout.roomy(self._declared)
+            same = sum(one.declared == declared for one, _ in self.compiler.places)
+            self._layout = layout.take(declared, same, [e.field for e in self.entries])
+        address, room = self._layout.lend()
+        self._ends = weakref.finalize(self, _end, self._layout, address, self.compiler, self._runtime)
+        self._ends.atexit = False
+        self._address, self._room = address, room
+        self.compiler.places.append((self._layout, address))
+        if self._layout.shared:
+            self._layout.point(address)
         if self._later:
             self._load([entry for entry, _ in self._later], [values for _, values in self._later])
             self._later.clear()
-
-    def _finish(self) -> None:
-        self._trees = [builder.finalize() for builder in self._builders.values()]
-        runtime.trees += len(self._trees)
-        _unseen[self] = None
 
     def _seen(self) -> dict[int, np.ndarray]:
         """Arrays that are the fields, by the id of the entry; none where the host cannot see them.
 
         Reading and writing fields by kernels takes longer to compile than all else takes to run.
         """
-        if self._views is None:
-            self._views = self._look() if runtime.architecture() == "cpu" and not self._apart else {}
+        if not self._views and self._layout:
+            self._layout.look()
+            if self._layout.size:
+                views = self._layout.views(self._address, [(e.shape, e.kind) for e in self.entries])
+                self._views = {id(e): view for e, view in zip(self.entries, views, strict=False)}
         return self._views
-
-    def _look(self) -> dict[int, np.ndarray]:
-        if self in _unseen:  # for all that wait for it by one kernel, since that takes as long as for one
-            waiting = [m for m in _unseen if m._trees and m._runtime is self._runtime]
-            addresses = np.zeros(len(waiting), dtype=np.uint64)
-            with self.compiler():
-                Places([m.entries[0] for m in waiting]).find(addresses)
-            for memory, address in zip(waiting, addresses.tolist(), strict=True):
-                memory._address = address
-            _unseen.clear()
-        (start, *_), tree = chain(self.entries[0].field)
-        memory, out = (ctypes.c_char * tree.cell_size_bytes).from_address(self._address - start), {}
-        for e in self.entries:
-            offsets, _ = chain(e.field)
-            cell = e.field.parent().ptr.cell_size_bytes
-            steps = (cell, offsets[1] - offsets[0] if e.width > 1 else e.kind.itemsize)
-            if any(b - a != steps[1] for a, b in zip(offsets, offsets[1:], strict=False)):
-                return {}  # laid out as never seen yet: by kernels, then
-            out[id(e)] = np.ndarray(e.shape, e.kind, memory, offsets[0], steps[: 1 + bool(e.width)])
-        return out
-
-    def abandon(self) -> None:
-        """Give up before place(): a builder that is never finished would poison everything that Taichi does later.
-
-        So would fields that are gone before Taichi has looked at them, which it does before the next kernel.
-        """
-        if not self._trees:
-            self._finish()
-            self.destroy()
 
     def check(self) -> None:
         """Raise RuntimeError when the fields are gone or belong to a runtime that is."""
-        if inside.current() is not self._runtime:
+        if language.current() is not self._runtime:
             raise RuntimeError(
                 "Taichi was started again after this world was built, which destroyed its fields. Build the world anew."
             )
-        if not self._trees:
+        if not self._layout:
             raise RuntimeError("This world is closed; build a new one.")
         if runtime.forked():
             raise RuntimeError('This world was built before a fork and cannot run in the child; use "spawn".')
 
     def destroy(self) -> None:
         """Free the fields. Calling it twice, or after another ti.init, does nothing."""
-        if self._trees and inside.current() is self._runtime and not runtime.forked():
-            self._runtime.materialize()  # see abandon(); no kernel may have run since place()
-            for tree in self._trees:
-                tree.destroy()
-            runtime.trees -= len(self._trees)
-        self._trees = []
-        self._views = None
+        if self._ends:
+            self._ends()
+        elif self.entries and not patched:  # fields that are never placed would poison everything that Taichi does later
+            Layout(tuple(self._declared), [e.field for e in self.entries]).destroy()
+        self._layout, self._views, self._room = None, {}, None
+        self.entries = self.entries if self._ends else []
 
     def write(self, field, values) -> None:
         """Overwrite a whole field."""
@@ -199,7 +195,14 @@ class Memory:
         return self._transfers[key]
 
 
-_unseen: weakref.WeakKeyDictionary[Memory, None] = weakref.WeakKeyDictionary()  # placed, nobody knows where
+def _end(one: Layout, address: int, compiler: Compiler, of: Any) -> None:
+    """Free a place in a layout."""
+    compiler.places.remove((one, address))
+    one.give_back(address)
+    if not one.lasting and of is language.current():
+        one.destroy()
+
+
 _NUMPY = {ti.f32: np.float32, ti.f64: np.float64, ti.i32: np.int32, ti.u32: np.uint32}
 
 

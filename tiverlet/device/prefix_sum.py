@@ -1,8 +1,12 @@
 """Running sums of whole numbers, by one thread or by all of a GPU."""
 
-import taichi as ti
+from typing import TYPE_CHECKING, Any
 
-from .thread_team import Team
+from .language import ti
+from .number import OnDevice
+
+if TYPE_CHECKING:
+    from .thread_team import Team
 
 RADIX = 64  # entries that one thread of a GPU adds up
 MOST = 2**30 - 1  # two of them are still an i32
@@ -17,20 +21,22 @@ class Sums:
     `room` for both.
     """
 
-    def __init__(self, length: int, team: Team, capped: bool = False):
+    room: Any = OnDevice()
+
+    def __init__(self, length: int, team: "Team", capped: bool = False):
         self.team, self.capped = team, capped
-        self.lengths, self.begins = [length], [0]  # of each level
-        while team.launched and self.lengths[-1] > RADIX:
-            self.begins.append(self.begins[-1] + self.lengths[-1])
-            self.lengths.append(-(-self.lengths[-1] // RADIX))
-        self.levels = len(self.lengths)
-        self.room = self.begins[-1] + self.lengths[-1]
+        lengths, self.begins = [length], [0]  # of each level
+        while team.launched and lengths[-1] > RADIX:
+            self.begins.append(self.begins[-1] + lengths[-1])
+            lengths.append(-(-lengths[-1] // RADIX))
+        self.levels, self.above = len(lengths), lengths[1:]
+        self.room = team.memory.number(self.begins[-1] + lengths[-1])
 
     @ti.func
     def run(self, field: ti.template(), me):  # type: ignore[valid-type]
         """Add up."""
         for m in ti.static(range(1, self.levels)):
-            for b in range(ti.static(self.lengths[m])):
+            for b in range(ti.static(self.above[m - 1])):
                 total = 0
                 for k in range(self.low(m, b), self.high(m, b)):
                     total = self.plus(total, field[k])
@@ -39,7 +45,7 @@ class Sums:
         for k in range(self.begins[-1] + 1, self.team.one(self.room, me)):
             field[k] = self.plus(field[k], field[k - 1])
         for m in ti.static(range(self.levels - 1, 0, -1)):
-            for b in range(ti.static(self.lengths[m])):
+            for b in range(ti.static(self.above[m - 1])):
                 total = 0
                 if b > 0:
                     total = field[self.begins[m] + b - 1]

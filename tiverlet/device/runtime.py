@@ -4,34 +4,22 @@ import contextlib
 import ctypes
 import io
 import os
-import sys
-import tempfile
 import threading
 from typing import Any
 
-# Quiet and offline: no banner, no version check over the network. Taichi reads these when it is imported; where that was before,
-# it has printed its banner, and it would warn of the level being set twice.
-os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
-os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
-if "taichi" not in sys.modules:
-    os.environ.setdefault("TI_LOG_LEVEL", "error")
-    if os.name == "posix" and "HOME" not in os.environ:  # or Taichi ends the process
-        os.environ["HOME"] = next(folder for folder in (os.path.expanduser("~"), tempfile.gettempdir()) if os.path.isabs(folder))
-
-import taichi as ti
-
-from .patches import inside
+from . import language
+from .language import ti
 
 
 def _ask_for_start() -> None:
     """Say how to start Taichi where a field is made before it runs; ti.init, as Taichi says, would round otherwise."""
-    if inside.current().prog is None:
+    if language.current().prog is None:
         raise RuntimeError(
             "A field of Taichi was asked for before Taichi runs. Call tv.init() first; else the first tv.World starts it."
         )
 
 
-inside.before_fields(_ask_for_start)
+language.before_fields(_ask_for_start)
 
 ARCHITECTURES = ("cpu", "cuda", "metal", "vulkan")
 LLVM = ("cpu", "cuda")  # what LLVM compiles for; for the others Taichi writes SPIR-V
@@ -57,13 +45,13 @@ def init(arch: str = "cpu", threads: int | None = None, debug: bool = False, see
         raise ValueError(f"init: threads = {threads!r}, but it must be an integer of at least 1, or None for all cores.")
     wanted = {"arch": arch, "threads": threads, "debug": debug, "seed": seed}
     if ti.cfg is not None:
-        if _started.get("runtime") is inside.current() and wanted == _started["wanted"]:
+        if _started.get("runtime") is language.current() and wanted == _started["wanted"]:
             return
         raise RuntimeError(
             f"init: Taichi already runs (arch {architecture()}), and starting it again would destroy every live "
             "world's fields. Call tv.init before the first World and before any ti.init, or leave it out."
         )
-    if arch != "cpu" and not inside.has(arch):
+    if arch != "cpu" and not language.has(arch):
         offer = ", ".join(map(repr, available()))
         raise RuntimeError(f'init: arch "{arch}" is not available on this machine. Available: {offer}.')
     running = _threads()
@@ -111,7 +99,7 @@ def architecture() -> str:
 
 def available() -> list[str]:
     """The architectures that this machine and this Taichi have."""
-    return [a for a in ARCHITECTURES if a == "cpu" or inside.has(a)]
+    return [a for a in ARCHITECTURES if a == "cpu" or language.has(a)]
 
 
 def threads() -> int:
@@ -151,7 +139,7 @@ def ensure_started() -> None:
     """Start Taichi with the defaults if it does not run, and refuse where building fields would crash."""
     if ti.cfg is None:
         init()
-    if _started.get("runtime") is not inside.current():
+    if _started.get("runtime") is not language.current():
         _adopt()
     if forked():
         raise RuntimeError(
@@ -174,7 +162,7 @@ def _config() -> Any:
 def _leave() -> None:
     """In a forked child: keep Taichi from being ended there, which waits for ever for threads that only the parent has."""
     runtime = _started.get("runtime")
-    if runtime is not None and runtime is inside.current() and runtime.prog:
+    if runtime is not None and runtime is language.current() and runtime.prog:
         hold = ctypes.pythonapi.Py_IncRef
         hold.argtypes = [ctypes.py_object]
         hold(runtime.prog)
@@ -188,4 +176,4 @@ def _adopt(wanted: dict | None = None) -> None:
     """Remember the running Taichi, and what it was asked for if it was started here."""
     global trees
     trees = 0
-    _started.update(runtime=inside.current(), pid=os.getpid(), thread=threading.get_ident(), wanted=wanted)
+    _started.update(runtime=language.current(), pid=os.getpid(), thread=threading.get_ident(), wanted=wanted)

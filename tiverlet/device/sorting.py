@@ -1,6 +1,6 @@
 """Sorting short lists of whole numbers that stand in a field, each by one thread."""
 
-import taichi as ti
+from .language import ti
 
 LONG = 64  # numbers that heapsort puts in order before insertion does
 

@@ -8,12 +8,15 @@ milliseconds: after a few such waits the first thread goes on alone, and the oth
 
 import contextlib
 from collections.abc import Iterator
-
-import taichi as ti
+from typing import TYPE_CHECKING, Any
 
 from . import runtime
-from .memory import Memory
+from .language import ti
+from .number import OnDevice
 from .patches.compiler import inline
+
+if TYPE_CHECKING:
+    from .memory import Memory
 
 LEAST = 512  # iterations of a loop that Taichi gives to a CPU thread, at least
 PIECES = 16  # into which a team divides particles that touch, at most
@@ -65,10 +68,13 @@ class Team:
     does of it; what the shares are shows in no result. Particles are dealt out piece by piece, there and back, `pieces` in all:
     in a heap those below have more to do than those above, and one thread would wait for the other."""
 
-    def __init__(self, memory: Memory, size: int, particles: int, launched: bool, pieces: int):
-        self.size, self.launched, self.patience = size, launched, PATIENCE + particles
+    piece: Any = OnDevice()
+    patience: Any = OnDevice()
+
+    def __init__(self, memory: "Memory", size: int, particles: int, launched: bool, pieces: int):
+        self.size, self.launched, self.patience = size, launched, memory.number(PATIENCE + particles)
         even = -(-particles // (max(min(pieces, particles // SMALL), size) * EVEN)) * EVEN
-        self.piece = max(1, 1 if launched else particles if size == 1 else even)
+        self.piece = memory.number(max(1, 1 if launched else particles if size == 1 else even))
         self.spread = LEAST * size if size > 1 else 1
         self._alone, self._frames = 0, 0
         self.memory = memory
@@ -148,21 +154,21 @@ class Team:
                 self.ends[None] = 1
 
     @ti.func
-    def _share(self, n: ti.template(), k):  # type: ignore[valid-type]
+    def _share(self, n, k):
         active = self.active_threads[None]
         return ti.min(k * ((n + active - 1) // active), n)
 
     @ti.func
-    def _dealt_count(self, n: ti.template(), unit: ti.template(), thread):  # type: ignore[valid-type]
-        active, units = self.active_threads[None], ti.static(-(-n // unit))
+    def _dealt_count(self, n, unit, thread):
+        active, units = self.active_threads[None], (n + unit - 1) // unit
         out = (units // active + ti.cast(self._place(units // active, thread) < units % active, ti.i32)) * unit
         if self._place((units - 1) // active, (units - 1) % active) == thread:
-            out -= ti.static(-(-n // unit) * unit - n)
+            out -= units * unit - n
         return out
 
     @ti.func
-    def _dealt_index(self, k, unit: ti.template(), thread):  # type: ignore[valid-type]
-        before = ti.cast(ti.cast(k, ti.u32) // ti.u32(unit), ti.i32)  # i32 would look at the sign
+    def _dealt_index(self, k, unit, thread):
+        before = ti.cast(ti.cast(k, ti.u32) // ti.cast(unit, ti.u32), ti.i32)  # i32 would look at the sign
         return k + (before * (self.active_threads[None] - 1) + self._place(before, thread)) * unit
 
     @ti.func

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..device import at
-from ..device.patches import inside
+from ..device.language import inside_kernel
 from .read_only import assign_whole, handed_out, structure
 
 
@@ -33,7 +33,7 @@ class Knob:
     def __get__(self, feature, owner=None) -> Any:
         if feature is None:
             return self
-        if self.device and inside.inside_kernel() and self.device in vars(feature.dev):
+        if self.device and inside_kernel() and self.device in vars(feature.dev):
             return at(vars(feature.dev)[self.device], None)
         if self.name not in feature.__dict__:
             raise AttributeError(f"{feature!r} has no {self.name}.")
@@ -57,9 +57,12 @@ class RecordsArguments:
 
     arguments: Mapping[str, Any] = MappingProxyType({})
     kept_by_world: tuple[str, ...] = ()  # attributes that a world sets
+    host_only: tuple[str, ...] = ()  # attributes that kernels do not read
 
     def __init_subclass__(cls, **kwargs) -> None:
         super().__init_subclass__(**kwargs)
+        live = tuple(name for name, value in vars(cls).items() if isinstance(value, Knob))
+        cls.host_only = (*vars(cls).get("host_only", ()), *live)  # what kernels have of them is compiled()
         if "__init__" in vars(cls):
             type.__setattr__(cls, "__init__", _recording(cls.__init__))
 

@@ -29,7 +29,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..device import at, inline, ti
+from ..device.language import inside_kernel
 from ..device.memory import Memory
+from ..device.number import Number
 from .arguments import Knob as Knob
 from .arguments import RecordsArguments, knobs_of
 from .read_only import handed_out
@@ -44,6 +46,8 @@ BENT, FAR = 1, 2  # how far a constraint turned in a substep: by more than 26 de
 class Scene:
     """What a feature is bound to: the memory to declare fields in, and the particles they act on."""
 
+    host_only = ("inv_mass", "residuals", "hh")
+
     memory: Memory
     state: "State"
     particles: "Particles"
@@ -52,7 +56,12 @@ class Scene:
     slots: Any = None  # where constraints leave their moves
     residuals: Any = None  # batch -> what the last substep left of each of its violations
     order: int = 2  # of the substep in h
-    hh: float = 0.0  # [s^2] what an acceleration added to the displacement in the last substep, see Batch.relax
+    h2_effective: float = 0.0  # [s^2] what an acceleration added to the displacement in the last substep, see Batch.relax
+
+    @functools.cached_property
+    def count(self) -> Number:
+        """Of particles, for kernels."""
+        return self.memory.number(self.particles.count)
 
     @property
     def real(self):
@@ -65,6 +74,7 @@ class Feature(RecordsArguments):
     that it changes a force, `moving` that a target is under way."""
 
     kept_by_world = ("scene", "start", "changed", "moving", "new_force", "arguments")
+    host_only: tuple[str, ...] = ("start", "changed", "moving", "new_force", "arguments")  # what kernels do not read of it
     compiled_for: tuple[str, ...] = ()  # properties that decide what its kernels consist of
     changed = True
     moving = new_force = False
@@ -189,7 +199,7 @@ class Batch(Feature):
     @property
     def count(self) -> int:
         """The number of constraints, m."""
-        return self.members.count
+        return self.dev.constraint_count.now if inside_kernel() else self.members.count
 
     @property
     def blocks(self) -> int:
@@ -271,6 +281,7 @@ class Batch(Feature):
         self.dev.slots = scene.slots
         self.dev.w = scene.state.w
         self.dev.real = scene.real
+        self.dev.constraint_count = scene.memory.number(self.members.count)
         self.members.bind(self, scene)
 
     @inline
@@ -286,38 +297,38 @@ class Batch(Feature):
             self.dev.slots.move[place] = move
 
     @ti.func
-    def relax(self, c, h, hh, when, first, fresh):
+    def relax(self, c, h, h2_effective, frame_fraction, first, fresh):
         """One Jacobi correction of constraint c in a substep of h [s]: pushes one move for each corner.
 
-        hh: what a constant acceleration adds to the displacement, per m/s^2: h^2, half of it at a start, less with drag [s^2].
-        when: the fractions of the frame at the start and the end of the substep, for targets that move.
+        h2_effective: what a constant acceleration adds to the displacement, per m/s^2: h^2, half of it at a start, less with
+        drag [s^2]. frame_fraction: where in the frame the substep starts and ends, for targets that move.
         first: 1 in the first iteration of a substep. fresh: 1 in the first substep after a start.
         """
 
     @ti.func
-    def kick(self, c, h):
+    def push_spring_force(self, c, h):
         """Push what the constraint's spring, if it has one, adds to h^2 a at the present positions; for starts."""
 
     @ti.func
-    def bond(self, c, firm, soft):
+    def push_reaction(self, c, firm, soft):
         """Push what the constraint added to h^2 a in the last substep, along its directions at the present positions, about which
         it has no moment. firm, soft: h^2 over what its multiplier stands for, where it is rigid and where not."""
 
     @ti.func
-    def reduce_block(self, b, h, hh, first, fresh):
-        """Before relax() and kick() sum over block b of a ragged batch. first: -1 before kick()."""
+    def reduce_block(self, b, h, h2_effective, first, fresh):
+        """Before relax() and push_spring_force(): sum over block b of a ragged batch. first: -1 before the latter."""
 
     @ti.func
-    def scatter_corner(self, e, h, hh, first, fresh):
-        """After relax() and kick(): push the move of corner e of a ragged batch."""
+    def scatter_corner(self, e, h, h2_effective, first, fresh):
+        """After relax() and push_spring_force(): push the move of corner e of a ragged batch."""
 
     @ti.func
-    def residual_of(self, c, h, hh, when, fresh):
+    def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
         """How far constraint c is from fulfilled, relative to its size."""
         return 0.0
 
     @ti.func
-    def energy(self, c, back, hh, miss):
-        """Elastic energy [J] of constraint c at x - back d. miss: of residual_of(). hh: as in relax(), 0 where there was no
-        substep yet."""
+    def energy(self, c, back, h2_effective, residual):
+        """Elastic energy [J] of constraint c at x - back d. residual: what residual_of() returns. h2_effective: as in
+        relax(), 0 where there was no substep yet."""
         return 0.0

@@ -1,14 +1,16 @@
 """Friction and restitution: what users give, checked, and as tables for kernels."""
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from .. import checks
 from ..device import inline, ti
 from ..tools import distinct
-from .feature import Scene
+
+if TYPE_CHECKING:
+    from .feature import Scene
 
 
 def friction_of(who: str, name: str, value: Any) -> tuple[float, float]:
@@ -38,6 +40,8 @@ class Table:
     touching: None for all, or the pairs of groups that touch.
     """
 
+    kernels_read = ("uniform", "has_friction", "has_restitution", "groups", "rank", "entries")
+
     def __init__(self, who: str, friction: Any, restitution: Any, touching: Iterable | None):
         self.who, self.friction, self.restitution = who, friction, restitution
         self.touching = None
@@ -47,9 +51,9 @@ class Table:
         single = not isinstance(friction, Mapping) and not isinstance(restitution, Mapping)
         self.uniform = single and touching is None
         values = friction.values() if isinstance(friction, Mapping) else [friction]
-        self.rubs = any(friction_of(who, "friction", v)[0] > 0 for v in values)
+        self.has_friction = any(friction_of(who, "friction", v)[0] > 0 for v in values)
         values = restitution.values() if isinstance(restitution, Mapping) else [restitution]
-        self.bounces = any(restitution_of(who, "restitution", v) > 0 for v in values)
+        self.has_restitution = any(restitution_of(who, "restitution", v) > 0 for v in values)
 
     def rows(self, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The rank of each particle's group, (n,), and the table, (ranks * ranks, 4)."""
@@ -76,7 +80,7 @@ class Table:
                     table[at[a], at[b], columns] = table[at[b], at[a], columns] = parse(self.who, f"value of {pair}", value)
         return rank, table.reshape(m * m, 4)
 
-    def bind(self, scene: Scene, asked: bool = False) -> None:
+    def bind(self, scene: "Scene", asked: bool = False) -> None:
         """Declare the table and the groups, where they differ. asked: of() is asked even where all rows are 0."""
         rank, rows = self.rows(scene.particles.group)
         self.groups = int(rank.max(initial=0)) + 1
@@ -84,10 +88,10 @@ class Table:
             rows = rows[:1]
         else:
             self.rank = scene.memory.field("Contact.group", len(rank), kind=ti.i32, values=rank)
-        if self.rubs or self.bounces or not self.uniform or asked:
+        if self.has_friction or self.has_restitution or not self.uniform or asked:
             self.entries = scene.memory.field("Contact.table", len(rows), width=4, values=rows)
 
-    def upload(self, scene: Scene, other: "Table") -> None:
+    def upload(self, scene: "Scene", other: "Table") -> None:
         """Write the values of another table, for the same kernels."""
         if "entries" in vars(self):
             scene.memory.write(self.entries, other.rows(scene.particles.group)[1][: 1 if self.uniform else None])

@@ -4,6 +4,7 @@ from .attractor import Attractor
 from .drag import Drag
 from .force import Force
 from .gravity import Gravity
+from .hand import Hand
 from .wind import Wind
 
-__all__ = ["Attractor", "Drag", "Force", "Gravity", "Wind"]
+__all__ = ["Attractor", "Drag", "Force", "Gravity", "Hand", "Wind"]

@@ -5,7 +5,7 @@ import inspect
 import numpy as np
 
 from ..device import inline, ti
-from ..device.patches import inside
+from ..device.language import Expression, is_kernel_function, undecorated
 from ..device.patches.compiler import readable, refuse
 from ..features.feature import Acceleration, Scene
 from ..particles import Particles
@@ -30,12 +30,12 @@ class Force(Acceleration):
     """
 
     def __init__(self, function):
-        if not getattr(function, "_is_taichi_function", False):
+        if not is_kernel_function(function):
             raise TypeError(
                 f"Force: function = {function!r} is not a Taichi function. Put the decorator @ti.func above its def "
                 "(import taichi as ti), in a file: Taichi reads its source."
             )
-        plain = function.func.func
+        plain = undecorated(function)
         if not readable(plain):
             raise ValueError(
                 f"Force: the source of {plain.__name__} cannot be read, and Taichi compiles the source. Write it in a file or "
@@ -59,8 +59,8 @@ class Force(Acceleration):
     @inline
     def force(self, value):
         """What the function returned, if it is a vector; as a number it would be added to all components."""
-        dim, name = self.dev.dim, self.function.func.func.__name__
-        known = isinstance(value, inside.Expression)
+        dim, name = self.dev.dim, undecorated(self.function).__name__
+        known = isinstance(value, Expression)
         shape = (tuple(value.get_shape()) if value.is_tensor() else ()) if known else np.shape(value)
         if shape != (dim,):
             what = f"{shape[0]} components" if len(shape) == 1 else f"a matrix of shape {shape}" if shape else "a number"

@@ -1,6 +1,7 @@
 """Uniform gravity."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .. import checks
 from ..device import ti
@@ -25,7 +26,7 @@ class Gravity(Acceleration):
     dim = 0
     g = Knob(_vector, "Acceleration [m/s^2]: a number along -y, or a vector.")
 
-    def __init__(self, g=9.81):
+    def __init__(self, g: ArrayLike = 9.81):
         self.g = g
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
@@ -41,8 +42,8 @@ class Gravity(Acceleration):
 
     def _vector(self) -> list[float]:
         """g as a vector."""
-        down = [0.0, -1.0, 0.0][: self.dim]
-        return [self.g * c for c in down] if np.ndim(self.g) == 0 else list(np.asarray(self.g))
+        g = np.asarray(self.g, dtype=np.float64)
+        return (g if g.ndim else g * [0.0, -1.0, 0.0][: self.dim]).tolist()
 
     def upload(self) -> None:
         """Write g."""

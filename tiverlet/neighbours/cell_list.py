@@ -12,15 +12,18 @@ further it has to be found. A particle looks at its own level and at the coarser
 its neighbours are in the 3^dim cells around it; of the finer ones it hears when they find it.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..device import ti
+from ..device.number import OnDevice
 from ..device.prefix_sum import Sums
-from ..device.thread_team import Team
-from ..features.feature import Scene
 from ..tools import distinct
+
+if TYPE_CHECKING:
+    from ..device.thread_team import Team
+    from ..features.feature import Scene
 
 LEVELS = 14  # the last one holds all that are smaller, down to points
 
@@ -29,12 +32,16 @@ class CellList:
     """The tables. radius: (n,) [m]. reach: (n,) [m]. Pairs are looked for up to the sum of their radii, the longer of their
     reaches, and the skin [m]."""
 
-    def __init__(self, scene: Scene, radius: np.ndarray, reach: np.ndarray, skin: float, team: Team, scratch: Any):
+    n: Any = OnDevice()  # particles
+    buckets: Any = OnDevice()  # of the tables
+    coarsest: Any = OnDevice()  # cells per meter, of level 0
+
+    def __init__(self, scene: "Scene", radius: np.ndarray, reach: np.ndarray, skin: float, team: "Team", scratch: Any):
         self.team = team
         self.place = scratch  # of the particles as they are sorted, while a list is built: read one after the other
         self.memory = scene.memory
         n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
-        self.n, self.dim, self.state, self.real = n, dim, scene.state, scene.real
+        self.n, self.dim, self.state, self.real = scene.count, dim, scene.state, scene.real
         self.serial = not team.launched  # counting in order, on one thread, beats atomic counters in parallel on a CPU
         with np.errstate(divide="ignore"):
             size = radius + reach / 2
@@ -45,10 +52,11 @@ class CellList:
         finer, longest = (np.array([v[level >= m].max() for m in range(self.levels)]) for v in (radius, reach))
         # Rounding of floor(x * scale) must not hide a neighbour.
         self.sizes = (own + finer + longest + skin) * (1 + 2.0**-12)
+        self.coarsest = scene.memory.number(float(1 / self.sizes[0]), scene.real)
         counts = np.bincount(level, minlength=self.levels)
         self.bits = np.maximum(2 * dim, np.ceil(np.log2(np.maximum(2 * counts, 1)))).astype(int)
         offsets = np.concatenate([[0], np.cumsum(1 << self.bits)])
-        self.buckets = int(offsets[-1])
+        self.buckets = scene.memory.number(int(offsets[-1]))
         self._shapes = self.shapes(np.ptp(scene.particles.position, axis=0))
         self.sums = Sums(self.buckets + 2, team)
         self.edge = add("grid.edge", self.sums.room, kind=ti.i32)
@@ -95,7 +103,7 @@ class CellList:
     @ti.func
     def scale(self, m):
         """CellList per meter at level m."""
-        scale = ti.cast(1 / self.sizes[0], self.real)
+        scale = ti.cast(self.coarsest, self.real)
         if ti.static(self.levels > 1):
             scale = self.per_meter[m]
         return scale

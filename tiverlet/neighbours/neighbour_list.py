@@ -7,6 +7,7 @@ import numpy as np
 
 from ..device import ti
 from ..device.memory import Memory
+from ..device.number import Number, OnDevice
 from ..device.thread_team import Team
 
 CROWDED = 300  # near pairs per particle beyond which the user is told
@@ -31,13 +32,21 @@ class PairData:
 class NeighbourList:
     """For each particle, the entries of the list that are its own: `number` of them from `first` on, sorted by index.
 
-    n: particles. pair_data: what each pair remembers. short: entries of room after each block.
+    n: how many particles. pair_data: what each pair remembers. short: entries of room after each block.
     """
 
-    blocks: int  # parts of the list, each filled by one thread
+    n: Any = OnDevice()  # particles
+    blocks: Any = OnDevice()  # parts of the list, each filled by one thread
+    capacity: Any = OnDevice()  # entries of one
+    pitch: Any = OnDevice()  # from one to the next
+    capacity_number: Number
+    pitch_number: Number
+    host_only = ("room",)
 
-    def __init__(self, memory: Memory, n: int, rooms: int, pair_data: list[PairData], team: Team, short: int):
-        self.team, self.n, self.memory, self.real, self.short = team, n, memory, memory.real, short
+    def __init__(self, memory: Memory, count: Number, rooms: int, pair_data: list[PairData], team: Team, short: int):
+        self.team, self.n, self.memory, self.real, self.short = team, count, memory, memory.real, short
+        n = self.n
+        self.capacity, self.pitch = memory.number(0), memory.number(0)
         self.pair_data = pair_data
         self.lasting, self.transferred = [p for p in pair_data if p.lasting], [p for p in pair_data if p.kept]
         self.marked = all(p.marked for p in self.transferred)
@@ -53,6 +62,7 @@ class NeighbourList:
         self.neighbour: Any = None
         self.old_neighbour: Any = None  # of the old list, pairs with data other than 0, while a new one is built
         self.store: Memory | None = None
+        self.room = 0  # entries of one list
 
     def allocate(self, capacity: int) -> None:
         """Room for `capacity` entries of the list, in a tree of its own, so that it can grow."""
@@ -60,10 +70,10 @@ class NeighbourList:
             raise MemoryError(f"{capacity} near pairs exceed what a list can index; the particles overlap too much.")
         if self.store:
             self.store.destroy()
-        self.capacity = max(1, -(-capacity // self.blocks))  # of one block
-        self.pitch = self.capacity + self.short  # from one block to the next
-        self.room = self.pitch * self.blocks  # of one list
-        self.store = Memory(self.real)
+        self.capacity_number.set(max(1, -(-capacity // self.blocks)))
+        self.pitch_number.set(self.capacity + self.short)
+        self.room = self.pitch * self.blocks
+        self.store = self.memory.more()
         self.neighbour = self.store.field("grid.near", self.room, kind=ti.i32)
         self.old_neighbour = self.store.field("grid.aside", self.room, kind=ti.i32)
         for piece in self.pair_data:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..device import ti
+from ..device.number import OnDevice
 from ..device.patches.compiler import FEW
 from ..device.prefix_sum import MOST, Sums
 from ..device.sorting import exchange, sort, sorting_network
@@ -34,6 +35,9 @@ class NeighbourSearch(NeighbourList):
     by its radius a particle has to be found [m], see CellList.
     """
 
+    skin: Any = OnDevice()
+    too_far: Any = OnDevice()  # the square of the way after which the list is stale
+
     def __init__(
         self, scene: Scene, skin: float, linked: np.ndarray, table: Table, pair_data: list[PairData], team: Team, scratch: Any,
         reach: np.ndarray | None = None,
@@ -41,17 +45,19 @@ class NeighbourSearch(NeighbourList):
         n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
         self.sums = Sums(n, team, capped=True)
         # Entries of a list that is sorted without branches; to compile that takes an eighth of all.
-        super().__init__(scene.memory, n, self.sums.room, pair_data, team, 1 if n < FEW else 8 if dim == 2 else 16)
+        super().__init__(scene.memory, scene.count, self.sums.room, pair_data, team, 1 if n < FEW else 8 if dim == 2 else 16)
         self.network = sorting_network(self.short)
         self.dim, self.state, self.radius = dim, scene.state, scene.radius
-        self.table, self.skin = table, skin
+        self.table = table
+        number, real = scene.memory.number, scene.real
+        self.skin, self.too_far = number(skin, real), number((0.49 * skin) ** 2, real)
         self._extent: Sequence[float] = [-1.0] * dim
         radius = scene.particles.radius
         self.cells = CellList(scene, radius, 0 * radius if reach is None else reach, skin, team, scratch)
         self.several_levels = self.cells.levels > 1
         self.counts = self.several_levels or team.launched  # before it lists
         self.serial = not self.counts or (team.size == 1 and not team.launched)  # one thread makes a list, in order
-        self.blocks = max(1, -(-n // team.piece)) if team.size > 1 and not self.counts else 1
+        self.blocks = number(max(1, -(-n // team.piece)) if team.size > 1 and not self.counts else 1)
         self.origin = add("grid.built_at", n, width=dim)
         self.has_static = bool((scene.inv_mass == 0).any())  # whether there are pairs that cannot move
         self.linked = len(linked) > 0
@@ -80,7 +86,7 @@ class NeighbourSearch(NeighbourList):
     def moved_too_far(self, i):
         """1 if the list is stale: once a particle has moved by half the skin."""
         r = self.state.x[i] - self.origin[i]
-        return ti.select(r.dot(r) <= ti.cast((0.49 * self.skin) ** 2, self.real), 0, 1)  # 1 for NaN
+        return ti.select(r.dot(r) <= self.too_far, 0, 1)  # 1 for NaN
 
     @ti.func
     def build(self, thread):
@@ -106,7 +112,7 @@ class NeighbourSearch(NeighbourList):
     def fill(self, block):
         """One level: list the neighbours of a block of particles, one after the other. Beyond the room they are only counted."""
         start, room = block * self.pitch, self.capacity
-        size = ti.static(-(-self.n // self.blocks))
+        size = (self.n + self.blocks - 1) // self.blocks
         used = 0
         for i in range(block * size, ti.min((block + 1) * size, self.n)):
             self.first[i] = start + ti.min(used, room)

@@ -4,6 +4,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..colliders.collider import Collider
+from ..constraints.core.anchored import Anchored
+from ..features.feature import Batch
 from ..step.checkpoint import Checkpoint
 from ..step_report import StepReport
 
@@ -25,6 +28,26 @@ CURVES = {
 }  # fmt: skip
 
 
+def shown(world: "World") -> dict[str, tuple[str, list[bool]]]:
+    """Views of curves that say something of this scene, by title: the end of the path of their rows, and which of them show. No
+    overlap without contacts, no momentum where walls or pins take it, no substeps where they are given.
+    """
+    held = bool((world.particles.inv_mass == 0).any()) or any(isinstance(f, (Collider, Anchored)) for f in world.features)
+    hidden = {
+        "residual": not any(isinstance(f, Batch) for f in world.features), "overlap": not world._runner.step.contacts,
+        "substeps": world.settings["substeps"] != "auto", **{f"momentum/{axis}": held for axis in "xyz"},
+    }  # fmt: skip
+    out = {
+        title: (end, [not hidden.get(name, False) for name in _names(curves, world)]) for title, (end, curves) in CURVES.items()
+    }
+    return {title: (end, those) for title, (end, those) in out.items() if any(those)}
+
+
+def _names(curves: dict[str, Any], world: "World") -> list[str]:
+    """Of the curves of a view, at most one for each dimension."""
+    return list(curves)[: max(2, world.particles.dim)]
+
+
 class Curves:
     """Collects the figures of frames, and sends them on together, which takes a fifth of the time of sending each."""
 
@@ -35,9 +58,11 @@ class Curves:
         self.weigh(world)
         self._rows: dict[str, list[tuple[int, float, list[float]]]] = {}
         self._begun = False
-        for end, curves in CURVES.values():
-            titles, colors = zip(*list(curves.values())[: world.particles.dim], strict=True)
-            stream.log(f"figures/{end}", rr.SeriesLines(names=titles, colors=colors), static=True, strict=True)
+        for title, (end, curves) in CURVES.items():
+            titles, colors = zip(*(curves[name] for name in _names(curves, world)), strict=True)
+            _, those = shown(world).get(title, (end, [False] * len(titles)))
+            lines = rr.SeriesLines(names=titles, colors=colors, visible_series=those)
+            stream.log(f"figures/{end}", lines, static=True, strict=True)
 
     def weigh(self, world: "World") -> None:
         """Look at the masses; there may be others when particles were added or removed."""

@@ -5,23 +5,25 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..colliders import Box, Mesh, Polygon
+from ..colliders import Ball, Box, Capsule, HalfSpace, Mesh, Polygon
 from ..colliders.collider import Collider
 from ..constraints import Path
 from ..constraints.distance import Link
 from ..features.feature import Batch
+from ..forces import Gravity
 from ..tools import golden_colors
 from .journal import PARTICLES
 from .layout import LEGEND, SCENE, WIDE
-from .lines import Lines, Sheet
+from .lines import Lines
 from .strain import legend, levels
+from .surfaces import Surface, bodies, covered, triangles
 
 if TYPE_CHECKING:
     from ..world import World
 
 POINT = -2.5  # a particle without radius is drawn as a dot of so many pixels (negative: screen units)
 MANY = 5000  # links that are drawn as lines; of more, an even selection
-SHEET = 100_000  # links up to which it is asked whether they are a sheet
+WALL = np.array([[92, 97, 112]], dtype=np.uint8)  # of surfaces of walls
 FEW = 1500  # particles up to which contacts are drawn; finding them would take too much of the frame beyond
 TOUCH = 4  # one contact is drawn for so many particles, those that push most
 
@@ -61,11 +63,13 @@ class Drawing:
         self.scenes += 1
         self._contacts = len(p) <= FEW and bool(world._runner.step.contacts)
         self._broken = {k: f.broken for k, f in enumerate(world.features) if isinstance(f, Batch) and f.breaks}
-        hues = golden_colors(len(p))
-        hues[p.inv_mass == 0] = (140, 140, 150)
-        self._join()
-        what = [self._points.from_fields(radii=np.where(p.radius > 0, p.radius, POINT), colors=hues)]
-        what += [self._sheet.mesh(self._rr)] if self._sheet else []
+        hues = colors(world)
+        self._join(hues)
+        radii = np.where(p.radius > 0, p.radius, POINT)
+        if self._surface:
+            radii[covered(world, self._surface.triangles) & (p.inv_mass > 0)] = 0.0  # what is under a surface is not seen
+        what = [self._points.from_fields(radii=radii, colors=hues)]
+        what += [self._rr.Mesh3D.from_fields(triangle_indices=self._surface.triangles.astype(np.uint32))] if self._surface else []
         what += [self._strips.from_fields(radii=[-1.2])] if self._lines else []
         self.static(f"{self._root}/{PARTICLES}", *what)
         if len(self._pairs):
@@ -77,8 +81,8 @@ class Drawing:
                 f"{LEGEND}/labels", self._rr.Points2D(at + [0, 0.5], colors=hues, labels=labels, radii=[0], show_labels=True)
             )
 
-    def _join(self) -> None:
-        """All links together: as a sheet what is one, and the others as lines."""
+    def _join(self, hues: np.ndarray) -> None:
+        """All links together: in the colours of surfaces those that are part of one, and the others as lines."""
         world = self.world
         found = links(world)
         none = np.zeros((0, 2), dtype=np.int64)
@@ -87,20 +91,20 @@ class Drawing:
         number, row = (np.concatenate([[], *each]).astype(np.int64) for each in (
             [np.full(f.count, k) for k, f in found], [np.arange(f.count) for _, f in found]
         ))  # fmt: skip  # of the feature, and of the link in it
-        self._sheet = None
-        rest = np.ones(len(self._pairs), dtype=bool)  # of links that are not in it
-        if not self._flat and not any(k in self._broken for k, _ in found) and 0 < len(self._pairs) <= SHEET:
-            start = found[0][1].start.position
-            sheet = Sheet(self._pairs, start) if len(start) == len(world.particles) else None
-            if sheet and len(sheet.triangles):
-                self._sheet, rest = sheet, ~sheet.used
-        some = np.flatnonzero(rest)
+        self._surface = None
+        corners = np.zeros((0, 3), dtype=np.int64) if self._flat else triangles(world)
+        under = np.isin(self._pairs, corners).all(axis=1)  # links that are not drawn as lines
+        some = np.flatnonzero(~under)
         some = some[:: -(-len(some) // MANY) or 1]
         self._lines = Lines(self._pairs[some]) if len(some) else None
-        if not self._sheet:
+        if not under.any():
             self._pairs, self._rest, number, row = (each[some] for each in (self._pairs, self._rest, number, row))
-            some = np.arange(len(some))
-        self._some = some
+            some, under = np.arange(len(some)), np.zeros(len(some), dtype=bool)
+        if len(corners):
+            soft = np.isin(number, [k for k, f in found if np.any(getattr(f, "compliance", 0))])  # what is meant to give way
+            under &= ~soft
+            self._surface = Surface(corners, hues, self._pairs[under], upwards(world))
+        self._some, self._under = some, under
         self._tears = [(k, np.flatnonzero(number == k), row[number == k]) for k, _ in found if k in self._broken]
 
     def frame(self, x: np.ndarray, x32: np.ndarray, turned: Iterable[int], torn: bool) -> None:
@@ -110,7 +114,7 @@ class Drawing:
         # All in one row: then LZ4 finds the points of lines and sheets among those of the particles.
         row = [self._points.from_fields(positions=x32)]
         self.bytes += x32.nbytes
-        if len(self._pairs):
+        if len(self._pairs) or self._surface:
             row += self._link(x, x32)
         self._log(f"{self._root}/{PARTICLES}", *row)
         for k in turned:
@@ -129,8 +133,8 @@ class Drawing:
         for k, mine, rows in self._tears:
             level[mine[self._broken[k][rows]]] = -1
         row = []
-        if self._sheet:
-            shades = self._sheet.colors(level)
+        if self._surface:
+            shades = self._surface.colors(x, level[self._under])
             row.append(self._rr.Mesh3D.from_fields(vertex_positions=x32, vertex_colors=shades))
             self.bytes += shades.nbytes + x32.nbytes
         if self._lines:
@@ -146,10 +150,26 @@ class Drawing:
         """A wall or a path, where it is now."""
         wall = self.world.features[k]
         if isinstance(wall, (Collider, Path)):
+            if self._solid(k, wall):
+                return
             strips, thickness = wall.outline(*self._extent)
             radius = thickness if thickness else -1.5  # half the width in the scene, or pixels
             self._log(f"{self._root}/walls/{k}", self._strips(strips, colors=[[120, 125, 140]], radii=[radius]))
             self.bytes += strips.nbytes
+
+    def _solid(self, k: int, wall: Any) -> bool:
+        """Draw a wall of a 3D scene as a surface in light from above; whether it has one."""
+        if self._flat or not isinstance(wall, Collider):
+            return False
+        vertices, faces = wall.solid(*self._extent)
+        if len(faces):
+            corners = vertices.astype(np.float32)
+            hues = np.repeat(WALL, len(vertices), axis=0)
+            shades = Surface(faces, hues, np.zeros((0, 2), dtype=np.int64), upwards(self.world)).colors(vertices, np.zeros(0))
+            mesh = self._rr.Mesh3D(vertex_positions=corners, triangle_indices=faces.astype(np.uint32), vertex_colors=shades)
+            self._log(f"{self._root}/walls/{k}", mesh)
+            self.bytes += corners.nbytes + shades.nbytes + 4 * faces.size
+        return bool(len(faces))
 
     def _contact(self) -> None:
         """Where particles touch: between the two."""
@@ -188,21 +208,58 @@ class Drawing:
         self.bytes += len(text)
 
 
+def upwards(world: "World") -> np.ndarray:
+    """Against gravity, (dim,); along y without."""
+    dim = world.particles.dim
+    up = np.zeros(dim)
+    for f in world.features:
+        if isinstance(f, Gravity):
+            g = np.asarray(f.g, dtype=np.float64)
+            up -= g if g.ndim else -g * np.eye(dim)[1]
+    size = float(np.linalg.norm(up))
+    return up / size if size else np.eye(dim)[1]
+
+
+def colors(world: "World") -> np.ndarray:
+    """Hues, (n, 3): one for each body and for each loose particle; grey for what cannot move."""
+    body = bodies(world)
+    hues = golden_colors(len(body))[body]
+    hues[world.particles.inv_mass == 0] = (140, 140, 150)
+    return hues
+
+
 def links(world: "World") -> list[tuple[int, Batch]]:
     """The features that are drawn as lines between two particles, with their numbers."""
     return [(k, f) for k, f in enumerate(world.features) if isinstance(f, Batch) and f.arity == 2 and f.count]
 
 
 def bounds(world: "World") -> tuple[np.ndarray, np.ndarray]:
-    """A box around what will be seen: the walls where there is a finite Box, the particles where not."""
+    """A box around what will be seen: the particles and where they can get to, as far as that is known beforehand: finite walls,
+    the ground below, and around a place where a body hangs.
+    """
     x, r = world.position, world.particles.radius[:, None]
     low = (x - r).min(axis=0, initial=np.inf) if len(x) else np.zeros(world.particles.dim)
     high = (x + r).max(axis=0, initial=-np.inf) if len(x) else np.ones(world.particles.dim)
     for f in world.features:
-        if isinstance(f, (Mesh, Polygon)) and f.inside:  # a container
-            corners = f.placed(f.facets.corners).reshape(-1, world.particles.dim)
-            low, high = np.minimum(low, corners.min(axis=0)), np.maximum(high, corners.max(axis=0))
+        if isinstance(f, (Ball, Capsule, Mesh, Path, Polygon)):
+            strips, thickness = f.outline(low, high)
+            if strips.size:
+                low = np.minimum(low, strips.min(axis=(0, 1)) - thickness)
+                high = np.maximum(high, strips.max(axis=(0, 1)) + thickness)
+        if isinstance(f, HalfSpace) and len(x):
+            foot = x - np.maximum(0, x @ f.normal - f.offset)[:, None] * f.normal
+            low, high = np.minimum(low, foot.min(axis=0)), np.maximum(high, foot.max(axis=0))
         if isinstance(f, Box):
             low = np.where(np.isfinite(f.lower), np.minimum(low, f.lower), low)
             high = np.where(np.isfinite(f.upper), np.maximum(high, f.upper), high)
+    body, fixed = bodies(world), world.particles.inv_mass == 0
+    for k in np.unique(body[fixed]):
+        held, all_of_it = x[fixed & (body == k)], x[body == k]
+        reach = float(np.linalg.norm(all_of_it - held.mean(axis=0), axis=1).max())
+        if np.ptp(held, axis=0).max() < 0.1 * reach:  # it swings
+            swing = held.mean(axis=0) - reach, held.mean(axis=0) + reach
+            for f in world.features:
+                if isinstance(f, Box):
+                    swing = tuple(np.clip(corner, f.lower, f.upper) for corner in swing)
+            low, high = np.minimum(low, swing[0]), np.maximum(high, swing[1])
     return low, high

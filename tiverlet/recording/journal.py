@@ -32,7 +32,7 @@ from . import rrd, scene
 if TYPE_CHECKING:
     from ..world import World
 
-FORMAT = 3
+FORMAT = 4
 GUARD = {"stuck", "substeps-capped"}  # flags that do not follow from the steps: the StepController knows what it tried in vain
 JOURNAL = "tiverlet/journal"
 SCENE = "world/scene"
@@ -157,7 +157,7 @@ class Journal:
     def state(self, kind: str = "state") -> int:
         """Write the exact state; returns the size of the entry [bytes]."""
         kept, world = checkpoint.keep(self.world), self.world
-        more = {"flags": checkpoint.flags(world), "reach": world._runner.scene.hh}
+        more = {"flags": checkpoint.flags(world), "reach": world._runner.scene.h2_effective}
         return self.put(kind, {"clock": kept.clock, **more}, kept.values)
 
     def before(self) -> None:

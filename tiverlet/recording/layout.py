@@ -6,8 +6,6 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from .curves import CURVES
-
 SCENE_VIEW = uuid.uuid5(uuid.NAMESPACE_DNS, "scene.tiverlet")  # the view of the scene, to be found in any recording
 SCENE = "world/scene"  # the view looks at "world", so that a mirror at "world/scene" shows
 LEGEND = "legend/strain"
@@ -18,8 +16,18 @@ WIDE = 5.0  # steps of the legend are so far apart, with a height of 1
 MIRROR = rr.Transform3D(scale=[1.0, -1.0, 1.0])
 
 
-def blueprint(low: np.ndarray, high: np.ndarray, links: bool) -> rrb.Blueprint:
-    """The scene on the left, curves and text on the right, for a scene within the corners low and high [m]."""
+def upright(up: np.ndarray) -> rr.components.ViewCoordinates:
+    """Which axis of a 3D scene points up, and in which sense."""
+    axis = "XYZ"[int(np.argmax(np.abs(up)))]
+    return getattr(rr.ViewCoordinates, f"RIGHT_HAND_{axis}_{'UP' if up.max() > -up.min() else 'DOWN'}")
+
+
+def blueprint(
+    low: np.ndarray, high: np.ndarray, links: bool, figures: dict[str, tuple[str, list[bool]]], up: np.ndarray
+) -> rrb.Blueprint:
+    """The scene on the left, curves and text on the right, for a scene within the corners low and high [m]. figures: see shown()
+    in curves.py. up: against gravity.
+    """
     size = np.maximum(high - low, 1e-9)
     if len(low) == 2:
         edge = 0.05 * size.max()
@@ -27,33 +35,35 @@ def blueprint(low: np.ndarray, high: np.ndarray, links: bool) -> rrb.Blueprint:
             x_range=[float(low[0] - edge), float(high[0] + edge)],
             y_range=[float(-high[1] - edge), float(-low[1] + edge)],
         )
-        view = rrb.Spatial2DView(origin="world", name="Scene", visual_bounds=bounds, background=[18, 20, 26])
+        view = rrb.Spatial2DView(origin="world", name="Scene", visual_bounds=bounds)
     else:
         middle, far = (low + high) / 2, 1.05 * float(np.linalg.norm(size))
-        eye = rrb.EyeControls3D(position=middle + far * np.array([0.45, 0.35, 0.82]), look_target=middle, eye_up=(0.0, 1.0, 0.0))
-        view = rrb.Spatial3DView(origin="world", name="Scene", eye_controls=eye, background=[18, 20, 26])
+        k = int(np.argmax(np.abs(up)))  # to the right, up and back, in a turn that keeps the senses of the axes
+        right, back = np.roll(np.eye(3)[0], k - 1), np.roll(np.eye(3)[2], k - 1)
+        eye = rrb.EyeControls3D(position=middle + far * (0.45 * right + 0.35 * up + 0.82 * back), look_target=middle, eye_up=up)
+        view = rrb.Spatial3DView(origin="world", name="Scene", eye_controls=eye, line_grid=rrb.LineGrid3D(visible=False))
     curves = [
         rrb.TimeSeriesView(
             origin="figures",
             contents=[f"figures/{end}"],
             name=title,
-            plot_legend=rrb.PlotLegend(corner="RightTop", visible=len(names) > 1),
+            plot_legend=rrb.PlotLegend(corner="RightTop", visible=sum(those) > 1),
         )
-        for title, (end, names) in CURVES.items()
+        for title, (end, those) in figures.items()
     ]
     pages = [rrb.TextDocumentView(origin="about", name="About"), rrb.TextLogView(origin="events", name="Events")]
     scale = rrb.Spatial2DView(
-        origin="legend", name="Strain of links", background=[18, 20, 26],
+        origin="legend", name="Strain of links",
         visual_bounds=rrb.VisualBounds2D(x_range=[-0.6 * WIDE, 6.6 * WIDE], y_range=[-1.3, 1.5]),
     )  # fmt: skip
-    side = rrb.Vertical(*curves[:-2], rrb.Horizontal(*curves[-2:]), rrb.Tabs(*pages), row_shares=[1, 1, 1, 1, 1.6])
-    left = rrb.Vertical(view, scale, row_shares=[10, 1.2]) if links else view
-    whole = rrb.Horizontal(left, side, column_shares=[7, 3])
+    side = rrb.Vertical(*curves, rrb.Tabs(*pages), row_shares=[*(1 for _ in curves), 1.6])
+    left = rrb.Vertical(view, scale, row_shares=[12, 1]) if links else view
+    whole = rrb.Horizontal(left, side, column_shares=[4, 1])
     _name(whole, "layout")
     view.id = SCENE_VIEW
     return rrb.Blueprint(
         whole,
-        rrb.TimePanel(state="collapsed", timeline="frame"),
+        rrb.TimePanel(state="collapsed", timeline="time"),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
         auto_views=False,

@@ -21,15 +21,14 @@ class Picture:
     """
 
     def __init__(self, world: "World", stream: Any, explained: str, environment: dict[str, Any]):
-        import rerun as rr
 
         from .curves import Curves
-        from .drawing import Drawing, bounds
-        from .layout import MIRROR, SCENE
+        from .drawing import Drawing, bounds, upwards
+        from .layout import MIRROR, SCENE, upright
 
         self.world, self._stream, self._explained, self._environment = world, stream, explained, environment
         self.drawing = Drawing(world, stream, bounds(world))
-        self.drawing.static(SCENE, MIRROR if world.particles.dim == 2 else rr.ViewCoordinates.RIGHT_HAND_Y_UP)
+        self.drawing.static(SCENE, MIRROR if world.particles.dim == 2 else upright(upwards(world)))
         self.curves = Curves(world, stream)
         self._about(None, 0, "")
         self._seen: set[str] = set()  # flags
@@ -73,10 +72,11 @@ class Picture:
 
 def layout(world: "World") -> Any:
     """How it opens in the viewer."""
-    from .drawing import bounds, links
+    from .curves import shown
+    from .drawing import bounds, links, upwards
     from .layout import blueprint
 
-    return blueprint(*bounds(world), bool(links(world)))
+    return blueprint(*bounds(world), bool(links(world)), shown(world), upwards(world))
 
 
 def about(

@@ -41,9 +41,10 @@ class Recorder:
     at the end says so; all steps stay in the file. overwrite: whether a file that is there may be replaced; it stays as it is
     until the new one has its first frame.
 
-    Drawn are positions (f32), links coloured by their strain, walls, contacts of up to 1500 particles, what breaks, and curves.
-    Beside that the file holds the scene with all arguments, exact states to continue from, the hash of every frame drawn, every
-    step, and what the user turned or assigned in between, also between frames that are not drawn: see tv.replay.
+    Drawn are positions (f32), in the colours of bodies; surfaces where bodies have them; links, coloured by their strain;
+    walls, contacts of up to 1500 particles, what breaks, and curves. Beside that the file holds the scene with all arguments,
+    exact states to continue from, the hash of every frame drawn, every step, and what the user turned or assigned in between,
+    also between frames that are not drawn: see tv.replay.
 
     The file is complete when the block ends. Of a process that is killed, the first frame and all but about the last fifth of a
     second is there (of curves, the last second), and can be replayed; what flush() has brought to the file is there in any case.

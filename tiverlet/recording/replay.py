@@ -226,7 +226,7 @@ class Replay:
         world = scene.rebuild(source.data, source.arrays, self._given, before)
         _settle(world, [e.data["now"] for e in self._entries[: start + 1] if "now" in e.data][-1])
         checkpoint.install(world, _kept(state, world), state.data["flags"])
-        world._runner.scene.hh = state.data["reach"]
+        world._runner.scene.h2_effective = state.data["reach"]
         return world
 
     def _run(self, start: int, end: int) -> Iterator[tuple["World", Entry]]:
@@ -256,7 +256,7 @@ class Replay:
                 scene.turn(world.features[k], values)
         elif entry.kind == "taken":
             checkpoint.install(world, _kept(entry, world), entry.data["flags"])
-            world._runner.scene.hh = entry.data["reach"]
+            world._runner.scene.h2_effective = entry.data["reach"]
         elif entry.kind == "assigned":
             if entry.data["name"] not in ("position", "velocity"):
                 raise ValueError(f"replay: {self.path} says that {plain(entry.data['name'])!r} was assigned.")
@@ -271,7 +271,8 @@ class Replay:
         ]
 
     def export(self, path: str) -> None:
-        """Write positions, times, masses, radii and curves to an .npz file, or positions to a .csv table."""
+        """Write positions, times, masses, radii and curves to an .npz file, positions to a .csv table, or to extended .xyz, which
+        OVITO and ASE read, with the radii where the particles are the same in all frames."""
         x = [self.position(int(k)) for k in self.frames]
         kind, p = os.path.splitext(path)[1], self._entries[0].arrays
         if kind == ".npz":
@@ -290,8 +291,19 @@ class Replay:
                 for frame, time, rows in zip(self.frames.tolist(), self.times.tolist(), x, strict=True):
                     for i, row in enumerate(rows.tolist()):
                         out.write(f"{frame},{time!r},{i},{','.join(f'{v:.9g}' for v in row)}\n")
+        elif kind == ".xyz":
+            same = sum(e.kind == "scene" for e in self._entries) == 1
+            columns = "species:S:1:pos:R:3" + (":radius:R:1" if same else "")
+            with open(path, "w") as out:
+                for frame, time, rows in zip(self.frames.tolist(), self.times.tolist(), x, strict=True):
+                    out.write(f'{len(rows)}\nProperties={columns} Time={time!r} Frame={frame} pbc="F F F"\n')
+                    flat = np.zeros((len(rows), 3 + same))  # a plane is at z = 0
+                    flat[:, : rows.shape[1]] = rows
+                    if same:
+                        flat[:, 3] = p["radius"]
+                    out.writelines(f"X {' '.join(f'{v:.9g}' for v in row)}\n" for row in flat.tolist())
         else:
-            raise ValueError(f"replay: {path} ends in {kind!r}, but .npz or .csv can be written.")
+            raise ValueError(f"replay: {path} ends in {kind!r}, but .npz, .csv or .xyz can be written.")
 
 
 def replay(path, given: Iterable[Any] | Mapping[str, Any] = ()) -> Replay:

@@ -12,6 +12,7 @@ import numpy as np
 
 from .. import colliders, constraints, contact, forces, solvers
 from ..device import runtime
+from ..device.language import is_kernel_function, undecorated
 from ..features.arguments import RecordsArguments, knobs_of
 from ..features.feature import Feature
 from ..particles import Particles
@@ -57,7 +58,7 @@ class Needs:
 
 def source(thing: Any) -> str:
     """The text of a function or class, a ti.func among them; "" where there is none."""
-    plain = thing.func.func if getattr(thing, "_is_taichi_function", False) else thing
+    plain = undecorated(thing)
     try:
         return textwrap.dedent(inspect.getsource(plain))
     except (OSError, TypeError):
@@ -195,7 +196,7 @@ def rebuild(scene: dict[str, Any], arrays: Mapping[str, np.ndarray], given: Mapp
                 if not (own or argument in TAKES.get(name, ())):
                     raise ValueError(f"replay: {kind.__name__} takes no function for {argument!r}.")
                 arguments[argument] = given[value["given"]]
-                if not (getattr(arguments[argument], "_is_taichi_function", False) or inspect.isfunction(arguments[argument])):
+                if not (is_kernel_function(arguments[argument]) or inspect.isfunction(arguments[argument])):
                     raise TypeError(
                         f"replay: given {value['given']} is {arguments[argument]!r}, but the scene has a function there."
                     )

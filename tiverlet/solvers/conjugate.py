@@ -1,10 +1,13 @@
 """Preconditioned conjugate gradients on the constraints of a scene: cloth and nets that converge."""
 
+from typing import Any
+
 import numpy as np
 
 from .. import checks
 from ..constraints.core.scalar import TENSEST, Scalar
 from ..device import ti
+from ..device.number import OnDevice
 from ..features.feature import Batch, Scene
 from .slots import Slots
 from .solver import Solver
@@ -47,7 +50,8 @@ class ConjugateGradient(Solver):
     def system(self, scene: Scene, batches: list[Batch], slots: Slots) -> "CGSystem | None":
         """The system of a scene on the device; None where there is none."""
         scalars = [b for b in batches if isinstance(b, Scalar) and b.solvable_together and b.side == 0]
-        return CGSystem(scene, batches, slots, scalars, self.steps) if scalars else None
+        joined = any((~b.relaxed_alone(scene) & ~b.idle(scene.inv_mass)).any() for b in scalars)
+        return CGSystem(scene, batches, slots, scalars, self.steps) if joined else None
 
     def remedy(self, batches: list[Batch], slots: Slots, inv_mass: np.ndarray) -> str:
         """More steps."""
@@ -66,15 +70,20 @@ class ConjugateGradient(Solver):
 class CGSystem(System):
     """The system of one world on the device. Row r is a constraint in its batch's order."""
 
+    n: Any = OnDevice()
+    least: Any = OnDevice()
+
     def __init__(self, scene: Scene, batches: list[Batch], slots: Slots, scalars: list[Scalar], steps: int):
         places = [slots.places(b) for b in scalars]
-        rows = np.flatnonzero(np.concatenate([(p >= 0).any(axis=1) for p in places]))
+        rows = np.flatnonzero(
+            np.concatenate([(p >= 0).any(axis=1) & ~b.relaxed_alone(scene) for b, p in zip(scalars, places, strict=True)])
+        )
         super().__init__(scene, batches, slots, scalars, rows)
-        self.steps, self.n, self.begin, self.w = steps, scene.particles.count, slots.begin, scene.state.w
+        self.steps, self.n, self.begin, self.w = steps, scene.count, slots.begin, scene.state.w
         self.stride = 1  # launches for each block; Taichi gives each CPU thread at least 512 of them, see Step
         row = np.concatenate([np.repeat(self.row(b), b.arity) for b in scalars])
         slot, who = (np.concatenate([a.ravel() for a in arrays]) for arrays in (places, [b.indices for b in scalars]))
-        free = slot >= 0
+        free = (slot >= 0) & (row >= 0)
         order = np.argsort(row[free], kind="stable")
         ends = np.concatenate([[0], np.cumsum(np.bincount(row[free], minlength=self.rows))])
         self.corner_begin = self.ints("corner_begin", ends)
@@ -84,11 +93,12 @@ class CGSystem(System):
         self.gradient = scene.memory.field("system.gradient", slots.total, width=self.dim)
         self.pulled = scene.memory.field("system.pulled", self.n, width=self.dim)
         self.partial, self.worst = self.reals("partial_sums", BLOCKS), self.reals("worst", BLOCKS)
-        if self.guarded:
+        if self.limits_steps:
             self.gain, self.over = self.reals("gain", BLOCKS), self.reals("over", BLOCKS)
         # r . z, the coming weight, what is taken back; r . z at the start, and the worst tension since
         self.sums = scene.memory.field("system.sums", None, width=5, kind=ti.f64)
-        self.least = 1.2 * largest(scene, scalars, self.blocks * scene.inv_mass, POWER) / steps**2
+        least = 1.2 * largest(scene, scalars, self.blocks * scene.inv_mass, POWER) / steps**2
+        self.least = self.memory.number(least, scene.real)
         self.floor = scene.memory.field("system.floor", None, kind=ti.f64, state=True)
 
     def vector(self, name: str):
@@ -158,7 +168,7 @@ class CGSystem(System):
     def iterate(self, thread):
         """One step of conjugate gradients. One that needs a tension too large for the substep is taken back, and is the last."""
         for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
-            if self.w.of(i) > 0:
+            if self.w.positive(i):
                 total = 0 * self.pulled[i]
                 for s in range(self.begin[i], self.begin[i + 1]):
                     r = self.row_of[s]
@@ -195,15 +205,15 @@ class CGSystem(System):
                     self.residual[r] = left
                     total += ti.cast(self.inverse_diagonal[r] * left, ti.f64) * left
                     worst = ti.max(worst, self.geometric_stiffness[r] * ti.abs(self.lam[r] + self.step[r]))
-                    if ti.static(self.guarded):
+                    if ti.static(self.limits_steps):
                         if self.scale[r] != 0:
                             change = self.violation[r] + self.scale[r] * (left + self.shift[r] * self.step[r])
-                            gain += self.step[r] * (self.toward[r] - change / 2) - self.spare[r]
+                            gain += self.step[r] * (self.motion[r] - change / 2) - self.spare_energy[r]
                             gain -= SLACK * ti.abs(self.step[r] * self.violation[r])
-                            if ti.abs(self.step[r]) > self.most[r]:
+                            if ti.abs(self.step[r]) > self.trusted_step[r]:
                                 over = 1.0
                 self.partial[b], self.worst[b] = total, worst
-                if ti.static(self.guarded):
+                if ti.static(self.limits_steps):
                     self.gain[b], self.over[b] = gain, over
         self.team.wait()
         ti.loop_config(serialize=True)
@@ -212,7 +222,7 @@ class CGSystem(System):
             for b in range(1, BLOCKS):
                 worst = ti.max(worst, self.worst[b])
             ti.atomic_max(self.tension[None], worst)
-            if ti.static(self.guarded):
+            if ti.static(self.limits_steps):
                 gain, over = self.gain[0], self.over[0]
                 for b in range(1, BLOCKS):
                     gain += self.gain[b]

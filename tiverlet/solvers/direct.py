@@ -1,10 +1,13 @@
 """Chains, trees and loops by elimination: exact for any length, any mass ratio and any compliance."""
 
+from typing import Any
+
 import numpy as np
 
 from .. import checks
 from ..constraints.core.scalar import TENSEST, Scalar
 from ..device import ti
+from ..device.number import OnDevice
 from ..features.feature import Batch, Scene
 from .elimination import Plan, plan
 from .slots import Slots
@@ -12,16 +15,16 @@ from .solver import WIDTH, Solver
 from .system import SLACK, System
 
 REDUNDANT = 1e-12  # of its diagonal: a pivot this small belongs to a constraint that others imply
-ODD = 1e-6  # of its violation: what others leave of such a constraint without contradicting it
-SMALL = 2e-3  # of what the heaviest of its particles adds to it: with a pivot below, a load is hardly borne to first order
-AGREE = 0.25  # of the tension: how far the two ends of a substep may differ about it there
-CALM = 2.0  # (omega h)^2 that is allowed there: half the limit of stability
+CONTRADICTION = 1e-6  # of its violation: what others leave of such a constraint without contradicting it
+SMALL_PIVOT = 2e-3  # of what the heaviest of its particles adds to it: with a pivot below, a load is hardly borne to first order
+AGREEMENT = 0.25  # of the tension: how far the two ends of a substep may differ about it there
+STABLE = 2.0  # (omega h)^2 that is allowed there: half the limit of stability
 ROUNDS = 8  # of finding out which ropes pull, and how soft a system has to be
 
 # (omega h)^2 to which a tension gives way with directions at the end of the substep. There the move is a step down the gradient
 # of a convex energy, sum lam |r|; as long as this is at most 1, it brings in no more than lam times what the links shorten.
-BACKWARD = 1.0
-FLOOR = 2e-12  # of its diagonal: how much it gives way in any case, so that no pivot vanishes
+SOFTENED_TO = 1.0
+LEAST_SOFTNESS = 2e-12  # of its diagonal: how much it gives way in any case, so that no pivot vanishes
 
 # What a system is solved for: with directions at the start of the substep, in f32 first with violations to f32; with those at its
 # end, to compare; then as before if they agree, else at the end as softly as it has to be.
@@ -67,7 +70,7 @@ class Direct(Solver):
         item = np.concatenate([b.indices.ravel() for b in scalars])
         arity = np.repeat([b.arity for b in scalars], [b.count for b in scalars])
         owner = np.repeat(np.arange(len(arity)), arity)
-        free = (slot >= 0) & ~np.concatenate([b.acts_as_force(scene) for b in scalars])[owner]
+        free = (slot >= 0) & ~np.concatenate([b.relaxed_alone(scene) for b in scalars])[owner]
         found = plan(len(arity), owner[free], item[free], self.width)
         return Elimination(scene, batches, slots, scalars, found, slot[free], item[free]) if found.parts else None
 
@@ -88,12 +91,16 @@ class Direct(Solver):
 class Elimination(System):
     """The systems of one world on the device. Row r is a constraint, at its place in the elimination."""
 
+    host_only = ("plan",)
+    parts: Any = OnDevice()
+    entries: Any = OnDevice()
+
     def __init__(
         self, scene: Scene, batches: list[Batch], slots: Slots, scalars: list[Scalar], found: Plan, slot: np.ndarray,
         item: np.ndarray,
     ):  # fmt: skip
         super().__init__(scene, batches, slots, scalars, found.rows)
-        self.plan, self.parts, self.entries = found, found.parts, len(found.column)
+        self.plan, self.parts, self.entries = found, self.memory.number(found.parts), self.memory.number(len(found.column))
         product = found.product.copy()
         product[:, 1:] = slot[product[:, 1:]]
         side = np.repeat([b.side for b in scalars], [b.count for b in scalars])[found.rows]
@@ -103,29 +110,29 @@ class Elimination(System):
         self.entry_begin, self.product_begin = ints("entry_begin", found.entry_begin), ints("product_begin", found.product_begin)
         self.update_begin, self.product = ints("update_begin", found.update_begin), ints("product", product, 3)
         self.gradient = scene.memory.field("system.gradient", slots.total, width=self.dim)
-        self.value, self.weight = reals("value", self.rows + 2 * self.entries), reals("weight")
+        self.value, self.diagonal = reals("value", self.rows + 2 * self.entries), reals("weight")
         who = np.zeros(slots.total, dtype=np.int64)
         who[slot] = item
-        self.who, self.w, self.close = ints("who", who), scene.state.w, reals("close")
-        self.digit = float(np.finfo(np.float32 if scene.real == ti.f32 else np.float64).eps)
+        self.particle_of, self.w, self.inverse_size = ints("who", who), scene.state.w, reals("close")
+        self.epsilon = float(np.finfo(np.float32 if scene.real == ti.f32 else np.float64).eps)
         parts = [scene.inv_mass[b.indices] * (b.gradients(b.start.position) ** 2).sum(axis=2) for b in scalars]
         least = np.concatenate([np.where(p > 0, p, np.inf).min(axis=1, initial=np.inf) for p in parts])[found.rows]
-        small = np.where(np.isfinite(least), SMALL * least, 0.0)
-        self.small = scene.memory.field("system.small", self.rows, kind=ti.f64, values=small)
+        small = np.where(np.isfinite(least), SMALL_PIVOT * least, 0.0)
+        self.small_pivot = scene.memory.field("system.small", self.rows, kind=ti.f64, values=small)
         self.precise = [(k, b) for k, b in enumerate(scalars) if b.precise and scene.real == ti.f32]
         if self.precise:
             batch = np.repeat(np.arange(len(scalars)), [b.count for b in scalars])[found.rows]
             number = np.concatenate([np.arange(b.count) for b in scalars])[found.rows]
             self.batch, self.number = ints("batch", batch), ints("number", number)
         if self.one_sided:
-            self.side, self.active, self.left = ints("side", side), ints("active", 0 * side), reals("left")
+            self.side, self.active, self.remaining = ints("side", side), ints("active", 0 * side), reals("left")
 
     @ti.func
     def set_row(self, r, violation, A, alpha, lam, W, geometric_stiffness):
         """What constraint r is about in this pass, but for what its corners tell. geometric_stiffness: see Scalar."""
         System.set_row(self, r, violation, A, alpha, lam, W, geometric_stiffness)
         if W > 0:
-            self.close[r] = geometric_stiffness / (2 * W)
+            self.inverse_size[r] = geometric_stiffness / (2 * W)
         if ti.static(self.one_sided):
             acts = self.side[r] == 0 or self.side[r] * violation > 0 or lam != 0
             self.active[r] = ti.cast(acts and W > 0, ti.i32)
@@ -147,53 +154,54 @@ class Elimination(System):
         return out
 
     @ti.func
-    def assemble(self, begin, end, soft, backward):
-        """The matrix, with `soft` added to its diagonal, and the right side of the rows that act; others get the multiplier 0."""
+    def assemble(self, begin, end, softness, at_end):
+        """The matrix, `softness` added to its diagonal, and the right side of the rows that act; others get the multiplier 0."""
+        rows, entries = self.rows, self.entries
         for r in range(begin, end):
             self.value[r] = 0
             for e in range(self.entry_begin[r], self.entry_begin[r + 1]):
-                self.value[self.rows + e] = 0
-                self.value[self.rows + self.entries + e] = 0
+                self.value[rows + e] = 0
+                self.value[rows + entries + e] = 0
         for r in range(begin, end):
             if self.acts(r):
                 for q in range(self.product_begin[r], self.product_begin[r + 1]):
                     at = self.product[q]
-                    self.value[at[0]] = self.value[at[0]] + self.scale[r] * self.coupling(at, backward)
-                self.value[r] = self.value[r] + (self.alpha[r] + soft)
+                    self.value[at[0]] = self.value[at[0]] + self.scale[r] * self.coupling(at, at_end)
+                self.value[r] = self.value[r] + (self.alpha[r] + softness)
                 self.step[r] = -self.violation[r]
             else:
                 self.value[r] = 1
                 self.step[r] = -self.lam[r]
-            self.weight[r] = self.value[r]
+            self.diagonal[r] = self.value[r]
 
     @ti.func
-    def coupling(self, at, backward):
-        """grad C_j . w . grad C_k of one particle. backward: with the gradient at the end of the substep for both."""
+    def coupling(self, at, at_end):
+        """grad C_j . w . grad C_k of one particle. at_end: with the gradient at the end of the substep for both."""
         move = self.move[at[2]]
-        if backward != 0:
-            move = self.move_back(at[2])
+        if at_end != 0:
+            move = self.move_at_end(at[2])
         out = ti.cast(0, ti.f64)
         for k in ti.static(range(self.dim)):
             out += ti.cast(self.gradient[at[1]][k], ti.f64) * ti.cast(move[k], ti.f64)
         return out
 
     @ti.func
-    def move_back(self, s):
+    def move_at_end(self, s):
         """What a multiplier of 1 moves the corner of slot s along the gradient at the end of the substep."""
-        i = self.who[s]
+        i = self.particle_of[s]
         move = self.gradient[s] * self.w.of(i)
         if ti.static(self.shares):
             move /= self.share[i]
         return move
 
     @ti.func
-    def turn_back(self, begin, end):
+    def use_end_directions(self, begin, end):
         """Rows move corners along their gradients at the end of the substep."""
         for r in range(begin, end):
             for q in range(self.product_begin[r], self.product_begin[r + 1]):
                 s = self.product[q][1]
                 if s == self.product[q][2]:
-                    self.move[s] = self.move_back(s)
+                    self.move[s] = self.move_at_end(s)
 
     @ti.func
     def eliminate(self, begin, end):
@@ -201,48 +209,48 @@ class Elimination(System):
 
         A constraint that others imply is left to them; it contradicts them where it is off by more than its digits.
         """
-        hard = 0
+        hard, rows, entries = 0, self.rows, self.entries
         for r in range(begin, end):
             first, last, pivot, step = self.entry_begin[r], self.entry_begin[r + 1], self.value[r], self.step[r]
-            if ti.abs(pivot) <= REDUNDANT * self.weight[r]:
-                if (ti.abs(step) - ODD * ti.abs(self.violation[r])) * self.close[r] > 8 * self.digit:
+            if ti.abs(pivot) <= REDUNDANT * self.diagonal[r]:
+                if (ti.abs(step) - CONTRADICTION * ti.abs(self.violation[r])) * self.inverse_size[r] > 8 * self.epsilon:
                     hard = 2
                 self.value[r] = 1
                 self.step[r] = 0
                 for e in range(first, last):
-                    self.value[self.rows + e] = 0
+                    self.value[rows + e] = 0
             else:
-                if pivot <= self.small[r]:
+                if pivot <= self.small_pivot[r]:
                     hard = ti.max(hard, 1)
                 u = self.update_begin[r]
                 for e in range(first, last):
-                    part, later = self.value[self.rows + self.entries + e] / pivot, self.column[e]
+                    part, later = self.value[rows + entries + e] / pivot, self.column[e]
                     self.step[later] = self.step[later] - part * step
                     for k in range(first, last):
                         at = self.update[u]
-                        self.value[at] = self.value[at] - part * self.value[self.rows + k]
+                        self.value[at] = self.value[at] - part * self.value[rows + k]
                         u += 1
         for k in range(end - begin):
             r = end - 1 - k
             rest = self.step[r]
             for e in range(self.entry_begin[r], self.entry_begin[r + 1]):
-                rest -= self.value[self.rows + e] * self.step[self.column[e]]
+                rest -= self.value[rows + e] * self.step[self.column[e]]
             self.step[r] = rest / self.value[r]
         return hard
 
     @ti.func
-    def switch(self, begin, end, backward):
+    def update_active_set(self, begin, end, at_end):
         """Rows off that would push where they can only pull, rows on that are violated; returns whether any changed."""
         for r in range(begin, end):
-            self.left[r] = 0
+            self.remaining[r] = 0
         changed = 0
         for r in range(begin, end):
             for q in range(self.product_begin[r], self.product_begin[r + 1]):
                 at = self.product[q]
-                self.left[r] = self.left[r] + self.scale[r] * self.coupling(at, backward) * self.step[self.row_of[at[2]]]
+                self.remaining[r] = self.remaining[r] + self.scale[r] * self.coupling(at, at_end) * self.step[self.row_of[at[2]]]
             if self.side[r] != 0 and self.scale[r] != 0:
                 new = self.lam[r] + self.step[r]
-                left = self.violation[r] + self.left[r] + self.alpha[r] * self.step[r]
+                left = self.violation[r] + self.remaining[r] + self.alpha[r] * self.step[r]
                 acts = ti.select(self.active[r] != 0, self.side[r] * new < 0, self.side[r] * left > 0)
                 if acts != (self.active[r] != 0):
                     self.active[r] = 1 - self.active[r]
@@ -250,70 +258,84 @@ class Elimination(System):
         return changed
 
     @ti.func
-    def find(self, begin, end, soft, backward):
+    def solve_active_set(self, begin, end, softness, at_end):
         """The step of every multiplier, of those that act. Returns what eliminate() does."""
         hard = 0
         if ti.static(self.one_sided):
             k = 0
             while k < ROUNDS:
-                self.assemble(begin, end, soft, backward)
+                self.assemble(begin, end, softness, at_end)
                 found = self.eliminate(begin, end)
                 hard = ti.max(found, ti.select(hard == 2, 2, 0))  # one that contradicts gets no multiplier, and is switched off
-                k = ti.select(self.switch(begin, end, backward) != 0, k + 1, ROUNDS)
+                k = ti.select(self.update_active_set(begin, end, at_end) != 0, k + 1, ROUNDS)
             for r in range(begin, end):
                 if self.side[r] * (self.lam[r] + self.step[r]) > 0:
                     self.step[r] = -self.lam[r]
         else:
-            self.assemble(begin, end, soft, backward)
+            self.assemble(begin, end, softness, at_end)
             hard = self.eliminate(begin, end)
         return hard
 
     @ti.func
-    def hold(self, begin, end):
+    def limit_steps(self, begin, end):
         """Whether steps leave where gradients are trusted and bring in energy, sum step (u + A step / 2), A step = -violation.
 
         Then the rows of which f is curved take the step that they would by themselves, and the others have to follow.
         """
-        gain, spare, far, found = ti.cast(0, ti.f64), ti.cast(0, ti.f64), False, 0
+        gain, spare, too_far, found = ti.cast(0, ti.f64), ti.cast(0, ti.f64), False, 0
         for r in range(begin, end):
-            gain += self.step[r] * (self.toward[r] - self.violation[r] / 2)
-            spare += self.spare[r] + SLACK * ti.abs(self.step[r] * self.violation[r])
-            far = far or (self.scale[r] != 0 and ti.abs(self.step[r]) > self.most[r])
-        if far and gain > spare:
+            gain += self.step[r] * (self.motion[r] - self.violation[r] / 2)
+            spare += self.spare_energy[r] + SLACK * ti.abs(self.step[r] * self.violation[r])
+            too_far = too_far or (self.scale[r] != 0 and ti.abs(self.step[r]) > self.trusted_step[r])
+        if too_far and gain > spare:
             for r in range(begin, end):
-                if self.most[r] < ti.math.inf and self.scale[r] != 0:
-                    self.scale[r], self.lam[r], self.geometric_stiffness[r], found = 0, self.instead[r], 0, 1
+                if self.trusted_step[r] < ti.math.inf and self.scale[r] != 0:
+                    self.scale[r], self.lam[r], self.geometric_stiffness[r], found = 0, self.own_step[r], 0, 1
                     if ti.static(self.one_sided):
                         self.active[r] = 0
         return found
 
     @ti.func
-    def longer(self, r):
+    def stretch(self, r):
         """The length of constraint r, relative to that at rest: a longer one vibrates less."""
         out = ti.cast(1, ti.f64)
         if self.scale[r] != 0:
-            out += ti.max(self.violation[r], 0 * out) * self.close[r] / self.scale[r]
+            out += ti.max(self.violation[r], 0 * out) * self.inverse_size[r] / self.scale[r]
         return out
 
     @ti.func
-    def tensest(self, begin, end, backward):
+    def tensions(self, begin, end, at_end):
         """(omega h)^2 of a transverse vibration under the multipliers found: the largest, and the sum; the stiffness behind it,
         and the largest diagonal."""
         worst, total = ti.cast(0, ti.f64), ti.cast(0, ti.f64)
         size, steps, most = ti.cast(0, ti.f64), ti.cast(0, ti.f64), ti.cast(0, ti.f64)
         for r in range(begin, end):
             step, geometric_stiffness = self.step[r], self.geometric_stiffness[r]
-            if backward != 0:
-                geometric_stiffness /= self.longer(r)
+            if at_end != 0:
+                geometric_stiffness /= self.stretch(r)
             worst = ti.max(worst, geometric_stiffness * ti.abs(self.lam[r] + step))
             total += geometric_stiffness * (self.lam[r] + step)
             size += ti.abs(self.violation[r])
             steps += ti.abs(step)
-            most = ti.max(most, self.weight[r])
+            most = ti.max(most, self.diagonal[r])
         return worst, total, ti.select(steps > 0, size / steps, 0 * size), most
 
     @ti.func
-    def measure_again(self, begin, end):
+    def bears(self, begin, end):
+        """(omega h)^2 under the multipliers of the passes before."""
+        worst = ti.cast(0, ti.f64)
+        for r in range(begin, end):
+            worst = ti.max(worst, self.geometric_stiffness[r] * ti.abs(self.lam[r]))
+        return worst
+
+    @ti.func
+    def stay(self, begin, end):
+        """No steps."""
+        for r in range(begin, end):
+            self.step[r] = 0
+
+    @ti.func
+    def refine_violations(self, begin, end):
         """In f32: violations to all the digits that positions have. Those of a taut rope are of second order in its slopes."""
         for r in range(begin, end):
             for k, b in ti.static(self.precise):
@@ -321,11 +343,11 @@ class Elimination(System):
                     self.violation[r] = b.exactly(self.number[r])
 
     @ti.func
-    def cut(self, begin, end):
+    def limit_tensions(self, begin, end):
         """No multiplier beyond what its tension may be."""
         for r in range(begin, end):
             if self.geometric_stiffness[r] > 0:
-                most = BACKWARD * self.longer(r) / self.geometric_stiffness[r]
+                most = SOFTENED_TO * self.stretch(r) / self.geometric_stiffness[r]
                 self.step[r] = ti.max(-most, ti.min(most, self.lam[r] + self.step[r])) - self.lam[r]
 
     @ti.func
@@ -334,51 +356,56 @@ class Elimination(System):
 
         A tension makes particles vibrate across. Where the substep is too long for that, or no tension is right, see Direct, the
         system is solved with directions at the end of the substep, and gives way until its tension is small enough: one over the
-        tension grows linearly with the softness, where one load cannot be borne.
+        tension grows linearly with the softness, where one load cannot be borne. Where an earlier pass found more tension than
+        that, to give way now would be to take most of it back, along other directions: the system stays where it is.
         """
         begin, end = self.part_begin[b], self.part_begin[b + 1]
         zero = ti.cast(0, ti.f64)
-        soft, least, inverse, ahead, sum_ahead = zero, zero, zero, zero, zero
+        softness, least, inverse, tension_at_start, total_at_start = zero, zero, zero, zero, zero
         stage, k, bound = FORWARD, 0, True
         if ti.static(len(self.precise) > 0):
             stage = ROUGH
         while stage != DONE:
-            hard = self.find(begin, end, soft, ti.cast(stage >= COMPARE, ti.i32))
-            tension, total, stiffness, most = self.tensest(begin, end, ti.cast(stage >= COMPARE, ti.i32))
-            if ti.static(self.guarded):
-                if stage <= FORWARD and self.hold(begin, end) != 0:
+            hard = self.solve_active_set(begin, end, softness, ti.cast(stage >= COMPARE, ti.i32))
+            tension, total, stiffness, most = self.tensions(begin, end, ti.cast(stage >= COMPARE, ti.i32))
+            if ti.static(self.limits_steps):
+                if stage <= FORWARD and self.limit_steps(begin, end) != 0:
                     continue
             if stage <= AGAIN:
                 if (hard == 0 and tension <= TENSEST) or stage == AGAIN:
                     ti.atomic_max(self.tension[None], tension)
                     stage = DONE
                 elif stage == ROUGH:
-                    self.measure_again(begin, end)
+                    self.refine_violations(begin, end)
                     stage = FORWARD
                 elif hard == 2:
                     ti.atomic_max(self.tension[None], ti.cast(TENSEST, ti.f64))
-                    soft, stage = FLOOR * most, GIVE_WAY
+                    softness, stage = LEAST_SOFTNESS * most, GIVE_WAY
                 else:
-                    ahead, sum_ahead, bound, stage = tension, total, hard == 0, COMPARE
+                    tension_at_start, total_at_start, bound, stage = tension, total, hard == 0, COMPARE
             elif stage == COMPARE:
-                same = ti.abs(tension - ahead) <= AGREE * tension and ti.abs(total - sum_ahead) <= AGREE * ti.abs(total)
-                if same and tension <= CALM:
+                same = ti.abs(tension - tension_at_start) <= AGREEMENT * tension
+                same = same and ti.abs(total - total_at_start) <= AGREEMENT * ti.abs(total)
+                if same and tension <= STABLE:
                     stage = AGAIN
                 else:
                     # What more substeps do not help has the figure of what is just unstable.
-                    ti.atomic_max(self.tension[None], ti.select(bound, ahead, ti.min(tension, TENSEST)))
-                    soft, stage = FLOOR * most, GIVE_WAY
+                    ti.atomic_max(self.tension[None], ti.select(bound, tension_at_start, ti.min(tension, TENSEST)))
+                    softness, stage = LEAST_SOFTNESS * most, GIVE_WAY
+                    if self.bears(begin, end) > SOFTENED_TO:
+                        self.stay(begin, end)
+                        stage = DONE
             else:
                 k += 1
-                if k == ROUNDS or (tension <= BACKWARD and (k == 1 or k > 3 or tension > 0.8 * BACKWARD)):
-                    self.turn_back(begin, end)
-                    self.cut(begin, end)
+                if k == ROUNDS or (tension <= SOFTENED_TO and (k == 1 or k > 3 or tension > 0.8 * SOFTENED_TO)):
+                    self.use_end_directions(begin, end)
+                    self.limit_tensions(begin, end)
                     stage = DONE
                 else:
-                    new = soft + stiffness * (tension / BACKWARD - 1)
+                    new = softness + stiffness * (tension / SOFTENED_TO - 1)
                     if k > 1 and 1 / tension > inverse:
-                        new = least + (soft - least) * (1.1 / BACKWARD - inverse) / (1 / tension - inverse)
-                    if tension > BACKWARD:
-                        least, inverse = soft, 1 / tension
-                        new = ti.max(new, 1.1 * soft)
-                    soft = new
+                        new = least + (softness - least) * (1.1 / SOFTENED_TO - inverse) / (1 / tension - inverse)
+                    if tension > SOFTENED_TO:
+                        least, inverse = softness, 1 / tension
+                        new = ti.max(new, 1.1 * softness)
+                    softness = new

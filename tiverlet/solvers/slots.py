@@ -19,6 +19,8 @@ class Slots:
     as a whole is one, and each constraint that is relaxed by itself.
     """
 
+    host_only = ("total",)
+
     def __init__(self, scene: Scene, batches: list[Batch], solver):
         memory, state, inv_mass = scene.memory, scene.state, scene.inv_mass
         n = len(inv_mass)

@@ -1,13 +1,16 @@
 """Constraints that are solved together: what they tell, and what particles make of the answer."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..constraints.core.scalar import Scalar
 from ..device import ti
-from ..features.feature import Batch, Scene
-from .slots import Slots
+from ..device.number import OnDevice
+
+if TYPE_CHECKING:
+    from ..features.feature import Batch, Scene
+    from .slots import Slots
 
 SLACK = 0.1  # of |step violation|: how much energy steps may bring in by their own curvature
 
@@ -21,14 +24,15 @@ class System:
     scalars: the batches that take part, their constraints numbered through; rows: those numbers, in the order of the solver.
     """
 
-    parts = 1  # systems that have nothing to do with each other
+    rows: Any = OnDevice()
+    parts: Any = 1  # systems that have nothing to do with each other
     steps = 0  # of an iteration, by start(), iterate() and end(); 0 for a solution by solve()
     team: Any  # the threads that share the loops of start(), iterate() and end(), given when the kernels are made
     stride: int  # iterations of such a loop for each block of rows
 
-    def __init__(self, scene: Scene, batches: list[Batch], slots: Slots, scalars: list[Scalar], rows: np.ndarray):
+    def __init__(self, scene: "Scene", batches: "list[Batch]", slots: "Slots", scalars: list[Scalar], rows: np.ndarray):
         self.real, self.dim, self.move, self.tension = scene.real, scene.state.dim, slots.move, slots.tension
-        self.memory, self.inv_mass, self.rows = scene.memory, scene.inv_mass, len(rows)
+        self.memory, self.inv_mass, self.rows = scene.memory, scene.inv_mass, scene.memory.number(len(rows))
         counts = [b.count for b in scalars]
         row = np.full(sum(counts), -1)
         row[rows] = np.arange(len(rows))
@@ -42,10 +46,10 @@ class System:
         self.step, self.violation, self.scale = self.reals("step"), self.reals("violation"), self.reals("scale")
         self.alpha, self.lam = self.reals("alpha"), self.reals("multiplier")
         self.geometric_stiffness = self.reals("geometric_stiffness")
-        self.guarded = any(b.limited for b in scalars) and scene.order == 2
-        if self.guarded:
-            self.toward, self.spare, self.instead = self.reals("toward"), self.reals("spare"), self.reals("instead")
-            self.most = self.reals("most")
+        self.limits_steps = any(b.limited for b in scalars) and scene.order == 2
+        if self.limits_steps:
+            self.motion, self.spare_energy, self.own_step = self.reals("toward"), self.reals("spare"), self.reals("instead")
+            self.trusted_step = self.reals("most")
         if self.shares:
             self.share = self.ints("share", self.blocks)
 
@@ -57,7 +61,7 @@ class System:
         """A field of f64, one for each row."""
         return self.memory.field(f"system.{name}", self.rows if length is None else length, kind=ti.f64)
 
-    def _blocks(self, batches: list[Batch], scene: Scene) -> tuple[np.ndarray, bool]:
+    def _blocks(self, batches: "list[Batch]", scene: "Scene") -> tuple[np.ndarray, bool]:
         """The number of blocks that each particle belongs to, one system at most; and whether any is in a system and others."""
         n = len(scene.inv_mass)
         inside, alone = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64)
@@ -73,11 +77,11 @@ class System:
         free = scene.inv_mass > 0
         return np.where(free, inside + alone, 0), bool((inside & (alone > 0) & free).any())
 
-    def row(self, batch: Batch) -> np.ndarray:
+    def row(self, batch: "Batch") -> np.ndarray:
         """The row of each constraint of a batch, -1 where it is relaxed by itself."""
         return self._rows.get(id(batch), np.full(batch.count, -1))
 
-    def left_out(self, batches: list[Batch]) -> int:
+    def left_out(self, batches: "list[Batch]") -> int:
         """The number of constraints that are relaxed by themselves, of those with a particle that can move."""
         return sum(int((~b.idle(self.inv_mass) & (self.row(b) < 0)).sum()) for b in batches)
 
@@ -91,10 +95,11 @@ class System:
         self.scale[r] = ti.select(W > 0, A, 0 * A)
 
     @ti.func
-    def guard(self, r, toward, spare, most, instead):
+    def limit_row(self, r, motion, spare_energy, trusted_step, own_step):
         """Where steps are limited, see Scalar: the motion along row r in this substep, the energy that it may bring in, the step
         up to which its gradient is trusted, and minus the step that it takes where the others' brings in energy."""
-        self.toward[r], self.spare[r], self.most[r], self.instead[r] = toward, spare, most, instead
+        self.motion[r], self.spare_energy[r] = motion, spare_energy
+        self.trusted_step[r], self.own_step[r] = trusted_step, own_step
 
     @ti.func
     def set_gradient(self, place, i, gradient):

@@ -84,7 +84,7 @@ def assemble(
         state = State(memory, particles, inv_mass, precision == "f32-compensated")
         return _bind(Scene(memory, state, particles, inv_mass, order=order), features, solver, path)
     except BaseException:
-        memory.abandon()
+        memory.destroy()
         for feature in features:
             feature.scene = None
         raise
@@ -103,7 +103,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     if contact or walls:
         scene.radius = Radii(memory, particles.radius)
     surfaces = [*walls, *([contact] if contact else [])]
-    rubs, bounces = any(f.rubs for f in surfaces), any(f.bounces for f in surfaces)
+    has_friction, bounces = any(f.has_friction for f in surfaces), any(f.has_restitution for f in surfaces)
     solver = solver or (by_structure(batches, scene.inv_mass) if scene.order == 2 else Direct())
     if batches:
         scene.slots = Slots(scene, batches, solver)
@@ -111,7 +111,9 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
             state.carry(memory, particles)
         if scene.order > 2:
             high_order.check_solved(batches, scene, solver)
-    state.remember(memory, rubs or any(w.sweeps for w in walls) or (bounces and bool(walls)), bounces, bool(contact and walls))
+    state.remember(
+        memory, has_friction or any(w.sweeps for w in walls) or (bounces and bool(walls)), bounces, bool(contact and walls)
+    )
     size = size_of(path, _work(particles, features))
     team = Team(memory, size, len(particles), path == "parallel" and size == 1, pieces=PIECES if contact else size)
     grid = contact.join(scene, batches, team) if contact else None

@@ -39,12 +39,12 @@ class ConstraintPass:
             self.team.wait()
 
     @ti.func
-    def kick(self, thread, h):
+    def spring_forces(self, thread, h):
         """h^2 times what springs, at the present positions, accelerate: to the slots."""
         self.reduce_blocks(thread, h, h * h, -1, 0, True)
         for f in ti.static(self.batches):
             for c in range(self.team.chunk_begin(f.count, thread), self.team.chunk_end(f.count, thread)):
-                f.kick(c, h)
+                f.push_spring_force(c, h)
         self.team.wait()
         self.scatter_blocks(thread, h, h * h, -1, 0)
 
@@ -52,7 +52,7 @@ class ConstraintPass:
     def solve(self, now):
         """Every constraint leaves the moves that it wants in its slots, or tells its system what it is about."""
         fresh = now.fresh if ti.static(self.integrator.half_kick) else 0
-        h2_effective = self.integrator.reach(now.h, fresh)
+        h2_effective = self.integrator.h2_effective(now.h, fresh)
         self.reduce_blocks(now.thread, now.h, h2_effective, now.first, fresh, True)
         for semi_iteration in ti.static(self.semi_iterations):
             ti.loop_config(serialize=True)
@@ -104,8 +104,8 @@ class ConstraintPass:
             self.team.wait()
 
     @ti.func
-    def bond(self, firm, soft):
-        """What constraints added to h^2 a in the last substep, to the slots; see Batch.bond."""
+    def reactions(self, firm, soft):
+        """What constraints added to h^2 a in the last substep, to the slots; see Batch.push_reaction."""
         for f in ti.static(self.batches):
             for c in range(f.count):
-                f.bond(c, firm, soft)
+                f.push_reaction(c, firm, soft)

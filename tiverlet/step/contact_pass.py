@@ -1,22 +1,28 @@
 """The loops over contacts: which there are, what they want, and what they remember."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..device import ti
-from ..device.thread_team import Team, block, blocks
-from ..features.feature import Scene
-from .particle_pass import ParticlePass
+from ..device.number import OnDevice
+from ..device.thread_team import block, blocks
+
+if TYPE_CHECKING:
+    from ..device.thread_team import Team
+    from ..features.feature import Scene
+    from .particle_pass import ParticlePass
 
 
 class ContactPass:
     """The contacts of one world, of which there may be none. They are worked out from both sides, particle by particle."""
 
-    def __init__(self, scene: Scene, contact: Any, particles: ParticlePass, team: Team):
+    n: Any = OnDevice()  # particles
+
+    def __init__(self, scene: "Scene", contact: Any, particles: "ParticlePass", team: "Team"):
         self.contacts, self.particles, self.team = particles.contacts, particles, team
-        self.n, self.real, self.dim = particles.n, scene.real, scene.particles.dim
-        self.bounces = bool(contact) and contact.bounces
-        self.remembers = bool(contact) and (contact.rubs or contact.bounces)
-        self.calms = bool(contact) and contact.projects
+        self.n, self.real, self.dim = scene.count, scene.real, scene.particles.dim
+        self.has_restitution = bool(contact) and contact.has_restitution
+        self.remembers = bool(contact) and (contact.has_friction or contact.has_restitution)
+        self.projects_velocities = bool(contact) and contact.projects
 
     @ti.func
     def solve(self, now):
@@ -40,7 +46,7 @@ class ContactPass:
                         for i in range(low, high):
                             c.relax(i, now.first, now.fresh, now.final)
                     elif now.final != 0:
-                        if ti.static(c.rubs):
+                        if ti.static(c.has_friction):
                             for i in range(low, high):
                                 c.dev.forces.add(i, ti.Vector.zero(self.real, self.dim), now.first)
             self.team.wait()
@@ -50,7 +56,7 @@ class ContactPass:
         """1 when a pair bounces in this substep."""
         out = 0
         for c in ti.static(self.contacts):
-            if ti.static(c.bounces):
+            if ti.static(c.has_restitution):
                 out = c.dev.hit[None]
         return out
 
@@ -58,7 +64,7 @@ class ContactPass:
     def rebound(self, thread):
         """One round of restitution; struck() tells whether another one is needed."""
         for c in ti.static(self.contacts):
-            if ti.static(c.bounces):
+            if ti.static(c.has_restitution):
                 self.team.wait()
                 ti.loop_config(serialize=True)
                 for _ in range(self.team.one(1, thread)):
@@ -75,11 +81,11 @@ class ContactPass:
     def finish(self, thread):
         """Keep the slip of friction, and what was left of bounces."""
         for c in ti.static(self.contacts):
-            if ti.static(c.rubs or c.bounces):
+            if ti.static(c.has_friction or c.has_restitution):
                 for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
                     c.finish_substep(i)
             self.team.wait()
-            if ti.static(c.bounces):
+            if ti.static(c.has_restitution):
                 ti.loop_config(serialize=True)
                 for _ in range(self.team.one(1, thread)):
                     c.dev.hit[None] = 0

@@ -7,6 +7,7 @@ import numpy as np
 
 from ..constraints.core.scalar import TENSEST
 from ..device import runtime, ti
+from ..device.number import OnDevice
 from ..device.thread_team import LEAST
 from ..features.feature import FAR
 from ..neighbours.neighbour_search import FARTHEST
@@ -30,10 +31,13 @@ class Diagnostics:
     measure() is the last one.
     """
 
+    host_only = ("sheet", "report", "details")
+    n: Any = OnDevice()  # particles
+
     def __init__(self, step: Step, solver: Solver):
         self.step: Any = step
         self.team = step.team
-        self.n, self.dim, self.state = step.n, step.dim, step.state
+        self.n, self.dim, self.state = step.scene.count, step.dim, step.state
         self.batches = step.batches
         self.contacts = step.contacts
         self.single = step.real == ti.f32
@@ -75,7 +79,7 @@ class Diagnostics:
         """Kinetic and potential energy at x - back d, f64: second order at the middle of a substep, where d / h is v."""
         d = self.state.d[i] * ti.cast(1, ti.f64)
         out = ti.cast(0, ti.f64)
-        if self.state.w.of(i) > 0:
+        if self.state.w.positive(i):
             out = 0.5 * scale * scale * d.dot(d)
             for f in ti.static(self.step.integrator.forces.all):
                 if ti.static(f.conservative):
@@ -88,7 +92,7 @@ class Diagnostics:
         """(omega h)^2 of the motion that dominates: the force's Rayleigh quotient along the last move."""
         d = self.state.d[i]
         dd, out = d.dot(d), ti.cast(0, ti.f64)
-        if dd > 0 and self.state.w.of(i) > 0:
+        if dd > 0 and self.state.w.positive(i):
             change = 0 * d
             for f in ti.static(self.probes):
                 change += f.acceleration(i, x, d / h, t) - f.acceleration(i, x - d, d / h, t)
@@ -102,7 +106,7 @@ class Diagnostics:
         return ti.Vector([0, 0, 0, 0, 0, 2.0**31], ti.f64), zero + ti.math.inf, zero - ti.math.inf
 
     @ti.func
-    def block(self, b, h, t, when, fresh, begin):
+    def block(self, b, h, t, frame_fraction, fresh, begin):
         """One block of particles and constraints. Returns energy, residual, overlap, stiffness, contacts, bad; low, high."""
         figures, low, high = self.nothing()
         scale, back = ti.cast(1, ti.f64), ti.cast(0, self.step.real)
@@ -123,24 +127,22 @@ class Diagnostics:
                     touching, worst = c.worst_overlap(i)
                     figures[2] = ti.max(figures[2], worst)
                     figures[4] += touching
-                    if begin == 0:
-                        c.sum_pushes(i)
         for f in ti.static(self.batches):
             part = (f.count + self.blocks - 1) // self.blocks
             for c in range(b * part, ti.min((b + 1) * part, f.count)):
-                h2_effective, miss = 0 * h, 0 * h
+                h2_effective, residual = 0 * h, 0 * h
                 if begin == 0:
-                    h2_effective = self.step.integrator.reach(h, fresh)
-                    miss = f.residual_of(c, h, h2_effective, when, fresh)
-                    figures[1] = ti.max(figures[1], ti.cast(miss, ti.f64))
-                figures[0] += f.energy(c, back, h2_effective, miss)
+                    h2_effective = self.step.integrator.h2_effective(h, fresh)
+                    residual = f.residual_of(c, h, h2_effective, frame_fraction, fresh)
+                    figures[1] = ti.max(figures[1], ti.cast(residual, ti.f64))
+                figures[0] += f.energy(c, back, h2_effective, residual)
         return figures, low, high
 
     @ti.func
     def reduce_blocks(self, thread, h64, state_origin):
         """The sums behind residuals."""
         h, fresh = ti.cast(h64, self.step.real), ti.cast(state_origin == STARTED, ti.i32)
-        self.step.constraints.reduce_blocks(thread, h, self.step.integrator.reach(h, fresh), 0, fresh, False)
+        self.step.constraints.reduce_blocks(thread, h, self.step.integrator.h2_effective(h, fresh), 0, fresh, False)
 
     @ti.kernel
     def measure(self, sheet: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
@@ -231,7 +233,7 @@ class Residuals:
         for c in range(self.batch.count):
             h = ti.cast(h64, self.step.real)
             fraction = self.step.integrator.frame_fraction(0, 1)
-            out[c] = self.batch.residual_of(c, h, self.step.integrator.reach(h, fresh), fraction, fresh)
+            out[c] = self.batch.residual_of(c, h, self.step.integrator.h2_effective(h, fresh), fraction, fresh)
 
 
 class Reporter:
@@ -245,9 +247,10 @@ class Reporter:
         self.figures = sheet[: 11 + step.dim]
 
     def __call__(
-        self, time: float, h: float, substeps: int, iterations: int, before: float | None
+        self, time: float, h: float, substeps: int, iterations: int, before: float | None, moved: float
     ) -> tuple[StepReport, list[float]]:
-        """The report of a frame, and the size of the bounding box [m]. before: the energy one frame ago [J]."""
+        """The report of a frame, and the size of the bounding box [m]. before: the energy one frame ago [J]. moved: how far
+        particles were moved before the first substep [m]."""
         energy, residual, overlap, stiff, contacts, bad, fast, reach, broken, tension, turned, *extent = self.figures.tolist()
         stiff = max(stiff, self.fastest * h * h)
         notes = {}
@@ -266,6 +269,11 @@ class Reporter:
             )
         if turned == FAR:
             notes["turned"] = "A constraint turned by more than 41 degrees in one substep and is damped there; use more substeps."
+        if moved > 0:
+            notes["moved"] = (
+                f"Particles were off their rigid constraints by more than a fifth, and were moved by up to {moved:.3g} m "
+                "to where these are met. Place them there, or give the constraints other rest values, or compliance."
+            )
         if tension > TENSEST:
             need = int(np.ceil(substeps * np.sqrt(tension / STIFF)))
             notes["softened"] = (

@@ -133,10 +133,13 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
             checkpoint.put_back(world, kept)
         raise
     memories, particles = world._runner.memories, world._particles.regrouped(some, added)
-    contact, reach = next((c for c in world._runner.step.contacts if c in features), None), world._runner.scene.hh
+    contact, h2_effective = (
+        next((c for c in world._runner.step.contacts if c in features), None),
+        world._runner.scene.h2_effective,
+    )
     world._clock.parted = None
     world._install(particles, features, parts)
-    world._runner.scene.hh = reach
+    world._runner.scene.h2_effective = h2_effective
     world._runner.memory.restore(state)
     if contact and contact in world._runner.step.contacts:
         _give_contacts(world, contact, old, number, some)
@@ -174,8 +177,8 @@ def _drives(feature: Feature, number: np.ndarray) -> bool:
 
 
 def _loses(feature: Feature, number: np.ndarray, features: tuple[Feature, ...]) -> bool:
-    """Whether constraints go."""
-    return isinstance(feature, Batch) and (feature not in features or not feature.kept_mask(number)[0].all())
+    """Whether constraints go, or what may touch."""
+    return isinstance(feature, Batch | PairContact) and (feature not in features or not feature.kept_mask(number)[0].all())
 
 
 def _carried(

@@ -99,7 +99,7 @@ class Composition:
         self.real, self.dim = scene.real, scene.particles.dim
         g = stages(scene.order)
         self.stages, self.first = len(g), float(g[0])
-        self.reaches = float(1 + g[-2] / g[-1]) / 2
+        self.h2_factor = float(1 + g[-2] / g[-1]) / 2
         self.springs_pull = any(b.soft for b in batches)
         self.solved = PASSES[scene.order] if scene.slots and scene.slots.system else 0
         begin = np.concatenate([[0], np.cumsum(g)[:-1]])
@@ -126,7 +126,7 @@ class Composition:
         return ti.Vector([ti.cast(s, self.real) / substeps, ti.cast(s + 1, self.real) / substeps])
 
     @ti.func
-    def reach(self, h, fresh):
+    def h2_effective(self, h, fresh):
         """What a constant acceleration adds to the displacement in a substep, per m/s^2."""
         return h * h / 2 if fresh != 0 else h * h
 
@@ -154,7 +154,7 @@ class Composition:
             self.state.d[i] = 0 * self.state.d[i]
 
     @ti.func
-    def velocity_after(self, i, h, t, bond):
+    def velocity_after(self, i, h, t, reaction):
         """That at a start; velocity() finds all others."""
         return self.state.d[i]
 

@@ -42,7 +42,7 @@ class Verlet:
 
     stages = 1  # of a substep
     first = 1.0  # the share of the first of them
-    reaches = 1.0  # what accelerates in the last of them, per h^2
+    h2_factor = 1.0  # what accelerates in the last of them, per h^2
     fastest = 0.0  # omega^2 of springs that act as forces [1/s^2]
     springs_pull = False  # springs act as forces in every stage, and not only at starts
     half_kick = True  # at a start, constraints know that the force acts for half of the substep
@@ -76,13 +76,13 @@ class Verlet:
     @ti.func
     def advance(self, first, end, now):
         """Integrate some particles. Short loops, so that it is done for several of them at once."""
-        pull, share, reach = self.forces.pull(now.time), ti.cast(1, self.real), self.reach(now.h, now.fresh)
+        pull, share, h2_effective = self.forces.pull(now.time), ti.cast(1, self.real), self.h2_effective(now.h, now.fresh)
         if now.fresh != 0:
             share = now.h
             if ti.static(self.decays):
                 share *= self.decay[None][1]
         for i in range(first, end):
-            self.integrate(i, now, pull, share, reach)
+            self.integrate(i, now, pull, share, h2_effective)
 
     @ti.func
     def velocity_before(self, i, h, fresh):
@@ -112,19 +112,19 @@ class Verlet:
         return small
 
     @ti.func
-    def integrate(self, i, now, pull, share, reach):
+    def integrate(self, i, now, pull, share, h2_effective):
         """d += h^2 a, x += d; at a start (d is v) x += h v + h^2 a / 2. Linear drag is exact in both.
 
         Only the writes depend on whether it moves, so that several particles are integrated at once.
         """
-        live, x, d, h = self.state.w.of(i) > 0, self.state.x[i], self.state.d[i], now.h
+        live, x, d, h = self.state.w.positive(i), self.state.x[i], self.state.d[i], now.h
         v = self.velocity_before(i, h, now.fresh)
         a = self.forces.accelerate(i, self.state.place(i), v, now.time, pull)
         before, low = ti.select(now.fresh != 0, h * v - h * h / 2 * a, d), ti.zero(d)
         if ti.static(self.state.carries):
             low = self.state.d_low[i]
         if ti.static(self.decays or len(self.forces.all) > 0):
-            kick = reach * a
+            kick = h2_effective * a
             if ti.static(self.decays):
                 # d' = exp(-z) d + phi1 h^2 a, as a small change of d, which f32 holds to more digits.
                 kick -= ti.select(now.fresh != 0, ti.zero(d), self.decay[None][4] * d)
@@ -155,27 +155,27 @@ class Verlet:
             self.state.d[i] = ti.zero(d)
 
     @ti.func
-    def reach(self, h, fresh):
+    def h2_effective(self, h, fresh):
         """What a constant acceleration adds to the displacement in a substep, per m/s^2: h^2, half of it at a start."""
-        hh = h * h
+        h2_effective = h * h
         if ti.static(self.decays):
-            hh *= self.decay[None][2] if fresh != 0 else self.decay[None][1]
+            h2_effective *= self.decay[None][2] if fresh != 0 else self.decay[None][1]
         elif fresh != 0:
-            hh /= 2
-        return hh
+            h2_effective /= 2
+        return h2_effective
 
     @ti.func
-    def velocity_after(self, i, h, t, bond):
-        """v_n from d_n and the acceleration at x_n: d / h + (h a + bond / h) / 2, or what the solution with drag makes of it.
+    def velocity_after(self, i, h, t, reaction):
+        """v_n from d_n and the acceleration at x_n: d / h + (h a + reaction / h) / 2, or what the solution with drag makes of it.
 
-        bond: h^2 times the acceleration by constraints.
+        reaction: h^2 times the acceleration by constraints.
         """
         d = self.state.d[i]
         v = d / h
-        if self.state.w.of(i) > 0:
+        if self.state.w.positive(i):
             if ti.static(self.uses_velocity):
                 v = (3 * d - self.earlier[i]) / (2 * h)
-            force = h * h * self.forces.accelerate(i, self.state.place(i), v, t, self.forces.pull(t)) + bond
+            force = h * h * self.forces.accelerate(i, self.state.place(i), v, t, self.forces.pull(t)) + reaction
             if ti.static(self.decays):
                 v = (self.decay[None][0] * d + self.decay[None][3] * force) / h
             else:

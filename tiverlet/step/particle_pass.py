@@ -6,6 +6,7 @@ from typing import Any
 from ..colliders.collider import ROUNDS, SWEEPS, Collider
 from ..colliders.surface import AGAIN, FIRST, GENTLY
 from ..device import ti
+from ..device.number import OnDevice
 from ..device.patches.compiler import FEW
 from ..device.thread_team import Team, block, blocks
 from ..features.feature import Batch, Scene
@@ -14,22 +15,31 @@ TILE = 256  # particles that a thread takes at a time, through several loops: th
 
 
 class ParticlePass:
-    """The motion of particles, and what they gather of constraints, contacts and walls. contact and grid may be None."""
+    """The motion of particles, and what they gather of constraints, contacts and walls. contact and grid may be None.
+
+    n: particles. pieces: of them, see Team. tile: particles in one. each: tiles of a piece.
+    """
+
+    n: Any = OnDevice()
+    pieces: Any = OnDevice()
+    tile: Any = OnDevice()
+    each: Any = OnDevice()
 
     def __init__(self, scene: Scene, integrator: Any, batches: list[Batch], contact, grid, walls: list[Collider], team: Team):
         self.integrator, self.forces, self.team = integrator, integrator.forces, team
-        self.state, self.n, self.real = scene.state, scene.particles.count, scene.real
-        self.pieces = -(-self.n // team.piece)
-        self.tile = min(TILE, team.piece)
-        self.each = -(-team.piece // self.tile)  # tiles of a piece
+        self.state, self.n, self.real = scene.state, scene.count, scene.real
+        n, number = scene.particles.count, scene.memory.number
+        tile = min(TILE, team.piece)
+        self.pieces, self.tile, self.each = number(-(-n // team.piece)), number(tile), number(-(-team.piece // tile))
+        self.few = n < FEW
         self.slots, self.grid, self.walls, self.radius = scene.slots, grid, walls, scene.radius
         self.gathers = bool(batches) and not contact  # else the moves of constraints are applied before contacts are solved
         self.held = bool(batches)
         self.contacts = [contact] if contact else []
         self.acts = bool(batches or contact or walls)
-        self.rough = any(w.rubs or w.bounces for w in walls)
+        self.rough = any(w.has_friction or w.has_restitution for w in walls)
         if walls:
-            self.wall_push = scene.memory.field("thrust", self.n, width=scene.particles.dim, state=True)
+            self.wall_displacement = scene.memory.field("thrust", n, width=scene.particles.dim, state=True)
 
     @ti.func
     def piece(self, k, thread):
@@ -40,12 +50,12 @@ class ParticlePass:
     @ti.func
     def tile_of(self, k, thread):
         """Those of the k-th tile of a thread."""
-        tile = self.team.dealt_index(k, self.each, thread)
-        piece, first = tile, tile * self.team.piece
-        if ti.static(self.each > 1):
+        first, end = k * self.tile, self.n  # of the one piece that there is, without a division
+        if ti.static(self.team.size > 1):
+            tile = self.team.dealt_index(k, self.each, thread)
             piece = tile // self.each
-            first = piece * self.team.piece + tile % self.each * self.tile
-        return first, ti.min(first + self.tile, (piece + 1) * self.team.piece, self.n)
+            first, end = piece * self.team.piece + tile % self.each * self.tile, (piece + 1) * self.team.piece
+        return first, ti.min(first + self.tile, end, self.n)
 
     @ti.func
     def integrate(self, now):
@@ -67,10 +77,10 @@ class ParticlePass:
                 self.state.x0[i] = self.state.x[i]
                 if ti.static(self.state.sums):
                     self.state.low0[i] = self.state.low[i]
-        if ti.static(self.state.leans):
+        if ti.static(self.state.keeps_wall_push):
             if now.damps != 0:
                 for i in range(first, end):
-                    self.state.lean[i] = ti.zero(self.state.x[i])
+                    self.state.wall_push[i] = ti.zero(self.state.x[i])
         self.integrator.advance(first, end, now)
         for c in ti.static(self.contacts):
             stale, fast = 0, 0
@@ -116,10 +126,10 @@ class ParticlePass:
             if now.final != 0:
                 for i in range(begin, end):
                     if now.first != 0:
-                        self.wall_push[i] = -self.state.d[i]
+                        self.wall_displacement[i] = -self.state.d[i]
                     else:
-                        self.wall_push[i] = self.wall_push[i] - self.state.d[i]
-        if ti.static(len(self.walls) > 0 and self.n < FEW):
+                        self.wall_displacement[i] = self.wall_displacement[i] - self.state.d[i]
+        if ti.static(len(self.walls) > 0 and self.few):
             for i in range(begin, end):
                 self.confine(i, now.h, now.frame_fraction)
         elif ti.static(len(self.walls) > 0):
@@ -141,12 +151,12 @@ class ParticlePass:
         if ti.static(len(self.walls) > 0):
             if now.final != 0:
                 for i in range(begin, end):
-                    self.wall_push[i] = self.wall_push[i] + self.state.d[i]
+                    self.wall_displacement[i] = self.wall_displacement[i] + self.state.d[i]
 
     @ti.func
     def confine(self, i, h, frame_fraction):
         """The walls, which have the last word; they take turns until they agree, see Collider."""
-        if self.state.w.of(i) > 0:
+        if self.state.w.positive(i):
             if ti.static(len(self.walls) == 1 and not self.walls[0].repeats):
                 for f in ti.static(self.walls):
                     f.confine(i, self.radius.of(i), h, frame_fraction, FIRST)
@@ -178,23 +188,23 @@ class ParticlePass:
             self.state.shift(i, -self.state.d[i])
 
     @ti.func
-    def felt(self, i, h, t, firm):
+    def reaction(self, i, h, t, firm):
         """h^2 times what constraints (from Slots), contacts and walls accelerated particle i by in the last substep.
 
         Walls count as far as they balance the rest: a body at rest has velocity 0, but one that has just bounced is not credited
         with half of the blow.
         """
-        bond = 0 * self.state.d[i]
+        reaction = 0 * self.state.d[i]
         if ti.static(self.held):
-            bond = self.slots.total_of(i)
+            reaction = self.slots.total_of(i)
         for c in ti.static(self.contacts):
-            bond += firm * c.forced(i)
+            reaction += firm * c.reaction(i)
         if ti.static(len(self.walls) > 0):
-            push = firm * self.wall_push[i]
+            push = firm * self.wall_displacement[i]
             v = self.state.d[i] / h
-            limit = (h * h * self.forces.accelerate(i, self.state.place(i), v, t, self.forces.pull(t)) + bond).norm()
+            limit = (h * h * self.forces.accelerate(i, self.state.place(i), v, t, self.forces.pull(t)) + reaction).norm()
             size = push.norm()
             if size > limit:
                 push *= limit / size
-            bond += push
-        return bond
+            reaction += push
+        return reaction

@@ -24,6 +24,7 @@ from ..constraints.core.scalar import Scalar
 from .block_matrix import BlockMatrix
 from .integrator import FREE
 from .jacobian import Jacobian, bodies_of
+from .rigid_rows import RigidRows, rigid_rows
 
 if TYPE_CHECKING:
     from .runner import Runner
@@ -35,6 +36,7 @@ NEWTON = 40  # steps, at most
 BEGIN, HARDEST, LEAST = 1e-3, 10.0, 1e-9  # mu of the first, and of the last try; the least
 LEFT = 0.01  # of what violations store: what may be left of it in the shorter substep
 DONE = 1e-6  # of its size: a violation that is none
+LARGEST = 300  # corners: outlines of more couple each with each
 
 
 def project(runner: "Runner", h: float, longest: float) -> bool:
@@ -44,11 +46,12 @@ def project(runner: "Runner", h: float, longest: float) -> bool:
     """
     ratio = h / longest
     slots = runner.scene.slots
-    batches = [b for b in runner.batches if isinstance(b, Scalar) and b.arity and b.count]
+    batches: list[Any] = [b for b in runner.batches if isinstance(b, Scalar) and b.count and _sizes(b).max() <= LARGEST]
     w, state, memory = runner.scene.inv_mass, runner.scene.state, runner.memory
     x = before = state.get(memory)
     if slots and slots.system and not slots.system.steps and not runner.clock.softened:  # it holds loads without a violation
-        batches = [b for b in batches if (slots.rows(b) < 0).all()]
+        batches = [b for b in batches if ((slots.rows(b) < 0) & ~b.idle(w)).any()]
+    batches += rigid_rows(runner.batches, w)
     if not batches or not np.isfinite(x).all():
         return True
     start = Rows(batches, w, x)
@@ -98,6 +101,11 @@ def _seen(runner: Any) -> tuple[float, float]:
     return report.energy, report.overlap
 
 
+def _sizes(batch: Scalar | RigidRows) -> np.ndarray:
+    """The number of corners of each constraint, (m,)."""
+    return np.bincount(batch.owner, minlength=batch.count)
+
+
 def _over(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """a / b; 0 where b is."""
     return np.divide(a, b, out=np.zeros_like(a), where=b > 0)
@@ -113,15 +121,13 @@ class Rows:
     theta: Any = 1.0  # how rigid they are
     weight: Any = 1.0  # the same as passes see it, which split masses
 
-    def __init__(self, batches: list[Scalar], w: np.ndarray, x: np.ndarray):
+    def __init__(self, batches: list[Scalar | RigidRows], w: np.ndarray, x: np.ndarray):
         self.batches, self.w, self.n, self.dim = batches, w, *x.shape
         self.some = [~b.idle(w) & ~b.broken if b.breaks else ~b.idle(w) for b in batches]
-        self.side, arity = (
-            np.concatenate([np.full(some.sum(), of(b)) for b, some in zip(batches, self.some, strict=True)])
-            for of in (lambda b: b.side, lambda b: b.arity)
-        )
+        self.side, arity = (self._each([of(b) for b in batches]) for of in (lambda b: np.full(b.count, b.side), _sizes))
         self.m = len(self.side)
-        self.who = np.concatenate([b.indices[some].ravel() for b, some in zip(batches, self.some, strict=True)])
+        self.corner = [some[b.owner] for b, some in zip(batches, self.some, strict=True)]
+        self.who = np.concatenate([b.indices.ravel()[some] for b, some in zip(batches, self.corner, strict=True)])
         self.row = np.repeat(np.arange(self.m), arity)
         self.close = self._each([b.inverse_size(b.start.position) for b in batches])
         first = (np.cumsum(arity) - arity)[arity == 2]
@@ -135,7 +141,7 @@ class Rows:
 
     def _measure(self, x: np.ndarray) -> None:
         self.x, self.C = x, self._bounded(self._each([b.violation(x) for b in self.batches]) - self.goal)
-        J = [b.gradients(x)[some].reshape(-1, self.dim) for b, some in zip(self.batches, self.some, strict=True)]
+        J = [b.gradients(x).reshape(-1, self.dim)[some] for b, some in zip(self.batches, self.corner, strict=True)]
         self.jacobian = Jacobian(self.m, self.row, self.who, self.w, np.concatenate(J))
         self.J, self.diagonal = self.jacobian.J, self.jacobian.diagonal
         self.worst = float(np.abs(self.C * self.close).max(initial=0.0))
@@ -187,12 +193,14 @@ class Rows:
         shared = np.bincount(self.row, split[self.who] * (self.J**2).sum(axis=1), minlength=self.m)
         self.weight = self._rigid(alpha, shared * h * h)
         gamma = self.theta + damping * alpha / h
-        hh = h * h * (runner.clock.drag or FREE)[2 if runner.clock.started else 1]
+        h2_effective = h * h * (runner.clock.drag or FREE)[2 if runner.clock.started else 1]
         springs = [b.dev.spring for b in self.batches]
         before = [
             read(s.last)[: b.count] - b.goal if s.soft else np.zeros(b.count) for b, s in zip(self.batches, springs, strict=True)
         ]
-        borne = [b.compliance * read(b.dev.lam)[: b.count] / hh for b in self.batches]
+        borne = [
+            b.compliance * read(b.dev.lam)[: b.count] / h2_effective if b.compliance.any() else b.compliance for b in self.batches
+        ]
         return self._bounded(gamma * self.C + (1 - gamma) * self._bounded(self._each(before)) + self._each(borne))
 
     def _rigid(self, alpha: np.ndarray, reach: np.ndarray) -> np.ndarray:

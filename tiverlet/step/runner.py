@@ -29,6 +29,7 @@ class Runner:
         self.memory, self.scene, self.batches, self.grid = parts.memory, parts.scene, parts.batches, parts.grid
         self.step, self.diagnostics, self.path, self.solver = parts.step, parts.diagnostics, parts.path, parts.solver
         self.clock = clock
+        self.moved = 0.0  # how far the coming frame has had to move a particle to where its constraints are met [m]
         self.interruptible = False  # what handlers of signals raise in the middle of a frame is followed by an undo
         # Asked in every frame, and Taichi looks at each attribute of what has kernels.
         step = self.step
@@ -70,11 +71,13 @@ class Runner:
                     clock.longest = h
             if clock.d_is_velocity:
                 clock.since = 0
-            moved = None
+            moved, self.moved = None, 0.0
             if clock.first_moved is not None and self.scene.slots:
                 moved = initial_violation.remove(self.scene, self.batches, clock.first_moved)
-                if moved is not None and self.grid:
-                    self.grid.invalidate()
+                if moved is not None:
+                    self.moved = float(moved.max())
+                    if self.grid:
+                        self.grid.invalidate()
                 if self.scene.slots.system:
                     self.scene.slots.system.forget()
             self.set_substep(h, drag)
@@ -98,8 +101,8 @@ class Runner:
         span, started = clock.counted(dt), clock.d_is_velocity and substeps == 1
         self.run(substeps if self.n else 0, iterations, span[0] + span[1] * span[2], STARTED if started else STEPPED)
         clock.advance(substeps, span, started)
-        self.scene.hh = clock.h**2 * self.integrator.reaches * (clock.drag or FREE)[2 if started else 1]
-        report = self.report(substeps, iterations)
+        self.scene.h2_effective = clock.h**2 * self.integrator.h2_factor * (clock.drag or FREE)[2 if started else 1]
+        report, self.moved = self.report(substeps, iterations), 0.0
         clock.softened = "softened" in report.flags
         return report
 
@@ -129,6 +132,8 @@ class Runner:
         elif self.probe:
             out = high_order.velocity(self.probe, clock, self.memory, iterations)
         else:
+            if self.grid and self.memory.read(self.grid.old_saved)[0]:  # of a state that was put back
+                self.list_neighbours()
             out = np.zeros((max(1, self.n), self.step.dim))
             self.step.velocities(clock.h, clock.time, *self._shares(), out)
         return out[: self.n]
@@ -179,17 +184,17 @@ class Runner:
             else:
                 resumed, begin, half, part = 0, until, 0, min(passes, some) if splits else passes
                 until = min(stages + 1, until + max(1, some // passes))
-            self.heed_signals()
+            self.raise_signals()
 
     def measure(self, end: float, state_origin: int) -> None:
         """Launch the diagnostics alone."""
         self._data[H], self._data[END], self._data[ORIGIN] = self.clock.h, end, state_origin
         self._measure()
 
-    def heed_signals(self) -> None:
+    def raise_signals(self) -> None:
         """In a long frame: call the handlers of signals that came. What they raise undoes the frame, see World.step."""
         if self.interruptible:
-            whole.heed()
+            whole.raise_pending()
 
     def look(self) -> None:
         """Diagnose the state where no frame did."""
@@ -221,7 +226,7 @@ class Runner:
 
     def report(self, substeps: int = 1, iterations: int = 1) -> StepReport:
         """What the diagnostics found."""
-        report, extent = self._reporter(self.clock.time, self.clock.h, substeps, iterations, self.clock.energy)
+        report, extent = self._reporter(self.clock.time, self.clock.h, substeps, iterations, self.clock.energy, self.moved)
         if self.grid:
             self.grid.fit(extent)
         return report
@@ -250,7 +255,12 @@ class Launcher:
 
     def __init__(self, runner: Runner):
         self.runner, step = runner, runner.step
-        self.halves, self.bounces, self.finishes, self.calms = step.halves, step.bounces, step.finishes, step.calms
+        self.halves, self.has_restitution, self.finishes, self.projects_velocities = (
+            step.halves,
+            step.has_restitution,
+            step.finishes,
+            step.projects_velocities,
+        )
         self.drives, self.constrains, self.touches, self.acts = map(
             bool, (step.drivers, step.batches, step.contacts, step.particles.acts)
         )
@@ -286,7 +296,7 @@ class Launcher:
 
     def works(self, now: Moment) -> bool:
         """Between two substeps, signals are heeded."""
-        self.runner.heed_signals()
+        self.runner.raise_signals()
         if now.s == now.span.begin:
             self.stale = None
         return True
@@ -322,7 +332,7 @@ class Launcher:
         """Here the list may have to grow."""
         self.flush()
         if half and not half % self.halves:
-            self.runner.heed_signals()
+            self.runner.raise_signals()
         grid = self.runner.grid
         if grid and self.stale is None:
             self.stale = bool(self.runner.memory.read(grid.stale)[0])
@@ -354,7 +364,7 @@ class Launcher:
     def solve_contacts(self, now: Moment) -> None:
         """Where pairs bounce, it has to be asked whether any does."""
         self.put(now, "solve_contacts", self.touches)
-        if self.bounces:
+        if self.has_restitution:
             self.flush()
 
     def struck(self) -> bool:

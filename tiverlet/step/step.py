@@ -11,6 +11,7 @@ from typing import Any
 from ..colliders.collider import Collider
 from ..contact.velocity_projection import EVERY, PASSES
 from ..device import at, inline, record, runtime, ti
+from ..device.number import OnDevice
 from ..device.thread_team import LEAST, Team
 from ..features.feature import Batch, Scene
 from .constraint_pass import ConstraintPass
@@ -48,7 +49,7 @@ def substep(do, now):
                 do.apply_constraints(turn)
             if half % do.halves == do.halves - 1:
                 do.solve_contacts(turn)
-                if ti.static(do.bounces):
+                if ti.static(do.has_restitution):
                     for _ in range(REBOUNDS):
                         if turn.first != 0 and do.struck() != 0:
                             do.rebound(turn)
@@ -56,7 +57,7 @@ def substep(do, now):
     if ti.static(do.finishes):
         if do.leaves(now):
             do.finish_substep(now)
-    if ti.static(do.calms):
+    if ti.static(do.projects_velocities):
         if do.leaves(now) and now.damps != 0:
             for k in range(PASSES):
                 do.project_contact_velocities(now.of(k))
@@ -134,13 +135,14 @@ class Step:
     """
 
     diagnostics: Any  # what sums up a frame; given once it is there
+    n: Any = OnDevice()  # particles
 
     def __init__(
         self, scene: Scene, integrator: Any, batches: list[Batch], drivers: list[Batch], contact: Any, grid: Any,
         walls: list[Collider], team: Team,
     ):  # fmt: skip
         self.scene, self.state, self.slots, self.team = scene, scene.state, scene.slots, team
-        self.n, self.dim, self.real = scene.particles.count, scene.particles.dim, scene.real
+        self.n, self.dim, self.real = scene.count, scene.particles.dim, scene.real
         self.integrator, self.grid, self.walls, self.drivers, self.batches = integrator, grid, walls, drivers, batches
         self.posed = [w for w in walls if w.poses]
         self.breakers: list[Any] = [b for b in batches if b.breaks]
@@ -152,7 +154,7 @@ class Step:
         self.contact_pass = ContactPass(scene, contact, self.particles, team)
         self.contacts = self.particles.contacts
         self.halves = 2 if batches and contact else 1  # of a pass, each with a list that is good
-        self.bounces, self.calms = self.contact_pass.bounces, self.contact_pass.calms
+        self.has_restitution, self.projects_velocities = self.contact_pass.has_restitution, self.contact_pass.projects_velocities
         self.finishes = self.contact_pass.remembers or bool(self.breakers)
         self.hashes = bool(grid)
         if grid:
@@ -263,7 +265,7 @@ class Step:
     def integrate(self, now):
         """Particles move on their own. Walls go to where they are in this substep."""
         if ti.static(self.integrator.springs_pull):
-            self.constraints.kick(now.thread, now.h)
+            self.constraints.spring_forces(now.thread, now.h)
         for w in ti.static(self.posed):
             ti.loop_config(serialize=True)
             for _ in range(self.team.one(1, now.thread)):
@@ -352,7 +354,7 @@ class Step:
         """
         for f in ti.static(self.breakers):
             for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
-                f.break_overloaded(c, self.integrator.reach(now.h, 0), now.tick)
+                f.break_overloaded(c, self.integrator.h2_effective(now.h, 0), now.tick)
         self.contact_pass.finish(now.thread)
         self.team.wait()
 
@@ -407,29 +409,29 @@ class Step:
         h = ti.cast(h64, self.real)
         if ti.static(self.constraints.springs):
             if ti.static(self.team.size == 1):
-                self.constraints.kick(0, h)
+                self.constraints.spring_forces(0, h)
             else:
                 for thread in range(self.team.spread):
                     if thread % LEAST == 0:
-                        self.constraints.kick(thread // LEAST, h)
+                        self.constraints.spring_forces(thread // LEAST, h)
         for i in range(self.n):
-            bond = 0 * self.state.d[i]
+            force = 0 * self.state.d[i]
             if ti.static(self.constraints.springs):
-                bond = self.slots.total_of(i)
-            self.state.d[i] = self.integrator.velocity_after(i, h, ti.cast(t, self.real), bond)
+                force = self.slots.total_of(i)
+            self.state.d[i] = self.integrator.velocity_after(i, h, ti.cast(t, self.real), force)
             if ti.static(self.state.carries):
                 self.state.d_low[i] = ti.zero(self.state.d[i])
 
     @ti.kernel
     def velocities(self, h64: ti.f64, t: ti.f64, firm64: ti.f64, soft64: ti.f64, out: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
-        """Velocities as the user sees them. firm, soft: see Batch.bond.
+        """Velocities as the user sees them. firm, soft: see Batch.push_reaction.
 
         With the multipliers of the last substep along the directions at its end they are second order, and have the momentum and
         the angular momentum of the motion, sum m x_n x (x_n - x_(n-1)) / h and what forces from outside add in h / 2.
         """
-        self.constraints.bond(ti.cast(firm64, self.real), ti.cast(soft64, self.real))
+        self.constraints.reactions(ti.cast(firm64, self.real), ti.cast(soft64, self.real))
         for i in range(self.n):
             h, time, firm = ti.cast(h64, self.real), ti.cast(t, self.real), ti.cast(firm64, self.real)
-            v = self.integrator.velocity_after(i, h, time, self.particles.felt(i, h, time, firm))
+            v = self.integrator.velocity_after(i, h, time, self.particles.reaction(i, h, time, firm))
             for k in ti.static(range(self.dim)):
                 out[i, k] = v[k]

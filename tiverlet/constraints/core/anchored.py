@@ -15,7 +15,7 @@ class Anchored(Batch):
     with unit vectors for gradients.
 
     Subclasses give, on the device, offsets(): C at the end and at the start of a substep, and offset_now(): C at present; where
-    they drive their particles instead (`drives`), drive(c, h, when) puts particle c in its place.
+    they drive their particles instead (`drives`), drive(c, h, frame_fraction) puts particle c in its place.
     """
 
     arity = 1
@@ -81,11 +81,11 @@ class Anchored(Batch):
             raise RuntimeError(f"{self!r}.load: driven particles are taken along whatever it takes; give compliance to measure.")
         if not self.acts:
             return np.zeros((self.count, self.scene.particles.dim))
-        scale = 1 / self.scene.hh if self.scene.hh else 0.0
+        scale = 1 / self.scene.h2_effective if self.scene.h2_effective else 0.0
         return scale * self.scene.memory.read(self.dev.lam)[: self.count].astype(np.float64)
 
     @ti.func
-    def offsets(self, c, when, first, fresh):
+    def offsets(self, c, frame_fraction, first, fresh):
         """C at the end and at the start of the substep."""
         zero = 0 * self.dev.state.d[0]
         return zero, zero
@@ -101,10 +101,10 @@ class Anchored(Batch):
         return self.dev.state.d[self.member(c, 0)]
 
     @ti.func
-    def solve(self, c, h, hh, when, first, fresh):
+    def solve(self, c, h, h2_effective, frame_fraction, first, fresh):
         """Multiplier before and after, and the size of the violation that this removes."""
         w = self.dev.w.of(self.member(c, 0))
-        C, C0 = self.offsets(c, when, first, fresh)
+        C, C0 = self.offsets(c, frame_fraction, first, fresh)
         lam, B = self.dev.lam[c], 0 * C
         if first != 0:
             lam = 0 * lam
@@ -112,7 +112,7 @@ class Anchored(Batch):
         if w > 0:
             alpha, A = 0 * w, 1 + 0 * w
             if ti.static(self.dev.spring.soft):
-                alpha = self.dev.spring.alpha[c] / hh
+                alpha = self.dev.spring.alpha[c] / h2_effective
                 A, now, last = self.dev.spring.law(c, h, w, fresh)
                 if first != 0:
                     self.dev.spring.history[c] = now * C0 + last * self.dev.spring.last[c]
@@ -124,14 +124,14 @@ class Anchored(Batch):
         return lam, new, size
 
     @ti.func
-    def relax(self, c, h, hh, when, first, fresh):
+    def relax(self, c, h, h2_effective, frame_fraction, first, fresh):
         """Draw the particle to its place."""
-        lam, new, size = self.solve(c, h, hh, when, first, fresh)
+        lam, new, size = self.solve(c, h, h2_effective, frame_fraction, first, fresh)
         self.dev.lam[c] = new
         self.push(c, 0, self.dev.w.of(self.member(c, 0)) * (new - lam))
 
     @ti.func
-    def kick(self, c, h):
+    def push_spring_force(self, c, h):
         """As in Scalar, for each axis."""
         move = 0 * self.dev.state.d[0]
         if ti.static(self.dev.spring.soft):
@@ -143,7 +143,7 @@ class Anchored(Batch):
         self.push(c, 0, move)
 
     @ti.func
-    def bond(self, c, firm, soft):
+    def push_reaction(self, c, firm, soft):
         """As in Scalar, for each axis."""
         scale = firm
         if ti.static(self.dev.spring.soft):
@@ -151,18 +151,19 @@ class Anchored(Batch):
         self.push(c, 0, scale * self.dev.w.of(self.member(c, 0)) * self.dev.lam[c])
 
     @ti.func
-    def residual_of(self, c, h, hh, when, fresh):
+    def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
         """What is left, relative to the size of the scene."""
-        _, _, size = self.solve(c, h, hh, when, 0, fresh)
+        _, _, size = self.solve(c, h, h2_effective, frame_fraction, 0, fresh)
         return size / self.dev.size
 
     @ti.func
-    def energy(self, c, back, hh, miss):
-        """|C|^2 / (2 alpha)."""
+    def energy(self, c, back, h2_effective, residual):
+        """|C|^2 / (2 alpha), of what bears a load: F C / 2, see Scalar."""
         out = ti.cast(0, ti.f64)
         if ti.static(self.dev.spring.soft):
             alpha = self.dev.spring.alpha[c]
             if alpha > 0:
                 C = self.offset_now(c, back)
                 out = ti.cast(C.dot(C) / (2 * alpha), ti.f64)
+                out *= self.dev.spring.solved(self.dev.lam[c].norm() * alpha, h2_effective, residual * self.dev.size)
         return out

@@ -116,7 +116,7 @@ class Enclosed(Scalar):
         return self.function.measure(q)
 
     @ti.func
-    def reduce_block(self, b, h, hh, first, fresh):
+    def reduce_block(self, b, h, h2_effective, first, fresh):
         """Of a block: f and f0, w |grad|^2; mass-split along both, current, start; its squared size, and of what it moves."""
         begin, end, c = self.dev.corners.block[b]
         i0 = self.dev.corners.hub(c)
@@ -148,21 +148,21 @@ class Enclosed(Scalar):
         return sums[0] / self.dev.state.dim, sums[1] / self.dev.state.dim, sums[2], W, turn, sums[6], sums[7]
 
     @ti.func
-    def relax(self, c, h, hh, when, first, fresh):
+    def relax(self, c, h, h2_effective, frame_fraction, first, fresh):
         """Find dlam."""
         if ti.static(self.arity > 0):
-            Scalar.relax(self, c, h, hh, when, first, fresh)
+            Scalar.relax(self, c, h, h2_effective, frame_fraction, first, fresh)
         else:
             f, f0, w, W, turn, extent, move = self.total(c)
-            violation, A, alpha, lam, W = self.equation(c, f, f0, w, W, h, hh, first, fresh)
+            violation, A, alpha, lam, W = self.equation(c, f, f0, w, W, h, h2_effective, first, fresh)
             if ti.static(self.dev.limited):
-                violation -= A * self.postpone(c, f0, W, when[1] - when[0], first)
+                violation -= A * self.postpone(c, f0, W, frame_fraction[1] - frame_fraction[0], first)
             new, left = self.jacobi_update(violation, A, alpha, lam, W, turn)
             new = self.limit_collapse(c, lam, new, extent, move)
             self.dev.lam[c], self.dev.change[c], self.dev.astray[c] = new, new - lam, turn == FAR
 
     @ti.func
-    def scatter_corner(self, e, h, hh, first, fresh):
+    def scatter_corner(self, e, h, h2_effective, first, fresh):
         """Move each corner by w_j dlam grad_j C."""
         c = self.dev.corners.owner[e]
         n = self.dev.start[e]
@@ -171,32 +171,32 @@ class Enclosed(Scalar):
         self.dev.corners.give(e, self.dev.w.of(self.dev.corners.members[e]) * self.dev.change[c] * n)
 
     @ti.func
-    def kick(self, c, h):
+    def push_spring_force(self, c, h):
         """As in Scalar; of outlines, scatter_corner() pushes what is found here."""
         if ti.static(self.arity > 0):
-            Scalar.kick(self, c, h)
+            Scalar.push_spring_force(self, c, h)
         else:
             f, f0, w, W, turn, extent, move = self.total(c)
             self.dev.change[c], self.dev.astray[c] = h * h * self.force(c, f, f0, w, h), 1
 
     @ti.func
-    def bond(self, c, firm, soft):
+    def push_reaction(self, c, firm, soft):
         """As in Scalar."""
         if ti.static(self.arity > 0):
-            Scalar.bond(self, c, firm, soft)
+            Scalar.push_reaction(self, c, firm, soft)
         else:
             pull = self.dev.lam[c] * ti.select(self.dev.spring.is_rigid(c), firm, soft)
             for e in range(self.dev.corners.starts[c], self.dev.corners.starts[c + 1]):
                 self.dev.corners.give(e, self.dev.w.of(self.dev.corners.members[e]) * pull * self.dev.outline.slope(e, 0))
 
     @ti.func
-    def residual_of(self, c, h, hh, when, fresh):
+    def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
         """The violation that is left, relative to the rest value."""
         if ti.static(self.arity > 0):
-            return Scalar.residual_of(self, c, h, hh, when, fresh)
+            return Scalar.residual_of(self, c, h, h2_effective, frame_fraction, fresh)
         else:
             f, f0, w, W, turn, extent, move = self.total(c)
-            violation, A, alpha, lam, W = self.equation(c, f, f0, w, W, h, hh, 0, fresh)
+            violation, A, alpha, lam, W = self.equation(c, f, f0, w, W, h, h2_effective, 0, fresh)
             new, left = self.jacobi_update(violation, A, alpha, lam, W, turn)
             if w == 0:  # collapsed, or static
                 for e in range(self.dev.corners.starts[c], self.dev.corners.starts[c + 1]):

@@ -1,7 +1,7 @@
 """Constraints that are one number, C = f - rest: how a substep fulfils them, from soft to rigid."""
 
 import warnings
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -9,10 +9,12 @@ from ... import checks
 from ...device import ti
 from ...features.feature import FAR, Batch, Knob, Scene
 from ...features.members import FixedSize
-from ...particles import Particles
 from ...tools import distinct
 from .spring import Spring, stiff
 from .strength import Strength, strength_of
+
+if TYPE_CHECKING:
+    from ...particles import Particles
 
 # Where constraints converge within a substep, SHAKE is an explicit method for what is across them, with its limits:
 TENSEST = 4.0  # (omega h)^2 of a vibration across a tension, beyond which Verlet diverges
@@ -85,7 +87,7 @@ class Scalar(Batch):
         self.members = FixedSize(type(self).__name__, indices)
         self._warn_duplicates()
 
-    def check_indices(self, particles: Particles) -> None:
+    def check_indices(self, particles: "Particles") -> None:
         """Check the particles of each constraint against those that there are."""
         self.members.check(repr(self), self.index_name, particles.count)
 
@@ -137,7 +139,7 @@ class Scalar(Batch):
         size *= np.sqrt((self.gradients(position) ** 2).sum(axis=(1, 2)) / 2)
         return np.divide(1, size, out=np.zeros(self.count), where=size > 0)
 
-    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+    def prepare(self, particles: "Particles", inv_mass: np.ndarray) -> None:
         """Check indices against the number of particles and settle the rest values."""
         self.check_indices(particles)
         if "rest" not in self.__dict__:
@@ -146,7 +148,7 @@ class Scalar(Batch):
             else:
                 self.rest = self._rest_given
 
-    def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
+    def review(self, particles: "Particles", inv_mass: np.ndarray) -> None:
         """Warn of constraints that are violated between particles that cannot move."""
         stuck = self.idle(inv_mass)
         if stuck.any():
@@ -187,6 +189,10 @@ class Scalar(Batch):
         """Which constraints act as forces, (m,): soft ones in substeps of an order above 2. See high_order.py."""
         return (self.compliance > 0) & (scene.order > 2)
 
+    def relaxed_alone(self, scene: Scene) -> np.ndarray:
+        """Which constraints no system is to have, (m,): forces, and those that end where gradients do."""
+        return self.acts_as_force(scene) | (self.cusp & (self.goal == 0) & (self.compliance == 0))
+
     @property
     def limited(self) -> bool:
         """Whether steps of the batch have to be limited, or had to be when kernels were compiled: f is curved, and some rigid."""
@@ -202,7 +208,8 @@ class Scalar(Batch):
         super().bind(scene)
         self.dev.forces = bool(self.acts_as_force(scene).any())
         start = self.rest_of(self.start.position) if self.count else np.zeros(0)
-        self.dev.scale = self.unit or (float(np.abs(start).mean()) if np.any(start) else self.start.size)
+        scale = self.unit or (float(np.abs(start).mean()) if np.any(start) else self.start.size)
+        self.dev.scale = scene.memory.number(scale, scene.real)
         name, m, add = repr(self), self.count, scene.memory.field
         self.dev.rest = add(f"{name}.rest", m, values=self.goal)
         self.dev.lam = add(f"{name}.multiplier", m, state=True)
@@ -249,7 +256,7 @@ class Scalar(Batch):
             raise RuntimeError(f"{self!r}.load: there is none before a world has been stepped with it.")
         if not self.acts:
             return np.zeros(self.count)
-        scale = 1 / self.scene.hh if self.scene.hh else 0.0
+        scale = 1 / self.scene.h2_effective if self.scene.h2_effective else 0.0
         return -scale * self.scene.memory.read(self.dev.lam)[: self.count].astype(np.float64)
 
     @ti.func
@@ -315,7 +322,7 @@ class Scalar(Batch):
         return value
 
     @ti.func
-    def equation(self, c, f, f0, w, W, h, hh, first, fresh):
+    def equation(self, c, f, f0, w, W, h, h2_effective, first, fresh):
         """A C + B + alpha' lam, A, alpha', lam and W (0 where it is broken), from f at the end and at the start, and w."""
         if ti.static(self.dev.strength.breaks):
             if not self.dev.strength.holds(c):
@@ -331,7 +338,7 @@ class Scalar(Batch):
         if ti.static(self.dev.spring.soft):
             if W > 0:
                 A, now, last = self.dev.spring.law(c, h, w, fresh)
-                alpha = self.dev.spring.alpha[c] / hh
+                alpha = self.dev.spring.alpha[c] / h2_effective
                 if first != 0:
                     rest = self.dev.rest[c]
                     B = now * self.bounded(f0 - rest) + last * self.bounded(self.unwrap(self.dev.spring.last[c], f0) - rest)
@@ -362,7 +369,7 @@ class Scalar(Batch):
         return out
 
     @ti.func
-    def linearise(self, c, h, hh, share, first, fresh):
+    def linearise(self, c, h, h2_effective, share, first, fresh):
         """What every solver knows of constraint c in a pass; of the state it writes nothing but the memory of soft constraints.
 
         Returns the violation A C + B + alpha' lam, A, alpha', lam, the mass-split weight W (0: no corner can move), directions n
@@ -386,17 +393,25 @@ class Scalar(Batch):
             there += split * n[k, :].dot(n[k, :])
         turn = self.dev.slots.turn(both, ti.sqrt(here * there))
         lost = turn == FAR
-        if ti.static(self.dev.cusp):
-            lost = lost or (self.dev.rest[c] == 0 and self.dev.spring.is_rigid(c))
+        if self.has_cusp(c):
+            lost, turn = True, 0
         if ti.static(self.dev.converges):
             if self.dev.spring.is_rigid(c):
                 lost = lost or ti.abs(self.bounded(f0 - self.dev.rest[c])) * self.dev.inverse_size[c] > LOST
         if lost:
             n, both = g, here
-        violation, A, alpha, lam, W = self.equation(c, f, f0, w, both, h, hh, first, fresh)
+        violation, A, alpha, lam, W = self.equation(c, f, f0, w, both, h, h2_effective, first, fresh)
         if ti.static(self.dev.limited):
             violation -= A * self.postpone(c, f0, W, share, first)
         return violation, A, alpha, lam, W, n, g, turn * ti.cast(self.direction_reliable(f, f0), ti.i32), f - f0
+
+    @ti.func
+    def has_cusp(self, c):
+        """Whether constraint c ends where gradients do: its directions mean nothing, from one substep or pass to the next."""
+        out = False
+        if ti.static(self.dev.cusp):
+            out = self.dev.rest[c] == 0 and self.dev.spring.is_rigid(c)
+        return out
 
     @ti.func
     def jacobi_update(self, violation, A, alpha, lam, W, turn):
@@ -472,9 +487,11 @@ class Scalar(Batch):
         return new, far
 
     @ti.func
-    def relax(self, c, h, hh, when, first, fresh):
+    def relax(self, c, h, h2_effective, frame_fraction, first, fresh):
         """Move each corner by w_j dlam grad_j C; a constraint that belongs to a system tells it what it knows."""
-        violation, A, alpha, lam, W, n, g, turn, moved = self.linearise(c, h, hh, when[1] - when[0], first, fresh)
+        violation, A, alpha, lam, W, n, g, turn, moved = self.linearise(
+            c, h, h2_effective, frame_fraction[1] - frame_fraction[0], first, fresh
+        )
         step = ti.cast(1, self.dev.real)
         if ti.static(self.dev.in_system):
             row = self.dev.row[c]
@@ -483,18 +500,18 @@ class Scalar(Batch):
                 if ti.static(self.dev.limited):
                     if W > 0:
                         new, _ = self.jacobi_update(violation, A, alpha, lam, W, 0)
-                        new, far = self.limit_step(c, lam, new, n, when[1] - when[0], 1)
+                        new, far = self.limit_step(c, lam, new, n, frame_fraction[1] - frame_fraction[0], 1)
                         if far:  # the others follow: a row without a weight goes back by its multiplier
                             start, weight = lam - new, 0 * W
                 self.dev.slots.system.set_row(row, violation, A, alpha, start, weight, self.geometric_stiffness(c, weight))
-                if ti.static(self.dev.slots.system.guarded):
+                if ti.static(self.dev.slots.system.limits_steps):
                     u, split, longest, _ = self.motion(c, n, 0)
                     spare, most = ti.math.inf + 0 * u, ti.math.inf + 0 * u
                     if split > 0 and self.dev.spring.is_rigid(c):
                         spare = 2 * (violation - moved) ** 2 / split
                         if ti.static(self.dev.limited):
                             most = TRUST * self.reach(c, self.corners(c, 0)) / longest
-                    self.dev.slots.system.guard(row, u, spare, most, lam - new)
+                    self.dev.slots.system.limit_row(row, u, spare, most, lam - new)
                 for k in ti.static(range(self.arity)):
                     self.dev.slots.system.set_gradient(self.dev.places[c][k], self.member(c, k), g[k, :])
                 if violation != 0:
@@ -510,15 +527,16 @@ class Scalar(Batch):
                     new = self.limit_collapse(c, lam, new, self.corners(c, 0).norm_sqr(), move)
                 step = new - lam
                 if ti.static(self.dev.steps):
-                    last = self.dev.step[c]
+                    last, wanted = self.dev.step[c], new
                     if first != 0:
                         last = 0
-                    wanted = lam + self.dev.slots.semi_iteration.step(last, step)
+                    if not self.has_cusp(c):  # there the last step went elsewhere
+                        wanted = lam + self.dev.slots.semi_iteration.step(last, step)
                     step = self.dev.slots.limited(wanted, self.geometric_stiffness(c, W / 2)) - lam  # split by two in a chain
                     new = lam + step
                 if ti.static(self.dev.limited):
                     if W > 0:
-                        new, _ = self.limit_step(c, lam, new, n, when[1] - when[0], 0)
+                        new, _ = self.limit_step(c, lam, new, n, frame_fraction[1] - frame_fraction[0], 0)
                         step = new - lam
                 if ti.static(self.dev.steps):
                     self.dev.step[c] = step
@@ -552,7 +570,7 @@ class Scalar(Batch):
                     self.dev.lam[c] = self.dev.lam[c] + step
 
     @ti.func
-    def kick(self, c, h):
+    def push_spring_force(self, c, h):
         """h^2 w_j F grad_j C with F = -(1 - theta) (C / alpha + damping dC/dt).
 
         Rigid links find their force in the next substep.
@@ -570,7 +588,7 @@ class Scalar(Batch):
 
     @ti.func
     def force(self, c, f, f0, w, h):
-        """F of kick(), from f now and a substep ago."""
+        """F of push_spring_force(), from f now and a substep ago."""
         force = ti.cast(0, self.dev.real)
         if ti.static(self.dev.spring.soft):
             alpha = self.dev.spring.alpha[c]
@@ -586,7 +604,7 @@ class Scalar(Batch):
         return force
 
     @ti.func
-    def bond(self, c, firm, soft):
+    def push_reaction(self, c, firm, soft):
         """scale w_j lam grad_j C(x_n)."""
         _, g = self.measure(c, self.corners(c, 0))
         pull = self.dev.lam[c] * ti.select(self.dev.spring.is_rigid(c), firm, soft)
@@ -594,14 +612,14 @@ class Scalar(Batch):
             self.push(c, k, self.dev.w.of(self.member(c, k)) * pull * g[k, :])
 
     @ti.func
-    def break_overloaded(self, c, hh, tick):
+    def break_overloaded(self, c, h2_effective, tick):
         """Break constraint c if its load in this substep was too large; it acts no more from the next one on."""
-        self.dev.strength.test(c, ti.abs(self.dev.lam[c]), hh, tick)
+        self.dev.strength.test(c, ti.abs(self.dev.lam[c]), h2_effective, tick)
 
     @ti.func
-    def residual_of(self, c, h, hh, when, fresh):
+    def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
         """The violation that is left, relative to the rest value (to the batch's mean f where that is 0)."""
-        violation, A, alpha, lam, W, _, _, _, _ = self.linearise(c, h, hh, 0 * h, 0, fresh)
+        violation, A, alpha, lam, W, _, _, _, _ = self.linearise(c, h, h2_effective, 0 * h, 0, fresh)
         _, left = self.jacobi_update(violation, A, alpha, lam, W, 0)
         if ti.static(self.collapses > 0):
             f, g = self.measure(c, self.corners(c, 0))
@@ -610,11 +628,10 @@ class Scalar(Batch):
         return left / self.residual_scale(c)
 
     @ti.func
-    def energy(self, c, back, hh, miss):
+    def energy(self, c, back, h2_effective, residual):
         """Elastic energy [J] at x - back d: F C / 2, which is C^2 / (2 alpha) once solved.
 
-        What a solver leaves of the violation bears no load: the spring is as soft as it was solved, F = C / (alpha + what that
-        adds), and 1 / alpha would count energy that nobody supplied. hh: F = -lam / hh; 0 where there was no substep yet.
+        See Spring.solved(). h2_effective: F = -lam / h2_effective; 0 where there was no substep yet.
         """
         out = ti.cast(0, ti.f64)
         if ti.static(self.dev.spring.soft):
@@ -623,15 +640,15 @@ class Scalar(Batch):
                 C = self.bounded(self.unwrap(self.value(c, back), self.dev.rest[c]) - self.dev.rest[c])
                 out = ti.cast(C, ti.f64) * C / (2 * alpha)
                 if ti.static(not self.dev.forces):
-                    if hh > 0 and miss > 0:
-                        borne = ti.abs(self.dev.lam[c]) * alpha / hh
-                        out *= borne / (borne + miss * self.residual_scale(c))
+                    out *= self.dev.spring.solved(
+                        ti.abs(self.dev.lam[c]) * alpha, h2_effective, residual * self.residual_scale(c)
+                    )
         return out
 
     @ti.func
     def residual_scale(self, c):
         """What the residual of constraint c is relative to."""
-        size = ti.cast(self.dev.scale, self.dev.real)
+        size = self.dev.scale.now
         if ti.static(not self.unit):
             if self.dev.rest[c] != 0:
                 size = ti.abs(self.dev.rest[c])

@@ -1,9 +1,13 @@
 """Springs of constraints: one law from soft to rigid, for every constraint that has a spring. See Scalar for the letters."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ...device import ti
-from ...features.feature import Scene
+
+if TYPE_CHECKING:
+    from ...features.feature import Scene
 
 
 @ti.func
@@ -33,7 +37,7 @@ class Spring:
     """
 
     def __init__(
-        self, scene: Scene, name: str, compliance: np.ndarray | None, damping: np.ndarray | None, start: np.ndarray
+        self, scene: "Scene", name: str, compliance: np.ndarray | None, damping: np.ndarray | None, start: np.ndarray
     ):  # fmt: skip
         add, width = scene.memory.field, start.shape[1] if start.ndim == 2 else 0
         self._memory, self.real = scene.memory, scene.real
@@ -67,6 +71,19 @@ class Spring:
         out = ti.cast(0, self.real)
         if ti.static(self.damped):
             out = self.damping[c]
+        return out
+
+    @ti.func
+    def solved(self, borne, h2_effective, left):
+        """F C / 2 over C^2 / (2 alpha): the part of a violation that bears the load; `left` is the rest of it.
+
+        What a solver leaves of a violation bears no load: the spring is as soft as it was solved, F = C / (alpha + what that
+        adds), and 1 / alpha would count energy that nobody supplied. borne: alpha |lam|, for the part alpha |lam| / h2_effective,
+        which is 0 where there was no substep yet.
+        """
+        out = ti.cast(1, self.real)
+        if h2_effective > 0 and left > 0:
+            out = borne / (borne + left * h2_effective)
         return out
 
     @ti.func

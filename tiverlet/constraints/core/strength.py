@@ -1,17 +1,19 @@
 """When constraints break."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ... import checks
 from ...device import ti
-from ...features.feature import Batch, Scene
+
+if TYPE_CHECKING:
+    from ...features.feature import Batch, Scene
 
 BREAKS = 2**30  # substeps after which the number of one comes again
 
 
-def strength_of(batch: Batch, value: Any) -> np.ndarray | None:
+def strength_of(batch: "Batch", value: Any) -> np.ndarray | None:
     """break_at as the user gives it, checked: (m,), or None for never."""
     if value is None:
         return None
@@ -27,7 +29,7 @@ class Strength:
     Where the batch never `breaks` it costs nothing. in_state: what it has in the exact state, by name.
     """
 
-    def __init__(self, scene: Scene, name: str, batch: Any):
+    def __init__(self, scene: "Scene", name: str, batch: Any):
         self._memory, self.breaks, self.in_state = scene.memory, batch.breaks, {}
         if self.breaks:
             limit = np.full(batch.count, np.inf) if batch.break_at is None else batch.break_at
@@ -54,8 +56,8 @@ class Strength:
         return out
 
     @ti.func
-    def test(self, c, load, hh, tick):
+    def test(self, c, load, h2_effective, tick):
         """Break constraint c in this substep if its load, given as a multiplier, is too large."""
-        if self.stamp[c] == 0 and load > self.limit[c] * hh:
+        if self.stamp[c] == 0 and load > self.limit[c] * h2_effective:
             self.stamp[c] = tick % ti.static(BREAKS) + 1
             self.counter[None] += 1

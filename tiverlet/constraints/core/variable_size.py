@@ -101,7 +101,7 @@ class Corners:
         relax(c)   adds up its blocks, blocks[c] to blocks[c + 1], in order, and solves
         scatter_corner(e)  gives corner e its move, with give(e, move)
 
-    The same loops run before kick(), and reduce_block() before residual_of() where the batch `reweighs`.
+    The same loops run before push_spring_force(), and reduce_block() before residual_of() where the batch `reweighs`.
     members, owner: the particle and the constraint of each corner. starts: the first corner of each constraint.
     """
 

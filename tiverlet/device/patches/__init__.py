@@ -1,1 +1,13 @@
-"""What replaces parts of Taichi 1.7.4, so that kernels compile and launch sooner, to the same bits."""
+"""What replaces parts of Taichi 1.7.4, so that kernels compile and launch sooner, to the same bits.
+
+device/__init__.py applies them where `patched` holds.
+"""
+
+import os
+from typing import Any
+
+from ..language import COMPILER, ti
+
+# Whether Taichi is the one that these are made for, and TIVERLET_PATCHES is not 0.
+patched = COMPILER == "taichi" and ti.__version__ == (1, 7, 4) and os.environ.get("TIVERLET_PATCHES") != "0"
+active: list[Any] = []  # Compilers whose kernels are being compiled or launched, the innermost last

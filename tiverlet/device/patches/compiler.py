@@ -2,9 +2,9 @@
 
 Most of that time goes into Taichi's analysis of control flow and, in small worlds, its simplifier; LLVM does both again. They are
 left out while a kernel of ours compiles, and only then: what the user compiles in the same process is compiled as ever. A kernel
-with the user's functions in it keeps them, because they can hide what LLVM ends the process for: a vector assigned to a variable
-that is a number, where nobody reads it (`_, gap, _ = nearest(x)`). How functions are read is in source_cache.py,
-and how they become statements in syntax_cache.py.
+keeps them where a vector is assigned to a variable that is a number, as functions of the user's may do where nobody reads it
+(`_, gap, _ = nearest(x)`): Taichi finds that nobody does, and LLVM would end the process. How functions are read is in
+source_cache.py, and how they become statements in syntax_cache.py.
 
 Everything here knows the inside of Taichi 1.7.4; with another one, kernels are compiled as Taichi does.
 """
@@ -14,13 +14,12 @@ import gc
 import threading
 from collections.abc import Callable, Iterator
 from functools import partial
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from taichi.lang import _wrap_inspect, impl
 
-from .source_cache import active, patched
+from ..language import callable_in_kernels, impl, sources
+from . import active, patched
 
 HOSTS = ("Arch.x64", "Arch.arm64")  # whose kernels LLVM makes as fast without it; measured on x64
 # No variables for what loops read and write at one address: Taichi does not see that another address may be the same place, such
@@ -52,6 +51,13 @@ class Compiler:
         self._settings: dict[str, Any] = {}  # that Taichi was started with
         self._thread = 0
         self.refused: Exception | None = None  # what is wrong with a function that is being compiled, see refuse()
+        self.places: list[tuple[Any, int]] = []  # where the world's fields are: layouts and addresses
+
+    def point(self) -> None:
+        """Have kernels find the fields of this world."""
+        for layout, address in self.places:
+            if layout.shared:
+                layout.point(address)
 
     def __call__(self) -> contextlib.AbstractContextManager[None]:
         """The context; inside itself it has nothing to do."""
@@ -71,6 +77,7 @@ class Compiler:
             _set(config, self.lean if str(config.arch) in HOSTS and not self.thorough else SAFE)
             active.append(self)
             self._thread = threading.get_ident()
+            self.point()
             collects = gc.isenabled()
             gc.disable()  # trees are many small objects, none of them garbage
             try:
@@ -82,13 +89,15 @@ class Compiler:
                 raise error from None
             finally:
                 active.pop()
+                if active:
+                    active[-1].point()
                 runtime.set_default_fp(literals)
                 _set(config, before)
                 if collects:
                     gc.enable()
 
     def beware(self) -> None:
-        """Be thorough from here on: a function that is not ours is being compiled."""
+        """Be thorough from here on: there is what LLVM does not take as it is."""
         runtime: Any = impl.get_runtime()
         self.thorough = True
         _set(runtime.prog.config(), self._settings | SAFE)
@@ -104,7 +113,7 @@ def refuse(error: Exception) -> None:
 def readable(function: Any) -> bool:
     """Whether Taichi will find the source of a Python function."""
     try:
-        _wrap_inspect.getsourcelines(function)
+        sources.getsourcelines(function)
     except (OSError, TypeError):
         return False
     return True
@@ -116,8 +125,7 @@ def inline(function: Any) -> Any:
     Taichi compiles a call of a ti.func by reading its source, copying each argument to a variable, and each result: as much as
     for ten more operations.
     """
-    function._is_taichi_function, function.func = True, SimpleNamespace(has_print=False)  # it asks functions for these two
-    return function
+    return callable_in_kernels(function)
 
 
 def record(kind: Any) -> Any:
@@ -150,7 +158,9 @@ class CachedLaunch:
 
     def launch(self) -> None:
         """Launch it when it is compiled."""
-        self._ready()
+        with _lock:  # lest another thread's world is told to kernels before
+            self.compiler.point()
+            self._ready()
 
     def _prepared(self) -> Callable[[], Any]:
         """A launch; each one on a GPU, which copies arrays to and fro, has a context of its own."""

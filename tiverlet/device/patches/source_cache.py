@@ -18,15 +18,16 @@ import weakref
 from types import CodeType, SimpleNamespace
 from typing import Any
 
-import taichi as ti
 from taichi.lang import impl, kernel_impl, matrix, snode
 from taichi.lang.ast import ASTTransformerContext
+
+from ..language import ti
+from . import active
 
 # Where functions come from that are known to be safe.
 HOME = OURS, TAICHI = tuple(str(p) + os.sep for p in (pathlib.Path(__file__).parents[2], pathlib.Path(ti.__file__).parent))
 CLOSING = (")", "]", "}")  # what the last lines of a function may begin with that are not in its code
 NOTHING = 8  # bytes of code of a function that has nothing but a docstring
-active: list[Any] = []  # Compilers whose kernels are being compiled or launched, the innermost last
 _lines: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()  # of functions, as inspect finds them
 
 
@@ -34,8 +35,6 @@ def _lines_of(function) -> tuple[list[str], int]:
     """The source of a function that is about to be compiled, found once and not at each call of it."""
     if not active:
         return _find_lines(function)
-    if not function.__code__.co_filename.startswith(HOME):
-        active[-1].beware()
     if function not in _lines:
         _lines[function] = _cut_out(function.__code__) or _find_lines(function)
     return _lines[function]
@@ -108,25 +107,16 @@ def _trace(stacklevel: int = 1) -> str:
     return "" if frame and frame.f_code.co_filename.startswith(OURS) else _who(stacklevel + 1)
 
 
-def _patch() -> bool:
-    """Put these in the place of what Taichi calls, if it is the Taichi that they are made for and TIVERLET_PATCHES is not 0."""
-    names = ("getsourcelines", "textwrap", "_inside_class")
-    if (
-        os.environ.get("TIVERLET_PATCHES") == "0"
-        or ti.__version__ != (1, 7, 4)
-        or not all(hasattr(kernel_impl, name) for name in names)
-    ):
-        return False
+def apply() -> None:
+    """Put these in the place of what Taichi calls."""
     kernel_impl.getsourcelines, kernel_impl._inside_class = _lines_of, _in_class
     kernel_impl.textwrap = SimpleNamespace(fill=_filled, dedent=_dedented)
     context: Any = ASTTransformerContext
     context.get_pos_info, context.line, context.place = _place_of, 0, ""
     impl.get_traceback = matrix.get_traceback = snode.get_traceback = _trace
-    return True
 
 
-_find_lines: Any = getattr(kernel_impl, "getsourcelines", None)
-_look_around: Any = getattr(kernel_impl, "_inside_class", None)
-_draw: Any = getattr(ASTTransformerContext, "get_pos_info", None)
-_who: Any = getattr(snode, "get_traceback", None)
-patched = _patch()
+_find_lines: Any = kernel_impl.getsourcelines
+_look_around: Any = kernel_impl._inside_class
+_draw: Any = ASTTransformerContext.get_pos_info
+_who: Any = snode.get_traceback

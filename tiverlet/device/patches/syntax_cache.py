@@ -13,18 +13,19 @@ import operator
 from functools import cache, lru_cache, wraps
 from typing import Any
 
-import taichi as ti
 from taichi._lib import core
 from taichi.lang import expr, impl, matrix_ops
 from taichi.lang.any_array import AnyArray
 from taichi.lang.ast import ast_transformer
 from taichi.lang.ast.ast_transformer import ASTTransformer
 from taichi.lang.ast.ast_transformer_utils import LoopStatus, ReturnStatus
+from taichi.lang.common_ops import TaichiOperations
 from taichi.lang.expr import Expr
 from taichi.lang.field import ScalarField
 from taichi.lang.matrix import MatrixField
 
-from .source_cache import active, patched
+from ..language import at, ti
+from . import active
 
 PLACES = 1000  # lines of code that are kept as what Taichi tells its compiler about where things are
 INT = range(-(2**31), 2**31)  # what a literal may be without a type of its own
@@ -153,6 +154,15 @@ def _target(value: Any) -> Any:
     return value.ptr if kind in (MatrixField, AnyArray) or kind is Expr and value.is_tensor() else None
 
 
+def _assigned(self: Any, value: Any) -> Any:
+    """An assignment. That of a vector to a number, or of a number to a truth value, ends the process where Taichi does not find
+    that nobody reads it."""
+    if active and type(self) is type(value) is Expr and not self.is_tensor():
+        if value.is_tensor() or self.ptr.get_rvalue_type() == ti.u1 and value.ptr.get_rvalue_type() != ti.u1:
+            active[-1].beware()
+    return _assign(self, value)
+
+
 def _product(x: Any, y: Any) -> Any:
     """The dot product of two vectors: the same sum in the same order, without the functions inside functions that Taichi makes
     of it, which copy their arguments."""
@@ -163,19 +173,14 @@ def _product(x: Any, y: Any) -> Any:
     return sum((at(parts, k) for k in range(1, x.get_shape()[0])), at(parts, 0))
 
 
-def at(field: Any, index: Any) -> Any:
-    """field[index], in a Python function that a kernel calls as it is; see compiling.inline."""
-    runtime: Any = impl.get_runtime()
-    return impl.subscript(runtime.compiling_callable.ast_builder(), field, index)
-
-
-def _patch() -> None:
+def apply() -> None:
     """Put these in the place of what Taichi calls."""
     core.DebugInfo = lru_cache(PLACES)(core.DebugInfo)
     Expr.__init__, impl.expr_init, impl.subscript = _express, _variable, _subscript
     ASTTransformer.__call__, ASTTransformer.get_decorator = _visited, staticmethod(_decorated)
     ASTTransformer.build_call_if_is_builtin, ast_transformer.build_stmts = staticmethod(_builtin), _statements
     matrix_ops.dot = wraps(_dot)(_product)
+    operations._assign = _assigned
 
 
 _visit: Any = ASTTransformer.__call__
@@ -187,5 +192,5 @@ _init: Any = Expr.__init__
 _declare: Any = impl.expr_init
 _at: Any = impl.subscript
 _dot: Any = matrix_ops.dot
-if patched:
-    _patch()
+operations: Any = TaichiOperations
+_assign: Any = operations._assign

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from time import perf_counter
 from typing import Any
 
-import taichi as ti
-from taichi.lang import common_ops, impl, kernel_impl
-from taichi.lang.ast.ast_transformer import ASTTransformer
-
+from ..language import COMPILER, NAME, impl, module, ti
 from .compiler import CachedLaunch
 
+Kernel: Any = module("kernel_impl" if COMPILER == "taichi" else "kernel").Kernel
+ASTTransformer: Any = module("ast.ast_transformer").ASTTransformer
+Operations: Any = getattr(module("common_ops"), f"{NAME}Operations")
 ATOMIC = (ti.atomic_add, ti.atomic_sub, ti.atomic_max, ti.atomic_min)
 
 
@@ -47,9 +47,9 @@ def launches(timed: bool = False) -> Iterator[Launches]:
     count = Launches()
 
     def counted(launch, name):
-        def run(self, *args):
+        def run(self, *args, **options):
             clock = perf_counter()
-            out = launch(self, *args)
+            out = launch(self, *args, **options)
             known = name(self, args)
             count[known] += 1
             if timed:
@@ -60,7 +60,7 @@ def launches(timed: bool = False) -> Iterator[Launches]:
         return run
 
     with replaced(
-        (kernel_impl.Kernel, "launch_kernel", counted(kernel_impl.Kernel.launch_kernel, known_as)),
+        (Kernel, "launch_kernel", counted(Kernel.launch_kernel, known_as)),
         (CachedLaunch, "launch", counted(CachedLaunch.launch, lambda quick, _: quick.name)),
     ):
         yield count
@@ -97,14 +97,14 @@ class Tracer:
     @contextlib.contextmanager
     def watching(self) -> Iterator[None]:
         """While this lasts."""
-        materialize, subscript = kernel_impl.Kernel.materialize, impl.subscript
+        materialize, subscript = Kernel.materialize, impl.subscript
         loop, call = ASTTransformer.build_range_for, ASTTransformer.build_Call
-        common: Any = common_ops.TaichiOperations
-        assign, augment = common._assign, common._augassign
+        assign, augment = Operations._assign, Operations._augassign
 
-        def translated(kernel, key=None, args=(), arg_features=None):
+        def translated(kernel, **given):
             self._open, self._known = [], {}
-            out = materialize(kernel, key=key, args=args, arg_features=arg_features)
+            out = materialize(kernel, **given)
+            args = given.get("args") or given.get("py_args") or ()
             if self._known:  # it was not there already
                 self.sweeps[known_as(kernel, args)] = self._open
             return out
@@ -150,8 +150,8 @@ class Tracer:
             return out
 
         with replaced(
-            (kernel_impl.Kernel, "materialize", translated), (ASTTransformer, "build_range_for", staticmethod(looped)),
-            (impl, "subscript", subscripted), (common, "_assign", assigned), (common, "_augassign", changed),
+            (Kernel, "materialize", translated), (ASTTransformer, "build_range_for", staticmethod(looped)),
+            (impl, "subscript", subscripted), (Operations, "_assign", assigned), (Operations, "_augassign", changed),
             (ASTTransformer, "build_Call", staticmethod(called)),
         ):  # fmt: skip
             yield

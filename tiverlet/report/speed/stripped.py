@@ -1,4 +1,4 @@
-"""A copy of the package without the files of the features that a scene does not use, without reports and recording."""
+"""A copy of the package without the files of the features that a scene does not use, without reports, recording and play."""
 
 import ast
 import os
@@ -9,7 +9,7 @@ import shutil
 PACKAGE = pathlib.Path(__file__).parents[2]
 FOLDERS = ("colliders", "constraints", "contact", "forces")
 HERE = ("child.py", "counting.py", "scenes.py")  # what the process of a scene runs
-IGNORED = shutil.ignore_patterns("__pycache__", "recording", "report", "commands")
+IGNORED = shutil.ignore_patterns("__pycache__", "recording", "live", "report", "commands")
 
 
 def copy(folder: str, needs: frozenset[str]) -> str:

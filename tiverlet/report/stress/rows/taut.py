@@ -131,7 +131,10 @@ def _braced() -> Finding:
     below, above = (k[:-1, :-1], k[1:, :-1], k[:-1, 1:]), (k[1:, :-1], k[1:, 1:], k[:-1, 1:])
     triangles = np.concatenate([np.stack([corner.ravel() for corner in half], axis=1) for half in (below, above)])
     particles = Particles(x, mass=MASS, pinned=np.arange(3))
-    watch.run("areas", particles, [Gravity(G), Distance(pairs, compliance=1e-3), Area(triangles)], solver=Jacobi())
+    loops = np.stack([c.ravel() for c in (k[:-1, :-1], k[1:, :-1], k[1:, 1:], k[:-1, 1:])], axis=1)
+    for name, areas, compliance in (("areas", triangles, 1e-3), ("loops", list(loops), 0.0)):
+        links_ = Distance(pairs, compliance=compliance)
+        watch.run(name, particles, [Gravity(G), links_, Area(areas)], solver=Jacobi())
     return watch.finding()
 
 
@@ -175,10 +178,11 @@ def _twice() -> Finding:
             [Gravity(G), Distance(np.vstack([once, once]), rest)],
             solver=solver,
         )
-        at = np.vstack([x, x[:1], x[-1:]])
+    at = np.vstack([x, x[:1], x[-1:]])
+    hung = Particles(at, mass=MASS, pinned=[n, n + 1])
+    for solver, passes in ((Direct(), 1), (Jacobi(), 1), (Chebyshev(), 4), (ConjugateGradient(8), 1)):
         zero = Distance(np.vstack([once, [[n, 0], [n - 1, n + 1]]]))
-        hung = Particles(at, mass=MASS, pinned=[n, n + 1])
-        watch.run("length 0", hung, [Gravity(G), zero], precision="f64", solver=solver)
+        watch.run("length 0", hung, [Gravity(G), zero], precision="f64", solver=solver, iterations=passes)
     return watch.finding()
 
 
@@ -188,7 +192,9 @@ def _clusters() -> Finding:
     x, pairs = grid(3, 5)
     k = np.arange(15).reshape(3, 5).T
     shared = ShapeMatch([k[:3].ravel(), k[2:].ravel()])
-    watch.run("shared", Particles(x, mass=MASS, pinned=[0]), [Gravity(G), shared], steps=STEPS[:3])
+    watch.run("shared", Particles(x, mass=MASS, pinned=[0]), [Gravity(G), shared])
+    row_, _ = grid(8, 2)
+    watch.run("in a row", Particles(row_, mass=MASS, pinned=[0, 1]), [Gravity(G), ShapeMatch(np.arange(4) + 2 * k[:7, :1])])
     watch.run("links inside", Particles(x, mass=MASS, pinned=[0]), [Gravity(G), ShapeMatch([np.arange(15)]), Distance(pairs)])
     return watch.finding()
 

@@ -1,0 +1,274 @@
+"""Scenes that are taken by hand: the hand's law, what pages may ask for, and a real mouse in a real browser."""
+
+import json
+import shutil
+import threading
+import time
+import urllib.error
+import urllib.request
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+from tiverlet.commands.play import built
+from tiverlet.live import session
+from tiverlet.live.server import Server
+from tiverlet.live.session import Session
+from tiverlet.recording import surfaces
+
+pytest.importorskip("websockets")
+from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
+from websockets.sync.client import connect  # noqa: E402
+
+pytestmark = pytest.mark.usefixtures("read_here")
+
+
+def test_a_hand_is_a_critically_damped_spring_on_whom_it_holds(world):
+    # x'' = -k^2 x - 2 k x' from x0 at rest: x0 (1 + k t) exp(-k t). Second order: half the substep, a quarter of the error.
+    hand = tv.Hand((0, 0), 1, rate=5.0)
+    w = world(tv.Particles([[3.0, 0], [1.0, 2], [2.0, 2]]), [hand], precision="f64", substeps=8)
+    exact, errors = 6 * np.exp(-5.0), []
+    for substeps in (8, 16):
+        w.substeps, w.position, w.velocity = substeps, w.particles.position, np.zeros((3, 2))
+        w.run(1.0, dt=0.1)
+        errors.append(np.abs(w.position[1] - exact * np.array([1.0, 2])).max())
+    assert errors[0] < 1e-3 and errors[0] / errors[1] == pytest.approx(4, rel=0.2)
+    np.testing.assert_array_equal(w.position[[0, 2]], w.particles.position[[0, 2]])
+    fields = w.fields
+    hand.particle, hand.target = 2, (5, 5)  # another one, elsewhere: nothing is built or compiled again
+    w.run(3.0, dt=0.1)
+    np.testing.assert_allclose(w.position[2], (5, 5), atol=1e-4)  # 3 (1 + 15) exp(-15) = 1e-5
+    assert w.fields == fields and w.position[1, 1] < 0.1
+    for wrong in (3, -2, 1.5):
+        with pytest.raises((ValueError, TypeError), match="Hand: particle"):
+            hand.particle = wrong
+    with pytest.raises(ValueError, match="target"):
+        hand.target = (0, np.nan)
+    w.remove([0])
+    assert hand.particle == 1
+    w.remove([1])
+    assert hand.particle == -1
+
+
+@pytest.fixture
+def server():
+    made = Server()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def rope(world):
+    line = tv.shapes.rope((0, 2), (1, 2), points=6)
+    return world(tv.Particles(line.position, radius=0.02, pinned=[0]), [tv.Gravity(9.81), tv.Distance(line.links)], substeps=4)
+
+
+def page(server, **headers):
+    origin = headers.pop("origin", f"http://127.0.0.1:{server.port}")
+    return connect(server.url.replace("http", "ws") + "socket", origin=origin, additional_headers=headers, compression=None)
+
+
+def figures(message: bytes) -> tuple[dict, np.ndarray]:
+    length = int.from_bytes(message[:4], "little")
+    return json.loads(message[4 : 4 + length]), np.frombuffer(message[4 + length :], "<f4")
+
+
+def hear(server, count: int) -> None:
+    """Wait until so many messages have come."""
+    end = time.monotonic() + 10
+    while server.said.qsize() < count and time.monotonic() < end:
+        time.sleep(0.005)
+    assert server.said.qsize() >= count
+
+
+def test_what_pages_ask_for_is_done_recorded_and_replayed(rope, server, tmp_path):
+    live = Session(rope, server, title="<rope>", record=tmp_path / "play.rrd")
+    start = rope.hash()
+    with page(server) as there:
+
+        def turn(*messages) -> tuple[dict, np.ndarray]:
+            for message in messages:
+                there.send(json.dumps(message))
+            hear(server, len(messages) + (not came))
+            came.append(True)
+            live.turn()
+            there.send('{"do": "shown"}')
+            while isinstance(text := there.recv(timeout=10), str):
+                said.append(json.loads(text))
+            return figures(text)
+
+        came, said = [], []
+        told, x = turn()
+        assert [m["kind"] for m in said] == ["scene", "walls"] and said[0]["title"] == "<rope>"
+        assert said[0]["links"] == [[k, k + 1] for k in range(5)] and said[0]["pinned"] == [1, 0, 0, 0, 0, 0]
+        np.testing.assert_array_equal(x.reshape(6, 2), rope.position.astype(np.float32))
+        assert told["time"] == pytest.approx(1 / 60) and "held" not in told
+        told, x = turn({"do": "grab", "particle": 5, "target": [1.5, 2.5]})
+        assert told["held"] == 5 and told["target"] == [1.5, 2.5]
+        for _ in range(20):
+            told, x = turn({"do": "move", "target": [0.5, 2.5]})
+        assert x.reshape(6, 2)[5, 1] > 2.2  # it hangs above where it was pinned
+        told, _ = turn({"do": "drop"}, {"do": "slower"})
+        assert "held" not in told and told["slower"] == 2
+        before = rope.time
+        turn()
+        assert rope.time - before == pytest.approx(1 / 120)
+        told, _ = turn({"do": "pause"})
+        assert told["paused"] and rope.time == pytest.approx(before + 1 / 120)
+        told, _ = turn({"do": "frame"}, {"do": "name", "particle": 0})
+        assert rope.time == pytest.approx(before + 1 / 60) and "particle 0, pinned" in said[-1]["text"]
+        assert "Distance" in said[-1]["text"]
+        # Nonsense is answered, and the scene goes on.
+        steps = live.steps
+        for message in (
+            {"do": "grab", "particle": 99, "target": [0, 0]}, {"do": "grab", "particle": 1}, {"do": "name", "particle": "x"},
+            {"do": "grab", "particle": 1, "target": [0, float("inf")]}, {"do": "grab", "particle": 1, "target": "here"},
+        ):  # fmt: skip
+            turn(message)
+            assert said[-1]["kind"] == "told" and live.hand.particle == -1
+        turn({"do": "nothing"}, {"no": "thing"})
+        assert live.steps == steps
+        there.send("no JSON")
+        with pytest.raises(ConnectionClosed):
+            while True:
+                there.recv(timeout=10)
+    live.close()
+    recording = tv.replay(tmp_path / "play.rrd")
+    assert len(recording.frames) == live.steps + 1 and recording.verify().kind == "intact"
+    # A restart leads back to the start bit for bit, and the file begins there, too.
+    live._restart()
+    assert rope.time == 0.0 and rope.hash() == start
+    live.paused = False
+    live.turn()
+    live.close()
+    assert len(tv.replay(tmp_path / "play.rrd").frames) == 2
+
+
+def test_a_page_that_goes_lets_go_and_one_that_is_slow_is_not_waited_for(rope, server):
+    live = Session(rope, server)
+    with page(server) as there:
+        there.send(json.dumps({"do": "grab", "particle": 5, "target": [0, 0]}))
+        hear(server, 2)
+        for _ in range(20):  # it never says that it has shown one
+            live.turn()
+        assert live.hand.particle == 5 and live.steps == 20
+        assert server.viewers[0].waiting == session.AHEAD
+    hear(server, 1)
+    live.turn()
+    assert live.hand.particle == -1 and not server.viewers
+
+
+def test_only_who_knows_the_address_gets_in(server):
+    with urllib.request.urlopen(server.url) as answer:
+        assert b"<canvas" in answer.read() and "default-src 'none'" in answer.headers["Content-Security-Policy"]
+    wrong = [("x" * 22, None), (server.token, "evil.example:80"), ("", None), (server.token + "x", None)]
+    for token, host in wrong:
+        request = urllib.request.Request(f"http://127.0.0.1:{server.port}/{token}/", headers={"Host": host} if host else {})
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(request)
+    for name in ("session.py", "../server.py", "page.html", "%2e%2e/server.py"):
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            urllib.request.urlopen(server.url + name)
+    for origin in ("http://evil.example", None, f"http://127.0.0.1:{server.port + 1}", "null"):
+        with pytest.raises(InvalidStatus, match="403"):
+            page(server, origin=origin)
+
+
+def test_the_world_of_a_script_is_found(tmp_path, world):
+    script = tmp_path / "s.py"
+    start = "import tiverlet as tv\nw = lambda: tv.World(tv.Particles([[0.0, 0.0]]))\n"
+    for text in ("build = lambda: (1, w())", "world = w()", "def play():\n    return w()\nbuild = None"):
+        script.write_text(start + text)
+        found, each_frame = built(str(script))
+        assert isinstance(found, tv.World) and each_frame is None
+        found.close()
+    script.write_text("x = 1")
+    with pytest.raises(ValueError, match="no world to play"):
+        built(str(script))
+
+
+def test_bodies_and_their_surfaces_are_found(world):
+    # A loop around an area is filled, also where it is not convex: the triangles' areas add up to the loop's.
+    star = np.array([[r * np.sin(t), r * np.cos(t)] for t, r in zip(np.arange(10) * np.pi / 5, [1.0, 0.4] * 5, strict=True)])
+    x = np.concatenate([star, [[3, 0], [4, 0], [4, 1], [3, 1]], [[6, 0], [7, 0], [8, 0]]])
+    features = [tv.Area([np.arange(10)]), tv.ShapeMatch([np.arange(10, 14)]), tv.Distance([(14, 15), (15, 16)])]
+    w = world(tv.Particles(x), features)
+    assert surfaces.bodies(w).tolist() == [0] * 10 + [10] * 4 + [14] * 3
+    corners = surfaces.triangles(w)
+    areas = surfaces.doubled(x[corners[:, 1]] - x[corners[:, 0]], x[corners[:, 2]] - x[corners[:, 0]]) / 2
+    body = surfaces.bodies(w)[corners[:, 0]]
+    assert areas[body == 0].sum() == pytest.approx(w.features[0].rest[0]) and areas[body == 10].sum() == pytest.approx(1)
+    assert set(body.tolist()) == {0, 10} and len(corners) == 8 + 2
+    # A cube of six tetrahedra has twelve faces; a cloth two triangles in each cell.
+    cube = np.array([[a, b, c] for a in (0, 1) for b in (0, 1) for c in (0, 1)], dtype=float)
+    tets = [[0, a, a + b, 7] for a, b in ((1, 2), (1, 4), (2, 1), (2, 4), (4, 1), (4, 2))]
+    assert len(surfaces.skin(np.array(tets))) == 12
+    sheet = tv.shapes.cloth((0, 0, 0), (1, 0, 0), (0, 0, 1), (4, 5))
+    solid = world(tv.Particles(np.concatenate([cube, sheet.position + 5])), [tv.Volume(tets), tv.Distance(sheet.links + 8)])
+    corners = surfaces.triangles(solid)
+    assert (corners < 8).all(axis=1).sum() == 12
+
+
+def test_walls_have_surfaces_that_lie_on_them(world):
+    low, high = np.zeros(3), np.ones(3)
+    for wall, far in (
+        (tv.Ball((1, 2, 3), 0.5), lambda p: np.linalg.norm(p - [1, 2, 3], axis=1) - 0.5),
+        (
+            tv.Capsule((0, 0, 0), (0, 0, 2), 0.3),
+            lambda p: np.linalg.norm(p - np.c_[0 * p[:, :2], p[:, 2].clip(0, 2)], axis=1) - 0.3,
+        ),
+        (tv.HalfSpace((0, 1, 0), 0.25), lambda p: p[:, 1] - 0.25),
+    ):
+        world(tv.Particles(np.array([[0.0, 9, 0]])), [wall])
+        vertices, faces = wall.solid(low, high)
+        np.testing.assert_allclose(far(vertices), 0, atol=1e-12)
+        assert faces.min() == 0 and faces.max() == len(vertices) - 1
+
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
+def test_a_mouse_in_a_browser_drags_a_particle(rope, server):
+    # Real events: press on the last particle of a rope, which is paused and still straight, and pull it up.
+    sync = pytest.importorskip("playwright.sync_api")
+    live, errors = Session(rope, server), []
+    live.paused = True
+    done = threading.Event()
+
+    def mouse():
+        try:
+            with sync.sync_playwright() as play:
+                browser = play.chromium.launch(
+                    executable_path=CHROMIUM,
+                    args=["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"],
+                )
+                there = browser.new_page(viewport={"width": 600, "height": 500}, bypass_csp=True)  # for what is asked
+                there.on("pageerror", lambda e: errors.append(str(e)))
+                there.goto(server.url)
+                there.wait_for_function("x && scene && canvas.width == 600")
+                px, py = there.evaluate("(() => { aim(); return project(at(5)); })()")[:2]
+                there.mouse.move(px, py)
+                there.mouse.down()
+                there.mouse.move(px - 100, py - 150, steps=5)
+                there.keyboard.press("Space")
+                there.wait_for_function("figures.held == 5 && figures.time > 0.5")
+                told.append(there.evaluate(f"[x[10], x[11], under({px - 100}, {py - 150})]"))
+                there.mouse.up()
+                there.wait_for_function("!('held' in figures)")
+                there.mouse.click(px, py)
+                browser.close()
+        except BaseException as e:
+            errors.append(repr(e))
+        done.set()
+
+    told: list = []
+    thread = threading.Thread(target=mouse, daemon=True)
+    thread.start()
+    while not done.is_set():
+        live.run(1)
+    assert not errors
+    x, y, point = told[0]
+    # Drawn to where the mouse is, but for the weight of all five, 5 g / k^2 = 0.12 m, at most twice while it still swings.
+    assert np.hypot(x - point[0], y - point[1]) < 2 * 5 * 9.81 / 20**2 and y > 2.2

@@ -1,0 +1,177 @@
+"""Worlds of the same structure share what is compiled, and nothing of each other."""
+
+import contextlib
+import inspect
+import sys
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import taichi as ti
+from taichi.lang.kernel_impl import Kernel
+
+import tiverlet as tv
+from tiverlet.device import layout, runtime
+from tiverlet.device.patches import sharing
+from tiverlet.features.arguments import knobs_of
+
+from .conftest import ARCH
+from .rows import OTHERS, ROWS
+
+pytestmark = pytest.mark.skipif(ARCH != "cpu", reason="every world has kernels of its own there")
+
+
+@contextlib.contextmanager
+def compiled() -> Iterator[list[str]]:
+    """The names of the kernels that are compiled meanwhile."""
+    names, materialize = [], Kernel.materialize
+
+    def noted(self, key=None, args=None, arg_features=None):
+        if key not in self.compiled_kernels:
+            names.append(self.func.__name__)
+        return materialize(self, key=key, args=args, arg_features=arg_features)
+
+    Kernel.materialize = noted
+    try:
+        yield names
+    finally:
+        Kernel.materialize = materialize
+
+
+def hung(world, mass, compliance, g, rest, points):
+    """A rope that hangs, with a spring across."""
+    rope = tv.shapes.rope((0, 0), (1, 0.2), points=points)
+    links = [tv.Distance(rope.links), tv.Distance([[2, 7]], rest=rest, compliance=compliance)]
+    return world(tv.Particles(rope.position, mass=mass, pinned=[0]), [tv.Gravity(g), *links], substeps=5)
+
+
+NUMBERS = [(0.01, 1e-3, 9.81, 0.3, 12), (0.5, 1e-5, 1.6, 0.6, 9), (2.0, 0.1, -3.0, 0.2, 17)]
+
+
+def test_worlds_with_other_numbers_and_counts_and_clones_compile_nothing(world):
+    # And have the bits that they have alone: when nobody shares, each compiles its own.
+    first = hung(world, *NUMBERS[0])
+    first.run(0.1)
+    assert first.velocity.shape == (12, 2)
+    with compiled() as names:
+        shared = [hung(world, *numbers) for numbers in NUMBERS]
+        for _ in range(6):
+            for w in shared:
+                w.step(1 / 60)
+        copy = shared[1].clone()
+        copy.step(1 / 60)
+        shared[1].step(1 / 60)
+        speeds = [w.velocity for w in shared]
+    assert names == []
+    assert copy.hash() == shared[1].hash() != shared[0].hash() == first.hash()
+    alone = []
+    for k, numbers in enumerate(NUMBERS):
+        with layout.unshared(), compiled() as names:
+            w = hung(world, *numbers)
+            for _ in range(7 if k == 1 else 6):
+                w.step(1 / 60)
+            np.testing.assert_array_equal(w.velocity, speeds[k])
+            alone.append(w.hash())
+        assert names
+    assert alone == [w.hash() for w in shared]
+
+
+def test_what_is_left_out_of_the_writing_is_not_read(world, monkeypatch):
+    # What is compiled is a function of what is read. So while kernels are translated, nothing of what sharing.Writing leaves out
+    # may be read: attributes that are for the host, and what arrays hold.
+    class Untold(np.ndarray):
+        def refuse(self, *args, **kwargs):
+            raise AssertionError("a kernel reads what an array holds")
+
+        shape = size = property(refuse)
+        __len__ = __getitem__ = __array_ufunc__ = __array_function__ = __float__ = __int__ = __bool__ = __iter__ = tolist = refuse
+
+    translating, modules = [False], [m for name, m in sys.modules.items() if name.startswith("tiverlet")]
+    kinds = {o for m in modules for o in vars(m).values() if inspect.isclass(o) and o.__module__.startswith("tiverlet.")}
+    for kind in kinds:
+        if (
+            "patches" in kind.__module__
+            or issubclass(kind, (BaseException, np.ndarray))
+            or (kind.__bases__ != (object,) and "__getattribute__" not in vars(kind))
+        ):
+            continue
+
+        def read(self, name, plain=kind.__getattribute__):
+            value = plain(self, name)
+            if translating[0] and name in object.__getattribute__(self, "__dict__"):
+                told = sharing.may_read(type(self), name) or name in knobs_of(type(self))  # see Feature.compiled()
+                assert told or name.startswith("__"), f"a kernel reads {name} of a {type(self).__name__}"
+                if isinstance(value, np.ndarray):
+                    return value.view(Untold)
+            return value
+
+        monkeypatch.setattr(kind, "__getattribute__", read)
+
+    class Translated(Exception):
+        pass
+
+    materialize = Kernel.materialize
+
+    def translate(self, key=None, args=None, arg_features=None):
+        translating[0] = True
+        try:
+            materialize(self, key=key, args=args, arg_features=arg_features)
+        finally:
+            translating[0] = False
+        raise Translated
+
+    rows = [(row.points, lambda c, row=row, **more: row.make(c, np.full(len(c), 0.5), **more)) for row in ROWS.values()]
+    rows += [(points, make) for points, make, _ in OTHERS.values()]
+    for dim in (2, 3):
+        points, features, begin = [np.random.default_rng(0).normal(size=(9, dim))], [], 9
+        for corners, make in rows:
+            if corners.shape[1] == dim:
+                features.append(make(begin + np.arange(len(corners))[None]))
+                points.append(corners)
+                begin += len(corners)
+        low, high = [-9.0] * dim, [9.0] * dim
+        walls = [tv.Box(low, high), tv.HalfSpace([0.0, 1.0, 0.0][:dim], -8.0), tv.Ball([0.0] * dim, 9.0, inside=True)]
+        push = [tv.Gravity(9.81), tv.Drag(0.1), tv.Contact(friction=0.5, restitution=0.5), *walls]
+        w = world(tv.Particles(np.concatenate(points), radius=0.01), [*features, *push])
+        r = w._runner
+        with monkeypatch.context() as patch:
+            patch.setattr(Kernel, "materialize", translate)
+            for owner, name, given in ((r.step, "fused", (r.sheet,)), (r.step, "to_velocity", (0.1, 0.0))):
+                with pytest.raises(Translated), r.memory.compiler():
+                    getattr(owner, name)(*given)
+
+
+def test_what_functions_of_the_user_know_is_part_of_the_structure(world):
+    # Taichi writes numbers and arrays from around a function into the kernel.
+    def force(strength, table):
+        @ti.func
+        def pull(x):
+            return -strength * x * ti.static(float(table[1]))
+
+        return tv.Force(pull)
+
+    def end(strength, table):
+        w = world(tv.Particles([[1.0, 0.0]]), [force(strength, np.array(table))], substeps=50)
+        w.run(0.2, dt=0.1)
+        return float(w.position[0, 0])
+
+    for strength, table in ((1.0, [5.0, 1.0]), (2.0, [5.0, 1.0]), (2.0, [5.0, 2.0]), (1.0, [5.0, 1.0])):
+        assert end(strength, table) == pytest.approx(np.cos(np.sqrt(strength * table[1]) * 0.2), abs=1e-5)  # cos(omega t)
+
+
+def test_many_worlds_one_after_the_other_take_no_more_than_a_few():
+    # Whether they are closed or forgotten; more than the 511 trees that Taichi has would end the process.
+    point = tv.Particles([[0.0, 0.0]])
+    for _ in range(2):
+        tv.World(point, [tv.Gravity()]).step(0.1)
+    trees, known = runtime.trees, len(sharing._known)
+    many = [tv.World(point, [tv.Gravity(float(k))]) for k in range(600)]
+    for w in many:
+        w.step(0.1)
+    assert [w.velocity[0, 1] for w in many[:3]] == pytest.approx([0.0, -0.1, -0.2])
+    for k in range(30):
+        one = tv.World(tv.Particles(np.zeros((k % 3 + 1, 2))), [tv.Gravity()])
+        one.step(0.1)
+        if k % 2:
+            one.close()
+    assert runtime.trees <= trees + 6 and len(sharing._known) <= known + 6

@@ -1,0 +1,42 @@
+"""Run a demo or a script at real time in a page of the browser, and take what is in it by hand."""
+
+import argparse
+import runpy
+from typing import Any
+
+ABOUT = "run a demo or script live, and take it by hand"
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """The script, and how it is shown."""
+    parser.add_argument("script", help="a .py file with a function play() or build() that returns a world, or the name of a demo")
+    parser.add_argument("--record", metavar="FILE.rrd", help="write what happens, the hand included; replays bit for bit")
+    parser.add_argument("--port", type=int, default=0, help="default: a free one")
+    parser.add_argument("--no-browser", dest="browser", action="store_false", help="only print the address")
+
+
+def main(args: argparse.Namespace) -> int:
+    """Until interrupted."""
+    from ..live import play
+    from .run import find
+
+    path = find(args.script)
+    world, each_frame = built(str(path))
+    play(world, record=args.record, each_frame=each_frame, title=path.stem, port=args.port, browser=args.browser)
+    return 0
+
+
+def built(script: str) -> tuple[Any, Any]:
+    """The world of a script's play() or build(), or its variable `world`; and its function each_frame(world), if it has one."""
+    from ..world import World
+
+    found = runpy.run_path(script, run_name="play")
+    make = found.get("play", found.get("build"))
+    made: Any = make() if callable(make) else found.get("world")
+    parts = list(made) if isinstance(made, (tuple, list)) else [made, *vars(made).values()] if hasattr(made, "__dict__") else []
+    worlds = [part for part in parts if isinstance(part, World)]
+    if not worlds:
+        raise ValueError(
+            f"{script} has no world to play: give it a function build() that returns a tv.World, alone or among other things."
+        )
+    return worlds[0], found.get("each_frame")

@@ -1,0 +1,84 @@
+"""A hand that draws one particle, whichever it is now."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .. import checks
+from ..device import ti
+from ..features.feature import Acceleration, Knob, Scene
+from ..particles import Particles, in_range
+
+
+def _particle(hand: "Hand", value) -> int:
+    value = checks.integer("Hand", "particle", value, least=-1)
+    if hand.count and value >= hand.count:
+        raise ValueError(f"Hand: particle = {value}, but there are {hand.count} particles (0 ... {hand.count - 1}; -1 for none).")
+    return value
+
+
+def _target(hand: "Hand", value) -> np.ndarray:
+    value = checks.vector("Hand", "target", value, hand.dim or len(np.atleast_1d(value)))
+    in_range("Hand", "target", value[None])
+    return value
+
+
+class Hand(Acceleration):
+    """a = -rate^2 (x - target) - 2 rate v, of one particle: a hand, a mouse, which may take another particle at any time.
+
+    It is a critically damped spring, so the particle comes to a target at rest without swinging, in a few times 1 / rate,
+    whatever its mass; where others hang on it, they weigh it down. A Pin with compliance holds many, but always the same ones.
+
+    target: (dim,) [m]. particle: its number, -1 for none. rate: [1/s], at least 0; the step resolves it while h times the rate
+    is well below 1. All live: assign between frames, at no compile cost. A particle that is pinned stays where it is.
+    """
+
+    uses_velocity = True
+    conservative = True
+    particle = Knob(_particle, "The particle that is drawn; -1: none.")
+    target = Knob(_target, "Where it is drawn to [m].")
+    rate = Knob(lambda f, v: checks.number("Hand", "rate", v, least=0.0), "How fast it gets there [1/s].")
+    dim = count = 0
+
+    def __init__(self, target: ArrayLike, particle: int = -1, *, rate: float = 20.0):
+        self.target, self.particle, self.rate = target, particle, rate
+
+    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Check the vector's length and the particle."""
+        self._keep(dim=particles.dim, count=len(particles))
+        self.target, self.particle = self.target, self.particle
+
+    def remap_indices(self, number: np.ndarray, count: int) -> None:
+        """Go on with the same particle; let go of one that goes."""
+        self._keep(count=count)
+        if self.particle >= 0:
+            self.particle = int(number[self.particle])
+
+    def bind(self, scene: Scene) -> None:
+        """Which particle, where to, how fast."""
+        self.scene = scene
+        self.dev.particle = scene.memory.field("Hand.particle", None, kind=ti.i32, values=self.particle)
+        self.dev.target = scene.memory.field("Hand.target", None, width=self.dim, values=self.target)
+        self.dev.rate = scene.memory.field("Hand.rate", None, values=self.rate)
+        self.changed = False
+
+    def upload(self) -> None:
+        """Write all three."""
+        self.scene.memory.write(self.dev.particle, self.particle)
+        self.scene.memory.write(self.dev.target, self.target)
+        self.scene.memory.write(self.dev.rate, self.rate)
+
+    @ti.func
+    def acceleration(self, i, x, v, t):
+        """-rate^2 (x - target) - 2 rate v."""
+        out, rate = 0 * x, self.dev.rate[None]
+        if i == self.dev.particle[None]:
+            out = -rate * (rate * (x - self.dev.target[None]) + 2 * v)
+        return out
+
+    @ti.func
+    def potential(self, i, x):
+        """rate^2 |x - target|^2 / 2."""
+        out, r = 0 * x[0], x - self.dev.target[None]
+        if i == self.dev.particle[None]:
+            out = self.dev.rate[None] ** 2 * r.dot(r) / 2
+        return out

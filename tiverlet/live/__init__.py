@@ -1,0 +1,5 @@
+"""Scenes that run while they are watched, and are taken by hand."""
+
+from .session import play
+
+__all__ = ["play"]

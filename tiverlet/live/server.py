@@ -1,0 +1,120 @@
+"""The page and its connection: one port on this machine, which serves nobody who does not know its token."""
+
+import contextlib
+import json
+import pathlib
+import queue
+import secrets
+import threading
+import urllib.parse
+from http import HTTPStatus
+from typing import Any
+
+LOCAL = "127.0.0.1"
+NAMES = (LOCAL, "localhost")
+AHEAD = 2  # frames that may be under way to a page that has not shown the last ones
+LARGEST = 4096  # bytes of what a page says
+FILES = {"": ("page.html", "text/html"), "page.js": ("page.js", "text/javascript")}
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; connect-src 'self' ws:; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'self' http://localhost:* http://127.0.0.1:*"
+)
+
+
+class Viewer:
+    """One open page."""
+
+    def __init__(self, connection: Any):
+        self.connection = connection
+        self.waiting = 0  # frames that it was sent and has not shown yet
+
+    def send(self, message: str | bytes) -> None:
+        """To the page, unless it has gone."""
+        from websockets.exceptions import ConnectionClosed
+
+        with contextlib.suppress(ConnectionClosed, OSError):
+            self.connection.send(message)
+
+
+class Server:
+    """Serves the page at `url`. said: what pages say, (viewer, message), in the order in which it came.
+
+    Who asks has to know the token, which is in the address; to name this machine as Host, so that no page from elsewhere, whose
+    name was made to mean this machine, comes in; and for the connection to have the page from here, by its Origin.
+    """
+
+    def __init__(self, port: int = 0):
+        try:
+            from websockets.sync.server import serve
+        except ModuleNotFoundError:
+            raise ModuleNotFoundError(
+                "play: a page in the browser needs the package websockets: pip install 'tiverlet[play]'."
+            ) from None
+        self.token = secrets.token_urlsafe(16)
+        self.said: queue.Queue[tuple[Viewer, dict[str, Any]]] = queue.Queue()
+        self._viewers: list[Viewer] = []
+        self._lock = threading.Lock()
+        self._server = serve(self._listen, LOCAL, port, process_request=self._answer, compression=None, max_size=LARGEST)
+        self.port = self._server.socket.getsockname()[1]
+        self.url = f"http://{LOCAL}:{self.port}/{self.token}/"
+        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
+        self._thread.start()
+
+    @property
+    def viewers(self) -> list[Viewer]:
+        """The pages that are open."""
+        with self._lock:
+            return list(self._viewers)
+
+    def close(self) -> None:
+        """End all connections."""
+        self._server.shutdown()
+        self._thread.join(5)
+
+    def _answer(self, connection: Any, request: Any) -> Any:
+        """A file of the page; None lets the connection be made."""
+        host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
+        _, token, name = (urllib.parse.urlsplit(request.path).path + "//").split("/")[:3]
+        if host.rpartition(":")[0] not in NAMES or not secrets.compare_digest(token.encode(), self.token.encode()):
+            return connection.respond(HTTPStatus.FORBIDDEN, "Open the address that tiverlet play has printed.\n")
+        if name == "socket":
+            wrong = origin != f"http://{host}"
+            return connection.respond(HTTPStatus.FORBIDDEN, "Another page asks.\n") if wrong else None
+        if name not in FILES:
+            return connection.respond(HTTPStatus.NOT_FOUND, "There is no such file.\n")
+        file, kind = FILES[name]
+        response = connection.respond(HTTPStatus.OK, (pathlib.Path(__file__).parent / file).read_text(encoding="utf-8"))
+        del response.headers["Content-Type"]
+        headers = {"Content-Type": f"{kind}; charset=utf-8", "Content-Security-Policy": POLICY, "Cache-Control": "no-store"}
+        response.headers.update({**headers, "Referrer-Policy": "no-referrer", "X-Content-Type-Options": "nosniff"})
+        return response
+
+    def _take(self, viewer: Viewer, text: str | bytes) -> None:
+        """What a page has said."""
+        try:
+            message = json.loads(text)
+        except ValueError:
+            message = None
+        if not isinstance(message, dict):
+            viewer.connection.close(1003, "an object is needed")
+        elif message.get("do") == "shown":
+            viewer.waiting = max(0, viewer.waiting - 1)
+        else:
+            self.said.put((viewer, message))
+
+    def _listen(self, connection: Any) -> None:
+        """Of each page, in a thread of its own."""
+        from websockets.exceptions import ConnectionClosed
+
+        viewer = Viewer(connection)
+        with self._lock:
+            self._viewers.append(viewer)
+        self.said.put((viewer, {"do": "came"}))
+        try:
+            with contextlib.suppress(ConnectionClosed):
+                for text in connection:
+                    self._take(viewer, text)
+        finally:
+            with self._lock:
+                self._viewers.remove(viewer)
+            self.said.put((viewer, {"do": "went"}))

@@ -1,0 +1,222 @@
+"""A world that runs at real time under the eyes and hands of who watches."""
+
+import os
+import sys
+import time
+import webbrowser
+from collections import deque
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..forces import Hand
+from ..step import checkpoint
+from . import scene
+from .server import AHEAD, LOCAL, Server, Viewer
+
+if TYPE_CHECKING:
+    from ..recording import Recorder
+    from ..world import World
+
+DT = 1 / 60  # [s] of a frame at full speed
+SLOWEST = 64
+REFRESH = 0.25  # [s] after which a page of a paused scene gets its figures again
+
+
+class Session:
+    """A world, the hand that it gets, and the pages that show it.
+
+    Frames are 1/60 s long, and 1/60 s apart where the machine keeps up; at a half of the speed they are half as long, so that
+    slow motion is smooth, and is computed more finely.
+    """
+
+    def __init__(
+        self, world: "World", server: Server, *, title: str = "", record: str | os.PathLike | None = None,
+        each_frame: Callable[["World"], None] | None = None,
+    ):  # fmt: skip
+        self.world, self.server, self.title, self.record, self.each_frame = world, server, title, record, each_frame
+        hands = [f for f in world.features if isinstance(f, Hand)]
+        if not hands:
+            hands = [Hand(np.zeros(world.particles.dim))]
+            world.add(features=hands)
+        self.hand = hands[0]
+        self.paused, self.slower, self.steps, self.restarts = False, 1, 0, 0
+        self._one = False  # whether one frame is asked for, of a scene that is paused
+        self._start = checkpoint.keep(world), checkpoint.flags(world)
+        self._extent = scene.bounds(world)
+        self._computed: deque[tuple[float, float]] = deque(maxlen=30)  # of frames: when [s], and how long it took [ms]
+        self._walls: Any = None
+        self._sent = 0.0
+        self._holder: Viewer | None = None
+        self._recorder: Recorder | None = None
+        self._recording()
+
+    def _recording(self) -> None:
+        """Begin a file, if there is to be one."""
+        if self.record is not None:
+            from ..recording import Recorder
+
+            self.close()
+            self._recorder = Recorder(self.record, self.world, overwrite=True)
+
+    def close(self) -> None:
+        """Finish the file."""
+        if self._recorder is not None:
+            self._recorder.close()
+
+    def turn(self) -> None:
+        """What was said is done, a frame is made, and shown."""
+        heard = self._hear()
+        if not self.paused or self._one:
+            self._one = False
+            self._step()
+        elif not heard and time.monotonic() - self._sent < REFRESH:
+            return
+        self._show()
+
+    def run(self, frames: int | None = None) -> None:
+        """Turn by turn at real time, until interrupted; or so many of them."""
+        due = time.perf_counter()
+        while frames is None or frames > 0:
+            frames = None if frames is None else frames - 1
+            self.turn()
+            due = max(due + DT, time.perf_counter() - DT)  # what was lost is not made up for
+            time.sleep(max(0.0, due - time.perf_counter()))
+
+    def _step(self) -> None:
+        clock = time.perf_counter()
+        if self.each_frame:
+            self.each_frame(self.world)
+        self.world.step(DT / self.slower)
+        if self._recorder is not None:
+            self._recorder.log()
+        self.steps += 1
+        self._computed.append((clock, 1e3 * (time.perf_counter() - clock)))
+
+    def _restart(self) -> None:
+        """Back to the start; the file, too, begins there."""
+        if self._recorder is not None:
+            self._recorder.close()
+        checkpoint.undo(self.world, *self._start)
+        self.hand.particle = -1
+        self._computed.clear()
+        self.restarts += 1
+        self._recording()
+
+    def _hear(self) -> bool:
+        """Do what pages have asked for; returns whether there was something."""
+        heard = False
+        while not self.server.said.empty():
+            viewer, message = self.server.said.get()
+            heard = True
+            try:
+                self._do(viewer, message)
+            except (ValueError, TypeError, KeyError) as e:  # of what it said: the scene goes on
+                viewer.send(scene.told(str(e)))
+        return heard
+
+    def _do(self, viewer: Viewer, message: dict[str, Any]) -> None:
+        what = message.get("do")
+        if what == "came":
+            viewer.send(scene.scene(self.world, self.title))
+            viewer.send(scene.placed_walls(self._wall_list()))
+        elif what == "pause":
+            self.paused = not self.paused
+        elif what == "frame":
+            self.paused = self._one = True
+        elif what == "restart":
+            self._restart()
+        elif what == "slower":
+            self.slower = min(2 * self.slower, SLOWEST)
+        elif what == "faster":
+            self.slower = max(self.slower // 2, 1)
+        elif what == "grab":
+            self.hand.target, self.hand.particle = message["target"], message["particle"]
+            self._holder = viewer
+        elif what == "move":
+            if self.hand.particle >= 0 and viewer is self._holder:
+                self.hand.target = message["target"]
+        elif what == "drop" or (what == "went" and viewer is self._holder):
+            if self.hand.particle >= 0:
+                self.hand.particle = -1
+        elif what == "name":
+            viewer.send(scene.told(scene.named(self.world, message["particle"])))
+
+    def _wall_list(self) -> list[dict[str, Any]]:
+        return scene.walls(self.world, self._extent)
+
+    def _figures(self) -> dict[str, Any]:
+        """Of the last frame."""
+        report, out = self.world.last, {"time": self.world.time, "paused": self.paused, "slower": self.slower, "step": self.steps}
+        if len(self._computed) > 1:
+            first, last = self._computed[0][0], self._computed[-1][0]
+            out["rate"] = (len(self._computed) - 1) / max(last - first, 1e-9) * DT
+            out["ms"] = float(np.median([ms for _, ms in self._computed]))
+        if report:
+            out |= {name: getattr(report, name) for name in ("substeps", "iterations", "residual", "overlap", "energy")}
+            out["notes"] = list(report.notes)
+        if self.hand.particle >= 0:
+            out |= {"held": self.hand.particle, "target": np.asarray(self.hand.target).tolist()}
+        return out
+
+    def _show(self) -> None:
+        """Send the frame to all pages that keep up."""
+        self._sent = time.monotonic()
+        ready = [viewer for viewer in self.server.viewers if viewer.waiting < AHEAD]
+        if not ready:
+            return
+        message, walls = scene.frame(self.world, self._figures()), None
+        if any(f.moving for f in self.world.features):
+            walls = scene.placed_walls(self._wall_list())
+        for viewer in ready:
+            viewer.waiting += 1
+            if walls:
+                viewer.send(walls)
+            viewer.send(message)
+
+
+def play(
+    world: "World", *, record: str | os.PathLike | None = None, each_frame: Callable[["World"], None] | None = None,
+    title: str = "tiverlet", port: int = 0, browser: bool = True,
+) -> None:  # fmt: skip
+    """Run a world at real time in a page of the browser, and take it by hand, until Ctrl-C.
+
+    Drag a particle with the mouse; the keys are on the page. The world gets a Hand, unless it has one, and is where it was left
+    afterwards. record: a file that is written meanwhile, see Recorder; what the hand did is in it, and is computed again bit for
+    bit. After a restart it begins anew. each_frame: called with the world before each frame, for what moves by itself. title: of
+    the page. port: 0 takes a free one. browser: whether to open the page; its address is printed in any case.
+
+    The page is served to this machine only. From another one forward the port: ssh -L PORT:127.0.0.1:PORT host, and open the
+    address there; the line is printed. In a notebook the page shows below the cell, which runs until it is interrupted.
+
+    Raises ModuleNotFoundError without the package websockets: pip install 'tiverlet[play]'.
+    """
+    server = Server(port)
+    session = None
+    try:
+        session = Session(world, server, title=title, record=record, each_frame=each_frame)
+        _announce(server, browser)
+        session.run()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        if session:
+            session.close()
+        server.close()
+
+
+def _announce(server: Server, browser: bool) -> None:
+    """Say where it is, and open it where that can be done."""
+    if "ipykernel" in sys.modules:
+        from IPython.display import IFrame, display  # type: ignore[import-not-found]
+
+        display(IFrame(server.url, width="100%", height=600))
+        return
+    print(f"{server.url}   (Ctrl-C ends it)", flush=True)
+    if os.environ.get("SSH_CONNECTION"):
+        print(
+            f"From your machine: ssh -L {server.port}:{LOCAL}:{server.port} this-host, then open the address there.", flush=True
+        )
+    elif browser and not webbrowser.open(server.url):
+        print("No browser was found here: open the address in one.", flush=True)

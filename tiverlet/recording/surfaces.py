@@ -1,0 +1,193 @@
+"""What is one body to the eye, and where it has a surface: for pictures."""
+
+from collections import defaultdict
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..constraints import Area, Dihedral, ShapeMatch, Volume
+from ..contact import Polygons
+from ..features.feature import Batch
+from .lines import cells
+from .strain import LEVELS, LONGER, SHORTER
+
+if TYPE_CHECKING:
+    from ..world import World
+
+LIGHT, DARKEST = np.array([0.45, 0.35, 0.82]), 0.3  # where it comes from, beside from above; of what is edge on
+SHADES = 15
+MOST = 200_000  # links up to which it is asked whether they are sides of triangles
+
+
+def bodies(world: "World") -> np.ndarray:
+    """The body of each particle, (n,): the lowest number of those that constraints and loops join, its own where none do."""
+    ends = [np.zeros((0, 2), dtype=np.int64)]
+    for f in world.features:
+        if isinstance(f, Batch) and f.count:
+            members, owner = f.indices.ravel(), f.owner
+            same = owner[1:] == owner[:-1]
+            ends.append(np.stack([members[:-1][same], members[1:][same]], axis=1))
+        elif isinstance(f, Polygons):
+            ends += [np.stack([loop, np.roll(loop, 1)], axis=1) for loop in f.loops]
+    a, b = np.concatenate(ends).T
+    body = np.arange(len(world.particles))
+    while True:  # the lowest number on either side of each link, and then that one's: a few rounds, also along a chain
+        low = np.minimum(body[a], body[b])
+        new = body.copy()
+        np.minimum.at(new, body[a], low)
+        np.minimum.at(new, body[b], low)
+        while (new != new[new]).any():
+            new = new[new]
+        if (new == body).all():
+            return body
+        body = new
+
+
+def triangles(world: "World") -> np.ndarray:
+    """Triangles of particles that cover bodies, (t, 3): loops and volumes, what bends along an edge, and links, where they are
+    the sides of triangles. They may overlap.
+    """
+    x, found = world.particles.position, [np.zeros((0, 3), dtype=np.int64)]
+    flat = world.particles.dim == 2
+    links = [np.zeros((0, 2), dtype=np.int64)]
+    for f in world.features:
+        if isinstance(f, Polygons) or (isinstance(f, Area) and flat):
+            loops = f.loops if isinstance(f, Polygons) else [f.members_of(c) for c in range(f.count)]
+            found += [clipped(np.asarray(loop), x) for loop in loops]
+        elif isinstance(f, Area):
+            found.append(f.indices.reshape(-1, 3))
+        elif isinstance(f, Volume):
+            listing = np.asarray(f.listing)
+            found.append(skin(listing) if listing.shape[-1] == 4 else listing)
+        elif isinstance(f, Dihedral):
+            a, b, c, d = f.indices.T
+            found += [np.stack([a, b, c], axis=1), np.stack([b, a, d], axis=1)]
+        elif isinstance(f, Batch) and f.arity == 2 and f.count and not f.breaks:
+            links.append(f.indices)
+    done = np.unique(np.concatenate(found))
+    pairs = np.concatenate(links)
+    pairs = pairs[~np.isin(pairs, done).all(axis=1)]
+    if 0 < len(pairs) <= MOST:
+        used = np.zeros(len(pairs), dtype=bool)
+        if not flat:
+            used, sheet = cells(pairs, x)
+            found += [sheet[:, :3], sheet[:, [0, 2, 3]]]
+        found.append(cliques(pairs[~used]))
+    if flat:
+        done = np.unique(np.concatenate(found))
+        for f in world.features:
+            clusters = [f.members_of(c) for c in range(f.count)] if isinstance(f, ShapeMatch) else []
+            found += [hull(cluster, x) for cluster in clusters if not np.isin(cluster, done).all() and len(cluster) > 2]
+    out = np.concatenate(found)
+    a, b, c = (x[k] for k in out.T)
+    sides = np.linalg.norm(b - a, axis=1) * np.linalg.norm(c - a, axis=1)
+    return out[doubled(b - a, c - a) > 1e-3 * sides]  # none that are flat
+
+
+def covered(world: "World", corners: np.ndarray) -> np.ndarray:
+    """Which particles are part of a surface, Boolean (n,): its corners, and in 2D what is in a body that keeps its shape."""
+    out = np.zeros(len(world.particles), dtype=bool)
+    out[corners.ravel()] = True
+    for f in world.features:
+        if isinstance(f, ShapeMatch) and world.particles.dim == 2 and f.count:
+            out[f.indices[(np.bincount(f.owner) > 2)[f.owner]]] = True
+    return out
+
+
+def doubled(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Twice the areas between vectors, (m,)."""
+    uu, vv, uv = (np.einsum("ij,ij->i", *pair) for pair in ((u, u), (v, v), (u, v)))
+    return np.sqrt(np.maximum(uu * vv - uv * uv, 0))
+
+
+class Surface:
+    """Bodies as one mesh, in the colours of their particles, in light that falls from the eye's side and above.
+
+    triangles: (t, 3). hues: (n, 3), of particles. pairs: (m, 2), links whose strain shows in the colours of their ends, from 1 %
+    on.
+    """
+
+    def __init__(self, triangles: np.ndarray, hues: np.ndarray, pairs: np.ndarray, up: np.ndarray):
+        self.triangles, self._hues = triangles, hues.astype(np.float64)
+        self._light = LIGHT + up
+        self._light /= np.linalg.norm(self._light)
+        corner = triangles.ravel()
+        order = np.argsort(corner, kind="stable")
+        self._at, self._begin = np.unique(corner[order], return_index=True)
+        self._face = (order // 3).astype(np.int64)
+        ends = pairs.T.ravel()
+        order = np.argsort(ends, kind="stable")
+        self._end, self._first = np.unique(ends[order], return_index=True)
+        self._link = (order % max(1, len(pairs))).astype(np.int64)
+
+    def colors(self, x: np.ndarray, level: np.ndarray) -> np.ndarray:
+        """RGBA as u32 of all particles at x, (n,). level: of the strain of each link, (m,); the worst at a particle shows."""
+        a, b, c = (x[k] for k in self.triangles.T)
+        normal = np.add.reduceat(np.cross(b - a, c - a)[self._face], self._begin, axis=0)
+        size = np.sqrt(np.einsum("ij,ij->i", normal, normal))
+        light = np.abs(normal @ self._light) / np.where(size > 0, size, 1)
+        shade = np.ones(len(x))
+        shade[self._at] = DARKEST + (1 - DARKEST) * np.rint(SHADES * light) / SHADES  # few, so that they take few bytes
+        hues = self._hues
+        if len(self._end):
+            off = level[self._link] - LEVELS
+            most = np.maximum.reduceat(2 * np.abs(off) + (off > 0), self._first)
+            share = np.maximum(0, 3 * (most >> 1) / LEVELS - 2)[:, None]  # from 1 % of strain on, in full at 10 %
+            hues = hues.copy()
+            hues[self._end] += share * (np.where((most & 1)[:, None], LONGER, SHORTER) - hues[self._end])
+        rgb = np.rint(hues * shade[:, None]).astype(np.uint32)
+        return rgb[:, 0] << 24 | rgb[:, 1] << 16 | rgb[:, 2] << 8 | np.uint32(255)
+
+
+def cliques(pairs: np.ndarray) -> np.ndarray:
+    """Three particles that are all linked to each other, (t, 3)."""
+    near: dict[int, set[int]] = defaultdict(set)
+    for i, j in pairs.tolist():
+        near[min(i, j)].add(max(i, j))
+    out = [(i, j, k) for i in list(near) for j in near[i] for k in near[i] & near.get(j, set())]
+    return np.array(sorted(out), dtype=np.int64).reshape(-1, 3)
+
+
+def skin(tetrahedra: np.ndarray) -> np.ndarray:
+    """The faces that only one tetrahedron has, (t, 3)."""
+    faces = np.concatenate([tetrahedra[:, k] for k in ([0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2])])
+    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    return faces[np.sort(first[count == 1])]
+
+
+def clipped(loop: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Triangles that fill a loop in the plane, (k - 2, 3), by cutting off ears."""
+    q = x[loop]
+    if np.sum(q[:, 0] * np.roll(q[:, 1], -1) - q[:, 1] * np.roll(q[:, 0], -1)) < 0:
+        loop = loop[::-1]
+    left, out = loop.tolist(), []
+    while len(left) > 3:
+        corner = np.array([left[-1:] + left[:-1], left, left[1:] + left[:1]]).T
+        a, b, c = x[corner[:, 0]], x[corner[:, 1]], x[corner[:, 2]]
+        turn = _cross(b - a, c - b)
+        for k in np.argsort(-turn, kind="stable").tolist():
+            others = x[[i for i in left if i not in corner[k]]]
+            sides = [_cross(np.tile(v - u, (len(others), 1)), others - u) for u, v in ((a[k], b[k]), (b[k], c[k]), (c[k], a[k]))]
+            if turn[k] <= 0 or not (np.array(sides) > 0).all(axis=0).any():
+                break
+        out.append(corner[k].tolist())
+        left.pop(k)
+    return np.array([*out, left], dtype=np.int64)
+
+
+def hull(cluster: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Triangles that fill what is around particles in the plane, (t, 3): a fan in their convex hull (Andrew 1979)."""
+    order = cluster[np.lexsort(x[cluster].T[::-1])].tolist()
+    ring: list[int] = []
+    for way in (order, order[::-1]):
+        side: list[int] = []
+        for i in way:
+            while len(side) > 1 and _cross(x[side[-1:]] - x[side[-2]], x[[i]] - x[side[-2]])[0] <= 0:
+                side.pop()
+            side.append(i)
+        ring += side[:-1]
+    return np.array([[ring[0], *pair] for pair in zip(ring[1:-1], ring[2:], strict=True)], dtype=np.int64).reshape(-1, 3)
+
+
+def _cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    return u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]

@@ -1,0 +1,89 @@
+"""Rigid clusters as constraints that are one number each: what deforms a cluster, in its own frame."""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from ..constraints.shape_match import ShapeMatch
+
+HEAVY = 1024  # masses of the cluster: what a particle that cannot move weighs in it
+WIDEST = 60  # numbers of a cluster: LAPACK takes one thread for them, and with more its bits depend on how many there are
+NONE = 1e-9  # of the largest: a way to move that is none
+
+
+class RigidRows:
+    """What every deformation of some rigid clusters is to be, 0; to projection.Rows they are a batch of Scalar.
+
+    With D_i = R^T (x_i - c) - q_i for the best fit c, R of a cluster and B_r a basis, orthonormal in the metric of the masses, of
+    what is no motion of the whole, C_r = sum_i m_i B_ri . D_i; to first order R and c do not matter, grad_i C_r = m_i R B_ri.
+    """
+
+    side, breaks, unit = 0, False, None
+
+    def __init__(self, batch: ShapeMatch, w: np.ndarray, some: np.ndarray):
+        self.clusters = [Cluster(batch, c, w) for c in np.flatnonzero(some).tolist()]
+        self.count = sum(len(c.basis) for c in self.clusters)
+        who = [(c.who, len(c.basis)) for c in self.clusters]
+        self.indices = np.concatenate([*(np.tile(members, m) for members, m in who), np.zeros(0, dtype=np.int64)])
+        self.owner = np.repeat(np.arange(self.count), [len(members) for members, m in who for _ in range(m)])
+        self.compliance = self.damping = self.goal = np.zeros(self.count)
+        self.broken = np.zeros(self.count, dtype=bool)
+        self.start, self.dev = batch.start, SimpleNamespace(spring=SimpleNamespace(soft=False))
+
+    def idle(self, w: np.ndarray) -> np.ndarray:
+        """No row; those that nothing can move are left out."""
+        return np.zeros(self.count, dtype=bool)
+
+    def violation(self, x: np.ndarray) -> np.ndarray:
+        """C at positions x, (m,)."""
+        return np.concatenate([np.einsum("rka,ka->r", c.basis, c.strain(x)[1]) for c in self.clusters])
+
+    def gradients(self, x: np.ndarray) -> np.ndarray:
+        """Of all corners, (total, dim)."""
+        return np.concatenate([(c.basis @ c.strain(x)[0].T).reshape(-1, x.shape[1]) for c in self.clusters])
+
+    def inverse_size(self, x: np.ndarray) -> np.ndarray:
+        """What makes C a share of the size of its cluster, (m,)."""
+        return np.concatenate([np.full(len(c.basis), c.close) for c in self.clusters])
+
+
+class Cluster:
+    """One of them: its particles, masses (k,), shape at rest (k, dim) about its center, and basis m B, (rows, k, dim)."""
+
+    def __init__(self, batch: ShapeMatch, c: int, w: np.ndarray):
+        self.who = batch.members_of(c).astype(np.int64)
+        free = w[self.who] > 0
+        m = np.divide(1, w[self.who], out=np.zeros(len(free)), where=free)
+        self.mass = np.where(free, m, HEAVY * m.sum())
+        q = batch.shape_of(c)
+        self.shape = q - self.mass @ q / self.mass.sum()
+        dim, root = q.shape[1], np.sqrt(self.mass)
+        shifts = [np.tile(e, (len(q), 1)) for e in np.eye(dim)]
+        turns = [np.outer(self.shape[:, b], np.eye(dim)[a]) - np.outer(self.shape[:, a], np.eye(dim)[b])
+                 for a, b in zip(*np.triu_indices(dim, 1), strict=True)]  # fmt: skip
+        motions = np.stack([(root[:, None] * motion).ravel() for motion in (*shifts, *turns)], axis=1)
+        u, s, _ = np.linalg.svd(motions, full_matrices=True)
+        rest = u[:, (s > NONE * s[0]).sum() :].T.reshape(-1, len(q), dim) * root[:, None]
+        self.basis = rest[(rest[:, free] != 0).any(axis=(1, 2))]
+        radius = np.sqrt(self.mass @ (self.shape**2).sum(axis=1) / self.mass.sum())
+        self.close = 1 / (radius * np.sqrt(self.mass[free].min())) if radius > 0 else 0.0
+
+    def strain(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """R, and D (k, dim), at positions x (Kabsch 1976)."""
+        p = x[self.who] - self.mass @ x[self.who] / self.mass.sum()
+        u, _, vt = np.linalg.svd((self.mass[:, None] * p).T @ self.shape)
+        u[:, -1] *= np.sign(np.linalg.det(u @ vt)) or 1.0
+        R = u @ vt
+        return R, p @ R - self.shape
+
+
+def rigid_rows(batches: list, w: np.ndarray) -> list[RigidRows]:
+    """Those of the rigid clusters of a world that are in anything else, which passes leave undone; of those not too large."""
+    out = []
+    degree = np.bincount(np.concatenate([np.zeros(0, dtype=np.int64), *(b.indices.ravel() for b in batches)]), minlength=len(w))
+    for b in batches:
+        if isinstance(b, ShapeMatch) and b.count:
+            some = (b.compliance == 0) & ~b.broken & ~b.idle(w) & (np.diff(b.members.starts) * b.start.dim <= WIDEST)
+            some &= np.maximum.reduceat(degree[b.indices], b.members.starts[:-1]) > 1
+            out += [RigidRows(b, w, some)] if some.any() else []
+    return [rows for rows in out if rows.count]
