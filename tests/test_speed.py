@@ -91,11 +91,11 @@ def test_plots(report, tmp_path):
 
 def test_bytes_are_those_of_the_fields(world):
     # Free fall in f32 and 2D, in each substep: x and d (8 bytes each) are read and written, the inverse mass (4), if not all have
-    # the same, and, once for all, g (8) are read.
+    # the same, and, once for all, g (8) and how many there are of what (4 each).
     for mass, more in ((1.0, 0), (np.arange(1.0, 301.0), 4)):
         w = world(tv.Particles(np.zeros((300, 2)), mass=mass), [tv.Gravity(9.81)], substeps=5)
         w.step(counting.DT)
-        assert counting.traffic(w, 2)["integrate"][0] == 5 * (300 * (4 * 8 + more) + 8)
+        assert counting.traffic(w, 2)["integrate"][0] == 5 * (300 * (4 * 8 + more) + 8 + 4 * 6)
 
 
 def test_launches_are_counted(world):

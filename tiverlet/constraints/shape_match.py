@@ -50,6 +50,7 @@ class ShapeMatch(Batch):
     "f32-compensated" is without the part of x, "f64" without both (1e-11).
     """
 
+    clusters = True
     each = ("compliance", "damping", "creep", "yield_strain", "break_at")
     index_name = "clusters"
     compliance: Any = Knob(lambda f, v: f._setting("compliance", v), "Inverse stiffness [m/N], (m,).", force=True)

@@ -185,6 +185,7 @@ class Batch(Feature):
     reweighs = False  # residual_of() needs reduce_block()
     soft = False  # has springs, which act at a start
     breaks = False  # has constraints that a load can break
+    clusters = False  # keeps shapes, which members_of() and shape_of() give
     drives = False  # puts its particles in place instead of relaxing them
     transcends = False  # takes angles, cube roots or exponentials, which SPIR-V has for f32 only
     members: Any  # FixedSize or VariableSize: the particles of each constraint

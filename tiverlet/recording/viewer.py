@@ -195,7 +195,7 @@ def _settled(process: subprocess.Popen, port: int, frame: int, name: str, view: 
             except (RuntimeError, OSError):  # not up yet, or not loaded
                 continue
             pixels = pixels_of(shot)
-            if last is not None and pixels.shape == last.shape and (pixels == last).all() and pixels.std() > 1:
+            if last is not None and pixels.shape == last.shape and (pixels == last).all() and (pixels != pixels[0, 0]).any():
                 shutil.copyfile(shot, name)
                 return
             last = pixels

@@ -1,10 +1,9 @@
 """Rigid clusters as constraints that are one number each: what deforms a cluster, in its own frame."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
-
-from ..constraints.shape_match import ShapeMatch
 
 HEAVY = 1024  # masses of the cluster: what a particle that cannot move weighs in it
 WIDEST = 60  # numbers of a cluster: LAPACK takes one thread for them, and with more its bits depend on how many there are
@@ -20,7 +19,7 @@ class RigidRows:
 
     side, breaks, unit = 0, False, None
 
-    def __init__(self, batch: ShapeMatch, w: np.ndarray, some: np.ndarray):
+    def __init__(self, batch: Any, w: np.ndarray, some: np.ndarray):
         self.clusters = [Cluster(batch, c, w) for c in np.flatnonzero(some).tolist()]
         self.count = sum(len(c.basis) for c in self.clusters)
         who = [(c.who, len(c.basis)) for c in self.clusters]
@@ -50,7 +49,7 @@ class RigidRows:
 class Cluster:
     """One of them: its particles, masses (k,), shape at rest (k, dim) about its center, and basis m B, (rows, k, dim)."""
 
-    def __init__(self, batch: ShapeMatch, c: int, w: np.ndarray):
+    def __init__(self, batch: Any, c: int, w: np.ndarray):
         self.who = batch.members_of(c).astype(np.int64)
         free = w[self.who] > 0
         m = np.divide(1, w[self.who], out=np.zeros(len(free)), where=free)
@@ -82,7 +81,7 @@ def rigid_rows(batches: list, w: np.ndarray) -> list[RigidRows]:
     out = []
     degree = np.bincount(np.concatenate([np.zeros(0, dtype=np.int64), *(b.indices.ravel() for b in batches)]), minlength=len(w))
     for b in batches:
-        if isinstance(b, ShapeMatch) and b.count:
+        if b.clusters and b.count:
             some = (b.compliance == 0) & ~b.broken & ~b.idle(w) & (np.diff(b.members.starts) * b.start.dim <= WIDEST)
             some &= np.maximum.reduceat(degree[b.indices], b.members.starts[:-1]) > 1
             out += [RigidRows(b, w, some)] if some.any() else []
