@@ -5,6 +5,7 @@ import functools
 import json
 import os
 import pathlib
+import signal
 import subprocess
 import sys
 import tempfile
@@ -24,6 +25,8 @@ from tiverlet.step import build
 # order: a second run takes half of the time or less. All of them are about as large as what it keeps by default, 100 MB.
 os.environ.setdefault("TI_OFFLINE_CACHE_MAX_SIZE_OF_FILES", str(512 << 20))
 
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as it is in the background of a shell; tests send it
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 ARCH = os.environ.get("TIVERLET_ARCH", "cpu")
 SOURCES = str(pathlib.Path(tv.__file__).parent)
 # Functions of tests are compiled as ours are, in a third of the time; those of these files are a user's, as those in the pages

@@ -74,7 +74,7 @@ def test_pairs_equal_brute_force(world, path, name, radius, several):
         pairs, _ = w._runner.grid.entries()
         pairs = pairs[pairs[:, 0] < pairs[:, 1]]
         np.testing.assert_array_equal(pairs, want)
-        found = w._runner.grid.number.to_numpy()[: len(position)]
+        found = w._runner.memory.read(w._runner.grid.number)
         np.testing.assert_array_equal(found, np.bincount(pairs.ravel(), minlength=len(position)))  # each by both
         if filled:
             in_bucket = np.diff(w._runner.grid.cells.edge.to_numpy()[: w._runner.grid.cells.buckets + 2])

@@ -76,6 +76,63 @@ def test_worlds_with_other_numbers_and_counts_and_clones_compile_nothing(world):
     assert alone == [w.hash() for w in shared]
 
 
+def test_a_world_that_grows_compiles_nothing(world):
+    # From 30 discs to 110 and back, with a list that is too short at first; with the bits that it has when all is compiled anew.
+    def grown(compiles):
+        x = np.stack(np.meshgrid(np.arange(10.0), np.arange(3.0)), axis=-1).reshape(-1, 2) + 0.6
+        w = world(tv.Particles(x, radius=0.45), [tv.Gravity(9.81), tv.Contact(), tv.Box((0, 0), (10, 99))], substeps=4)
+        hashes, names = [], []
+        for k in range(9):
+            with compiled() as more:
+                if k < 8:
+                    w.add(tv.Particles(x[: 10 * (k % 2 + 1) - 3] + [0.0, 4.0 + 3 * k], velocity=(0.1, -1), radius=0.45))
+                    assert w._runner.grid.capacity < 1000
+                else:
+                    w.remove(np.arange(25, len(w.particles)))
+                w.run(0.3)
+            hashes.append(w.hash())
+            names += more if k > 1 else []  # by then each kernel was needed once
+        assert bool(names) == compiles and len(w.particles) == 25
+        return hashes
+
+    shared = grown(False)
+    with layout.unshared():
+        assert grown(True) == shared
+
+
+ALL = {name: (row.points, lambda c, row=row: row.make(c, np.full(len(c), 0.5))) for name, row in ROWS.items()}
+ALL |= {name: (points, make) for name, (points, make, _) in OTHERS.items()}
+
+
+@pytest.mark.filterwarnings("ignore:Path")  # which points are off
+@pytest.mark.parametrize("name", ALL)
+def test_kernels_depend_on_no_number_of_anything(world, name):
+    # What is written of a world, which decides what is compiled: for one constraint and for three, with more and fewer free
+    # particles, other sizes of the scene, before and after steps of several lengths.
+    points, make = ALL[name]
+    m, dim = points.shape
+
+    def built(count, free, far):
+        x = np.concatenate([*(points + far * k for k in range(count)), np.full((free, dim), 99.0) + np.arange(free)[:, None]])
+        return world(tv.Particles(x), [make(np.arange(count * m).reshape(count, m)), tv.Gravity(count)])
+
+    def written(w):
+        return [sharing.Writing(part).key for part in (w._runner.step, w._runner.diagnostics)]
+
+    one, more = built(1, 2, 0.0), built(3, 7, 20.0)
+    first = written(one)
+    assert written(more) == first
+    for w in (one, more):
+        w.step(1 / 60)
+        w.substeps = 7
+        w.step(1 / 50)
+        assert written(w) == first
+        w.add(tv.Particles(points + 200.0))
+        assert written(w) == first
+        w.remove([len(w.particles) - 1])
+        assert written(w) == first
+
+
 def test_what_is_left_out_of_the_writing_is_not_read(world, monkeypatch):
     # What is compiled is a function of what is read. So while kernels are translated, nothing of what sharing.Writing leaves out
     # may be read: attributes that are for the host, and what arrays hold.
@@ -120,11 +177,9 @@ def test_what_is_left_out_of_the_writing_is_not_read(world, monkeypatch):
             translating[0] = False
         raise Translated
 
-    rows = [(row.points, lambda c, row=row, **more: row.make(c, np.full(len(c), 0.5), **more)) for row in ROWS.values()]
-    rows += [(points, make) for points, make, _ in OTHERS.values()]
     for dim in (2, 3):
         points, features, begin = [np.random.default_rng(0).normal(size=(9, dim))], [], 9
-        for corners, make in rows:
+        for corners, make in ALL.values():
             if corners.shape[1] == dim:
                 features.append(make(begin + np.arange(len(corners))[None]))
                 points.append(corners)

@@ -20,7 +20,7 @@ from .particles import Particles, in_range
 from .solvers.solver import Solver
 from .step import checkpoint, edit_scene
 from .step.adaptive import StepController
-from .step.build import Assembly, assemble, check_settings, checked_features, checked_solver
+from .step.build import Assembly, Scale, assemble, check_settings, checked_features, checked_solver
 from .step.clock import Clock
 from .step.edit_scene import Handle
 from .step.explain import explain
@@ -84,15 +84,15 @@ class World:
         self._undo: tuple | None = None  # the state before a step that takes long, and flags of features
 
     @property
-    def _build_options(self) -> tuple[Solver | None, str, str, int]:
+    def _build_options(self) -> tuple[Solver | None, str, str, int, Scale]:
         """What assemble() takes. A solver that was chosen for constraints that there are stays."""
         solver = self._requested[0] or (self._solver if self._runner.batches else None)
-        return solver, self._precision, self._requested[1], self._order
+        return solver, self._precision, self._requested[1], self._order, self._scale
 
     def _install(self, particles: Particles, features: tuple[Feature, ...], parts: Assembly) -> None:
         """Take these for the parts of the world."""
         self._particles, self._features = particles, features
-        self._runner, self._solver = Runner(parts, self._clock), parts.solver
+        self._runner, self._solver, self._scale = Runner(parts, self._clock), parts.solver, parts.scale
         self._search: PointSearch | None = None  # compiled when it is first asked
         parts.scene.residuals = self._runner.residuals
 
@@ -406,9 +406,9 @@ class World:
 
         What was there goes on to the bit: time, positions, velocities, multipliers, the history of springs, what pairs in contact
         remember. Where a force or a spring is added, displacements are first turned into velocities, as when a force changes.
-        On a CPU it takes milliseconds where the world has room for them, and nothing is compiled: small worlds have it up to the
-        next power of four, large ones for a sixteenth to an eighth more. Beyond, or with features or masses of another kind, it
-        costs the compiling that a new world costs, once; all worlds share what was compiled.
+        On a CPU it takes milliseconds, and nothing is compiled: the world keeps its kernels until there are four times as many of
+        what they work on. Features, masses or radii of a kind that it did not have, and the first particles that overlap others,
+        cost the compiling that a new world costs, once; all worlds share what was compiled.
 
         Raises as World() does; the world is then as before.
         """

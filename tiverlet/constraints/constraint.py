@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from .. import checks
 from ..device import ti
 from ..device.language import undecorated
-from ..features.feature import Knob
+from ..features.feature import Knob, Scene
 from ..particles import Particles
 from ..tools import golden
 from .core.finite_differences import NumericGradient
@@ -49,7 +49,8 @@ class Constraint(Scalar):
 
     index_name = "indices"
     exchangeable = ()
-    size = 0.0  # of the scene [m]
+    _size = 0.0  # of the scene [m]
+    _known: tuple[Any, Any, Any] = (None, None, None)  # positions, and values and gradients there
     rest = Knob(lambda f, v: checks.per_item(repr(f), "rest", v, f.count), "What function should be.")
 
     def __init__(
@@ -97,28 +98,33 @@ class Constraint(Scalar):
             self._keep(origin=origin)
             high = origin.astype(np.float32).astype(np.float64)  # two words: in f32 too, the origin is where it was put
             self.dev.origin = [high.tolist(), (origin - high).tolist()]
-        self._keep(size=particles.size)
-        self.dev.known: tuple[Any, Any, Any] = (None, None, None)
+        self._keep(_size=particles.size)
+        self._keep(_known=(None, None, None))
         self.dev.fixed = int(self.origin is None)
-        self.dev.gradient = NumericGradient(self.function, self.gradient, self.arity, particles.dim, self.dev.fixed, self.size)
+        self.dev.gradient = NumericGradient(self.function, self.gradient, self.arity, particles.dim, self.dev.fixed)
         Scalar.prepare(self, particles, inv_mass)
         values, slopes = np.zeros(0), np.zeros((0, self.arity, particles.dim))
         if self.count:
-            values, slopes, _ = self.dev.gradient(self._corners(particles.position))
-        self.dev.known = (particles.position, values, slopes)
+            values, slopes, _ = self.dev.gradient(self._corners(particles.position), self._size)
+        self._keep(_known=(particles.position, values, slopes))
         if not np.isfinite(values).all():
             i = int(np.argmin(np.isfinite(values)))
             raise ValueError(f"{self!r}: the function is {values[i]} for {self.index_name}[{i}] at its initial position.")
         if self.gradient is not None and self.count:
             self._check_gradient(particles.position)
 
+    def bind(self, scene: Scene) -> None:
+        """The step of differences, too."""
+        super().bind(scene)
+        self.dev.size = scene.memory.number(self._size, ti.f64)
+
     def _check_gradient(self, position: np.ndarray) -> None:
         """Compare with differences at the initial positions and near by; two of four must agree, since there may be kinks."""
         wrong, found = np.zeros((self.count, self.arity, position.shape[1]), dtype=int), []
         for k in range(4):
             q = self._corners(position)
-            q = q + k * 0.01 * self.size * (golden(np.arange(1, q.size + 1) + 1000 * k).reshape(q.shape) - 0.5)
-            _, given, differences = self.dev.gradient(q)
+            q = q + k * 0.01 * self._size * (golden(np.arange(1, q.size + 1) + 1000 * k).reshape(q.shape) - 0.5)
+            _, given, differences = self.dev.gradient(q, self._size)
             size = np.abs(differences).max(axis=(1, 2), keepdims=True)
             off = ~(np.abs(given - differences) <= WRONG * size + 1e-9 * np.abs(given))
             wrong += off & np.isfinite(differences)
@@ -138,17 +144,19 @@ class Constraint(Scalar):
 
     def rest_of(self, position: np.ndarray) -> np.ndarray:
         """The values of function."""
-        known, values, _ = self.dev.known
+        known, values, _ = self._known
         if position is known:  # while the world's fields are being declared, Taichi cannot launch kernels
             return values
-        return self.dev.gradient(self._corners(position))[0] if self.count else np.zeros(0)
+        return self.dev.gradient(self._corners(position), self._size)[0] if self.count else np.zeros(0)
 
     def gradients(self, position: np.ndarray) -> np.ndarray:
         """The gradients of function."""
-        known, _, slopes = self.dev.known
+        known, _, slopes = self._known
         if position is known:
             return slopes
-        return self.dev.gradient(self._corners(position))[1] if self.count else np.zeros((0, self.arity, position.shape[1]))
+        if not self.count:
+            return np.zeros((0, self.arity, position.shape[1]))
+        return self.dev.gradient(self._corners(position), self._size)[1]
 
     @ti.func
     def corners(self, c, back):
@@ -177,7 +185,7 @@ class Constraint(Scalar):
     @ti.func
     def measure(self, c, q):
         """The function and its gradient; nothing where they are not finite."""
-        f, g = self.dev.gradient.both(c, ti.cast(q, ti.f64))
+        f, g = self.dev.gradient.both(c, ti.cast(q, ti.f64), self.dev.size.now)
         total = f
         for k, a in ti.static(ti.ndrange(self.arity, self.dev.state.dim)):
             total += g[k, a] * g[k, a]

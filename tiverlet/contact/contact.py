@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..device import ti
-from ..device.patches.compiler import FEW
 from ..device.thread_team import Team
 from ..features.feature import Batch, Knob, Scene
 from ..neighbours.neighbour_list import WORD, PairData, lowest_bit
@@ -96,13 +95,7 @@ class Contact(PairContact):
         n, dim, dev = scene.particles.count, scene.particles.dim, self.dev
         pairs = [b.excluded_pairs(b.start) for b in batches]
         linked = np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=np.int32)
-        self.scene, dev.state, dev.w, dev.has_friction, dev.has_restitution = (
-            scene,
-            scene.state,
-            scene.state.w,
-            self.has_friction,
-            self.has_restitution,
-        )
+        self.enter(scene)
         dev.move = scene.memory.field("Contact.move", n, width=dim)
         self.table.bind(scene)
         # What parted the pair in the last substep, per inverse mass [kg m].
@@ -118,7 +111,7 @@ class Contact(PairContact):
         ]
         dev.grid = NeighbourSearch(scene, self._listed, linked, self.table, pair_data, team, dev.move)
         dev.geometry = DiscGeometry(scene, dev.grid, self.push_out, dev.impulse if dev.has_restitution else dev.push)
-        skips = n >= FEW and not dev.has_restitution  # in relax() what bounces forgets the last impact
+        skips = not scene.memory.compiler.few and not dev.has_restitution  # in relax() what bounces forgets the last impact
         dev.splitting = MassSplitting(scene, dev.geometry, dev.has_friction, skips, [dev.push, *bouncing], team)
         dev.forces = ForceShare(scene, sums=dev.has_friction, lasting=True)
         dev.fast = scene.memory.field("Contact.fast", None, kind=ti.i32)

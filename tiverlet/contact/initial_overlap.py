@@ -1,4 +1,4 @@
-"""Whether particles overlap when a world is built: what is known then need not be compiled for twice."""
+"""Whether particles overlap where they are put: a world that knows it need not be compiled for it, or not twice."""
 
 from itertools import product
 
@@ -6,23 +6,46 @@ import numpy as np
 
 from ..features.feature import Batch, Scene
 
+FEW = 1_000_000  # pairs that are looked at one by one
 MANY = 20_000  # particles for which it is not worth the time
 CROWD = 16  # in a cell, likewise
 
 
-def overlapping(scene: Scene, batches: list[Batch]) -> bool:
-    """Whether discs or spheres overlap, one of them free to move, by more than what f32 rounds; what is linked never touches.
-
-    False also where finding out would take long.
+def overlapping(scene: Scene, batches: list[Batch], first: int = 0) -> bool | None:
+    """Whether discs or spheres overlap, one of them free to move and one of them from number `first` on, by more than what f32
+    rounds; what is linked never touches. None where finding out would take long.
     """
     x, radius, free = scene.particles.position, scene.particles.radius, scene.inv_mass > 0
-    if not 1 < len(x) <= MANY:
+    close = 2.0**-20 * float(np.abs(x).max(initial=0.0) + radius.max(initial=0.0))
+    pairs = _by_all(x, radius, first) if (len(x) - first) * len(x) <= FEW else _by_cells(x, radius)
+    if pairs is None:
+        return None
+    i, j = pairs[(pairs >= first).any(axis=1)].T
+    near = ((x[i] - x[j]) ** 2).sum(axis=1) < np.maximum(radius[i] + radius[j] - close, 0) ** 2
+    pairs = np.stack([i, j], axis=1)[near & (free[i] | free[j])]
+    if not len(pairs):
         return False
-    cell, close = 2 * radius.max(), 2.0**-20 * float(np.abs(x).max() + radius.max())
-    place = np.floor((x - x.min(axis=0)) / cell) + 1
+    linked = np.concatenate([*(b.excluded_pairs(b.start) for b in batches), pairs[:0]])
+    some, without = (np.sort(p, axis=1).astype(np.int64) @ [len(x), 1] for p in (pairs, linked))
+    return not np.isin(some, without).all()
+
+
+def _by_all(x: np.ndarray, radius: np.ndarray, first: int) -> np.ndarray:
+    """Pairs of which one is from number `first` on, near along the first axis."""
+    near = np.abs(x[first:, None, 0] - x[None, :, 0]) < radius[first:, None] + radius
+    i, j = np.nonzero(near)
+    i += first
+    return np.stack([i, j], axis=1)[(j < i) | (j < first)]
+
+
+def _by_cells(x: np.ndarray, radius: np.ndarray) -> np.ndarray | None:
+    """Pairs in the same cell or in cells side by side; None where that would take long."""
+    if len(x) > MANY:
+        return None
+    place = np.floor((x - x.min(axis=0)) / (2 * radius.max())) + 1
     size = place.max(axis=0) + 2
     if size.prod() >= 2.0**53:
-        return False
+        return None
     stride = np.concatenate([[1.0], np.cumprod(size[:-1])])
     key = place @ stride
     order = np.argsort(key, kind="stable")
@@ -30,15 +53,8 @@ def overlapping(scene: Scene, batches: list[Batch]) -> bool:
     for step in (s for s in (np.array(s) @ stride for s in product((-1, 0, 1), repeat=x.shape[1])) if s >= 0):
         begin, end = np.searchsorted(key, key + step), np.searchsorted(key, key + step, side="right")
         if (end - begin).max() > CROWD:
-            return False
+            return None
         for k in range((end - begin).max()):
             some = (begin + k < end) & ((step > 0) | (begin + k > numbers))
-            i, j = order[some], order[begin[some] + k]
-            near = ((x[i] - x[j]) ** 2).sum(axis=1) < np.maximum(radius[i] + radius[j] - close, 0) ** 2
-            found.append(np.stack([i, j], axis=1)[near & (free[i] | free[j])])
-    pairs = np.concatenate(found)
-    if not len(pairs):
-        return False
-    linked = np.concatenate([*(b.excluded_pairs(b.start) for b in batches), pairs[:0]])
-    some, without = (np.sort(p, axis=1).astype(np.int64) @ [len(x), 1] for p in (pairs, linked))
-    return not np.isin(some, without).all()
+            found.append(np.stack([order[some], order[begin[some] + k]], axis=1))
+    return np.concatenate(found)

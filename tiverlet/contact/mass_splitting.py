@@ -1,7 +1,6 @@
 """How often the mass of a particle is split, so that all contacts that it is in can be solved at once."""
 
 from ..device import ti
-from ..device.patches.compiler import FEW
 from ..device.thread_team import BLOCK, Team
 from ..features.feature import Scene
 from ..neighbours.neighbour_list import WORD, PairData, lowest_bit
@@ -20,7 +19,7 @@ class MassSplitting:
     def __init__(self, scene: Scene, geometry: DiscGeometry, has_friction: bool, skips: bool, ended: list[PairData], team: Team):
         n = scene.particles.count
         self.geometry, self.grid, self.ended, self.has_friction, self.skips = geometry, geometry.grid, ended, has_friction, skips
-        self.state, self.real, self.few = scene.state, scene.real, n < FEW
+        self.state, self.real, self.few = scene.state, scene.real, scene.memory.compiler.few
         self.weight = scene.memory.field("Contact.split_mass", n, state=True)
         self.in_state = {"weight": self.weight}
         self.block = min(BLOCK, team.piece) if skips else BLOCK

@@ -110,6 +110,12 @@ class PairContact(Feature):
         """Declare the fields, among them the neighbour list's, which is returned."""
         raise NotImplementedError
 
+    def enter(self, scene: Scene) -> None:
+        """What comes first when fields are declared."""
+        dev = self.dev
+        self.scene, dev.state, dev.w = scene, scene.state, scene.state.w
+        dev.has_friction, dev.has_restitution = self.has_friction, self.has_restitution
+
     def upload(self) -> None:
         """Write friction and restitution."""
         if self.scene:

@@ -86,13 +86,7 @@ class Polygons(PairContact):
     def join(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
         """Declare the fields, among them the neighbour list's, which is returned."""
         n, add, dev = scene.particles.count, scene.memory.field, self.dev
-        self.scene, dev.state, dev.w, dev.has_friction, dev.has_restitution = (
-            scene,
-            scene.state,
-            scene.state.w,
-            self.has_friction,
-            self.has_restitution,
-        )
+        self.enter(scene)
         dev.forces = ForceShare(scene, sums=True, lasting=False)
         dev.geometry = PolygonGeometry(scene, dev.outline, self.push_out)
         dev.move = add("Contact.move", n, width=2)

@@ -1,12 +1,16 @@
 """Trees of fields, which worlds of the same structure share: bytes are their own, and kernels find those that they are told.
 
 A kernel of Taichi knows of a field in which tree it is, and where in that. Where the tree is, it looks up at each launch. So
-worlds whose fields are of the same kinds and lengths have one tree, and before a launch the place of their own bytes is written
-to where kernels look it up, see patches/roots.py. Where that cannot be done, as on a GPU, every world has trees of its own.
+worlds whose fields are of the same kinds have one tree, and before a launch the place of their own bytes is written to where
+kernels look it up, see patches/roots.py. Every field of a shared tree has ROOM, of which the system gives what is used, page by
+page: what grows stays where it is, and no kernel has to know. Where that cannot be done, as on a GPU, every world has trees of
+its own, with fields as long as they must be.
 """
 
 import contextlib
 import ctypes
+import mmap
+import sys
 from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -18,15 +22,14 @@ import numpy as np
 from . import language, runtime
 from .host_copy import Places, chain
 from .language import ti
-from .patches import patched
+from .patches import patched, roots
 
 MAX_TREES = 400  # Taichi holds at most 511 trees of fields and does not check; the rest is left to the user's own fields.
 SPARE = 64  # trees that are kept for the next world while no world has them
-SPARE_BYTES = 1 << 26  # that they may take up together
-ROOMS = (64, 256, 1024, 4096)  # elements for which small fields have room
-MANY = ROOMS[-1]
+ROOM = 1 << 24  # elements of a field; what is longer has a power of two
 BETWEEN = 23 * 64  # bytes; 64 fields, one after the other, begin at 64 places of a page
-LINE = 64  # bytes, at a multiple of which a tree begins
+NORESERVE = {"linux": 0x4000}.get(sys.platform, 0)  # lest Linux counts addresses as memory; Python has no name for it before 3.13
+LAZY = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | NORESERVE if sys.platform != "win32" else 0
 
 
 @dataclass(frozen=True)
@@ -40,61 +43,48 @@ class Declared:
 
 
 class Layout:
-    """Fields that are placed together, and where. serial: no other one ever has this number."""
+    """Fields that are placed together, and where. serial: no other one ever has this number. shared: several can have it."""
 
     _serials = count()
 
-    def __init__(self, declared: tuple[Declared, ...], fields: list[Any] | None = None):
+    def __init__(self, declared: tuple[Declared, ...], fields: list[Any] | None = None, shared: bool = False):
         if runtime.trees >= MAX_TREES:
             raise RuntimeError(
                 f"So many worlds are alive that they have {runtime.trees} trees of fields, and Taichi crashes near 512. "
                 "Close worlds that you no longer need: world.close(), or `with tv.World(...) as world:`."
             )
         self.declared, self.serial, self.runtime, self.users = declared, next(self._serials), language.current(), 0
+        self.shared = shared
         self.fields = fields or [made(d.kind, d.width) for d in declared]
         builders: dict[bool, Any] = {d.apart: None for d in declared}
         for apart in builders:
             builders[apart] = ti.FieldsBuilder()
         for d, field in zip(declared, self.fields, strict=True):
             (builders[d.apart].dense(ti.i, d.length) if d.length else builders[d.apart]).place(field)
-        self.trees = [builder.finalize() for builder in builders.values()]
+        self.trees = [roots.planned(builder) if shared else builder.finalize() for builder in builders.values()]
         runtime.trees += len(self.trees)
-        self._table: Any = None  # where kernels look up where trees are
-        self._home = self._now = 0  # the address of Taichi's own bytes of the tree, and of those that kernels find
-        self._at_home, self._used = False, False  # whether somebody has these, and whether somebody had
+        self._now = 0  # the address of the bytes that kernels find
         self._places: list[tuple[int, tuple[int, ...]]] = []  # of the fields in the tree: offset, strides; none if not seen
-        self.lasting = False  # whether it is kept for others
         self.size = 0  # [bytes] of the tree; 0 where the host cannot see it
-        if patched:
+        if shared or patched:
             self.look()
-        if _table[0] is not self.runtime:
+        if not shared and patched and _table[0] is not self.runtime:
             _know(self.runtime, None)
-
-    @property
-    def shared(self) -> bool:
-        """Whether several can have it."""
-        return self._table is not None
 
     def look(self) -> None:
         """Find the tree, and the fields in it, where the host can see them. All fields that were made must have their places."""
         if self.size or runtime.architecture() != "cpu" or len(self.trees) > 1:
             return
         (first, *_), tree = chain(self.fields[0])
-        if patched and _table[0] is not self.runtime:
-            from .patches.roots import table_of  # noqa: PLC0415  # which is there only where it is patched
-
+        if not self.shared:
             addresses = np.zeros(1, dtype=np.uint64)
             finder = Places(self.fields[0])
-            _know(self.runtime, table_of(finder, "find", addresses, self.trees[0].id, first))
-            self._home = int(addresses[0]) - first
-        if _table[1] is not None:
-            self._table = _table[1]
-            self._home = int(self._table[self.trees[0].id])
-        elif not self._home:
-            addresses = np.zeros(1, dtype=np.uint64)
-            Places(self.fields[0]).find(addresses)
-            self._home = int(addresses[0]) - first
-        self._now, self.size = self._home, tree.cell_size_bytes
+            if patched and _table[0] is not self.runtime:
+                _know(self.runtime, roots.table_of(finder, "find", addresses, self.trees[0].id, first))
+            else:
+                finder.find(addresses)
+            self._now = int(addresses[0]) - first
+        self.size = tree.cell_size_bytes
         for field in self.fields:
             offsets, _ = chain(field)
             steps = {b - a for a, b in pairwise(offsets)}
@@ -107,31 +97,29 @@ class Layout:
     def lend(self) -> tuple[int, Any]:
         """Bytes, all 0, for one more: their address, and what is to be kept as long as they are needed.
 
-        The address is 0 for Taichi's own bytes that nobody has looked for yet.
+        The address is 0 for bytes of Taichi's that nobody has looked for yet.
         """
+        if not self.shared:
+            return self._now, None
+        try:
+            room = mmap.mmap(-1, self.size, flags=LAZY)
+        except OSError as e:
+            raise MemoryError(f"The system has no room for one more world: {self.size >> 30} GiB of addresses ({e}).") from None
         self.users += 1
-        if not self._at_home:
-            if self._used and self.size:
-                ctypes.memset(self._home, 0, self.size)
-            self._at_home = self._used = True
-            return self._home, None
-        room = np.zeros(self.size + LINE, dtype=np.uint8)
-        return -(-room.ctypes.data // LINE) * LINE, room
+        return ctypes.addressof(ctypes.c_char.from_buffer(room)), room
 
-    def give_back(self, address: int) -> None:
-        """These are no longer needed."""
+    def give_back(self) -> None:
+        """Bytes that were lent are no longer needed."""
         self.users -= 1
-        if address == self._home:
-            self._at_home = False
 
     def point(self, address: int) -> None:
         """Have kernels find these bytes."""
         if address != self._now:
-            self._table[self.trees[0].id] = self._now = address
+            _table[1][self.trees[0].id] = self._now = address
 
     def views(self, address: int, shapes: list[tuple[tuple[int, ...], np.dtype]]) -> list[np.ndarray]:
         """The fields, as arrays of these shapes that are what is at this address; none where the host cannot see them."""
-        memory: Any = (ctypes.c_char * self.size).from_address(address or self._home)
+        memory: Any = (ctypes.c_char * self.size).from_address(address or self._now)
         return [
             np.ndarray(shape, kind, memory, offset, strides[: len(shape)])
             for (shape, kind), (offset, strides) in zip(shapes, self._places, strict=False)
@@ -178,48 +166,39 @@ def _know(of: Any, table: Any) -> None:
     _table = of, table
 
 
-def roomy(declared: list[Declared]) -> tuple[Declared, ...]:
-    """The same fields where worlds with other numbers of elements find place, too: so that these can share what is compiled, and
-    particles can come and go. The first world of a layout has Taichi's own bytes, which are all in memory; of the bytes of others
-    only those that are used.
-
-    Beyond the last of ROOMS it is for an eighth more at most. Between fields are BETWEEN bytes: where two begin at the same place
-    of a page, a processor takes a write to one for a write to the other, and they drive each other out of its first cache.
-    """
+def sharing() -> bool:
+    """Whether worlds can share trees."""
     if patched and _table[0] is not language.current():
-        Layout((Declared(ti.i32, 0, 1, False),)).destroy()  # which finds out whether they can
-    if _table[1] is None or _alone:
-        return tuple(declared)
-    return tuple(replace(d, length=_room(d)) if d.length else d for d in declared)
+        Layout((Declared(ti.i32, 0, 1, False),)).destroy()  # which finds out
+    return bool(LAZY) and _table[1] is not None and not _alone
 
 
-def _room(d: Declared) -> int:
+def roomy(d: Declared) -> Declared:
+    """The same field, as long as a tree has it that others share.
+
+    Between fields are BETWEEN bytes: where two begin at the same place of a page, a processor takes a write to one for a write to
+    the other, and they drive each other out of its first cache.
+    """
     size = (8 if d.kind == ti.f64 else 4) * max(1, d.width)
-    if d.length <= MANY:
-        room = next(room for room in ROOMS if d.length <= room)
-    else:
-        step = 1 << ((d.length - 1).bit_length() - 4)
-        room = -(-d.length // step) * step
-    return room + -(-BETWEEN // size)
+    room = max(ROOM, 1 << (d.length - 1).bit_length()) + -(-BETWEEN // size)
+    return replace(d, length=room) if d.length else d
 
 
-def take(declared: tuple[Declared, ...], turn: int, fields: list[Any]) -> Layout:
+def take(declared: tuple[Declared, ...], turn: int, fields: list[Any], shared: bool) -> Layout:
     """A layout of these fields, for one more: one that is there, or a new one. turn: how many of the same the world has already,
-    since kernels of one world need a tree for each. fields: from field(); they get their places."""
+    since kernels of one world need a tree for each. fields: from field(); they get their places. shared: see sharing()."""
     now = language.current()
     for key in [key for key, layout in _layouts.items() if layout.runtime is not now]:
         del _layouts[key]
-    layout = None if _alone else _layouts.get((declared, turn))
+    layout = _layouts.get((declared, turn)) if shared else None
     if layout is None:
-        layout = Layout(declared, None if patched else fields)
-        layout.lasting = layout.shared and not _alone
-        if layout.lasting:
+        layout = Layout(declared, None if patched else fields, shared)
+        if shared:
             _layouts[declared, turn] = layout
     else:
         _layouts.move_to_end((declared, turn))
     unused = [(key, one) for key, one in _layouts.items() if not one.users and one is not layout]
-    while unused and (len(unused) > SPARE or sum(one.size for _, one in unused) > SPARE_BYTES):
-        key, one = unused.pop(0)
+    for key, one in unused[: max(0, len(unused) - SPARE)]:
         del _layouts[key]
         one.destroy()
     if patched:

@@ -6,6 +6,7 @@ these into an error that says what to do, so that no other module has to know.
 """
 
 import weakref
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from .language import ti
 from .layout import Declared, Layout
 from .number import Number
 from .patches import patched
-from .patches.compiler import FEW, Compiler
+from .patches.compiler import Compiler
 
 GROUP = 16  # fields that one transfer kernel serves; Taichi unrolls the loop over them
 
@@ -24,15 +25,15 @@ GROUP = 16  # fields that one transfer kernel serves; Taichi unrolls the loop ov
 class Memory:
     """The fields of one world: declared first, then placed together, freed together.
 
-    `real` is ti.f32 or ti.f64; particles: how many the world has, see Compiler. Every method that touches the fields checks first
-    that they still exist.
+    `real` is ti.f32 or ti.f64; few: whether the world has few particles, see Compiler. Every method that touches the fields
+    checks first that they still exist.
     """
 
     kernels_read = ("real",)
 
-    def __init__(self, real, particles: int = FEW, compiler: Compiler | None = None):
+    def __init__(self, real, few: bool = False, compiler: Compiler | None = None):
         self.real = real
-        self.compiler = compiler or Compiler(real, particles)
+        self.compiler = compiler or Compiler(real, few)
         self.entries: list[Entry] = []
         self._later: list[tuple[Entry, np.ndarray]] = []
         self._declared: list[Declared] = []
@@ -86,9 +87,10 @@ class Memory:
             self._declare(f"numbers.{np.dtype(_NUMPY[kind]).name}", field, len(known), 0, kind, False)
             self._later.append((self.entries[-1], np.array([number._value for number in known], dtype=np.float64)))
         with self.compiler():
-            declared = layout.roomy(self._declared)
+            shared = layout.sharing()
+            declared = tuple(layout.roomy(d) if shared else d for d in self._declared)
             same = sum(one.declared == declared for one, _ in self.compiler.places)
-            self._layout = layout.take(declared, same, [e.field for e in self.entries])
+            self._layout = layout.take(declared, same, [e.field for e in self.entries], shared)
         address, room = self._layout.lend()
         self._ends = weakref.finalize(self, _end, self._layout, address, self.compiler, self._runtime)
         self._ends.atexit = False
@@ -99,6 +101,15 @@ class Memory:
         if self._later:
             self._load([entry for entry, _ in self._later], [values for _, values in self._later])
             self._later.clear()
+
+    def lengthen(self, length: int) -> bool:
+        """Give all fields so many elements, where they are. False where kernels would have to know: nothing was done then."""
+        longer = [replace(d, length=length) for d in self._declared]
+        if not (self._layout and self._layout.shared and tuple(map(layout.roomy, longer)) == self._layout.declared):
+            return False
+        self._declared, self._views = longer, {}
+        self.entries = [replace(e, length=length) for e in self.entries]
+        return True
 
     def _seen(self) -> dict[int, np.ndarray]:
         """Arrays that are the fields, by the id of the entry; none where the host cannot see them.
@@ -198,8 +209,8 @@ class Memory:
 def _end(one: Layout, address: int, compiler: Compiler, of: Any) -> None:
     """Free a place in a layout."""
     compiler.places.remove((one, address))
-    one.give_back(address)
-    if not one.lasting and of is language.current():
+    one.give_back()
+    if not one.shared and of is language.current():
         one.destroy()
 
 

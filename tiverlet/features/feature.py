@@ -46,7 +46,7 @@ BENT, FAR = 1, 2  # how far a constraint turned in a substep: by more than 26 de
 class Scene:
     """What a feature is bound to: the memory to declare fields in, and the particles they act on."""
 
-    host_only = ("inv_mass", "residuals", "hh")
+    host_only = ("inv_mass", "residuals", "h2_effective")
 
     memory: Memory
     state: "State"

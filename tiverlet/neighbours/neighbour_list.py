@@ -64,15 +64,17 @@ class NeighbourList:
         self.store: Memory | None = None
         self.room = 0  # entries of one list
 
-    def allocate(self, capacity: int) -> None:
-        """Room for `capacity` entries of the list, in a tree of its own, so that it can grow."""
+    def allocate(self, capacity: int) -> bool:
+        """Room for `capacity` entries of the list, in a tree of its own, so that it can grow. True if there are new fields."""
         if 2 * capacity > 2**31 - 1:
             raise MemoryError(f"{capacity} near pairs exceed what a list can index; the particles overlap too much.")
-        if self.store:
-            self.store.destroy()
         self.capacity_number.set(max(1, -(-capacity // self.blocks)))
         self.pitch_number.set(self.capacity + self.short)
         self.room = self.pitch * self.blocks
+        if self.store and self.store.lengthen(self.room):
+            return False
+        if self.store:
+            self.store.destroy()
         self.store = self.memory.more()
         self.neighbour = self.store.field("grid.near", self.room, kind=ti.i32)
         self.old_neighbour = self.store.field("grid.aside", self.room, kind=ti.i32)
@@ -81,9 +83,10 @@ class NeighbourList:
             if piece.kept:
                 piece.old = self.store.field(f"grid.{piece.name}_aside", self.room, width=piece.width)
         self.store.place()
+        return True
 
-    def grow(self) -> None:
-        """Make room for what the last build needed, and a quarter more."""
+    def grow(self) -> bool:
+        """Make room for what the last build needed, and a quarter more. True if kernels have to be told."""
         need = int(self.memory.read(self.need)[0])
         each = need * self.blocks / self.n
         if each > CROWDED:
@@ -94,10 +97,12 @@ class NeighbourList:
             )
         assert self.store
         kept = [self.store.read(field) for field in self._fields()]
-        self.allocate(int(need * 1.25 + 16) * self.blocks)
-        for field, values in zip(self._fields(), kept, strict=True):
-            self._write_old(field, values)
+        new = self.allocate(int(need * 1.25 + 16) * self.blocks)
+        if new:
+            for field, values in zip(self._fields(), kept, strict=True):
+                self._write_old(field, values)
         self.invalidate()
+        return new
 
     def _fields(self) -> list:
         return [self.old_neighbour, *(piece.old for piece in self.transferred)]

@@ -13,7 +13,6 @@ import numpy as np
 
 from ..device import ti
 from ..device.number import OnDevice
-from ..device.patches.compiler import FEW
 from ..device.prefix_sum import MOST, Sums
 from ..device.sorting import exchange, sort, sorting_network
 from ..device.thread_team import Team
@@ -45,7 +44,8 @@ class NeighbourSearch(NeighbourList):
         n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
         self.sums = Sums(n, team, capped=True)
         # Entries of a list that is sorted without branches; to compile that takes an eighth of all.
-        super().__init__(scene.memory, scene.count, self.sums.room, pair_data, team, 1 if n < FEW else 8 if dim == 2 else 16)
+        short = 1 if scene.memory.compiler.few else 8 if dim == 2 else 16
+        super().__init__(scene.memory, scene.count, self.sums.room, pair_data, team, short)
         self.network = sorting_network(self.short)
         self.dim, self.state, self.radius = dim, scene.state, scene.radius
         self.table = table

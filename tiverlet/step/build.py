@@ -12,6 +12,7 @@ from ..constraints.core.scalar import LOST, Scalar
 from ..contact.pair_contact import PairContact
 from ..device import runtime, ti
 from ..device.memory import Memory
+from ..device.patches.compiler import FEW
 from ..device.thread_team import PIECES, Team, size_of
 from ..features.feature import Acceleration, Batch, Feature, Scene
 from ..neighbours.neighbour_search import NeighbourSearch
@@ -37,16 +38,31 @@ ROOM = {True: (6.5, 14), False: (12, 32)}
 # pile, 0.122 and 0.136 ms with 500 discs, 0.169 and 0.170 with 1000, 0.50 and 0.37 with 4000; of 20 substeps of cloth with 225
 # particles (1200 with constraints) 0.55 and 0.35; of ropes with 205 (405) 0.18 and 0.18, with 820 (1620) 0.64 and 0.40.
 CROSSOVER = 1000
+STRETCH = 4  # times more or fewer of them, for which a world keeps its kernels
 USUAL = 1 / 1200  # [s] substep: 20 of a frame of 1/60 s
 MANY = 200  # stiff links from which systems are worth their sums
 STEPS = 5  # of conjugate gradients: at equal time 5 to 20 leave about the same, and these take the least of a frame
 WIDTH = 2  # of the systems that are solved directly where the user names no solver: chains, loops, joints of up to 3 rods
 
 
+@dataclass(frozen=True)
+class Scale:
+    """How many there are of what kernels work on, which decides how they are made. work: particles and constraints."""
+
+    particles: int
+    work: int
+
+    def holds(self, now: "Scale") -> bool:
+        """Whether what was made for this is still good, so that what comes and goes compiles nothing."""
+        pairs = (self.particles, now.particles), (self.work, now.work)
+        return all(max(some) <= STRETCH * max(1, min(some)) for some in pairs)
+
+
 @dataclass
 class Assembly:
     """The parts of a world on the device."""
 
+    scale: Scale
     path: str
     solver: Solver
     memory: Memory
@@ -59,12 +75,12 @@ class Assembly:
 
 def assemble(
     particles: Particles, features: tuple[Feature, ...], starts: Sequence[Particles | None], first: int,
-    solver: Solver | None, precision: str, path: str, order: int,
+    solver: Solver | None, precision: str, path: str, order: int, scale: Scale | None = None,
 ) -> Assembly:  # fmt: skip
     """Check the features against the particles and each other, then declare and place every field, in one tree.
 
     particles: as they are now. starts: for each feature how they were when it came; None if it comes now. first: from this
-    number on particles come now. solver: None for the one that suits the structure.
+    number on particles come now. solver: None for the one that suits the structure. scale: of the world that this one follows.
     """
     inv_mass = particles.inv_mass.copy()
     for feature, start in zip(features, starts, strict=True):
@@ -78,11 +94,13 @@ def assemble(
             feature.check_added(particles, first)
     runtime.ensure_started()
     check_architecture(precision, features)
-    path = _chosen(path, particles, features) if order == 2 else "fused"
-    memory = Memory(PRECISIONS[precision], len(particles))
+    now = Scale(len(particles), len(particles) + sum(f.count for f in features if isinstance(f, Batch)))
+    scale = scale if scale and scale.holds(now) else now
+    path = _chosen(path, scale) if order == 2 else "fused"
+    memory = Memory(PRECISIONS[precision], scale.particles < FEW)
     try:
         state = State(memory, particles, inv_mass, precision == "f32-compensated")
-        return _bind(Scene(memory, state, particles, inv_mass, order=order), features, solver, path)
+        return _bind(Scene(memory, state, particles, inv_mass, order=order), features, solver, path, scale)
     except BaseException:
         memory.destroy()
         for feature in features:
@@ -90,7 +108,7 @@ def assemble(
         raise
 
 
-def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, path: str) -> Assembly:
+def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, path: str, scale: Scale) -> Assembly:
     memory, state, particles = scene.memory, scene.state, scene.particles
 
     def of(kind: type[T]) -> list[T]:
@@ -114,7 +132,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     state.remember(
         memory, has_friction or any(w.sweeps for w in walls) or (bounces and bool(walls)), bounces, bool(contact and walls)
     )
-    size = size_of(path, _work(particles, features))
+    size = size_of(path, scale.work)
     team = Team(memory, size, len(particles), path == "parallel" and size == 1, pieces=PIECES if contact else size)
     grid = contact.join(scene, batches, team) if contact else None
     for feature in of(Batch):
@@ -131,7 +149,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     if grid and contact:
         grid.allocate(int(len(particles) * max(ROOM[scene.radius.uniform][particles.dim - 2], contact.room)) + 64)
     memory.place()
-    return Assembly(path, solver, memory, scene, batches, grid, step, diagnostics)
+    return Assembly(scale, path, solver, memory, scene, batches, grid, step, diagnostics)
 
 
 def checked_features(features: Iterable[Feature]) -> tuple[Feature, ...]:
@@ -265,14 +283,10 @@ def check_architecture(precision: str, features: tuple[Feature, ...]) -> None:
             )
 
 
-def _chosen(path: str, particles: Particles, features: tuple[Feature, ...]) -> str:
+def _chosen(path: str, scale: Scale) -> str:
     """The path for "auto": on one CPU thread while others would cost more than they do."""
     if path != "auto":
         return path
     if runtime.architecture() != "cpu":
         return "parallel"
-    return "fused" if _work(particles, features) < CROSSOVER or runtime.cores() == 1 else "parallel"
-
-
-def _work(particles: Particles, features: tuple[Feature, ...]) -> int:
-    return len(particles) + sum(f.count for f in features if isinstance(f, Batch))
+    return "fused" if scale.work < CROSSOVER or runtime.cores() == 1 else "parallel"

@@ -7,7 +7,6 @@ from ..colliders.collider import ROUNDS, SWEEPS, Collider
 from ..colliders.surface import AGAIN, FIRST, GENTLY
 from ..device import ti
 from ..device.number import OnDevice
-from ..device.patches.compiler import FEW
 from ..device.thread_team import Team, block, blocks
 from ..features.feature import Batch, Scene
 
@@ -31,7 +30,7 @@ class ParticlePass:
         n, number = scene.particles.count, scene.memory.number
         tile = min(TILE, team.piece)
         self.pieces, self.tile, self.each = number(-(-n // team.piece)), number(tile), number(-(-team.piece // tile))
-        self.few = n < FEW
+        self.few = scene.memory.compiler.few
         self.slots, self.grid, self.walls, self.radius = scene.slots, grid, walls, scene.radius
         self.gathers = bool(batches) and not contact  # else the moves of constraints are applied before contacts are solved
         self.held = bool(batches)

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from ..contact.initial_overlap import overlapping
 from ..contact.velocity_projection import EVERY
 from ..device.interrupts import whole
 from ..device.patches.compiler import CachedLaunch
@@ -213,13 +214,15 @@ class Runner:
 
     def grow(self) -> None:
         """More room for near pairs, and kernels that know of it. Nothing is lost: what did not fit was counted."""
-        self.grid.grow()
-        self.renew()
+        if self.grid.grow():
+            self.renew()
 
     def ease(self, first: int) -> None:
         """Let particles part gently that the user put into each other, from number `first` on."""
         contact = self.step.contacts[0]
         if not contact.shrinks:
+            if first and overlapping(self.scene, self.batches, first) is False:
+                return  # others do, under their loads
             contact.enable_shrink()
             self.renew()
         self.step.shrunk(first)

@@ -64,7 +64,7 @@ class Anchored(Batch):
     def bind(self, scene: Scene) -> None:
         """For what is not driven its multiplier, and for springs their memory."""
         super().bind(scene)
-        self.dev.size = self.start.size
+        self.dev.size = scene.memory.number(self.start.size, scene.real)
         if not self.drives:
             self.dev.lam = scene.memory.field(f"{self!r}.multiplier", self.count, width=scene.particles.dim, state=True)
             compliance, damping = (self.compliance, self.damping) if self.soft else (None, None)
@@ -154,7 +154,7 @@ class Anchored(Batch):
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
         """What is left, relative to the size of the scene."""
         _, _, size = self.solve(c, h, h2_effective, frame_fraction, 0, fresh)
-        return size / self.dev.size
+        return size / self.dev.size.now
 
     @ti.func
     def energy(self, c, back, h2_effective, residual):
@@ -165,5 +165,5 @@ class Anchored(Batch):
             if alpha > 0:
                 C = self.offset_now(c, back)
                 out = ti.cast(C.dot(C) / (2 * alpha), ti.f64)
-                out *= self.dev.spring.solved(self.dev.lam[c].norm() * alpha, h2_effective, residual * self.dev.size)
+                out *= self.dev.spring.solved(self.dev.lam[c].norm() * alpha, h2_effective, residual * self.dev.size.now)
         return out

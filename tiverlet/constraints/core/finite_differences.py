@@ -16,39 +16,39 @@ class NumericGradient:
 
     function, gradient: a Taichi function, and whether it takes the number of the constraint after the corners.
     fixed: 1 if the function does not change when all corners move together; the gradient of the first is then what the others
-    lack to a sum of 0. size: of the step where all corners coincide, in units of STEP [m].
+    lack to a sum of 0. size, where it is asked: of the step where all corners coincide, in units of STEP [m].
     """
 
-    def __init__(self, function: tuple, gradient: tuple | None, arity: int, dim: int, fixed: int, size: float):
+    def __init__(self, function: tuple, gradient: tuple | None, arity: int, dim: int, fixed: int):
         self.compiler = Compiler(ti.f64)
         self.function, self.counts = function
         self.given: Any = gradient[0] if gradient else None
         self.gradient_counts = bool(gradient and gradient[1])
         self.analytic = gradient is not None
-        self.arity, self.dim, self.fixed, self.size = arity, dim, fixed, size
+        self.arity, self.dim, self.fixed = arity, dim, fixed
         self.unknowns = [(k, a) for k in range(fixed, arity) for a in range(dim)]
         self.number = [[(k - fixed) * dim + a + 1 if k >= fixed else -1 for a in range(dim)] for k in range(arity)]
 
-    def __call__(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def __call__(self, q: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Values (m,), gradients and differences (m, arity, dim) at corners q (m, arity, dim), in f64."""
         runtime.ensure_started()
         m = len(q)
         f, g, d = np.zeros(m), np.zeros((m, self.arity, self.dim)), np.zeros((m, self.arity, self.dim))
         with self.compiler():
-            self.evaluate(np.ascontiguousarray(q), f, g, d)
+            self.evaluate(np.ascontiguousarray(q), f, g, d, size)
         return f, g if self.analytic else d, d
 
     @ti.kernel
     def evaluate(
         self, points: ti.types.ndarray(ti.f64, 3), f: ti.types.ndarray(ti.f64, 1), g: ti.types.ndarray(ti.f64, 3),
-        d: ti.types.ndarray(ti.f64, 3),
+        d: ti.types.ndarray(ti.f64, 3), size: ti.f64,
     ):  # fmt: skip
         """The function, its gradient as constraints use it, and by differences."""
         for c in range(points.shape[0]):
             q = ti.Matrix.zero(ti.f64, self.arity, self.dim)
             for k, a in ti.static(ti.ndrange(self.arity, self.dim)):
                 q[k, a] = points[c, k, a]
-            value, slope = self.differentiate(c, q)
+            value, slope = self.differentiate(c, q, size)
             f[c] = value
             for k, a in ti.static(ti.ndrange(self.arity, self.dim)):
                 d[c, k, a] = slope[k, a]
@@ -94,13 +94,16 @@ class NumericGradient:
         return g
 
     @ti.func
-    def differentiate(self, c, q):
-        """function and central differences of it at q. One loop, not unrolled, holds the only copy of the function."""
+    def differentiate(self, c, q, scale):
+        """function and central differences of it at q. scale: the step where q is 0, in units of STEP.
+
+        One loop, not unrolled, holds the only copy of the function.
+        """
         size = 0 * q[0, 0]
         for k, a in ti.static(ti.ndrange(self.arity, self.dim)):
             size = ti.max(size, ti.abs(q[k, a]))
         if size == 0:
-            size += self.size
+            size += scale
         step, f = STEP * size, 0 * size
         g = ti.Matrix.zero(ti.f64, self.arity, self.dim)
         for j in range(ti.static(2 * len(self.unknowns) + 1)):
@@ -116,9 +119,9 @@ class NumericGradient:
         return f, g
 
     @ti.func
-    def both(self, c, q):
+    def both(self, c, q, scale):
         """The function and its gradient."""
         if ti.static(self.analytic):
             return self.value(c, q, 0, 0 * q[0, 0]), self.slope(c, q)
         else:
-            return self.differentiate(c, q)
+            return self.differentiate(c, q, scale)

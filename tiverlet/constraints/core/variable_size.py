@@ -7,6 +7,7 @@ import numpy as np
 
 from ... import checks
 from ...device import ti
+from ...device.number import OnDevice
 from ...features.feature import Scene
 from ...features.read_only import handed_out, structure
 
@@ -105,21 +106,24 @@ class Corners:
     members, owner: the particle and the constraint of each corner. starts: the first corner of each constraint.
     """
 
+    count: Any = OnDevice()
+    blocks_in_all: Any = OnDevice()
+
     def __init__(self, scene: Scene, name: str, members: VariableSize, places: np.ndarray):
         self.state, self.slots = scene.state, scene.slots
         count, starts, size = members.count, members.starts, len(members.indices)
-        self.count = size
         parts = -(-np.diff(starts) // BLOCK)
         first = np.concatenate([[0], np.cumsum(parts)])
-        self.blocks_in_all = int(first[-1])
+        blocks, number = int(first[-1]), scene.memory.number
+        self.count, self.blocks_in_all = number(size), number(blocks)
         owner = np.repeat(np.arange(count), parts)
-        begin = starts[owner] + BLOCK * (np.arange(self.blocks_in_all) - first[owner])
+        begin = starts[owner] + BLOCK * (np.arange(blocks) - first[owner])
         end = np.minimum(begin + BLOCK, starts[owner + 1])
         add = scene.memory.field
         self.members = add(f"{name}.members", size, kind=ti.i32, values=members.indices)
         self.owner = add(f"{name}.owner", size, kind=ti.i32, values=members.owner)
         self.starts = add(f"{name}.starts", count + 1, kind=ti.i32, values=starts)
-        self.block = add(f"{name}.block", self.blocks_in_all, width=3, kind=ti.i32, values=np.stack([begin, end, owner], axis=1))
+        self.block = add(f"{name}.block", blocks, width=3, kind=ti.i32, values=np.stack([begin, end, owner], axis=1))
         self.blocks = add(f"{name}.blocks", count + 1, kind=ti.i32, values=first)
         self.places = add(f"{name}.slots", size, kind=ti.i32, values=places)
 

@@ -39,13 +39,13 @@ class Compiler:
     """How the kernels of one world are compiled, while it is called as a context.
 
     real: the type of their literals. Taichi rounds the literal 0.1 to its default type even next to f64 operands; a world of
-    precision "f64" (and the user's own functions in it) must not lose half of the digits that way. particles: how many they are
-    for. Kernels compile at their first launch.
+    precision "f64" (and the user's own functions in it) must not lose half of the digits that way. few: whether they are
+    for fewer than FEW particles. Kernels compile at their first launch.
     """
 
-    def __init__(self, real, particles: int = FEW):
-        self.real = real
-        self.lean = LEAN | BRIEF if particles < FEW else LEAN
+    def __init__(self, real, few: bool = False):
+        self.real, self.few = real, few
+        self.lean = LEAN | BRIEF if few else LEAN
         self.thorough = not patched  # once and for all, since what Taichi fails to compile may be tried again
         self.config: Any = None  # of Taichi, while kernels compile
         self._settings: dict[str, Any] = {}  # that Taichi was started with

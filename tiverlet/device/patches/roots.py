@@ -9,10 +9,16 @@ import ctypes
 from typing import Any
 
 import numpy as np
-from taichi.lang import impl
+
+from ..language import impl
 
 NEAR = 64  # words from the begin of the runtime within which the table begins; it is the twelfth
 TREES = 512  # that it has room for
+
+
+def planned(builder: Any) -> Any:
+    """A tree of fields that kernels can be compiled for, without bytes: they have to be told of some before they run."""
+    return builder._finalize_for_aot()
 
 
 def table_of(finder: Any, kernel: str, addresses: np.ndarray, tree: int, offset: int) -> Any:
