@@ -214,6 +214,33 @@ def test_what_functions_of_the_user_know_is_part_of_the_structure(world):
         assert end(strength, table) == pytest.approx(np.cos(np.sqrt(strength * table[1]) * 0.2), abs=1e-5)  # cos(omega t)
 
 
+def test_worlds_of_many_kinds_take_few_trees(world, monkeypatch):
+    # When there are many trees, the next has all fields that any has: most of what comes then finds place there.
+    def built(k):
+        x = tv.golden(np.arange(12)).reshape(6, 2)
+        more = [tv.Contact(), tv.Drag(0.1), tv.Box((-9, -9), (9, 9)), tv.Pin([0]), tv.Distance([[1, 2]], compliance=1e-3)]
+        chosen = [f for j, f in enumerate(more) if k >> j & 1]
+        return world(tv.Particles(x, radius=0.01), [tv.Gravity(), *chosen], precision=("f32", "f64")[k >> 5], substeps=3)
+
+    def end(k):
+        w = built(k)
+        w.run(0.1)
+        return w.hash()
+
+    some = (0, 21, 63)
+    with layout.unshared():
+        alone = [end(k) for k in some]
+    monkeypatch.setattr(layout, "MANY", 2)
+    monkeypatch.setattr(layout, "_known", {})
+    trees = runtime.trees
+    for k in range(64):
+        built(k)
+    made = runtime.trees - trees
+    assert made <= 20  # 96 without, as 32 of them have contacts and so two trees
+    assert [end(k) for k in some] == alone
+    assert runtime.trees - trees == made
+
+
 def test_many_worlds_one_after_the_other_take_no_more_than_a_few():
     # Whether they are closed or forgotten; more than the 511 trees that Taichi has would end the process.
     point = tv.Particles([[0.0, 0.0]])

@@ -46,6 +46,10 @@ class Particles:
         self.group = _group(who, group, self.count)
         with np.errstate(divide="ignore"):
             self.inv_mass = np.where(self.pinned, 0.0, 1.0 / self.mass)
+        self._fix()
+
+    def _fix(self) -> None:
+        """All that was set is structure from now on."""
         for name, array in vars(self).items():
             if isinstance(array, np.ndarray):
                 live = f" To move particles, assign to world.{name}." if name in ("position", "velocity") else ""
@@ -61,12 +65,14 @@ class Particles:
     def regrouped(self, some: np.ndarray, added: "Particles | None" = None, position: np.ndarray | None = None) -> "Particles":
         """Those in the mask `some` and then `added` ones; position: where those are, if not where they were."""
         here = self.position[some] if position is None else position
-        both: dict[str, np.ndarray] = {"position": here} | {
-            name: getattr(self, name)[some] for name in ("velocity", "mass", "radius", "pinned", "group")
-        }
+        names = ("velocity", "mass", "radius", "pinned", "group", "inv_mass")
+        both: dict[str, np.ndarray] = {"position": here} | {name: getattr(self, name)[some] for name in names}
         if added is not None:
             both = {name: np.concatenate([values, getattr(added, name)]) for name, values in both.items()}
-        return Particles(**both)
+        new = object.__new__(Particles)  # of what was checked when it came
+        vars(new).update(both, count=len(both["position"]), dim=self.dim)
+        new._fix()
+        return new
 
     def __setattr__(self, name: str, value) -> None:
         if getattr(self, "_fixed", False):

@@ -3,17 +3,18 @@
 A kernel of Taichi knows of a field in which tree it is, and where in that. Where the tree is, it looks up at each launch. So
 worlds whose fields are of the same kinds have one tree, and before a launch the place of their own bytes is written to where
 kernels look it up, see patches/roots.py. Every field of a shared tree has ROOM, of which the system gives what is used, page by
-page: what grows stays where it is, and no kernel has to know. Where that cannot be done, as on a GPU, every world has trees of
-its own, with fields as long as they must be.
+page: what grows stays where it is, and no kernel has to know. Such a tree stays as long as Taichi runs; it takes no memory. When
+there are MANY, the next has all that any had, so that there will not be many more. Where trees cannot be shared, as on a GPU,
+every world has its own, with fields as long as they must be.
 """
 
 import contextlib
 import ctypes
 import mmap
 import sys
-from collections import OrderedDict
+from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import count, pairwise
 from typing import Any
 
@@ -25,7 +26,8 @@ from .language import ti
 from .patches import patched, roots
 
 MAX_TREES = 400  # Taichi holds at most 511 trees of fields and does not check; the rest is left to the user's own fields.
-SPARE = 64  # trees that are kept for the next world while no world has them
+MANY = 200  # shared ones, each for worlds of one kind; further ones are for all
+FEW = 4  # fields of a kind, at least, that a shared tree has; it has 4, 8, 16 and so on
 ROOM = 1 << 24  # elements of a field; what is longer has a power of two
 BETWEEN = 23 * 64  # bytes; 64 fields, one after the other, begin at 64 places of a page
 NORESERVE = {"linux": 0x4000}.get(sys.platform, 0)  # lest Linux counts addresses as memory; Python has no name for it before 3.13
@@ -42,6 +44,9 @@ class Declared:
     apart: bool  # in a second tree
 
 
+Kind = tuple[Any, int, int]  # of a field in a shared tree: its type, width, and how many elements it has room for
+
+
 class Layout:
     """Fields that are placed together, and where. serial: no other one ever has this number. shared: several can have it."""
 
@@ -53,8 +58,7 @@ class Layout:
                 f"So many worlds are alive that they have {runtime.trees} trees of fields, and Taichi crashes near 512. "
                 "Close worlds that you no longer need: world.close(), or `with tv.World(...) as world:`."
             )
-        self.declared, self.serial, self.runtime, self.users = declared, next(self._serials), language.current(), 0
-        self.shared = shared
+        self.serial, self.runtime, self.shared = next(self._serials), language.current(), shared
         self.fields = fields or [made(d.kind, d.width) for d in declared]
         builders: dict[bool, Any] = {d.apart: None for d in declared}
         for apart in builders:
@@ -63,6 +67,7 @@ class Layout:
             (builders[d.apart].dense(ti.i, d.length) if d.length else builders[d.apart]).place(field)
         self.trees = [roots.planned(builder) if shared else builder.finalize() for builder in builders.values()]
         runtime.trees += len(self.trees)
+        self.numbers: dict[Kind, list[int]] = {}  # of a shared one: by kind, which of its fields are of it
         self._now = 0  # the address of the bytes that kernels find
         self._places: list[tuple[int, tuple[int, ...]]] = []  # of the fields in the tree: offset, strides; none if not seen
         self.size = 0  # [bytes] of the tree; 0 where the host cannot see it
@@ -105,38 +110,29 @@ class Layout:
             room = mmap.mmap(-1, self.size, flags=LAZY)
         except OSError as e:
             raise MemoryError(f"The system has no room for one more world: {self.size >> 30} GiB of addresses ({e}).") from None
-        self.users += 1
         return ctypes.addressof(ctypes.c_char.from_buffer(room)), room
-
-    def give_back(self) -> None:
-        """Bytes that were lent are no longer needed."""
-        self.users -= 1
 
     def point(self, address: int) -> None:
         """Have kernels find these bytes."""
         if address != self._now:
             _table[1][self.trees[0].id] = self._now = address
 
-    def views(self, address: int, shapes: list[tuple[tuple[int, ...], np.dtype]]) -> list[np.ndarray]:
-        """The fields, as arrays of these shapes that are what is at this address; none where the host cannot see them."""
+    def views(self, address: int, wanted: list[tuple[int, tuple[int, ...], np.dtype]]) -> list[np.ndarray]:
+        """Some fields, by number, as arrays of these shapes that are what is at this address; none where the host sees none."""
+        if not self._places:
+            return []
         memory: Any = (ctypes.c_char * self.size).from_address(address or self._now)
-        return [
-            np.ndarray(shape, kind, memory, offset, strides[: len(shape)])
-            for (shape, kind), (offset, strides) in zip(shapes, self._places, strict=False)
-        ]
+        places = [(self._places[k], shape, kind) for k, shape, kind in wanted]
+        return [np.ndarray(shape, kind, memory, offset, strides[: len(shape)]) for (offset, strides), shape, kind in places]
 
     def destroy(self) -> None:
-        """Free the trees."""
-        if self.trees and language.current() is self.runtime and not runtime.forked():
+        """Free the trees, unless they are shared."""
+        if not self.shared and self.trees and language.current() is self.runtime and not runtime.forked():
             self.runtime.materialize()  # no kernel may have run since they were made
             for tree in self.trees:
-                if self.shared:  # no kernel that knows it will be asked for again; Taichi would forget all others, too
-                    tree.ptr.destroy_snode_tree(language.current().prog)
-                    tree.destroyed = True
-                else:
-                    tree.destroy()
+                tree.destroy()
             runtime.trees -= len(self.trees)
-        self.trees = []
+            self.trees = []
 
 
 @contextlib.contextmanager
@@ -173,40 +169,58 @@ def sharing() -> bool:
     return bool(LAZY) and _table[1] is not None and not _alone
 
 
-def roomy(d: Declared) -> Declared:
-    """The same field, as long as a tree has it that others share.
-
-    Between fields are BETWEEN bytes: where two begin at the same place of a page, a processor takes a write to one for a write to
-    the other, and they drive each other out of its first cache.
-    """
-    size = (8 if d.kind == ti.f64 else 4) * max(1, d.width)
-    room = max(ROOM, 1 << (d.length - 1).bit_length()) + -(-BETWEEN // size)
-    return replace(d, length=room) if d.length else d
+def kind_of(d: Declared) -> Kind:
+    """What kind of field it is in a shared tree."""
+    return d.kind, d.width, max(ROOM, 1 << (d.length - 1).bit_length()) if d.length else 0
 
 
-def take(declared: tuple[Declared, ...], turn: int, fields: list[Any], shared: bool) -> Layout:
-    """A layout of these fields, for one more: one that is there, or a new one. turn: how many of the same the world has already,
-    since kernels of one world need a tree for each. fields: from field(); they get their places. shared: see sharing()."""
-    now = language.current()
-    for key in [key for key, layout in _layouts.items() if layout.runtime is not now]:
-        del _layouts[key]
-    layout = _layouts.get((declared, turn)) if shared else None
-    if layout is None:
-        layout = Layout(declared, None if patched else fields, shared)
-        if shared:
-            _layouts[declared, turn] = layout
+def take(declared: list[Declared], fields: list[Any], held: list[Layout], shared: bool) -> tuple[Layout, list[int]]:
+    """A layout with such fields, and which of its fields they are. held: those that the world has, since the kernels of a world
+    need another tree for each. fields: from field(); they get their places. shared: see sharing()."""
+    if not shared:
+        layout, which = Layout(tuple(declared), None if patched else fields), list(range(len(declared)))
     else:
-        _layouts.move_to_end((declared, turn))
-    unused = [(key, one) for key, one in _layouts.items() if not one.users and one is not layout]
-    for key, one in unused[: max(0, len(unused) - SPARE)]:
-        del _layouts[key]
-        one.destroy()
+        kinds = [kind_of(d) for d in declared]
+        layout = _shared(Counter(kinds), held)
+        numbers = {kind: iter(some) for kind, some in layout.numbers.items()}
+        which = [next(numbers[kind]) for kind in kinds]
     if patched:
-        for k, (unplaced, placed) in enumerate(zip(fields, layout.fields, strict=True)):
-            language.place_field(unplaced, placed, (layout.serial, k))
+        for k, unplaced in zip(which, fields, strict=True):
+            language.place_field(unplaced, layout.fields[k], (layout.serial, k))
+    return layout, which
+
+
+def _shared(need: Counter[Kind], held: list[Layout]) -> Layout:
+    """One that has so many fields of each kind, and is not held."""
+    now = language.current()
+    for layout in [layout for layout in _known if layout.runtime is not now]:
+        del _known[layout]
+    want = Counter({kind: max(FEW, 1 << (number - 1).bit_length()) for kind, number in need.items()})
+    for layout, has in _known.items():
+        if has == want and layout not in held:
+            return layout
+    if len(_known) >= MANY:
+        for layout, has in _known.items():
+            if need <= has and layout not in held:
+                return layout
+            want |= has
+    kinds = sorted(want.elements(), key=lambda kind: (kind[2], kind[1], str(kind[0])))
+    layout = Layout(tuple(_roomy(*kind) for kind in kinds), shared=True)
+    layout.numbers = {kind: [k for k, one in enumerate(kinds) if one == kind] for kind in want}
+    _known[layout] = want
     return layout
 
 
-_layouts: OrderedDict[tuple[tuple[Declared, ...], int], Layout] = OrderedDict()  # the last to be taken last
+def _roomy(kind: Any, width: int, room: int) -> Declared:
+    """A field of a shared tree.
+
+    Between two of them are BETWEEN bytes: where two begin at the same place of a page, a processor takes a write to one for a
+    write to the other, and they drive each other out of its first cache.
+    """
+    size = (8 if kind == ti.f64 else 4) * max(1, width)
+    return Declared(kind, width, room + -(-BETWEEN // size) if room else 0, False)
+
+
+_known: dict[Layout, Counter[Kind]] = {}  # the shared ones, and how many fields of each kind they have
 _alone = False
 _table: tuple[Any, Any] = (None, None)  # a runtime, and where its kernels look up where trees are

@@ -40,6 +40,7 @@ class Memory:
         self._numbers: dict[Any, tuple[Any, list[Number]]] = {}  # by kind: the field, and what it holds
         self._apart = not aligned()
         self._layout: Layout | None = None
+        self._which: list[int] = []  # of its fields
         self._runtime = language.current()
         self._transfers: dict[tuple, Transfer] = {}  # compiled once, since that costs more than running them
         self._views: dict[int, np.ndarray] = {}  # see _seen()
@@ -88,9 +89,8 @@ class Memory:
             self._later.append((self.entries[-1], np.array([number._value for number in known], dtype=np.float64)))
         with self.compiler():
             shared = layout.sharing()
-            declared = tuple(layout.roomy(d) if shared else d for d in self._declared)
-            same = sum(one.declared == declared for one, _ in self.compiler.places)
-            self._layout = layout.take(declared, same, [e.field for e in self.entries], shared)
+            held = [one for one, _ in self.compiler.places]
+            self._layout, self._which = layout.take(self._declared, [e.field for e in self.entries], held, shared)
         address, room = self._layout.lend()
         self._ends = weakref.finalize(self, _end, self._layout, address, self.compiler, self._runtime)
         self._ends.atexit = False
@@ -105,7 +105,8 @@ class Memory:
     def lengthen(self, length: int) -> bool:
         """Give all fields so many elements, where they are. False where kernels would have to know: nothing was done then."""
         longer = [replace(d, length=length) for d in self._declared]
-        if not (self._layout and self._layout.shared and tuple(map(layout.roomy, longer)) == self._layout.declared):
+        same = [*map(layout.kind_of, longer)] == [*map(layout.kind_of, self._declared)]
+        if not (self._layout and self._layout.shared and same):
             return False
         self._declared, self._views = longer, {}
         self.entries = [replace(e, length=length) for e in self.entries]
@@ -119,7 +120,8 @@ class Memory:
         if not self._views and self._layout:
             self._layout.look()
             if self._layout.size:
-                views = self._layout.views(self._address, [(e.shape, e.kind) for e in self.entries])
+                wanted = [(k, e.shape, e.kind) for k, e in zip(self._which, self.entries, strict=True)]
+                views = self._layout.views(self._address, wanted)
                 self._views = {id(e): view for e, view in zip(self.entries, views, strict=False)}
         return self._views
 
@@ -209,8 +211,7 @@ class Memory:
 def _end(one: Layout, address: int, compiler: Compiler, of: Any) -> None:
     """Free a place in a layout."""
     compiler.places.remove((one, address))
-    one.give_back()
-    if not one.shared and of is language.current():
+    if of is language.current():
         one.destroy()
 
 

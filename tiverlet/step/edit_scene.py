@@ -241,7 +241,9 @@ def _launch(world: Any, first: int) -> None:
         rows[first:] = h * want
         memory.write(field, rows)
     share = max(decay(sum(f.rate for f in integrator.forces.drags), h)[0], NOTHING)
-    d = h * want + h / share * (want - world.velocity[first:])
+    with world._runner.memory.compiler():
+        seen = world._runner.velocity(world.iterations, touching=False)
+    d = h * want + h / share * (want - seen[first:])
     d[world._runner.scene.inv_mass[first:] == 0] = 0.0
     values[0][first:] = d
     for rows in values[1:]:

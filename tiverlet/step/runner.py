@@ -125,15 +125,15 @@ class Runner:
                 clock.owed = (clock.drag or FREE)[3] * clock.h
             clock.d_is_velocity, clock.parted = True, None
 
-    def velocity(self, iterations: int) -> np.ndarray:
-        """Velocities as the user sees them, to the order of the world."""
+    def velocity(self, iterations: int, touching: bool = True) -> np.ndarray:
+        """Velocities as the user sees them, to the order of the world; without `touching` of particles that touch nothing yet."""
         clock = self.clock
         if clock.d_is_velocity:
             out = self.memory.read(self.scene.state.d).astype(np.float64)
         elif self.probe:
             out = high_order.velocity(self.probe, clock, self.memory, iterations)
         else:
-            if self.grid and self.memory.read(self.grid.old_saved)[0]:  # of a state that was put back
+            if self.grid and touching and self.memory.read(self.grid.old_saved)[0]:  # of a state that was put back
                 self.list_neighbours()
             out = np.zeros((max(1, self.n), self.step.dim))
             self.step.velocities(clock.h, clock.time, *self._shares(), out)

@@ -164,6 +164,7 @@ def may_read(kind: type, name: str) -> bool:
 
 _known: dict[tuple, str] = {}  # writings in short, and by which name their kernels are known
 _names_of: weakref.WeakKeyDictionary[Any, dict[tuple, str]] = weakref.WeakKeyDictionary()  # by objects: their kernels
+_keys_of: weakref.WeakKeyDictionary[Any, tuple] = weakref.WeakKeyDictionary()  # by objects: their writings in short
 
 
 def _ensured(self: Any, *args: Any) -> Any:
@@ -175,7 +176,9 @@ def _ensured(self: Any, *args: Any) -> Any:
     which = (self.func, *features[1:])
     if which not in known:
         options = (compiler.real, compiler.thorough, tuple(compiler.lean.items()))
-        writing = (self.func, options, features[1:], Writing(args[0]).key)
+        if args[0] not in _keys_of:
+            _keys_of[args[0]] = Writing(args[0]).key
+        writing = (self.func, options, features[1:], _keys_of[args[0]])
         known[which] = _known.setdefault(writing, f"shared{len(_known)}")
     key = (self.func, known[which], self.autodiff_mode)
     self.materialize(key=key, args=args, arg_features=features)
