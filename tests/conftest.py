@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -57,6 +58,25 @@ def checked_assignments():
     home, source_cache.HOME = source_cache.HOME, source_cache.HOME + OURS
     yield
     ops.assign, source_cache.HOME = assign, home
+
+
+@contextlib.contextmanager
+def compiled() -> Iterator[list[str]]:
+    """The names of the kernels that are compiled meanwhile."""
+    from taichi.lang.kernel_impl import Kernel  # noqa: PLC0415
+
+    names, materialize = [], Kernel.materialize
+
+    def noted(self, key=None, args=None, arg_features=None):
+        if key not in self.compiled_kernels:
+            names.append(self.func.__name__)
+        return materialize(self, key=key, args=args, arg_features=arg_features)
+
+    Kernel.materialize = noted
+    try:
+        yield names
+    finally:
+        Kernel.materialize = materialize
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -1,10 +1,11 @@
 """Particles that are held at targets, driven or by springs."""
 
 import numpy as np
+import pytest
 
 import tiverlet as tv
 
-from .conftest import order, rerun, rms
+from .conftest import compiled, order, rerun, rms
 
 
 def test_driven_pins_follow_their_targets(world):
@@ -44,3 +45,43 @@ def test_soft_pins_are_springs(world):
     w = world(tv.Particles([[0.0, 0.0]]), [tv.Gravity(9.81), hand], iterations=4, precision="f64")
     w.run(3.0)
     np.testing.assert_allclose(w.position[0], [0, -9.81 / k], atol=1e-7)
+
+
+@pytest.mark.parametrize("compliance", [0.0, 1e-3])
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+def test_a_pin_that_takes_other_particles_is_as_a_new_one(world, compliance, precision):
+    # To the bit, and nothing is compiled. What it held goes on freely.
+    def scene():
+        pin = tv.Pin([1, 3], [(0.0, 1.0), (1.0, 1.0)], compliance=compliance)
+        x = np.stack([np.arange(6) * 0.3, np.zeros(6)], axis=1)
+        links = tv.Distance([[0, 1], [1, 2], [2, 3], [3, 4], [4, 5]], compliance=1e-4)
+        features, solver = [tv.Gravity(9.81), links, tv.Contact(), pin], tv.Jacobi(0.5)
+        w = world(tv.Particles(x, radius=0.1), features, precision=precision, substeps=5, solver=solver)
+        w.run(0.3)
+        return w, pin
+
+    w, pin = scene()
+    other, old = scene()
+    assert w.hash() == other.hash()
+    for indices in ([2, 4], [2, 0], [1, 3]):
+        pin.indices, pin.target = indices, [(0.2, 0.9), (1.2, 0.8)]
+        new = tv.Pin(indices, [(0.2, 0.9), (1.2, 0.8)], compliance=compliance)
+        other.remove(features=[old])
+        other.add(features=[new])
+        old = new
+        with compiled() as names:
+            w.run(0.2)
+        other.run(0.2)
+        assert names == []
+        np.testing.assert_array_equal(w.position, other.position)
+        np.testing.assert_array_equal(w.velocity, other.velocity)
+        assert pin.indices[:, 0].tolist() == indices
+    w.remove([0])
+    assert pin.indices[:, 0].tolist() == [0, 2]
+    for value, words in (
+        ([0], "has 1 particles, but this Pin holds 2"),
+        ([0, 9], "there are 5 particles"),
+        ([1, 1], "named twice"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            pin.indices = value

@@ -1,9 +1,7 @@
 """Worlds of the same structure share what is compiled, and nothing of each other."""
 
-import contextlib
 import inspect
 import sys
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -15,27 +13,10 @@ from tiverlet.device import layout, runtime
 from tiverlet.device.patches import sharing
 from tiverlet.features.arguments import knobs_of
 
-from .conftest import ARCH
+from .conftest import ARCH, compiled
 from .rows import OTHERS, ROWS
 
 pytestmark = pytest.mark.skipif(ARCH != "cpu", reason="every world has kernels of its own there")
-
-
-@contextlib.contextmanager
-def compiled() -> Iterator[list[str]]:
-    """The names of the kernels that are compiled meanwhile."""
-    names, materialize = [], Kernel.materialize
-
-    def noted(self, key=None, args=None, arg_features=None):
-        if key not in self.compiled_kernels:
-            names.append(self.func.__name__)
-        return materialize(self, key=key, args=args, arg_features=arg_features)
-
-    Kernel.materialize = noted
-    try:
-        yield names
-    finally:
-        Kernel.materialize = materialize
 
 
 def hung(world, mass, compliance, g, rest, points):

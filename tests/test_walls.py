@@ -6,6 +6,7 @@ import pytest
 import tiverlet as tv
 from tiverlet.device import ti
 
+from .conftest import compiled
 from .outlines import CUBE, CUBE_FACES, SQUARE
 
 
@@ -193,6 +194,46 @@ def test_pendulum_in_a_bowl(world):
         energies.append(w.step(1 / 60).energy)
         lowest = min(lowest, w.position[0, 1])
     assert lowest == pytest.approx(-0.8, abs=1e-3) and min(energies) > -0.02 * 9.81 * 0.8 and max(energies) < 1e-3
+
+
+@pytest.mark.parametrize("name", scenes(2))
+def test_walls_that_are_switched_off_are_not_there(world, name):
+    # Through one that is off everything goes straight, x = x0 + v t; one that is on lets nothing in. Switching compiles nothing,
+    # where the wall was made with a switch.
+    make, outside = scenes(2)[name]
+    inside = outside(np.zeros((1, 2)))[0] < 0.2
+    x, v = np.array([[0.95, 0.93] if inside else [0.0, 0.0]]), np.array([[-3.0, -3.1]])
+    wall = make(active=True)
+    w = world(tv.Particles(x, velocity=v, radius=0.02), [wall], precision="f64", substeps=4)
+    for on in (True, False, True):
+        wall.active = on
+        w.position, w.velocity = x, v
+        with compiled() as names:
+            for k in range(1, 60):
+                w.step(1 / 60)
+                assert not on or outside(w.position)[0] >= 0.02 - 1e-9
+        assert wall.active is on and (w.velocity == v).all() != on
+        if not on:
+            np.testing.assert_allclose(w.position, x + v * k / 60, atol=1e-12)
+    assert names == [] and w.clone().features[0].active
+
+
+def test_a_wall_without_a_switch_can_be_switched_off_too(world):
+    # Which builds the world anew, once: it falls from rest at 0.2 m for t = 0.5 s, g t^2 / 2.
+    floor = tv.HalfSpace((0, 1))
+    w = world(tv.Particles([[0.0, 0.2]], radius=0.2), [tv.Gravity(9.81), floor], precision="f64")
+    w.run(0.1)
+    assert w.position[0, 1] == 0.2 and "HalfSpace.active" not in w.fields
+    floor.active = False
+    w.run(0.5)
+    assert w.position[0, 1] == pytest.approx(0.2 - 9.81 * 0.5**2 / 2, abs=1e-9)
+    floor.active, w.position, w.velocity = True, [[0.0, 0.2]], [[0.0, 0.0]]
+    w.run(0.1)
+    w.remove(features=[floor])
+    w.run(0.5)
+    assert w.position[0, 1] == pytest.approx(0.2 - 9.81 * 0.5**2 / 2, abs=1e-9)
+    with pytest.raises(TypeError, match="active = 0 is a int, but True or False"):
+        floor.active = 0
 
 
 def test_moving_balls_and_rods_carry_what_they_meet(world):

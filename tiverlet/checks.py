@@ -30,6 +30,13 @@ def _real(who: str, name: str, value: Any) -> float:
     return float(value)
 
 
+def flag(who: str, name: str, value: Any) -> bool:
+    """value as True or False."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise TypeError(f"{who}: {name} = {value!r} is a {type(value).__name__}, but True or False is needed.")
+    return bool(value)
+
+
 def integer(who: str, name: str, value, *, least: int) -> int:
     """An integer of at least `least`."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, numbers.Integral):

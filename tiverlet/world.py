@@ -163,9 +163,21 @@ class World:
 
     def _settle_forces(self) -> None:
         """Where a force has changed, take velocities by what it was: before that is overwritten, or left behind by a copy."""
-        if self._force_waits:
+        if any(f.changed and f.lets_go for f in self._features):
+            self._let_go()
+        elif self._force_waits:
             with self._runner.memory.compiler():
                 self._runner.restart(self._iterations)
+
+    def _let_go(self) -> None:
+        """Start from velocities, with the part in them of what is about to go."""
+        if not self._clock.d_is_velocity:
+            self._start_from(self.velocity)
+
+    def _start_from(self, velocity: np.ndarray) -> None:
+        clock = self._clock
+        self._runner.scene.state.start(self._runner.memory, velocity)
+        clock.d_is_velocity, clock.energy, clock.owed, clock.parted = True, None, 0.0, None
 
     def _adapt(self) -> None:
         """Settle forces; where knobs ask for what the kernels do not have, build the world anew."""
@@ -271,9 +283,7 @@ class World:
         with whole:
             for watcher in self._watchers:
                 watcher.assigned("velocity", value)
-            self._runner.scene.state.start(self._runner.memory, value)
-            clock = self._clock
-            clock.d_is_velocity, clock.energy, clock.owed, clock.parted = True, None, 0.0, None
+            self._start_from(value)
 
     def near(self, points, radius) -> np.ndarray:
         """The particles whose centers are within `radius` [m] of points: (m, 2), rows of `points` and particles, in order.

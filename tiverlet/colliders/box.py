@@ -48,10 +48,13 @@ class Box(Collider):
     lower = Knob(_corner("lower"), "Lower corner [m].")
     upper = Knob(_corner("upper"), "Upper corner [m].")
 
-    def __init__(self, lower, upper, *, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float = 1.0):
+    def __init__(
+        self, lower, upper, *, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float = 1.0, active: bool |
+        None = None,
+    ):  # fmt: skip
         self.lower = lower
         self.upper = upper
-        self.surface(friction, restitution, push_out)
+        self.surface(friction, restitution, push_out, active)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the corners against the dimension and the widest particle."""

@@ -33,20 +33,27 @@ class Collider(Feature):
     where it was at the start of the substep, to the bit, so it does not creep.
     restitution: 0 ... 1. The moment of the impact within the substep is solved for, with the acceleration in it; the particle
     leaves at restitution times its velocity then, and is placed where it would be at the end of the substep.
+    active: whether it is there, a gate that opens and closes. With True or False given it is a switch, which costs nothing to
+    turn; None is always there, and costs the compiling of another scene when it is switched off for the first time. What is
+    inside of a wall that comes back is left at push_out.
     """
 
     friction = Knob(lambda f, v: _friction(f, v), "A number, or (static, dynamic).")
     restitution = Knob(lambda f, v: restitution_of(repr(f), "restitution", v), "0 to 1.")
+    active = Knob(lambda f, v: checks.flag(repr(f), "active", v), "Whether it is there.")
     push_out = Knob(lambda f, v: checks.number(repr(f), "push_out", v, least=0.0), "[m/s].", compiled=True)
-    compiled_for = ("has_friction", "has_restitution")
+    compiled_for = ("has_friction", "has_restitution", "has_switch")
     host_only = ("widest",)
+    _switch = False  # it was made with one
+    _stands = True  # on the device
     sweeps = False  # needs the exact position at the start of the substep
     repeats = False  # one confine() may leave a particle that rubs or bounces where it has to be confined again
     poses = False  # has a pose(when) to be worked out once for each substep, before any confine()
 
-    def surface(self, friction: Any, restitution: Any, push_out: float) -> None:
+    def surface(self, friction: Any, restitution: Any, push_out: float, active: bool | None) -> None:
         """Check and keep the arguments that all walls have."""
         self.friction, self.restitution, self.push_out = friction, restitution, push_out
+        self._switch, self.active = active is not None, True if active is None else active
 
     @property
     def has_friction(self) -> bool:
@@ -58,17 +65,30 @@ class Collider(Feature):
         """Whether there is restitution, or was when kernels were compiled."""
         return self.restitution > 0 or self._built("surface", "has_restitution")
 
+    @property
+    def lets_go(self) -> bool:
+        """Whether it bore what it no longer will."""
+        return self._stands and not self.active
+
+    @property
+    def has_switch(self) -> bool:
+        """Whether it can be switched off, by the kernels as they are or are to be."""
+        return self._switch or not self.active or self._built("surface", "has_switch")
+
     def bind(self, scene: Scene) -> None:
         """Keep the state at hand, and make the surface."""
         self.scene = scene
         self.dev.state = scene.state
         self.dev.real = scene.real
         both = friction_of(repr(self), "friction", self.friction) if self.has_friction else None
-        self.dev.surface = Surface(scene, repr(self), both, self.restitution if self.has_restitution else None, self.push_out)
+        restitution, active = self.restitution if self.has_restitution else None, self.active if self.has_switch else None
+        self.dev.surface = Surface(scene, repr(self), both, restitution, self.push_out, active)
+        self._stands = self.active
 
     def upload(self) -> None:
-        """Write friction and restitution."""
-        self.dev.surface.upload(friction_of(repr(self), "friction", self.friction), self.restitution)
+        """Write friction and restitution, and whether it is there."""
+        self.dev.surface.upload(friction_of(repr(self), "friction", self.friction), self.restitution, self.active)
+        self._stands = self.active
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
         """For pictures of a scene between two corners: line strips (m, k, dim), and half their width [m], 0 for a thin line."""

@@ -14,25 +14,32 @@ FIRST, AGAIN, GENTLY = range(3)
 class Surface:
     """How the surface of one collider answers on the device: friction, restitution, push_out; see Collider for what they mean.
 
-    friction: (static, dynamic), or None for a surface without. restitution: 0 to 1, or None. push_out: [m/s].
+    friction: (static, dynamic), or None for a surface without. restitution: 0 to 1, or None. push_out: [m/s]. active: whether
+    it is there, or None for one without a switch.
     """
 
     def __init__(
-        self, scene: "Scene", name: str, friction: tuple[float, float] | None, restitution: float | None, push_out: float
-    ):
+        self, scene: "Scene", name: str, friction: tuple[float, float] | None, restitution: float | None, push_out: float, active:
+        bool | None,
+    ):  # fmt: skip
         self._memory, self.state, self.push_out = scene.memory, scene.state, push_out
         self.has_friction, self.has_restitution = friction is not None, restitution is not None
         if self.has_friction:
             self.friction = scene.memory.field(f"{name}.friction", None, width=2, values=friction)
         if self.has_restitution:
             self.restitution = scene.memory.field(f"{name}.restitution", None, values=restitution)
+        self.has_switch = active is not None
+        if self.has_switch:
+            self.active = scene.memory.field(f"{name}.active", None, kind=ti.i32, values=float(active or 0))
 
-    def upload(self, friction: tuple[float, float], restitution: float) -> None:
-        """Write both to the device, as far as kernels read them."""
+    def upload(self, friction: tuple[float, float], restitution: float, active: bool) -> None:
+        """Write these to the device, as far as kernels read them."""
         if self.has_friction:
             self._memory.write(self.friction, friction)
         if self.has_restitution:
             self._memory.write(self.restitution, restitution)
+        if self.has_switch:
+            self._memory.write(self.active, float(active))
 
     @inline
     def static(self):

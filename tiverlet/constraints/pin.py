@@ -7,7 +7,7 @@ from .. import checks
 from ..device import ti
 from ..features.feature import Knob, Scene
 from ..particles import Particles, in_range
-from .core.anchored import Anchored
+from .core.anchored import Anchored, one_each
 
 
 def _targets(pin: "Pin", target):
@@ -19,13 +19,26 @@ def _targets(pin: "Pin", target):
     return target
 
 
+def _indices(pin: "Pin", indices) -> np.ndarray:
+    """Those in hand: also the members, which are made of them."""
+    rows = np.asarray(indices)
+    rows = rows[:, 0] if rows.ndim == 2 and rows.shape[1] == 1 else rows  # as they are read
+    members = one_each("Pin", rows, pin.start.count if pin.start else checks.ANY)
+    if members.count != pin.count:
+        raise ValueError(f"Pin: indices has {members.count} particles, but this Pin holds {pin.count}. Make another one.")
+    pin._keep(members=members)
+    pin._grabs = pin.scene is not None
+    return members.indices
+
+
 class Pin(Anchored):
     """Particles held at targets that may move: an anchor, a hand, a mouse.
 
     C(x) = x - target (a vector), with unit gradients.
 
-    indices: (m,) particles; target: (m, dim) or (dim,) [m]; None holds them where they start. Live: assign to .target between
-    frames, and the particles go there in a straight line during the next frame.
+    indices: (m,) particles. target: (m, dim) or (dim,) [m]; None holds them where they start. Both are live: assign to .target
+    between frames, and the particles go there in a straight line during the next frame; assign as many other particles to
+    .indices, and these are held from then on, as by a new Pin. That compiles nothing; a tv.Hand takes others faster still.
     compliance: number or (m,) [m/N]. 0 takes the particles out of the solver and drives them, whatever pulls at them; above 0
     they are drawn by a spring of stiffness 1 / compliance, as by a mouse. damping: [N s/m], of that spring.
 
@@ -35,10 +48,13 @@ class Pin(Anchored):
     each = ("compliance", "damping", "target")
     dim = 0
     exclusive = True
+    indices = Knob(_indices, "The particles that are held, (m, 1).")
+    _grabs = False  # other particles than in the frame before
     target = Knob(_targets, "Where the particles are held, (m, dim) [m].")
 
     def __init__(self, indices, target=None, *, compliance: ArrayLike = 0.0, damping: ArrayLike = 0.0):
         self.setup(indices, compliance, damping)
+        self._keep(indices=self.members.indices)
         if target is not None:
             self.target = target
 
@@ -59,6 +75,26 @@ class Pin(Anchored):
     def drives(self) -> bool:
         """Whether the particles follow the target exactly."""
         return not self.soft
+
+    @property
+    def outgrown(self) -> bool:
+        """Other particles are other masses, and another place for what they are moved by."""
+        return self._grabs or super().outgrown
+
+    @property
+    def afresh(self) -> bool:
+        """Whether it holds others."""
+        return self._grabs
+
+    def select(self, some: np.ndarray, number: np.ndarray) -> None:
+        """Keep some, by their new numbers."""
+        super().select(some, number)
+        self._keep(indices=self.members.indices)
+
+    def release(self) -> None:
+        """Forget the world, and what was held there."""
+        super().release()
+        self._grabs = False
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check indices and targets; driven particles cannot be moved by anything else."""

@@ -26,6 +26,7 @@ from .language import ti
 from .patches import patched, roots
 
 MAX_TREES = 400  # Taichi holds at most 511 trees of fields and does not check; the rest is left to the user's own fields.
+NODES = 900  # of a tree: one for a field, and one for each of its components; Taichi takes 1024
 MANY = 200  # shared ones, each for worlds of one kind; further ones are for all
 FEW = 4  # fields of a kind, at least, that a shared tree has; it has 4, 8, 16 and so on
 ROOM = 1 << 24  # elements of a field; what is longer has a power of two
@@ -203,7 +204,8 @@ def _shared(need: Counter[Kind], held: list[Layout]) -> Layout:
         for layout, has in _known.items():
             if need <= has and layout not in held:
                 return layout
-            want |= has
+            if sum(number * (1 + max(1, kind[1])) for kind, number in (want | has).items()) <= NODES:
+                want |= has
     kinds = sorted(want.elements(), key=lambda kind: (kind[2], kind[1], str(kind[0])))
     layout = Layout(tuple(_roomy(*kind) for kind in kinds), shared=True)
     layout.numbers = {kind: [k for k, one in enumerate(kinds) if one == kind] for kind in want}

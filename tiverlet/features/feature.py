@@ -71,13 +71,14 @@ class Scene:
 
 class Feature(RecordsArguments):
     """Base of all. `arguments` are those that it was made with; `changed` says that a knob waits to be uploaded, `new_force`
-    that it changes a force, `moving` that a target is under way."""
+    that it changes a force, `lets_go` that it no longer bears what it bore, `afresh` that it begins anew where the world is built
+    anew, `moving` that a target is under way."""
 
     kept_by_world = ("scene", "start", "changed", "moving", "new_force", "arguments")
     host_only: tuple[str, ...] = ("start", "changed", "moving", "new_force", "arguments")  # what kernels do not read of it
     compiled_for: tuple[str, ...] = ()  # properties that decide what its kernels consist of
     changed = True
-    moving = new_force = False
+    moving = new_force = lets_go = afresh = False
     scene: Any = None  # Scene, from bind() on
     start: Any = None  # Particles, as they were when it came: what it takes from them is what it took then, when bound again too
 

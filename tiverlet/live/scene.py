@@ -44,7 +44,7 @@ def walls(world: "World", extent: tuple[np.ndarray, np.ndarray]) -> list[dict[st
     """Outlines of walls and paths, where they are now."""
     out = []
     for f in world.features:
-        if isinstance(f, (Collider, Path)):
+        if isinstance(f, (Collider, Path)) and getattr(f, "active", True):
             strips, radius = f.outline(*extent)
             vertices, faces = f.solid(*extent) if isinstance(f, Collider) else (np.zeros((0, 3)), np.zeros((0, 3)))
             lines = [] if len(faces) else [_short(strip) for strip in strips]

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 POINT = -2.5  # a particle without radius is drawn as a dot of so many pixels (negative: screen units)
 MANY = 5000  # links that are drawn as lines; of more, an even selection
 WALL = np.array([[92, 97, 112]], dtype=np.uint8)  # of surfaces of walls
+OPEN = (60, 63, 70)  # of a wall that is switched off
 FEW = 1500  # particles up to which contacts are drawn; finding them would take too much of the frame beyond
 TOUCH = 4  # one contact is drawn for so many particles, those that push most
 
@@ -154,7 +155,8 @@ class Drawing:
                 return
             strips, thickness = wall.outline(*self._extent)
             radius = thickness if thickness else -1.5  # half the width in the scene, or pixels
-            self._log(f"{self._root}/walls/{k}", self._strips(strips, colors=[[120, 125, 140]], radii=[radius]))
+            hue = OPEN if isinstance(wall, Collider) and not wall.active else (120, 125, 140)
+            self._log(f"{self._root}/walls/{k}", self._strips(strips, colors=[hue], radii=[radius]))
             self.bytes += strips.nbytes
 
     def _solid(self, k: int, wall: Any) -> bool:
@@ -164,7 +166,7 @@ class Drawing:
         vertices, faces = wall.solid(*self._extent)
         if len(faces):
             corners = vertices.astype(np.float32)
-            hues = np.repeat(WALL, len(vertices), axis=0)
+            hues = np.repeat(WALL if wall.active else WALL // 2, len(vertices), axis=0)
             shades = Surface(faces, hues, np.zeros((0, 2), dtype=np.int64), upwards(self.world)).colors(vertices, np.zeros(0))
             mesh = self._rr.Mesh3D(vertex_positions=corners, triangle_indices=faces.astype(np.uint32), vertex_colors=shades)
             self._log(f"{self._root}/walls/{k}", mesh)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from .. import checks
+from ..colliders.collider import Collider
 from ..contact.pair_contact import PairContact
 from ..device.memory import Memory
 from ..features.feature import Acceleration, Batch, Feature
@@ -104,20 +105,23 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
     number = np.where(some, np.cumsum(some) - 1, -1)
     now = world._particles.regrouped(some, added, world.position[some])
     kept, attributes = checkpoint.keep(world), {f: dict(vars(f)) for f in {*before, *features}}
-    came = [f for f in features if f not in before]
-    went = [f for f in before if f not in features]
+    came = [f for f in features if f not in before or f.afresh]
+    went = [f for f in before if f not in features or f.afresh]
     starts = {id(f.start): f.start.regrouped(some, added) for f in before}
     starts = [None if f in came else starts[id(f.start)] for f in features]
     parts, seen = None, None
     if not world._clock.d_is_velocity and (world._clock.parted is not None or any(_loses(f, number, features) for f in before)):
         seen = world.velocity
     try:
-        turned = world._force_waits or any(_drives(f, number) for f in came + went)
-        if turned:
+        borne = any(isinstance(f, Collider) for f in went)
+        turned = borne or world._force_waits or any(_drives(f, number) for f in came + went)
+        if borne:
+            world._let_go()
+        elif turned:
             with world._runner.memory.compiler():
                 world._runner.restart(world.iterations)
         old = checkpoint.state(world) if turned else kept.values
-        masks = {f: f.kept_mask(number) for f in before}
+        masks = {f: tuple(mask & (f not in came) for mask in f.kept_mask(number)) for f in before}
         for f in before:
             f.release()
             f.remap_indices(number, n + m)

@@ -158,7 +158,7 @@ class ParticlePass:
         if self.state.w.positive(i):
             if ti.static(len(self.walls) == 1 and not self.walls[0].repeats):
                 for f in ti.static(self.walls):
-                    f.confine(i, self.radius.of(i), h, frame_fraction, FIRST)
+                    self.touch(f, i, h, frame_fraction, FIRST)
             else:
                 moving, turn = True, FIRST
                 for k in range(SWEEPS + ROUNDS + 1):
@@ -167,13 +167,22 @@ class ParticlePass:
                             self.stay(i)
                         x, d = self.state.x[i], self.state.d[i]
                         for f in ti.static(self.walls):
-                            f.confine(i, self.radius.of(i), h, frame_fraction, turn)
+                            self.touch(f, i, h, frame_fraction, turn)
                         settled = (self.state.d[i] == d).all() and (self.state.x[i] == x).all()
                         # With friction or bounces a round may come back to where it began, and not be free there.
                         moving = not (settled and (turn == GENTLY or ti.static(not self.rough)))
                         turn = FIRST if ti.static(len(self.walls) > 1) else AGAIN
                         if settled or k + 1 >= SWEEPS:
                             turn = GENTLY
+
+    @ti.func
+    def touch(self, wall: ti.template(), i, h, frame_fraction, turn):  # type: ignore[valid-type]
+        """One wall, if it is there."""
+        if ti.static(wall.dev.surface.has_switch):
+            if wall.dev.surface.active[None] != 0:
+                wall.confine(i, self.radius.of(i), h, frame_fraction, turn)
+        else:
+            wall.confine(i, self.radius.of(i), h, frame_fraction, turn)
 
     @ti.func
     def stay(self, i):

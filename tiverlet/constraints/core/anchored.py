@@ -10,6 +10,15 @@ from ...particles import Particles
 from .spring import Spring, stiff
 
 
+def one_each(who: str, indices, count: int = checks.ANY) -> FixedSize:
+    """Particles of `count`, each of which has a place."""
+    rows = checks.indices(who, "indices", indices, count)
+    if len(np.unique(rows)) < len(rows):
+        values, counts = np.unique(rows, return_counts=True)
+        raise ValueError(f"{who}: particle {values[counts > 1][0]} is named twice, and can have only one place.")
+    return FixedSize(who, rows[:, None])
+
+
 class Anchored(Batch):
     """Constraints C(x) = x - place on one particle each, a vector, from soft to rigid: the formula of Scalar for each axis alike,
     with unit vectors for gradients.
@@ -27,12 +36,7 @@ class Anchored(Batch):
 
     def setup(self, indices, compliance, damping) -> None:
         """Keep the arguments of __init__."""
-        who = repr(self)
-        rows = checks.indices(who, "indices", indices, checks.ANY)
-        if len(np.unique(rows)) < len(rows):
-            values, counts = np.unique(rows, return_counts=True)
-            raise ValueError(f"{who}: particle {values[counts > 1][0]} is named twice, and can have only one place.")
-        self.members = FixedSize(type(self).__name__, rows[:, None])
+        self.members = one_each(repr(self), indices)
         self.compliance, self.damping = compliance, damping
 
     def _compliance(self, value) -> np.ndarray:
