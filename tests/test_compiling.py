@@ -2,14 +2,19 @@
 
 import gc
 import inspect
+import io
 import re
 import sys
 import tempfile
 
-import tiverlet as tv
-from tiverlet.device.patches import source_cache
+import pytest
+from rich.console import Console
 
-from .conftest import python
+import tiverlet as tv
+from tiverlet.device import ti
+from tiverlet.device.patches import patched, source_cache, timing
+
+from .conftest import ARCH, python
 
 PILE = """
 import numpy as np
@@ -151,3 +156,29 @@ def test_compiling_leaves_nothing_behind(world):
     w = world(tv.Particles([[0.0, 1.0], [1.0, 1.0]], radius=0.1), [tv.Gravity(9.81), tv.Contact()])
     w.run(0.1)
     assert not source_cache.active and gc.isenabled()
+
+
+@pytest.mark.skipif(ARCH != "cpu" or not patched, reason="of the patches of Taichi on a CPU")
+def test_who_waits_is_told_what_for(world, monkeypatch):
+    # On a terminal, a line while LLVM works; afterwards explain() says how long it took, and what for. All times add up.
+    shown = io.StringIO()
+    monkeypatch.setattr("rich.console.Console", lambda **_: Console(file=shown, force_terminal=True))
+    monkeypatch.setattr(timing, "LONG", 0.0)
+
+    @ti.func
+    def pull(x):
+        return -1.2345 * x
+
+    features = [tv.Force(pull), tv.Contact(friction=0.123), tv.Box((-9, -9), (9, 9))]
+    w = world(tv.Particles([[0.0, 0.0], [1.0, 0.0]], radius=0.4), features)
+    assert "Nothing was compiled for it" in w.explain()
+    w.step(1 / 60)
+    assert "compiling fused: Box, Contact, Force" in shown.getvalue()
+    times, (line,) = w._runner.memory.compiler.times, [row for row in w.explain().splitlines() if row.startswith("Compiled in")]
+    total = sum(times.kernels.values())
+    assert f"Compiled in {total:.2f} s: " in line and times.kernels["fused"] > 0.5 * total
+    assert {"Contact", "Box", "neighbour list", "report"} < times.features.keys() and 0 < sum(times.features.values()) < total
+    assert "Nothing was compiled for it" in w.clone().explain()
+    other = w.clone()
+    other.step(1 / 60)
+    assert "Nothing was compiled for it" in other.explain()

@@ -23,7 +23,7 @@ from .step.adaptive import StepController
 from .step.build import Assembly, Scale, assemble, check_settings, checked_features, checked_solver
 from .step.clock import Clock
 from .step.edit_scene import Handle
-from .step.explain import explain
+from .step.explain import compiling, explain
 from .step.runner import Runner
 from .step_report import StepReport
 
@@ -239,8 +239,8 @@ class World:
         return checkpoint.keep(self).digest()
 
     def explain(self) -> str:
-        """What was compiled and what was left out, with fields, bytes and launches."""
-        return explain(self)
+        """What was compiled and what was left out, with fields, bytes and launches, and how long compiling took."""
+        return "\n".join([explain(self), *compiling(self)])
 
     # State.
 

@@ -26,8 +26,8 @@ def _indices(pin: "Pin", indices) -> np.ndarray:
     members = one_each("Pin", rows, pin.start.count if pin.start else checks.ANY)
     if members.count != pin.count:
         raise ValueError(f"Pin: indices has {members.count} particles, but this Pin holds {pin.count}. Make another one.")
+    pin._grabs |= pin.scene is not None and not np.array_equal(members.indices, pin.members.indices)
     pin._keep(members=members)
-    pin._grabs = pin.scene is not None
     return members.indices
 
 

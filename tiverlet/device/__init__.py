@@ -4,11 +4,12 @@ from .language import at, ti
 from .patches import patched
 
 if patched:
-    from .patches import sharing, source_cache, syntax_cache
+    from .patches import sharing, source_cache, syntax_cache, timing
 
     source_cache.apply()  # before what comes next, which is imported in half the time
     syntax_cache.apply()
     sharing.apply()
+    timing.apply()
 from .patches.compiler import inline, record
 
 __all__ = ["at", "inline", "record", "ti"]

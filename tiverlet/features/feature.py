@@ -77,6 +77,7 @@ class Feature(RecordsArguments):
     kept_by_world = ("scene", "start", "changed", "moving", "new_force", "arguments")
     host_only: tuple[str, ...] = ("start", "changed", "moving", "new_force", "arguments")  # what kernels do not read of it
     compiled_for: tuple[str, ...] = ()  # properties that decide what its kernels consist of
+    told_apart = True  # its share of the time that kernels take to compile is known by its name
     changed = True
     moving = new_force = lets_go = afresh = False
     scene: Any = None  # Scene, from bind() on

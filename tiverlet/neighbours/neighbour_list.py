@@ -42,6 +42,7 @@ class NeighbourList:
     capacity_number: Number
     pitch_number: Number
     host_only = ("room",)
+    told_apart = True  # as a Feature
 
     def __init__(self, memory: Memory, count: Number, rooms: int, pair_data: list[PairData], team: Team, short: int):
         self.team, self.n, self.memory, self.real, self.short = team, count, memory, memory.real, short
@@ -63,6 +64,9 @@ class NeighbourList:
         self.old_neighbour: Any = None  # of the old list, pairs with data other than 0, while a new one is built
         self.store: Memory | None = None
         self.room = 0  # entries of one list
+
+    def __repr__(self) -> str:
+        return "neighbour list"
 
     def allocate(self, capacity: int) -> bool:
         """Room for `capacity` entries of the list, in a tree of its own, so that it can grow. True if there are new fields."""

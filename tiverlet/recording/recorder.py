@@ -14,6 +14,7 @@ import numpy as np
 from .. import checks
 from ..device import interrupts
 from ..step import checkpoint
+from ..step.explain import explain
 from ..world import World
 from .journal import JOURNAL, Journal, brief, said
 from .picture import Picture, layout
@@ -98,7 +99,7 @@ class Recorder:
 
     def _begin(self, title: str) -> None:
         """Write what holds for all frames, and the first one."""
-        world, explained = self.world, self.world.explain()
+        world, explained = self.world, explain(self.world)
         world._settle_forces()
         self._picture = Picture(world, self._stream, explained, environment())
         self._sent, self._flushed = perf_counter(), 0

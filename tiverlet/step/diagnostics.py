@@ -32,6 +32,7 @@ class Diagnostics:
     """
 
     host_only = ("sheet", "report", "details")
+    told_apart = True  # as a Feature
     n: Any = OnDevice()  # particles
 
     def __init__(self, step: Step, solver: Solver):
@@ -52,6 +53,9 @@ class Diagnostics:
         self.sheet: Any = np.zeros(SHEET)
         self.report = Reporter(step, solver, self.sheet)
         step.diagnostics = self
+
+    def __repr__(self) -> str:
+        return "report"
 
     def of(self, step: Step) -> "Diagnostics":
         """The same fields, for another Step."""

@@ -7,6 +7,7 @@ import numpy as np
 
 from ..colliders.collider import Collider
 from ..device import runtime
+from ..device.patches import patched
 from ..features.feature import Acceleration, Batch
 from ..shapes.shape import morton
 from .build import reason
@@ -47,6 +48,18 @@ def explain(world: "World") -> str:
             "large worlds then take half of the time."
         )
     return "\n".join(lines)
+
+
+def compiling(world: "World") -> list[str]:
+    """How long it took, which is known where Taichi is the one that device/patches knows."""
+    times = world._runner.memory.compiler.times
+    if not times.kernels:
+        return ["Nothing was compiled for it, or not yet."] if patched else []
+    total = sum(times.kernels.values())
+    rest = {"motion and the rest": total - sum(times.features.values())}
+    lines = [f"Compiled in {total:.2f} s: {', '.join(f'{name} {t:.2f}' for name, t in times.kernels.items())}"]
+    parts = sorted((times.features | rest).items(), key=lambda part: -part[1])
+    return [*lines, f"    of which about {', '.join(f'{t:.2f} for {name}' for name, t in parts)}"]
 
 
 def _scattered(position: np.ndarray) -> bool:

@@ -13,6 +13,7 @@ import contextlib
 import gc
 import threading
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -35,6 +36,14 @@ _INSIDE = contextlib.nullcontext()
 _lock = threading.RLock()  # the type of literals is one for all threads
 
 
+@dataclass
+class Times:
+    """What was compiled for a world [s], by kernels and by features; nothing for what another world had compiled."""
+
+    kernels: dict[str, float]
+    features: dict[str, float]
+
+
 class Compiler:
     """How the kernels of one world are compiled, while it is called as a context.
 
@@ -51,6 +60,7 @@ class Compiler:
         self._settings: dict[str, Any] = {}  # that Taichi was started with
         self._thread = 0
         self.refused: Exception | None = None  # what is wrong with a function that is being compiled, see refuse()
+        self.times = Times({}, {})
         self.places: list[tuple[Any, int]] = []  # where the world's fields are: layouts and addresses
 
     def point(self) -> None:

@@ -22,7 +22,7 @@ import taichi as ti
 from taichi.lang.field import Field
 from taichi.lang.kernel_impl import Func, Kernel
 
-from . import active
+from . import active, timing
 from .source_cache import OURS, TAICHI
 
 OF_TAICHI = ("taichi", "numpy", "math")  # modules that stay as they are
@@ -181,7 +181,8 @@ def _ensured(self: Any, *args: Any) -> Any:
         writing = (self.func, options, features[1:], _keys_of[args[0]])
         known[which] = _known.setdefault(writing, f"shared{len(_known)}")
     key = (self.func, known[which], self.autodiff_mode)
-    self.materialize(key=key, args=args, arg_features=features)
+    name = next((a for a in args if isinstance(a, str)), self.func.__name__)
+    timing.compiled(self, key, name, lambda: self.materialize(key=key, args=args, arg_features=features))
     return key
 
 

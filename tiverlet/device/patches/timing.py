@@ -1,0 +1,98 @@
+"""How long kernels take to compile, and what of them, by what is `told_apart`; and a word for who waits.
+
+While LLVM works, Taichi holds Python, so nothing can move on a terminal. What is to be seen has to be there before: LLVM takes
+longer than the translation, which is measured.
+"""
+
+import contextlib
+from collections.abc import Iterator
+from time import perf_counter
+from typing import Any
+
+from taichi.lang import impl
+from taichi.lang.kernel_impl import Func
+
+from . import active
+
+LONG = 0.3  # [s] of translating a kernel, after which LLVM is expected to take the better part of a second
+
+
+class Translation:
+    """One that is going on: the time that functions of each feature take, without what they call of others."""
+
+    now: "Translation | None" = None
+
+    def __init__(self):
+        self.seconds: dict[str, float] = {}
+        self._open: list[str] = [""]
+        self._since = perf_counter()
+
+    def enter(self, name: str) -> None:
+        """A function of this one begins."""
+        self._count()
+        self._open.append(name)
+
+    def leave(self) -> None:
+        """It has ended."""
+        self._count()
+        self._open.pop()
+
+    def _count(self) -> None:
+        now = perf_counter()
+        self.seconds[self._open[-1]] = self.seconds.get(self._open[-1], 0.0) + now - self._since
+        self._since = now
+
+
+def compiled(kernel: Any, key: Any, name: str, translate: Any) -> None:
+    """Translate and compile a kernel, and note how long that took: in all, and by features, in parts as their statements took."""
+    if key in kernel.compiled_kernels:
+        return
+    begin, outer, translation = perf_counter(), Translation.now, Translation()
+    Translation.now = translation
+    try:
+        translate()
+        translation.leave()
+    finally:
+        Translation.now = outer
+    program: Any = impl.get_runtime().prog
+    own = {feature: seconds for feature, seconds in translation.seconds.items() if feature}
+    with _told(name, [*own]) if perf_counter() - begin > LONG else contextlib.nullcontext():
+        program.compile_kernel(program.config(), program.get_device_caps(), kernel.compiled_kernels[key])
+    taken, times = perf_counter() - begin, active[-1].times
+    times.kernels[name] = times.kernels.get(name, 0.0) + taken
+    part = taken / sum(translation.seconds.values())
+    for feature, seconds in own.items():
+        times.features[feature] = times.features.get(feature, 0.0) + part * seconds
+
+
+@contextlib.contextmanager
+def _told(name: str, features: list[str]) -> Iterator[None]:
+    """On a terminal, a line that says what is compiled, as long as it is."""
+    from rich.console import Console  # noqa: PLC0415  # which takes 50 ms to import
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield
+        return
+    with console.status(f"compiling {name}: {', '.join(sorted(features)) or 'motion'} (kept for the next time)"):
+        yield
+
+
+def _called(self: Any, *args: Any, **kwargs: Any) -> Any:
+    """A function inside of a kernel: whose it is."""
+    now = Translation.now
+    if now is None or not args or not getattr(args[0], "told_apart", False):
+        return _call(self, *args, **kwargs)
+    now.enter(repr(args[0]))
+    try:
+        return _call(self, *args, **kwargs)
+    finally:
+        now.leave()
+
+
+def apply() -> None:
+    """Put this in the place of what Taichi calls."""
+    Func.__call__ = _called  # type: ignore[method-assign]
+
+
+_call: Any = Func.__call__
