@@ -14,6 +14,7 @@ from tiverlet.device.patches import sharing
 from tiverlet.features.arguments import knobs_of
 
 from .conftest import ARCH, compiled
+from .outlines import CUBE, CUBE_FACES, SQUARE
 from .rows import OTHERS, ROWS
 
 pytestmark = pytest.mark.skipif(ARCH != "cpu", reason="every world has kernels of its own there")
@@ -81,6 +82,11 @@ def test_a_world_that_grows_compiles_nothing(world):
         assert grown(True) == shared
 
 
+@ti.func
+def spring(x):
+    return -0.1 * x
+
+
 ALL = {name: (row.points, lambda c, row=row: row.make(c, np.full(len(c), 0.5))) for name, row in ROWS.items()}
 ALL |= {name: (points, make) for name, (points, make, _) in OTHERS.items()}
 
@@ -112,6 +118,31 @@ def test_kernels_depend_on_no_number_of_anything(world, name):
         assert written(w) == first
         w.remove([len(w.particles) - 1])
         assert written(w) == first
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_kernels_depend_on_no_number_of_particles(world, dim):
+    # The same for what acts on all particles: all forces and walls, contacts of discs and of polygons.
+    shapes = [tv.Polygon(SQUARE)] if dim == 2 else [tv.Mesh(CUBE, CUBE_FACES)]
+    far, ahead = np.full(dim, 50.0), np.eye(dim)[0]
+    forces = [tv.Gravity(), tv.Drag(0.1), tv.Wind(ahead, 0.1), tv.Attractor(far, 1.0), tv.Hand(far, 1), tv.Force(spring)]
+    rod = tv.Capsule(far, far + ahead, 1.0, active=True)
+    walls = [tv.Box(-99 - far, 99 + far), tv.HalfSpace(ahead, -99.0), tv.Ball(far, 1.0), rod]
+    corners = 20.0 * np.eye(dim)[:2].sum(axis=0) + np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]) @ np.eye(2, dim)
+
+    def built(n, touch):
+        x = np.concatenate([corners, 3.0 * np.arange(n)[:, None] * ahead])
+        return world(tv.Particles(x, radius=0.1), [*(f.copy() for f in (*forces, *walls, *shapes)), touch])
+
+    def written(w):
+        return [sharing.Writing(part).key for part in (w._runner.step, w._runner.diagnostics)]
+
+    for touch in (tv.Contact(friction=0.1), tv.Polygons([range(4)]))[: 4 - dim]:
+        one, more = built(3, touch.copy()), built(8, touch.copy())
+        first = written(one)
+        assert written(more) == first
+        one.add(tv.Particles([-9.0 * ahead], radius=0.1))
+        assert written(one) == first
 
 
 def test_what_is_left_out_of_the_writing_is_not_read(world, monkeypatch):

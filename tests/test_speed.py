@@ -10,14 +10,14 @@ import pytest
 import tiverlet as tv
 from tiverlet.__main__ import main
 from tiverlet.report import speed
-from tiverlet.report.speed import SCENES, SpeedReport, c_baseline, counting, measure, peers, scenes, stripped
+from tiverlet.report.speed import SCENES, SpeedReport, c_baseline, counting, measure, peers, scenes, stripped, waits
 
 
 @pytest.fixture(scope="module")
 def report():
     """Two scenes of one size each, quickly, one of them by a copy of the package that lacks what it does not use."""
-    whole = speed(["pile"], sizes=[41], threads=[1], quick=True, peers=False, absent=False)
-    rope = speed(["rope"], sizes=[41], threads=[1], quick=True, peers=False, yardstick=False)
+    whole = speed(["pile"], sizes=[41], threads=[1], quick=True, peers=False, absent=False, waits=True)
+    rope = speed(["rope"], sizes=[41], threads=[1], quick=True, peers=False, yardstick=False, waits=False)
     return replace(whole, runs=whole.runs + rope.runs, absent=rope.absent)
 
 
@@ -35,6 +35,12 @@ def test_figures_are_positive_and_belong_together(report):
     assert 0 < pile.overlap < 0.05 and pile.residual == 0
     assert 0 < rope.residual < 1e-4 and rope.overlap == 0 and rope.yardstick is None
     assert not report.missing
+
+
+def test_edits_are_timed(report):
+    assert {w.act for w in report.waits} == {*waits.FIRST, *waits.AIMS} and {w.particles for w in report.waits} == {400}
+    assert all(w.cold >= 0 and w.warm >= 0 and w.aim == waits.AIMS.get(w.act) for w in report.waits)
+    assert "take another in hand" in str(report)
 
 
 def test_pile_in_c_does_the_same(report):

@@ -13,7 +13,8 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--arch", default="cpu", help="cpu, cuda, metal or vulkan (default cpu)")
     parser.add_argument("--list", action="store_true", help="list the scenes and their sizes")
     parser.add_argument("--quick", action="store_true", help="two small sizes of each, and few runs")
-    for name, what in (("yardstick", "pile.c"), ("peers", "other engines"), ("absent", "the package without unused files")):
+    parts = {"yardstick": "pile.c", "peers": "other engines", "absent": "the package without unused files", "waits": "edits"}
+    for name, what in parts.items():
         parser.add_argument(f"--no-{name}", dest=name, action="store_false", help=f"without {what}")
     parser.add_argument("--json", metavar="FILE", help="write everything, for machines")
     parser.add_argument("--markdown", metavar="FILE", help="write the tables")
@@ -35,7 +36,7 @@ def main(args: argparse.Namespace) -> int:
         return 0
     report = speed(
         args.scenes or None, sizes=args.sizes, threads=args.threads, arch=args.arch, quick=args.quick, yardstick=args.yardstick,
-        peers=args.peers, absent=args.absent, progress=console.is_terminal,
+        peers=args.peers, absent=args.absent, waits=args.waits, progress=console.is_terminal,
     )  # fmt: skip
     console.print(report)
     for path, text in ((args.json, report.json), (args.markdown, report.markdown)):

@@ -1,5 +1,7 @@
 """Particles held at targets."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -48,7 +50,7 @@ class Pin(Anchored):
     each = ("compliance", "damping", "target")
     dim = 0
     exclusive = True
-    indices = Knob(_indices, "The particles that are held, (m, 1).")
+    indices: Any = Knob(_indices, "The particles that are held, (m, 1).")
     _grabs = False  # other particles than in the frame before
     target = Knob(_targets, "Where the particles are held, (m, dim) [m].")
 

@@ -1,10 +1,11 @@
 """Where vertices are to the edges of bodies made of loops of particles (2D)."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..device import ti
+from ..device.number import Number, OnDevice
 from ..features.feature import Scene
 from ..features.material import Table
 from ..neighbours.neighbour_list import PairData
@@ -446,8 +447,9 @@ class Beside:
     """What the neighbour search asks which pairs to list: those of different bodies, as far as their groups touch."""
 
     uniform = False
+    skin: Any = OnDevice()
 
-    def __init__(self, geometry: PolygonGeometry, table: Table, skin: float):
+    def __init__(self, geometry: PolygonGeometry, table: Table, skin: Number):
         self.table, self.skin = table, skin
         self.loop, self.longest, self.radius, self.state = geometry.loop, geometry.longest, geometry.radius, geometry.state
 
@@ -470,7 +472,7 @@ class Beside:
         """Whether v is near one of the edges of c: within the skin or, behind it, not deeper than half of it."""
         out = False
         if self.loop[c][2] >= 0:
-            r, reach = self.state.apart(v, c), self.radius.of(v) + ti.cast(self.skin, self.state.real)
+            r, reach = self.state.apart(v, c), self.radius.of(v) + self.skin
             for k in ti.static(range(2)):
                 other = self.loop[c][k]
                 u, size = self.state.apart(other, c), reach + ti.max(self.radius.of(c), self.radius.of(other))

@@ -104,7 +104,7 @@ class Polygons(PairContact):
             *([dev.slip] if dev.has_friction else []),
             *([dev.restitution.aim] if dev.has_restitution else []),
         ]
-        beside: Any = Beside(dev.geometry, self.table, self._listed)
+        beside: Any = Beside(dev.geometry, self.table, scene.memory.number(self._listed, scene.real))
         dev.grid = NeighbourSearch(scene, self._listed, linked, beside, pair_data, team, dev.move, dev.outline.reach)
         dev.geometry.bind(dev.grid)
         return dev.grid

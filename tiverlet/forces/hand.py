@@ -11,8 +11,9 @@ from ..particles import Particles, in_range
 
 def _particle(hand: "Hand", value) -> int:
     value = checks.integer("Hand", "particle", value, least=-1)
-    if hand.count and value >= hand.count:
-        raise ValueError(f"Hand: particle = {value}, but there are {hand.count} particles (0 ... {hand.count - 1}; -1 for none).")
+    if hand._count and value >= hand._count:
+        there = f"there are {hand._count} particles (0 ... {hand._count - 1}; -1 for none)"
+        raise ValueError(f"Hand: particle = {value}, but {there}.")
     return value
 
 
@@ -37,19 +38,19 @@ class Hand(Acceleration):
     particle = Knob(_particle, "The particle that is drawn; -1: none.")
     target = Knob(_target, "Where it is drawn to [m].")
     rate = Knob(lambda f, v: checks.number("Hand", "rate", v, least=0.0), "How fast it gets there [1/s].")
-    dim = count = 0
+    dim = _count = 0
 
     def __init__(self, target: ArrayLike, particle: int = -1, *, rate: float = 20.0):
         self.target, self.particle, self.rate = target, particle, rate
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the vector's length and the particle."""
-        self._keep(dim=particles.dim, count=len(particles))
+        self._keep(dim=particles.dim, _count=len(particles))
         self.target, self.particle = self.target, self.particle
 
     def remap_indices(self, number: np.ndarray, count: int) -> None:
         """Go on with the same particle; let go of one that goes."""
-        self._keep(count=count)
+        self._keep(_count=count)
         if self.particle >= 0:
             self.particle = int(number[self.particle])
 

@@ -52,6 +52,8 @@ class Compiler:
     for fewer than FEW particles. Kernels compile at their first launch.
     """
 
+    kernels_read = ("real", "few", "thorough")
+
     def __init__(self, real, few: bool = False):
         self.real, self.few = real, few
         self.lean = LEAN | BRIEF if few else LEAN

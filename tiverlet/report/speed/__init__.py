@@ -4,7 +4,7 @@ Every figure of a scene comes from a process of its own (Taichi's threads are se
 """
 
 from .measure import speed
-from .result import Absent, Peer, Run, SpeedReport
+from .result import Absent, Peer, Run, SpeedReport, Wait
 from .scenes import SCENES
 
-__all__ = ["SCENES", "Absent", "Peer", "Run", "SpeedReport", "speed"]
+__all__ = ["SCENES", "Absent", "Peer", "Run", "SpeedReport", "Wait", "speed"]

@@ -16,7 +16,8 @@ from ... import checks
 from ..output import machine, said
 from . import c_baseline, processes, stripped
 from . import peers as others
-from .result import Absent, Peer, Run, SpeedReport
+from . import waits as edits
+from .result import Absent, Peer, Run, SpeedReport, Wait
 from .scenes import SCENES
 
 BLOCK = 1 << 28  # bytes of each of the arrays that are copied: many times the caches
@@ -25,12 +26,13 @@ WORK = 5e7  # particle-substeps of a round, at most, if that is more than the le
 TURN = 1e6  # particle-substeps of a turn, if those are more than 6 frames and less than the round
 ROUNDS, SECONDS = 25, 2.0  # rounds at most; seconds of ours after which none is begun
 QUICK = (3, 0.2)  # the same, of a quick report
+EDITED = 4000  # discs of the pile that is edited
 PAIRS = 5  # of processes with and without the rest of the package: where a process has its memory matters by some percent
 
 
 def speed(
     scenes: Sequence[str] | str | None = None, *, sizes: Iterable[int] | None = None, threads: Iterable[int] | None = None,
-    arch: str = "cpu", quick: bool = False, yardstick: bool = True, peers: bool = True, absent: bool = True,
+    arch: str = "cpu", quick: bool = False, yardstick: bool = True, peers: bool = True, absent: bool = True, waits: bool = True,
     progress: bool = False,
 ) -> SpeedReport:  # fmt: skip
     """Measure how fast scenes are computed, beside a pile written by hand in C and other engines, and what a start costs.
@@ -38,7 +40,8 @@ def speed(
     scenes: names in SCENES; None for all. sizes: numbers of particles; None for those of each scene. threads: numbers of CPU
     threads; None for 1, 2, 4, ... up to all cores. arch: of tv.init; on a GPU all cores serve the yardstick. quick: two small
     sizes, and few rounds. yardstick: run pile.c too, where there is a C compiler. peers: run pymunk and newton too, where they
-    are installed. absent: compare with a package that lacks what the scene does not use. progress: show a bar.
+    are installed. absent: compare with a package that lacks what the scene does not use. waits: time edits of a pile. progress:
+    show a bar.
 
     A scene is run over its first frames again and again, in turns with the yardstick; medians are reported, and the ratio of
     medians. ValueError for scenes, sizes or threads that there are not; what fails while it runs is named in .notes.
@@ -66,9 +69,10 @@ def speed(
             if SCENES[name].needs is not None:
                 with session.noting(f"{name} without the rest of the package"):
                     session.absent.append(session.without(name, min(ladder[name], key=lambda n: abs(n - 1000))))
+        found = session.waits(peers) if waits and "pile" in names else []
         copy = {t: bandwidth(t) if arch == "cpu" else session.copy() for t in cores}
     s = session
-    return SpeedReport(machine(), arch, copy, tuple(s.runs), tuple(s.peers), tuple(s.absent), tuple(s.notes))
+    return SpeedReport(machine(), arch, copy, tuple(s.runs), tuple(s.peers), tuple(s.absent), tuple(found), tuple(s.notes))
 
 
 class Session:
@@ -187,6 +191,13 @@ class Session:
             f"{peer.name} {peer.version()}", name, count, threads, setting,
             median(times[1]), median(times[0]), others.WORDS[measure], quality, target, quality <= target,
         )  # fmt: skip
+
+    def waits(self, peers: bool) -> list[Wait]:
+        """What edits of a pile take, here and by the peers that there are."""
+        names = [peer.name for peer in others.PEERS.values() if peers and not peer.missing()]
+        with self.noting("waits"):
+            return edits.waits(EDITED if self.rounds == ROUNDS else EDITED // 10, self.cache(), names)
+        return []
 
     def without(self, name: str, n: int) -> Absent:
         """A scene by this package, and by one that has only what the scene uses."""

@@ -105,6 +105,19 @@ class Absent:
 
 
 @dataclass(frozen=True)
+class Wait:
+    """One act of who edits a pile, with what it puts off for the next frame [s]. cold, warm: by ours, without and with kernels
+    that another process has compiled. aim: what is to be reached; None for none. peers: the same by others, by name."""
+
+    act: str
+    particles: int
+    aim: float | None
+    cold: float
+    warm: float
+    peers: dict[str, float]
+
+
+@dataclass(frozen=True)
 class SpeedReport:
     """Speed, memory and starts. print() shows it; see .run(), .growth(), .scaling(), .json(), .markdown(), .plot().
 
@@ -118,6 +131,7 @@ class SpeedReport:
     runs: tuple[Run, ...]
     peers: tuple[Peer, ...]
     absent: tuple[Absent, ...]
+    waits: tuple[Wait, ...]
     notes: tuple[str, ...]
 
     @property
@@ -160,6 +174,7 @@ class SpeedReport:
             ("Starts, memory, quality", STARTS, [started(r) for r in self.runs]),
             ("Peers, at the same measured quality or better", PEERS, [beside(p) for p in self.peers]),
             ("Features that exist but are not in the scene", ABSENT, [without(a) for a in self.absent]),
+            ("Waits of who edits a pile, in ms", WAITS, [waited(w) for w in self.waits]),
         ):
             full = [k for k in range(len(heads)) if any(row[k] for row in rows)]
             if full:
@@ -232,7 +247,7 @@ class SpeedReport:
         return plot(self, folder)
 
 
-ROWS = {"runs": Run, "peers": Peer, "absent": Absent}
+ROWS = {"runs": Run, "peers": Peer, "absent": Absent, "waits": Wait}
 HEADS = (
     "scene", "particles", "threads", "ms", "Mps/s", "of pile.c", "of 1 thread", "launches", "bytes", "of a copy",
 )  # fmt: skip
@@ -241,6 +256,7 @@ STARTS = (
 )  # fmt: skip
 PEERS = ("peer", "scene", "particles", "threads", "setting", "ms", "ours", "ratio", "measure", "its", "ours", "as good")
 ABSENT = ("scene", "particles", "fields", "bytes", "launches", "ms", "ratio")
+WAITS = ("act", "particles", "aim", "cold", "warm", "pymunk", "newton")
 TEXT = ("path", "flags", "setting", "measure")
 LEGEND = (
     "ms: of a frame of 1/60 s, median. Mps/s: millions of particle-substeps per second. launches: kernels of a frame, counted.",
@@ -292,3 +308,9 @@ def without(a: Absent) -> tuple[str, ...]:
     pairs = (f"{x:g} / {y:g}" for x, y in (a.fields, a.bytes, a.launches))
     times = f"{1e3 * a.seconds[0]:.4g} / {1e3 * a.seconds[1]:.4g}"
     return (a.scene, f"{a.particles:,}", *pairs, times, f"{a.ratio:.3f}")
+
+
+def waited(w: Wait) -> tuple[str, ...]:
+    """A line about a wait."""
+    times = (w.aim, w.cold, w.warm, w.peers.get("pymunk"), w.peers.get("newton"))
+    return (w.act, f"{w.particles:,}", *("" if t is None else f"{1e3 * t:.3g}" for t in times))

@@ -1,0 +1,234 @@
+"""What one waits for: starts, copies, and edits of a pile, beside the same acts by other engines.
+
+Every engine has a process of its own, ours two: one with nothing compiled, one with what the other has left in Taichi's cache. An
+act is timed with the frame that follows it, less an ordinary frame, since an engine may put off what it has to do.
+"""
+
+import json
+import sys
+from collections.abc import Callable
+from statistics import median
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from .result import Wait
+
+TIMES = 7  # that an act is done; the median counts
+FEW, SOME = 1, 100  # that come and go
+START = """
+from time import perf_counter
+clock = perf_counter()
+import sys, json
+job = json.loads(sys.argv[1])
+__import__(job["engine"])
+seconds = perf_counter() - clock
+from tiverlet.report.speed.waits import main
+main(job, seconds)
+"""
+FIRST = ("import", "build, first step")
+# What is to be reached [s].
+AIMS = {
+    "second world, first step": 0.02, "copy, first step": 0.01, f"add {FEW}": 0.002, f"add {SOME}": 0.002,
+    f"remove {FEW}": 0.002, f"remove {SOME}": 0.002, "add as many again": 0.05, "pin another particle": 0.0002,
+    "take another in hand": 0.0002, "switch a wall": 0.002,
+}  # fmt: skip
+
+
+def waits(n: int, cache: str, peers: list[str]) -> list[Wait]:
+    """Of a pile of n discs. cache: an empty folder. peers: those that are installed."""
+    from .processes import Talker, paths
+
+    def of(engine: str) -> dict[str, float]:
+        environment = {"PYTHONPATH": paths(), "TI_OFFLINE_CACHE_FILE_PATH": cache, "TI_OFFLINE_CACHE": "1"}
+        with Talker([sys.executable, "-P", "-c", START, json.dumps({"engine": engine, "n": n})], environment) as talker:
+            return talker.ask()
+
+    cold, warm, theirs = of("tiverlet"), of("tiverlet"), {name: of(name) for name in peers}
+    found = {act: {name: seconds[act] for name, seconds in theirs.items() if act in seconds} for act in cold}
+    return [Wait(act, n, AIMS.get(act), cold[act], warm[act], found[act]) for act in cold]
+
+
+def main(job: dict[str, Any], imported: float) -> None:
+    """The process of an engine: seconds, by act."""
+    out = {FIRST[0]: imported, **{"tiverlet": ours, "pymunk": pymunks, "newton": newtons}[job["engine"]](job["n"])}
+    print(json.dumps(out), flush=True)
+
+
+def pile(n: int):
+    """Particles and features of the scene, and discs that come from above."""
+    from ...particles import Particles
+    from .scenes import SCENES
+
+    particles, features = SCENES["pile"].build(n)
+    x, radius = particles.position, float(particles.radius[0])
+
+    def more(k: int, turn: int) -> Particles:
+        place = np.stack([np.arange(k) % 30, np.arange(k) // 30], axis=1) * 2.2 * radius
+        return Particles(place + [x[:, 0].min(), x[:, 1].max() + 3 * radius + turn * 10 * radius], radius=radius)
+
+    return particles, features, more
+
+
+Act = Callable[[int], Any]
+
+
+def timed(acts: dict[str, tuple[Act, Act | None]], frame: Callable[[], Any]) -> dict[str, float]:
+    """Seconds that acts take, and what they put off for the next frame. By name: the act, and what takes it back, or None."""
+    out = {}
+    for name, (act, back) in acts.items():
+        spent, usual = [], []
+        for k in range(TIMES):
+            for _ in range(2):
+                clock = perf_counter()
+                frame()
+                usual.append(perf_counter() - clock)
+            clock = perf_counter()
+            act(k)
+            frame()
+            spent.append(perf_counter() - clock)
+            if back:
+                back(k)
+                frame()
+        out[name] = max(0.0, median(spent) - median(usual))
+    return out
+
+
+def ours(n: int) -> dict[str, float]:
+    """By tiverlet, with a pin, a hand and a wall that can be switched in the scene."""
+    import tiverlet as tv
+
+    from .counting import DT
+
+    particles, features, more = pile(n)
+
+    def built(count: int):
+        some = tv.Particles(particles.position[:count], radius=particles.radius[:count])
+        wall, hand = tv.HalfSpace((0, -1), -1e3, active=True), tv.Hand((0.0, 0.0), rate=0.0)
+        pin = tv.Pin([0])
+        own = [f.copy() for f in features]
+        return tv.World(some, [*own, wall, hand, pin], substeps=8), wall, hand, pin
+
+    clock = perf_counter()
+    world, wall, hand, pin = built(n)
+    world.step(DT)
+    first = perf_counter() - clock
+    clock = perf_counter()
+    with built(n - n // 8)[0] as other:
+        other.step(DT)
+        second = perf_counter() - clock
+    for _ in range(5):
+        world.step(DT)
+    clock = perf_counter()
+    with world.clone() as other:
+        other.step(DT)
+        copied = perf_counter() - clock
+
+    def frame():
+        world.step(DT)
+
+    def hold(k: int):
+        pin.indices = [n // 2 + k]
+
+    def take(k: int):
+        hand.particle = k
+
+    def switch(k: int):
+        wall.active = bool(k % 2)
+
+    def added(k: int):
+        return lambda turn: world.add(more(k, turn))
+
+    def removed(k: int):
+        return lambda turn: world.remove(np.arange(len(world.particles) - k, len(world.particles)))
+
+    acts = {
+        f"add {FEW}": (added(FEW), removed(FEW)), f"add {SOME}": (added(SOME), removed(SOME)),
+        f"remove {FEW}": (removed(FEW), added(FEW)), f"remove {SOME}": (removed(SOME), added(SOME)),
+        "pin another particle": (hold, None), "take another in hand": (take, None), "switch a wall": (switch, None),
+        "add as many again": (added(n), removed(n)),
+    }  # fmt: skip
+    return {FIRST[1]: first, "second world, first step": second, "copy, first step": copied, **timed(acts, frame)}
+
+
+def pymunks(n: int) -> dict[str, float]:
+    """By pymunk."""
+    import pymunk  # pyright: ignore[reportMissingImports]
+    from pymunk.constraints import PivotJoint  # pyright: ignore[reportMissingImports]
+
+    from .peers import Pymunk
+
+    particles, features, more = pile(n)
+
+    def built():
+        return Pymunk(particles, features, 1, (8, 10))
+
+    clock = perf_counter()
+    engine = built()
+    engine.frame()
+    first = perf_counter() - clock
+    clock = perf_counter()
+    built().frame()
+    second = perf_counter() - clock
+    clock = perf_counter()
+    engine.space.copy()
+    engine.frame()
+    copied = perf_counter() - clock
+    space, come, grip = engine.space, [], []
+
+    def added(k: int):
+        def act(turn: int):
+            for x in more(k, turn).position.tolist():
+                body = pymunk.Body(1.0, float("inf"))
+                body.position = tuple(x)
+                circle = pymunk.Circle(body, float(particles.radius[0]))
+                space.add(body, circle)
+                come.append((body, circle))
+
+        return act
+
+    def removed(k: int):
+        def act(turn: int):
+            for _ in range(k):
+                space.remove(*come.pop())
+
+        return act
+
+    def hold(k: int):
+        body = engine.bodies[n // 2 + k]
+        space.remove(*grip)
+        grip[:] = [PivotJoint(space.static_body, body, tuple(body.position))]
+        space.add(*grip)
+
+    added(2 * SOME)(0)  # which can be removed
+    acts = {
+        f"add {FEW}": (added(FEW), removed(FEW)), f"add {SOME}": (added(SOME), removed(SOME)),
+        f"remove {FEW}": (removed(FEW), added(FEW)), f"remove {SOME}": (removed(SOME), added(SOME)),
+        "pin another particle": (hold, None), "add as many again": (added(n), removed(n)),
+    }  # fmt: skip
+    return {FIRST[1]: first, "second world, first step": second, "copy, first step": copied, **timed(acts, engine.frame)}
+
+
+def newtons(n: int) -> dict[str, float]:
+    """By newton, whose models are fixed: all acts are building one anew. Its discs are balls in a plane."""
+    from .peers import Newton
+
+    particles, features, _ = pile(n)
+
+    def built():
+        engine = Newton(particles, features, 1, (8, 2))
+        engine.frame()
+        return engine
+
+    clock = perf_counter()
+    engine = built()
+    first = perf_counter() - clock
+    clock = perf_counter()
+    engine.frame()
+    usual = perf_counter() - clock
+    clock = perf_counter()
+    built()
+    again = perf_counter() - clock
+    edits = {act: again - usual for act in AIMS if act.startswith(("add", "remove"))}
+    return {FIRST[1]: first, "second world, first step": again, **edits}
