@@ -2,7 +2,7 @@
 
 A kernel of Taichi knows of a field in which tree it is, and where in that. Where the tree is, it looks up at each launch. So
 worlds whose fields are of the same kinds have one tree, and before a launch the place of their own bytes is written to where
-kernels look it up, see patches/roots.py. Every field of a shared tree has ROOM, of which the system gives what is used, page by
+kernels look it up, see patches/roots.py. Every field of a shared tree has room, of which the system gives what is used, page by
 page: what grows stays where it is, and no kernel has to know. Such a tree stays as long as Taichi runs; it takes no memory. When
 there are MANY, the next has all that any had, so that there will not be many more. Where trees cannot be shared, as on a GPU,
 every world has its own, with fields as long as they must be.
@@ -29,7 +29,8 @@ MAX_TREES = 400  # Taichi holds at most 511 trees of fields and does not check; 
 NODES = 900  # of a tree: one for a field, and one for each of its components; Taichi takes 1024
 MANY = 200  # shared ones, each for worlds of one kind; further ones are for all
 FEW = 4  # fields of a kind, at least, that a shared tree has; it has 4, 8, 16 and so on
-ROOM = 1 << 24  # elements of a field; what is longer has a power of two
+ROOMS = (1 << 24, 1 << 20, 1 << 17)  # elements of a field: the first with which a tree is no larger than NEAR
+NEAR = 1 << 31  # bytes: what is as near as that to the begin of a tree, processors find without a number of its own
 BETWEEN = 23 * 64  # bytes; 64 fields, one after the other, begin at 64 places of a page
 NORESERVE = {"linux": 0x4000}.get(sys.platform, 0)  # lest Linux counts addresses as memory; Python has no name for it before 3.13
 LAZY = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | NORESERVE if sys.platform != "win32" else 0
@@ -45,7 +46,7 @@ class Declared:
     apart: bool  # in a second tree
 
 
-Kind = tuple[Any, int, int]  # of a field in a shared tree: its type, width, and how many elements it has room for
+Kind = tuple[Any, int, bool]  # of a field in a shared tree: its type, width, and whether it has many elements
 
 
 class Layout:
@@ -69,6 +70,7 @@ class Layout:
         self.trees = [roots.planned(builder) if shared else builder.finalize() for builder in builders.values()]
         runtime.trees += len(self.trees)
         self.numbers: dict[Kind, list[int]] = {}  # of a shared one: by kind, which of its fields are of it
+        self.room = 0  # elements that fields of a shared one can have
         self._now = 0  # the address of the bytes that kernels find
         self._places: list[tuple[int, tuple[int, ...]]] = []  # of the fields in the tree: offset, strides; none if not seen
         self.size = 0  # [bytes] of the tree; 0 where the host cannot see it
@@ -170,19 +172,14 @@ def sharing() -> bool:
     return bool(LAZY) and _table[1] is not None and not _alone
 
 
-def kind_of(d: Declared) -> Kind:
-    """What kind of field it is in a shared tree."""
-    return d.kind, d.width, max(ROOM, 1 << (d.length - 1).bit_length()) if d.length else 0
-
-
 def take(declared: list[Declared], fields: list[Any], held: list[Layout], shared: bool) -> tuple[Layout, list[int]]:
     """A layout with such fields, and which of its fields they are. held: those that the world has, since the kernels of a world
     need another tree for each. fields: from field(); they get their places. shared: see sharing()."""
     if not shared:
         layout, which = Layout(tuple(declared), None if patched else fields), list(range(len(declared)))
     else:
-        kinds = [kind_of(d) for d in declared]
-        layout = _shared(Counter(kinds), held)
+        kinds = [(d.kind, d.width, d.length > 0) for d in declared]
+        layout = _shared(Counter(kinds), max(d.length for d in declared), held)
         numbers = {kind: iter(some) for kind, some in layout.numbers.items()}
         which = [next(numbers[kind]) for kind in kinds]
     if patched:
@@ -191,36 +188,47 @@ def take(declared: list[Declared], fields: list[Any], held: list[Layout], shared
     return layout, which
 
 
-def _shared(need: Counter[Kind], held: list[Layout]) -> Layout:
-    """One that has so many fields of each kind, and is not held."""
+def _shared(need: Counter[Kind], length: int, held: list[Layout]) -> Layout:
+    """One that has so many fields of each kind with room for `length` elements, and is not held."""
     now = language.current()
     for layout in [layout for layout in _known if layout.runtime is not now]:
         del _known[layout]
     want = Counter({kind: max(FEW, 1 << (number - 1).bit_length()) for kind, number in need.items()})
+    room = _room(want, length)
     for layout, has in _known.items():
-        if has == want and layout not in held:
+        if has == want and layout.room == room and layout not in held:
             return layout
     if len(_known) >= MANY:
         for layout, has in _known.items():
-            if need <= has and layout not in held:
+            if need <= has and layout.room >= length and layout not in held:
                 return layout
             if sum(number * (1 + max(1, kind[1])) for kind, number in (want | has).items()) <= NODES:
                 want |= has
+        room = _room(want, length)
     kinds = sorted(want.elements(), key=lambda kind: (kind[2], kind[1], str(kind[0])))
-    layout = Layout(tuple(_roomy(*kind) for kind in kinds), shared=True)
-    layout.numbers = {kind: [k for k, one in enumerate(kinds) if one == kind] for kind in want}
+    layout = Layout(tuple(_roomy(*kind, room) for kind in kinds), shared=True)
+    layout.numbers, layout.room = {kind: [k for k, one in enumerate(kinds) if one == kind] for kind in want}, room
     _known[layout] = want
     return layout
 
 
-def _roomy(kind: Any, width: int, room: int) -> Declared:
+def _room(want: Counter[Kind], length: int) -> int:
+    """Elements that each of these fields is to have room for, `length` at least."""
+    each = sum(number * _size(kind, width) for (kind, width, many), number in want.items() if many)
+    return next((room for room in ROOMS if length <= room and room * each <= NEAR), 1 << (length - 1).bit_length())
+
+
+def _size(kind: Any, width: int) -> int:
+    return (8 if kind == ti.f64 else 4) * max(1, width)
+
+
+def _roomy(kind: Any, width: int, many: bool, room: int) -> Declared:
     """A field of a shared tree.
 
     Between two of them are BETWEEN bytes: where two begin at the same place of a page, a processor takes a write to one for a
     write to the other, and they drive each other out of its first cache.
     """
-    size = (8 if kind == ti.f64 else 4) * max(1, width)
-    return Declared(kind, width, room + -(-BETWEEN // size) if room else 0, False)
+    return Declared(kind, width, room + -(-BETWEEN // _size(kind, width)) if many else 0, False)
 
 
 _known: dict[Layout, Counter[Kind]] = {}  # the shared ones, and how many fields of each kind they have

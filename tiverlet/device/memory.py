@@ -104,10 +104,9 @@ class Memory:
 
     def lengthen(self, length: int) -> bool:
         """Give all fields so many elements, where they are. False where kernels would have to know: nothing was done then."""
-        longer = [replace(d, length=length) for d in self._declared]
-        same = [*map(layout.kind_of, longer)] == [*map(layout.kind_of, self._declared)]
-        if not (self._layout and self._layout.shared and same):
+        if not (self._layout and self._layout.shared and length <= self._layout.room):
             return False
+        longer = [replace(d, length=length) for d in self._declared]
         self._declared, self._views = longer, {}
         self.entries = [replace(e, length=length) for e in self.entries]
         return True
