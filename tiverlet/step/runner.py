@@ -38,6 +38,7 @@ class Runner:
         self.semi_iterations, self.drags = step.constraints.semi_iterations, step.integrator.forces.drags
         self.probe = high_order.Probe(step) if self.scene.order > 2 else None
         self.passes_at_once = max(1, LONG // (1 + self.n + sum(b.count for b in self.batches)))  # in a launch
+        self.asks_velocities = any(wall.has_switch for wall in step.walls)
         self.launcher = Launcher(self)
         self._prepare()
 
@@ -84,6 +85,9 @@ class Runner:
             self.set_substep(h, drag)
             if clock.energy is None:
                 self.look()
+                if self.asks_velocities:  # so that nobody waits later for its kernel to compile
+                    self._velocities()
+                    self.asks_velocities = False
                 report = self.report()
                 clock.energy = report.energy
                 if report.overlap > 0 and clock.first_moved is not None:
@@ -135,9 +139,14 @@ class Runner:
         else:
             if self.grid and touching and self.memory.read(self.grid.old_saved)[0]:  # of a state that was put back
                 self.list_neighbours()
-            out = np.zeros((max(1, self.n), self.step.dim))
-            self.step.velocities(clock.h, clock.time, *self._shares(), out)
+            out = self._velocities()
         return out[: self.n]
+
+    def _velocities(self) -> np.ndarray:
+        """By the kernel, from displacements."""
+        out = np.zeros((max(1, self.n), self.step.dim))
+        self.step.velocities(self.clock.h, self.clock.time, *self._shares(), out)
+        return out
 
     def _shares(self) -> tuple[float, float]:
         """What multipliers of the last substep are to be taken for: h^2 over what an acceleration added to the displacement. A
