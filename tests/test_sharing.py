@@ -59,14 +59,14 @@ def test_worlds_with_other_numbers_and_counts_and_clones_compile_nothing(world):
 
 
 def test_a_world_that_grows_compiles_nothing(world):
-    # From 30 discs to 110 and back, with a list that is too short at first; with the bits that it has when all is compiled anew.
+    # From 30 discs to 78 and back, with a list that is too short at first; with the bits that it has when all is compiled anew.
     def grown(compiles):
         x = np.stack(np.meshgrid(np.arange(10.0), np.arange(3.0)), axis=-1).reshape(-1, 2) + 0.6
         w = world(tv.Particles(x, radius=0.45), [tv.Gravity(9.81), tv.Contact(), tv.Box((0, 0), (10, 99))], substeps=4)
         hashes, names = [], []
-        for k in range(9):
+        for k in range(5):
             with compiled() as more:
-                if k < 8:
+                if k < 4:
                     w.add(tv.Particles(x[: 10 * (k % 2 + 1) - 3] + [0.0, 4.0 + 3 * k], velocity=(0.1, -1), radius=0.45))
                     assert w._runner.grid.capacity < 1000
                 else:
