@@ -6,6 +6,7 @@ import pytest
 import tiverlet as tv
 from tiverlet.step import block_matrix
 from tiverlet.step.adaptive import StepController
+from tiverlet.step.projection import Rows
 
 from .chains import Scene, hung
 from .conftest import rerun
@@ -238,3 +239,17 @@ def test_wrong_aims_are_refused(world):
             w.step(1 / 60, budget=wrong)
     with pytest.raises(ValueError, match="substeps = 'adaptive', but it must be an integer of at least 1, or \"auto\""):
         w.substeps = "adaptive"
+
+
+def test_what_cannot_be_paid_or_said_in_numbers(world):
+    # Found by the fuzzer. Where nothing has moved, nothing is due: no division by 0. A tension beyond all numbers is a note.
+    link = tv.Distance([[0, 1]])
+    w = world(tv.Particles([[0.0, 0.0], [1.0, 0.0]], pinned=[0]), [tv.Gravity(), link], solver=tv.Direct())
+    v = np.array([[0.0, 0.0], [0.0, 2.0]])
+    rows = Rows([link], w._runner.scene.inv_mass, w.position)
+    np.testing.assert_array_equal(rows.paid(v, np.zeros((2, 2)), 1e-4), v)
+    w.step(1 / 60)
+    reporter = w._runner.diagnostics.report
+    reporter.figures[9] = np.inf
+    report, _ = reporter(w.time, 1 / 1200, 20, 1, None, 0.0)
+    assert report.flags == {"softened"} and "Use about inf substeps" in report.notes[0]

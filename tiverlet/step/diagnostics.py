@@ -279,10 +279,10 @@ class Reporter:
                 "to where these are met. Place them there, or give the constraints other rest values, or compliance."
             )
         if tension > TENSEST:
-            need = int(np.ceil(substeps * np.sqrt(tension / STIFF)))
+            need = np.ceil(substeps * np.sqrt(tension / STIFF))  # may be infinite
             notes["softened"] = (
                 f"A tension makes particles vibrate too fast for the substep: omega h >= {np.sqrt(tension):.3g}, stable below 2. "
-                f"Its constraints give way instead. Use about {need} substeps."
+                f"Its constraints give way instead. Use about {need:.7g} substeps."
             )
         elif tension == TENSEST:
             notes["softened"] = (
@@ -290,19 +290,19 @@ class Reporter:
                 "give way and sag with h^2. Give them slack or compliance, or use more substeps."
             )
         if stiff > STIFF:
-            need = int(np.ceil(substeps * np.sqrt(stiff / STIFF))) + 1
+            need = np.ceil(substeps * np.sqrt(stiff / STIFF)) + 1
             notes["stiff-force"] = (
                 f"A force changes too fast for the substep: omega h = {np.sqrt(stiff):.3g}, stable below 2. "
-                f"Use at least {need} substeps."
+                f"Use at least {need:.7g} substeps."
             )
         if residual > UNCONVERGED:
-            need = int(np.ceil(substeps * residual / UNCONVERGED))  # of order h^2 under loads, h after impacts
+            need = np.ceil(substeps * residual / UNCONVERGED)  # of order h^2 under loads, h after impacts
             if self.remedy is None:
                 self.remedy = self.solver.remedy(self.batches, self.scene.slots, self.scene.inv_mass)
             other = f", or {self.remedy}" if self.remedy else ""
             notes["unconverged"] = (
                 f"Constraints are not met: the worst is off by {100 * residual:.3g} % of its size. "
-                f"Use about {need} substeps{other}. Where neither helps, constraints contradict each other."
+                f"Use about {need:.7g} substeps{other}. Where neither helps, constraints contradict each other."
             )
         report = StepReport.of(
             {

@@ -240,7 +240,7 @@ class Rows:
             return np.bincount(body, m * values, minlength=rows + 1)
 
         work, size, along = summed(np.linalg.norm(moves, axis=1)), summed((moves**2).sum(axis=1)), summed((moves * v).sum(axis=1))
-        due = energy * work / work.sum()
+        due = energy * _over(work, np.full(len(work), work.sum()))  # none where rounding gained it, and nothing moved
         part = _over(along, size)
         due, left = _settled(due, part * along / 2)
         v = v - ((1 - left) * part)[body][:, None] * moves
