@@ -87,3 +87,24 @@ def test_a_pin_that_takes_other_particles_is_as_a_new_one(world, compliance, pre
     ):
         with pytest.raises(ValueError, match=words):
             pin.indices = value
+
+
+@pytest.mark.skipif(not patched, reason="takes minutes to compile there")
+@pytest.mark.parametrize("compliance", [0.0, 1e-3])
+def test_a_recording_knows_which_particles_were_held(world, tmp_path, compliance):
+    pin, gate = tv.Pin([0], (0.0, 1.0), compliance=compliance), tv.HalfSpace((0, 1), -0.2, active=True)
+    x = np.stack([np.arange(6) * 0.3, np.zeros(6)], axis=1)
+    w = world(tv.Particles(x, radius=0.1), [tv.Gravity(9.81), tv.Contact(), gate, pin], substeps=5)
+    with tv.Recorder(tmp_path / "a.rrd", w) as recorder:
+        for k in range(24):
+            if k == 8:
+                pin.indices, pin.target = [3], [(0.5, 1.0)]
+            if k == 16:
+                pin.indices, gate.active = [5], False
+            w.step(1 / 60)
+            recorder.log()
+    recording = tv.replay(tmp_path / "a.rrd")
+    verdict = recording.verify()
+    assert verdict.kind == "intact", verdict
+    again = recording.world(20)
+    assert again.features[3].indices.tolist() == [[5]] and not again.features[2].active
