@@ -30,8 +30,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as it is in the backgro
     signal.signal(signal.SIGINT, signal.default_int_handler)
 ARCH = os.environ.get("TIVERLET_ARCH", "cpu")
 SOURCES = str(pathlib.Path(tv.__file__).parent)
-# Functions of tests are compiled as ours are, in a third of the time; those of these files are a user's, as those in the pages
-# and demos are, and get the whole of Taichi's analysis.
+# Functions of tests are held to what ours are, see checked_assignments(); those of these files try what a user's may do.
 USERS = ("test_free_motion", "test_walls")
 OURS = tuple(str(path) for path in pathlib.Path(__file__).parent.rglob("*.py") if path.stem not in USERS)
 CASES = {name: known(name) for name in entries()}
@@ -43,8 +42,6 @@ def checked_assignments():
     """Refuse, in our own kernels, what compiles only with Taichi's analysis; without it LLVM ends the process."""
     from taichi.lang import ops  # noqa: PLC0415
 
-    from tiverlet.device.patches import source_cache  # noqa: PLC0415
-
     assign = ops.assign
 
     def checked(to, value):
@@ -55,9 +52,8 @@ def checked_assignments():
         return assign(to, value)
 
     ops.assign = checked
-    home, source_cache.HOME = source_cache.HOME, source_cache.HOME + OURS
     yield
-    ops.assign, source_cache.HOME = assign, home
+    ops.assign = assign
 
 
 @contextlib.contextmanager

@@ -9,7 +9,6 @@ import re
 import pytest
 
 import tiverlet as tv
-from tiverlet.device.patches import source_cache
 from tiverlet.features.arguments import knobs_of
 
 ROOT = pathlib.Path(__file__).parent.parent
@@ -27,8 +26,6 @@ def test_code_runs(page, tmp_path, monkeypatch, capsys):
     script = tmp_path / "page.py"
     script.write_text("\n\n".join(blocks(page)))
     monkeypatch.chdir(tmp_path)
-    if page.parts != ("README.md",):  # whose functions are compiled as those of users are
-        monkeypatch.setattr(source_cache, "HOME", (*source_cache.HOME, str(tmp_path)))
     spec = importlib.util.spec_from_file_location("page", script)
     assert spec and spec.loader
     module = importlib.util.module_from_spec(spec)

@@ -112,7 +112,7 @@ class Layout:
         try:
             room = mmap.mmap(-1, self.size, flags=LAZY)
         except OSError as e:
-            raise MemoryError(f"The system has no room for one more world: {self.size >> 30} GiB of addresses ({e}).") from None
+            raise MemoryError(f"The system has no room for one more world: {self.size >> 20} MiB of addresses ({e}).") from None
         return ctypes.addressof(ctypes.c_char.from_buffer(room)), room
 
     def point(self, address: int) -> None:

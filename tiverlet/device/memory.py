@@ -92,7 +92,7 @@ class Memory:
             held = [one for one, _ in self.compiler.places]
             self._layout, self._which = layout.take(self._declared, [e.field for e in self.entries], held, shared)
         address, room = self._layout.lend()
-        self._ends = weakref.finalize(self, _end, self._layout, address, self.compiler, self._runtime)
+        self._ends = weakref.finalize(self, _end, self._layout, address, self.compiler)
         self._ends.atexit = False
         self._address, self._room = address, room
         self.compiler.places.append((self._layout, address))
@@ -207,11 +207,10 @@ class Memory:
         return self._transfers[key]
 
 
-def _end(one: Layout, address: int, compiler: Compiler, of: Any) -> None:
+def _end(one: Layout, address: int, compiler: Compiler) -> None:
     """Free a place in a layout."""
     compiler.places.remove((one, address))
-    if of is language.current():
-        one.destroy()
+    one.destroy()
 
 
 _NUMPY = {ti.f32: np.float32, ti.f64: np.float64, ti.i32: np.int32, ti.u32: np.uint32}
