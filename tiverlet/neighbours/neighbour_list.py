@@ -69,7 +69,8 @@ class NeighbourList:
         return "neighbour list"
 
     def allocate(self, capacity: int) -> bool:
-        """Room for `capacity` entries of the list, in a tree of its own, so that it can grow. True if there are new fields."""
+        """Room for `capacity` entries of the list, in a tree of its own, so that it can grow. The old list stays. True if
+        there are new fields."""
         if 2 * capacity > 2**31 - 1:
             raise MemoryError(f"{capacity} near pairs exceed what a list can index; the particles overlap too much.")
         self.capacity_number.set(max(1, -(-capacity // self.blocks)))
@@ -77,7 +78,9 @@ class NeighbourList:
         self.room = self.pitch * self.blocks
         if self.store and self.store.lengthen(self.room):
             return False
+        kept = []
         if self.store:
+            kept = [self.store.read(field) for field in self._fields()]
             self.store.destroy()
         self.store = self.memory.more()
         self.neighbour = self.store.field("grid.near", self.room, kind=ti.i32)
@@ -87,6 +90,8 @@ class NeighbourList:
             if piece.kept:
                 piece.old = self.store.field(f"grid.{piece.name}_aside", self.room, width=piece.width)
         self.store.place()
+        for field, values in zip(self._fields(), kept, strict=False):
+            self._write_old(field, values)
         return True
 
     def grow(self) -> bool:
@@ -99,12 +104,7 @@ class NeighbourList:
                 "overlap each other, or one is much larger than the rest.",
                 stacklevel=2,
             )
-        assert self.store
-        kept = [self.store.read(field) for field in self._fields()]
         new = self.allocate(int(need * 1.25 + 16) * self.blocks)
-        if new:
-            for field, values in zip(self._fields(), kept, strict=True):
-                self._write_old(field, values)
         self.invalidate()
         return new
 
