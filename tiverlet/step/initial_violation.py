@@ -10,8 +10,11 @@ for each body by itself, that is, for constraints that hang together by particle
 falls; no particle moves further in a step than its body is large, and no leg of an angle changes by more than half. From afar
 an angle is flat: Newton's step, pi r^2 / L for one that has to be straight between two pins L apart, would throw its corner away,
 or into one of the pins. Where constraints contradict each other, the violation gets as small as it can, and the report says so;
-links that do stay where they are, for their passes find the compromise between them.
+links that do stay where they are, for their passes find the compromise between them. Walls have the last word: what they stop
+goes on from there, in turns.
 """
+
+from collections.abc import Callable
 
 import numpy as np
 
@@ -22,15 +25,16 @@ from .jacobian import Jacobian, bodies_of
 ENOUGH = 0.2  # of its size: a violation from where on it is taken out before the first substep
 DONE = 1e-6  # of its size: a violation that is none
 NEWTON = 60  # steps at most
+TURNS = 16  # with walls, at most: a link that stands on one halves its violation in each
 LEAST = 1e-2  # part of a step: where even less does not help, nothing does
 BETTER = 0.99  # of its square: a violation that falls by less in a step contradicts others
 
 
-def remove(scene: Scene, batches: list[Batch], placed: int) -> np.ndarray | None:
+def remove(scene: Scene, batches: list[Batch], placed: int, stop: Callable[[np.ndarray], None]) -> np.ndarray | None:
     """Move bodies to where their rigid constraints are met, or as near to it as they get; those that are there stay.
 
-    placed: the first of the particles that were placed anew; bodies without any stay as they are. Returns how far each particle
-    went [m], (n,); None where nothing moved.
+    placed: the first of the particles that were placed anew; bodies without any stay as they are. stop: lets walls stop what has
+    moved from some places, (n, dim). Returns how far each particle went [m], (n,); None where nothing moved.
     """
     w, state, memory = scene.inv_mass, scene.state, scene.memory
     rigid = [b for b in batches if isinstance(b, Scalar) and b.count and (b.compliance == 0).any() and not b.broken.any()]
@@ -44,8 +48,18 @@ def remove(scene: Scene, batches: list[Batch], placed: int) -> np.ndarray | None
     rows = Rows(rigid, x, w)
     going &= _violation(rows, body, bodies)[0] > ENOUGH
     if going.any():
-        new = met(rows, body, going)
-        state.put(memory, new)
+        new, moving = x, going.copy()
+        for _ in range(TURNS):
+            old = new
+            state.put(memory, met(rows, body, moving))
+            sent = state.get(memory)
+            stop(old)
+            new = state.get(memory)
+            rows = rows.at(new)
+            stopped = np.bincount(body, (sent != new).any(axis=1), minlength=bodies) > 0
+            moving &= stopped & (_violation(rows, body, bodies)[0] > DONE)
+            if not moving.any():
+                break
         for b in rigid:
             lam = memory.read(b.dev.lam)[: b.count]
             here = np.logical_or.reduceat(going[body[b.indices.ravel()]], np.searchsorted(b.owner, np.arange(b.count)))

@@ -185,6 +185,35 @@ class ParticlePass:
             wall.confine(i, self.radius.of(i), h, frame_fraction, turn)
 
     @ti.func
+    def stop(self, i, move):
+        """Walls stop particle i, which the host has moved by `move` from x0. Only its position changes: no time goes by."""
+        d = self.state.d[i]
+        d_low = before = wall_push = ti.zero(d)
+        if ti.static(self.state.carries):
+            d_low = self.state.d_low[i]
+        if ti.static(self.state.befores):
+            before = self.state.before[i]
+        if ti.static(self.state.keeps_wall_push):
+            wall_push = self.state.wall_push[i]
+        self.state.d[i] = move
+        moving = True
+        for k in range(ROUNDS + 1):
+            if moving:
+                if k == ROUNDS:
+                    self.stay(i)
+                x, here = self.state.x[i], self.state.d[i]
+                for f in ti.static(self.walls):
+                    self.touch(f, i, 0 * d[0], ti.Vector([0, 0], self.real), GENTLY)
+                moving = not ((self.state.d[i] == here).all() and (self.state.x[i] == x).all())
+        self.state.d[i] = d
+        if ti.static(self.state.carries):
+            self.state.d_low[i] = d_low
+        if ti.static(self.state.befores):
+            self.state.before[i] = before
+        if ti.static(self.state.keeps_wall_push):
+            self.state.wall_push[i] = wall_push
+
+    @ti.func
     def stay(self, i):
         """Put particle i back to where it was at the start of the substep, at rest."""
         if ti.static(self.state.starts):

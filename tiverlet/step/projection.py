@@ -83,6 +83,8 @@ def project(runner: "Runner", h: float, longest: float) -> bool:
     if known is not None:  # by the loads of the last substep: what springs of its violations would hold is not there
         energy = known
     state.put(memory, x)
+    runner.stop_at_walls(before)
+    x = state.get(memory)
     memory.write(state.d, v)
     more, deeper = _seen(runner)
     if deeper > overlap:

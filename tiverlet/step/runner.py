@@ -75,7 +75,7 @@ class Runner:
                 clock.since = 0
             moved, self.moved = None, 0.0
             if clock.first_moved is not None and self.scene.slots:
-                moved = initial_violation.remove(self.scene, self.batches, clock.first_moved)
+                moved = initial_violation.remove(self.scene, self.batches, clock.first_moved, self.stop_at_walls)
                 if moved is not None:
                     self.moved = float(moved.max())
                     if self.grid:
@@ -128,6 +128,11 @@ class Runner:
                 self.step.to_velocity(clock.h, clock.time)
                 clock.owed = (clock.drag or FREE)[3] * clock.h
             clock.d_is_velocity, clock.parted = True, None
+
+    def stop_at_walls(self, before: np.ndarray) -> None:
+        """Let walls stop particles that the host has moved from `before`, (n, dim); with memory.compiler()."""
+        if self.step.walls:
+            self.step.stopped(before)
 
     def velocity(self, iterations: int, touching: bool = True) -> np.ndarray:
         """Velocities as the user sees them, to the order of the world; without `touching` of particles that touch nothing yet."""

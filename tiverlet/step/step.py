@@ -400,6 +400,26 @@ class Step:
                 c.shrink(i, first)
 
     @ti.kernel
+    def stopped(self, old: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
+        """Walls, where they are as a frame begins, stop what the host has moved from `old`, (n, dim), between two substeps."""
+        for w in ti.static(self.posed):
+            for _ in range(1):
+                w.pose(ti.Vector([0, 0], self.real))
+        for i in range(self.n):
+            move = ti.zero(self.state.d[i])
+            for k in ti.static(range(self.dim)):
+                way = ti.cast(self.state.x[i][k], ti.f64) - old[i, k]
+                if ti.static(self.state.sums):
+                    way += self.state.low[i][k]
+                move[k] = ti.cast(way, self.real)
+                if ti.static(self.state.starts):
+                    self.state.x0[i][k] = ti.cast(old[i, k], self.real)
+                    if ti.static(self.state.sums):
+                        self.state.low0[i][k] = ti.cast(old[i, k] - self.state.x0[i][k], self.real)
+            if self.state.w.positive(i) and (move != 0).any():
+                self.particles.stop(i, move)
+
+    @ti.kernel
     def to_velocity(self, h64: ti.f64, t: ti.f64):
         """Turn displacements into velocities, for a start with another h or another state.
 
