@@ -15,10 +15,11 @@ def main(args: argparse.Namespace) -> int:
     from importlib import metadata
 
     from ..device import runtime
+    from ..device.language import NAME
     from ..report.output import machine
 
     print(f"machine        {machine()}")
-    for package in ("tiverlet", "taichi", "numpy", "rerun-sdk", "rich", "matplotlib"):
+    for package in ("tiverlet", "taichi", "quadrants", "numpy", "rerun-sdk", "rich", "matplotlib"):
         try:
             print(f"{package:14} {metadata.version(package)}")
         except metadata.PackageNotFoundError:
@@ -26,5 +27,5 @@ def main(args: argparse.Namespace) -> int:
     print(f"system         {platform.platform()}")
     print(f"architectures  {', '.join(runtime.available())}")
     runtime.ensure_started()
-    print(f"Taichi runs on {runtime.architecture()}, {runtime.threads()} threads")
+    print(f"{NAME} runs on {runtime.architecture()}, {runtime.threads()} threads")
     return 0

@@ -1,8 +1,10 @@
 """The door to Taichi: starting it, memory, threads. All other modules import Taichi from here."""
 
 from .language import at, ti
-from .patches import patched
+from .patches import assignments, lean, patched
 
+if lean:
+    assignments.apply()
 if patched:
     from .patches import sharing, source_cache, syntax_cache, timing
 

@@ -51,6 +51,7 @@ def module(name: str) -> Any:
 impl, sources = module("impl"), module("_wrap_inspect")
 inside_kernel: Callable[[], bool] = impl.inside_kernel
 Expression: Any = module("expr").Expr  # a number or a vector while a kernel is translated
+Operations: Any = getattr(module("common_ops"), f"{NAME}Operations")  # what it inherits
 
 
 def current() -> Any:

@@ -124,10 +124,10 @@ def default_fp() -> str:
 
 
 def compiler() -> str:
-    """What makes machine code of kernels: Taichi, of which commit, and what it was built with."""
+    """What makes machine code of kernels: Taichi or Quadrants, of which commit, and what it was built with."""
     library: Any = ti._lib
     core = library.core
-    return f"Taichi {core.get_version_string()} ({core.get_commit_hash()[:8]}), LLVM {core.get_llvm_target_support()}"
+    return f"{language.NAME} {core.get_version_string()} ({core.get_commit_hash()[:8]}), LLVM {core.get_llvm_target_support()}"
 
 
 def wanted() -> dict[str, Any]:

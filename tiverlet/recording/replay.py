@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import checks
+from ..device.language import NAMES
 from ..step import checkpoint
 from . import journal, rrd, scene
 from .curves import CURVES
@@ -82,7 +83,8 @@ class Replay:
         out = f"{self.path}: {len(self.frames)} frames"
         if len(self.frames):
             out += f" (0 ... {self.frames[-1]}), {self.times[-1]:.6g} s"
-        out += f", recorded with tiverlet {s['tiverlet']} and Taichi {s['taichi']} on {s['arch']} ({s['machine']}, {s['system']})"
+        out += f", recorded with tiverlet {s['tiverlet']} and {_compiler(s)} {s['taichi']}"
+        out += f" on {s['arch']} ({s['machine']}, {s['system']})"
         if not self.complete:
             last = f"it ends with frame {self.frames[-1]}" if len(self.frames) else "it has no frame"
             out += f". It is not complete ({plain(self._gap)}): {last}"
@@ -132,9 +134,17 @@ class Replay:
 
         What the user turned, assigned, added or removed is taken as the journal says, and so are the state at the start, the
         environment, what explain() said, and times of computing; the page about the scene and the curves have to say the same.
+        Raises RuntimeError for what was recorded with the other compiler, see device/README.md.
         In a world with contacts, what pairs carry along is part of the hash of states and of the end, but not of that of frames,
         where it shows in the next one.
         """
+        recorded, here = (_compiler(where) for where in (self.scene["environment"], scene.environment()))
+        if recorded != here and recorded in NAMES.values():
+            raise RuntimeError(
+                f"replay: {self.path} was recorded with {recorded}, and {here} runs here, which makes other machine code: frames "
+                f"would not come out bit for bit. Set TIVERLET_COMPILER={recorded.lower()} before Python starts. Frames that are "
+                "read, .position(), .curves and .export(), are as they were recorded."
+            )
         contents = rrd.read(self.path, rows=True)
         if [row[3] for row in contents.journal()] != [row[3] for row in self._contents.journal()]:
             raise ValueError(f"replay: {self.path} has changed since it was read; read it again.")
@@ -332,6 +342,11 @@ def replay(path, given: Iterable[Any] | Mapping[str, Any] = ()) -> Replay:
         return Replay(os.fspath(path), dict(names))
     except (KeyError, IndexError, TypeError, AttributeError, OverflowError, RecursionError) as e:
         raise ValueError(f"replay: {path} is damaged, or was not written by a Recorder: {e!r}.") from e
+
+
+def _compiler(environment: dict[str, Any]) -> str:
+    """Which one the kernels of a recording were compiled with, by its name."""
+    return plain(str(environment["compiler"])).partition(" ")[0]
 
 
 def _settle(world: "World", settings: list) -> None:

@@ -194,6 +194,12 @@ class Scalar(Batch):
         return self.acts_as_force(scene) | (self.cusp & (self.goal == 0) & (self.compliance == 0))
 
     @property
+    def outgrown(self) -> bool:
+        """Whether others than before are to be relaxed alone, too: a world is what its knobs say, not how they came there."""
+        acts = self.scene is not None and self.acts and self.solvable_together
+        return super().outgrown or (acts and not np.array_equal(self._alone, self.relaxed_alone(self.scene)))
+
+    @property
     def limited(self) -> bool:
         """Whether steps of the batch have to be limited, or had to be when kernels were compiled: f is curved, and some rigid."""
         return self.curved and bool((self.compliance == 0).any()) or bool(vars(self.dev).get("limited", False))
@@ -206,6 +212,7 @@ class Scalar(Batch):
     def bind(self, scene: Scene) -> None:
         """Declare rest values, multipliers, springs and strengths; and, for solvers, which rows of a system constraints are."""
         super().bind(scene)
+        self._alone = self.relaxed_alone(scene)
         self.dev.forces = bool(self.acts_as_force(scene).any())
         start = self.rest_of(self.start.position) if self.count else np.zeros(0)
         scale = self.unit or (float(np.abs(start).mean()) if np.any(start) else self.start.size)

@@ -8,6 +8,6 @@ from typing import Any
 
 from ..language import COMPILER, ti
 
-# Whether Taichi is the one that these are made for, and TIVERLET_PATCHES is not 0.
-patched = COMPILER == "taichi" and ti.__version__ == (1, 7, 4) and os.environ.get("TIVERLET_PATCHES") != "0"
+lean = os.environ.get("TIVERLET_PATCHES") != "0"  # whether passes are left out that LLVM does again: settings, of both compilers
+patched = lean and COMPILER == "taichi" and ti.__version__ == (1, 7, 4)  # whether Taichi is the one that these are made for
 active: list[Any] = []  # Compilers whose kernels are being compiled or launched, the innermost last

@@ -6,7 +6,8 @@ keeps them where a vector is assigned to a variable that is a number, as functio
 (`_, gap, _ = nearest(x)`): Taichi finds that nobody does, and LLVM would end the process. How functions are read is in
 source_cache.py, and how they become statements in syntax_cache.py.
 
-Everything here knows the inside of Taichi 1.7.4; with another one, kernels are compiled as Taichi does.
+These are settings, which Quadrants has, too. What goes past the door of a launch knows the inside of Taichi 1.7.4; with another
+one, every launch goes through the door.
 """
 
 import contextlib
@@ -20,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from ..language import callable_in_kernels, impl, sources
-from . import active, patched
+from . import active, lean, patched
 
 HOSTS = ("Arch.x64", "Arch.arm64")  # whose kernels LLVM makes as fast without it; measured on x64
 # No variables for what loops read and write at one address: Taichi does not see that another address may be the same place, such
@@ -57,7 +58,7 @@ class Compiler:
     def __init__(self, real, few: bool = False):
         self.real, self.few = real, few
         self.lean = LEAN | BRIEF if few else LEAN
-        self.thorough = not patched  # once and for all, since what Taichi fails to compile may be tried again
+        self.thorough = not lean  # once and for all, since what Taichi fails to compile may be tried again
         self.config: Any = None  # of Taichi, while kernels compile
         self._settings: dict[str, Any] = {}  # that Taichi was started with
         self._thread = 0

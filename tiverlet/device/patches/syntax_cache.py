@@ -19,7 +19,6 @@ from taichi.lang.any_array import AnyArray
 from taichi.lang.ast import ast_transformer
 from taichi.lang.ast.ast_transformer import ASTTransformer
 from taichi.lang.ast.ast_transformer_utils import LoopStatus, ReturnStatus
-from taichi.lang.common_ops import TaichiOperations
 from taichi.lang.expr import Expr
 from taichi.lang.field import ScalarField
 from taichi.lang.matrix import MatrixField
@@ -154,15 +153,6 @@ def _target(value: Any) -> Any:
     return value.ptr if kind in (MatrixField, AnyArray) or kind is Expr and value.is_tensor() else None
 
 
-def _assigned(self: Any, value: Any) -> Any:
-    """An assignment. That of a vector to a number, or of a number to a truth value, ends the process where Taichi does not find
-    that nobody reads it."""
-    if active and type(self) is type(value) is Expr and not self.is_tensor():
-        if value.is_tensor() or self.ptr.get_rvalue_type() == ti.u1 and value.ptr.get_rvalue_type() != ti.u1:
-            active[-1].beware()
-    return _assign(self, value)
-
-
 def _product(x: Any, y: Any) -> Any:
     """The dot product of two vectors: the same sum in the same order, without the functions inside functions that Taichi makes
     of it, which copy their arguments."""
@@ -180,7 +170,6 @@ def apply() -> None:
     ASTTransformer.__call__, ASTTransformer.get_decorator = _visited, staticmethod(_decorated)
     ASTTransformer.build_call_if_is_builtin, ast_transformer.build_stmts = staticmethod(_builtin), _statements
     matrix_ops.dot = wraps(_dot)(_product)
-    operations._assign = _assigned
 
 
 _visit: Any = ASTTransformer.__call__
@@ -192,5 +181,3 @@ _init: Any = Expr.__init__
 _declare: Any = impl.expr_init
 _at: Any = impl.subscript
 _dot: Any = matrix_ops.dot
-operations: Any = TaichiOperations
-_assign: Any = operations._assign

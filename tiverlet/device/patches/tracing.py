@@ -6,12 +6,11 @@ from collections.abc import Iterator
 from time import perf_counter
 from typing import Any
 
-from ..language import COMPILER, NAME, impl, module, ti
+from ..language import COMPILER, Operations, impl, module, ti
 from .compiler import CachedLaunch
 
 Kernel: Any = module("kernel_impl" if COMPILER == "taichi" else "kernel").Kernel
 ASTTransformer: Any = module("ast.ast_transformer").ASTTransformer
-Operations: Any = getattr(module("common_ops"), f"{NAME}Operations")
 ATOMIC = (ti.atomic_add, ti.atomic_sub, ti.atomic_max, ti.atomic_min)
 
 
