@@ -78,6 +78,7 @@ class Trial:
         for f, values in zip(self.features, self.knobs, strict=True):
             if any(vars(f)[k] is not v for k, v in values.items()):
                 turn(f, values)
+        w._adapt()  # to what they ask for: install() is for worlds that were just built
         checkpoint.install(w, self.kept, self.flags)
         w._last = None
         w.substeps, w.iterations = 20, 1
