@@ -94,6 +94,16 @@ def at(field: Any, index: Any) -> Any:
     return impl.subscript(current().compiling_callable.ast_builder(), field, index)
 
 
+class _Text(str):
+    """A text that can be weakly referred to, as a str cannot."""
+
+
+@functools.cache
+def template(text: str) -> str:
+    """A text for a kernel to have as a template: Quadrants refers weakly to what these are."""
+    return _Text(text)
+
+
 def callable_in_kernels(function: Any) -> Any:
     """A Python function or class that kernels may call as it is, without a warning; functions are asked for these two."""
     setattr(function, _MARK, True)

@@ -8,6 +8,7 @@ import numpy as np
 from ..contact.initial_overlap import overlapping
 from ..contact.velocity_projection import EVERY
 from ..device.interrupts import whole
+from ..device.language import template
 from ..device.patches.compiler import CachedLaunch
 from ..step_report import StepReport
 from . import high_order, initial_violation
@@ -290,7 +291,7 @@ class Launcher:
     def flush(self) -> None:
         """Launch what waits."""
         if self.waiting:
-            names, now, span = " ".join(self.waiting), self.now, self.now.span
+            names, now, span = template(" ".join(self.waiting)), self.now, self.now.span
             self.waiting = []
             found = self.runner.step.phases(
                 names, span.h64, span.start, span.tick, span.since, span.fresh, now.s, span.substeps, span.iterations, now.it
