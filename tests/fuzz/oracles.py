@@ -108,9 +108,10 @@ def shapeless(f: Any, x: np.ndarray) -> np.ndarray:
     return np.linalg.norm(legs, axis=2).min(axis=1, initial=np.inf) < 1e-6 * f.start.size
 
 
-def rigid(features: list[Any], free: np.ndarray, x: np.ndarray) -> tuple[float, bool]:
-    """The worst violation of rigid constraints that are one number, relative to their size, and whether it is all."""
-    worst, whole = 0.0, True
+def rigid(features: list[Any], free: np.ndarray, x: np.ndarray) -> tuple[float, bool, float]:
+    """The worst violation of rigid constraints that are one number, relative to their size, whether it is all, and what the
+    violations would change by if all coordinates were the whole scene larger: what rounding changes, over the precision."""
+    worst, whole, steepest, reach = 0.0, True, 0.0, float(np.abs(x).max(initial=0.0))
     for f in features:
         if not isinstance(f, Batch) or getattr(f, "drives", False) or not f.count:
             continue
@@ -125,7 +126,10 @@ def rigid(features: list[Any], free: np.ndarray, x: np.ndarray) -> tuple[float, 
         size = np.full(f.count, unit) if f.unit else np.where(f.goal != 0, np.abs(f.goal), unit)
         some = (f.compliance == 0) & ~f.broken & ~f.idle(free) & ~shapeless(f, x)
         worst = max(worst, float((C / size)[some].max(initial=0.0)))
-    return worst, whole
+        if f.arity and f.count:
+            slope = np.linalg.norm(f.gradients(x), axis=-1).reshape(f.count, -1).sum(axis=1)
+            steepest = max(steepest, float((slope / size)[some].max(initial=0.0)))
+    return worst, whole, steepest * reach
 
 
 def passive(structure: Structure) -> bool:

@@ -215,8 +215,8 @@ class Judge:
         least = min(p.size, *(v for f in t.features if getattr(f, "joins", False) for v in np.abs(f.goal) if v > 0), 1e300)
         blur = 64 * t.eps * reach / least
         if blur < 1e-2:
-            worst, whole = oracles.rigid(t.features, t.free, x)
-            near = max(1e-3 * worst, 1e-6 if t.eps < 1e-10 else 2e-3 if not whole else 1e-4, blur)
+            worst, whole, steep = oracles.rigid(t.features, t.free, x)
+            near = max(1e-3 * worst, 1e-6 if t.eps < 1e-10 else 2e-3 if not whole else 1e-4, blur, 4 * t.eps * steep)
             if whole and abs(report.residual - worst) > near:
                 raise Find("residual", f"reported {report.residual:.6g}, by brute force {worst:.6g}, {report}")
             if report.residual < worst - near:
