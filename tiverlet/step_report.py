@@ -25,6 +25,7 @@ class StepReport:
         "stiff-force"       a force changes too fast for the substep (omega h > 2) and makes energy grow
         "softened"          a system was made to give way, because its tension is too large for the substep
         "unconverged"       the residual is above 0.1: a link is off by a tenth of its length, an angle by a tenth of a radian
+                            (or large clusters that share particles gained energy, because a substep became shorter)
         "turned"            a constraint turned by more than 41 degrees in a substep and lost its second order there
         "moved"             what was placed off its rigid constraints by a fifth went to where they are met before the frame
         "substeps-capped"   the controller would have taken more substeps, but they are at most 4096, or the budget was spent

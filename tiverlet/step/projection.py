@@ -24,7 +24,7 @@ from ..constraints.core.scalar import Scalar
 from .block_matrix import BlockMatrix
 from .integrator import FREE
 from .jacobian import Jacobian, bodies_of
-from .rigid_rows import RigidRows, rigid_rows
+from .rigid_rows import RigidRows, left_out, rigid_rows
 
 if TYPE_CHECKING:
     from .runner import Runner
@@ -46,9 +46,14 @@ def project(runner: "Runner", h: float, longest: float) -> bool:
     """
     ratio = h / longest
     slots = runner.scene.slots
-    batches: list[Any] = [b for b in runner.batches if isinstance(b, Scalar) and b.count and _sizes(b).max() <= LARGEST]
     w, state, memory = runner.scene.inv_mass, runner.scene.state, runner.memory
     x = before = state.get(memory)
+    scalars: list[Any] = [b for b in runner.batches if isinstance(b, Scalar) and b.count]
+    batches = [b for b in scalars if _sizes(b).max() <= LARGEST]
+    others = [b for b in scalars if _sizes(b).max() > LARGEST and (b.compliance == 0).any()]
+    stays = max([left_out(runner.batches, w, x), *(float(np.abs(b.violation(x) * b.inverse_size(x)).max()) for b in others)])
+    if _matters(stays, ratio):
+        runner.released = stays
     if slots and slots.system and not slots.system.steps and not runner.clock.softened:  # it holds loads without a violation
         batches = [b for b in batches if ((slots.rows(b) < 0) & ~b.idle(w)).any()]
     batches += rigid_rows(runner.batches, w)
@@ -56,7 +61,7 @@ def project(runner: "Runner", h: float, longest: float) -> bool:
         return True
     start = Rows(batches, w, x)
     undone = start.undone(runner)
-    if float(np.abs(undone * start.close).max(initial=0.0)) * (1 - ratio**2) ** 2 <= ENOUGH * ratio**2:
+    if not _matters(float(np.abs(undone * start.close).max(initial=0.0)), ratio):
         return ratio < FAR
     rows = start = start.towards(start.C - (1 - ratio**2) * undone)
     mu, enough, far, first = BEGIN, LEFT * ratio**2, None, rows.stored
@@ -94,6 +99,11 @@ def project(runner: "Runner", h: float, longest: float) -> bool:
         v[:n] = start.paid(v[:n], x - before, more - energy)
         memory.write(state.d, v)
     return True
+
+
+def _matters(violation: float, ratio: float) -> bool:
+    """Whether what a violation, as a share of its size, leaves to vibrate is worth a look."""
+    return violation * (1 - ratio**2) ** 2 > ENOUGH * ratio**2
 
 
 def _seen(runner: Any) -> tuple[float, float]:

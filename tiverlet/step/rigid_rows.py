@@ -1,5 +1,7 @@
 """Rigid clusters as constraints that are one number each: what deforms a cluster, in its own frame."""
 
+import functools
+from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -47,7 +49,7 @@ class RigidRows:
 
 
 class Cluster:
-    """One of them: its particles, masses (k,), shape at rest (k, dim) about its center, and basis m B, (rows, k, dim)."""
+    """One of them: its particles, masses (k,), shape at rest (k, dim) about its center, its radius [m]; w: inverse masses."""
 
     def __init__(self, batch: Any, c: int, w: np.ndarray):
         self.who = batch.members_of(c).astype(np.int64)
@@ -56,16 +58,26 @@ class Cluster:
         self.mass = np.where(free, m, HEAVY * m.sum())
         q = batch.shape_of(c)
         self.shape = q - self.mass @ q / self.mass.sum()
-        dim, root = q.shape[1], np.sqrt(self.mass)
+        self.radius = np.sqrt(self.mass @ (self.shape**2).sum(axis=1) / self.mass.sum())
+        self.free = free
+
+    @functools.cached_property
+    def basis(self) -> np.ndarray:
+        """m B, (rows, k, dim)."""
+        q, root = self.shape, np.sqrt(self.mass)
+        dim = q.shape[1]
         shifts = [np.tile(e, (len(q), 1)) for e in np.eye(dim)]
-        turns = [np.outer(self.shape[:, b], np.eye(dim)[a]) - np.outer(self.shape[:, a], np.eye(dim)[b])
+        turns = [np.outer(q[:, b], np.eye(dim)[a]) - np.outer(q[:, a], np.eye(dim)[b])
                  for a, b in zip(*np.triu_indices(dim, 1), strict=True)]  # fmt: skip
         motions = np.stack([(root[:, None] * motion).ravel() for motion in (*shifts, *turns)], axis=1)
         u, s, _ = np.linalg.svd(motions, full_matrices=True)
         rest = u[:, (s > NONE * s[0]).sum() :].T.reshape(-1, len(q), dim) * root[:, None]
-        self.basis = rest[(rest[:, free] != 0).any(axis=(1, 2))]
-        radius = np.sqrt(self.mass @ (self.shape**2).sum(axis=1) / self.mass.sum())
-        self.close = 1 / (radius * np.sqrt(self.mass[free].min())) if radius > 0 else 0.0
+        return rest[(rest[:, self.free] != 0).any(axis=(1, 2))]
+
+    @property
+    def close(self) -> float:
+        """What makes a row a share of its size."""
+        return 1 / (self.radius * np.sqrt(self.mass[self.free].min())) if self.radius > 0 else 0.0
 
     def strain(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """R, and D (k, dim), at positions x (Kabsch 1976)."""
@@ -78,11 +90,30 @@ class Cluster:
 
 def rigid_rows(batches: list, w: np.ndarray) -> list[RigidRows]:
     """Those of the rigid clusters of a world that are in anything else, which passes leave undone; of those not too large."""
-    out = []
+    rows = [RigidRows(b, w, some & ~_wide(b)) for b, some in _coupled(batches, w) if (some & ~_wide(b)).any()]
+    return [some for some in rows if some.count]
+
+
+def left_out(batches: list, w: np.ndarray, x: np.ndarray) -> float:
+    """How far, in radii, particles are from their places in the clusters that are too large for rows."""
+    worst = 0.0
+    for b, some in _coupled(batches, w):
+        for c in np.flatnonzero(some & _wide(b)).tolist():
+            cluster = Cluster(b, c, w)
+            far = np.linalg.norm(cluster.strain(x)[1], axis=1).max()
+            worst = max(worst, float(far / cluster.radius) if cluster.radius > 0 else 0.0)
+    return worst
+
+
+def _coupled(batches: list, w: np.ndarray) -> Iterator[tuple[Any, np.ndarray]]:
+    """Which rigid clusters share particles with anything."""
     degree = np.bincount(np.concatenate([np.zeros(0, dtype=np.int64), *(b.indices.ravel() for b in batches)]), minlength=len(w))
     for b in batches:
         if b.clusters and b.count:
-            some = (b.compliance == 0) & ~b.broken & ~b.idle(w) & (np.diff(b.members.starts) * b.start.dim <= WIDEST)
-            some &= np.maximum.reduceat(degree[b.indices], b.members.starts[:-1]) > 1
-            out += [RigidRows(b, w, some)] if some.any() else []
-    return [rows for rows in out if rows.count]
+            shares = np.maximum.reduceat(degree[b.indices], b.members.starts[:-1]) > 1
+            yield b, (b.compliance == 0) & ~b.broken & ~b.idle(w) & shares
+
+
+def _wide(batch: Any) -> np.ndarray:
+    """Which clusters are too large."""
+    return np.diff(batch.members.starts) * batch.start.dim > WIDEST

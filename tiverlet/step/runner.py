@@ -32,6 +32,7 @@ class Runner:
         self.step, self.diagnostics, self.path, self.solver = parts.step, parts.diagnostics, parts.path, parts.solver
         self.clock = clock
         self.moved = 0.0  # how far the coming frame has had to move a particle to where its constraints are met [m]
+        self.released = 0.0  # the violation that its shorter substep turns into energy, as a share of its size
         self.interruptible = False  # what handlers of signals raise in the middle of a frame is followed by an undo
         # Asked in every frame, and Taichi looks at each attribute of what has kernels.
         step = self.step
@@ -61,7 +62,7 @@ class Runner:
     def begin(self, substep: float, iterations: int) -> None:
         """Take a length [s] for the substep; with another one than before, displacements mean something else: start anew from
         velocities."""
-        h, clock = substep * self.integrator.first, self.clock
+        h, clock, self.released = substep * self.integrator.first, self.clock, 0.0
         drag = decay(sum(f.rate for f in self.drags), h) if self.drags else None
         known = clock.energy is not None and clock.first_moved is None
         if h == clock.h and drag == clock.drag and not clock.d_is_velocity and known:
@@ -108,7 +109,7 @@ class Runner:
         self.run(substeps if self.n else 0, iterations, span[0] + span[1] * span[2], STARTED if started else STEPPED)
         clock.advance(substeps, span, started)
         self.scene.h2_effective = clock.h**2 * self.integrator.h2_factor * (clock.drag or FREE)[2 if started else 1]
-        report, self.moved = self.report(substeps, iterations), 0.0
+        report, self.moved, self.released = self.report(substeps, iterations), 0.0, 0.0
         clock.softened = "softened" in report.flags
         return report
 
@@ -244,7 +245,8 @@ class Runner:
 
     def report(self, substeps: int = 1, iterations: int = 1) -> StepReport:
         """What the diagnostics found."""
-        report, extent = self._reporter(self.clock.time, self.clock.h, substeps, iterations, self.clock.energy, self.moved)
+        clock = self.clock
+        report, extent = self._reporter(clock.time, clock.h, substeps, iterations, clock.energy, self.moved, self.released)
         if self.grid:
             self.grid.fit(extent)
         return report
