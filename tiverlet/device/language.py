@@ -1,7 +1,7 @@
 """The language that kernels are written in: Taichi, or Quadrants, its maintained fork, where TIVERLET_COMPILER=quadrants.
 
 Both speak nearly the same language. They are imported here alone, quietly and offline: without banner, and without a version
-check over the network. Where their insides differ, it is said here. Nothing here changes what they do.
+check over the network. Where their insides differ, it is said here.
 """
 
 import contextlib
@@ -48,6 +48,10 @@ def module(name: str) -> Any:
     return import_module(f"{COMPILER}.lang.{name}")
 
 
+if COMPILER == "quadrants":
+    # It would keep the functions of an object in the object, bound; those of a copy would go on with the original.
+    _callable: Any = module("_quadrants_callable").QuadrantsCallable
+    _callable.__set_name__ = lambda self, owner, name: None
 impl, sources = module("impl"), module("_wrap_inspect")
 inside_kernel: Callable[[], bool] = impl.inside_kernel
 Expression: Any = module("expr").Expr  # a number or a vector while a kernel is translated

@@ -82,11 +82,14 @@ class Memory:
         if self._layout:
             self.write(number.field, [one._value for one in next(all for f, all in self._numbers.values() if f is number.field)])
 
-    def place(self) -> None:
-        """Allocate what was declared and write the first values (everything else is zero)."""
+    def _declare_numbers(self) -> None:
         for kind, (field, known) in self._numbers.items():
             self._declare(f"numbers.{np.dtype(_NUMPY[kind]).name}", field, len(known), 0, kind, False)
             self._later.append((self.entries[-1], np.array([number._value for number in known], dtype=np.float64)))
+
+    def place(self) -> None:
+        """Allocate what was declared and write the first values (everything else is zero)."""
+        self._declare_numbers()
         with self.compiler():
             shared = layout.sharing()
             held = [one for one, _ in self.compiler.places]
@@ -140,6 +143,7 @@ class Memory:
         if self._ends:
             self._ends()
         elif self.entries and not patched:  # fields that are never placed would poison everything that Taichi does later
+            self._declare_numbers()
             Layout(tuple(self._declared), [e.field for e in self.entries]).destroy()
         self._layout, self._views, self._room = None, {}, None
         self.entries = self.entries if self._ends else []
