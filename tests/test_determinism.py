@@ -169,19 +169,35 @@ def test_what_is_absent_has_no_field_and_no_kernel(world):
 
 
 def test_launches_count_what_the_scene_needs(world):
-    # Kernel launches of a frame, counted at Taichi's door: one for all of it on a CPU; else one per substep without constraints,
-    # and one more per pass with them.
+    # Kernel launches of a frame, counted at Taichi's door: one for all of it on a CPU; else one for each pass of a substep.
     for features, path, expected in (
         ([tv.Gravity(1.0)], "launched", {"integrate": 5, "measure": 1}),
-        ([tv.Gravity(1.0), tv.Distance([[0, 1]])], "launched", {"integrate": 5, PASS: 10, "measure": 1}),
+        ([tv.Gravity(1.0), tv.Distance([[0, 1]])], "launched", {f"integrate {PASS}": 5, PASS: 5, "measure": 1}),
+        (
+            [tv.Gravity(1.0), tv.Distance([[0, 1]]), tv.Contact(friction=0.1, restitution=0.5)],
+            "launched",
+            {
+                "integrate ask_for_list solve_constraints apply_constraints": 5,
+                "ask_for_list solve_contacts": 5,
+                "rebound": 40,
+                "apply_corrections": 5,
+                "ask_for_list solve_constraints apply_constraints": 5,
+                "ask_for_list solve_contacts apply_corrections finish_substep": 5,
+                "ask_for_list": 1,
+                "measure": 1,
+            },
+        ),
         ([tv.Gravity(1.0), tv.Distance([[0, 1]])], "parallel" if cores() > 1 else "fused", {"fused": 1}),
         ([tv.Gravity(1.0), tv.Distance([[0, 1]])], "fused", {"fused": 1}),
     ):
-        w = world(tv.Particles([[0.0, 0], [1, 0]]), features, path=path, substeps=5, iterations=2)
+        w = world(tv.Particles([[0.0, 0], [1, 0]], radius=0.1), features, path=path, substeps=5, iterations=2)
+        w.step(0.01)
         w.step(0.01)
         with counting.launches() as count:
             w.step(0.01)
         assert count == expected
+        total = "1 launch" if path != "launched" else f"{count.total()} launches"
+        assert f"{total} per frame" in w.explain()
 
 
 def test_unused_files_change_no_bit(tmp_path):

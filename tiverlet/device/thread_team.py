@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from . import runtime
-from .language import ti
+from .language import at, ti
 from .number import OnDevice
 from .patches.compiler import inline
 
@@ -66,7 +66,12 @@ class Team:
     """size: the number of threads; 1 where there is nobody to wait for, because Taichi itself spreads loops over threads or
     because there is one thread only. launched: which of the two; phase by phase, as on a GPU. A share of n is what a thread
     does of it; what the shares are shows in no result. Particles are dealt out piece by piece, there and back, `pieces` in all:
-    in a heap those below have more to do than those above, and one thread would wait for the other."""
+    in a heap those below have more to do than those above, and one thread would wait for the other.
+
+    halt: where a frame that is launched phase by phase notes that it waits for a list, [1, substep, half of a pass]; what was
+    launched behind has nothing to do then. None where it cannot happen, or is asked in other ways."""
+
+    halt: Any = None
 
     piece: Any = OnDevice()
     patience: Any = OnDevice()
@@ -103,6 +108,11 @@ class Team:
         return self._works(thread) if self.size > 1 else True
 
     @inline
+    def left(self, n):
+        """How many of n things there are to do: none while the frame waits."""
+        return n if self.halt is None else n * (1 - at(at(self.halt, None), 0))
+
+    @inline
     def chunk_begin(self, n, thread):
         """Where the share begins. That of a single thread begins at 0, which LLVM must not know: it would write out loops over
         few particles, one by one, and take half as long again for all."""
@@ -111,12 +121,12 @@ class Team:
     @inline
     def chunk_end(self, n, thread):
         """Where it ends."""
-        return self._share(n, thread + 1) if self.size > 1 else n
+        return self._share(n, thread + 1) if self.size > 1 else self.left(n)
 
     @inline
     def dealt_count(self, n, unit, thread):
         """How many of n things fall to a thread where they are dealt out in turn, `unit` at a time."""
-        return self._dealt_count(n, unit, thread) if self.size > 1 else n
+        return self._dealt_count(n, unit, thread) if self.size > 1 else self.left(n)
 
     @inline
     def dealt_index(self, k, unit, thread):
@@ -126,7 +136,7 @@ class Team:
     @inline
     def one(self, n, thread):
         """All of it for one of them, nothing for the others."""
-        return ti.select(thread == 0, n, 0) if self.size > 1 else n
+        return ti.select(thread == 0, n, 0) if self.size > 1 else self.left(n)
 
     @inline
     def wait(self):

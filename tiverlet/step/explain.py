@@ -11,6 +11,7 @@ from ..device.patches import patched
 from ..features.feature import Acceleration, Batch
 from ..shapes.shape import morton
 from .build import reason
+from .step import REBOUNDS
 
 if TYPE_CHECKING:
     from ..world import World
@@ -78,9 +79,11 @@ def _launches(world: "World") -> str:
     step = world._runner.step
     if not step.launched:
         return "1 launch per frame" + f", of {step.team.size} threads" * (step.team.size > 1)
-    passes = world.iterations if step.particles.acts else 0
-    more = ", and one for each neighbour list" if step.grid else ""
-    return f"{world.substeps * (1 + passes) + 1} launches per frame{more}"
+    solved = world.iterations * (step.constraints.steps + 1) if step.constraints.steps else 0
+    rounds = REBOUNDS + 1 if step.has_restitution else 0
+    each = (world.iterations * step.halves if step.particles.acts else 1) + solved + rounds
+    more = ", and those behind a stale list again, once it was built" if step.grid else ""
+    return f"{world.substeps * each + 1 + bool(step.grid)} launches per frame, of which the host waits for one{more}"
 
 
 def _present(world: "World") -> list[str]:

@@ -172,10 +172,10 @@ class Runner:
         clock, stages = self.clock, self.integrator.stages * substeps
         passes = self.integrator.passes(iterations)
         if self.launched:
+            span = Span(clock.h, clock.time, end, clock.tick, clock.since, clock.d_is_velocity, state_origin, stages, passes)
+            span.until, span.part = stages + 1, passes
             with self.memory.compiler():
-                span = Span(clock.h, clock.time, end, clock.tick, clock.since, clock.d_is_velocity, state_origin, stages, passes)
-                span.until, span.part = stages + 1, passes
-                frame(self.launcher, span)
+                self._launch(span)
             return
         self.team.rejoin(self._data[ACTIVE_THREADS])
         begin = half = resumed = 0
@@ -202,6 +202,21 @@ class Runner:
                 resumed, begin, half, part = 0, until, 0, min(passes, some) if splits else passes
                 until = min(stages + 1, until + max(1, some // passes))
             self.raise_signals()
+
+    def _launch(self, span: Span) -> None:
+        """Phase by phase. Whether the frame waits for a list is all that the host asks, when all is launched."""
+        try:
+            frame(self.launcher, span)
+            while self.grid and self._data[HALT]:
+                span.resumed, span.begin, span.half = (int(v) for v in self._data[HALT:ACTIVE_THREADS])
+                self.memory.write(self.step.halt, 0)
+                self.list_neighbours()
+                frame(self.launcher, span)
+        except BaseException:  # as signals raise
+            self.launcher.waiting.clear()
+            if self.grid:
+                self.memory.write(self.step.halt, 0)
+            raise
 
     def measure(self, end: float, state_origin: int) -> None:
         """Launch the diagnostics alone."""
@@ -267,10 +282,10 @@ class Runner:
 
 
 class Launcher:
-    """Goes through frame() where each phase is launched, as on a GPU.
+    """Goes through frame() where each phase is launched, as on a GPU, which does not wait for the host, nor the host for it.
 
-    Phases wait until the host has to know what came of them, and then go together in one launch; so do those of a pass that
-    nobody has to ask in between. What a scene does not have is left out.
+    Phases of one half of a pass go together in one launch. What a scene does not have is left out. Where the list of neighbours
+    is stale, all that is launched behind does nothing, and the frame goes on there when the host has had it built, see run().
     """
 
     def __init__(self, runner: Runner):
@@ -286,62 +301,66 @@ class Launcher:
         )
         self.systems, self.steps = bool(step.constraints.systems), step.constraints.steps
         self.waiting: list[str] = []
-        self.now: Any = None  # the pass that they are in
-        self.stale: bool | None = None  # whether the list is; None where nothing was launched since others could change that
-        self.hit = False  # whether a pair bounces
+        self.now: Any = None  # the half of a pass that they are in
 
     def flush(self) -> None:
         """Launch what waits."""
         if self.waiting:
             names, now, span = template(" ".join(self.waiting)), self.now, self.now.span
             self.waiting = []
-            found = self.runner.step.phases(
-                names, span.h64, span.start, span.tick, span.since, span.fresh, now.s, span.substeps, span.iterations, now.it
+            self.runner.step.phases(
+                names, span.h64, span.start, span.tick, span.since, span.fresh, now.s, span.substeps, span.iterations, now.half
             )
-            self.stale, self.hit = bool(found & 1), bool(found & 2)
 
     def put(self, now: Moment, name: str, there: bool = True) -> None:
-        """One more phase that waits, if the scene has it."""
+        """One more phase that waits, if the scene has it; in a launch of its own if others wait that are in another half."""
         if there:
+            if self.waiting and (self.now.s, self.now.half) != (now.s, now.half):
+                self.flush()
             self.waiting.append(name)
             self.now = now
+
+    def again(self, now: Moment) -> bool:
+        """Whether the substep goes on in the middle."""
+        return bool(now.span.resumed) and now.s == now.span.begin
 
     def moment(self, span: Span, s: int) -> Moment:
         """Substep s, as far as the host has to know of it."""
         return Moment(span, s, damps=(span.since + s) % EVERY == EVERY - 1)
 
     def turn(self, now: Moment, half: int) -> Moment:
-        """A pass."""
-        return now.of(half // self.halves, half < self.halves)
+        """A pass, by one of its halves."""
+        return now.of(half // self.halves, half < self.halves, half=half)
 
     def works(self, now: Moment) -> bool:
         """Between two substeps, signals are heeded."""
         self.runner.raise_signals()
-        if now.s == now.span.begin:
-            self.stale = None
         return True
 
     def enters(self, now: Moment) -> bool:
+        """Whether the substep begins here."""
+        return now.s < now.span.substeps and not self.again(now)
+
+    def solves(self, now: Moment) -> bool:
         """Whether there is such a substep."""
         return now.s < now.span.substeps
 
-    solves = leaves = enters
+    leaves = solves
 
     def ends(self, now: Moment) -> bool:
         """Whether all are done."""
         return now.s >= now.span.substeps
 
     def first_half(self, now: Moment) -> int:
-        """The half of a pass in which the substep begins."""
-        return 0
+        """The half of a pass in which the substep begins or goes on."""
+        return now.span.half if self.again(now) else 0
 
     def last_half(self, now: Moment) -> int:
         """The one before which it ends; one more for the list after all of them."""
         return now.span.iterations * self.halves if now.s < now.span.substeps else 1
 
     def integrate(self, now: Moment) -> None:
-        """A launch of its own, with the next one."""
-        self.flush()
+        """The first of a substep."""
         self.put(now, "integrate")
 
     def drive(self, now: Moment) -> None:
@@ -349,19 +368,13 @@ class Launcher:
         self.put(now, "drive", self.drives)
 
     def update_neighbours(self, now: Moment, half: int) -> None:
-        """Here the list may have to grow."""
-        self.flush()
+        """Here the frame may have to wait for a list."""
         if half and not half % self.halves:
             self.runner.raise_signals()
-        grid = self.runner.grid
-        if grid and self.stale is None:
-            self.stale = bool(self.runner.memory.read(grid.stale)[0])
-        if grid and self.stale:
-            self.runner.list_neighbours()
-            self.stale = False
+        self.put(self.turn(now, half), "ask_for_list", bool(self.runner.grid))
 
     def solve_constraints(self, now: Moment) -> None:
-        """The first of a pass."""
+        """Behind it, and so on."""
         self.put(now, "solve_constraints", self.constrains)
 
     def solve_systems(self, now: Moment) -> None:
@@ -374,25 +387,24 @@ class Launcher:
             self.flush()
 
     def update_multipliers(self, now: Moment) -> None:
-        """Behind it, and so on."""
+        """What they found."""
         self.put(now, "update_multipliers", self.systems)
 
     def apply_constraints(self, now: Moment) -> None:
-        """The list has to hear of it."""
+        """The last of the first half."""
         self.put(now, "apply_constraints", self.halves == 2)
 
     def solve_contacts(self, now: Moment) -> None:
-        """Where pairs bounce, it has to be asked whether any does."""
+        """The first of the second half."""
         self.put(now, "solve_contacts", self.touches)
-        if self.has_restitution:
-            self.flush()
 
     def struck(self) -> bool:
-        """Whether one does."""
-        return self.hit
+        """Whether a pair bounces, which nobody asks: rounds in which none does have nothing to do."""
+        return True
 
     def rebound(self, now: Moment) -> None:
-        """A launch of its own, that is asked, too."""
+        """One launch for every round."""
+        self.flush()
         self.put(now, "rebound")
         self.flush()
 
@@ -401,14 +413,13 @@ class Launcher:
         self.put(now, "apply_corrections", self.acts)
 
     def finish_substep(self, now: Moment) -> None:
-        """A launch of its own."""
-        self.flush()
-        self.put(now, "finish_substep")
+        """Once, behind the last pass."""
+        self.put(self.now if self.waiting else now, "finish_substep")
 
     def project_contact_velocities(self, now: Moment) -> None:
         """A launch for each pass."""
         self.flush()
-        self.put(now, "project_contact_velocities")
+        self.put(now.of(now.it, half=now.it * self.halves), "project_contact_velocities")
 
     def diagnose(self, now: Moment) -> None:
         """The last launch of a frame."""

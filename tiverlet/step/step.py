@@ -89,23 +89,23 @@ class Moment:
     s, h, last, time: number, length, length of the one before, start [s]. frame_fraction: where it starts and ends in the frame.
     fresh: whether it is a start. damps: whether sound is taken out after it. final: whether it is the last of the frame.
     it: the pass. first: whether it is the first one. checks_list: whether it is checked after it if the list is stale; the next
-    substep does so, too.
+    substep does so, too. half: of the passes, counted through.
     """
 
     def __init__(
         self, span, s, h=0.0, last=0.0, time=0.0, tick=0, frame_fraction=None, fresh=0, damps=0, final=0, it=0, first=0,
-        checks_list=0,
+        checks_list=0, half=0,
     ):  # fmt: skip
         self.span, self.thread, self.s, self.h, self.last, self.time, self.tick = span, span.thread, s, h, last, time, tick
         self.frame_fraction, self.fresh, self.damps, self.final = frame_fraction, fresh, damps, final
-        self.it, self.first, self.checks_list = it, first, checks_list
+        self.it, self.first, self.checks_list, self.half = it, first, checks_list, half
 
     @inline
-    def of(self, it, first=0, checks_list=0):
+    def of(self, it, first=0, checks_list=0, half=0):
         """The same, in a pass."""
         return Moment(
             self.span, self.s, self.h, self.last, self.time, self.tick, self.frame_fraction, self.fresh, self.damps, self.final,
-            it, first, checks_list,
+            it, first, checks_list, half,
         )  # fmt: skip
 
 
@@ -159,6 +159,8 @@ class Step:
         self.hashes = bool(grid)
         if grid:
             self.halt = scene.memory.field("halt", None, width=3, kind=ti.i32)
+            if self.launched:
+                team.halt = self.halt
 
     @ti.kernel
     def fused(self, sheet: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
@@ -193,13 +195,12 @@ class Step:
     @ti.kernel
     def phases(
         self, names: ti.template(), h64: ti.f64, start: ti.f64, tick: ti.i32, since: ti.i32, fresh: ti.i32, s: ti.i32,  # type: ignore[valid-type]
-        substeps: ti.i32, iterations: ti.i32, it: ti.i32,
-    ) -> ti.i32:  # fmt: skip
-        """Some phases of a substep, by their names; returns whether the list is stale, and 2 more if a pair bounces."""
-        now = self.turn(self.moment(Span(h64, start, start, tick, since, fresh, 0, substeps, iterations), s), it * self.halves)
+        substeps: ti.i32, iterations: ti.i32, half: ti.i32,
+    ):  # fmt: skip
+        """Some phases of a substep, by their names. Nothing is returned: that would be waited for."""
+        now = self.turn(self.moment(Span(h64, start, start, tick, since, fresh, 0, substeps, iterations), s), half)
         for phase in ti.static(self.named(names)):
             phase(now)
-        return self.is_stale() + 2 * self.struck()
 
     def named(self, names: str) -> list[Any]:
         """The phases of these names, one after the other."""
@@ -219,7 +220,7 @@ class Step:
         it = half // self.halves
         first = ti.cast(it == 0, ti.i32)
         checks_list = ti.select(it + 1 < now.span.iterations, 1, now.final)
-        return now.of(it, first, checks_list)
+        return now.of(it, first, checks_list, half)
 
     @ti.func
     def works(self, now):
@@ -294,6 +295,14 @@ class Step:
                 self.grid.build(now.thread)
                 if self.grid.need[None] > self.grid.capacity:
                     self.halt[None] = [1, now.s, half]  # all write the same
+
+    @ti.func
+    def ask_for_list(self, now):
+        """Where phases are launched: have a list built that is stale. The frame waits for it, see Team."""
+        ti.loop_config(serialize=True)
+        for _ in range(self.team.one(1, now.thread)):
+            if self.is_stale() != 0:
+                self.halt[None] = [1, now.s, now.half]
 
     @ti.func
     def solve_constraints(self, now):

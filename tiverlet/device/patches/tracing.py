@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from time import perf_counter
 from typing import Any
 
+import numpy as np
+
 from ..language import COMPILER, Operations, impl, module, ti
 from .compiler import CachedLaunch
 
@@ -33,11 +35,13 @@ def known_as(kernel: Any, args: tuple) -> str:
 
 
 class Launches(Counter[str]):
-    """How often kernels were launched, by name; seconds: in all, if they were timed."""
+    """How often kernels were launched, by name; seconds: in all, if they were timed. answers: how often the host waited for what
+    they give back, a number or what they write to an array."""
 
     def __init__(self):
         super().__init__()
         self.seconds: dict[str, float] = {}
+        self.answers = 0
 
 
 @contextlib.contextmanager
@@ -51,6 +55,7 @@ def launches(timed: bool = False) -> Iterator[Launches]:
             out = launch(self, *args, **options)
             known = name(self, args)
             count[known] += 1
+            count.answers += out is not None or any(isinstance(a, np.ndarray) for a in (*args, *getattr(self, "arrays", ())))
             if timed:
                 ti.sync()
                 count.seconds[known] = count.seconds.get(known, 0.0) + perf_counter() - clock

@@ -1,5 +1,6 @@
 """What a frame does, seen at Taichi's door: kernels launched, the time they take, and bytes that their loops read and write."""
 
+from ...device.layout import unshared
 from ...device.patches.tracing import Launches, Tracer, launches
 from ...device.thread_team import launching
 
@@ -15,7 +16,7 @@ def traffic(world, frames: int) -> dict[str, tuple[float, float]]:
     fetched once, and if every branch were taken. The fields are those that the kernels name while they are translated.
     """
     tracer, known, count = Tracer(), -1, Launches()
-    with tracer.watching(), launching(), world.clone(path="parallel") as clone:
+    with tracer.watching(), launching(), unshared(), world.clone(path="parallel") as clone:
         while known < len(tracer.sweeps):  # until no kernel was compiled on the way
             known = len(tracer.sweeps)
             with launches(timed=True) as count:
