@@ -28,6 +28,7 @@ os.environ.setdefault("TI_OFFLINE_CACHE_MAX_SIZE_OF_FILES", str(512 << 20))
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as it is in the background of a shell; tests send it
     signal.signal(signal.SIGINT, signal.default_int_handler)
+collect_ignore = [] if patched else ["test_compiling.py", "test_sharing.py"]  # which are about what is not there then
 ARCH = os.environ.get("TIVERLET_ARCH", "cpu")
 SOURCES = str(pathlib.Path(tv.__file__).parent)
 # Functions of tests are held to what ours are, see checked_assignments(); those of these files try what a user's may do.

@@ -7,6 +7,7 @@ import pytest
 
 import tiverlet as tv
 from tiverlet.device import ti
+from tiverlet.device.language import COMPILER
 
 from .conftest import python
 
@@ -183,7 +184,7 @@ def test_a_force_is_a_vector_of_the_world(world, function, words):
 
 def test_what_taichi_says_of_a_start_is_said_in_our_words():
     typed = (
-        "import taichi as ti\nimport tiverlet as tv\n"
+        f"import {COMPILER} as ti\nimport tiverlet as tv\n"
         "for make in (lambda: ti.field(ti.f32, 4), lambda: ti.Vector.field(2, ti.f32, 4)):\n"
         "    try:\n        make()\n    except RuntimeError as e:\n        print(e)\n"
         "space = {'ti': ti}\nexec('@ti.func\\ndef f(x):\\n    return -x', space)\n"

@@ -55,11 +55,7 @@ class Layout:
     _serials = count()
 
     def __init__(self, declared: tuple[Declared, ...], fields: list[Any] | None = None, shared: bool = False):
-        if runtime.trees >= MAX_TREES:
-            raise RuntimeError(
-                f"So many worlds are alive that they have {runtime.trees} trees of fields, and Taichi crashes near 512. "
-                "Close worlds that you no longer need: world.close(), or `with tv.World(...) as world:`."
-            )
+        check_trees()
         self.serial, self.runtime, self.shared = next(self._serials), language.current(), shared
         self.fields = fields or [made(d.kind, d.width) for d in declared]
         builders: dict[bool, Any] = {d.apart: None for d in declared}
@@ -131,11 +127,27 @@ class Layout:
     def destroy(self) -> None:
         """Free the trees, unless they are shared."""
         if not self.shared and self.trees and language.current() is self.runtime and not runtime.forked():
-            self.runtime.materialize()  # no kernel may have run since they were made
+            _leaving.append(self)
+            with contextlib.suppress(RuntimeError):  # while another world is built, whose fields have no place: some time later
+                self.runtime.materialize()  # no kernel may have run since they were made
+                while _leaving:
+                    _leaving.pop()._free()
+
+    def _free(self) -> None:
+        if language.current() is self.runtime:
             for tree in self.trees:
                 tree.destroy()
             runtime.trees -= len(self.trees)
-            self.trees = []
+        self.trees = []
+
+
+def check_trees() -> None:
+    """Raise RuntimeError where there is no room for one more."""
+    if runtime.trees >= MAX_TREES:
+        raise RuntimeError(
+            f"So many worlds are alive that they have {runtime.trees} trees of fields, and Taichi crashes near 512. "
+            "Close worlds that you no longer need: world.close(), or `with tv.World(...) as world:`."
+        )
 
 
 @contextlib.contextmanager
@@ -231,6 +243,7 @@ def _roomy(kind: Any, width: int, many: bool, room: int) -> Declared:
     return Declared(kind, width, room + -(-BETWEEN // _size(kind, width)) if many else 0, False)
 
 
+_leaving: list[Layout] = []  # that are to be freed
 _known: dict[Layout, Counter[Kind]] = {}  # the shared ones, and how many fields of each kind they have
 _alone = False
 _table: tuple[Any, Any] = (None, None)  # a runtime, and where its kernels look up where trees are

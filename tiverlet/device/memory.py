@@ -32,6 +32,8 @@ class Memory:
     kernels_read = ("real",)
 
     def __init__(self, real, few: bool = False, compiler: Compiler | None = None):
+        if not patched:  # whose fields need a place once they are made
+            layout.check_trees()
         self.real = real
         self.compiler = compiler or Compiler(real, few)
         self.entries: list[Entry] = []

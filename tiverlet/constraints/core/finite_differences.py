@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ...device import runtime, ti
+from ...device import inline, runtime, ti
 from ...device.patches.compiler import Compiler
 
 STEP = 2.0**-20  # of central differences, relative to the distance between corners
@@ -66,21 +66,18 @@ class NumericGradient:
             ti.Vector([q[k, a] + sign * ti.cast((j + 1) // 2 == self.number[k][a], ti.f64) for a in ti.static(range(self.dim))])
             for k in ti.static(range(self.arity))
         ]
-        out = 0 * step
-        if ti.static(self.counts):
-            out = self.function(*corners, c)
-        else:
-            out = self.function(*corners)
-        return out
+        return self.function(*self.arguments(corners, c, self.counts))
+
+    @inline
+    def arguments(self, corners, c, counts):
+        """Of a call; Quadrants takes what is unpacked only at their end."""
+        return [*corners, c] if counts else corners
 
     @ti.func
     def slope(self, c, q):
         """The gradient that was given."""
         corners = [q[k, :] for k in ti.static(range(self.arity))]
-        if ti.static(self.gradient_counts):
-            return self.rows(self.given(*corners, c))
-        else:
-            return self.rows(self.given(*corners))
+        return self.rows(self.given(*self.arguments(corners, c, self.gradient_counts)))
 
     @ti.func
     def rows(self, vectors: ti.template()):  # type: ignore[valid-type]
