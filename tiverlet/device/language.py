@@ -50,8 +50,10 @@ def module(name: str) -> Any:
 
 if COMPILER == "quadrants":
     # It would keep the functions of an object in the object, bound; those of a copy would go on with the original.
-    _callable: Any = module("_quadrants_callable").QuadrantsCallable
-    _callable.__set_name__ = lambda self, owner, name: None
+    _callables: Any = module("_quadrants_callable")
+    _callables.QuadrantsCallable.__get__ = lambda self, instance, owner: (
+        self if instance is None else _callables.BoundQuadrantsCallable(instance, self)
+    )
 impl, sources = module("impl"), module("_wrap_inspect")
 inside_kernel: Callable[[], bool] = impl.inside_kernel
 Expression: Any = module("expr").Expr  # a number or a vector while a kernel is translated
