@@ -16,6 +16,7 @@ import pytest
 import tiverlet as tv
 from tiverlet.__main__ import main
 from tiverlet.device import ti
+from tiverlet.device.language import NAME, NAMES
 from tiverlet.recording import journal, messages, reader, recorder, viewer
 
 from .conftest import python
@@ -141,6 +142,16 @@ def test_tampering_is_found(falling, tmp_path):
 
     def elsewhere(text):
         return re.sub(r'"g": 5.0', '"g": 5.5', text.replace('"taichi": "1', '"taichi": "0'))
+
+    other = next(name for name in NAMES.values() if name != NAME)
+
+    def compiled(text):
+        return text.replace(f'"compiler": "{NAME} ', f'"compiler": "{other} ')
+
+    recording = tv.replay(rewrite(falling, tmp_path / "e.rrd", compiled))
+    with pytest.raises(RuntimeError, match=f"recorded with {other}, and {NAME} runs here.*TIVERLET_COMPILER={other.lower()}"):
+        recording.verify()
+    assert f"{other} " in recording.text and len(recording.position(12)) == len(tv.replay(falling).position(12))
 
     minor = ".".join(map(str, ti.__version__[1:]))
     with pytest.raises(RuntimeError, match=f"frame 12 .* not as it was: taichi 0.{minor} then, 1.{minor} now"):
