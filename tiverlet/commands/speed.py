@@ -16,6 +16,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     parts = {"yardstick": "pile.c", "peers": "other engines", "absent": "the package without unused files", "waits": "edits"}
     for name, what in parts.items():
         parser.add_argument(f"--no-{name}", dest=name, action="store_false", help=f"without {what}")
+    parser.add_argument("--compilers", action="store_true", help="Taichi beside Quadrants, and nothing else")
     parser.add_argument("--json", metavar="FILE", help="write everything, for machines")
     parser.add_argument("--markdown", metavar="FILE", help="write the tables")
     parser.add_argument("--plot", metavar="FOLDER", help="write plots (needs matplotlib)")
@@ -33,6 +34,11 @@ def main(args: argparse.Namespace) -> int:
         for name, scene in SCENES.items():
             sizes = ", ".join(f"{n:,}" for n in scene.sizes)
             console.print(f"{name:8} {scene.title}, {scene.substeps} substeps; {sizes} particles", highlight=False)
+        return 0
+    if args.compilers:
+        from ..report.speed.compilers import SIZES, compilers
+
+        console.print(compilers(tuple(args.sizes or SIZES)))
         return 0
     report = speed(
         args.scenes or None, sizes=args.sizes, threads=args.threads, arch=args.arch, quick=args.quick, yardstick=args.yardstick,

@@ -55,11 +55,16 @@ class Talker:
             pipe.close()  # type: ignore[union-attr]
 
 
+def cached(folder: str) -> dict[str, str]:
+    """What has Taichi, or Quadrants, keep what it compiles in a folder."""
+    return {f"{of}_OFFLINE_CACHE{what}": value for of in ("TI", "QD") for what, value in (("", "1"), ("_FILE_PATH", folder))}
+
+
 def world(job: Mapping[str, Any], cache: str, root: str = ROOT) -> Talker:
     """The process of a scene, by the package in `root`. cache: the folder where Taichi keeps what it has compiled."""
     from .child import START
 
-    environment = {"PYTHONPATH": paths(root), "TI_OFFLINE_CACHE_FILE_PATH": cache, "TI_OFFLINE_CACHE": "1"}
+    environment = {"PYTHONPATH": paths(root), **cached(cache)}
     return Talker([sys.executable, "-P", "-c", START, json.dumps(job)], environment)
 
 

@@ -38,10 +38,10 @@ AIMS = {
 
 def waits(n: int, cache: str, peers: list[str]) -> list[Wait]:
     """Of a pile of n discs. cache: an empty folder. peers: those that are installed."""
-    from .processes import Talker, paths
+    from .processes import Talker, cached, paths
 
     def of(engine: str) -> dict[str, float]:
-        environment = {"PYTHONPATH": paths(), "TI_OFFLINE_CACHE_FILE_PATH": cache, "TI_OFFLINE_CACHE": "1"}
+        environment = {"PYTHONPATH": paths(), **cached(cache)}
         with Talker([sys.executable, "-P", "-c", START, json.dumps({"engine": engine, "n": n})], environment) as talker:
             return talker.ask()
 

@@ -1,0 +1,102 @@
+"""The two compilers side by side, Taichi and Quadrants, with the patches of device/patches and without.
+
+Each way has a process of its own, and an empty cache; a second process finds what the first has left there. Processes take turns,
+so that what else the machine does meets all of them.
+"""
+
+import json
+import sys
+import tempfile
+from importlib.util import find_spec
+from statistics import median
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+WAYS = {
+    "Taichi": {"TIVERLET_COMPILER": "taichi"},
+    "Taichi, no patches": {"TIVERLET_COMPILER": "taichi", "TIVERLET_PATCHES": "0"},
+    "Quadrants": {"TIVERLET_COMPILER": "quadrants"},
+    "Quadrants, no patches": {"TIVERLET_COMPILER": "quadrants", "TIVERLET_PATCHES": "0"},
+}
+SIZES = (1000, 10_000, 100_000)
+TURNS = 3  # of the processes; the medians count
+FALLING, SETTLED = (10, 40), (400, 430)  # frames that are timed
+SMALL = 20_000  # discs up to which a pile is waited for until it has settled
+START = """
+from time import perf_counter
+clock = perf_counter()
+import sys, json
+import tiverlet
+seconds = perf_counter() - clock
+from tiverlet.report.speed.compilers import main
+main(json.loads(sys.argv[1]), seconds)
+"""
+
+
+def compilers(sizes: tuple[int, ...] = SIZES) -> "Table":
+    """A table of seconds, frames and memory, by ways; those of Quadrants where it is installed. sizes: of piles."""
+    from rich.table import Table
+
+    ways = [way for way in WAYS if way.startswith("Taichi") or find_spec("quadrants")]
+    found: dict[str, list[dict[str, float]]] = {way: [] for way in ways}
+    for turn in range(TURNS):
+        for way in ways:
+            with tempfile.TemporaryDirectory() as cache:
+                cold, warm = (measured(way, cache, sizes if turn == again == 0 else ()) for again in (0, 1))
+                starts = {"import": warm["import"], "first step, cold": cold["first"], "first step, warm": warm["first"]}
+                found[way].append(starts | {k: v for k, v in {**cold, **warm}.items() if k not in ("import", "first")})
+    table = Table("", *ways, title="Compilers: a pile of 1 000 discs, 1 thread; s, us, ms and MB")
+    for row in found[ways[0]][0]:
+        cells = [median([one[row] for one in found[way] if row in one]) for way in ways]
+        table.add_row(row, *(f"{cell:.3g}" for cell in cells))
+    return table
+
+
+def measured(way: str, cache: str, sizes: tuple[int, ...]) -> dict[str, float]:
+    """What a process of one way finds."""
+    from .processes import Talker, cached, paths
+
+    environment = {"PYTHONPATH": paths(), "TIVERLET_PATCHES": "1", **cached(cache), **WAYS[way]}
+    with Talker([sys.executable, "-P", "-c", START, json.dumps(sizes)], environment) as talker:
+        return talker.ask()
+
+
+def main(sizes: list[int], imported: float) -> None:
+    """The process: seconds, by what they are spent on."""
+    import resource
+
+    import numpy as np
+
+    import tiverlet as tv
+
+    from .counting import DT
+    from .scenes import SCENES
+
+    out: dict[str, Any] = {"import": imported}
+    tv.init(threads=1)
+    clock = perf_counter()
+    particles, features = SCENES["pile"].build(1000)
+    with tv.World(particles, features, substeps=8) as world:
+        world.step(DT)
+        out["first"] = perf_counter() - clock
+    with tv.World(tv.Particles(np.zeros((1, 2))), [tv.Gravity()], substeps=1) as world:
+        times = []
+        for _ in range(1000):
+            clock = perf_counter()
+            world.step(DT)
+            times.append(perf_counter() - clock)
+    out["frame of one particle [us]"] = 1e6 * median(times)
+    for n in sizes:
+        particles, features = SCENES["pile"].build(n)
+        with tv.World(particles, features, substeps=8) as world:
+            for name, (begin, end) in (("falling", FALLING), ("settled", SETTLED)):
+                if name == "falling" or n <= SMALL:
+                    world.run(begin * DT - world.time, DT)
+                    clock = perf_counter()
+                    world.run((end - begin) * DT, DT)
+                    out[f"{n:,} discs, {name} [ms a frame]"] = 1e3 * (perf_counter() - clock) / (end - begin)
+    out["memory [MB]"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(json.dumps(out), flush=True)
