@@ -7,6 +7,7 @@ import tiverlet as tv
 from tiverlet.device import ti
 from tiverlet.device.memory import Memory
 from tiverlet.device.prefix_sum import MOST, RADIX, Sums
+from tiverlet.device.runtime import LLVM
 from tiverlet.device.sorting import LONG, sort
 from tiverlet.device.thread_team import Team
 
@@ -153,5 +154,5 @@ def test_what_pairs_carry_goes_with_them(world):
             w._runner.renew()
         w.run(0.2)
         made.append((w.hash(), w._runner.grid.need[None]))
-        assert w._runner.grid.cells.levels > 3
+        assert w._runner.grid.cells.levels > 3 or ARCH not in LLVM
     assert made[0] == made[1]

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..device import ti
+from ..device import runtime, ti
 from ..device.number import OnDevice
 from ..device.prefix_sum import Sums
 from ..tools import distinct
@@ -45,7 +45,7 @@ class CellList:
         self.serial = not team.launched  # counting in order, on one thread, beats atomic counters in parallel on a CPU
         with np.errstate(divide="ignore"):
             size = radius + reach / 2
-            level = np.minimum(np.floor(np.log2(size.max() / size)), LEVELS - 1).astype(int)
+            level = np.minimum(np.floor(np.log2(size.max() / size)), most_levels() - 1).astype(int)
         used, level, _ = distinct(level)
         self.levels = len(used)
         own = np.array([radius[level == m].max() for m in range(self.levels)])
@@ -169,6 +169,12 @@ class CellList:
         if low + 2 <= mask:
             span = 3
         return self.bucket(at, m), low, mask, span
+
+
+def most_levels() -> int:
+    """LEVELS; but one where Taichi writes SPIR-V: there (1.7.4, Vulkan in software) lists that are written to from both sides of
+    their pairs lack entries."""
+    return LEVELS if runtime.architecture() in runtime.LLVM else 1
 
 
 @ti.func

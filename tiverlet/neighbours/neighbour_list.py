@@ -114,7 +114,7 @@ class NeighbourList:
     def _write_old(self, field, values: np.ndarray) -> None:
         """Write a field of the old list."""
         room = np.zeros((self.room, *values.shape[1:]), dtype=values.dtype)
-        room[: len(values)] = values
+        room[: len(values)] = values[: self.room]
         self.store.write(field, room)  # type: ignore[union-attr]
 
     def invalidate(self) -> None:
