@@ -196,8 +196,9 @@ class Scalar(Batch):
     @property
     def outgrown(self) -> bool:
         """Whether others than before are to be relaxed alone, too: a world is what its knobs say, not how they came there."""
-        acts = self.scene is not None and self.acts and self.solvable_together
-        return super().outgrown or (acts and not np.array_equal(self._alone, self.relaxed_alone(self.scene)))
+        if not self.scene or not self.acts or not self.solvable_together:
+            return super().outgrown
+        return super().outgrown or not np.array_equal(self._alone, self.relaxed_alone(self.scene))
 
     @property
     def limited(self) -> bool:
