@@ -9,6 +9,7 @@ import re
 import pytest
 
 import tiverlet as tv
+from tiverlet.device.language import COMPILER
 from tiverlet.features.arguments import knobs_of
 
 ROOT = pathlib.Path(__file__).parent.parent
@@ -24,7 +25,7 @@ def blocks(page: pathlib.Path) -> list[str]:
 def test_code_runs(page, tmp_path, monkeypatch, capsys):
     # In the order in which it is read, each page in a file of its own, since Taichi reads the source of functions.
     script = tmp_path / "page.py"
-    script.write_text("\n\n".join(blocks(page)))
+    script.write_text("\n\n".join(blocks(page)).replace("import taichi as ti", f"import {COMPILER} as ti"))
     monkeypatch.chdir(tmp_path)
     spec = importlib.util.spec_from_file_location("page", script)
     assert spec and spec.loader

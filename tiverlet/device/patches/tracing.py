@@ -102,8 +102,13 @@ class Tracer:
     def watching(self) -> Iterator[None]:
         """While this lasts."""
         materialize, subscript = Kernel.materialize, impl.subscript
-        loop, call = ASTTransformer.build_range_for, ASTTransformer.build_Call
+        loop, call, define = ASTTransformer.build_range_for, ASTTransformer.build_Call, ASTTransformer.build_FunctionDef
         assign, augment = Operations._assign, Operations._augassign
+
+        def begun(ctx, node):
+            if ctx.is_kernel:  # Quadrants does so twice, and the second time it counts
+                self._open, self._known = [], {}
+            return define(ctx, node)
 
         def translated(kernel, **given):
             self._open, self._known = [], {}
@@ -157,5 +162,6 @@ class Tracer:
             (Kernel, "materialize", translated), (ASTTransformer, "build_range_for", staticmethod(looped)),
             (impl, "subscript", subscripted), (Operations, "_assign", assigned), (Operations, "_augassign", changed),
             (ASTTransformer, "build_Call", staticmethod(called)),
+            (ASTTransformer, "build_FunctionDef", staticmethod(begun)),
         ):  # fmt: skip
             yield
