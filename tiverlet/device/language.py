@@ -57,6 +57,7 @@ if COMPILER == "quadrants":
 impl, sources = module("impl"), module("_wrap_inspect")
 inside_kernel: Callable[[], bool] = impl.inside_kernel
 Expression: Any = module("expr").Expr  # a number or a vector while a kernel is translated
+_VECTORS, _NUMBERS = module("matrix").MatrixField, module("field").ScalarField
 Operations: Any = getattr(module("common_ops"), f"{NAME}Operations")  # what it inherits
 
 
@@ -75,7 +76,7 @@ def has(arch: str) -> bool:
 
 def unplaced_field(width: int) -> Any:
     """A field that is nowhere yet, of vectors or, with a width of 0, of numbers."""
-    return object.__new__(module("matrix").MatrixField if width else module("field").ScalarField)
+    return object.__new__(_VECTORS if width else _NUMBERS)
 
 
 def place_field(field: Any, placed: Any, name: Any) -> None:

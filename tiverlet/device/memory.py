@@ -6,6 +6,7 @@ these into an error that says what to do, so that no other module has to know.
 """
 
 import weakref
+from collections import Counter
 from dataclasses import replace
 from typing import Any
 
@@ -37,6 +38,7 @@ class Memory:
         self.real = real
         self.compiler = compiler or Compiler(real, few)
         self.entries: list[Entry] = []
+        self._named: Counter[str] = Counter()
         self._later: list[tuple[Entry, np.ndarray]] = []
         self._declared: list[Declared] = []
         self._numbers: dict[Any, tuple[Any, list[Number]]] = {}  # by kind: the field, and what it holds
@@ -66,8 +68,9 @@ class Memory:
 
     def _declare(self, name: str, made: Any, length: int, width: int, kind: Any, state: bool) -> None:
         self._declared.append(Declared(kind, width, length, self._apart and kind == ti.f64))
-        same = sum(e.name == name or e.name.startswith(f"{name} #") for e in self.entries)
-        name = f"{name} #{same + 1}" if same else name  # two batches of a kind
+        self._named[name] += 1
+        same = self._named[name]
+        name = f"{name} #{same}" if same > 1 else name  # two batches of a kind
         self.entries.append(Entry(name, made, width, length, np.dtype(_NUMPY[kind]), state))
 
     def number(self, value: float, kind=None) -> Number:

@@ -107,7 +107,7 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
     kept, attributes = checkpoint.keep(world), {f: dict(vars(f)) for f in {*before, *features}}
     came = [f for f in features if f not in before or f.afresh]
     went = [f for f in before if f not in features or f.afresh]
-    starts = {id(f.start): f.start.regrouped(some, added) for f in before}
+    starts = {known: start.regrouped(some, added) for known, start in {id(f.start): f.start for f in before}.items()}
     starts = [None if f in came else starts[id(f.start)] for f in features]
     parts, seen = None, None
     if not world._clock.d_is_velocity and (world._clock.parted is not None or any(_loses(f, number, features) for f in before)):
