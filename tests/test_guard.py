@@ -200,6 +200,9 @@ def test_large_clusters_say_what_a_shorter_substep_makes_of_their_sag(world):
         gain = (max(r.energy for r in reports) - start) / scale
         told = [k for k, r in enumerate(reports) if any("Large clusters" in note for note in r.notes)]
         assert told == [0] if substeps == 20 else told == [] and gain < 1e-3, (substeps, told, gain)
+    w._runner.memory.write(w._runner.scene.state.x, np.where(np.arange(len(g))[:, None] == 70, np.nan, w.position))
+    w.substeps = 40
+    assert "non-finite" in w.step(1 / 60).flags  # and is nothing to fit a cluster to
 
 
 def test_systems_of_particles_are_solved(monkeypatch):

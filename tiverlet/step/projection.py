@@ -48,6 +48,8 @@ def project(runner: "Runner", h: float, longest: float) -> bool:
     slots = runner.scene.slots
     w, state, memory = runner.scene.inv_mass, runner.scene.state, runner.memory
     x = before = state.get(memory)
+    if not np.isfinite(x).all():
+        return True
     scalars: list[Any] = [b for b in runner.batches if isinstance(b, Scalar) and b.count]
     batches = [b for b in scalars if _sizes(b).max() <= LARGEST]
     others = [b for b in scalars if _sizes(b).max() > LARGEST and (b.compliance == 0).any()]
@@ -57,7 +59,7 @@ def project(runner: "Runner", h: float, longest: float) -> bool:
     if slots and slots.system and not slots.system.steps and not runner.clock.softened:  # it holds loads without a violation
         batches = [b for b in batches if ((slots.rows(b) < 0) & ~b.idle(w)).any()]
     batches += rigid_rows(runner.batches, w)
-    if not batches or not np.isfinite(x).all():
+    if not batches:
         return True
     start = Rows(batches, w, x)
     undone = start.undone(runner)
