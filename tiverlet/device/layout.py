@@ -128,10 +128,12 @@ class Layout:
         """Free the trees, unless they are shared."""
         if not self.shared and self.trees and language.current() is self.runtime and not runtime.forked():
             _leaving.append(self)
-            with contextlib.suppress(RuntimeError):  # while another world is built, whose fields have no place: some time later
+            try:
                 self.runtime.materialize()  # no kernel may have run since they were made
-                while _leaving:
-                    _leaving.pop()._free()
+            except RuntimeError:  # another world is being built, whose fields have no place: some time later
+                return
+            while _leaving:
+                _leaving.pop()._free()
 
     def _free(self) -> None:
         if language.current() is self.runtime:

@@ -23,8 +23,8 @@ class ContactPass:
         self.has_restitution = bool(contact) and contact.has_restitution
         self.remembers = bool(contact) and (contact.has_friction or contact.has_restitution)
         self.projects_velocities = bool(contact) and contact.projects
-        if self.has_restitution:
-            self.bounces = scene.memory.field("Contact.bounces", None, kind=ti.i32)  # whether any pair does, in this round
+        if self.has_restitution and team.launched:  # where nobody asks whether any pair bounces in a round
+            self.bounces = scene.memory.field("Contact.bounces", None, kind=ti.i32)
 
     @ti.func
     def solve(self, now):
@@ -70,11 +70,12 @@ class ContactPass:
                 self.team.wait()
                 ti.loop_config(serialize=True)
                 for _ in range(self.team.one(1, thread)):
-                    self.bounces[None] = c.dev.hit[None]
+                    if ti.static(self.team.launched):
+                        self.bounces[None] = c.dev.hit[None]
                     c.dev.hit[None] = 0
                 self.team.wait()
                 n = self.n
-                if ti.static(self.team.launched):  # where nobody has asked
+                if ti.static(self.team.launched):
                     n *= self.bounces[None]
                 for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
                     c.choose_impact(i)

@@ -14,7 +14,7 @@ from ..neighbours.neighbour_search import FARTHEST
 from ..particles import LARGEST
 from ..solvers.solver import Solver
 from ..step_report import UNCONVERGED, StepReport
-from .step import END, FIGURES, HALT, ORIGIN, SHEET, H, Step, integer
+from .step import END, FIGURES, ORIGIN, SHEET, H, Step, integer
 
 BLOCKS = 64  # partial sums: their number is fixed, so the total has the same bits on any number of threads; squared on a GPU
 TURNS = (0, 26, 41)  # degrees, for nothing, BENT and FAR
@@ -154,9 +154,7 @@ class Diagnostics:
         h64, t64, state_origin = sheet[H], sheet[END], integer(sheet, ORIGIN)
         self.reduce_blocks(0, h64, state_origin)
         self.sum_up(0, h64, t64, state_origin, sheet)
-        if ti.static(self.step.hashes):
-            for k in ti.static(range(3)):
-                sheet[HALT + k] = self.step.halt[None][k]
+        self.step.tell_halt(sheet)
 
     @ti.func
     def sum_up(self, thread, h64, t64, state_origin, sheet: ti.template()):  # type: ignore[valid-type]

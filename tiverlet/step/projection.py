@@ -52,8 +52,8 @@ def project(runner: "Runner", h: float, longest: float) -> bool:
         return True
     scalars: list[Any] = [b for b in runner.batches if isinstance(b, Scalar) and b.count]
     batches = [b for b in scalars if _sizes(b).max() <= LARGEST]
-    others = [b for b in scalars if _sizes(b).max() > LARGEST and (b.compliance == 0).any()]
-    stays = max([left_out(runner.batches, w, x), *(float(np.abs(b.violation(x) * b.inverse_size(x)).max()) for b in others)])
+    large = [b.violation(x) * b.inverse_size(b.start.position) * (b.compliance == 0) for b in scalars if b not in batches]
+    stays = max([left_out(runner.batches, w, x), *(float(np.abs(C).max()) for C in large)])
     if _matters(stays, ratio):
         runner.released = stays
     if slots and slots.system and not slots.system.steps and not runner.clock.softened:  # it holds loads without a violation

@@ -190,8 +190,7 @@ class Runner:
             )  # fmt: skip
             self._fused()
             if self._data[HALT]:
-                resumed, begin, half = (int(v) for v in self._data[HALT:ACTIVE_THREADS])
-                self.memory.write(self.step.halt, 0)
+                resumed, begin, half = self._stopped()
                 self.grow()
                 continue
             if begin == stages or (until > stages and part == passes):
@@ -203,13 +202,18 @@ class Runner:
                 until = min(stages + 1, until + max(1, some // passes))
             self.raise_signals()
 
+    def _stopped(self) -> tuple[int, int, int]:
+        """Where the frame stopped, for Span, when what it waits for is about to be done."""
+        self.memory.write(self.step.halt, 0)
+        resumed, begin, half = (int(v) for v in self._data[HALT:ACTIVE_THREADS])
+        return resumed, begin, half
+
     def _launch(self, span: Span) -> None:
         """Phase by phase. Whether the frame waits for a list is all that the host asks, when all is launched."""
         try:
             frame(self.launcher, span)
             while self.grid and self._data[HALT]:
-                span.resumed, span.begin, span.half = (int(v) for v in self._data[HALT:ACTIVE_THREADS])
-                self.memory.write(self.step.halt, 0)
+                span.resumed, span.begin, span.half = self._stopped()
                 self.list_neighbours()
                 frame(self.launcher, span)
         except BaseException:  # as signals raise

@@ -186,9 +186,7 @@ class Step:
         )  # fmt: skip
         frame(self, span)
         if thread == 0:
-            if ti.static(self.hashes):
-                for k in ti.static(range(3)):
-                    sheet[HALT + k] = self.halt[None][k]
+            self.tell_halt(sheet)
             if ti.static(self.team.size > 1):
                 sheet[ACTIVE_THREADS] = self.team.active_threads[None]
 
@@ -386,6 +384,13 @@ class Step:
         if ti.static(self.hashes):
             out = self.grid.stale[None]
         return out
+
+    @ti.func
+    def tell_halt(self, sheet: ti.template()):  # type: ignore[valid-type]
+        """Whether, and where, the frame stopped to have the list grown, or built."""
+        if ti.static(self.hashes):
+            for k in ti.static(range(3)):
+                sheet[HALT + k] = self.halt[None][k]
 
     @ti.func
     def halted(self):

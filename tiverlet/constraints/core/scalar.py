@@ -196,9 +196,8 @@ class Scalar(Batch):
     @property
     def outgrown(self) -> bool:
         """Whether others than before are to be relaxed alone, too: a world is what its knobs say, not how they came there."""
-        if not self.scene or not self.acts or not self.solvable_together:
-            return super().outgrown
-        return super().outgrown or not np.array_equal(self._alone, self.relaxed_alone(self.scene))
+        solved = self.scene and self.acts and self.solvable_together
+        return super().outgrown or bool(solved and not np.array_equal(self._alone, self.relaxed_alone(self.scene)))
 
     @property
     def limited(self) -> bool:

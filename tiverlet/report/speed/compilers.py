@@ -5,7 +5,6 @@ so that what else the machine does meets all of them.
 """
 
 import json
-import sys
 import tempfile
 from importlib.util import find_spec
 from statistics import median
@@ -58,10 +57,9 @@ def compilers(sizes: tuple[int, ...] = SIZES) -> "Table":
 
 def measured(way: str, cache: str, sizes: tuple[int, ...]) -> dict[str, float]:
     """What a process of one way finds."""
-    from .processes import Talker, cached, paths
+    from .processes import started
 
-    environment = {"PYTHONPATH": paths(), "TIVERLET_PATCHES": "1", **cached(cache), **WAYS[way]}
-    with Talker([sys.executable, "-P", "-c", START, json.dumps(sizes)], environment) as talker:
+    with started(START, sizes, cache, **({"TIVERLET_PATCHES": "1"} | WAYS[way])) as talker:
         return talker.ask()
 
 

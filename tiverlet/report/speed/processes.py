@@ -55,17 +55,18 @@ class Talker:
             pipe.close()  # type: ignore[union-attr]
 
 
-def cached(folder: str) -> dict[str, str]:
-    """What has Taichi, or Quadrants, keep what it compiles in a folder."""
-    return {f"{of}_OFFLINE_CACHE{what}": value for of in ("TI", "QD") for what, value in (("", "1"), ("_FILE_PATH", folder))}
+def started(code: str, job: Any, cache: str, root: str = ROOT, **environment: str) -> Talker:
+    """A process that runs code, with a job for its argument. cache: the folder where Taichi, or Quadrants, keeps what it has
+    compiled. root: the folder of the package."""
+    keeps = {f"{of}_OFFLINE_CACHE{what}": value for of in ("TI", "QD") for what, value in (("", "1"), ("_FILE_PATH", cache))}
+    return Talker([sys.executable, "-P", "-c", code, json.dumps(job)], {"PYTHONPATH": paths(root), **keeps, **environment})
 
 
 def world(job: Mapping[str, Any], cache: str, root: str = ROOT) -> Talker:
     """The process of a scene, by the package in `root`. cache: the folder where Taichi keeps what it has compiled."""
     from .child import START
 
-    environment = {"PYTHONPATH": paths(root), **cached(cache)}
-    return Talker([sys.executable, "-P", "-c", START, json.dumps(job)], environment)
+    return started(START, job, cache, root)
 
 
 def paths(root: str = ROOT) -> str:

@@ -5,7 +5,6 @@ act is timed with the frame that follows it, less an ordinary frame, since an en
 """
 
 import json
-import sys
 from collections.abc import Callable
 from statistics import median
 from time import perf_counter
@@ -38,11 +37,10 @@ AIMS = {
 
 def waits(n: int, cache: str, peers: list[str]) -> list[Wait]:
     """Of a pile of n discs. cache: an empty folder. peers: those that are installed."""
-    from .processes import Talker, cached, paths
+    from .processes import started
 
     def of(engine: str) -> dict[str, float]:
-        environment = {"PYTHONPATH": paths(), **cached(cache)}
-        with Talker([sys.executable, "-P", "-c", START, json.dumps({"engine": engine, "n": n})], environment) as talker:
+        with started(START, {"engine": engine, "n": n}, cache) as talker:
             return talker.ask()
 
     cold, warm, theirs = of("tiverlet"), of("tiverlet"), {name: of(name) for name in peers}
