@@ -207,7 +207,7 @@ def test_unused_files_change_no_bit(tmp_path):
     package = pathlib.Path(tv.__file__).parent
     bare = tmp_path / "bare" / "tiverlet"
     shutil.copytree(package, bare, ignore=shutil.ignore_patterns("__pycache__"))
-    gone = {"forces": ["attractor", "drag", "force", "wind"], "constraints": ["rope", "spacer"]}
+    gone = {"forces": ["attractor", "drag", "pair_force", "force", "wind"], "constraints": ["rope", "spacer"]}
     for folder, files in gone.items():
         init = bare / folder / "__init__.py"
         text = init.read_text()
@@ -218,7 +218,7 @@ def test_unused_files_change_no_bit(tmp_path):
         init.write_text(text)
     init = bare / "__init__.py"
     text = init.read_text()
-    for title in ("Attractor", "Drag", "Force", "Wind", "Rope", "Spacer"):
+    for title in ("Attractor", "Drag", "PairForce", "Force", "Wind", "Rope", "Spacer"):
         text = text.replace(f'"{title}", ', "").replace(f"{title}, ", "").replace(f", {title}\n", "\n")
         text = text.replace(f"    {title},\n", "")
     init.write_text(text)

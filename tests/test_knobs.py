@@ -66,6 +66,7 @@ ROWS3 = {
         {"target": (1, 0, 2), "particle": 4 * len(PATH) + 1, "rate": 9.0},
     ),
     "Force": (lambda i, x: tv.Force(pull), PATH, {}, {}),
+    "PairForce": (lambda i, x: tv.PairForce(pull), PATH, {}, {}),
     "Distance": (lambda i, x, **k: tv.Distance([i], **k), LINK, ANGLE | SPRING, {"rest": 0.7} | SPRINGS),
     "Rope": (lambda i, x, rest, **k: tv.Rope([i], rest, **k), LINK, ANGLE | SPRING, {"rest": 0.2} | SPRINGS),
     "Spacer": (lambda i, x, rest, **k: tv.Spacer([i], rest, **k), LINK, {"rest": 1.0} | SPRING, {"rest": 1.2} | SPRINGS),
@@ -232,7 +233,7 @@ LIKE = {  # settings that the same code writes for the same code to read; these 
 def test_the_rows_have_every_feature():
     shown = {name.split(",")[0] for names in GROUPED.values() for name in names}
     exported = {name for package in (colliders, constraints, contact, forces) for name in package.__all__}
-    assert shown | {*LIKE, "Force"} == exported == {name.split(",")[0] for name in (ROWS3 | ROWS2)}
+    assert shown | {*LIKE, "Force", "PairForce"} == exported == {name.split(",")[0] for name in (ROWS3 | ROWS2)}
     for name, like in LIKE.items():
         kind = getattr(tv, name)
         assert {*knobs_of(kind)} == {*knobs_of(like)} - (

@@ -126,6 +126,7 @@ def test_kernels_depend_on_no_number_of_particles(world, dim):
     shapes = [tv.Polygon(SQUARE)] if dim == 2 else [tv.Mesh(CUBE, CUBE_FACES)]
     far, ahead = np.full(dim, 50.0), np.eye(dim)[0]
     forces = [tv.Gravity(), tv.Drag(0.1), tv.Wind(ahead, 0.1), tv.Attractor(far, 1.0), tv.Hand(far, 1), tv.Force(spring)]
+    forces += [tv.PairForce(spring), tv.PairForce(spring, 0.5)]
     rod = tv.Capsule(far, far + ahead, 1.0, active=True)
     walls = [tv.Box(-99 - far, 99 + far), tv.HalfSpace(ahead, -99.0), tv.Ball(far, 1.0), rod]
     corners = 20.0 * np.eye(dim)[:2].sum(axis=0) + np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]) @ np.eye(2, dim)

@@ -8,7 +8,7 @@ from .colliders import Ball, Box, Capsule, HalfSpace, Mesh, Polygon, Sdf
 from .constraints import AngleLimit, Area, Bend, Constraint, Dihedral, Distance, Path, Pin, Rope, ShapeMatch, Snap, Spacer, Volume
 from .contact import Contact, Polygons
 from .device.runtime import init
-from .forces import Attractor, Drag, Force, Gravity, Hand, Wind
+from .forces import Attractor, Drag, Force, Gravity, Hand, PairForce, Wind
 from .particles import Particles
 from .recording import Recorder, replay
 from .solvers import Chebyshev, ConjugateGradient, Direct, Jacobi
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AngleLimit", "Area", "Attractor", "Ball", "Bend", "Box", "Capsule", "Chebyshev", "ConjugateGradient", "Constraint",
-    "Contact", "Dihedral", "Direct", "Distance", "Drag", "Force", "Gravity", "HalfSpace", "Hand", "Jacobi", "Mesh", "Particles",
-    "Path", "Pin", "Polygon", "Polygons", "Recorder", "Rope", "Sdf", "ShapeMatch", "Snap", "Spacer", "StepReport", "Volume",
-    "Wind", "World", "approach", "clamp", "golden", "golden_colors", "golden_index", "init", "measure", "mix", "play", "replay",
-    "runtime", "shapes", "smoothstep",
+    "Contact", "Dihedral", "Direct", "Distance", "Drag", "Force", "Gravity", "HalfSpace", "Hand", "Jacobi", "Mesh", "PairForce",
+    "Particles", "Path", "Pin", "Polygon", "Polygons", "Recorder", "Rope", "Sdf", "ShapeMatch", "Snap", "Spacer", "StepReport",
+    "Volume", "Wind", "World", "approach", "clamp", "golden", "golden_colors", "golden_index", "init", "measure", "mix", "play",
+    "replay", "runtime", "shapes", "smoothstep",
 ]  # fmt: skip
 __version__ = "0.1.0"  # the only place that says it
 

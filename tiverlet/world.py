@@ -263,8 +263,7 @@ class World:
                 self._runner.restart(self._iterations)
                 self._runner.scene.state.put(self._runner.memory, value)
             self._clock.energy, self._clock.first_moved = None, 0
-            if self._runner.grid:
-                self._runner.grid.invalidate()
+            self._runner.invalidate()
 
     @property
     def velocity(self) -> np.ndarray:

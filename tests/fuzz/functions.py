@@ -12,6 +12,12 @@ def spring(x):
 
 
 @ti.func
+def repel(r):
+    """As a spring that ends at 1 m, of 1 N/m."""
+    return r * ti.max(1.0 / (r.norm() + 1e-9) - 1.0, 0.0)
+
+
+@ti.func
 def swirl(x, v):
     """Across the velocity."""
     f = 0.0 * x

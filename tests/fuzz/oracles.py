@@ -13,7 +13,7 @@ from .functions import SDF
 from .scenes import Structure, plain
 
 WALLS = ("Box", "HalfSpace", "Ball", "Capsule", "Polygon", "Mesh", "Sdf")
-PULLS = ("Gravity", "Drag", "Wind", "Attractor", "Force")
+PULLS = ("Gravity", "Drag", "Wind", "Attractor", "Force", "PairForce")
 TETHERS = ("Pin", "Path", "Snap")
 PASSIVE = ("Gravity", "Drag", *WALLS, "Distance", "Rope", "Spacer", "Bend", "AngleLimit", "Dihedral", "Constraint",
            "Area", "Volume", "ShapeMatch", "Snap", "Contact", "Polygons")  # fmt: skip

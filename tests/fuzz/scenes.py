@@ -354,7 +354,7 @@ def rails(draw, s: Stage) -> Call | None:
 
 def forces(draw, s: Stage) -> Call | None:
     """Any."""
-    kind = pick(draw, "Gravity", "Gravity", "Gravity", "Drag", "Wind", "Attractor", "Force")
+    kind = pick(draw, "Gravity", "Gravity", "Gravity", "Drag", "Wind", "Attractor", "Force", "PairForce")
     if kind == "Gravity":
         down = -9.81 * np.eye(s.dim)[1]
         return Call(kind, {"g": pick(draw, 9.81, 9.81, down + 3.0, 0.0, 1e4) if s.size == 1 else 9.81 * s.size})
@@ -365,6 +365,8 @@ def forces(draw, s: Stage) -> Call | None:
         return Call(kind, wind | {"rate": pick(draw, 0.5, 0.0, 30.0, 1e4)})
     if kind == "Attractor":
         return Call(kind, {"center": s.x[0] + 2 * s.size, "strength": pick(draw, 1.0, 0.0, -1.0, 100.0) * s.size**3})
+    if kind == "PairForce":
+        return Call(kind, {"function": functions.repel, "radius": pick(draw, None, 0.5 * s.size, 2.0 * s.size)})
     own = [functions.spring] if s.order > 2 else [functions.spring, functions.swirl, functions.waves]
     return Call(kind, {"function": pick(draw, *own)})
 

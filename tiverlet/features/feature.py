@@ -155,6 +155,7 @@ class Acceleration(Feature):
     uses_velocity: acceleration() reads v, which costs one more field to have it to second order.
     conservative: potential() is known, so the energy report can account for it.
     decays: it has a rate, a linear drag [1/s] that is solved exactly (exponential); several add up.
+    pairwise: it acts between particles, and is worked out for all before any of them moves, see PairForce.
     """
 
     accelerates = True
@@ -164,6 +165,11 @@ class Acceleration(Feature):
     conservative = False
     decays = False
     rate = 0.0
+    pairwise = False
+    room = 0  # listed neighbours of a particle for which there is room at first
+
+    def join(self, scene: Scene, team: Any) -> Any:
+        """Where it is pairwise: declare its neighbour list and return it, None if it has none."""
 
     @ti.func
     def acceleration(self, i, x, v, t):

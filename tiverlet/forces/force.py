@@ -1,6 +1,7 @@
 """The user's own force."""
 
 import inspect
+from typing import Any
 
 import numpy as np
 
@@ -30,22 +31,8 @@ class Force(Acceleration):
     """
 
     def __init__(self, function):
-        if not is_kernel_function(function):
-            raise TypeError(
-                f"Force: function = {function!r} is not a Taichi function. Put the decorator @ti.func above its def "
-                "(import taichi as ti), in a file: Taichi reads its source."
-            )
-        plain = undecorated(function)
-        if not readable(plain):
-            raise ValueError(
-                f"Force: the source of {plain.__name__} cannot be read, and Taichi compiles the source. Write it in a file or "
-                "in a notebook; what is typed in a console is not kept."
-            )
-        names = list(inspect.signature(plain).parameters)
-        if not 1 <= len(names) <= 4:
-            raise TypeError(f"Force: function takes {names}, but it must take 1 to 4 of (x, v, t, i), in this order.")
+        self.arity = check_function("Force", "function", function, ("x", "v", "t", "i"), (1, 2, 3, 4))
         self.function = function
-        self.arity = len(names)
         self.uses_velocity = self.arity >= 2
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
@@ -59,13 +46,7 @@ class Force(Acceleration):
     @inline
     def force(self, value):
         """What the function returned, if it is a vector; as a number it would be added to all components."""
-        dim, name = self.dev.dim, undecorated(self.function).__name__
-        known = isinstance(value, Expression)
-        shape = (tuple(value.get_shape()) if value.is_tensor() else ()) if known else np.shape(value)
-        if shape != (dim,):
-            what = f"{shape[0]} components" if len(shape) == 1 else f"a matrix of shape {shape}" if shape else "a number"
-            refuse(TypeError(f"Force: {name} returns {what}, but in {dim}D a force has {dim} components [N]: ti.Vector([...])."))
-        return value
+        return check_vector("Force", undecorated(self.function).__name__, value, self.dev.dim)
 
     @ti.func
     def acceleration(self, i, x, v, t):
@@ -80,3 +61,33 @@ class Force(Acceleration):
         else:
             out = self.force(self.function(x, v, t, i))
         return self.dev.w.of(i) * out
+
+
+def check_function(who: str, name: str, function: Any, takes: tuple[str, ...], counts: tuple[int, ...]) -> int:
+    """How many arguments a ti.func of the user's takes, which must be one of `counts`, of those in `takes`."""
+    if not is_kernel_function(function):
+        raise TypeError(
+            f"{who}: {name} = {function!r} is not a Taichi function. Put the decorator @ti.func above its def "
+            "(import taichi as ti), in a file: Taichi reads its source."
+        )
+    plain = undecorated(function)
+    if not readable(plain):
+        raise ValueError(
+            f"{who}: the source of {plain.__name__} cannot be read, and Taichi compiles the source. Write it in a file or "
+            "in a notebook; what is typed in a console is not kept."
+        )
+    names = list(inspect.signature(plain).parameters)
+    if len(names) not in counts:
+        some = f"{counts[0]} to {counts[-1]}" if len(counts) == counts[-1] else " or ".join(map(str, counts))
+        raise TypeError(f"{who}: {name} takes {names}, but it must take {some} of ({', '.join(takes)}), in this order.")
+    return len(names)
+
+
+def check_vector(who: str, name: str, value: Any, dim: int) -> Any:
+    """What a function returned, if it is a vector; as a number it would be added to all components."""
+    known = isinstance(value, Expression)
+    shape = (tuple(value.get_shape()) if value.is_tensor() else ()) if known else np.shape(value)
+    if shape != (dim,):
+        what = f"{shape[0]} components" if len(shape) == 1 else f"a matrix of shape {shape}" if shape else "a number"
+        refuse(TypeError(f"{who}: {name} returns {what}, but in {dim}D a force has {dim} components [N]: ti.Vector([...])."))
+    return value

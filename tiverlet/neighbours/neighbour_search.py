@@ -17,7 +17,6 @@ from ..device.prefix_sum import MOST, Sums
 from ..device.sorting import exchange, sort, sorting_network
 from ..device.thread_team import Team
 from ..features.feature import Scene
-from ..features.material import Table
 from ..tools import distinct
 from .cell_list import CellList, add_to
 from .neighbour_list import NeighbourList, PairData
@@ -29,17 +28,18 @@ APPEND, COUNT, FILL = range(3)  # what a scan of the cells around a particle doe
 class NeighbourSearch(NeighbourList):
     """The list of near pairs, from a hash of cells.
 
-    skin: what is listed beyond touching [m]. linked: (m, 2) pairs that are never listed. table: which groups touch. pair_data:
-    what each pair remembers. scratch: a field of vectors, (n,), to use while the list is built. reach: (n,) how much further than
-    by its radius a particle has to be found [m], see CellList.
+    skin: what is listed beyond touching [m]. linked: (m, 2) pairs that are never listed. table: which pairs are near, as Table
+    says it. pair_data: what each pair remembers. scratch: a field of vectors, (n,), to use while the list is built. reach: (n,)
+    how much further than by its radius a particle has to be found [m], see CellList. radius: (n,) [m], where it is not that of
+    the particles.
     """
 
     skin: Any = OnDevice()
     too_far: Any = OnDevice()  # the square of the way after which the list is stale
 
     def __init__(
-        self, scene: Scene, skin: float, linked: np.ndarray, table: Table, pair_data: list[PairData], team: Team, scratch: Any,
-        reach: np.ndarray | None = None,
+        self, scene: Scene, skin: float, linked: np.ndarray, table: Any, pair_data: list[PairData], team: Team, scratch: Any,
+        reach: np.ndarray | None = None, radius: np.ndarray | None = None,
     ):  # fmt: skip
         n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
         self.sums = Sums(n, team, capped=True)
@@ -52,7 +52,7 @@ class NeighbourSearch(NeighbourList):
         number, real = scene.memory.number, scene.real
         self.skin, self.too_far = number(skin, real), number((0.49 * skin) ** 2, real)
         self._extent: Sequence[float] = [-1.0] * dim
-        radius = scene.particles.radius
+        radius = scene.particles.radius if radius is None else radius
         self.cells = CellList(scene, radius, 0 * radius if reach is None else reach, skin, team, scratch)
         self.several_levels = self.cells.levels > 1
         self.counts = self.several_levels or team.launched  # before it lists

@@ -27,7 +27,12 @@ PUBLIC = {
     if isinstance(kind, type) and issubclass(kind, RecordsArguments)
 }  # fmt: skip
 Turned = tuple[int, dict[str, Any]]  # the number of a feature, and its knobs
-TAKES = {"Force": ("function",), "Constraint": ("function", "gradient"), "Sdf": ("function", "gradient")}  # functions
+TAKES = {
+    "Force": ("function",),
+    "PairForce": ("function", "potential"),
+    "Constraint": ("function", "gradient"),
+    "Sdf": ("function", "gradient"),
+}  # functions
 MOST = 10_000  # steps of a solver in a substep
 LONG = 8  # numbers in a list from which it is kept as an array
 

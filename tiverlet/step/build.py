@@ -139,6 +139,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
         feature.scene = scene  # also of those that do nothing, because all of their particles are held
     for feature in [*accelerations, *drivers, *batches, *walls]:
         feature.bind(scene)
+    lists = [(f.join(scene, team), f.room) for f in accelerations if f.pairwise]
     for feature in features:
         feature.new_force = False  # it was given when it was made
         feature.dev.built = feature.compiled() if not isinstance(feature, Batch) or feature.acts else None
@@ -148,6 +149,9 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     diagnostics = Diagnostics(step, solver)
     if grid and contact:
         grid.allocate(int(len(particles) * max(ROOM[scene.radius.uniform][particles.dim - 2], contact.room)) + 64)
+    for pairs, each in lists:
+        if pairs:
+            pairs.allocate(len(particles) * each + 64)
     memory.place()
     return Assembly(scale, path, solver, memory, scene, batches, grid, step, diagnostics)
 

@@ -86,6 +86,7 @@ def put_back(world: "World", kept: Checkpoint) -> None:
     if grid:
         pieces = {piece.name: kept.values[f"Contact.{piece.name}"] for piece in grid.lasting}
         grid.restore(kept.values["Contact.pairs"], pieces)
+    world._runner.invalidate()
     if list(map(id, world._runner.memories)) != stores:
         world._runner.renew()  # there are new fields
     world._clock.put_back(kept.clock)

@@ -43,10 +43,13 @@ class Diagnostics:
         self.contacts = step.contacts
         self.single = step.real == ti.f32
         self.probes = [f for f in step.integrator.forces.all if not f.uniform]
+        self.pair_forces = step.pair_forces
+        self.measured = [f for f in self.pair_forces if f.potential_arity]
+        self.width = 8 if self.pair_forces else 6
         self.stride = step.stride
         add = step.scene.memory.field
         self.blocks = BLOCKS if runtime.architecture() == "cpu" else BLOCKS**2
-        self.parts = add("survey.figures", self.blocks, width=6, kind=ti.f64)
+        self.parts = add("survey.figures", self.blocks, width=self.width, kind=ti.f64)
         self.low = add("survey.low", self.blocks, width=self.dim, kind=ti.f64)
         self.high = add("survey.high", self.blocks, width=self.dim, kind=ti.f64)
         self.details: dict[int, Residuals] = {}  # compiled when asked for
@@ -89,6 +92,8 @@ class Diagnostics:
                 if ti.static(f.conservative):
                     out += f.potential(i, ti.cast(x, ti.f64) - back * d)
             out /= self.state.w.of(i)
+            for f in ti.static(self.measured):
+                out += f.energy(i, back)
         return out
 
     @ti.func
@@ -104,14 +109,26 @@ class Diagnostics:
         return out
 
     @ti.func
+    def pair_stiffness(self, i, h):
+        """The same of forces between particles, as two sums over all of them: each moves the others, too."""
+        d, change, moved = self.state.d[i] * ti.cast(1, ti.f64), ti.cast(0, ti.f64), ti.cast(0, ti.f64)
+        if self.state.w.positive(i):
+            for f in ti.static(self.pair_forces):
+                change -= h * h * (f.dev.now[i] - f.dev.last[i]).dot(d) / self.state.w.of(i)
+            moved = d.dot(d) / self.state.w.of(i)
+        return change, moved
+
+    @ti.func
     def nothing(self):
         """Figures to begin with."""
-        zero = ti.Vector.zero(ti.f64, self.dim)
-        return ti.Vector([0, 0, 0, 0, 0, 2.0**31], ti.f64), zero + ti.math.inf, zero - ti.math.inf
+        zero, figures = ti.Vector.zero(ti.f64, self.dim), ti.Vector.zero(ti.f64, self.width)
+        figures[5] = 2.0**31
+        return figures, zero + ti.math.inf, zero - ti.math.inf
 
     @ti.func
     def block(self, b, h, t, frame_fraction, fresh, begin):
-        """One block of particles and constraints. Returns energy, residual, overlap, stiffness, contacts, bad; low, high."""
+        """One block of particles and constraints. Returns energy, residual, overlap, stiffness, contacts, bad, and where there
+        are pair forces the two sums of pair_stiffness(); low, high."""
         figures, low, high = self.nothing()
         scale, back = ti.cast(1, ti.f64), ti.cast(0, self.step.real)
         if begin == 0:
@@ -127,6 +144,11 @@ class Diagnostics:
                 if ti.static(len(self.probes) > 0):
                     if begin == 0:
                         figures[3] = ti.max(figures[3], self.stiffness(i, x, h, t))
+                if ti.static(len(self.pair_forces) > 0):
+                    if begin == 0:
+                        change, moved = self.pair_stiffness(i, h)
+                        figures[6] += change
+                        figures[7] += moved
                 for c in ti.static(self.contacts):
                     touching, worst = c.worst_overlap(i)
                     figures[2] = ti.max(figures[2], worst)
@@ -178,6 +200,9 @@ class Diagnostics:
             total, low, high = self.fold(0, self.blocks // BLOCKS)
             for k in ti.static(range(6)):
                 sheet[k] = total[k]
+            if ti.static(len(self.pair_forces) > 0):
+                if total[7] > 0:
+                    sheet[3] = ti.max(sheet[3], total[6] / total[7])
             if low[0] <= high[0]:
                 for k in ti.static(range(self.dim)):
                     sheet[7] = ti.max(sheet[7], -low[k], high[k])
@@ -204,6 +229,8 @@ class Diagnostics:
             part = self.parts[at]
             total[0] += part[0]
             total[4] += part[4]
+            for k in ti.static(range(6, self.width)):
+                total[k] += part[k]
             for k in ti.static(range(1, 4)):
                 total[k] = ti.max(total[k], part[k])
             total[5] = ti.min(total[5], part[5])

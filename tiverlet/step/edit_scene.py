@@ -114,7 +114,8 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
         seen = world.velocity
     try:
         borne = any(isinstance(f, Collider) for f in went)
-        turned = borne or world._force_waits or any(_drives(f, number) for f in came + went)
+        pulled = (added is not None or not some.all()) and world._runner.step.has_pair_forces  # by others than before
+        turned = borne or pulled or world._force_waits or any(_drives(f, number) for f in came + went)
         if borne:
             world._let_go()
         elif turned:

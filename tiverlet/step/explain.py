@@ -82,8 +82,8 @@ def _launches(world: "World") -> str:
     solved = world.iterations * (step.constraints.steps + 1) if step.constraints.steps else 0
     rounds = REBOUNDS + 1 if step.has_restitution else 0
     each = (world.iterations * step.halves if step.particles.acts else 1) + solved + rounds
-    more = ", and those behind a stale list again, once it was built" if step.grid else ""
-    return f"{world.substeps * each + 1 + bool(step.grid)} launches per frame, of which the host waits for one{more}"
+    more = ", and those behind a stale list again, once it was built" if step.grids else ""
+    return f"{world.substeps * each + 1 + bool(step.grids)} launches per frame, of which the host waits for one{more}"
 
 
 def _present(world: "World") -> list[str]:
@@ -93,6 +93,8 @@ def _present(world: "World") -> list[str]:
             idle = int(f.idle(world._runner.scene.inv_mass).sum()) if f.count and not f.drives else 0
             note = f", {idle} of them between particles that cannot move" if idle else ""
             out.append(f"{f!r}: {f.count} {'driven particles' if f.drives else 'constraints'}{note}")
+        elif isinstance(f, Acceleration) and f.pairwise:
+            out.append(_pairs(f))
         elif isinstance(f, Acceleration):
             out.append(f"{f!r}: in the loop over particles")
         elif isinstance(f, Collider):
@@ -104,6 +106,15 @@ def _present(world: "World") -> list[str]:
         else:
             out.append(f"{f!r}: nothing, since all radii are 0")
     return out or ["motion in a straight line"]
+
+
+def _pairs(f: Acceleration) -> str:
+    """How pairs are found that a force acts on."""
+    grid = f.dev.grid
+    if not grid:
+        return f"{f!r}: all pairs, before the loop over particles"
+    size = f"{grid.cells.sizes[0]:.3g}"
+    return f"{f!r}: before the loop over particles; grid with cells of {size} m, neighbour list with a skin of {grid.skin:.3g} m"
 
 
 def _absent(world: "World") -> list[str]:

@@ -17,6 +17,7 @@ class Forces:
         self.real, self.dim = scene.real, scene.particles.dim
         self.all = [f for f in accelerations if f.accelerates]
         self.common, self.others = ([f for f in self.all if f.common is it] for it in (True, False))
+        self.pairwise = [f for f in self.all if f.pairwise]
         self.use_velocity = any(f.uses_velocity for f in accelerations)
         self.drags = [f for f in accelerations if f.decays]
 

@@ -16,7 +16,7 @@ from .clock import Clock
 from .diagnostics import STARTED, STEPPED, UNSTEPPED
 from .integrator import FREE, decay
 from .projection import project
-from .step import ACTIVE_THREADS, END, GIVE, HALT, ORIGIN, H, Moment, Span, frame
+from .step import ACTIVE_THREADS, BEFORE, END, GIVE, HALT, ORIGIN, H, Moment, Span, frame
 
 LONG = 10_000_000  # particles and constraints, times passes, in a launch: it takes about a second
 
@@ -80,8 +80,7 @@ class Runner:
                 moved = initial_violation.remove(self.scene, self.batches, clock.first_moved, self.stop_at_walls)
                 if moved is not None:
                     self.moved = float(moved.max())
-                    if self.grid:
-                        self.grid.invalidate()
+                    self.invalidate()
                 if self.scene.slots.system:
                     self.scene.slots.system.forget()
             self.set_substep(h, drag)
@@ -206,19 +205,19 @@ class Runner:
         """Where the frame stopped, for Span, when what it waits for is about to be done."""
         self.memory.write(self.step.halt, 0)
         resumed, begin, half = (int(v) for v in self._data[HALT:ACTIVE_THREADS])
-        return resumed, begin, half
+        return (0, begin, 0) if half == BEFORE else (resumed, begin, half)
 
     def _launch(self, span: Span) -> None:
         """Phase by phase. Whether the frame waits for a list is all that the host asks, when all is launched."""
         try:
             frame(self.launcher, span)
-            while self.grid and self._data[HALT]:
+            while self.step.grids and self._data[HALT]:
                 span.resumed, span.begin, span.half = self._stopped()
                 self.list_neighbours()
                 frame(self.launcher, span)
         except BaseException:  # as signals raise
             self.launcher.waiting.clear()
-            if self.grid:
+            if self.step.grids:
                 self.memory.write(self.step.halt, 0)
             raise
 
@@ -238,19 +237,26 @@ class Runner:
         self.run(0, 1, clock.time, UNSTEPPED if clock.d_is_velocity else STARTED if clock.started else STEPPED)
 
     def list_neighbours(self) -> None:
-        """Build the list, growing it until everything fits."""
+        """Build the lists, growing them until everything fits."""
         if not self.launched:
-            self.grid.invalidate()
+            self.invalidate()
             self.look()  # whose kernel is there anyway, and lists
             return
         with self.memory.compiler():
-            while self.step.listed() > self.grid.capacity:
-                self.grow()
+            for k, grid in enumerate(self.step.grids):
+                while self.step.listed(k) > grid.capacity:
+                    self.grow()
 
     def grow(self) -> None:
         """More room for near pairs, and kernels that know of it. Nothing is lost: what did not fit was counted."""
-        if self.grid.grow():
+        short = [grid for grid in self.step.grids if self.memory.read(grid.need)[0] > grid.capacity]
+        if any([grid.grow() for grid in short]):
             self.renew()
+
+    def invalidate(self) -> None:
+        """Have lists of neighbours built anew in the next frame."""
+        for grid in self.step.grids:
+            grid.invalidate()
 
     def ease(self, first: int) -> None:
         """Let particles part gently that the user put into each other, from number `first` on."""
@@ -266,8 +272,8 @@ class Runner:
         """What the diagnostics found."""
         clock = self.clock
         report, extent = self._reporter(clock.time, clock.h, substeps, iterations, clock.energy, self.moved, self.released)
-        if self.grid:
-            self.grid.fit(extent)
+        for grid in self.step.grids:
+            grid.fit(extent)
         return report
 
     def residuals(self, batch) -> np.ndarray:
@@ -281,7 +287,7 @@ class Runner:
     @property
     def memories(self) -> list[Any]:
         """The trees of fields: one from the start, others where a list or a need has grown."""
-        grown = [self.grid.store if self.grid else None, *(c.store for c in self.step.contacts)]
+        grown = [*(grid.store for grid in self.step.grids), *(c.store for c in self.step.contacts)]
         return [self.memory, *(m for m in grown if m)]
 
 
@@ -303,6 +309,7 @@ class Launcher:
         self.drives, self.constrains, self.touches, self.acts = map(
             bool, (step.drivers, step.batches, step.contacts, step.particles.acts)
         )
+        self.has_pair_forces, self.lists_pairs = step.has_pair_forces, bool(step.listed_forces)
         self.systems, self.steps = bool(step.constraints.systems), step.constraints.steps
         self.waiting: list[str] = []
         self.now: Any = None  # the half of a pass that they are in
@@ -363,8 +370,17 @@ class Launcher:
         """The one before which it ends; one more for the list after all of them."""
         return now.span.iterations * self.halves if now.s < now.span.substeps else 1
 
+    def begins(self, now: Moment) -> bool:
+        """Whether the substep, or what comes after all of them, begins here."""
+        return not self.again(now)
+
+    def evaluate_pair_forces(self, now: Moment) -> None:
+        """The first of a substep, where the frame may have to wait for lists."""
+        self.put(now, "ask_for_pairs", self.lists_pairs)
+        self.put(now, "sum_pair_forces")
+
     def integrate(self, now: Moment) -> None:
-        """The first of a substep."""
+        """How it begins."""
         self.put(now, "integrate")
 
     def drive(self, now: Moment) -> None:

@@ -18,6 +18,7 @@ from .constraint_pass import ConstraintPass
 from .contact_pass import ContactPass
 from .particle_pass import ParticlePass
 
+BEFORE = -1  # the half of a pass in which a substep is that has not begun
 REBOUNDS = 8  # rounds of restitution in a substep, at most
 
 
@@ -35,6 +36,9 @@ def frame(do, span):
 @ti.pyfunc
 def substep(do, now):
     """A substep. Where there are constraints and contacts, a pass has two halves, and each begins with a good list."""
+    if ti.static(do.has_pair_forces):
+        if do.begins(now):
+            do.evaluate_pair_forces(now)
     if do.enters(now):
         do.integrate(now)
         do.drive(now)
@@ -157,7 +161,11 @@ class Step:
         self.has_restitution, self.projects_velocities = self.contact_pass.has_restitution, self.contact_pass.projects_velocities
         self.finishes = self.contact_pass.remembers or bool(self.breakers)
         self.hashes = bool(grid)
-        if grid:
+        self.pair_forces: list[Any] = integrator.forces.pairwise
+        self.has_pair_forces = bool(self.pair_forces)
+        self.listed_forces = [f for f in self.pair_forces if f.dev.grid]
+        self.grids = [*([grid] if grid else []), *(f.dev.grid for f in self.listed_forces)]
+        if self.grids:
             self.halt = scene.memory.field("halt", None, width=3, kind=ti.i32)
             if self.launched:
                 team.halt = self.halt
@@ -232,8 +240,16 @@ class Step:
 
     @ti.func
     def enters(self, now):
-        """Whether the substep begins here."""
-        return now.s < now.span.substeps and self.again(now) == 0
+        """Whether the substep begins here, with what it needs."""
+        out = now.s < now.span.substeps and self.again(now) == 0
+        if ti.static(len(self.listed_forces) > 0):
+            out = out and self.halted() == 0
+        return out
+
+    @ti.func
+    def begins(self, now):
+        """Whether the substep, or what comes after all of them, begins here."""
+        return self.again(now) == 0
 
     @ti.func
     def first_half(self, now):
@@ -259,6 +275,51 @@ class Step:
     def ends(self, now):
         """Whether all substeps are done."""
         return now.s >= now.span.substeps and self.halted() == 0
+
+    @ti.func
+    def evaluate_pair_forces(self, now):
+        """What particles do to each other where they are now, before any of them moves."""
+        self.list_pairs(now)
+        if self.halted() == 0:
+            self.sum_pair_forces(now)
+
+    @ti.func
+    def list_pairs(self, now):
+        """Their lists, built anew where they are stale. Where one has no room for all pairs, the frame stops."""
+        self.look_for_motion(now)
+        for f in ti.static(self.listed_forces):
+            if f.dev.grid.stale[None] != 0:
+                f.dev.grid.build(now.thread)
+                if f.dev.grid.need[None] > f.dev.grid.capacity:
+                    self.halt[None] = [1, now.s, BEFORE]  # all write the same
+        self.team.wait()
+
+    @ti.func
+    def look_for_motion(self, now):
+        """Which of their lists are stale."""
+        for f in ti.static(self.listed_forces):
+            for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
+                if f.dev.grid.moved_too_far(i) != 0:
+                    f.dev.grid.stale[None] = 1
+        self.team.wait()
+
+    @ti.func
+    def ask_for_pairs(self, now):
+        """Where phases are launched: have their lists built that are stale, see ask_for_list()."""
+        self.look_for_motion(now)
+        for f in ti.static(self.listed_forces):
+            ti.loop_config(serialize=True)
+            for _ in range(self.team.one(1, now.thread)):
+                if f.dev.grid.stale[None] != 0:
+                    self.halt[None] = [1, now.s, BEFORE]
+
+    @ti.func
+    def sum_pair_forces(self, now):
+        """With good lists."""
+        for f in ti.static(self.pair_forces):
+            for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
+                f.evaluate(i)
+        self.team.wait()
 
     @ti.func
     def integrate(self, now):
@@ -388,7 +449,7 @@ class Step:
     @ti.func
     def tell_halt(self, sheet: ti.template()):  # type: ignore[valid-type]
         """Whether, and where, the frame stopped to have the list grown, or built."""
-        if ti.static(self.hashes):
+        if ti.static(len(self.grids) > 0):
             for k in ti.static(range(3)):
                 sheet[HALT + k] = self.halt[None][k]
 
@@ -396,15 +457,15 @@ class Step:
     def halted(self):
         """1 when the frame waits for a longer list."""
         out = 0
-        if ti.static(self.hashes):
+        if ti.static(len(self.grids) > 0):
             out = self.halt[None][0]
         return out
 
     @ti.kernel
-    def listed(self) -> ti.i32:
-        """Build the neighbour list where frames do not; returns the largest number of entries that a block needs."""
-        self.grid.build(0)
-        return self.grid.need[None]
+    def listed(self, k: ti.template()) -> ti.i32:  # type: ignore[valid-type]
+        """Build the k-th neighbour list where frames do not; returns the largest number of entries that a block needs."""
+        self.grids[k].build(0)
+        return self.grids[k].need[None]
 
     @ti.kernel
     def shrunk(self, first: ti.i32):

@@ -1,0 +1,184 @@
+"""The user's own force between particles."""
+
+from typing import Any
+
+import numpy as np
+
+from .. import checks
+from ..device import inline, ti
+from ..device.language import undecorated
+from ..device.number import OnDevice
+from ..features.feature import Acceleration, Scene
+from ..neighbours.neighbour_search import NeighbourSearch
+from ..particles import Particles
+from .force import check_function, check_vector
+
+ROOM = (8, 40)  # listed neighbours of a particle for which there is room at first, in 2D and 3D; lists grow
+SKIN = 0.15  # of the radius, how far beyond it pairs are listed
+
+
+class Cutoff:
+    """Which pairs are listed: those closer than a radius, whatever they are."""
+
+    uniform = True
+    radius: Any = OnDevice()
+
+    def __init__(self, scene: Scene, radius: float):
+        self.radius = scene.memory.number(radius, scene.real)
+
+    @inline
+    def reach(self, radius, i, j):
+        """How far from each other particles i and j may act."""
+        return self.radius
+
+
+class PairForce(Acceleration):
+    """F = function(r) or function(r, i, j): the user's own force between each two particles [N], such as charges or gravity.
+
+    function: a ti.func of r = x_i - x_j [m], and, if it names them, of the two indices, i < j; it returns the force on i as a
+    vector [N]. The force on j is the opposite one, to the last bit, so momentum is kept whatever the function is.
+    potential: a ti.func of the same arguments that returns the energy of the pair [J], 0 where the force ends, for the energy in
+    reports; None leaves it out of them. radius: only pairs closer than this act [m], found by a neighbour list that is built
+    anew when a particle has moved by half of its skin; None for all pairs, which takes time as n^2.
+
+        @ti.func
+        def repel(r, i, j):
+            return charge[i] * charge[j] * r / r.norm() ** 3
+
+        world = tv.World(particles, [tv.PairForce(repel)])
+
+    It acts on present positions, whichever particles are linked or touch. Particles in the same place do not act on each other,
+    nor do two that cannot move. Sums go by index, so they have the same bits on any threads. Numbers that the function reads
+    from Python are frozen when the world is first stepped; put what changes into a Taichi field.
+
+    Position Verlet is second order in h while h times the fastest frequency of the motion stays below 2, and diverges beyond;
+    the step then flags "stiff-force". A force that does not end at the radius, but jumps there, makes energy drift.
+    """
+
+    pairwise = True
+    uniform = True  # it has a measure of stiffness of its own
+    host_only = ("radius",)
+
+    def __init__(self, function, radius: float | None = None, *, potential=None):
+        self.arity = check_function("PairForce", "function", function, ("r", "i", "j"), (1, 3))
+        self.function: Any = function
+        self.potential_of: Any = potential
+        self.radius = None if radius is None else checks.number("PairForce", "radius", radius, above=0.0)
+        self.potential_arity = 0
+        if potential is not None:
+            self.potential_arity = check_function("PairForce", "potential", potential, ("r", "i", "j"), (1, 3))
+        self.listed = radius is not None
+
+    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Nothing to check before the functions are compiled."""
+
+    def bind(self, scene: Scene) -> None:
+        """Two fields of accelerations; the list comes with join()."""
+        self.scene, dev = scene, self.dev
+        n, dim = scene.particles.count, scene.particles.dim
+        dev.state, dev.w, dev.dim, dev.n, dev.real = scene.state, scene.state.w, dim, scene.count, scene.real
+        dev.now = scene.memory.field("PairForce.acceleration", n, width=dim, state=True)
+        dev.last = scene.memory.field("PairForce.acceleration_before", n, width=dim)
+
+    def join(self, scene: Scene, team: Any) -> NeighbourSearch | None:
+        """Declare the neighbour list; None without a radius."""
+        dev = self.dev
+        dev.grid = None
+        if self.radius is not None:
+            dev.cutoff = Cutoff(scene, self.radius)
+            none, half = np.zeros((0, 2), dtype=np.int32), np.full(scene.particles.count, self.radius / 2)
+            dev.grid = NeighbourSearch(scene, SKIN * self.radius, none, dev.cutoff, [], team, dev.last, radius=half)
+        return dev.grid
+
+    def kept_mask(self, number: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Its fields are those of the particles."""
+        return (number >= 0,)
+
+    @property
+    def room(self) -> int:
+        """Listed neighbours of a particle for which there is room at first."""
+        return ROOM[self.dev.dim - 2]
+
+    @inline
+    def checked(self, value):
+        """What the function returned, if it is a vector."""
+        return check_vector("PairForce", undecorated(self.function).__name__, value, self.dev.dim)
+
+    @ti.func
+    def between(self, i, j, r):
+        """The force on particle i from particle j, r apart."""
+        out = 0 * r
+        if ti.static(self.arity == 1):
+            out = self.checked(self.function(r))
+        else:
+            out = self.checked(self.function(r, i, j))
+        return out
+
+    @ti.func
+    def pull(self, i, j):
+        """The acceleration of particle i by particle j, per 1 / m_i: worked out once for both, from the lower index."""
+        r = self.dev.state.apart(i, j)
+        rr = r.dot(r)
+        out = 0 * r
+        near = rr > 0
+        if ti.static(self.listed):
+            near = near and rr < self.dev.cutoff.radius * self.dev.cutoff.radius
+        if near:
+            if i < j:
+                out = self.between(i, j, r)
+            else:
+                out = -self.between(j, i, -r)
+        return out
+
+    @ti.func
+    def evaluate(self, i):
+        """The acceleration of particle i by all others, in the order of their indices."""
+        self.dev.last[i] = self.dev.now[i]
+        total, w = ti.zero(self.dev.now[i]), self.dev.w.of(i)
+        if w > 0:
+            if ti.static(self.listed):
+                for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
+                    total += self.pull(i, self.dev.grid.neighbour[e])
+            else:
+                for j in range(self.dev.n.now):
+                    if j != i:
+                        total += self.pull(i, j)
+        self.dev.now[i] = w * total
+
+    @ti.func
+    def acceleration(self, i, x, v, t):
+        """As evaluate() left it."""
+        return self.dev.now[i]
+
+    @ti.func
+    def energy_between(self, i, j, back):
+        """The share of particle i in the energy of a pair, at x - back d, f64: half, or all where the other one is held."""
+        shift = back * (self.dev.state.d[i] - self.dev.state.d[j])
+        r = self.dev.state.apart(i, j) - shift
+        rr, out = r.dot(r), ti.cast(0, ti.f64)
+        near = rr > 0
+        if ti.static(self.listed):
+            near = near and rr < self.dev.cutoff.radius * self.dev.cutoff.radius
+        if near:
+            low, high = ti.min(i, j), ti.max(i, j)
+            way = ti.select(i < j, r, -r)
+            if ti.static(self.potential_arity == 1):
+                out = ti.cast(self.potential_of(way), ti.f64)
+            else:
+                out = ti.cast(self.potential_of(way, low, high), ti.f64)
+            if self.dev.w.positive(j):
+                out *= 0.5
+        return out
+
+    @ti.func
+    def energy(self, i, back):
+        """The share of particle i in the energy of all pairs [J]."""
+        out = ti.cast(0, ti.f64)
+        if ti.static(self.listed):
+            for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
+                out += self.energy_between(i, self.dev.grid.neighbour[e], back)
+        else:
+            for j in range(self.dev.n.now):
+                if j != i:
+                    out += self.energy_between(i, j, back)
+        return out
