@@ -29,7 +29,12 @@ def bowl(p):
     return 3.0 - p.norm()
 
 
-USERS = [swirl, spacing, bowl]
+@ti.func
+def crowding(r):
+    return 0.1 * ti.max(0.0, 0.3 - r.norm()) * r
+
+
+USERS = [swirl, spacing, bowl, crowding]
 
 
 def flat(precision="f32", **settings):
@@ -40,7 +45,7 @@ def flat(precision="f32", **settings):
     position, n = np.concatenate([body.position, more]), len(body)
     features = [
         tv.Gravity(9.81), tv.Drag(0.1), tv.Wind((0.3, 0.0), 0.2), tv.Attractor((0.0, 3.0), 0.5), tv.Hand((0.5, 2.0), 3),
-        tv.Force(swirl),
+        tv.Force(swirl), tv.PairForce(crowding, 0.3),
         tv.Distance(rope.links[:3], compliance=1e-4, damping=0.01, break_at=50.0), tv.Rope(rope.links[3:], length=0.21),
         tv.Distance(blob.links + b.start), tv.Bend(blob.bends[:2] + b.start, compliance=0.1), tv.Spacer([(n, n + 1)], 0.05),
         tv.AngleLimit([(n + 1, n + 2, n + 3)], -0.5, 0.5), tv.Area([i.tolist() for i in ball.loops], pressure=1.1),

@@ -26,6 +26,7 @@ CURVES = {
     "Substeps": ("substeps", {"substeps": ("substeps", [150, 160, 175])}),
     "Time per frame [ms]": ("milliseconds", {"milliseconds": ("ms", [190, 140, 220])}),
 }  # fmt: skip
+OWN = "own"  # the begin of the paths of quantities of the user's
 
 
 def shown(world: "World") -> dict[str, tuple[str, list[bool]]]:
@@ -58,6 +59,7 @@ class Curves:
         self.weigh(world)
         self._rows: dict[str, list[tuple[int, float, list[float]]]] = {}
         self._begun = False
+        self.own: list[str] = []  # quantities of the user's
         for title, (end, curves) in CURVES.items():
             titles, colors = zip(*(curves[name] for name in _names(curves, world)), strict=True)
             _, those = shown(world).get(title, (end, [False] * len(titles)))
@@ -81,6 +83,14 @@ class Curves:
         for end, curves in CURVES.values():
             if values := [figures[name] for name in curves if name in figures]:
                 self._rows.setdefault(end, []).append((frame, now.clock["_time"], values))
+
+    def log(self, frame: int, time: float, numbers: dict[str, float]) -> None:
+        """Quantities of the user's."""
+        for name, value in numbers.items():
+            if name not in self.own:
+                self.own.append(name)
+                self._stream.log(f"figures/{OWN}/{name}", self._rr.SeriesLines(names=[name]), static=True, strict=True)
+            self._rows.setdefault(f"{OWN}/{name}", []).append((frame, time, [value]))
 
     def send(self) -> None:
         """Log what was collected."""

@@ -15,7 +15,8 @@ from ..tools import golden_colors
 from .journal import PARTICLES
 from .layout import LEGEND, SCENE, WIDE
 from .lines import Lines
-from .strain import legend, levels
+from .overlays import AHEAD, ARROW, LOAD, Overlays, loads, ramp
+from .strain import LEVELS, levels
 from .surfaces import Surface, bodies, covered, triangles
 
 if TYPE_CHECKING:
@@ -25,6 +26,8 @@ POINT = -2.5  # a particle without radius is drawn as a dot of so many pixels (n
 MANY = 5000  # links that are drawn as lines; of more, an even selection
 WALL = np.array([[92, 97, 112]], dtype=np.uint8)  # of surfaces of walls
 OPEN = (60, 63, 70)  # of a wall that is switched off
+LABEL = (140, 144, 155)  # can be read on black and on white
+ABOVE = 40.0  # the order in which a plane is drawn: after particles (30)
 FEW = 1500  # particles up to which contacts are drawn; finding them would take too much of the frame beyond
 TOUCH = 4  # one contact is drawn for so many particles, those that push most
 
@@ -32,19 +35,22 @@ TOUCH = 4  # one contact is drawn for so many particles, those that push most
 class Drawing:
     """The picture of a world in a rerun stream. `bytes` is about what was logged, uncompressed."""
 
-    def __init__(self, world: "World", stream: Any, extent: tuple[np.ndarray, np.ndarray]):
+    def __init__(self, world: "World", stream: Any, extent: tuple[np.ndarray, np.ndarray], overlays: Overlays):
         import pyarrow
         import rerun as rr
 
         self._rr, self._pa, self.world, self._stream = rr, pyarrow, world, stream
         flat = world.particles.dim == 2
         self._points: Any = rr.Points2D if flat else rr.Points3D
+        self._arrows: Any = rr.Arrows2D if flat else rr.Arrows3D
         self._strips: Any = rr.LineStrips2D if flat else rr.LineStrips3D
         self._flat = flat
+        self._above = {"draw_order": ABOVE} if flat else {}  # in 3D what is nearer hides the rest
         point = pyarrow.list_(pyarrow.field("item", pyarrow.float32(), nullable=False), world.particles.dim)
         self._strip = pyarrow.list_(pyarrow.field("item", point, nullable=False))  # of rerun's lines
         self.bytes = 0
-        self._extent = extent
+        self.extent, self._overlays = extent, overlays
+        self.hues: np.ndarray | None = None  # of particles in the coming frame, where they are not always the same
         self.scenes = 0  # that were begun
         self._touched = self._torn = False
 
@@ -69,17 +75,19 @@ class Drawing:
         radii = np.where(p.radius > 0, p.radius, POINT)
         if self._surface:
             radii[covered(world, self._surface.triangles) & (p.inv_mass > 0)] = 0.0  # what is under a surface is not seen
-        what = [self._points.from_fields(radii=radii, colors=hues)]
+        fixed = {} if self._overlays.color else {"colors": hues}  # what is static hides what is not
+        what = [self._points.from_fields(radii=radii, **fixed)]
         what += [self._rr.Mesh3D.from_fields(triangle_indices=self._surface.triangles.astype(np.uint32))] if self._surface else []
         what += [self._strips.from_fields(radii=[-1.2])] if self._lines else []
         self.static(f"{self._root}/{PARTICLES}", *what)
-        if len(self._pairs):
-            hues, labels = legend()
+        scale = self._overlays.scale(bool(len(self._pairs)))
+        if scale:
+            hues, labels = scale
             at = np.stack([WIDE * np.arange(len(hues)), np.zeros(len(hues))], axis=1)
             ends = np.stack([at - [0.45 * WIDE, 0.4], at + [0.45 * WIDE, -0.4]], axis=1)
             self.static(f"{LEGEND}/scale", self._rr.LineStrips2D(ends, colors=hues, radii=[-5.0]))
             self.static(
-                f"{LEGEND}/labels", self._rr.Points2D(at + [0, 0.5], colors=hues, labels=labels, radii=[0], show_labels=True)
+                f"{LEGEND}/labels", self._rr.Points2D(at + [0, 0.5], colors=[LABEL], labels=labels, radii=[0], show_labels=True)
             )
 
     def _join(self, hues: np.ndarray) -> None:
@@ -113,15 +121,30 @@ class Drawing:
         something broke since then.
         """
         # All in one row: then LZ4 finds the points of lines and sheets among those of the particles.
-        row = [self._points.from_fields(positions=x32)]
+        colored = {}
+        if self._overlays.color:
+            known = self.hues is not None and len(self.hues) == len(x32)
+            hues = self.hues if known and self.hues is not None else np.full((len(x32), 3), 128, dtype=np.uint8)
+            colored = {"colors": hues}
+            self.bytes += hues.nbytes
+            if self._surface:
+                self._surface.paint(hues)
+        row = [self._points.from_fields(positions=x32, **colored)]
         self.bytes += x32.nbytes
         if len(self._pairs) or self._surface:
             row += self._link(x, x32)
         self._log(f"{self._root}/{PARTICLES}", *row)
         for k in turned:
             self._wall(k)
-        if self._contacts:
+        if self._overlays.forces and self.world._runner.step.contacts:
+            self._load(x)
+        elif self._contacts:
             self._contact()
+        if self._overlays.velocities:
+            way = (AHEAD * self.world.velocity).astype(np.float32)
+            arrows = self._arrows.from_fields(origins=x32, vectors=way, colors=[ARROW], radii=[-0.7], **self._above)
+            self._log(f"{self._root}/velocities", arrows)
+            self.bytes += 2 * x32.nbytes
         if torn or self._torn:
             self._breaks(x)
             self._torn = torn
@@ -131,6 +154,8 @@ class Drawing:
         r = x[self._pairs[:, 0]] - x[self._pairs[:, 1]]
         with np.errstate(divide="ignore", invalid="ignore"):
             level = levels(np.sqrt(np.einsum("ij,ij->i", r, r)) / self._rest - 1)
+        if not self._overlays.strain:
+            level[:] = LEVELS
         for k, mine, rows in self._tears:
             level[mine[self._broken[k][rows]]] = -1
         row = []
@@ -153,7 +178,7 @@ class Drawing:
         if isinstance(wall, (Collider, Path)):
             if self._solid(k, wall):
                 return
-            strips, thickness = wall.outline(*self._extent)
+            strips, thickness = wall.outline(*self.extent)
             radius = thickness if thickness else -1.5  # half the width in the scene, or pixels
             hue = OPEN if isinstance(wall, Collider) and not wall.active else (120, 125, 140)
             self._log(f"{self._root}/walls/{k}", self._strips(strips, colors=[hue], radii=[radius]))
@@ -163,7 +188,7 @@ class Drawing:
         """Draw a wall of a 3D scene as a surface in light from above; whether it has one."""
         if self._flat or not isinstance(wall, Collider):
             return False
-        vertices, faces = wall.solid(*self._extent)
+        vertices, faces = wall.solid(*self.extent)
         if len(faces):
             corners = vertices.astype(np.float32)
             hues = np.repeat(WALL if wall.active else WALL // 2, len(vertices), axis=0)
@@ -186,6 +211,22 @@ class Drawing:
         self._touched = bool(len(middle))
         self._log(f"{self._root}/contacts", self._points(middle.astype(np.float32), radii=[-1.2], colors=[[20, 22, 28]]))
         self.bytes += middle.nbytes // 2
+
+    def _load(self, x: np.ndarray) -> None:
+        """What contacts bear."""
+        strips, radii = loads(self.world, x)
+        if len(strips) or self._touched:
+            self._touched = bool(len(strips))
+            strips, radii = strips.astype(np.float32), radii.astype(np.float32)
+            self._log(
+                f"{self._root}/contacts", self._strips.from_fields(strips=strips, radii=radii, colors=[LOAD], **self._above)
+            )
+            self.bytes += strips.nbytes
+
+    def color(self, values: np.ndarray) -> None:
+        """Draw the coming frames in the colours of a quantity of particles, (n,)."""
+        assert self._overlays.color
+        self.hues = ramp(values, *self._overlays.color[1:])
 
     def _breaks(self, x: np.ndarray) -> None:
         """A mark where something broke since the last frame, and a line in the list of events."""

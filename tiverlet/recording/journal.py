@@ -5,6 +5,7 @@
     taken     the state after a step that an exception has ended; to be taken as it is, since no whole steps lead to it
     turned    knobs that the user turned, before the next step
     assigned  positions or velocities that the user assigned
+    logged    quantities of the user's, for the next frame
     frame     a frame of the picture, and the hash of the state then
     thinned   of all frames before, only one of `stride` is still in the picture
     end       the recording was closed
@@ -32,7 +33,7 @@ from . import rrd, scene
 if TYPE_CHECKING:
     from ..world import World
 
-FORMAT = 4
+FORMAT = 5
 GUARD = {"stuck", "substeps-capped"}  # flags that do not follow from the steps: the StepController knows what it tried in vain
 JOURNAL = "tiverlet/journal"
 SCENE = "world/scene"

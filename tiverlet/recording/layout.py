@@ -23,10 +23,10 @@ def upright(up: np.ndarray) -> rr.components.ViewCoordinates:
 
 
 def blueprint(
-    low: np.ndarray, high: np.ndarray, links: bool, figures: dict[str, tuple[str, list[bool]]], up: np.ndarray
+    low: np.ndarray, high: np.ndarray, legend: str | None, figures: dict[str, tuple[str, list[bool]]], up: np.ndarray
 ) -> rrb.Blueprint:
     """The scene on the left, curves and text on the right, for a scene within the corners low and high [m]. figures: see shown()
-    in curves.py. up: against gravity.
+    in curves.py. legend: the title of the scale of colours, None where there is none. up: against gravity.
     """
     size = np.maximum(high - low, 1e-9)
     if len(low) == 2:
@@ -53,11 +53,11 @@ def blueprint(
     ]
     pages = [rrb.TextDocumentView(origin="about", name="About"), rrb.TextLogView(origin="events", name="Events")]
     scale = rrb.Spatial2DView(
-        origin="legend", name="Strain of links",
+        origin="legend", name=legend,
         visual_bounds=rrb.VisualBounds2D(x_range=[-0.6 * WIDE, 6.6 * WIDE], y_range=[-1.3, 1.5]),
     )  # fmt: skip
     side = rrb.Vertical(*curves, rrb.Tabs(*pages), row_shares=[*(1 for _ in curves), 1.6])
-    left = rrb.Vertical(view, scale, row_shares=[12, 1]) if links else view
+    left = rrb.Vertical(view, scale, row_shares=[12, 1]) if legend else view
     whole = rrb.Horizontal(left, side, column_shares=[4, 1])
     _name(whole, "layout")
     view.id = SCENE_VIEW

@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from . import journal
+from . import journal, reader
 
 HEADER = 12  # bytes of a file before its first message
 HEAD = struct.Struct("<QQ")  # of a message: its kind, and the bytes that follow
-END, CHUNK = 0, 2  # kinds: the last message, and one with rows of an entity
+END, STORE, CHUNK, SHOWN = range(4)  # kinds: the last message, a store, rows of an entity, and which layout is shown
+LAYOUT = 2  # the kind of a store that has one
 COMPRESSION, SIZE, PAYLOAD = 2, 3, 5  # fields of the latter: how its bytes are compressed, how many they are without it, and they
 LZ4 = 2
 BATCH = 120_000  # bytes that are sent together: LZ4 looks back by 64 kB
@@ -107,9 +108,11 @@ def thins(entity: str) -> bool:
 def thinned(messages: list[tuple[int, bytes]], stride: int) -> Iterator[tuple[int, bytes]]:
     """Messages (kind, bytes) with the picture of one of `stride` frames; all others as they are.
 
-    stride = 1: nothing is left out, but the rows of each entity stand together, and so do entries of the journal, which come
-    first, and in pieces: what is left of a file that was cut short can be replayed.
+    stride = 1: nothing is left out but the layout that another one has replaced; the rows of each entity stand together, and so
+    do entries of the journal, which come first, and in pieces: what is left of a file that was cut short can be replayed.
     """
+    if stride == 1:
+        messages = latest(messages)
     found, frames = [], defaultdict(list)
     for kind, message in messages:
         entity = ""
@@ -145,6 +148,21 @@ def thinned(messages: list[tuple[int, bytes]], stride: int) -> Iterator[tuple[in
     yield from ((CHUNK, message) for message in _packed(entries))
     pictures += [_joined(together) for together in waiting.values() if together]
     yield from ((CHUNK, message) for message in pictures)
+
+
+def latest(messages: list[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
+    """The messages without those of layouts that later ones have replaced."""
+    where = [_store(kind, message) for kind, message in messages]
+    layouts = [store for store in dict.fromkeys(where) if store and store[0] == LAYOUT]
+    return [one for one, store in zip(messages, where, strict=True) if store not in layouts[:-1]]
+
+
+def _store(kind: int, message: bytes) -> tuple | None:
+    """The store that a message is about."""
+    if kind == STORE:
+        message = reader.record(reader.record(message, "1 2").get(2, b""), "2 5 6")[2]
+        return tuple(reader.store_of(message))
+    return tuple(reader.store_of(reader.record(message, "1 2 3 4 5 6 7").get(1, b""))) if kind in (CHUNK, SHOWN) else None
 
 
 def _packed(entries: list[tuple[Chunk, Any]]) -> Iterator[bytes]:

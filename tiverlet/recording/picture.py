@@ -10,24 +10,30 @@ import numpy as np
 
 from ..step.checkpoint import Checkpoint
 from ..step_report import StepReport
+from .overlays import Overlays
 
 if TYPE_CHECKING:
     from ..world import World
 
+NEAR = 0.35  # of the size of what moved: how far around it the view goes where there are walls
+FLOWN = 3.0  # times the size of the scene: what went further is not looked for
+
 
 class Picture:
     """The scene, its figures as curves, events, and a page about it. explained: what world.explain() says. environment: what it
-    was recorded with, see scene.environment().
+    was recorded with, see scene.environment(). overlays: what is drawn on request.
     """
 
-    def __init__(self, world: "World", stream: Any, explained: str, environment: dict[str, Any]):
+    def __init__(self, world: "World", stream: Any, explained: str, environment: dict[str, Any], overlays: Overlays):
 
         from .curves import Curves
         from .drawing import Drawing, bounds, upwards
         from .layout import MIRROR, SCENE, upright
 
         self.world, self._stream, self._explained, self._environment = world, stream, explained, environment
-        self.drawing = Drawing(world, stream, bounds(world))
+        self._overlays = overlays
+        self.drawing = Drawing(world, stream, bounds(world), overlays)
+        self._low, self._high = np.full((2, world.particles.dim), [[np.inf], [-np.inf]])  # of all that was drawn
         self.drawing.static(SCENE, MIRROR if world.particles.dim == 2 else upright(upwards(world)))
         self.curves = Curves(world, stream)
         self._about(None, 0, "")
@@ -58,6 +64,7 @@ class Picture:
         if scenes > self.drawing.scenes:
             self.curves.weigh(self.world)
             self.drawing.begin()
+        self._frame_all(x)
         self.drawing.frame(x, x32, stirred, bool(report and report.broken))
         if report:
             self.curves.add(number, report, now)
@@ -65,18 +72,57 @@ class Picture:
                 self._seen |= report.flags
                 self.drawing.event(" ".join(report.notes), "WARN")
 
+    def log(self, number: int, values: dict[str, Any]) -> None:
+        """Quantities of the user's, for the coming frame: numbers, and arrays of one for each particle, (n,)."""
+        self.curves.log(number, self.world.time, {name: value for name, value in values.items() if np.ndim(value) == 0})
+        color = self._overlays.color
+        if color and np.ndim(values.get(color[0], 0.0)):
+            self.drawing.color(values[color[0]])
+
+    def _frame_all(self, x: np.ndarray) -> None:
+        """Remember where particles are, for layout()."""
+        radius = self.world.particles.radius[:, None]
+        some = np.isfinite(x).all(axis=1)
+        if some.any():
+            self._low = np.minimum(self._low, (x - radius)[some].min(axis=0))
+            self._high = np.maximum(self._high, (x + radius)[some].max(axis=0))
+
+    def layout(self) -> Any:
+        """How the recording opens, once all of it is known: the view frames the whole run."""
+        extent = framed(self.drawing.extent, self._low, self._high)
+        return layout(self.world, self._overlays, extent, self.curves.own)
+
     def end(self, worst: StepReport | None, frames: int, note: str) -> None:
         """The page about all frames."""
         self._about(worst, frames, note)
 
 
-def layout(world: "World") -> Any:
-    """How it opens in the viewer."""
-    from .curves import shown
+def layout(
+    world: "World", overlays: Overlays, extent: tuple[np.ndarray, np.ndarray] | None = None, own: Iterable[str] = ()
+) -> Any:
+    """How it opens in the viewer. extent: the corners of what is to be seen [m], None for what is known beforehand. own:
+    quantities of the user's that have curves.
+    """
+    from .curves import OWN, shown
     from .drawing import bounds, links, upwards
     from .layout import blueprint
 
-    return blueprint(*bounds(world), bool(links(world)), shown(world), upwards(world))
+    low, high = extent or bounds(world)
+    figures = {name: (f"{OWN}/{name}", [True]) for name in own} | shown(world)
+    return blueprint(low, high, overlays.title(bool(links(world))), figures, upwards(world))
+
+
+def framed(extent: tuple[np.ndarray, np.ndarray], low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The corners of the view of a run whose particles were between `low` and `high`: these, and what of the scene is near.
+
+    What flew out so far that the rest would be a speck is left out.
+    """
+    if not (low <= high).all():
+        return extent
+    size = np.maximum(extent[1] - extent[0], 1e-12).max()
+    low, high = np.maximum(low, extent[0] - FLOWN * size), np.minimum(high, extent[1] + FLOWN * size)
+    near = NEAR * max(float((high - low).max()), 1e-12)
+    return np.minimum(low, np.maximum(extent[0], low - near)), np.maximum(high, np.minimum(extent[1], high + near))
 
 
 def about(

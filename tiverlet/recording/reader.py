@@ -25,6 +25,7 @@ SPARE = 256 << 20  # bytes of memory, and of what is found, in any case
 FOLD = 64  # times the size of the file that may be found
 UNTOLD = {"RecordingInfo:start_time"}  # nothing says whether it is true
 BROKEN = "its checksum is not that of the file"
+LAYOUTS = 2  # the number of the store of the first layout; that of the recording itself is 1
 DEEP = 16  # levels of lists in lists
 ROWS = {"world/scene": "Points2D:positions Points3D:positions", "figures": "Scalars:scalars"}
 
@@ -190,7 +191,8 @@ class Reader:
             self.trouble.append(f"rows of {entity} are said to be in order and are not")
         if bool(parts.get(7, 0)) != (not times):
             self.trouble.append(f"rows of {entity} are said to be static or not, and are not so")
-        self._keep(store[0], entity, ids, times, columns["data"])
+        number = 1 if store[0] == 1 else LAYOUTS + [one for one in dict.fromkeys(self.stores) if one[0] != 1].index(store)
+        self._keep(number, entity, ids, times, columns["data"])
 
     def _keep(self, store: int, entity: str, ids: list, times: dict, data: dict) -> None:
         number = self.entities.setdefault(entity, len(self.entities))

@@ -6,6 +6,7 @@ import os
 import warnings
 import weakref
 import zlib
+from dataclasses import asdict
 from time import perf_counter
 from typing import Any
 
@@ -17,6 +18,7 @@ from ..step import checkpoint
 from ..step.explain import explain
 from ..world import World
 from .journal import JOURNAL, Journal, brief, said
+from .overlays import Overlays, checked_color, checked_quantities
 from .picture import Picture, layout
 from .scene import environment
 from .sink import Sink
@@ -37,10 +39,15 @@ class Recorder:
             world.step(1 / 60)
             recorder.log()
 
-    path: the file; its folder must exist. world: what to record. every: log only each so many frames. budget: bytes that the file
-    may have. When they run short, every other frame is taken out of the picture of the whole run, again and again, and a warning
-    at the end says so; all steps stay in the file. overwrite: whether a file that is there may be replaced; it stays as it is
-    until the new one has its first frame.
+    path: the file; its folder must exist. None with live: no file. world: what to record. every: log only each so many frames.
+    budget: bytes that the file may have. When they run short, every other frame is taken out of the picture of the whole run,
+    again and again, and a warning at the end says so; all steps stay in the file. overwrite: whether a file that is there may be
+    replaced; it stays as it is until the new one has its first frame.
+
+    strain: whether links and surfaces show it. forces: draw the loads of contacts as lines, as wide as the load next to those of
+    the frame. velocities: draw arrows that show the way of 0.05 s. color: (name, least, most), a quantity of log() in whose
+    colours particles are drawn. live: show what is recorded while it is, see watch.py: True for a window, "web" for a page in the
+    browser, "notebook" below a cell, or the address of a viewer that runs.
 
     Drawn are positions (f32), in the colours of bodies; surfaces where bodies have them; links, coloured by their strain;
     walls, contacts of up to 1500 particles, what breaks, and curves. Beside that the file holds the scene with all arguments,
@@ -53,7 +60,10 @@ class Recorder:
     already, and OSError when it cannot be written any further, or was removed; what has been written then can be read.
     """
 
-    def __init__(self, path, world: World, every: int = 1, budget: int | None = None, overwrite: bool = False):
+    def __init__(
+        self, path, world: World, every: int = 1, budget: int | None = None, overwrite: bool = False, *, strain: bool = True,
+        forces: bool = False, velocities: bool = False, color: tuple[str, float, float] | None = None, live: bool | str = False,
+    ):  # fmt: skip
         import rerun as rr
 
         if not isinstance(world, World):
@@ -63,6 +73,10 @@ class Recorder:
         self.world = world
         self.every = checks.integer("Recorder", "every", every, least=1)
         self.budget = None if budget is None else checks.integer("Recorder", "budget", budget, least=1)
+        flags = {"strain": strain, "forces": forces, "velocities": velocities}
+        given = {name: checks.flag("Recorder", name, value) for name, value in flags.items()}
+        self._overlays = Overlays(color=checked_color(color), **given | ({"strain": False} if color else {}))
+        self._own: dict[str, Any] = {}  # quantities of the user's, for the next frame that is drawn
         self.path = os.fspath(path)
         folder = os.path.dirname(os.path.abspath(self.path))
         if not os.path.isdir(folder):
@@ -84,7 +98,8 @@ class Recorder:
     def _open(self, overwrite: bool) -> None:
         world = self.world
         title = os.path.splitext(os.path.basename(self.path))[0]
-        self._sink = Sink(self.path, f"tiverlet_{world.particles.dim}d", layout(world), title, overwrite)
+        opens = layout(world, self._overlays)
+        self._sink = Sink(self.path, f"tiverlet_{world.particles.dim}d", opens, title, overwrite)
         self._closing = weakref.finalize(self, self._sink.close)  # also when the process ends
         self._stream = self._sink.stream
         try:
@@ -101,10 +116,11 @@ class Recorder:
         """Write what holds for all frames, and the first one."""
         world, explained = self.world, explain(self.world)
         world._settle_forces()
-        self._picture = Picture(world, self._stream, explained, environment())
+        self._picture = Picture(world, self._stream, explained, environment(), self._overlays)
         self._sent, self._flushed = perf_counter(), 0
         self._picture.stamp(0)
-        self._journal = Journal(world, self._write, {"title": title, "explained": explained})
+        told = {"title": title, "explained": explained, "overlays": asdict(self._overlays)}
+        self._journal = Journal(world, self._write, told)
         self._note_state(self._journal.size)
         self._frame(0)
         self.flush()  # so that a process that dies soon leaves something
@@ -131,11 +147,19 @@ class Recorder:
         return self._sink.bytes + self._logged - self._flushed
 
     @interrupts.uncut
-    def log(self) -> None:
-        """Write the present frame, if it is one of `every`."""
+    def log(self, **quantities) -> None:
+        """Write the present frame, if it is one of `every`, and quantities of your own: numbers, which become curves, and arrays
+        of one number for each particle, (n,), for `color` and for what reads the file. See Replay.quantities.
+
+            recorder.log(height=float(x[:, 1].max()), heat=heat)
+
+        Raises ValueError for what is neither, and for the name of a curve that is there.
+        """
         if self._full:
             return
         self._check()
+        if quantities:
+            self._own = checked_quantities(quantities, len(self.world.particles))
         self._calls += 1
         if self.budget is not None and self._left() < self._each:
             self._thin()
@@ -228,6 +252,12 @@ class Recorder:
         due = picture.drawing.bytes - self._drawn > self._due or sparse
         if number and due and not world._force_waits:  # a state does not hold the force that it came about under
             self._note_state(journal.state())
+        if self._own:
+            numbers = {name: value for name, value in self._own.items() if isinstance(value, float)}
+            arrays = {name: value for name, value in self._own.items() if not isinstance(value, float)}
+            journal.put("logged", {"numbers": numbers}, arrays)
+            picture.log(number, self._own)
+            self._own = {}
         now = checkpoint.keep(world, pairs=False)
         x = now.position(len(world.particles))
         x32 = x.astype(np.float32)
@@ -262,6 +292,8 @@ class Recorder:
         if "hash" in end:
             self._picture.end(journal.worst, self.frames, self._note)
         journal.put("end", {**end, "note": self._note, **said(journal.worst)})
+        if "hash" in end:
+            self._sink.show(self._picture.layout())
         self._sink.flush()
         self._sink.check()
         if self._sink.bytes < SMALL:

@@ -12,7 +12,9 @@ from ..step_report import StepReport
 from . import reader
 from .journal import GUARD, JOURNAL, PARTICLES, Entry
 from .messages import droppable, thins
+from .overlays import Overlays
 from .picture import Picture, layout
+from .reader import LAYOUTS
 from .rrd import Contents
 
 if TYPE_CHECKING:
@@ -72,7 +74,7 @@ class Redraw:
         self._world: Any = None
         self._recent: StepReport | None = None
         self._worst: StepReport | None = None
-        self.layout: list[Row] = []
+        self.layouts: list[list[Row]] = []  # how it opens: as was known at first, and when it had ended
         self.frames = 0
         self.ended = False
         self.stride, self.thin = 1, -1  # of frames up to this one, one of so many may be all that is in the picture
@@ -94,10 +96,9 @@ class Redraw:
             self._picture.follow(world)
             return
         self._rows.log("__properties", rr.archetypes.RecordingInfo(name=self._told["title"]), static=True)
-        self._picture = Picture(world, self._rows, self._told["explained"], self._told["environment"])
-        views = Rows()
-        layout(world)._log_to_stream(views)
-        self.layout = views.rows
+        overlays = Overlays.of(self._told["overlays"])
+        self._picture = Picture(world, self._rows, self._told["explained"], self._told["environment"], overlays)
+        self.layouts.append(_rows_of(layout(world, overlays)))
 
     def before(self) -> None:
         """A step begins."""
@@ -163,6 +164,11 @@ class Redraw:
         self.frames += 1
         return None
 
+    def logged(self, entry: Entry) -> None:
+        """Quantities of the user's."""
+        assert self._picture
+        self._picture.log(entry.frame, {**entry.data["numbers"], **entry.arrays})
+
     def end(self, entry: Entry) -> str | None:
         """The last entry."""
         assert self._picture
@@ -177,12 +183,19 @@ class Redraw:
             return wrong
         if "hash" in entry.data:
             self._picture.end(worst, self.frames, entry.data["note"])
+            self.layouts.append(_rows_of(self._picture.layout()))
         return None
 
     def send(self) -> None:
         """What was collected of curves, where there is no end."""
         if self._picture:
             self._picture.curves.send()
+
+
+def _rows_of(blueprint: Any) -> list[Row]:
+    views = Rows()
+    blueprint._log_to_stream(views)
+    return views.rows
 
 
 def _amended(report: StepReport, told: dict[str, Any]) -> tuple[StepReport, str | None]:
@@ -207,11 +220,13 @@ def compare(contents: Contents, redraw: Redraw, application: str, complete: bool
     """
     if contents.trouble:
         return None, contents.trouble[0]
-    kinds = sorted({(kind, name) for kind, name, _ in contents.stores})
-    if kinds != [(1, application), (2, application)] or len(set(contents.stores)) != 2:
+    stores = list(dict.fromkeys(contents.stores))
+    blueprints = [store[2] for store in stores if store[0] == 2]
+    kinds = [(1, application), *[(2, application)] * len(blueprints)]
+    if sorted(store[:2] for store in stores) != kinds or len({store[2] for store in stores}) != len(kinds):
         return None, f"it has other stores than a recording of {application}"
-    (blueprint,) = {store[2] for store in contents.stores if store[0] == 2}
-    if contents.shown != [(blueprint, 0, 1)]:
+    shown = [(blueprint, 0, 1) for blueprint in blueprints]
+    if contents.shown != shown and (complete or contents.shown != shown[:1]):
         return None, "it opens with another layout"
     rows = np.sort(contents.rows, order="f5")  # by id
     if len(np.unique(rows["f5"])) != len(rows):
@@ -219,18 +234,31 @@ def compare(contents: Contents, redraw: Redraw, application: str, complete: bool
     names = contents.entities
     last = None if complete else max((row[2] for row in redraw.rows), default=-1)  # nothing is known of later frames
     found: list[Row] = []
-    views: list[tuple[str, bytes]] = []
+    views: list[list[tuple[str, bytes]]] = [[] for _ in blueprints]
     for store, static, entity, frame, time, _, digest in rows.tolist():
         digest = digest.ljust(16, b"\0")
-        if store == 2:
-            views.append((names[entity], digest))
+        if store >= LAYOUTS:
+            views[store - LAYOUTS].append((names[entity], digest))
         elif names[entity] == "about" and not redraw.ended and any(row[0] == "about" for row in found):
             continue  # the page about all frames has come into the file, but not the entry that it follows from
         elif names[entity] != JOURNAL and digest != NOTHING and (last is None or frame <= last):
             found.append((names[entity], bool(static), frame, time, digest))
-    if sorted(views) != sorted((entity, digest) for entity, *_, digest in redraw.layout):
+    if not _opens_so(views, redraw, complete):
         return None, "the layout is not that of the recording"
     return _first(found, redraw.expected(found), complete)
+
+
+def _opens_so(views: list[list[tuple[str, bytes]]], redraw: Redraw, complete: bool) -> bool:
+    """Whether the layouts of a file are those of its recording: the one that was known at first, the one of the whole run, or
+    both; of what was cut short the last one may be there in part, and nothing be known of the whole run."""
+    drawn = [Counter((entity, digest) for entity, *_, digest in rows) for rows in redraw.layouts]
+    given = [Counter(rows) for rows in views]
+    if complete:
+        return given in (drawn, drawn[-1:])
+    if not redraw.ended:
+        return given[:1] == drawn[:1] or len(given) == 1
+    known = drawn if len(given) == len(drawn) else drawn[:1] if given[0] == drawn[0] else drawn[-1:]
+    return len(given) == len(known) and given[:-1] == known[:-1] and given[-1] <= known[-1]
 
 
 def _first(found: list[Row], drawn: list[Row], complete: bool) -> tuple[int | None, str] | int:

@@ -14,7 +14,7 @@ from .. import checks
 from ..device.language import NAMES
 from ..step import checkpoint
 from . import journal, rrd, scene
-from .curves import CURVES
+from .curves import CURVES, OWN
 from .journal import Entry
 from .redraw import Redraw, compare
 from .scene import plain
@@ -108,6 +108,18 @@ class Replay:
             raise ValueError(f"replay: the picture of frame {frame} in {self.path} is not what was recorded. See .verify().")
         return x
 
+    @property
+    def quantities(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """What log() was given for each particle, by name: the frames (m,) and the values (m, n); those that are numbers are in
+        .curves. Values of frames with other particles than the first of them are left out."""
+        found: dict[str, list[tuple[int, np.ndarray]]] = {}
+        for e in self._entries:
+            for name, values in e.arrays.items() if e.kind == "logged" else ():
+                rows = found.setdefault(name, [])
+                if not rows or len(rows[0][1]) == len(values):
+                    rows.append((e.frame, values))
+        return {name: (np.array([k for k, _ in rows]), np.array([v for _, v in rows])) for name, rows in found.items()}
+
     @_clear
     def world(self, frame: int) -> "World":
         """A world in the exact state of a frame, to go on with: computed from the nearest state before, and compared.
@@ -176,6 +188,8 @@ class Replay:
                     off = next((i for i in found if i is not None), None)
                 elif entry.kind == "scene":
                     redraw.scene(len(world.features))
+                elif entry.kind == "logged":
+                    redraw.logged(entry)
                 elif entry.kind == "thinned":
                     redraw.thinned(entry)
                 elif entry.kind == "turned":
@@ -327,7 +341,8 @@ def replay(path, given: Iterable[Any] | Mapping[str, Any] = ()) -> Replay:
     given: the user's own functions and classes that are in the scene, or a mapping from their names. Their source is in the file
     to be read, in scene["needs"]; loading a file runs nothing that it contains. Only world() and verify() need them.
 
-    .frames: the numbers of the frames in the file. .times [s]. .curves: (frames, values) of each figure by name. .complete:
+    .frames: the numbers of the frames in the file. .times [s]. .curves: (frames, values) of each figure by name, your own
+    among them; .quantities: of each that log() was given for each particle. .complete:
     whether the recording was closed; one that was cut short by a crash has all that was flushed. .text: what the file is, and
     where it ends.
 
@@ -387,6 +402,7 @@ def _curves(contents: rrd.Contents) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         if name.startswith("figures/"):
             found.setdefault(name[len("figures/") :], {})[frame] = k
     out, known = {}, {end: list(curves) for end, curves in CURVES.values()}
+    found = {end.removeprefix(f"{OWN}/"): rows for end, rows in found.items()}
     for end, rows in found.items():
         frames = sorted(rows)
         values = np.array([contents.values(rows[frame]) for frame in frames])

@@ -159,6 +159,10 @@ class Sink:
         self._sum.update(data)
         self.bytes += len(data)
 
+    def show(self, blueprint: Any) -> None:
+        """Let the recording open with another layout, unless the user has made one."""
+        self.stream.send_blueprint(blueprint, make_active=False)
+
     def thin(self, stride: int) -> bool:
         """Keep the picture of one of `stride` frames: write the file anew, and put it in the place of the old one.
 

@@ -120,6 +120,10 @@ class Surface:
         self._end, self._first = np.unique(ends[order], return_index=True)
         self._link = (order % max(1, len(pairs))).astype(np.int64)
 
+    def paint(self, hues: np.ndarray) -> None:
+        """Take other colours, (n, 3), for the particles."""
+        self._hues = hues.astype(np.float64)
+
     def colors(self, x: np.ndarray, level: np.ndarray) -> np.ndarray:
         """RGBA as u32 of all particles at x, (n,). level: of the strain of each link, (m,); the worst at a particle shows."""
         a, b, c = (x[k] for k in self.triangles.T)

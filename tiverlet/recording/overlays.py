@@ -1,0 +1,113 @@
+"""What is drawn only where it is asked for: strain, loads of contacts, velocities, and a quantity of the user's in colours."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .. import checks
+from ..contact import Polygons
+from .curves import CURVES
+from .strain import legend
+
+if TYPE_CHECKING:
+    from ..world import World
+
+AHEAD = 0.05  # [s] for which an arrow shows the way
+WIDEST = 0.2  # half the width of the line of a load, in radii
+COMMON = 0.95  # of all loads of a frame, what is no more than the one that has that width
+LOAD, ARROW = (255, 150, 60), (240, 240, 160)
+RAMP = np.array([[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], dtype=np.float64)  # viridis
+
+
+@dataclass(frozen=True)
+class Overlays:
+    """What a Recorder was asked for. color: name, least and most of a quantity of particles."""
+
+    strain: bool = True
+    forces: bool = False
+    velocities: bool = False
+    color: tuple[str, float, float] | None = None
+
+    def title(self, links: bool) -> str | None:
+        """Of the scale of colours; None where there is none. links: whether there are any."""
+        if self.color:
+            return self.color[0]
+        return "Strain of links" if links and self.strain else None
+
+    def scale(self, links: bool) -> tuple[np.ndarray, list[str]] | None:
+        """Colours and labels of that scale."""
+        if self.color:
+            at = np.linspace(*self.color[1:], 7)
+            return ramp(at, *self.color[1:]), [f"{value:.4g}" for value in at]
+        return legend() if self.title(links) else None
+
+    @staticmethod
+    def of(told: dict[str, Any]) -> "Overlays":
+        """As a recording tells it."""
+        color = told["color"]
+        return Overlays(told["strain"], told["forces"], told["velocities"], None if color is None else (*color,))  # type: ignore[arg-type]
+
+
+def checked_color(value: Any) -> tuple[str, float, float] | None:
+    """The argument `color` of a Recorder: None, or (name, least, most)."""
+    if value is None:
+        return None
+    if not (isinstance(value, (tuple, list)) and len(value) == 3 and isinstance(value[0], str)):
+        raise TypeError(
+            f'Recorder: color = {value!r}, but a name and the numbers of both ends of the scale are needed: ("heat", 0, 1).'
+        )
+    low, high = (checks.number("Recorder", "color", end) for end in value[1:])
+    if not low < high:
+        raise ValueError(f"Recorder: color = {value!r}, but {low:g} is not less than {high:g}.")
+    return value[0], low, high
+
+
+def checked_quantities(given: dict[str, Any], count: int) -> dict[str, Any]:
+    """Quantities of the user's as floats, and arrays (count,) in f64."""
+    taken = {name for _, curves in CURVES.values() for name in curves}
+    out: dict[str, Any] = {}
+    for name, value in given.items():
+        array = np.asarray(value)
+        if name in taken:
+            raise ValueError(f"Recorder.log: {name} is the name of a curve of every recording; choose another.")
+        if array.dtype.kind not in "biuf" or array.shape not in ((), (count,)):
+            raise ValueError(
+                f"Recorder.log: {name} has the shape {array.shape} and the type {array.dtype}, but a number, or one for each of "
+                f"the {count} particles, is needed."
+            )
+        out[name] = float(array) if array.ndim == 0 else array.astype(np.float64)
+    return out
+
+
+def ramp(values: np.ndarray, low: float, high: float) -> np.ndarray:
+    """Colours, (n, 3), of numbers (n,) between two ends; grey for what is not finite."""
+    with np.errstate(invalid="ignore"):
+        at = np.clip((values - low) / (high - low), 0, 1) * (len(RAMP) - 1)
+    known = np.isfinite(at)
+    at = np.where(known, at, 0.0)
+    k = np.minimum(at.astype(np.int64), len(RAMP) - 2)
+    colors = RAMP[k] + (at - k)[:, None] * (RAMP[k + 1] - RAMP[k])
+    return np.where(known[:, None], np.rint(colors), 128).astype(np.uint8)
+
+
+def loads(world: "World", x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The loads of contacts as lines from centre to centre, (m, 3, dim), and half their widths [m]: as wide as the load, next to
+    those of the frame. x: positions, (n, dim).
+    """
+    dim = x.shape[1]
+    if not world._clock.h:
+        return np.zeros((0, 3, dim)), np.zeros(0)
+    found = world.contacts
+    some = found.impulse > 0
+    ends = x.copy()
+    for f in world.features:
+        if isinstance(f, Polygons):
+            for loop in f.loops:
+                ends[loop] = x[loop].mean(axis=0)
+    a, b = (ends[found.pairs[some, k]] for k in (0, 1))
+    load = found.impulse[some]
+    if not len(load):
+        return np.zeros((0, 3, dim)), np.zeros(0)
+    size = np.linalg.norm(a - found.point[some], axis=1).mean()
+    return np.stack([a, found.point[some], b], axis=1), WIDEST * size * load / max(np.quantile(load, COMMON), 1e-300)
