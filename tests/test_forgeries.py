@@ -131,7 +131,7 @@ def test_what_a_file_asks_for_is_bounded(original, tmp_path):
 
 
 def test_the_page_for_browsers_talks_to_this_machine_only_and_ends_when_told(original):
-    port = viewer._free_port()
+    port = viewer.free_port()
     words = [sys.executable, "-m", "tiverlet", "replay", str(original), "--web", "--port", str(port)]
     process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
     assert process.stdout

@@ -17,6 +17,7 @@ from ..device import interrupts
 from ..step import checkpoint
 from ..step.explain import explain
 from ..world import World
+from . import watch
 from .journal import JOURNAL, Journal, brief, said
 from .overlays import Overlays, checked_color, checked_quantities
 from .picture import Picture, layout
@@ -46,7 +47,7 @@ class Recorder:
 
     strain: whether links and surfaces show it. forces: draw the loads of contacts as lines, as wide as the load next to those of
     the frame. velocities: draw arrows that show the way of 0.05 s. color: (name, least, most), a quantity of log() in whose
-    colours particles are drawn. live: show what is recorded while it is, see watch.py: True for a window, "web" for a page in the
+    colours particles are drawn. live: show what is recorded while it is: True for a window, "web" for a page in the
     browser, "notebook" below a cell, or the address of a viewer that runs.
 
     Drawn are positions (f32), in the colours of bodies; surfaces where bodies have them; links, coloured by their strain;
@@ -77,7 +78,12 @@ class Recorder:
         given = {name: checks.flag("Recorder", name, value) for name, value in flags.items()}
         self._overlays = Overlays(color=checked_color(color), **given | ({"strain": False} if color else {}))
         self._own: dict[str, Any] = {}  # quantities of the user's, for the next frame that is drawn
-        self.path = os.fspath(path)
+        if path is None and not live:
+            raise ValueError("Recorder: path = None is for live recordings; give a file, or live=True.")
+        if live == "notebook" and path is not None:
+            raise ValueError('Recorder: live="notebook" shows without a file; give path=None, or one of live=True and "web".')
+        self.path = os.devnull if path is None else os.fspath(path)
+        self._live = live
         folder = os.path.dirname(os.path.abspath(self.path))
         if not os.path.isdir(folder):
             raise ValueError(f"Recorder: the folder {folder} does not exist. Make it first: os.makedirs({folder!r}).")
@@ -97,11 +103,15 @@ class Recorder:
     @interrupts.uncut
     def _open(self, overwrite: bool) -> None:
         world = self.world
-        title = os.path.splitext(os.path.basename(self.path))[0]
+        title = "live" if self.path == os.devnull else os.path.splitext(os.path.basename(self.path))[0]
+        viewer = watch.address(self._live) if self._live else None
         opens = layout(world, self._overlays)
-        self._sink = Sink(self.path, f"tiverlet_{world.particles.dim}d", opens, title, overwrite)
+        self._sink = Sink(self.path, f"tiverlet_{world.particles.dim}d", opens, title, overwrite, viewer)
         self._closing = weakref.finalize(self, self._sink.close)  # also when the process ends
         self._stream = self._sink.stream
+        if self._live == "notebook":
+            watch.below_the_cell(self._stream)
+            self._stream.send_blueprint(opens)
         try:
             self._begin(title)
         except BaseException:

@@ -26,13 +26,15 @@ class Sink:
     and dropped, and `error` is set. On the way data is compressed better, and rerun's footer is left out: an index of all chunks,
     which takes 90 kB and which `rerun rrd optimize` makes again. Where there are no pipes by name, rerun writes the file itself.
 
-    A file that is to be overwritten stays as it is until keep().
+    A file that is to be overwritten stays as it is until keep(). viewer: the address of one that shows the recording meanwhile.
     """
 
-    def __init__(self, path: str, application: str, blueprint: Any, name: str, overwrite: bool = False):
+    def __init__(
+        self, path: str, application: str, blueprint: Any, name: str, overwrite: bool = False, viewer: str | None = None
+    ):  # fmt: skip
         import rerun as rr
 
-        self.path, self.bytes = path, 0
+        self.path, self.bytes, self._watched = path, 0, viewer is not None
         self.error: Exception | None = None
         batches = rr.ChunkBatcherConfig(flush_tick=TICK, flush_num_bytes=BATCH)
         self.stream: Any = rr.RecordingStream(application, recording_id=uuid.uuid4(), batcher_config=batches)
@@ -56,12 +58,20 @@ class Sink:
             self._out, into = os.pipe()
             self._copy = threading.Thread(target=self._pump, daemon=True)
             self._copy.start()
-            self.stream.save(f"/dev/fd/{into}", default_blueprint=blueprint)
+            self._open(f"/dev/fd/{into}", blueprint, viewer)
             os.close(into)
         else:
             self._file.close()
-            self.stream.save(path, default_blueprint=blueprint)
+            self._open(path, blueprint, viewer)
         self.stream.send_recording_name(name)
+
+    def _open(self, path: str, blueprint: Any, viewer: str | None) -> None:
+        import rerun as rr
+
+        if viewer is None:
+            self.stream.save(path, default_blueprint=blueprint)
+        else:
+            self.stream.set_sinks(rr.FileSink(path), rr.GrpcSink(viewer), default_blueprint=blueprint)
 
     def _create(self, overwrite: bool) -> Any:
         try:
@@ -201,7 +211,12 @@ class Sink:
     def flush(self) -> None:
         """Wait until all that was logged is in the file."""
         if self.error is None:
-            self.stream.flush(timeout_sec=WAIT)
+            try:
+                self.stream.flush(timeout_sec=WAIT)
+            except RuntimeError:  # the viewer was closed, which is no reason for the file to end
+                if not self._watched:
+                    raise
+                sleep(3 * TICK)
             self._drain()
 
     def _drain(self) -> None:

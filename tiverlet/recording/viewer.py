@@ -27,7 +27,7 @@ PATIENCE = 40.0  # [s] until a picture has to be there
 QUIET = {"CI": "true", "RUST_LOG": "error"}
 
 
-def _start(folder: str, *words: str, **options) -> subprocess.Popen:
+def launch(folder: str, *words: str, **options) -> subprocess.Popen:
     """rerun, on this machine only. `python -m rerun` is a wrapper, so it gets a group of its own, to end both.
 
     folder: for what it leaves behind.
@@ -36,7 +36,8 @@ def _start(folder: str, *words: str, **options) -> subprocess.Popen:
     return subprocess.Popen(command, env={**os.environ, **QUIET, "TMPDIR": folder}, start_new_session=True, **options)
 
 
-def _folder() -> tempfile.TemporaryDirectory:
+def scratch() -> tempfile.TemporaryDirectory:
+    """A folder for what a viewer leaves behind."""
     return tempfile.TemporaryDirectory(prefix="tiverlet-", ignore_cleanup_errors=True)
 
 
@@ -64,10 +65,11 @@ def _wait(process: subprocess.Popen) -> int:
     except KeyboardInterrupt:
         return 0
     finally:
-        _end(process)
+        stop(process)
 
 
-def _end(process: subprocess.Popen) -> None:
+def stop(process: subprocess.Popen) -> None:
+    """End a viewer that was launched, and what it started."""
     for number in (signal.SIGTERM, signal.SIGKILL):
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, number)
@@ -77,8 +79,8 @@ def _end(process: subprocess.Popen) -> None:
 
 def show(path: str) -> int:
     """Open the viewer's window, and wait until it is closed; returns its exit status."""
-    with _told_to_end(), _folder() as folder:
-        return _wait(_start(folder, "--port", str(_free_port()), path))
+    with _told_to_end(), scratch() as folder:
+        return _wait(launch(folder, "--port", str(free_port()), path))
 
 
 def serve(path: str, port: int) -> int:
@@ -87,15 +89,20 @@ def serve(path: str, port: int) -> int:
     rerun's page asks other hosts for news, fonts and examples. It comes through here, with a header by which the browser lets it
     talk to this machine only.
     """
-    data, page = _free_port(), _free_port()
-    with _told_to_end(), _folder() as folder, _Pages((LOCAL, port), page, data) as pages:
-        process = _start(folder, "--serve-web", "--port", str(data), "--web-viewer-port", str(page), path)
+    data, page = free_port(), free_port()
+    with _told_to_end(), scratch() as folder, Pages((LOCAL, port), page, data) as pages:
+        process = launch(folder, "--serve-web", "--port", str(data), "--web-viewer-port", str(page), path)
         threading.Thread(target=pages.serve_forever, daemon=True).start()
-        print(f"http://{LOCAL}:{port}/?url=rerun%2Bhttp%3A%2F%2F{LOCAL}%3A{data}%2Fproxy   (Ctrl-C ends it)", flush=True)
+        print(f"{url_of(port, data)}   (Ctrl-C ends it)", flush=True)
         return _wait(process)
 
 
-class _Pages(http.server.ThreadingHTTPServer):
+def url_of(page: int, data: int) -> str:
+    """The address of a page at one port that shows what comes from the other."""
+    return f"http://{LOCAL}:{page}/?url=rerun%2Bhttp%3A%2F%2F{LOCAL}%3A{data}%2Fproxy"
+
+
+class Pages(http.server.ThreadingHTTPServer):
     """Hands on the pages of rerun's server at port `page`; they may talk to it and to port `data`, and to nobody else."""
 
     daemon_threads = True
@@ -111,7 +118,7 @@ class _Pages(http.server.ThreadingHTTPServer):
 
 
 class _Page(http.server.BaseHTTPRequestHandler):
-    server: _Pages  # type: ignore[assignment]
+    server: Pages  # type: ignore[assignment]
 
     def do_GET(self) -> None:
         """One page."""
@@ -156,10 +163,10 @@ def picture(path: str, png: str, frames: list[int] | None = None, scene: bool = 
         raise ValueError(f"{len(frames)} frames need a name with %d in it, such as frame_%d.png.")
     if missing := [name for name in out if not os.path.isdir(os.path.dirname(name))]:
         raise ValueError(f"The folder of {missing[0]} does not exist.")
-    port = _free_port()
-    with _told_to_end(), tempfile.TemporaryFile() as said, _folder() as folder:
+    port = free_port()
+    with _told_to_end(), tempfile.TemporaryFile() as said, scratch() as folder:
         words = ("--headless", "--hide-welcome-screen", "--port", str(port), os.path.abspath(path))
-        process = _start(folder, *words, stdout=said, stderr=said)
+        process = launch(folder, *words, stdout=said, stderr=said)
         try:
             for frame, name in zip(frames, out, strict=True):
                 _settled(process, port, frame, name, str(SCENE_VIEW) if scene else None)
@@ -171,7 +178,7 @@ def picture(path: str, png: str, frames: list[int] | None = None, scene: bool = 
                 "enough (Debian, Ubuntu: apt-get install mesa-vulkan-drivers)."
             ) from None
         finally:
-            _end(process)
+            stop(process)
     return out
 
 
@@ -184,7 +191,7 @@ def _settled(process: subprocess.Popen, port: int, frame: int, name: str, view: 
     from rerun.experimental import ViewerClient
 
     viewer, last, end = None, None, time.monotonic() + PATIENCE
-    with _folder() as folder:
+    with scratch() as folder:
         shot = os.path.join(folder, "shot.png")
         while time.monotonic() < end and process.poll() is None:
             time.sleep(0.5)
@@ -210,7 +217,8 @@ def pixels_of(png: str) -> np.ndarray:
         return np.asarray(image.convert("RGB"))
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """A port of this machine that nobody has."""
     with socket.socket() as s:
         s.bind((LOCAL, 0))
         return s.getsockname()[1]
