@@ -57,6 +57,11 @@ class StepReport:
         new.__dict__.update(figures)
         return new
 
+    def _repr_html_(self) -> str:
+        from .recording.markup import of_report
+
+        return of_report(self)
+
     @property
     def clean(self) -> bool:
         """Whether nothing was flagged."""

@@ -504,6 +504,11 @@ class World:
             "write it to a file with tv.Recorder(path, world) and read it back with tv.replay(path).world()."
         )
 
+    def _repr_html_(self) -> str:
+        from .recording.markup import of_world
+
+        return of_world(self)
+
     def __repr__(self) -> str:
         names = ", ".join(map(repr, self._features))
         return f"World({self._particles!r}, [{names}], substeps={self.substeps}, iterations={self.iterations})"

@@ -146,6 +146,11 @@ class Feature(RecordsArguments):
     def __repr__(self) -> str:
         return type(self).__name__
 
+    def _repr_html_(self) -> str:
+        from ..recording.markup import of_feature
+
+        return of_feature(self)
+
 
 class Acceleration(Feature):
     """A force that acts on each particle by itself: gravity, drag, a field.

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from ..world import World
 
 NEAR = 0.35  # of the size of what moved: how far around it the view goes where there are walls
-FLOWN = 3.0  # times the size of the scene: what went further is not looked for
+FLOWN = 100.0  # times the size of the scene: what went further is not looked for
 
 
 class Picture:

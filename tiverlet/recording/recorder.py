@@ -17,7 +17,6 @@ from ..device import interrupts
 from ..step import checkpoint
 from ..step.explain import explain
 from ..world import World
-from . import watch
 from .journal import JOURNAL, Journal, brief, said
 from .overlays import Overlays, checked_color, checked_quantities
 from .picture import Picture, layout
@@ -104,12 +103,18 @@ class Recorder:
     def _open(self, overwrite: bool) -> None:
         world = self.world
         title = "live" if self.path == os.devnull else os.path.splitext(os.path.basename(self.path))[0]
-        viewer = watch.address(self._live) if self._live else None
+        viewer = None
+        if self._live:
+            from . import watch  # which imports a server
+
+            viewer = watch.address(self._live)
         opens = layout(world, self._overlays)
         self._sink = Sink(self.path, f"tiverlet_{world.particles.dim}d", opens, title, overwrite, viewer)
         self._closing = weakref.finalize(self, self._sink.close)  # also when the process ends
         self._stream = self._sink.stream
         if self._live == "notebook":
+            from . import watch
+
             watch.below_the_cell(self._stream)
             self._stream.send_blueprint(opens)
         try:

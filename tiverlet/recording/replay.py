@@ -90,6 +90,11 @@ class Replay:
             out += f". It is not complete ({plain(self._gap)}): {last}"
         return f"{out}."
 
+    def _repr_html_(self) -> str:
+        from .markup import of_replay
+
+        return of_replay(self)
+
     def __repr__(self) -> str:
         return f"Replay({self.path!r}, {len(self.frames)} frames{'' if self.complete else ', not complete'})"
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
+from rich.jupyter import JupyterMixin
 from rich.table import Table
 
 from .. import output
@@ -54,7 +55,7 @@ class Summary:
     failures: tuple[str, ...]
 
 
-class ErrorReport:
+class ErrorReport(JupyterMixin):
     """Points of error against run time. print() shows a table; see .markdown(), .json(), .plot(path), .record(path).
 
     every_column: whether print() shows all columns, which take 200 characters, and not those that fit 80.

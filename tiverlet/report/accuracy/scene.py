@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
+from rich.jupyter import JupyterMixin
 from rich.progress import Progress
 from rich.table import Table
 
@@ -59,7 +60,7 @@ class Setting:
         return ", ".join(words)
 
 
-class SceneReport:
+class SceneReport(JupyterMixin):
     """Settings of a scene, with error and cost. print() shows them; see .recommended, .paste, .json(), .markdown().
 
     settings: all that were tried. reference: what the reference is. reference_error [m]: how far it is itself from the truth, by

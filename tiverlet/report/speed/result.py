@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from rich.box import SIMPLE
 from rich.console import Console, ConsoleOptions, RenderResult
+from rich.jupyter import JupyterMixin
 from rich.table import Table
 from rich.text import Text
 
@@ -118,7 +119,7 @@ class Wait:
 
 
 @dataclass(frozen=True)
-class SpeedReport:
+class SpeedReport(JupyterMixin):
     """Speed, memory and starts. print() shows it; see .run(), .growth(), .scaling(), .json(), .markdown(), .plot().
 
     arch: of tv.init. copy: bytes per second that a copy of a large array moves (read and written), by threads; on a GPU, there.

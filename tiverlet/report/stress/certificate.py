@@ -9,6 +9,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, ConsoleOptions, RenderResult
+from rich.jupyter import JupyterMixin
 from rich.progress import Progress
 from rich.table import Table
 
@@ -35,7 +36,7 @@ class Result:
     seconds: float
 
 
-class Certificate:
+class Certificate(JupyterMixin):
     """Results of rows. print() shows a table; passed says whether none has failed. See .markdown(), .json()."""
 
     def __init__(self, results: Sequence[Result]):

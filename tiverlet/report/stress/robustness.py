@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
+from rich.jupyter import JupyterMixin
 from rich.table import Table
 
 from ... import checks
@@ -41,7 +42,7 @@ class Outcome:
     particle: int | None = None
 
 
-class Endurance:
+class Endurance(JupyterMixin):
     """What a scene stands and what breaks it. print() shows a table; see .breaks, .json()."""
 
     def __init__(self, outcomes: list[Outcome]):

@@ -1,0 +1,191 @@
+"""What a Recorder draws on request, what of one's own it takes along, and how it frames a run; and what notebooks show."""
+
+import re
+import subprocess
+import urllib.request
+import xml.etree.ElementTree as ET
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+from tests.test_recorder import read
+from tiverlet.recording import messages, overlays, viewer, watch
+from tiverlet.recording.layout import SCENE_VIEW
+from tiverlet.recording.picture import FLOWN, NEAR, framed
+
+
+def stack(n=4):
+    """Discs of 1 kg and 10 cm one on the other, touching."""
+    x = np.stack([np.zeros(n), 0.1 + 0.2 * np.arange(n)], axis=1)
+    features = [tv.Gravity(9.81), tv.Contact(), tv.Box((-0.1, 0.0), (0.1, 2.0))]
+    return tv.World(tv.Particles(x, mass=1.0, radius=0.1), features, substeps=20)
+
+
+def column(path, entity, name):
+    """The values of a component in all rows of an entity, in the order of frames."""
+    found = read(path, f"/{entity}", name)
+    return [found[k] for k in sorted(found, key=lambda k: -1 if k is None else k) if found[k] is not None]
+
+
+def test_lines_are_as_wide_as_the_loads_they_show(tmp_path):
+    # At rest the k-th contact from the top bears k m g, and lines are as wide as the loads.
+    path = tmp_path / "a.rrd"
+    world = stack()
+    with tv.Recorder(path, world, forces=True, velocities=True) as recorder:
+        world.run(4.0, recorder=recorder)
+    assert tv.replay(path).verify()
+    widths = np.sort(column(path, "world/scene/contacts", "LineStrips2D:radii")[-1])
+    np.testing.assert_allclose(widths / widths[0], [1, 2, 3], rtol=5e-3)
+    strips = np.array(column(path, "world/scene/contacts", "LineStrips2D:strips")[-1])
+    assert strips.shape == (3, 3, 2) and np.abs(strips[:, 2, 1] - strips[:, 0, 1]).max() == pytest.approx(0.2, rel=1e-2)
+    ways = np.array(column(path, "world/scene/velocities", "Arrows2D:vectors"))
+    assert ways.shape == (241, 4, 2) and np.abs(ways[-1]).max() < 1e-4
+
+
+def test_arrows_show_the_way_of_a_twentieth_of_a_second(tmp_path):
+    world = tv.World(tv.Particles([[0.0, 0, 0]], velocity=(1, 2, 3)), [], substeps=1)
+    with tv.Recorder(tmp_path / "a.rrd", world, velocities=True) as recorder:
+        world.run(0.1, recorder=recorder)
+    np.testing.assert_allclose(column(tmp_path / "a.rrd", "world/scene/velocities", "Arrows3D:vectors")[-1], [[0.05, 0.1, 0.15]])
+
+
+def test_quantities_of_ones_own_are_kept_and_shown(tmp_path):
+    path, world = tmp_path / "a.rrd", stack()
+    with tv.Recorder(path, world, every=2, color=("height", 0.0, 0.8)) as recorder:
+        for k in range(1, 7):
+            world.step(1 / 60)
+            recorder.log(top=k, height=world.position[:, 1])
+    recording = tv.replay(path)
+    assert recording.verify()
+    frames, top = recording.curves["top"]
+    assert frames.tolist() == [2, 4, 6] and top.tolist() == [2, 4, 6]
+    frames, height = recording.quantities["height"]
+    np.testing.assert_allclose(height, [recording.position(k)[:, 1] for k in frames], rtol=1e-6)
+    packed = np.array(column(path, "world/scene/particles", "Points2D:colors")[-1], dtype=np.uint32)
+    drawn = np.stack([packed >> 24, packed >> 16 & 255, packed >> 8 & 255], axis=1)
+    assert (drawn == overlays.ramp(height[-1], 0.0, 0.8)).all()
+
+
+def test_the_scale_of_colours_goes_from_end_to_end():
+    assert overlays.ramp(np.array([-1.0, 0, 1, 2, np.nan]), 0, 1).tolist() == [
+        [68, 1, 84], [68, 1, 84], [253, 231, 37], [253, 231, 37], [128, 128, 128]
+    ]  # fmt: skip
+    np.testing.assert_allclose(
+        overlays.ramp(np.array([0.625]), 0, 1), [[64, 173, 119]], atol=1
+    )  # between the third and the fourth
+
+
+@pytest.mark.parametrize(
+    "call, kind, text",
+    [
+        (lambda w, p: tv.Recorder(p, w, color="height"), TypeError, "a name and the numbers of both ends"),
+        (lambda w, p: tv.Recorder(p, w, color=("height", 1, 1)), ValueError, "1 is not less than 1"),
+        (lambda w, p: tv.Recorder(p, w, forces="yes"), TypeError, "forces = 'yes'"),
+        (lambda w, p: tv.Recorder(p, w).log(energy=1.0), ValueError, "energy is the name of a curve"),
+        (lambda w, p: tv.Recorder(p, w).log(heat=[1.0, 2.0]), ValueError, r"heat has the shape \(2,\)"),
+        (lambda w, p: tv.Recorder(p, w).log(heat="hot"), ValueError, "heat has the shape"),
+        (lambda w, p: tv.Recorder(None, w), ValueError, "path = None is for live recordings"),
+        (lambda w, p: tv.Recorder(p, w, live="window"), ValueError, "live = 'window'"),
+        (lambda w, p: tv.Recorder(p, w, live="notebook"), ValueError, "shows without a file"),
+    ],
+)
+def test_wrong_requests_are_refused(tmp_path, call, kind, text):
+    with pytest.raises(kind, match=text):
+        call(stack(), tmp_path / "a.rrd")
+
+
+def test_strain_can_be_left_out(tmp_path):
+    # A soft link under a load that draws it to twice its length: red on the scale of strain, or neutral without one.
+    shades = []
+    for strain in (True, False):
+        soft = tv.Distance([[0, 1]], 1.0, compliance=1.0)
+        world = tv.World(tv.Particles([[0.0, 0], [2, 0]], pinned=[0]), [soft], substeps=1)
+        with tv.Recorder(tmp_path / f"{strain}.rrd", world, strain=strain) as recorder:
+            world.run(1 / 60, recorder=recorder)
+        assert tv.replay(tmp_path / f"{strain}.rrd").verify()
+        (packed,) = column(tmp_path / f"{strain}.rrd", "world/scene/particles", "LineStrips2D:colors")[-1]
+        shades.append([packed >> 24, packed >> 16 & 255, packed >> 8 & 255])
+        assert bool(column(tmp_path / f"{strain}.rrd", "legend/strain/scale", "LineStrips2D:strips")) == strain
+    assert shades == [[255, 92, 48], [170, 172, 182]]
+
+
+def test_a_view_frames_the_whole_run(tmp_path):
+    # A ball is thrown; nothing but its way says what is to be seen.
+    world = tv.World(tv.Particles([[0.0, 0.0]], velocity=(3.0, 4.0), radius=0.1), [tv.Gravity(9.81)], precision="f64")
+    with tv.Recorder(tmp_path / "a.rrd", world) as recorder:
+        world.run(1.0, recorder=recorder)
+    assert tv.replay(tmp_path / "a.rrd").verify()
+    chunks = [messages.Chunk(m).rows() for kind, m in messages.split((tmp_path / "a.rrd").read_bytes()) if kind == messages.CHUNK]
+    name = f"/view/{SCENE_VIEW}/VisualBounds2D".encode()
+    (bounds,) = (rows for rows in chunks if rows.schema.metadata[b"rerun:entity_path"] == name)
+    ((value,),) = bounds.column("VisualBounds2D:range").to_pylist()
+    x, y = value["x_range"], value["y_range"]
+    edge = 0.05 * 3.2  # of the longer side: 3 m and two radii
+    np.testing.assert_allclose(x, [-0.1 - edge, 3.1 + edge], rtol=1e-6)
+    np.testing.assert_allclose(y, [-(4.0**2 / 2 / 9.81) - 0.1 - edge, 9.81 / 2 - 4.0 + 0.1 + edge], atol=2e-3)
+
+
+def test_what_is_near_is_framed_and_what_flew_off_is_not():
+    extent = np.array([-10.0, 0.0]), np.array([10.0, 1.0])
+    low, high = framed(extent, np.array([0.0, 0.0]), np.array([2.0, 0.5]))
+    np.testing.assert_allclose([low, high], [[-2 * NEAR, 0], [2 + 2 * NEAR, 0.5 + min(0.5, 2 * NEAR)]])
+    low, high = framed(extent, np.array([0.0, 0.0]), np.array([1e9, 0.5]))
+    assert high[0] == 10 + FLOWN * 20
+    assert framed(extent, np.array([np.inf, 0]), np.array([-np.inf, 0])) is extent
+
+
+def test_a_recording_is_served_while_it_is_made(tmp_path, monkeypatch, capsys):
+    opened = []
+    monkeypatch.setattr(watch.webbrowser, "open", opened.append)
+    world = stack()
+    with tv.Recorder(tmp_path / "a.rrd", world, live="web") as recorder:
+        world.run(0.2, recorder=recorder)
+        recorder.flush()
+        (url,) = opened
+        assert url in capsys.readouterr().out and url.startswith("http://127.0.0.1:")
+        assert b"rerun" in urllib.request.urlopen(url, timeout=20).read().lower()
+    assert tv.replay(tmp_path / "a.rrd").verify()
+
+
+def test_a_viewer_that_is_closed_ends_no_recording(tmp_path):
+    port, world = viewer.free_port(), stack()
+    with viewer.scratch() as folder:
+        words = ("--serve-web", "--port", str(port), "--web-viewer-port", str(viewer.free_port()))
+        process = viewer.launch(folder, *words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        watch._await(process, port)
+        with tv.Recorder(tmp_path / "a.rrd", world, live=f"rerun+http://127.0.0.1:{port}/proxy") as recorder:
+            world.run(0.1, recorder=recorder)
+            recorder.flush()
+            viewer.stop(process)
+            world.run(0.1, recorder=recorder)
+            recorder.flush()
+            world.run(0.1, recorder=recorder)
+    recording = tv.replay(tmp_path / "a.rrd")
+    assert recording.verify() and recording.frames[-1] == 18
+
+
+def test_where_no_viewer_starts_it_says_what_to_do(monkeypatch):
+    monkeypatch.setattr(viewer, "launch", lambda *words, **options: subprocess.Popen(["false"], start_new_session=True))
+    with pytest.raises(RuntimeError, match='without them use live="web"'):
+        watch.address(True)
+
+
+def test_notebooks_show_worlds_reports_features_and_recordings(tmp_path):
+    world = stack()
+    with tv.Recorder(tmp_path / "a.rrd", world) as recorder:
+        report = world.run(0.1, recorder=recorder)
+    html = world._repr_html_()
+    image = ET.fromstring(re.search(r"<svg.*</svg>", html, re.S)[0])  # type: ignore[index]
+    circles = [e for e in image if e.tag.endswith("circle")]
+    x, y = (np.array([float(c.get(k)) for c in circles]) for k in ("cx", "cy"))
+    scale = (280 - 0) / 2.0  # the box is 2 m high
+    np.testing.assert_allclose(x, 2 + 0.1 * scale, atol=0.1)
+    np.testing.assert_allclose(y, 2 + (2.0 - world.position[:, 1]) * scale, atol=0.1)
+    assert "explain()" in html and "neighbour list" in html
+    assert "residual" in report._repr_html_() and "(-0.1, 0.0)" in world.features[2]._repr_html_()
+    assert "7" in tv.replay(tmp_path / "a.rrd")._repr_html_()
+    world.close()
+    assert world._repr_html_() == f"<code>{world!r}</code>"
+    solid = tv.World(tv.Particles([[0.0, 0, 0], [1, 0, 0]], radius=0.1), [tv.HalfSpace((0, 1, 0)), tv.Gravity()])
+    assert solid._repr_html_().count("<circle") == 2
