@@ -11,7 +11,7 @@ import pytest
 import tiverlet as tv
 from tests.test_recorder import read
 from tiverlet.recording import messages, overlays, viewer, watch
-from tiverlet.recording.layout import SCENE_VIEW
+from tiverlet.recording.layout import SCENE_VIEW, unit
 from tiverlet.recording.picture import FLOWN, NEAR, framed
 
 
@@ -133,6 +133,18 @@ def test_what_is_near_is_framed_and_what_flew_off_is_not():
     low, high = framed(extent, np.array([0.0, 0.0]), np.array([1e9, 0.5]))
     assert high[0] == 10 + FLOWN * 20
     assert framed(extent, np.array([np.inf, 0]), np.array([-np.inf, 0])) is extent
+
+
+@pytest.mark.parametrize("size, times", [(1.0, 1), (2e-2, 1), (3e-6, 1e6), (5e6, 1e-6)])
+def test_small_and_large_scenes_are_shown_at_another_size(tmp_path, size, times):
+    assert unit(np.zeros(2), np.array([size, size / 2])) == pytest.approx(times)
+    world = tv.World(tv.Particles([[0.0, 0, 0], [size, 0, 0]]), [])
+    with tv.Recorder(tmp_path / "a.rrd", world) as recorder:
+        world.run(1 / 60, recorder=recorder)
+    assert tv.replay(tmp_path / "a.rrd").verify()
+    scales = column(tmp_path / "a.rrd", "world/scene", "Transform3D:scale")
+    assert scales == ([] if times == 1 else [[pytest.approx([times] * 3)]])
+    np.testing.assert_array_equal(tv.replay(tmp_path / "a.rrd").position(1)[1], np.float32([size, 0, 0]))
 
 
 def test_a_recording_is_served_while_it_is_made(tmp_path, monkeypatch, capsys):

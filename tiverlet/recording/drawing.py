@@ -26,6 +26,7 @@ POINT = -2.5  # a particle without radius is drawn as a dot of so many pixels (n
 MANY = 5000  # links that are drawn as lines; of more, an even selection
 WALL = np.array([[92, 97, 112]], dtype=np.uint8)  # of surfaces of walls
 OPEN = (60, 63, 70)  # of a wall that is switched off
+HELD, PINS = (225, 228, 235), 200  # the marks of particles that are held, and up to how many are marked
 LABEL = (140, 144, 155)  # can be read on black and on white
 ABOVE = 40.0  # the order in which a plane is drawn: after particles (30)
 FEW = 1500  # particles up to which contacts are drawn; finding them would take too much of the frame beyond
@@ -80,6 +81,10 @@ class Drawing:
         what += [self._rr.Mesh3D.from_fields(triangle_indices=self._surface.triangles.astype(np.uint32))] if self._surface else []
         what += [self._strips.from_fields(radii=[-1.2])] if self._lines else []
         self.static(f"{self._root}/{PARTICLES}", *what)
+        held = np.flatnonzero(p.inv_mass == 0)
+        if 0 < len(held) <= PINS:
+            at = world.position[held].astype(np.float32)
+            self.static(f"{self._root}/held", self._points.from_fields(positions=at, radii=[-3.5], colors=[HELD], **self._above))
         scale = self._overlays.scale(bool(len(self._pairs)))
         if scale:
             hues, labels = scale

@@ -11,9 +11,20 @@ SCENE = "world/scene"  # the view looks at "world", so that a mirror at "world/s
 LEGEND = "legend/strain"
 WIDE = 5.0  # steps of the legend are so far apart, with a height of 1
 
-# The viewer's 2D views have y pointing down, with no option. A mirror above the data, and below the
-# origin of the view, turns it up without touching the data.
-MIRROR = rr.Transform3D(scale=[1.0, -1.0, 1.0])
+SEEN = 1e-2, 1e4  # sizes of scenes [m] that the viewer shows as they are
+
+
+def unit(low: np.ndarray, high: np.ndarray) -> float:
+    """How many times its size a scene between two corners [m] is shown, a power of ten: 1, unless the viewer would show nothing
+    of it, because it is so small or large."""
+    size = min(float((high - low).max()), 1e30)
+    return 1.0 if size < 1e-30 or SEEN[0] <= size <= SEEN[1] else 10.0 ** -np.floor(np.log10(size))
+
+
+def transform(dim: int, unit: float) -> rr.Transform3D:
+    """What stands above the data, and below the origin of the view. The viewer's 2D views have y pointing down, with no option:
+    a mirror turns it up without touching the data."""
+    return rr.Transform3D(scale=[unit, -unit if dim == 2 else unit, unit])
 
 
 def upright(up: np.ndarray) -> rr.components.ViewCoordinates:

@@ -28,13 +28,15 @@ class Picture:
 
         from .curves import Curves
         from .drawing import Drawing, bounds, upwards
-        from .layout import MIRROR, SCENE, upright
+        from .layout import SCENE, transform, unit, upright
 
         self.world, self._stream, self._explained, self._environment = world, stream, explained, environment
         self._overlays = overlays
         self.drawing = Drawing(world, stream, bounds(world), overlays)
         self._low, self._high = np.full((2, world.particles.dim), [[np.inf], [-np.inf]])  # of all that was drawn
-        self.drawing.static(SCENE, MIRROR if world.particles.dim == 2 else upright(upwards(world)))
+        self._unit, dim = unit(*self.drawing.extent), world.particles.dim
+        about = [transform(dim, self._unit)] if dim == 2 or self._unit != 1 else []
+        self.drawing.static(SCENE, *about, *([upright(upwards(world))] if dim == 3 else []))
         self.curves = Curves(world, stream)
         self._about(None, 0, "")
         self._seen: set[str] = set()  # flags
@@ -90,7 +92,7 @@ class Picture:
     def layout(self) -> Any:
         """How the recording opens, once all of it is known: the view frames the whole run."""
         extent = framed(self.drawing.extent, self._low, self._high)
-        return layout(self.world, self._overlays, extent, self.curves.own)
+        return layout(self.world, self._overlays, (extent, self._unit), self.curves.own)
 
     def end(self, worst: StepReport | None, frames: int, note: str) -> None:
         """The page about all frames."""
@@ -98,18 +100,18 @@ class Picture:
 
 
 def layout(
-    world: "World", overlays: Overlays, extent: tuple[np.ndarray, np.ndarray] | None = None, own: Iterable[str] = ()
+    world: "World", overlays: Overlays, seen: tuple[tuple[np.ndarray, np.ndarray], float] | None = None, own: Iterable[str] = ()
 ) -> Any:
-    """How it opens in the viewer. extent: the corners of what is to be seen [m], None for what is known beforehand. own:
-    quantities of the user's that have curves.
+    """How it opens in the viewer. seen: the corners of what is to be seen [m], and how many times its size; None for what is
+    known beforehand. own: quantities of the user's that have curves.
     """
     from .curves import OWN, shown
     from .drawing import bounds, links, upwards
-    from .layout import blueprint
+    from .layout import blueprint, unit
 
-    low, high = extent or bounds(world)
+    (low, high), scale = seen or (bounds(world), unit(*bounds(world)))
     figures = {name: (f"{OWN}/{name}", [True]) for name in own} | shown(world)
-    return blueprint(low, high, overlays.title(bool(links(world))), figures, upwards(world))
+    return blueprint(scale * low, scale * high, overlays.title(bool(links(world))), figures, upwards(world))
 
 
 def framed(extent: tuple[np.ndarray, np.ndarray], low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -69,13 +69,13 @@ class Autopsy:
 
         if not self.found:
             raise RuntimeError("Autopsy: nothing went wrong, so there is nothing to record.")
-        from ...recording.layout import MIRROR
+        from ...recording.layout import transform
 
         flat = self.positions.shape[2] == 2
         points, strips = (rr.Points2D, rr.LineStrips2D) if flat else (rr.Points3D, rr.LineStrips3D)
         stream: Any = rr.RecordingStream("tiverlet_autopsy")
         stream.save(os.fspath(path))
-        stream.log("world/scene", MIRROR if flat else rr.ViewCoordinates.RIGHT_HAND_Y_UP, static=True)
+        stream.log("world/scene", transform(2, 1.0) if flat else rr.ViewCoordinates.RIGHT_HAND_Y_UP, static=True)
         stream.log("about", rr.TextDocument(str(self)), static=True)
         for k, (t, x) in enumerate(zip(self.times, self.positions, strict=True)):
             stream.set_time("substep", sequence=k)
