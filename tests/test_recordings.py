@@ -397,7 +397,7 @@ if __name__ == "__main__":
 
 def test_names_and_frames_of_pictures(falling, tmp_path, monkeypatch):
     taken = []
-    monkeypatch.setattr(viewer, "_start", lambda *words, **options: subprocess.Popen(["true"], start_new_session=True))
+    monkeypatch.setattr(viewer, "launch", lambda *words, **options: subprocess.Popen(["true"], start_new_session=True))
     monkeypatch.setattr(viewer, "_settled", lambda process, port, frame, name, view: taken.append((frame, name)))
     assert viewer.picture(str(falling), str(tmp_path / "100%.png")) == [str(tmp_path / "100%.png")] and taken[0][0] == 20
     viewer.picture(str(falling), str(tmp_path / "50%_%03d.png"), [0, 4])
@@ -415,7 +415,7 @@ def test_a_picture_that_is_told_to_end_ends_its_viewer(falling, tmp_path, monkey
         started.append(subprocess.Popen(["sleep", "60"], start_new_session=True))
         return started[0]
 
-    monkeypatch.setattr(viewer, "_start", start)
+    monkeypatch.setattr(viewer, "launch", start)
     monkeypatch.setattr(viewer, "_settled", lambda *words: os.kill(os.getpid(), signal.SIGTERM))
     before = signal.getsignal(signal.SIGTERM)
     with pytest.raises(SystemExit) as end:
