@@ -2,8 +2,8 @@
 
     python demos/jelly.py [jelly.rrd]
 
-What to look for: it bulges where the lid does not hold it, since its volume stays; when the lid opens it jumps back to its height,
-trembles and comes to rest.
+What to look for: it bulges where the lid does not hold it, since its volume stays; when the lid opens it jumps, trembles and
+comes to rest at its old height.
 """
 
 import sys
@@ -54,7 +54,7 @@ def main(path: str = "jelly.rrd", *, seconds: float = 4.0) -> None:
             lost, wide = max(lost, float(abs(volumes.sum() / rest - 1))), max(wide, float(np.ptp(x[:, 0])))
             high.append(float(x[top, 1].mean()) / SIDE)
     print(
-        f"{path}: squeezed to {min(high):.2f} of its height it is {wide / SIDE:.2f} times as wide and lost {lost:.1%} of its volume;"
+        f"{path}: squeezed to {min(high):.2f} of its height it is {wide / SIDE:.2f} times as wide and lost {lost:.1%} of volume;"
     )
     print(f"let go it jumps to {max(high):.2f} and ends at {high[-1]:.2f}, flags: {', '.join(sorted(flags)) or 'none'}")
     if lost > 0.03 or not 0.95 < high[-1] < 1.05 or min(high) > 0.6:
