@@ -12,15 +12,20 @@ from rich.table import Table
 import tiverlet as tv
 
 
-def cradle(substeps: tuple[int, int], restitution: float) -> list[float]:
-    """Speed of the last of five touching balls after the first was swung into the row, by the number of substeps."""
+def build(restitution: float = 1.0) -> tv.World:
+    """Five touching balls on threads, the first of them pulled aside."""
     hang = tv.shapes.join(*(tv.shapes.rope((0.1 * k, 1.0), (0.1 * k, 0.0), points=2) for k in range(5)))[0]
     position = hang.position.copy()
-    position[1] = [-np.sin(0.5), 1 - np.cos(0.5)]  # the first ball is pulled aside
+    position[1] = [-np.sin(0.5), 1 - np.cos(0.5)]
     radius = np.where(np.arange(10) % 2, 0.05, 0.0)
     features = [tv.Gravity(9.81), tv.Distance(hang.links), tv.Contact(restitution=restitution)]
+    return tv.World(tv.Particles(position, radius=radius, pinned=np.arange(0, 10, 2)), features)
+
+
+def cradle(substeps: tuple[int, int], restitution: float) -> list[float]:
+    """Speed of the last ball after the first was swung into the row, by the number of substeps."""
     speeds = []
-    with tv.World(tv.Particles(position, radius=radius, pinned=np.arange(0, 10, 2)), features) as world:
+    with build(restitution) as world:
         for n in substeps:
             again(world, n)
             speeds.append(0.0)

@@ -1,4 +1,4 @@
-"""A cube of jelly is squeezed to half its height and let go.
+"""A cube of jelly is squeezed to about half of its height and let go.
 
     python demos/jelly.py [jelly.rrd]
 

@@ -2,8 +2,8 @@
 
     python demos/stairs.py [stairs.rrd]
 
-What to look for: rows fall like dominoes, heaps form and slide; no limb goes further than a joint does, and nobody ends up in the
-stairs.
+What to look for: rows fall forward, slide over each other and heap up at the foot; no limb goes much further than a joint does,
+and nobody ends up in the stairs.
 """
 
 import sys

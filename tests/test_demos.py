@@ -67,4 +67,4 @@ def test_a_demo_that_fails_gives_no_picture(tmp_path, monkeypatch):
     spec.loader.exec_module(pictures)
     monkeypatch.setattr(pictures.run, "execute", lambda path, arguments: 1)
     with pytest.raises(SystemExit, match="cloth.py ended with 1"):
-        pictures.scene(str(tmp_path), "cloth", 1, 0.0, 1.0)
+        pictures.scene(str(tmp_path), "cloth", 1, pictures.ALL)
