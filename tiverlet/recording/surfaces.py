@@ -64,7 +64,8 @@ def triangles(world: "World") -> np.ndarray:
             found += [np.stack([a, b, c], axis=1), np.stack([b, a, d], axis=1)]
         elif isinstance(f, Batch) and f.arity == 2 and f.count and not f.breaks:
             links.append(f.indices)
-    done = np.unique(np.concatenate(found))
+    within = [f.indices.ravel() for f in world.features if isinstance(f, Volume)]  # also what is below the skin
+    done = np.unique(np.concatenate([*found, *within], axis=None))
     pairs = np.concatenate(links)
     pairs = pairs[~np.isin(pairs, done).all(axis=1)]
     if 0 < len(pairs) <= MOST:
