@@ -21,6 +21,7 @@ from .surfaces import Surface, bodies, covered, triangles
 
 if TYPE_CHECKING:
     from ..world import World
+    from .scene import Parts
 
 POINT = -2.5  # a particle without radius is drawn as a dot of so many pixels (negative: screen units)
 MANY = 5000  # links that are drawn as lines; of more, an even selection
@@ -256,7 +257,7 @@ class Drawing:
         self.bytes += len(text)
 
 
-def upwards(world: "World") -> np.ndarray:
+def upwards(world: "World | Parts") -> np.ndarray:
     """Against gravity, (dim,); along y without."""
     dim = world.particles.dim
     up = np.zeros(dim)
@@ -268,7 +269,7 @@ def upwards(world: "World") -> np.ndarray:
     return up / size if size else np.eye(dim)[1]
 
 
-def colors(world: "World") -> np.ndarray:
+def colors(world: "World | Parts") -> np.ndarray:
     """Hues, (n, 3): one for each body and for each loose particle; grey for what cannot move."""
     body = bodies(world)
     hues = golden_colors(len(body))[body]
@@ -276,7 +277,7 @@ def colors(world: "World") -> np.ndarray:
     return hues
 
 
-def links(world: "World") -> list[tuple[int, Batch]]:
+def links(world: "World | Parts") -> list[tuple[int, Batch]]:
     """The features that are drawn as lines between two particles, with their numbers."""
     return [(k, f) for k, f in enumerate(world.features) if isinstance(f, Batch) and f.arity == 2 and f.count]
 

@@ -2,7 +2,6 @@
 
 import functools
 import os
-import re
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -12,8 +11,9 @@ import numpy as np
 
 from .. import checks
 from ..device.language import NAMES
+from ..shapes import Shape
 from ..step import checkpoint
-from . import journal, rrd, scene
+from . import exports, journal, rrd, scene
 from .curves import CURVES, OWN
 from .journal import Entry
 from .redraw import Redraw, compare
@@ -299,40 +299,37 @@ class Replay:
             for k, values in entry.data["features"].items()
         ]
 
-    def export(self, path: str) -> None:
-        """Write positions, times, masses, radii and curves to an .npz file, positions to a .csv table, or to extended .xyz, which
-        OVITO and ASE read, with the radii where the particles are the same in all frames."""
-        x = [self.position(int(k)) for k in self.frames]
-        kind, p = os.path.splitext(path)[1], self._entries[0].arrays
-        if kind == ".npz":
-            if sum(e.kind == "scene" for e in self._entries) > 1:
-                raise ValueError("replay: the particles are not the same in all frames, so they are no array; export to .csv.")
-            more: dict[str, Any] = {name: p[name] for name in ("mass", "radius")}
-            for name, (frames, values) in self.curves.items():
-                if not re.fullmatch(r"\w+(/\w+)*", name):  # they become names of files in the archive
-                    raise ValueError(f"replay: {self.path} has a curve with the name {plain(name)!r}; see .verify().")
-                more |= {f"{name} frame": frames, f"{name} value": values}
-            np.savez_compressed(path, position=np.array(x), frame=self.frames, time=self.times, **more)
-        elif kind == ".csv":
-            dim = p["position"].shape[1]
-            with open(path, "w") as out:
-                out.write(f"frame,time,particle,{','.join('xyz'[:dim])}\n")
-                for frame, time, rows in zip(self.frames.tolist(), self.times.tolist(), x, strict=True):
-                    for i, row in enumerate(rows.tolist()):
-                        out.write(f"{frame},{time!r},{i},{','.join(f'{v:.9g}' for v in row)}\n")
-        elif kind == ".xyz":
-            same = sum(e.kind == "scene" for e in self._entries) == 1
-            columns = "species:S:1:pos:R:3" + (":radius:R:1" if same else "")
-            with open(path, "w") as out:
-                for frame, time, rows in zip(self.frames.tolist(), self.times.tolist(), x, strict=True):
-                    out.write(f'{len(rows)}\nProperties={columns} Time={time!r} Frame={frame} pbc="F F F"\n')
-                    flat = np.zeros((len(rows), 3 + same))  # a plane is at z = 0
-                    flat[:, : rows.shape[1]] = rows
-                    if same:
-                        flat[:, 3] = p["radius"]
-                    out.writelines(f"X {' '.join(f'{v:.9g}' for v in row)}\n" for row in flat.tolist())
-        else:
-            raise ValueError(f"replay: {path} ends in {kind!r}, but .npz, .csv or .xyz can be written.")
+    @property
+    def scenes(self) -> list[tuple[Entry, np.ndarray]]:
+        """The entry of each scene, and the frames that show it: another one begins where particles or features came or went."""
+        out: list[tuple[Entry, list[int]]] = []
+        for e in self._entries:
+            if e.kind == "scene":
+                out.append((e, []))
+            elif e.kind == "frame" and e.frame in self._frames:
+                out[-1][1].append(e.frame)
+        return [(entry, np.array(frames, dtype=np.int64)) for entry, frames in out]
+
+    @_clear
+    def export(self, path: str | os.PathLike, shape: Shape | None = None) -> list[str]:
+        """Write the recording for other programs, as the ending of `path` says; returns the names of the files.
+
+            .npz          positions [m], times [s], masses [kg], radii [m] and curves, for numpy
+            .csv          positions, a row for each particle in each frame
+            .xyz          extended XYZ for OVITO and ASE: positions, and radii where particles neither come nor go
+            .glb, .gltf   an animated mesh, y up, for Blender and browsers
+            .obj          a file for each frame, named a_0000.obj, a_0001.obj ..., or as a %d in the name says
+            .pvd          the same for ParaView, a_0000.vtu ..., with radii, masses, links and faces
+
+        Faces are those of the picture. shape: what the particles were made of, of which .glb, .gltf, .obj and .pvd take the faces
+        instead: with their quads and texture coordinates, where the shape came from a file that has them. Features with functions
+        of the user's are not asked for faces and links.
+
+        Raises ValueError for another ending, for particles that come and go where a format cannot hold it, and for a shape of
+        other particles; FileNotFoundError where the folder is missing; ImportError for .glb and .gltf without
+        tiverlet[export].
+        """
+        return exports.export(self, os.fspath(path), shape)
 
 
 def replay(path, given: Iterable[Any] | Mapping[str, Any] = ()) -> Replay:

@@ -5,6 +5,7 @@ import platform
 import textwrap
 import warnings
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ from .. import colliders, constraints, contact, forces, solvers
 from ..device import runtime
 from ..device.language import is_kernel_function, undecorated
 from ..features.arguments import RecordsArguments, knobs_of
-from ..features.feature import Feature
+from ..features.feature import Batch, Feature
 from ..particles import Particles
 from ..solvers.solver import Solver
 
@@ -174,6 +175,61 @@ def environment() -> dict[str, Any]:
     }  # fmt: skip
 
 
+def _made(thing: dict[str, Any], base: type, arrays: Mapping[str, np.ndarray], given: Mapping[str, Any]) -> Any:
+    """A feature or solver of its arguments."""
+    name = thing["class"]
+    own = isinstance(name, dict)
+    kind = given[name["given"]] if own else PUBLIC.get(name)
+    if not (isinstance(kind, type) and issubclass(kind, base)):
+        raise ValueError(f"replay: the scene has {name!r}, which is no {base.__name__.lower()} of this version of tiverlet.")
+    arguments = {}
+    for argument, value in thing["arguments"].items():
+        if isinstance(value, dict) and "given" in value:
+            if not (own or argument in TAKES.get(name, ())):
+                raise ValueError(f"replay: {kind.__name__} takes no function for {argument!r}.")
+            arguments[argument] = given[value["given"]]
+            if not (is_kernel_function(arguments[argument]) or inspect.isfunction(arguments[argument])):
+                raise TypeError(f"replay: given {value['given']} is {arguments[argument]!r}, but the scene has a function there.")
+        else:
+            arguments[argument] = decode(value, arrays)
+    if base is Solver and any(isinstance(v, int) and v > MOST for v in arguments.values()):
+        raise ValueError(f"replay: the scene has {kind.__name__}({arguments}), of more than {MOST} steps.")
+    try:
+        return kind(**arguments)
+    except TypeError as e:
+        raise ValueError(f"replay: the scene has a {kind.__name__} that this version of tiverlet cannot make: {e}") from e
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Particles and features without a world."""
+
+    particles: Particles
+    features: tuple[Feature, ...]
+
+
+def parts(scene: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> Parts:
+    """What a scene is made of, for who only looks at it. Nothing is put on a device; features with functions or classes of the
+    user's are left out.
+    """
+    particles, features = _particles(scene, arrays), []
+    for data in scene["features"]:
+        if any(isinstance(value, dict) and "given" in value for value in (data["class"], *data["arguments"].values())):
+            continue
+        feature = _made(data, Feature, arrays, {})
+        turn(feature, {name: decode(value, arrays) for name, value in data["knobs"].items()})
+        if isinstance(feature, Batch):  # it turns its tetrahedra and surfaces so that volumes are positive
+            came = Particles(decode(data["start"], arrays)) if "start" in data else particles
+            feature.prepare(came, came.inv_mass.copy())
+        features.append(feature)
+    return Parts(particles, tuple(features))
+
+
+def _particles(scene: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> Particles:
+    p = {name: decode(value, arrays) for name, value in scene["particles"].items()}
+    return Particles(p.pop("position"), **p)
+
+
 def rebuild(scene: dict[str, Any], arrays: Mapping[str, np.ndarray], given: Mapping[str, Any], turned: list[Turned]) -> "World":
     """A world of the scene, with what was turned since."""
     from ..world import World
@@ -189,43 +245,17 @@ def rebuild(scene: dict[str, Any], arrays: Mapping[str, np.ndarray], given: Mapp
         if text and source(given[name]) not in ("", text):
             warnings.warn(f"replay: {name} reads otherwise than when it was recorded; the bits may differ.", stacklevel=4)
 
-    def make(thing: dict[str, Any], base: type) -> Any:
-        name = thing["class"]
-        own = isinstance(name, dict)
-        kind = given[name["given"]] if own else PUBLIC.get(name)
-        if not (isinstance(kind, type) and issubclass(kind, base)):
-            raise ValueError(f"replay: the scene has {name!r}, which is no {base.__name__.lower()} of this version of tiverlet.")
-        arguments = {}
-        for argument, value in thing["arguments"].items():
-            if isinstance(value, dict) and "given" in value:
-                if not (own or argument in TAKES.get(name, ())):
-                    raise ValueError(f"replay: {kind.__name__} takes no function for {argument!r}.")
-                arguments[argument] = given[value["given"]]
-                if not (is_kernel_function(arguments[argument]) or inspect.isfunction(arguments[argument])):
-                    raise TypeError(
-                        f"replay: given {value['given']} is {arguments[argument]!r}, but the scene has a function there."
-                    )
-            else:
-                arguments[argument] = decode(value, arrays)
-        if base is Solver and any(isinstance(v, int) and v > MOST for v in arguments.values()):
-            raise ValueError(f"replay: the scene has {kind.__name__}({arguments}), of more than {MOST} steps.")
-        try:
-            return kind(**arguments)
-        except TypeError as e:
-            raise ValueError(f"replay: the scene has a {kind.__name__} that this version of tiverlet cannot make: {e}") from e
-
-    p = {name: decode(value, arrays) for name, value in scene["particles"].items()}
-    particles = Particles(p.pop("position"), **p)
+    particles = _particles(scene, arrays)
     everyone = np.ones(len(particles), dtype=bool)
     features, starts = [], []
     for data in scene["features"]:
         start = decode(data["start"], arrays) if "start" in data else None
         starts.append(None if start is None else particles.regrouped(everyone, position=start))
-        feature = make(data, Feature)
+        feature = _made(data, Feature, arrays, given)
         turn(feature, {name: decode(value, arrays) for name, value in data["knobs"].items()})
         features.append(feature)
     for k, values in turned:
         turn(features[k], values)
     settings = dict(scene["settings"])
-    settings["solver"] = make(settings["solver"], Solver)
+    settings["solver"] = _made(settings["solver"], Solver, arrays, given)
     return World._of(particles, tuple(features), starts, **settings)

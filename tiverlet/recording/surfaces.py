@@ -13,13 +13,14 @@ from .strain import LEVELS, LONGER, SHORTER
 
 if TYPE_CHECKING:
     from ..world import World
+    from .scene import Parts
 
 LIGHT, DARKEST = np.array([0.45, 0.35, 0.82]), 0.3  # where it comes from, beside from above; of what is edge on
 SHADES = 15
 MOST = 200_000  # links up to which it is asked whether they are sides of triangles
 
 
-def bodies(world: "World") -> np.ndarray:
+def bodies(world: "World | Parts") -> np.ndarray:
     """The body of each particle, (n,): the lowest number of those that constraints and loops join, its own where none do."""
     ends = [np.zeros((0, 2), dtype=np.int64)]
     for f in world.features:
@@ -43,11 +44,11 @@ def bodies(world: "World") -> np.ndarray:
         body = new
 
 
-def triangles(world: "World") -> np.ndarray:
+def triangles(world: "World | Parts") -> np.ndarray:
     """Triangles of particles that cover bodies, (t, 3): loops and volumes, what bends along an edge, and links, where they are
     the sides of triangles. They may overlap.
     """
-    x, found = world.particles.position, [np.zeros((0, 3), dtype=np.int64)]
+    x, found = np.asarray(world.particles.position), [np.zeros((0, 3), dtype=np.int64)]
     flat = world.particles.dim == 2
     links = [np.zeros((0, 2), dtype=np.int64)]
     for f in world.features:
@@ -85,7 +86,7 @@ def triangles(world: "World") -> np.ndarray:
     return out[doubled(b - a, c - a) > 1e-3 * sides]  # none that are flat
 
 
-def covered(world: "World", corners: np.ndarray) -> np.ndarray:
+def covered(world: "World | Parts", corners: np.ndarray) -> np.ndarray:
     """Which particles are part of a surface, Boolean (n,): its corners, and in 2D what is in a body that keeps its shape."""
     out = np.zeros(len(world.particles), dtype=bool)
     out[corners.ravel()] = True

@@ -158,7 +158,7 @@ def picture(path: str, png: str, frames: list[int] | None = None, scene: bool = 
     if wrong := [k for k in frames if k not in there]:
         near = f"; the nearest is {there[np.argmin(np.abs(there - wrong[0]))]}" if len(there) else ""
         raise ValueError(f"{path} has no frame {wrong[0]}{near}.")
-    out = [_name(png, k) for k in frames]
+    out = [os.path.abspath(named(png, k)) for k in frames]
     if len(set(out)) < len(set(frames)):
         raise ValueError(f"{len(frames)} frames need a name with %d in it, such as frame_%d.png.")
     if missing := [name for name in out if not os.path.isdir(os.path.dirname(name))]:
@@ -182,8 +182,9 @@ def picture(path: str, png: str, frames: list[int] | None = None, scene: bool = 
     return out
 
 
-def _name(png: str, frame: int) -> str:
-    return os.path.abspath(NUMBER.sub(lambda found: found.group() % frame, png))
+def named(path: str, frame: int) -> str:
+    """A name with the number of a frame for %d."""
+    return NUMBER.sub(lambda found: found.group() % frame, path)
 
 
 def _settled(process: subprocess.Popen, port: int, frame: int, name: str, view: str | None) -> None:

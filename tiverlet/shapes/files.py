@@ -1,6 +1,7 @@
 """Meshes from and to OBJ and PLY files. Both formats are short enough to need no library."""
 
 import os
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -18,7 +19,8 @@ def load(path, dim: int = 3) -> Shape:
 
     Faces of more than three corners are cut into fans. links: the edges that are given, or else those of faces and tetrahedra.
     PLY: elements vertex (x, y, z), edge (vertex1, vertex2), face, and tetrahedron, tetra, tet or cell (lists of indices).
-    OBJ: v, l and f; what else there is, is passed over. dim = 2 drops z. Vertices that nothing uses are kept.
+    OBJ: v, vt, l and f; what else there is, is passed over. Faces as they are, with texture coordinates, are kept in polygons and
+    uv. dim = 2 drops z. Vertices that nothing uses are kept.
     ValueError, with the line or the element, for what cannot be understood.
     """
     name = os.fspath(path)
@@ -29,7 +31,7 @@ def load(path, dim: int = 3) -> Shape:
         raise ValueError(f"load: dim = {dim!r}, but it must be 2 or 3.")
     with open(name, "rb") as file:
         data = file.read()
-    position, edges, faces, cells = (_obj if kind == ".obj" else _ply)(name, data)
+    position, edges, faces, cells, polygons, uv = (_obj if kind == ".obj" else _ply)(name, data)
     checks.finite("load", f"vertices of {name}", position)
     for what, tuples in (("edge", edges), ("face", faces), ("tetrahedron", cells)):
         wrong = ((tuples < 0) | (tuples >= len(position))).any(axis=1)
@@ -39,11 +41,13 @@ def load(path, dim: int = 3) -> Shape:
     if not len(edges):
         edges = edges_of(cells) if len(cells) else edges_of(faces)
     quads = quads_of(faces) if dim == 3 else np.zeros((0, 4), dtype=np.int64)
-    return Shape(position[:, :dim], edges, faces=faces, quads=quads, tetrahedra=cells)
+    return Shape(position[:, :dim], edges, faces=faces, quads=quads, tetrahedra=cells, polygons=polygons, uv=uv)
 
 
 def save(path, shape: Shape, binary: bool = True) -> None:
-    """Write a body to an .obj or .ply file: position, links, faces and (PLY) tetrahedra. In 2D z is 0."""
+    """Write a body to an .obj or .ply file: position, links, faces and (PLY) tetrahedra. In 2D z is 0. OBJ has faces with their
+    corners and texture coordinates as they came from a file, PLY triangles.
+    """
     name = os.fspath(path)
     kind = os.path.splitext(name)[1].lower()
     x = np.zeros((len(shape), 3))
@@ -51,7 +55,7 @@ def save(path, shape: Shape, binary: bool = True) -> None:
     if kind == ".obj":
         lines = [f"v {a!r} {b!r} {c!r}" for a, b, c in x.tolist()]
         lines += [f"l {i} {j}" for i, j in (shape.links + 1).tolist()]
-        lines += [f"f {i} {j} {k}" for i, j, k in (shape.faces + 1).tolist()]
+        lines += obj_faces(*shape.surface)
         text = "\n".join(lines) + "\n"
         with open(name, "w", encoding="ascii") as file:
             file.write(text)
@@ -62,35 +66,68 @@ def save(path, shape: Shape, binary: bool = True) -> None:
         raise ValueError(f"save: {name} ends with {kind!r}, but .obj and .ply are what can be written.")
 
 
+def obj_faces(faces: Sequence[np.ndarray], uv: Sequence[np.ndarray]) -> list[str]:
+    """The lines vt and f of an .obj file. uv: for each face the texture coordinates of its corners, or (0, 2)."""
+    number: dict[tuple[float, float], int] = {}
+    lines = []
+    for face, at in zip(faces, uv, strict=True):
+        corners = (face + 1).tolist()
+        if len(at):
+            places = [number.setdefault((u, v), len(number) + 1) for u, v in at.tolist()]
+            lines.append("f " + " ".join(f"{i}/{k}" for i, k in zip(corners, places, strict=True)))
+        else:
+            lines.append("f " + " ".join(map(str, corners)))
+    return [f"vt {u!r} {v!r}" for u, v in number] + lines
+
+
 def _fans(polygons: list[list[int]]) -> np.ndarray:
     out = [(p[0], p[k], p[k + 1]) for p in polygons for k in range(1, len(p) - 1)]
     return np.array(out, dtype=np.int64).reshape(-1, 3)
 
 
 def _obj(name: str, data: bytes):
-    points, edges, polygons = [], [], []
+    points, places, edges, polygons, textures = [], [], [], [], []
+
+    def numbers(words: list[str], count: int) -> list[int]:
+        found = [int(w) for w in words]
+        return [i - 1 if i > 0 else count + i if i < 0 else -1 for i in found]
+
     for number, line in enumerate(data.decode("utf-8", "replace").replace("\\\n", " ").splitlines(), 1):
         words = line.partition("#")[0].split()
-        if not words or words[0] not in ("v", "l", "f"):
+        if not words or words[0] not in ("v", "vt", "l", "f"):
             continue
         try:
             if words[0] == "v":
                 points.append([float(w) for w in words[1:4]])
                 if len(points[-1]) != 3:
                     raise ValueError
+            elif words[0] == "vt":
+                places.append([*(float(w) for w in words[1:3]), 0.0][:2])
+                if len(words) < 2:
+                    raise ValueError
             else:
-                indices = [int(w.partition("/")[0]) for w in words[1:]]
-                indices = [i - 1 if i > 0 else len(points) + i if i < 0 else -1 for i in indices]
+                corners = [w.split("/") for w in words[1:]]
+                indices = numbers([c[0] for c in corners], len(points))
                 if len(indices) < (2 if words[0] == "l" else 3):
                     raise ValueError
                 if words[0] == "l":
                     edges += list(zip(indices, indices[1:], strict=False))
-                else:
-                    polygons.append(indices)
+                    continue
+                polygons.append(indices)
+                has = all(len(c) > 1 and c[1] for c in corners)
+                textures.append(numbers([c[1] for c in corners], len(places)) if has else [])
+                if textures[-1] and not 0 <= min(textures[-1]) <= max(textures[-1]) < len(places):
+                    raise ValueError
         except ValueError:
             raise ValueError(f"load: {name}, line {number}: {line.strip()!r} cannot be understood.") from None
     none = np.zeros((0, 4), dtype=np.int64)
-    return np.array(points).reshape(-1, 3), np.array(edges, dtype=np.int64).reshape(-1, 2), _fans(polygons), none
+    at = np.array(places).reshape(-1, 2)
+    checks.finite("load", f"texture coordinates of {name}", at)
+    plain = all(len(p) == 3 for p in polygons) and not any(textures)
+    faces = () if plain else tuple(np.array(p, dtype=np.int64) for p in polygons)
+    uv = () if plain else tuple(at[np.array(t, dtype=np.int64)] for t in textures)
+    edges = np.array(edges, dtype=np.int64).reshape(-1, 2)
+    return np.array(points).reshape(-1, 3), edges, _fans(polygons), none, faces, uv
 
 
 def _header(name: str, data: bytes):
@@ -157,6 +194,8 @@ def _ply(name: str, data: bytes):
         np.array([edge.get("vertex1", []), edge.get("vertex2", [])], dtype=np.int64).T.reshape(-1, 2),
         _fans(_lists(found, "face")),
         np.array(cells, dtype=np.int64).reshape(-1, 4),
+        (),
+        (),
     )
 
 

@@ -25,6 +25,8 @@ class Shape:
     tetrahedra: (m, 4), of positive volume: Volume.
     loops: index arrays around areas, counterclockwise: Area.
     radius: (n,) [m].
+    polygons: index arrays around faces as they were in a file, where some have more than three corners or texture coordinates.
+    uv: for each of the polygons the texture coordinates of its corners, (corners, 2), or (0, 2).
     """
 
     position: np.ndarray
@@ -39,6 +41,8 @@ class Shape:
     tetrahedra: np.ndarray = _none(4)
     loops: tuple[np.ndarray, ...] = ()
     radius: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    polygons: tuple[np.ndarray, ...] = ()
+    uv: tuple[np.ndarray, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.radius) != len(self.position):
@@ -46,6 +50,13 @@ class Shape:
 
     def __len__(self) -> int:
         return len(self.position)
+
+    @property
+    def surface(self) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+        """Polygons and their texture coordinates; where there are none, faces."""
+        if self.polygons:
+            return self.polygons, self.uv
+        return tuple(self.faces), (np.zeros((0, 2)),) * len(self.faces)
 
     def moved(self, by) -> "Shape":
         """The same body, shifted by a vector [m]."""
@@ -83,10 +94,12 @@ class Shape:
             new[name] = rows[sort]
             if name == "limits":
                 new |= {"lower": self.lower[sort], "upper": self.upper[sort]}
-        return replace(self, **new, loops=tuple(number[loop] for loop in self.loops))
+        new |= {name: tuple(number[loop] for loop in getattr(self, name)) for name in LOOPS}
+        return replace(self, **new)
 
 
 INDICES = ("links", "braces", "bends", "limits", "faces", "quads", "tetrahedra")
+LOOPS = ("loops", "polygons")
 
 
 def join(*shapes: Shape) -> tuple[Shape, list[slice]]:
@@ -98,10 +111,14 @@ def join(*shapes: Shape) -> tuple[Shape, list[slice]]:
         raise ValueError("join: some shapes are in 2D, others in 3D.")
     starts = np.cumsum([0, *(len(s) for s in shapes)])
     parts = list(zip(shapes, starts[:-1].tolist(), strict=True))
-    all_: dict = {f.name: np.concatenate([getattr(s, f.name) for s in shapes]) for f in fields(Shape) if f.name != "loops"}
+    plain = [f.name for f in fields(Shape) if f.name not in (*LOOPS, "uv")]
+    all_: dict = {name: np.concatenate([getattr(s, name) for s in shapes]) for name in plain}
     all_ |= {name: np.concatenate([getattr(s, name) + k for s, k in parts]) for name in INDICES}
-    loops = tuple(loop + k for s, k in parts for loop in s.loops)
-    return Shape(**all_, loops=loops), [slice(int(a), int(b)) for a, b in zip(starts[:-1], starts[1:], strict=True)]
+    all_["loops"] = tuple(loop + k for s, k in parts for loop in s.loops)
+    if any(s.polygons for s in shapes):
+        all_["polygons"] = tuple(face + k for s, k in parts for face in s.surface[0])
+        all_["uv"] = tuple(uv for s in shapes for uv in s.surface[1])
+    return Shape(**all_), [slice(int(a), int(b)) for a, b in zip(starts[:-1], starts[1:], strict=True)]
 
 
 def morton(position: np.ndarray) -> np.ndarray:

@@ -1,0 +1,30 @@
+"""Recordings for other programs: a file for each format, and here which ending leads to which.
+
+A new format is one file with write(recording, path) -> the names of the files that it wrote, and one line here.
+"""
+
+import os
+from typing import TYPE_CHECKING
+
+from ...shapes import Shape
+from . import arrays, gltf, obj, table, vtk, xyz
+
+if TYPE_CHECKING:
+    from ..replay import Replay
+
+NUMBERS = {".npz": arrays.write, ".csv": table.write, ".xyz": xyz.write}
+MESHES = {".glb": gltf.write, ".gltf": gltf.write, ".obj": obj.write, ".pvd": vtk.write}  # these take a shape
+ENDINGS = sorted([*NUMBERS, *MESHES])
+
+
+def export(recording: "Replay", path: str, shape: Shape | None = None) -> list[str]:
+    """Write a recording as the ending of `path` says; see Replay.export()."""
+    kind = os.path.splitext(path)[1].lower()
+    if kind not in ENDINGS:
+        raise ValueError(f"replay: {path} ends in {kind!r}, but {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]} can be written.")
+    if shape is not None and kind not in MESHES:
+        raise ValueError(f"replay: {path} has no faces, so it takes no shape; {', '.join(sorted(MESHES))} do.")
+    folder = os.path.dirname(os.path.abspath(path))
+    if not os.path.isdir(folder):
+        raise FileNotFoundError(f"The folder of {path} does not exist.")
+    return MESHES[kind](recording, path, shape) if kind in MESHES else NUMBERS[kind](recording, path)

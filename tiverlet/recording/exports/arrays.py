@@ -1,0 +1,25 @@
+"""Arrays for numpy."""
+
+import re
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..scene import plain
+from .stretch import only
+
+if TYPE_CHECKING:
+    from ..replay import Replay
+
+
+def write(recording: "Replay", path: str) -> list[str]:
+    """Positions, times, masses, radii and curves, in an .npz file."""
+    stretch = only(recording, path, "array", ".csv")
+    more: dict[str, Any] = {name: stretch.column(name) for name in ("mass", "radius")}
+    for name, (frames, values) in recording.curves.items():
+        if not re.fullmatch(r"\w+(/\w+)*", name):  # they become names of files in the archive
+            raise ValueError(f"replay: {recording.path} has a curve with the name {plain(name)!r}; see .verify().")
+        more |= {f"{name} frame": frames, f"{name} value": values}
+    x = np.array([x for _, _, x in stretch])
+    np.savez_compressed(path, position=x, frame=stretch.frames, time=stretch.times, **more)
+    return [path]

@@ -1,0 +1,121 @@
+"""What the particles of a recording are to other programs: faces, links, and particles by themselves."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...shapes import Shape
+from ..drawing import colors, links, upwards
+from ..scene import Parts
+from ..surfaces import covered, triangles
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """The surface of a scene, and what has none.
+
+    faces: particles around each face, with corners in the same sense all over a surface. uv: for each face the texture
+    coordinates of its corners, (corners, 2), or (0, 2) where it has none. links: (m, 2), those that are no part of a surface.
+    loose: particles that nothing joins. bare: particles with a radius that no surface hides. hues: (n, 3). up: (dim,).
+    """
+
+    faces: tuple[np.ndarray, ...]
+    uv: tuple[np.ndarray, ...]
+    links: np.ndarray
+    loose: np.ndarray
+    bare: np.ndarray
+    hues: np.ndarray
+    up: np.ndarray
+
+    @property
+    def corners(self) -> np.ndarray:
+        """The triangles of all faces, (t, 3), as numbers of corners: faces one after the other, each as a fan."""
+        size = np.array([len(face) for face in self.faces], dtype=np.int64)
+        if (size == 3).all():
+            return np.arange(3 * len(size)).reshape(-1, 3)
+        begin = np.cumsum(size) - size
+        fans = [(b, b + k, b + k + 1) for b, n in zip(begin.tolist(), size.tolist(), strict=True) for k in range(1, n - 1)]
+        return np.array(fans, dtype=np.int64).reshape(-1, 3)
+
+    @property
+    def around(self) -> np.ndarray:
+        """The particles of all faces, one face after the other."""
+        return np.concatenate([np.zeros(0, dtype=np.int64), *self.faces])
+
+
+def bodies(parts: Parts, shape: Shape | None = None) -> Bodies:
+    """Those of a scene. shape: what has their faces and texture coordinates, for the same particles.
+
+    Raises ValueError for a shape of another number of points.
+    """
+    particles = parts.particles
+    if shape is not None and len(shape) != len(particles):
+        raise ValueError(
+            f"replay: shape has {len(shape)} points, but the recording has {len(particles)} particles. Give the one that they "
+            "were made of; tv.shapes.join(...) makes one of several."
+        )
+    up = upwards(parts)
+    if shape is None:
+        found = oriented(distinct(triangles(parts)), particles.position, up)
+        faces, uv = tuple(found), (np.zeros((0, 2)),) * len(found)
+    else:
+        faces, uv = shape.surface
+        found = np.concatenate([np.zeros(0, dtype=np.int64), *faces])
+    hidden = np.isin(np.arange(len(particles)), found)
+    pairs = np.concatenate([np.zeros((0, 2), dtype=np.int64), *(f.indices for _, f in links(parts))])
+    pairs = np.unique(np.sort(pairs[~hidden[pairs].all(axis=1)], axis=1), axis=0)
+    loose = np.flatnonzero(~hidden & ~np.isin(np.arange(len(particles)), pairs))
+    within = covered(parts, found)
+    bare = np.flatnonzero((particles.radius > 0) & ~within)
+    return Bodies(faces, uv, pairs, loose, bare, colors(parts), up)
+
+
+def distinct(faces: np.ndarray) -> np.ndarray:
+    """Each triangle once, (t, 3): constraints at several of its edges each name it."""
+    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    return faces[np.sort(first)]
+
+
+def oriented(faces: np.ndarray, x: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Triangles with corners in the same sense on both sides of each edge that two of them share: counterclockwise from outside
+    of what is closed, in the plane, and for the most part from above otherwise.
+    """
+    if x.shape[1] == 2:
+        a, b, c = (x[k] for k in faces.T)
+        u, v = b - a, c - a
+        return np.where((u[:, 0] * v[:, 1] < u[:, 1] * v[:, 0])[:, None], faces[:, ::-1], faces)
+    out = faces.copy()
+    for piece, turned, closed in _pieces(faces):
+        out[piece[turned]] = faces[piece[turned]][:, ::-1]
+        a, b, c = (x[k] - x[faces[piece[0], 0]] for k in out[piece].T)
+        normal = np.cross(b - a, c - a)
+        if float((a * normal).sum() if closed else (normal @ up).sum()) < 0:
+            out[piece] = out[piece][:, ::-1]
+    return out
+
+
+def _pieces(faces: np.ndarray) -> Iterable[tuple[np.ndarray, np.ndarray, bool]]:
+    """What hangs together by edges that two triangles share: its triangles, which of them run the other way than the first, and
+    whether there are no other edges.
+    """
+    halves = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    _, edge, count = np.unique(np.sort(halves, axis=1), axis=0, return_inverse=True, return_counts=True)
+    order = np.argsort(edge.ravel(), kind="stable")
+    pairs = order[count[edge.ravel()[order]] == 2].reshape(-1, 2)
+    alike = (halves[pairs[:, 0]] == halves[pairs[:, 1]]).all(axis=1)
+    near: list[list[tuple[int, bool]]] = [[] for _ in faces]
+    for (p, q), same in zip((pairs // 3).tolist(), alike.tolist(), strict=True):
+        near[p].append((q, same))
+        near[q].append((p, same))
+    turned = np.full(len(faces), -1)
+    for seed in range(len(faces)):
+        if turned[seed] >= 0:
+            continue
+        turned[seed], piece = 0, [seed]
+        for face in piece:  # which grows meanwhile
+            for other, same in near[face]:
+                if turned[other] < 0:
+                    turned[other] = turned[face] ^ same
+                    piece.append(other)
+        yield np.array(piece), turned[piece] == 1, all(len(near[face]) == 3 for face in piece)

@@ -1,0 +1,12 @@
+"""Libraries that only some formats need."""
+
+import importlib
+from types import ModuleType
+
+
+def needed(name: str, path: str) -> ModuleType:
+    """The module of this name. Raises ImportError that says how to install it."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as e:
+        raise ImportError(f"replay: {path} needs {name}, which is not installed: pip install 'tiverlet[export]'.") from e

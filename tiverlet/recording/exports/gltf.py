@@ -1,0 +1,232 @@
+"""glTF 2.0: a mesh whose shape is animated, for Blender, three.js and whatever else shows such files.
+
+Each frame but the first is a morph target, the way from the first frame, and weights blend from one to the next. Positions are as
+they were recorded; a node above turns the scene so that up is y.
+"""
+
+import os
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...colliders.round import rounded
+from ...shapes import Shape
+from .bodies import Bodies
+from .extras import needed
+from .stretch import Stretch, only
+
+if TYPE_CHECKING:
+    from ..replay import Replay
+
+SPHERES = 2000  # particles that are drawn as spheres, each a node that moves; of more, points
+MOST = 2**32 - 1  # bytes that a .glb file can have
+POINTS, LINES, TRIANGLES = 0, 1, 4  # glTF's numbers of kinds of primitives
+FLOAT, UINT, BYTE = 5126, 5125, 5121  # and of types of numbers
+
+
+def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
+    """Surfaces with normals, colours and texture coordinates; links without a surface as lines; particles that no surface hides
+    as spheres of their radii, or as points.
+    """
+    lib: Any = needed("pygltflib", path)
+    stretch = only(recording, path, "mesh", ".csv, .obj, .pvd or .xyz")
+    bodies = stretch.bodies(shape)
+    x = np.array([stretch.flat(x) for _, _, x in stretch], dtype=np.float32)
+    scene = _Scene(lib, x, stretch.times.astype(np.float32))
+    root = scene.node(name="scene", rotation=_turn(bodies.up))
+    single = bodies.bare if len(bodies.bare) <= SPHERES else bodies.bare[:0]
+    scene.children(root, [*_mesh(scene, bodies, np.setdiff1d(bodies.loose, single)), *_spheres(scene, stretch, bodies, single)])
+    return scene.save(path)
+
+
+def _turn(up: np.ndarray) -> list[float]:
+    """The quaternion that turns the axis nearest to `up` to y."""
+    axis = int(np.argmax(np.abs(up)))
+    sign, half = np.sign(up[axis]), float(np.sqrt(0.5))
+    if axis == 1:
+        return [0.0, 0.0, 0.0, 1.0] if sign > 0 else [1.0, 0.0, 0.0, 0.0]
+    return [0.0, 0.0, sign * half, half] if axis == 0 else [-sign * half, 0.0, 0.0, half]
+
+
+def _mesh(scene: "_Scene", bodies: Bodies, points: np.ndarray) -> list[int]:
+    """The node of the mesh of all surfaces, links and points; none where there are none."""
+    at, uv, triangles = _vertices(bodies)
+    if not len(at) + len(bodies.links) + len(points):
+        return []
+    parts = []
+    if len(at):
+        normals = np.array([_normals(x[at], triangles) for x in scene.x])
+        if len(uv):
+            normals = np.array([_joined(n, at) for n in normals])
+        parts.append(scene.primitive(TRIANGLES, at, bodies.hues, triangles, normals, uv))
+    if len(bodies.links):
+        ends, pairs = np.unique(bodies.links, return_inverse=True)
+        parts.append(scene.primitive(LINES, ends, bodies.hues, pairs))
+    if len(points):
+        parts.append(scene.primitive(POINTS, points, bodies.hues))
+    mesh = scene.mesh("bodies", parts)
+    node = scene.node(name="bodies", mesh=mesh)
+    if len(scene.x) > 1:
+        scene.animate(node, "weights", np.eye(len(scene.x), dtype=np.float32)[:, 1:].ravel(), "SCALAR")
+    return [node]
+
+
+def _vertices(bodies: Bodies) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The particle of each vertex, its texture coordinates ((0, 2) where there are none), and triangles of vertices.
+
+    A particle is as many vertices as it has texture coordinates.
+    """
+    around = bodies.around
+    if not any(len(uv) for uv in bodies.uv):
+        at, vertex = np.unique(around, return_inverse=True)
+        return at, np.zeros((0, 2)), vertex.ravel()[bodies.corners]
+    pairs = zip(bodies.faces, bodies.uv, strict=True)
+    uv = np.concatenate([uv if len(uv) else np.zeros((len(face), 2)) for face, uv in pairs])
+    rows, vertex = np.unique(np.column_stack([around, uv]), axis=0, return_inverse=True)
+    return rows[:, 0].astype(np.int64), rows[:, 1:], vertex.ravel()[bodies.corners]
+
+
+def _normals(x: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """The sum of the normals of the triangles at each vertex, as long as twice their areas."""
+    a, b, c = (x[k] for k in triangles.T)
+    across = np.cross(b - a, c - a)
+    corner = triangles.ravel()
+    return np.stack([np.bincount(corner, np.repeat(across[:, k], 3), len(x)) for k in range(3)], axis=1)
+
+
+def _joined(normals: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """The sum over the vertices of one particle."""
+    return np.stack([np.bincount(at, normals[:, k])[at] for k in range(3)], axis=1)
+
+
+def _spheres(scene: "_Scene", stretch: Stretch, bodies: Bodies, single: np.ndarray) -> list[int]:
+    """A node for each particle, which moves with it."""
+    if not len(single):
+        return []
+    vertices, faces = rounded(np.zeros(3), np.zeros(3), 1.0)
+    position = scene.add(vertices.astype(np.float32), "VEC3", ends=True)
+    normal, corners = scene.add(vertices.astype(np.float32), "VEC3"), scene.add(faces.astype(np.uint32).ravel(), "SCALAR")
+    meshes: dict[tuple, int] = {}
+    radius, nodes = stretch.column("radius"), []
+    for i in single.tolist():
+        hue = tuple(_linear(bodies.hues[i]).tolist())
+        if hue not in meshes:
+            part = scene.lib.Primitive(
+                mode=TRIANGLES, indices=corners, material=scene.material(hue),
+                attributes=scene.lib.Attributes(POSITION=position, NORMAL=normal),
+            )  # fmt: skip
+            meshes[hue] = scene.mesh("particle", [part])
+        place = scene.x[:, i]
+        node = scene.node(name=f"particle {i}", mesh=meshes[hue], translation=place[0].tolist(), scale=[float(radius[i])] * 3)
+        if (place != place[0]).any():
+            scene.animate(node, "translation", place, "VEC3")
+        nodes.append(node)
+    return nodes
+
+
+def _linear(hue: np.ndarray) -> np.ndarray:
+    """sRGB in 0 ... 255 as light in 0 ... 1, as glTF has colours."""
+    share = hue / 255
+    return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+
+
+class _Scene:
+    """A glTF file that is being made. x: (frames, n, 3) [m]. times: (frames,) [s]."""
+
+    def __init__(self, lib: Any, x: np.ndarray, times: np.ndarray):
+        self.lib, self.x = lib, x
+        self._file = lib.GLTF2(asset=lib.Asset(version="2.0", generator="tiverlet"), scene=0)
+        self._blocks: list[bytes] = []
+        self._size = 0
+        self._plain = self.material((1.0, 1.0, 1.0))
+        self._channels: list[Any] = []
+        self._samplers: list[Any] = []
+        self._times = self.add(times, "SCALAR", ends=True) if len(x) > 1 else None
+
+    def add(self, array: np.ndarray, kind: str, ends: bool = False, whole: bool = False) -> int:
+        """The number of an accessor of an array. ends: with its least and largest values. whole: integers are shares of 255."""
+        lib, data = self.lib, np.ascontiguousarray(array).tobytes()
+        number = {"f": FLOAT, "u": BYTE if array.dtype.itemsize == 1 else UINT}[array.dtype.kind]
+        rows = array.reshape(len(array), -1) if kind != "SCALAR" else array.reshape(-1, 1)
+        limits = {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()} if ends else {}
+        self._file.bufferViews.append(lib.BufferView(buffer=0, byteOffset=self._size, byteLength=len(data)))
+        self._file.accessors.append(
+            lib.Accessor(
+                bufferView=len(self._file.bufferViews) - 1,
+                componentType=number,
+                count=len(rows),
+                type=kind,
+                normalized=whole,
+                **limits,
+            )
+        )
+        self._blocks.append(data)
+        self._size += len(data)  # always whole words
+        return len(self._file.accessors) - 1
+
+    def material(self, hue: tuple) -> int:
+        """The number of a dull material that is seen from both sides."""
+        look = self.lib.PbrMetallicRoughness(baseColorFactor=[*hue, 1.0], metallicFactor=0.0, roughnessFactor=0.8)
+        self._file.materials.append(self.lib.Material(pbrMetallicRoughness=look, doubleSided=True, alphaCutoff=None))
+        return len(self._file.materials) - 1
+
+    def primitive(self, mode: int, at: np.ndarray, hues: np.ndarray, indices=None, normals=None, uv=()) -> Any:
+        """Vertices at the particles `at` that move with them. normals: (frames, vertices, 3), of any length."""
+        if normals is not None:
+            size = np.linalg.norm(normals, axis=2, keepdims=True)
+            normals = np.where(size > 0, normals / np.where(size > 0, size, 1), [0.0, 1.0, 0.0]).astype(np.float32)
+        hue = np.column_stack([np.rint(255 * _linear(hues[at])), np.full(len(at), 255)]).astype(np.uint8)
+        first = {"POSITION": self.add(self.x[0, at], "VEC3", ends=True), "COLOR_0": self.add(hue, "VEC4", whole=True)}
+        if normals is not None:
+            first["NORMAL"] = self.add(normals[0], "VEC3")
+        if len(uv):  # glTF counts v from above
+            first["TEXCOORD_0"] = self.add(np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1).astype(np.float32), "VEC2")
+        targets = []
+        for k in range(1, len(self.x)):
+            targets.append({"POSITION": self.add(self.x[k, at] - self.x[0, at], "VEC3", ends=True)})
+            if normals is not None:
+                targets[-1]["NORMAL"] = self.add(normals[k] - normals[0], "VEC3")
+        corners = None if indices is None else self.add(indices.astype(np.uint32).ravel(), "SCALAR")
+        attributes = self.lib.Attributes(**first)
+        return self.lib.Primitive(mode=mode, attributes=attributes, indices=corners, targets=targets, material=self._plain)
+
+    def mesh(self, name: str, parts: list) -> int:
+        """The number of a mesh."""
+        self._file.meshes.append(self.lib.Mesh(name=name, primitives=parts, weights=[0.0] * len(parts[0].targets or ())))
+        return len(self._file.meshes) - 1
+
+    def node(self, **what: Any) -> int:
+        """The number of a node."""
+        self._file.nodes.append(self.lib.Node(**what))
+        return len(self._file.nodes) - 1
+
+    def children(self, node: int, others: list[int]) -> None:
+        """Put nodes below another, which is all of the scene."""
+        self._file.nodes[node].children = others
+        self._file.scenes.append(self.lib.Scene(nodes=[node]))
+
+    def animate(self, node: int, what: str, values: np.ndarray, kind: str) -> None:
+        """Values of a node at the times of all frames; linear between them."""
+        self._samplers.append(self.lib.AnimationSampler(input=self._times, output=self.add(values, kind), interpolation="LINEAR"))
+        target = self.lib.AnimationChannelTarget(node=node, path=what)
+        self._channels.append(self.lib.AnimationChannel(sampler=len(self._samplers) - 1, target=target))
+
+    def save(self, path: str) -> list[str]:
+        """Write it: one file, or for .gltf two."""
+        lib, file = self.lib, self._file
+        if self._channels:
+            file.animations.append(lib.Animation(name="recording", channels=self._channels, samplers=self._samplers))
+        file.buffers.append(lib.Buffer(byteLength=self._size))
+        if path.lower().endswith(".glb"):
+            if self._size + 1024 * len(file.accessors) > MOST:
+                raise ValueError(f"replay: {path} would have more than 4 GiB, the most of a .glb file; export to .gltf or .obj.")
+            file.set_binary_blob(b"".join(self._blocks))
+            file.save_binary(path)
+            return [path]
+        beside = f"{os.path.splitext(path)[0]}.bin"
+        with open(beside, "wb") as out:
+            out.writelines(self._blocks)
+        file.buffers[0].uri = os.path.basename(beside)
+        with open(path, "w", encoding="utf-8") as out:
+            out.write(file.to_json())
+        return [path, beside]

@@ -1,0 +1,31 @@
+"""A sequence of Wavefront .obj files, one for each frame."""
+
+from typing import TYPE_CHECKING
+
+from ...shapes import Shape
+from ...shapes.files import obj_faces
+from .names import numbered
+from .stretch import stretches
+
+if TYPE_CHECKING:
+    from ..replay import Replay
+
+
+def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
+    """Positions, the faces and texture coordinates of `shape` or else triangles, links without a surface as lines, and loose
+    particles as points.
+    """
+    out = []
+    for stretch in stretches(recording):
+        bodies = stretch.bodies(shape)
+        rest = [*obj_faces(bodies.faces, bodies.uv), *(f"l {i} {j}" for i, j in (bodies.links + 1).tolist())]
+        rest += [f"p {i}" for i in (bodies.loose + 1).tolist()]
+        tail = "".join(f"{line}\n" for line in rest)
+        rows = "v %.9g %.9g %.9g\n" * len(stretch.column("mass"))
+        for frame, time, x in stretch:
+            out.append(numbered(path, frame))
+            with open(out[-1], "w", encoding="ascii") as file:
+                file.write(f"# frame {frame}, {time!r} s\n")
+                file.write(rows % tuple(stretch.flat(x).ravel().tolist()))
+                file.write(tail)
+    return out
