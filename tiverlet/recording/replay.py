@@ -311,6 +311,10 @@ class Replay:
         return [(entry, np.array(frames, dtype=np.int64)) for entry, frames in out]
 
     @_clear
+    def parts(self, entry: Entry) -> scene.Parts:
+        """Particles and features of the entry of a scene, without a world: to be looked at."""
+        return scene.parts(entry.data, entry.arrays)
+
     def export(self, path: str | os.PathLike, shape: Shape | None = None) -> list[str]:
         """Write the recording for other programs, as the ending of `path` says; returns the names of the files.
 

@@ -22,6 +22,8 @@ def export(recording: "Replay", path: str, shape: Shape | None = None) -> list[s
     kind = os.path.splitext(path)[1].lower()
     if kind not in ENDINGS:
         raise ValueError(f"replay: {path} ends in {kind!r}, but {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]} can be written.")
+    if not isinstance(shape, Shape | None):
+        raise TypeError(f"replay: shape = {shape!r} is a {type(shape).__name__}, but a tv.shapes.Shape is needed.")
     if shape is not None and kind not in MESHES:
         raise ValueError(f"replay: {path} has no faces, so it takes no shape; {', '.join(sorted(MESHES))} do.")
     folder = os.path.dirname(os.path.abspath(path))

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 SPHERES = 2000  # particles that are drawn as spheres, each a node that moves; of more, points
 MOST = 2**32 - 1  # bytes that a .glb file can have
 POINTS, LINES, TRIANGLES = 0, 1, 4  # glTF's numbers of kinds of primitives
-FLOAT, UINT, BYTE = 5126, 5125, 5121  # and of types of numbers
+FLOAT, UINT, BYTE = 5126, 5125, 5121  # of types of numbers
+VERTICES, INDICES = 34962, 34963  # and of what they are used for
 
 
 def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
@@ -32,6 +33,9 @@ def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
     stretch = only(recording, path, "mesh", ".csv, .obj, .pvd or .xyz")
     bodies = stretch.bodies(shape)
     x = np.array([stretch.flat(x) for _, _, x in stretch], dtype=np.float32)
+    if not (x.size and np.isfinite(x).all()):
+        why = "has positions that are not finite" if x.size else "has no particles"
+        raise ValueError(f"replay: {recording.path} {why}, which glTF cannot say; export to .csv, .obj, .pvd or .xyz.")
     scene = _Scene(lib, x, stretch.times.astype(np.float32))
     root = scene.node(name="scene", rotation=_turn(bodies.up))
     single = bodies.bare if len(bodies.bare) <= SPHERES else bodies.bare[:0]
@@ -104,8 +108,9 @@ def _spheres(scene: "_Scene", stretch: Stretch, bodies: Bodies, single: np.ndarr
     if not len(single):
         return []
     vertices, faces = rounded(np.zeros(3), np.zeros(3), 1.0)
-    position = scene.add(vertices.astype(np.float32), "VEC3", ends=True)
-    normal, corners = scene.add(vertices.astype(np.float32), "VEC3"), scene.add(faces.astype(np.uint32).ravel(), "SCALAR")
+    position = scene.add(vertices.astype(np.float32), "VEC3", VERTICES, ends=True)
+    normal = scene.add(vertices.astype(np.float32), "VEC3", VERTICES)
+    corners = scene.add(faces.astype(np.uint32).ravel(), "SCALAR", INDICES)
     meshes: dict[tuple, int] = {}
     radius, nodes = stretch.column("radius"), []
     for i in single.tolist():
@@ -143,26 +148,22 @@ class _Scene:
         self._samplers: list[Any] = []
         self._times = self.add(times, "SCALAR", ends=True) if len(x) > 1 else None
 
-    def add(self, array: np.ndarray, kind: str, ends: bool = False, whole: bool = False) -> int:
-        """The number of an accessor of an array. ends: with its least and largest values. whole: integers are shares of 255."""
+    def add(self, array: np.ndarray, kind: str, use: int | None = None, *, ends: bool = False) -> int:
+        """The number of an accessor of an array. use: VERTICES or INDICES. ends: with its least and largest values.
+
+        Bytes are shares of 255.
+        """
         lib, data = self.lib, np.ascontiguousarray(array).tobytes()
-        number = {"f": FLOAT, "u": BYTE if array.dtype.itemsize == 1 else UINT}[array.dtype.kind]
-        rows = array.reshape(len(array), -1) if kind != "SCALAR" else array.reshape(-1, 1)
+        number = {"f4": FLOAT, "u4": UINT, "u1": BYTE}[array.dtype.str[1:]]
+        rows = array.reshape(-1, 1) if kind == "SCALAR" else array.reshape(len(array), -1)
         limits = {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()} if ends else {}
-        self._file.bufferViews.append(lib.BufferView(buffer=0, byteOffset=self._size, byteLength=len(data)))
-        self._file.accessors.append(
-            lib.Accessor(
-                bufferView=len(self._file.bufferViews) - 1,
-                componentType=number,
-                count=len(rows),
-                type=kind,
-                normalized=whole,
-                **limits,
-            )
-        )
+        view, accessors = len(self._file.bufferViews), self._file.accessors
+        self._file.bufferViews.append(lib.BufferView(buffer=0, byteOffset=self._size, byteLength=len(data), target=use))
+        what = {"componentType": number, "normalized": number == BYTE, "count": len(rows), "type": kind}
+        accessors.append(lib.Accessor(bufferView=view, **what, **limits))
         self._blocks.append(data)
         self._size += len(data)  # always whole words
-        return len(self._file.accessors) - 1
+        return len(accessors) - 1
 
     def material(self, hue: tuple) -> int:
         """The number of a dull material that is seen from both sides."""
@@ -176,17 +177,17 @@ class _Scene:
             size = np.linalg.norm(normals, axis=2, keepdims=True)
             normals = np.where(size > 0, normals / np.where(size > 0, size, 1), [0.0, 1.0, 0.0]).astype(np.float32)
         hue = np.column_stack([np.rint(255 * _linear(hues[at])), np.full(len(at), 255)]).astype(np.uint8)
-        first = {"POSITION": self.add(self.x[0, at], "VEC3", ends=True), "COLOR_0": self.add(hue, "VEC4", whole=True)}
+        first = {"POSITION": self.add(self.x[0, at], "VEC3", VERTICES, ends=True), "COLOR_0": self.add(hue, "VEC4", VERTICES)}
         if normals is not None:
-            first["NORMAL"] = self.add(normals[0], "VEC3")
+            first["NORMAL"] = self.add(normals[0], "VEC3", VERTICES)
         if len(uv):  # glTF counts v from above
-            first["TEXCOORD_0"] = self.add(np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1).astype(np.float32), "VEC2")
+            first["TEXCOORD_0"] = self.add(np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1).astype(np.float32), "VEC2", VERTICES)
         targets = []
         for k in range(1, len(self.x)):
-            targets.append({"POSITION": self.add(self.x[k, at] - self.x[0, at], "VEC3", ends=True)})
+            targets.append({"POSITION": self.add(self.x[k, at] - self.x[0, at], "VEC3", VERTICES, ends=True)})
             if normals is not None:
-                targets[-1]["NORMAL"] = self.add(normals[k] - normals[0], "VEC3")
-        corners = None if indices is None else self.add(indices.astype(np.uint32).ravel(), "SCALAR")
+                targets[-1]["NORMAL"] = self.add(normals[k] - normals[0], "VEC3", VERTICES)
+        corners = None if indices is None else self.add(indices.astype(np.uint32).ravel(), "SCALAR", INDICES)
         attributes = self.lib.Attributes(**first)
         return self.lib.Primitive(mode=mode, attributes=attributes, indices=corners, targets=targets, material=self._plain)
 

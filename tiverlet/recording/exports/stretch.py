@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...shapes import Shape
-from .. import scene
 from ..journal import Entry
+from ..scene import Parts
 from .bodies import Bodies, bodies
 
 if TYPE_CHECKING:
@@ -35,9 +35,9 @@ class Stretch:
         return self.entry.arrays[name]
 
     @functools.cached_property
-    def parts(self) -> scene.Parts:
+    def parts(self) -> Parts:
         """Particles and features."""
-        return scene.parts(self.entry.data, self.entry.arrays)
+        return self.recording.parts(self.entry)
 
     def bodies(self, shape: Shape | None) -> Bodies:
         """Faces, links and loose particles."""
