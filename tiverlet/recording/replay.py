@@ -300,15 +300,23 @@ class Replay:
         ]
 
     @property
-    def scenes(self) -> list[tuple[Entry, np.ndarray]]:
-        """The entry of each scene, and the frames that show it: another one begins where particles or features came or went."""
-        out: list[tuple[Entry, list[int]]] = []
+    @_clear
+    def scenes(self) -> list[tuple[Entry, list[int], list[tuple[int, int, dict[str, Any]]]]]:
+        """The entry of each scene, the frames that show it, and what was turned in it: before which frame, the number of the
+        feature, and its knobs. Another scene begins where particles or features came or went.
+        """
+        out, waiting = [], []
         for e in self._entries:
             if e.kind == "scene":
-                out.append((e, []))
+                out.append((e, [], []))
+                waiting = []
+            elif e.kind == "turned":
+                waiting += self._turned(e)
             elif e.kind == "frame" and e.frame in self._frames:
                 out[-1][1].append(e.frame)
-        return [(entry, np.array(frames, dtype=np.int64)) for entry, frames in out]
+                out[-1][2].extend((e.frame, k, values) for k, values in waiting)
+                waiting = []
+        return out
 
     @_clear
     def parts(self, entry: Entry) -> scene.Parts:
@@ -324,13 +332,14 @@ class Replay:
             .glb, .gltf   an animated mesh, y up, for Blender and browsers
             .obj          a file for each frame, named a_0000.obj, a_0001.obj ..., or as a %d in the name says
             .pvd          the same for ParaView, a_0000.vtu ..., with radii, masses, links and faces
+            .gif, .webp, .mp4  a film in the scene's own time, 25 pictures a second
 
-        Faces are those of the picture. shape: what the particles were made of, of which .glb, .gltf, .obj and .pvd take the faces
+        Faces are those of the picture. shape: what the particles were made of, of which meshes and films take the faces
         instead: with their quads and texture coordinates, where the shape came from a file that has them. Features with functions
         of the user's are not asked for faces and links.
 
         Raises ValueError for another ending, for particles that come and go where a format cannot hold it, and for a shape of
-        other particles; FileNotFoundError where the folder is missing; ImportError for .glb and .gltf without
+        other particles; FileNotFoundError where the folder is missing; ImportError for .glb, .gltf and .mp4 without
         tiverlet[export].
         """
         return exports.export(self, os.fspath(path), shape)

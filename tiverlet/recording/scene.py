@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import colliders, constraints, contact, forces, solvers
+from ..colliders.collider import Collider
 from ..device import runtime
 from ..device.language import is_kernel_function, undecorated
 from ..features.arguments import RecordsArguments, knobs_of
@@ -202,27 +203,28 @@ def _made(thing: dict[str, Any], base: type, arrays: Mapping[str, np.ndarray], g
 
 @dataclass(frozen=True)
 class Parts:
-    """Particles and features without a world."""
+    """Particles and features without a world. numbers: of the features in the scene, of which some are left out."""
 
     particles: Particles
     features: tuple[Feature, ...]
+    numbers: tuple[int, ...]
 
 
 def parts(scene: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> Parts:
     """What a scene is made of, for who only looks at it. Nothing is put on a device; features with functions or classes of the
     user's are left out.
     """
-    particles, features = _particles(scene, arrays), []
-    for data in scene["features"]:
+    particles, features = _particles(scene, arrays), {}
+    for k, data in enumerate(scene["features"]):
         if any(isinstance(value, dict) and "given" in value for value in (data["class"], *data["arguments"].values())):
             continue
         feature = _made(data, Feature, arrays, {})
         turn(feature, {name: decode(value, arrays) for name, value in data["knobs"].items()})
-        if isinstance(feature, Batch):  # it turns its tetrahedra and surfaces so that volumes are positive
+        if isinstance(feature, Batch | Collider):  # it learns the dimension, and how surfaces have to be turned
             came = Particles(decode(data["start"], arrays)) if "start" in data else particles
             feature.prepare(came, came.inv_mass.copy())
-        features.append(feature)
-    return Parts(particles, tuple(features))
+        features[k] = feature
+    return Parts(particles, tuple(features.values()), tuple(features))
 
 
 def _particles(scene: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> Particles:

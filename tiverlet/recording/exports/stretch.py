@@ -3,7 +3,7 @@
 import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,12 +18,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Stretch:
-    """Frames with the same particles and features. frames: their numbers. times [s]. entry: of the scene."""
+    """Frames with the same particles and features.
+
+    entry: of the scene. frames: their numbers. times [s]. turned: what the user turned: before which frame, the number of the
+    feature, and its knobs.
+    """
 
     recording: "Replay"
     entry: Entry
     frames: np.ndarray
     times: np.ndarray
+    turned: list[tuple[int, int, dict[str, Any]]]
 
     def __iter__(self) -> Iterator[tuple[int, float, np.ndarray]]:
         """Number, time [s] and positions [m] of each frame."""
@@ -54,9 +59,9 @@ def stretches(recording: "Replay") -> list[Stretch]:
     """Those of a recording, in order."""
     times = dict(zip(recording.frames.tolist(), recording.times.tolist(), strict=True))
     out = []
-    for entry, frames in recording.scenes:
-        if len(frames):
-            out.append(Stretch(recording, entry, frames, np.array([times[k] for k in frames.tolist()])))
+    for entry, frames, turned in recording.scenes:
+        if frames:
+            out.append(Stretch(recording, entry, np.array(frames), np.array([times[k] for k in frames]), turned))
     return out
 
 

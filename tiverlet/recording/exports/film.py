@@ -1,0 +1,76 @@
+"""Films: .gif and .webp by Pillow, .mp4 by the ffmpeg that imageio-ffmpeg brings."""
+
+import itertools
+import os
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...shapes import Shape
+from ..scene import turn
+from .extras import needed
+from .sketch import Sketch, View, extent
+from .stretch import Stretch, stretches
+
+if TYPE_CHECKING:
+    from ..replay import Replay
+
+RATE = 25  # pictures a second: 40 ms each, which GIF, in hundredths of a second, has exactly
+QUALITY = 8  # of ten
+
+
+def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
+    """The scene as it went, in its own time, RATE pictures a second: of each moment the frame that is nearest."""
+    image, draw = needed("PIL.Image", path), needed("PIL.ImageDraw", path)
+    kind = os.path.splitext(path)[1].lower()
+    video: Any = needed("imageio_ffmpeg", path) if kind == ".mp4" else None
+    if not len(recording.frames):
+        raise ValueError(f"replay: {recording.path} has no frame, so there is nothing for {path}.")
+    pictures = _pictures(recording, shape, image, draw)
+    first = next(pictures)
+    if not video:
+        more = {"quality": 10 * QUALITY} if kind == ".webp" else {}
+        first.save(path, save_all=True, append_images=pictures, duration=1000 // RATE, loop=0, **more)
+        return [path]
+    out = video.write_frames(path, first.size, fps=RATE, quality=QUALITY)
+    try:
+        out.send(None)
+        for picture in itertools.chain([first], pictures):
+            out.send(picture.tobytes())
+    finally:
+        out.close()
+    return [path]
+
+
+def _pictures(recording: "Replay", shape: Shape | None, image: Any, draw: Any) -> Iterator[Any]:
+    """One picture after the other, all seen from the same place."""
+    times = recording.times
+    moments = np.arange(times[0], times[-1] + 0.5 / RATE, 1 / RATE)
+    after = np.clip(np.searchsorted(times, moments), 1, max(1, len(times) - 1))
+    before = after - 1
+    nearest = before if len(times) == 1 else np.where(moments - times[before] <= times[after] - moments, before, after)
+    wanted = recording.frames[nearest].tolist()
+    found = stretches(recording)
+    ends = [extent(s.parts, [x for _, _, x in s]) for s in found]
+    low, high = (pick([e[k] for e in ends], axis=0) for k, pick in enumerate((np.min, np.max)))
+    if not np.isfinite([low, high]).all():
+        raise ValueError(f"replay: {recording.path} has no particles, or positions that are not finite, so there is no picture.")
+    view = View(low, high, found[0].bodies(shape).up)
+    for stretch in found:
+        yield from _stretch(stretch, shape, [k for k in wanted if k in stretch.frames], image, draw, view, (low, high))
+
+
+def _stretch(
+    stretch: Stretch, shape: Shape | None, wanted: list[int], image: Any, draw: Any, view: View, ends: tuple
+) -> Iterator[Any]:
+    """Those of one scene, with walls where they are in each frame."""
+    sketch = Sketch(image, draw, stretch.parts, stretch.bodies(shape), view, ends)
+    features = dict(zip(stretch.parts.numbers, stretch.parts.features, strict=True))
+    turned = list(stretch.turned)
+    for frame in wanted:
+        while turned and turned[0][0] <= frame:
+            _, k, values = turned.pop(0)
+            if k in features:
+                turn(features[k], values)
+        yield sketch.frame(stretch.recording.position(frame))

@@ -1,0 +1,153 @@
+"""Pictures of frames, drawn in software: faces in light from above, particles as discs, links and walls as lines.
+
+They take no graphics driver and some hundredths of a second each, where the viewer takes two seconds; and show less: no strain,
+contacts or breaks.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ...colliders import Ball, Capsule, Mesh, Polygon
+from ...colliders.collider import Collider
+from ...constraints import Path
+from ..drawing import OPEN, WALL, upwards
+from ..scene import Parts
+from ..surfaces import Surface
+from .bodies import Bodies
+
+WIDE, MARGIN = 640, 0.04  # pixels, and the share of them that stays free on each side
+FINE = 2  # a picture is drawn in so many times as many pixels, for smooth edges
+STEP = 16  # sizes are multiples of so many pixels, as video wants them
+TALL = (0.3, 1.2)  # least and most height over width
+DOT, LINE = 3, 1.5  # pixels: of a particle without radius, and half the width of a line
+BACK, EDGE = (13, 16, 17), (120, 125, 140)
+ASIDE, ABOVE = np.radians(30), np.radians(20)  # of the eye in 3D
+
+
+class View:
+    """Where points of a scene between two corners [m] are in a picture, seen from far away."""
+
+    def __init__(self, low: np.ndarray, high: np.ndarray, up: np.ndarray):
+        if len(low) == 2:
+            self._axes = np.array([[1.0, 0], [0, 1], [0, 0]])
+        else:
+            level = np.eye(3)[np.argmin(np.abs(up[[2, 0, 1]]) > 0.5) - 1]  # to the eye
+            level -= level @ up * up
+            level /= np.linalg.norm(level)
+            right = np.cross(up, level)
+            away = np.cos(ABOVE) * (np.cos(ASIDE) * level + np.sin(ASIDE) * right) + np.sin(ABOVE) * up
+            right = np.cross(up, away)
+            right /= np.linalg.norm(right)
+            self._axes = np.array([right, np.cross(away, right), away])
+        corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(len(low), -1)
+        at = (self._axes @ corners)[:2]
+        self._low, size = at.min(axis=1), np.maximum(np.ptp(at, axis=1), 1e-9 * np.abs(at).max() + 1e-30)
+        share = np.clip(size[1] / size[0], *TALL)
+        self.size = tuple(STEP * max(1, round(WIDE * s / STEP)) for s in (1.0, share))
+        room = FINE * (1 - 2 * MARGIN) * np.array(self.size)
+        self.scale = float((room / size).min())  # pixels of a meter
+        self._begin = FINE * np.array(self.size) / 2 - self.scale * size / 2
+
+    def place(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels, (n, 2), and how near to the eye [m], (n,)."""
+        right, above, near = self._axes @ x.T
+        across = self._begin[0] + self.scale * (right - self._low[0])
+        down = FINE * self.size[1] - self._begin[1] - self.scale * (above - self._low[1])
+        return np.stack([across, down], axis=1), near
+
+
+def extent(parts: Parts, frames: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Two corners [m] around particles in all frames, and around walls of finite size."""
+    r, x = parts.particles.radius[:, None], np.array(frames)
+    low, high = ((x.astype(np.float64) + s * r).reshape(-1, x.shape[-1]) for s in (-1, 1))
+    low, high = low.min(axis=0, initial=np.inf), high.max(axis=0, initial=-np.inf)
+    for f in parts.features:
+        if isinstance(f, (Ball, Capsule, Mesh, Path, Polygon)) and not getattr(f, "inside", False):
+            strips, thickness = f.outline(low, high)
+            if strips.size:
+                low = np.minimum(low, strips.min(axis=(0, 1)) - thickness)
+                high = np.maximum(high, strips.max(axis=(0, 1)) + thickness)
+    return low, high
+
+
+class Sketch:
+    """Draws frames of a scene. view: of all of them. extent: two corners [m] between which walls are drawn."""
+
+    def __init__(self, image: Any, draw: Any, parts: Parts, bodies: Bodies, view: View, extent: tuple[np.ndarray, np.ndarray]):
+        self._image, self._draw, self._parts, self._bodies, self._view, self._extent = image, draw, parts, bodies, view, extent
+        self._triangles = bodies.around[bodies.corners]
+        self._flat = parts.particles.dim == 2
+        none = np.zeros((0, 2), dtype=np.int64)
+        lit = len(self._triangles) and not self._flat
+        self._surface = Surface(self._triangles, bodies.hues, none, bodies.up) if lit else None
+        self._dots = np.union1d(bodies.bare, bodies.loose)
+
+    def frame(self, x: np.ndarray) -> Any:
+        """The picture of a frame, positions [m]."""
+        view = self._view
+        canvas = self._image.new("RGB", tuple(FINE * s for s in view.size), BACK)
+        draw = self._draw.Draw(canvas)
+        x = x.astype(np.float64)
+        things = [*self._walls(), *self._faces(x), *self._links(x), *self._discs(x)]
+        for _, kind, places, hue, width in sorted(things, key=lambda thing: thing[0]) if not self._flat else things:
+            if kind == "face":
+                draw.polygon(places, fill=hue)
+            elif kind == "line":
+                draw.line(places, fill=hue, width=width)
+            else:
+                draw.ellipse(places, fill=hue)
+        return canvas.reduce(FINE)
+
+    def _mesh(self, x: np.ndarray, triangles: np.ndarray, hues: np.ndarray) -> list[tuple]:
+        at, near = self._view.place(x)
+        places, depth = at[triangles].reshape(-1, 6).tolist(), near[triangles].mean(axis=1).tolist()
+        shades = map(tuple, hues[triangles].mean(axis=1).astype(int).tolist())
+        return [(d, "face", p, hue, 0) for d, p, hue in zip(depth, places, shades, strict=True)]
+
+    def _faces(self, x: np.ndarray) -> list[tuple]:
+        if not len(self._triangles):
+            return []
+        hues = _bytes(self._surface.colors(x, np.zeros(0))) if self._surface else self._bodies.hues
+        return self._mesh(x, self._triangles, hues)
+
+    def _links(self, x: np.ndarray) -> list[tuple]:
+        at, near = self._view.place(x)
+        out, width = [], round(2 * FINE * LINE)
+        for i, j in self._bodies.links.tolist():
+            places = [*at[i].tolist(), *at[j].tolist()]
+            out.append(((near[i] + near[j]) / 2, "line", places, tuple(map(int, self._bodies.hues[i])), width))
+        return out
+
+    def _discs(self, x: np.ndarray) -> list[tuple]:
+        at, near = self._view.place(x)
+        radii = np.maximum(self._view.scale * self._parts.particles.radius, FINE * DOT / 2)[:, None]
+        boxes = np.concatenate([at - radii, at + radii], axis=1)
+        hues = self._bodies.hues.astype(int)
+        return [(near[i], "disc", boxes[i].tolist(), tuple(hues[i].tolist()), 0) for i in self._dots.tolist()]
+
+    def _walls(self) -> list[tuple]:
+        out = []
+        for wall in self._parts.features:
+            if not isinstance(wall, (Collider, Path)):
+                continue
+            closed = not isinstance(wall, Collider) or wall.active
+            if isinstance(wall, Collider) and not self._flat:
+                vertices, faces = wall.solid(*self._extent)
+                if len(faces):
+                    hues = np.repeat(WALL if closed else WALL // 2, len(vertices), axis=0)
+                    light = Surface(faces, hues, np.zeros((0, 2), dtype=np.int64), upwards(self._parts))
+                    out += self._mesh(vertices, faces, _bytes(light.colors(vertices, np.zeros(0))))
+                    continue
+            strips, thickness = wall.outline(*self._extent)
+            width = max(round(2 * self._view.scale * thickness), round(FINE * LINE))
+            for strip in strips:
+                at, near = self._view.place(np.asarray(strip))
+                out.append((float(near.min()), "line", at.ravel().tolist(), EDGE if closed else OPEN, width))
+        return out
+
+
+def _bytes(rgba: np.ndarray) -> np.ndarray:
+    """Red, green and blue of colours as u32, (n, 3)."""
+    return np.stack([rgba >> 24, rgba >> 16 & 255, rgba >> 8 & 255], axis=1)
