@@ -31,7 +31,7 @@ def main(words: list[str] | None = None) -> int:
     args = parser.parse_args([two, *words[2:]] if two in COMMANDS else words)
     try:
         return COMMANDS[args.command].main(args)
-    except (ValueError, TypeError, RuntimeError, OSError) as error:
+    except (ValueError, TypeError, RuntimeError, OSError, ImportError) as error:
         print(f"tiverlet {args.command}: {error}", file=sys.stderr)
         return 2
 

@@ -23,8 +23,11 @@ def add(parser: argparse.ArgumentParser) -> None:
     what.add_argument("--web", action="store_true", help="serve the viewer to browsers, on 127.0.0.1 only")
     what.add_argument("--png", metavar="OUT.png", help="save a picture, without a window; needs a Vulkan driver, in software too")
     what.add_argument(
-        "--export", choices=("npz", "csv", "xyz"), help="write positions (npz: and curves; xyz: for OVITO) beside the file"
-    )
+        "--export", metavar="KIND",
+        help="write for other programs, beside the file or to a name with this ending: npz (arrays, curves), csv, xyz (OVITO); "
+        "glb, gltf (an animated mesh, for Blender), obj (a file for each frame), pvd (ParaView); gif, webp, mp4 (a film)",
+    )  # fmt: skip
+    parser.add_argument("--shape", metavar="BODY.obj", help="of --export: take its faces, quads and texture coordinates")
     parser.add_argument("--frame", type=int, action="append", help="of --png; several with a %%d in the name; default the last")
     parser.add_argument("--scene", action="store_true", help="of --png: the scene alone, without curves and text")
     parser.add_argument("--port", type=int, default=9090, help="of --web; default 9090")
@@ -35,6 +38,7 @@ def main(args: argparse.Namespace) -> int:
     """Do it."""
     from ..recording import replay
     from ..recording.journal import Changed
+    from ..shapes import load
 
     try:
         recording = replay(args.file)
@@ -51,9 +55,10 @@ def main(args: argparse.Namespace) -> int:
         print(verdict)
         return STATUS[verdict.kind]
     if args.export:
-        out = f"{os.path.splitext(args.file)[0]}.{args.export}"
-        recording.export(out)
-        print(f"{out}: {os.path.getsize(out)} bytes")
+        out = args.export if "." in args.export else f"{os.path.splitext(args.file)[0]}.{args.export}"
+        written = recording.export(out, load(args.shape) if args.shape else None)
+        more = f" and {len(written) - 1} more" if len(written) > 1 else ""
+        print(f"{written[0]}{more}: {sum(map(os.path.getsize, written))} bytes")
         return 0
     from ..recording import viewer
 

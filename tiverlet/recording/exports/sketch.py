@@ -4,12 +4,12 @@ They take no graphics driver and some hundredths of a second each, where the vie
 contacts or breaks.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
-from ...colliders import Ball, Capsule, Mesh, Polygon
+from ...colliders import Ball, Box, Capsule, Mesh, Polygon
 from ...colliders.collider import Collider
 from ...constraints import Path
 from ..drawing import OPEN, WALL, upwards
@@ -64,6 +64,9 @@ def extent(parts: Parts, frames: Sequence[np.ndarray]) -> tuple[np.ndarray, np.n
     low, high = ((x.astype(np.float64) + s * r).reshape(-1, x.shape[-1]) for s in (-1, 1))
     low, high = low.min(axis=0, initial=np.inf), high.max(axis=0, initial=-np.inf)
     for f in parts.features:
+        if isinstance(f, Box):
+            low = np.where(np.isfinite(f.lower), np.minimum(low, f.lower), low)
+            high = np.where(np.isfinite(f.upper), np.maximum(high, f.upper), high)
         if isinstance(f, (Ball, Capsule, Mesh, Path, Polygon)) and not getattr(f, "inside", False):
             strips, thickness = f.outline(low, high)
             if strips.size:
@@ -100,17 +103,18 @@ class Sketch:
                 draw.ellipse(places, fill=hue)
         return canvas.reduce(FINE)
 
-    def _mesh(self, x: np.ndarray, triangles: np.ndarray, hues: np.ndarray) -> list[tuple]:
+    def _mesh(self, x: np.ndarray, triangles: np.ndarray, depth: Callable, hues: np.ndarray) -> list[tuple]:
+        """Triangles to draw. depth: how near each is, of how near its corners are."""
         at, near = self._view.place(x)
-        places, depth = at[triangles].reshape(-1, 6).tolist(), near[triangles].mean(axis=1).tolist()
+        places, nearness = at[triangles].reshape(-1, 6).tolist(), depth(near[triangles], axis=1).tolist()
         shades = map(tuple, hues[triangles].mean(axis=1).astype(int).tolist())
-        return [(d, "face", p, hue, 0) for d, p, hue in zip(depth, places, shades, strict=True)]
+        return [(d, "face", p, hue, 0) for d, p, hue in zip(nearness, places, shades, strict=True)]
 
     def _faces(self, x: np.ndarray) -> list[tuple]:
         if not len(self._triangles):
             return []
         hues = _bytes(self._surface.colors(x, np.zeros(0))) if self._surface else self._bodies.hues
-        return self._mesh(x, self._triangles, hues)
+        return self._mesh(x, self._triangles, np.mean, hues)
 
     def _links(self, x: np.ndarray) -> list[tuple]:
         at, near = self._view.place(x)
@@ -138,7 +142,8 @@ class Sketch:
                 if len(faces):
                     hues = np.repeat(WALL if closed else WALL // 2, len(vertices), axis=0)
                     light = Surface(faces, hues, np.zeros((0, 2), dtype=np.int64), upwards(self._parts))
-                    out += self._mesh(vertices, faces, _bytes(light.colors(vertices, np.zeros(0))))
+                    shades = _bytes(light.colors(vertices, np.zeros(0)))
+                    out += self._mesh(vertices, faces, np.min, shades)  # what lies on them is in front
                     continue
             strips, thickness = wall.outline(*self._extent)
             width = max(round(2 * self._view.scale * thickness), round(FINE * LINE))
