@@ -1,7 +1,11 @@
-"""Films: .gif and .webp by Pillow, .mp4 by the ffmpeg that imageio-ffmpeg brings."""
+"""Films: .gif and .webp by Pillow, .mp4 by ffmpeg, which imageio-ffmpeg brings where there is none."""
 
+import contextlib
 import itertools
 import os
+import shutil
+import subprocess
+import tempfile
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -17,30 +21,37 @@ if TYPE_CHECKING:
     from ..replay import Replay
 
 RATE = 25  # pictures a second: 40 ms each, which GIF, in hundredths of a second, has exactly
-QUALITY = 8  # of ten
 
 
 def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
     """The scene as it went, in its own time, RATE pictures a second: of each moment the frame that is nearest."""
     image, draw = needed("PIL.Image", path), needed("PIL.ImageDraw", path)
     kind = os.path.splitext(path)[1].lower()
-    video: Any = needed("imageio_ffmpeg", path) if kind == ".mp4" else None
+    video = _ffmpeg(path) if kind == ".mp4" else ""
     if not len(recording.frames):
         raise ValueError(f"replay: {recording.path} has no frame, so there is nothing for {path}.")
     pictures = _pictures(recording, shape, image, draw)
     first = next(pictures)
     if not video:
-        more = {"quality": 10 * QUALITY} if kind == ".webp" else {}
-        first.save(path, save_all=True, append_images=pictures, duration=1000 // RATE, loop=0, **more)
+        first.save(path, save_all=True, append_images=pictures, duration=1000 // RATE, loop=0)
         return [path]
-    out = video.write_frames(path, first.size, fps=RATE, quality=QUALITY)
-    try:
-        out.send(None)
-        for picture in itertools.chain([first], pictures):
-            out.send(picture.tobytes())
-    finally:
-        out.close()
+    size = "x".join(map(str, first.size))
+    words = [video, "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(RATE), "-i", "-"]
+    with tempfile.TemporaryFile() as said:
+        process = subprocess.Popen([*words, "-pix_fmt", "yuv420p", path], stdin=subprocess.PIPE, stderr=said)
+        with process, contextlib.suppress(BrokenPipeError):  # where it has ended, it has said why
+            assert process.stdin
+            for picture in itertools.chain([first], pictures):
+                process.stdin.write(picture.tobytes())
+        said.seek(0)
+        if process.returncode:
+            raise RuntimeError(f"replay: ffmpeg did not write {path}: {said.read().decode(errors='replace').strip()}")
     return [path]
+
+
+def _ffmpeg(path: str) -> str:
+    """Where the program is."""
+    return shutil.which("ffmpeg") or needed("imageio_ffmpeg", path).get_ffmpeg_exe()
 
 
 def _pictures(recording: "Replay", shape: Shape | None, image: Any, draw: Any) -> Iterator[Any]:

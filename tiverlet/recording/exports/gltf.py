@@ -36,10 +36,12 @@ def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
     if not (x.size and np.isfinite(x).all()):
         why = "has positions that are not finite" if x.size else "has no particles"
         raise ValueError(f"replay: {recording.path} {why}, which glTF cannot say; export to .csv, .obj, .pvd or .xyz.")
-    scene = _Scene(lib, x, stretch.times.astype(np.float32))
+    times = stretch.times.astype(np.float32)
+    later = np.append(np.diff(times) > 0, True)  # of frames at the same time, the last
+    scene = _Scene(lib, x[later], times[later])
     root = scene.node(name="scene", rotation=_turn(bodies.up))
     single = bodies.bare if len(bodies.bare) <= SPHERES else bodies.bare[:0]
-    scene.children(root, [*_mesh(scene, bodies, np.setdiff1d(bodies.loose, single)), *_spheres(scene, stretch, bodies, single)])
+    scene.children(root, [*_meshes(scene, bodies, np.setdiff1d(bodies.loose, single)), *_spheres(scene, stretch, bodies, single)])
     return scene.save(path)
 
 
@@ -52,27 +54,21 @@ def _turn(up: np.ndarray) -> list[float]:
     return [0.0, 0.0, sign * half, half] if axis == 0 else [-sign * half, 0.0, 0.0, half]
 
 
-def _mesh(scene: "_Scene", bodies: Bodies, points: np.ndarray) -> list[int]:
-    """The node of the mesh of all surfaces, links and points; none where there are none."""
+def _meshes(scene: "_Scene", bodies: Bodies, points: np.ndarray) -> list[int]:
+    """A node for all surfaces, one for links and one for points, where there are some: programs that read several kinds of
+    primitives from one animated mesh mix them up (VTK 9.7).
+    """
     at, uv, triangles = _vertices(bodies)
-    if not len(at) + len(bodies.links) + len(points):
-        return []
-    parts = []
+    nodes = []
     if len(at):
-        normals = np.array([_normals(x[at], triangles) for x in scene.x])
-        if len(uv):
-            normals = np.array([_joined(n, at) for n in normals])
-        parts.append(scene.primitive(TRIANGLES, at, bodies.hues, triangles, normals, uv))
+        normals = np.array([_normals(x, at, triangles) for x in scene.x], dtype=np.float32)
+        nodes.append(scene.moving("surfaces", scene.primitive(TRIANGLES, at, bodies.hues, triangles, normals, uv)))
     if len(bodies.links):
         ends, pairs = np.unique(bodies.links, return_inverse=True)
-        parts.append(scene.primitive(LINES, ends, bodies.hues, pairs))
+        nodes.append(scene.moving("links", scene.primitive(LINES, ends, bodies.hues, pairs)))
     if len(points):
-        parts.append(scene.primitive(POINTS, points, bodies.hues))
-    mesh = scene.mesh("bodies", parts)
-    node = scene.node(name="bodies", mesh=mesh)
-    if len(scene.x) > 1:
-        scene.animate(node, "weights", np.eye(len(scene.x), dtype=np.float32)[:, 1:].ravel(), "SCALAR")
-    return [node]
+        nodes.append(scene.moving("points", scene.primitive(POINTS, points, bodies.hues)))
+    return nodes
 
 
 def _vertices(bodies: Bodies) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -90,17 +86,13 @@ def _vertices(bodies: Bodies) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return rows[:, 0].astype(np.int64), rows[:, 1:], vertex.ravel()[bodies.corners]
 
 
-def _normals(x: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """The sum of the normals of the triangles at each vertex, as long as twice their areas."""
-    a, b, c = (x[k] for k in triangles.T)
-    across = np.cross(b - a, c - a)
-    corner = triangles.ravel()
-    return np.stack([np.bincount(corner, np.repeat(across[:, k], 3), len(x)) for k in range(3)], axis=1)
-
-
-def _joined(normals: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """The sum over the vertices of one particle."""
-    return np.stack([np.bincount(at, normals[:, k])[at] for k in range(3)], axis=1)
+def _normals(x: np.ndarray, at: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Unit normals at vertices, (v, 3): means over the triangles at a particle, by area. at: the particle of each vertex."""
+    a, b, c = (x[at[k]] for k in triangles.T)
+    across, corner = np.cross(b - a, c - a), at[triangles].ravel()
+    normal = np.stack([np.bincount(corner, np.repeat(across[:, k], 3), len(x)) for k in range(3)], axis=1)[at]
+    size = np.linalg.norm(normal, axis=1, keepdims=True)
+    return np.where(size > 0, normal / np.where(size > 0, size, 1), [0.0, 1.0, 0.0])
 
 
 def _spheres(scene: "_Scene", stretch: Stretch, bodies: Bodies, single: np.ndarray) -> list[int]:
@@ -120,11 +112,11 @@ def _spheres(scene: "_Scene", stretch: Stretch, bodies: Bodies, single: np.ndarr
                 mode=TRIANGLES, indices=corners, material=scene.material(hue),
                 attributes=scene.lib.Attributes(POSITION=position, NORMAL=normal),
             )  # fmt: skip
-            meshes[hue] = scene.mesh("particle", [part])
+            meshes[hue] = scene.mesh("particle", part)
         place = scene.x[:, i]
         node = scene.node(name=f"particle {i}", mesh=meshes[hue], translation=place[0].tolist(), scale=[float(radius[i])] * 3)
         if (place != place[0]).any():
-            scene.animate(node, "translation", place, "VEC3")
+            scene.animate(node, "translation", scene.sampler(place, "VEC3"))
         nodes.append(node)
     return nodes
 
@@ -146,6 +138,7 @@ class _Scene:
         self._plain = self.material((1.0, 1.0, 1.0))
         self._channels: list[Any] = []
         self._samplers: list[Any] = []
+        self._weights: int | None = None  # the sampler of all that is animated by them
         self._times = self.add(times, "SCALAR", ends=True) if len(x) > 1 else None
 
     def add(self, array: np.ndarray, kind: str, use: int | None = None, *, ends: bool = False) -> int:
@@ -172,10 +165,7 @@ class _Scene:
         return len(self._file.materials) - 1
 
     def primitive(self, mode: int, at: np.ndarray, hues: np.ndarray, indices=None, normals=None, uv=()) -> Any:
-        """Vertices at the particles `at` that move with them. normals: (frames, vertices, 3), of any length."""
-        if normals is not None:
-            size = np.linalg.norm(normals, axis=2, keepdims=True)
-            normals = np.where(size > 0, normals / np.where(size > 0, size, 1), [0.0, 1.0, 0.0]).astype(np.float32)
+        """Vertices at the particles `at` that move with them. normals: (frames, vertices, 3)."""
         hue = np.column_stack([np.rint(255 * _linear(hues[at])), np.full(len(at), 255)]).astype(np.uint8)
         first = {"POSITION": self.add(self.x[0, at], "VEC3", VERTICES, ends=True), "COLOR_0": self.add(hue, "VEC4", VERTICES)}
         if normals is not None:
@@ -191,9 +181,9 @@ class _Scene:
         attributes = self.lib.Attributes(**first)
         return self.lib.Primitive(mode=mode, attributes=attributes, indices=corners, targets=targets, material=self._plain)
 
-    def mesh(self, name: str, parts: list) -> int:
+    def mesh(self, name: str, part: Any) -> int:
         """The number of a mesh."""
-        self._file.meshes.append(self.lib.Mesh(name=name, primitives=parts, weights=[0.0] * len(parts[0].targets or ())))
+        self._file.meshes.append(self.lib.Mesh(name=name, primitives=[part], weights=[0.0] * len(part.targets or ())))
         return len(self._file.meshes) - 1
 
     def node(self, **what: Any) -> int:
@@ -206,11 +196,24 @@ class _Scene:
         self._file.nodes[node].children = others
         self._file.scenes.append(self.lib.Scene(nodes=[node]))
 
-    def animate(self, node: int, what: str, values: np.ndarray, kind: str) -> None:
-        """Values of a node at the times of all frames; linear between them."""
+    def moving(self, name: str, part: Any) -> int:
+        """The number of a node with a mesh that goes from frame to frame."""
+        node = self.node(name=name, mesh=self.mesh(name, part))
+        if len(self.x) > 1:
+            if self._weights is None:
+                self._weights = self.sampler(np.eye(len(self.x), dtype=np.float32)[:, 1:].ravel(), "SCALAR")
+            self.animate(node, "weights", self._weights)
+        return node
+
+    def sampler(self, values: np.ndarray, kind: str) -> int:
+        """Values at the times of all frames; linear between them."""
         self._samplers.append(self.lib.AnimationSampler(input=self._times, output=self.add(values, kind), interpolation="LINEAR"))
+        return len(self._samplers) - 1
+
+    def animate(self, node: int, what: str, sampler: int) -> None:
+        """Let something of a node have the values of a sampler."""
         target = self.lib.AnimationChannelTarget(node=node, path=what)
-        self._channels.append(self.lib.AnimationChannel(sampler=len(self._samplers) - 1, target=target))
+        self._channels.append(self.lib.AnimationChannel(sampler=sampler, target=target))
 
     def save(self, path: str) -> list[str]:
         """Write it: one file, or for .gltf two."""

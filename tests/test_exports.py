@@ -1,0 +1,361 @@
+"""Exports: what other programs read is what was recorded."""
+
+import json
+import pathlib
+import re
+import struct
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+
+import imageio_ffmpeg
+import meshio
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+import tiverlet as tv
+from tiverlet.__main__ import main
+from tiverlet.device import ti
+from tiverlet.recording import Replay, scene
+from tiverlet.recording.exports.bodies import bodies, oriented
+
+S = tv.shapes
+TEXT = """# a roof: a square and a triangle
+v 0 0 0
+v 1 0 0
+v 1 1 0
+v 0 1 0
+v 0.5 2 0.5
+vt 0 0
+vt 1 0
+vt 1 1
+vt 0 1
+vt 0.25 0.875
+vt 0.5 0.5
+f 1/1 2/2 3/3 4/4
+f 4/6 3/3 5/5
+"""
+
+
+@ti.func
+def breeze(x):
+    """A force of the user's."""
+    return 0.1 * x
+
+
+@pytest.fixture(scope="module")
+def roof(tmp_path_factory) -> S.Shape:
+    """A shape from a file, with a quad and texture coordinates, of which one particle has two."""
+    path = tmp_path_factory.mktemp("roof") / "roof.obj"
+    path.write_text(TEXT)
+    return S.load(path)
+
+
+@pytest.fixture(scope="module")
+def whole(roof) -> S.Shape:
+    """The roof (0 to 4), a rope (5 to 7), and two particles by themselves, one with a radius."""
+    alone = S.Shape(np.array([[3.0, 0.0, 2.0], [4.0, 0.0, 2.0]]), radius=np.array([0.25, 0.0]))
+    return S.join(roof, S.rope((2, 0, 0), (2, 1, 0), points=3), alone)[0]
+
+
+@pytest.fixture(scope="module")
+def recording(whole, tmp_path_factory) -> Replay:
+    """All of it falls along z, in four frames of 1/60 s."""
+    path = tmp_path_factory.mktemp("recording") / "a.rrd"
+    particles = tv.Particles(whole.position, mass=1 + np.arange(10) / 8, radius=whole.radius, velocity=(0.5, 0, 0), pinned=[5])
+    features = [tv.Gravity((0, 0, -9.81)), tv.Force(breeze), tv.Distance(whole.links), tv.Dihedral(whole.quads)]
+    with tv.World(particles, features, substeps=2) as world, tv.Recorder(path, world) as recorder:
+        world.run(4 / 60, recorder=recorder)
+    return tv.replay(path)
+
+
+@pytest.fixture
+def changing(tmp_path, world) -> Replay:
+    """A third particle comes; nothing was computed."""
+    w = world(tv.Particles([[0.0, 0.0], [1.0, 0.0]]), [tv.Distance([(0, 1)])])
+    with tv.Recorder(tmp_path / "c.rrd", w) as recorder:
+        w.add(tv.Particles([[2.0, 1.0]]))
+        recorder.log()
+    return tv.replay(tmp_path / "c.rrd")
+
+
+def positions(recording: Replay) -> list[np.ndarray]:
+    return [recording.position(int(k)) for k in recording.frames]
+
+
+def uv_of(mesh: trimesh.Trimesh) -> np.ndarray:
+    """Texture coordinates of vertices."""
+    return mesh.visual.uv  # type: ignore
+
+
+def parsed(path: pathlib.Path) -> tuple[dict, bytes]:
+    """The two chunks of a .glb file."""
+    data = path.read_bytes()
+    magic, version, size, first, kind = struct.unpack("<4sIII4s", data[:20])
+    assert (magic, version, size, kind) == (b"glTF", 2, len(data), b"JSON")
+    return json.loads(data[20 : 20 + first]), data[28 + first :]
+
+
+def values(text: dict, blob: bytes, number: int) -> np.ndarray:
+    """What an accessor says."""
+    accessor = text["accessors"][number]
+    view = text["bufferViews"][accessor["bufferView"]]
+    kind = {5126: "<f4", 5125: "<u4", 5121: "u1"}[accessor["componentType"]]
+    width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+    out = np.frombuffer(blob, kind, accessor["count"] * width, view["byteOffset"]).reshape(-1, width)
+    assert "min" not in accessor or (np.float32(accessor["min"]) == out.min(axis=0)).all()
+    return out
+
+
+def test_gltf_holds_every_frame(recording, tmp_path):
+    path = tmp_path / "a.glb"
+    assert recording.export(path) == [str(path)]
+    text, blob = parsed(path)
+    samplers = text["animations"][0]["samplers"]
+    channels = {(c["target"]["node"], c["target"]["path"]): samplers[c["sampler"]] for c in text["animations"][0]["channels"]}
+    x = np.array(positions(recording))
+    assert all((values(text, blob, s["input"]).ravel() == recording.times.astype(np.float32)).all() for s in samplers)
+
+    names = {node["name"]: k for k, node in enumerate(text["nodes"])}
+    assert set(names) == {"scene", "surfaces", "links", "points", "particle 8"}
+    at, parts = {4: np.arange(5), 1: np.arange(5, 8), 0: np.array([9])}, {}
+    for name, mode in (("surfaces", 4), ("links", 1), ("points", 0)):
+        weights = values(text, blob, channels[names[name], "weights"]["output"]).reshape(5, 4)
+        assert (weights == np.eye(5)[:, 1:]).all()
+        [part] = text["meshes"][text["nodes"][names[name]]["mesh"]]["primitives"]
+        assert part["mode"] == mode
+        parts[mode] = part
+        first = values(text, blob, part["attributes"]["POSITION"])
+        np.testing.assert_array_equal(first, x[0, at[mode]])
+        for k, target in enumerate(part["targets"], 1):
+            np.testing.assert_allclose(first + values(text, blob, target["POSITION"]), x[k, at[mode]], atol=3e-7)
+        assert len(part["targets"]) == 4
+    assert values(text, blob, parts[1]["indices"]).ravel().tolist() == [0, 1, 1, 2]
+    corners = values(text, blob, parts[4]["indices"]).reshape(-1, 3)
+    assert sorted(map(sorted, corners.tolist())) == [[0, 1, 2], [0, 2, 3], [2, 3, 4]]
+
+    # Normals are those of what was recorded, and point up, which is z; a node turns z to y.
+    last = x[-1, :5].astype(np.float64)
+    normal = values(text, blob, parts[4]["attributes"]["NORMAL"]) + values(text, blob, parts[4]["targets"][3]["NORMAL"])
+    across = np.cross(last[3] - last[2], last[4] - last[2])
+    np.testing.assert_allclose(normal[4], np.sign(across[2]) * across / np.linalg.norm(across), atol=1e-5)
+    *axis, w = text["nodes"][names["scene"]]["rotation"]
+    up = np.array([0.0, 0, 1])
+    turned = up + 2 * np.cross(axis, np.cross(axis, up) + w * up)
+    np.testing.assert_allclose(turned, [0, 1, 0], atol=1e-15)
+
+    sphere = text["nodes"][names["particle 8"]]
+    assert sphere["scale"] == [0.25] * 3
+    np.testing.assert_array_equal(values(text, blob, channels[names["particle 8"], "translation"]["output"]), x[:, 8])
+
+
+@pytest.mark.parametrize("kind", ["glb", "gltf"])
+def test_trimesh_reads_gltf(recording, whole, kind, tmp_path):
+    names = recording.export(tmp_path / f"a.{kind}", shape=whole)
+    assert names == [str(tmp_path / name) for name in (["a.glb"] if kind == "glb" else ["a.gltf", "a.bin"])]
+    meshes = [g for g in trimesh.load_scene(names[0]).geometry.values() if isinstance(g, trimesh.Trimesh)]
+    mesh = next(m for m in meshes if len(m.faces) == 3)
+    x, uv = recording.position(0), np.concatenate(whole.uv)
+    around = np.concatenate(whole.polygons)
+    pairs = sorted({(*x[i].tolist(), *place) for i, place in zip(around, uv.tolist(), strict=True)})
+    np.testing.assert_allclose(sorted(np.column_stack([mesh.vertices, uv_of(mesh)]).tolist()), pairs, atol=1e-7)
+    assert len(pairs) == 6  # particle 3 is there twice
+    np.testing.assert_allclose(mesh.area, 1 + np.sqrt(1.25) / 2, rtol=1e-6)
+
+
+def test_vtk_plays_gltf_and_reads_vtu(recording, tmp_path):
+    vtk = pytest.importorskip("vtk")
+    to_numpy = pytest.importorskip("vtk.util.numpy_support").vtk_to_numpy
+    recording.export(tmp_path / "a.glb")
+    reader = vtk.vtkGLTFReader()
+    reader.SetFileName(str(tmp_path / "a.glb"))
+    reader.UpdateInformation()
+    reader.EnableAnimation(0)
+    reader.ApplyDeformationsToGeometryOn()
+    for time, x in zip(recording.times, positions(recording), strict=True):
+        reader.UpdateTimeStep(float(np.float32(time)))
+        found = []
+        pieces = reader.GetOutput().NewIterator()
+        pieces.InitTraversal()
+        while not pieces.IsDoneWithTraversal():
+            found.append(to_numpy(pieces.GetCurrentDataObject().GetPoints().GetData()))
+            pieces.GoToNextItem()
+        np.testing.assert_allclose(next(f for f in found if len(f) == 5), x[:5, [0, 2, 1]] * [1, 1, -1], atol=1e-6)
+    recording.export(tmp_path / "a.pvd")
+    grid = vtk.vtkXMLUnstructuredGridReader()
+    grid.SetFileName(str(tmp_path / "a_0004.vtu"))
+    grid.Update()
+    np.testing.assert_array_equal(to_numpy(grid.GetOutput().GetPoints().GetData()), recording.position(4))
+    kinds = [grid.GetOutput().GetCellType(k) for k in range(grid.GetOutput().GetNumberOfCells())]
+    assert kinds == [5, 5, 5, 3, 3, 1, 1]
+
+
+def test_obj_files_keep_faces_and_texture_coordinates(recording, roof, whole, tmp_path):
+    names = recording.export(tmp_path / "f_%03d.obj", shape=whole)
+    assert names == [str(tmp_path / f"f_{k:03d}.obj") for k in range(5)]
+    for name, x in zip(names, positions(recording), strict=True):
+        back = S.load(name)
+        np.testing.assert_array_equal(back.position.astype(np.float32), x)
+        assert [p.tolist() for p in back.polygons] == [[0, 1, 2, 3], [3, 2, 4]]
+        assert [uv.tolist() for uv in back.uv] == [uv.tolist() for uv in roof.uv]
+        assert back.links.tolist() == [[5, 6], [6, 7]]
+    assert "p 9\np 10\n" in pathlib.Path(names[0]).read_text()
+    mesh = trimesh.load_mesh(names[-1], process=False, maintain_order=True)
+    assert len(mesh.faces) == 3 and len(uv_of(mesh)) == len(mesh.vertices)
+
+
+def test_obj_files_without_a_shape_are_triangles(recording, tmp_path):
+    assert recording.export(tmp_path / "f.obj")[-1] == str(tmp_path / "f_0004.obj")
+    back = S.load(tmp_path / "f_0004.obj")
+    np.testing.assert_array_equal(back.position.astype(np.float32), recording.position(4))
+    assert sorted(map(sorted, back.faces.tolist())) == [[0, 1, 2], [0, 2, 3], [2, 3, 4]] and not back.polygons
+
+
+def test_meshio_reads_vtk(recording, whole, tmp_path):
+    path = tmp_path / "a & b.pvd"
+    names = recording.export(path, shape=whole)
+    sets = ET.parse(path).getroot().findall("Collection/DataSet")
+    assert [float(s.attrib["timestep"]) for s in sets] == recording.times.tolist()
+    assert [str(tmp_path / s.attrib["file"]) for s in sets] == names[1:] and names[0] == str(path)
+    for name, x in zip(names[1:], positions(recording), strict=True):
+        mesh = meshio.read(name)
+        np.testing.assert_array_equal(mesh.points, x)
+        assert {block.type: block.data.tolist() for block in mesh.cells} == {
+            "quad": [[0, 1, 2, 3]], "triangle": [[3, 2, 4]], "line": [[5, 6], [6, 7]], "vertex": [[8], [9]],
+        }  # fmt: skip
+        np.testing.assert_array_equal(mesh.point_data["radius"], whole.radius)
+        np.testing.assert_array_equal(mesh.point_data["mass"], 1 + np.arange(10) / 8)
+
+
+def test_ase_reads_xyz(recording, tmp_path):
+    ase = pytest.importorskip("ase.io")
+    recording.export(tmp_path / "a.xyz")
+    frames = ase.read(tmp_path / "a.xyz", index=":")
+    np.testing.assert_array_equal(np.array([f.positions for f in frames], dtype=np.float32), positions(recording))
+    assert [f.info["Time"] for f in frames] == recording.times.tolist()
+    assert frames[0].arrays["radius"].tolist() == [0.0] * 8 + [0.25, 0.0]
+
+
+def test_a_plane_is_at_zero_and_particles_may_come(changing, tmp_path):
+    changing.export(tmp_path / "a.pvd")
+    assert meshio.read(tmp_path / "a_0000.vtu").points.tolist() == [[0, 0, 0], [1, 0, 0]]
+    assert meshio.read(tmp_path / "a_0001.vtu").points.tolist() == [[0, 0, 0], [1, 0, 0], [2, 1, 0]]
+    changing.export(tmp_path / "a.obj")
+    assert [len(S.load(tmp_path / f"a_000{k}.obj")) for k in (0, 1)] == [2, 3]
+    changing.export(tmp_path / "a.csv")
+    table = np.loadtxt(tmp_path / "a.csv", delimiter=",", skiprows=1)
+    assert table.tolist() == [[0, 0, 0, 0, 0], [0, 0, 1, 1, 0], [1, 0, 0, 0, 0], [1, 0, 1, 1, 0], [1, 0, 2, 2, 1]]
+    changing.export(tmp_path / "a.xyz")
+    assert "radius" not in (tmp_path / "a.xyz").read_text()
+    for kind, others in (("npz", ".csv"), ("glb", ".csv, .obj, .pvd or .xyz")):
+        with pytest.raises(ValueError, match=f"not the same in all frames, so .* export to {others}"):
+            changing.export(tmp_path / f"a.{kind}")
+        assert not (tmp_path / f"a.{kind}").exists()
+
+
+@pytest.mark.parametrize("kind", ["gif", "webp", "mp4"])
+def test_films_show_what_moves(kind, tmp_path, world):
+    # A disc goes to the right at 2 m/s between walls: a picture every 40 ms, of the nearest frame.
+    x, w = tmp_path / f"a.{kind}", world(tv.Particles([[0.5, 0.5]], radius=0.1, velocity=(2, 0)), [tv.Box((0, 0), (2, 1))])
+    with tv.Recorder(tmp_path / "a.rrd", w) as recorder:
+        w.run(0.5, recorder=recorder)
+    recording = tv.replay(tmp_path / "a.rrd")
+    assert recording.export(x) == [str(x)]
+    if kind == "mp4":
+        words = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(x), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+        done = subprocess.run(words, capture_output=True, check=True)
+        found = re.search(rb"Video: h264.* (\d+)x(\d+).* 25 fps", done.stderr)
+        assert found
+        width, height = map(int, found.groups())
+        pictures = list(np.frombuffer(done.stdout, np.uint8).reshape(-1, height, width, 3))
+    else:
+        with Image.open(x) as film:
+            pictures = []
+            for k in range(getattr(film, "n_frames", 0)):
+                film.seek(k)
+                pictures.append(np.asarray(film.convert("RGB")))
+                assert film.info["duration"] == 40
+    moments = np.arange(len(pictures)) / 25
+    assert len(pictures) == 13
+    wide = pictures[0].shape[1]
+    lit = [p.astype(int).max(axis=2) - p.astype(int).min(axis=2) > 80 for p in pictures]  # walls are grey
+    across = [np.nonzero(some)[1].mean() / wide for some in lit]
+    shown = recording.frames[[np.argmin(np.abs(recording.times - t)) for t in moments]]
+    truth = [recording.position(int(k))[0, 0] for k in shown]
+    slope, start = np.polyfit(truth, across, 1)
+    np.testing.assert_allclose(np.polyval([slope, start], truth), across, atol=0.004)
+    assert 0.4 < slope < 0.5 and 0.03 < start < 0.06
+
+
+def test_errors_say_what_can_be_done(recording, roof, whole, tmp_path, monkeypatch):
+    endings = ".csv, .gif, .glb, .gltf, .mp4, .npz, .obj, .pvd, .webp or .xyz can be written"
+    with pytest.raises(ValueError, match=f"a.stl ends in '.stl', but {endings}"):
+        recording.export("a.stl")
+    with pytest.raises(FileNotFoundError, match="folder of .*a.glb does not exist"):
+        recording.export(tmp_path / "none" / "a.glb")
+    with pytest.raises(ValueError, match="shape has 5 points, but the recording has 10 particles"):
+        recording.export(tmp_path / "a.obj", shape=roof)
+    with pytest.raises(ValueError, match="a.csv has no faces, so it takes no shape; .gif, .glb"):
+        recording.export(tmp_path / "a.csv", shape=whole)
+    with pytest.raises(TypeError, match="shape = 'roof.obj' is a str"):
+        recording.export(tmp_path / "a.obj", shape="roof.obj")  # type: ignore[arg-type]
+    monkeypatch.setenv("PATH", "")  # so that there is no other ffmpeg
+    for module, kind in (("pygltflib", "glb"), ("imageio_ffmpeg", "mp4")):
+        monkeypatch.setitem(sys.modules, module, None)
+        with pytest.raises(ImportError, match=rf"a.{kind} needs {module}, .* pip install 'tiverlet\[export\]'"):
+            recording.export(tmp_path / f"a.{kind}")
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command_exports(recording, whole, tmp_path, capsys):
+    S.save(tmp_path / "whole.obj", whole)
+    out = str(tmp_path / "b_%d.obj")
+    assert main(["replay", recording.path, "--export", out, "--shape", str(tmp_path / "whole.obj")]) == 0
+    assert "b_0.obj and 4 more: " in capsys.readouterr().out
+    assert [len(p) for p in S.load(tmp_path / "b_4.obj").polygons] == [4, 3]
+    assert main(["replay", recording.path, "--export", "stl"]) == 2
+    assert "can be written" in capsys.readouterr().err
+
+
+def test_shapes_keep_polygons(roof, whole, tmp_path):
+    assert [p.tolist() for p in roof.polygons] == [[0, 1, 2, 3], [3, 2, 4]]
+    assert roof.faces.tolist() == [[0, 1, 2], [0, 2, 3], [3, 2, 4]]
+    assert [uv.tolist() for uv in roof.uv] == [[[0, 0], [1, 0], [1, 1], [0, 1]], [[0.5, 0.5], [1, 1], [0.25, 0.875]]]
+    S.save(tmp_path / "b.obj", roof.moved((1, 2, 3)))
+    back = S.load(tmp_path / "b.obj")
+    assert all(np.array_equal(a, b) for a, b in zip((*back.polygons, *back.uv), (*roof.polygons, *roof.uv), strict=True))
+    assert (back.position == roof.position + [1, 2, 3]).all()
+
+    cloth = S.cloth((0, 0, 0), (1, 0, 0), (0, 0, 1), (2, 2))
+    both, (_, b) = S.join(cloth, roof)
+    assert not cloth.polygons and [len(p) for p in both.polygons] == [3, 3, 4, 3]
+    assert [len(uv) for uv in both.uv] == [0, 0, 4, 3] and (both.polygons[2] == roof.polygons[0] + b.start).all()
+    order = roof.in_order()
+    np.testing.assert_array_equal(order.position[order.polygons[1]], roof.position[roof.polygons[1]])
+    for wrong in ("f 1/1 2/2 3/3", "vt x"):
+        (tmp_path / "c.obj").write_text(f"v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\n{wrong}\n")
+        with pytest.raises(ValueError, match="line 5"):
+            S.load(tmp_path / "c.obj")
+
+
+def test_surfaces_have_one_sense():
+    ball = S.balloon((0, 0, 0), 1.0, level=1)
+    rng = np.random.default_rng(1)
+    faces = ball.faces.copy()
+    some = rng.random(len(faces)) < 0.5
+    faces[some] = faces[some][:, ::-1]
+    a, b, c = (ball.position[k] for k in oriented(faces, ball.position, np.array([0.0, 1.0, 0.0])).T)
+    assert (np.einsum("ij,ij->i", a, np.cross(b, c)) > 0).all()  # outwards, all of them
+    flat = oriented(np.array([[0, 2, 1]]), np.array([[0.0, 0], [1, 0], [0, 1]]), np.array([0.0, 1]))
+    assert flat.tolist() == [[1, 2, 0]]
+
+
+def test_parts_of_a_scene_need_no_function_of_the_users(recording):
+    entry, frames, _ = recording.scenes[0]
+    parts = scene.parts(entry.data, entry.arrays)
+    assert frames == [0, 1, 2, 3, 4] and parts.numbers == (0, 2, 3)
+    assert [type(f).__name__ for f in parts.features] == ["Gravity", "Distance", "Dihedral"]
+    found = bodies(parts)
+    assert found.loose.tolist() == [8, 9] and found.bare.tolist() == [8] and found.up.tolist() == [0, 0, 1]
