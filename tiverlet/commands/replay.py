@@ -1,4 +1,4 @@
-"""A recording: open it in the viewer, compute it again and compare, take a picture, or write its numbers to a file."""
+"""A recording: open it in the viewer, compute it again and compare, take a picture, or write it for other programs."""
 
 import argparse
 import os

@@ -67,7 +67,7 @@ def extent(parts: Parts, frames: Sequence[np.ndarray]) -> tuple[np.ndarray, np.n
         if isinstance(f, Box):
             low = np.where(np.isfinite(f.lower), np.minimum(low, f.lower), low)
             high = np.where(np.isfinite(f.upper), np.maximum(high, f.upper), high)
-        if isinstance(f, (Ball, Capsule, Mesh, Path, Polygon)) and not getattr(f, "inside", False):
+        if isinstance(f, (Ball, Capsule, Mesh, Path, Polygon)):
             strips, thickness = f.outline(low, high)
             if strips.size:
                 low = np.minimum(low, strips.min(axis=(0, 1)) - thickness)
