@@ -19,7 +19,7 @@ import tiverlet as tv
 from tiverlet.__main__ import main
 from tiverlet.device import ti
 from tiverlet.recording import Replay, scene
-from tiverlet.recording.exports.bodies import bodies, oriented
+from tiverlet.recording.exports.geometry import geometry, oriented
 
 S = tv.shapes
 TEXT = """# a roof: a square and a triangle
@@ -257,10 +257,13 @@ def test_a_plane_is_at_zero_and_particles_may_come(changing, tmp_path):
 
 @pytest.mark.parametrize("kind", ["gif", "webp", "mp4"])
 def test_films_show_what_moves(kind, tmp_path, world):
-    # A disc goes to the right at 2 m/s between walls: a picture every 40 ms, of the nearest frame.
-    x, w = tmp_path / f"a.{kind}", world(tv.Particles([[0.5, 0.5]], radius=0.1, velocity=(2, 0)), [tv.Box((0, 0), (2, 1))])
+    # A disc goes to the right at 2 m/s between walls: a picture every 40 ms, of the nearest frame. Then a wall is moved.
+    box = tv.Box((0, 0), (2, 1))
+    x, w = tmp_path / f"a.{kind}", world(tv.Particles([[0.5, 0.5]], radius=0.1, velocity=(2, 0)), [box])
     with tv.Recorder(tmp_path / "a.rrd", w) as recorder:
-        w.run(0.5, recorder=recorder)
+        w.run(0.4, recorder=recorder)
+        box.upper = (1.8, 1.0)
+        w.run(0.1, recorder=recorder)
     recording = tv.replay(tmp_path / "a.rrd")
     assert recording.export(x) == [str(x)]
     if kind == "mp4":
@@ -287,6 +290,8 @@ def test_films_show_what_moves(kind, tmp_path, world):
     slope, start = np.polyfit(truth, across, 1)
     np.testing.assert_allclose(np.polyval([slope, start], truth), across, atol=0.004)
     assert 0.4 < slope < 0.5 and 0.03 < start < 0.06
+    ends = [np.nonzero(p[5:-5].max(axis=(0, 2)) > 80)[0].max() / wide for p in (pictures[0], pictures[-1])]
+    np.testing.assert_allclose(ends, np.polyval([slope, start], [2.0, 1.8]), atol=0.005)
 
 
 def test_errors_say_what_can_be_done(recording, roof, whole, tmp_path, monkeypatch):
@@ -357,5 +362,5 @@ def test_parts_of_a_scene_need_no_function_of_the_users(recording):
     parts = scene.parts(entry.data, entry.arrays)
     assert frames == [0, 1, 2, 3, 4] and parts.numbers == (0, 2, 3)
     assert [type(f).__name__ for f in parts.features] == ["Gravity", "Distance", "Dihedral"]
-    found = bodies(parts)
+    found = geometry(parts)
     assert found.loose.tolist() == [8, 9] and found.bare.tolist() == [8] and found.up.tolist() == [0, 0, 1]

@@ -13,11 +13,11 @@ if TYPE_CHECKING:
     from ..replay import Replay
 
 NUMBERS = {".npz": arrays.write, ".csv": table.write, ".xyz": xyz.write}
-BODIES = {  # these take a shape
+SHAPED = {  # these take a shape
     ".glb": gltf.write, ".gltf": gltf.write, ".obj": obj.write, ".pvd": vtk.write,
     ".gif": film.write, ".mp4": film.write, ".webp": film.write,
 }  # fmt: skip
-ENDINGS = sorted([*NUMBERS, *BODIES])
+ENDINGS = sorted([*NUMBERS, *SHAPED])
 
 
 def export(recording: "Replay", path: str, shape: Shape | None = None) -> list[str]:
@@ -27,9 +27,9 @@ def export(recording: "Replay", path: str, shape: Shape | None = None) -> list[s
         raise ValueError(f"replay: {path} ends in {kind!r}, but {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]} can be written.")
     if not isinstance(shape, Shape | None):
         raise TypeError(f"replay: shape = {shape!r} is a {type(shape).__name__}, but a tv.shapes.Shape is needed.")
-    if shape is not None and kind not in BODIES:
-        raise ValueError(f"replay: {path} has no faces, so it takes no shape; {', '.join(sorted(BODIES))} do.")
+    if shape is not None and kind not in SHAPED:
+        raise ValueError(f"replay: {path} has no faces, so it takes no shape; {', '.join(sorted(SHAPED))} do.")
     folder = os.path.dirname(os.path.abspath(path))
     if not os.path.isdir(folder):
         raise FileNotFoundError(f"The folder of {path} does not exist.")
-    return BODIES[kind](recording, path, shape) if kind in BODIES else NUMBERS[kind](recording, path)
+    return SHAPED[kind](recording, path, shape) if kind in SHAPED else NUMBERS[kind](recording, path)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...shapes import Shape
+from ..drawing import upwards
 from ..scene import turn
 from .extras import needed
 from .sketch import Sketch, View, extent
@@ -67,7 +68,7 @@ def _pictures(recording: "Replay", shape: Shape | None, image: Any, draw: Any) -
     low, high = (pick([e[k] for e in ends], axis=0) for k, pick in enumerate((np.min, np.max)))
     if not np.isfinite([low, high]).all():
         raise ValueError(f"replay: {recording.path} has no particles, or positions that are not finite, so there is no picture.")
-    view = View(low, high, found[0].bodies(shape).up)
+    view = View(low, high, upwards(found[0].parts))
     for stretch in found:
         yield from _stretch(stretch, shape, [k for k in wanted if k in stretch.frames], image, draw, view, (low, high))
 
@@ -76,7 +77,7 @@ def _stretch(
     stretch: Stretch, shape: Shape | None, wanted: list[int], image: Any, draw: Any, view: View, ends: tuple
 ) -> Iterator[Any]:
     """Those of one scene, with walls where they are in each frame."""
-    sketch = Sketch(image, draw, stretch.parts, stretch.bodies(shape), view, ends)
+    sketch = Sketch(image, draw, stretch.parts, stretch.geometry(shape), view, ends)
     features = dict(zip(stretch.parts.numbers, stretch.parts.features, strict=True))
     turned = list(stretch.turned)
     for frame in wanted:

@@ -11,8 +11,8 @@ import numpy as np
 
 from ...colliders.round import rounded
 from ...shapes import Shape
-from .bodies import Bodies
 from .extras import needed
+from .geometry import Geometry
 from .stretch import Stretch, only
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
     """
     lib: Any = needed("pygltflib", path)
     stretch = only(recording, path, "mesh", ".csv, .obj, .pvd or .xyz")
-    bodies = stretch.bodies(shape)
+    geometry = stretch.geometry(shape)
     x = np.array([stretch.flat(x) for _, _, x in stretch], dtype=np.float32)
     if not (x.size and np.isfinite(x).all()):
         why = "has positions that are not finite" if x.size else "has no particles"
@@ -39,9 +39,11 @@ def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
     times = stretch.times.astype(np.float32)
     later = np.append(np.diff(times) > 0, True)  # of frames at the same time, the last
     scene = _Scene(lib, x[later], times[later])
-    root = scene.node(name="scene", rotation=_turn(bodies.up))
-    single = bodies.bare if len(bodies.bare) <= SPHERES else bodies.bare[:0]
-    scene.children(root, [*_meshes(scene, bodies, np.setdiff1d(bodies.loose, single)), *_spheres(scene, stretch, bodies, single)])
+    root = scene.node(name="scene", rotation=_turn(geometry.up))
+    single = geometry.bare if len(geometry.bare) <= SPHERES else geometry.bare[:0]
+    scene.children(
+        root, [*_meshes(scene, geometry, np.setdiff1d(geometry.loose, single)), *_spheres(scene, stretch, geometry, single)]
+    )
     return scene.save(path)
 
 
@@ -54,36 +56,36 @@ def _turn(up: np.ndarray) -> list[float]:
     return [0.0, 0.0, sign * half, half] if axis == 0 else [-sign * half, 0.0, 0.0, half]
 
 
-def _meshes(scene: "_Scene", bodies: Bodies, points: np.ndarray) -> list[int]:
+def _meshes(scene: "_Scene", geometry: Geometry, points: np.ndarray) -> list[int]:
     """A node for all surfaces, one for links and one for points, where there are some: programs that read several kinds of
     primitives from one animated mesh mix them up (VTK 9.7).
     """
-    at, uv, triangles = _vertices(bodies)
+    at, uv, triangles = _vertices(geometry)
     nodes = []
     if len(at):
         normals = np.array([_normals(x, at, triangles) for x in scene.x], dtype=np.float32)
-        nodes.append(scene.moving("surfaces", scene.primitive(TRIANGLES, at, bodies.hues, triangles, normals, uv)))
-    if len(bodies.links):
-        ends, pairs = np.unique(bodies.links, return_inverse=True)
-        nodes.append(scene.moving("links", scene.primitive(LINES, ends, bodies.hues, pairs)))
+        nodes.append(scene.moving("surfaces", scene.primitive(TRIANGLES, at, geometry.hues, triangles, normals, uv)))
+    if len(geometry.links):
+        ends, pairs = np.unique(geometry.links, return_inverse=True)
+        nodes.append(scene.moving("links", scene.primitive(LINES, ends, geometry.hues, pairs)))
     if len(points):
-        nodes.append(scene.moving("points", scene.primitive(POINTS, points, bodies.hues)))
+        nodes.append(scene.moving("points", scene.primitive(POINTS, points, geometry.hues)))
     return nodes
 
 
-def _vertices(bodies: Bodies) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _vertices(geometry: Geometry) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The particle of each vertex, its texture coordinates ((0, 2) where there are none), and triangles of vertices.
 
     A particle is as many vertices as it has texture coordinates.
     """
-    around = bodies.around
-    if not any(len(uv) for uv in bodies.uv):
+    around = geometry.around
+    if not any(len(uv) for uv in geometry.uv):
         at, vertex = np.unique(around, return_inverse=True)
-        return at, np.zeros((0, 2)), vertex.ravel()[bodies.corners]
-    pairs = zip(bodies.faces, bodies.uv, strict=True)
+        return at, np.zeros((0, 2)), vertex.ravel()[geometry.corners]
+    pairs = zip(geometry.faces, geometry.uv, strict=True)
     uv = np.concatenate([uv if len(uv) else np.zeros((len(face), 2)) for face, uv in pairs])
     rows, vertex = np.unique(np.column_stack([around, uv]), axis=0, return_inverse=True)
-    return rows[:, 0].astype(np.int64), rows[:, 1:], vertex.ravel()[bodies.corners]
+    return rows[:, 0].astype(np.int64), rows[:, 1:], vertex.ravel()[geometry.corners]
 
 
 def _normals(x: np.ndarray, at: np.ndarray, triangles: np.ndarray) -> np.ndarray:
@@ -95,7 +97,7 @@ def _normals(x: np.ndarray, at: np.ndarray, triangles: np.ndarray) -> np.ndarray
     return np.where(size > 0, normal / np.where(size > 0, size, 1), [0.0, 1.0, 0.0])
 
 
-def _spheres(scene: "_Scene", stretch: Stretch, bodies: Bodies, single: np.ndarray) -> list[int]:
+def _spheres(scene: "_Scene", stretch: Stretch, geometry: Geometry, single: np.ndarray) -> list[int]:
     """A node for each particle, which moves with it."""
     if not len(single):
         return []
@@ -106,7 +108,7 @@ def _spheres(scene: "_Scene", stretch: Stretch, bodies: Bodies, single: np.ndarr
     meshes: dict[tuple, int] = {}
     radius, nodes = stretch.column("radius"), []
     for i in single.tolist():
-        hue = tuple(_linear(bodies.hues[i]).tolist())
+        hue = tuple(_linear(geometry.hues[i]).tolist())
         if hue not in meshes:
             part = scene.lib.Primitive(
                 mode=TRIANGLES, indices=corners, material=scene.material(hue),

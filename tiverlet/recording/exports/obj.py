@@ -17,9 +17,9 @@ def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
     """
     out = []
     for stretch in stretches(recording):
-        bodies = stretch.bodies(shape)
-        rest = [*obj_faces(bodies.faces, bodies.uv), *(f"l {i} {j}" for i, j in (bodies.links + 1).tolist())]
-        rest += [f"p {i}" for i in (bodies.loose + 1).tolist()]
+        geometry = stretch.geometry(shape)
+        rest = [*obj_faces(geometry.faces, geometry.uv), *(f"l {i} {j}" for i, j in (geometry.links + 1).tolist())]
+        rest += [f"p {i}" for i in (geometry.loose + 1).tolist()]
         tail = "".join(f"{line}\n" for line in rest)
         rows = "v %.9g %.9g %.9g\n" * len(stretch.column("mass"))
         for frame, time, x in stretch:

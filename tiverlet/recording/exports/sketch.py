@@ -15,7 +15,7 @@ from ...constraints import Path
 from ..drawing import OPEN, WALL, upwards
 from ..scene import Parts
 from ..surfaces import Surface
-from .bodies import Bodies
+from .geometry import Geometry
 
 WIDE, MARGIN = 640, 0.04  # pixels, and the share of them that stays free on each side
 FINE = 2  # a picture is drawn in so many times as many pixels, for smooth edges
@@ -78,14 +78,23 @@ def extent(parts: Parts, frames: Sequence[np.ndarray]) -> tuple[np.ndarray, np.n
 class Sketch:
     """Draws frames of a scene. view: of all of them. extent: two corners [m] between which walls are drawn."""
 
-    def __init__(self, image: Any, draw: Any, parts: Parts, bodies: Bodies, view: View, extent: tuple[np.ndarray, np.ndarray]):
-        self._image, self._draw, self._parts, self._bodies, self._view, self._extent = image, draw, parts, bodies, view, extent
-        self._triangles = bodies.around[bodies.corners]
+    def __init__(
+        self, image: Any, draw: Any, parts: Parts, geometry: Geometry, view: View, extent: tuple[np.ndarray, np.ndarray]
+    ):
+        self._image, self._draw, self._parts, self._geometry, self._view, self._extent = (
+            image,
+            draw,
+            parts,
+            geometry,
+            view,
+            extent,
+        )
+        self._triangles = geometry.around[geometry.corners]
         self._flat = parts.particles.dim == 2
         none = np.zeros((0, 2), dtype=np.int64)
         lit = len(self._triangles) and not self._flat
-        self._surface = Surface(self._triangles, bodies.hues, none, bodies.up) if lit else None
-        self._dots = np.union1d(bodies.bare, bodies.loose)
+        self._surface = Surface(self._triangles, geometry.hues, none, geometry.up) if lit else None
+        self._dots = np.union1d(geometry.bare, geometry.loose)
 
     def frame(self, x: np.ndarray) -> Any:
         """The picture of a frame, positions [m]."""
@@ -113,22 +122,22 @@ class Sketch:
     def _faces(self, x: np.ndarray) -> list[tuple]:
         if not len(self._triangles):
             return []
-        hues = _bytes(self._surface.colors(x, np.zeros(0))) if self._surface else self._bodies.hues
+        hues = _bytes(self._surface.colors(x, np.zeros(0))) if self._surface else self._geometry.hues
         return self._mesh(x, self._triangles, np.mean, hues)
 
     def _links(self, x: np.ndarray) -> list[tuple]:
         at, near = self._view.place(x)
         out, width = [], round(2 * FINE * LINE)
-        for i, j in self._bodies.links.tolist():
+        for i, j in self._geometry.links.tolist():
             places = [*at[i].tolist(), *at[j].tolist()]
-            out.append(((near[i] + near[j]) / 2, "line", places, tuple(map(int, self._bodies.hues[i])), width))
+            out.append(((near[i] + near[j]) / 2, "line", places, tuple(map(int, self._geometry.hues[i])), width))
         return out
 
     def _discs(self, x: np.ndarray) -> list[tuple]:
         at, near = self._view.place(x)
         radii = np.maximum(self._view.scale * self._parts.particles.radius, FINE * DOT / 2)[:, None]
         boxes = np.concatenate([at - radii, at + radii], axis=1)
-        hues = self._bodies.hues.astype(int)
+        hues = self._geometry.hues.astype(int)
         return [(near[i], "disc", boxes[i].tolist(), tuple(hues[i].tolist()), 0) for i in self._dots.tolist()]
 
     def _walls(self) -> list[tuple]:

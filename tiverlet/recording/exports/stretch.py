@@ -10,7 +10,7 @@ import numpy as np
 from ...shapes import Shape
 from ..journal import Entry
 from ..scene import Parts
-from .bodies import Bodies, bodies
+from .geometry import Geometry, geometry
 
 if TYPE_CHECKING:
     from ..replay import Replay
@@ -44,9 +44,9 @@ class Stretch:
         """Particles and features."""
         return self.recording.parts(self.entry)
 
-    def bodies(self, shape: Shape | None) -> Bodies:
+    def geometry(self, shape: Shape | None) -> Geometry:
         """Faces, links and loose particles."""
-        return bodies(self.parts, shape)
+        return geometry(self.parts, shape)
 
     def flat(self, x: np.ndarray) -> np.ndarray:
         """Positions in 3D: a plane is at z = 0."""

@@ -12,7 +12,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from ...shapes import Shape
-from .bodies import Bodies
+from .geometry import Geometry
 from .names import numbered
 from .stretch import Stretch, stretches
 
@@ -28,7 +28,7 @@ def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
     """Points with radius [m] and mass [kg], and cells: faces, links without a surface, loose particles."""
     base, out, sets = os.path.splitext(path)[0], [path], []
     for stretch in stretches(recording):
-        before, after = _laid_out(stretch, stretch.bodies(shape))
+        before, after = _laid_out(stretch, stretch.geometry(shape))
         for frame, time, x in stretch:
             name = numbered(f"{base}.vtu", frame)
             with open(name, "wb") as file:
@@ -42,11 +42,11 @@ def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
     return out
 
 
-def _laid_out(stretch: Stretch, bodies: Bodies) -> tuple[bytes, bytes]:
+def _laid_out(stretch: Stretch, geometry: Geometry) -> tuple[bytes, bytes]:
     """What is the same in all files, before and after the positions."""
-    rows = [*bodies.faces, *bodies.links, *bodies.loose[:, None]]
-    kinds = [{3: TRIANGLE, 4: QUAD}.get(len(face), POLYGON) for face in bodies.faces]
-    kinds += [LINE] * len(bodies.links) + [VERTEX] * len(bodies.loose)
+    rows = [*geometry.faces, *geometry.links, *geometry.loose[:, None]]
+    kinds = [{3: TRIANGLE, 4: QUAD}.get(len(face), POLYGON) for face in geometry.faces]
+    kinds += [LINE] * len(geometry.links) + [VERTEX] * len(geometry.loose)
     around = np.concatenate([[], *rows]).astype(np.int32)
     ends = np.cumsum([len(row) for row in rows]).astype(np.int32)
     before = (

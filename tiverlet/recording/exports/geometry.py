@@ -12,7 +12,7 @@ from ..surfaces import covered, triangles
 
 
 @dataclass(frozen=True)
-class Bodies:
+class Geometry:
     """The surface of a scene, and what has none.
 
     faces: particles around each face, with corners in the same sense all over a surface. uv: for each face the texture
@@ -44,7 +44,7 @@ class Bodies:
         return np.concatenate([np.zeros(0, dtype=np.int64), *self.faces])
 
 
-def bodies(parts: Parts, shape: Shape | None = None) -> Bodies:
+def geometry(parts: Parts, shape: Shape | None = None) -> Geometry:
     """Those of a scene. shape: what has their faces and texture coordinates, for the same particles.
 
     Raises ValueError for a shape of another number of points.
@@ -68,7 +68,7 @@ def bodies(parts: Parts, shape: Shape | None = None) -> Bodies:
     loose = np.flatnonzero(~hidden & ~np.isin(np.arange(len(particles)), pairs))
     within = covered(parts, found)
     bare = np.flatnonzero((particles.radius > 0) & ~within)
-    return Bodies(faces, uv, pairs, loose, bare, colors(parts), up)
+    return Geometry(faces, uv, pairs, loose, bare, colors(parts), up)
 
 
 def distinct(faces: np.ndarray) -> np.ndarray:
