@@ -70,7 +70,8 @@ def _pictures(recording: "Replay", shape: Shape | None, image: Any, draw: Any) -
         raise ValueError(f"replay: {recording.path} has no particles, or positions that are not finite, so there is no picture.")
     view = View(low, high, upwards(found[0].parts))
     for stretch in found:
-        yield from _stretch(stretch, shape, [k for k in wanted if k in stretch.frames], image, draw, view, (low, high))
+        here = set(stretch.frames.tolist())
+        yield from _stretch(stretch, shape, [k for k in wanted if k in here], image, draw, view, (low, high))
 
 
 def _stretch(

@@ -41,9 +41,8 @@ def write(recording: "Replay", path: str, shape: Shape | None) -> list[str]:
     scene = _Scene(lib, x[later], times[later])
     root = scene.node(name="scene", rotation=_turn(geometry.up))
     single = geometry.bare if len(geometry.bare) <= SPHERES else geometry.bare[:0]
-    scene.children(
-        root, [*_meshes(scene, geometry, np.setdiff1d(geometry.loose, single)), *_spheres(scene, stretch, geometry, single)]
-    )
+    nodes = _meshes(scene, geometry, np.setdiff1d(geometry.loose, single))
+    scene.children(root, [*nodes, *_spheres(scene, stretch, geometry, single)])
     return scene.save(path)
 
 

@@ -33,14 +33,13 @@ class View:
         if len(low) == 2:
             self._axes = np.array([[1.0, 0], [0, 1], [0, 0]])
         else:
-            level = np.eye(3)[np.argmin(np.abs(up[[2, 0, 1]]) > 0.5) - 1]  # to the eye
-            level -= level @ up * up
-            level /= np.linalg.norm(level)
-            right = np.cross(up, level)
-            away = np.cos(ABOVE) * (np.cos(ASIDE) * level + np.sin(ASIDE) * right) + np.sin(ABOVE) * up
-            right = np.cross(up, away)
-            right /= np.linalg.norm(right)
-            self._axes = np.array([right, np.cross(away, right), away])
+            front = np.array([0.0, -1, 0] if abs(up[2]) > 0.5 else [0.0, 0, 1])  # so that x is to the right
+            front -= front @ up * up
+            front /= np.linalg.norm(front)
+            eye = np.cos(ASIDE) * front + np.sin(ASIDE) * np.cross(up, front)
+            right = np.cross(up, eye)
+            eye = np.cos(ABOVE) * eye + np.sin(ABOVE) * up
+            self._axes = np.array([right, np.cross(eye, right), eye])
         corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(len(low), -1)
         at = (self._axes @ corners)[:2]
         self._low, size = at.min(axis=1), np.maximum(np.ptp(at, axis=1), 1e-9 * np.abs(at).max() + 1e-30)
