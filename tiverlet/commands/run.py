@@ -18,6 +18,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     """The script, and where to record it."""
     parser.add_argument("script", help="a .py file, or the name of a demo")
     parser.add_argument("--out", metavar="FILE.rrd", help="default: the name of the script, here")
+    parser.add_argument("--live", nargs="?", const=True, default=False, choices=("web",), help="watch it meanwhile")
     parser.add_argument("arguments", nargs="*", help="passed on to the script")
 
 
@@ -30,7 +31,7 @@ def main(args: argparse.Namespace) -> int:
     out = args.out or f"{path.stem}.rrd"
     if os.path.isfile(out) and not is_recording(out):
         raise ValueError(f"{out} is no recording, and is not replaced. Give another --out, or remove it first.")
-    with recording(out) as made:
+    with recording(out, args.live) as made:
         status = execute(path, args.arguments)
     if made:
         print(f"{replay(out).text} {os.path.getsize(out)} bytes.")
@@ -64,23 +65,25 @@ def find(name: str) -> pathlib.Path:
 
 
 @contextlib.contextmanager
-def recording(out: str) -> Iterator[list[Any]]:
-    """While this lasts, the first Recorder writes to `out`, and a world that is stepped before there is one gets its own."""
+def recording(out: str, live: bool | str = False) -> Iterator[list[Any]]:
+    """While this lasts, the first Recorder writes to `out`, and a world that is stepped before there is one gets its own. live:
+    see Recorder."""
     import tiverlet
 
     from ..world import World
 
     made: list[Any] = []
+    given: dict[str, Any] = {"overwrite": True, "live": live}
     step, recorder = World.step, tiverlet.Recorder
 
     class Redirected(recorder):
         def __init__(self, path, *args, **kwargs):
-            super().__init__(path if made else out, *args, **(kwargs if made else kwargs | {"overwrite": True}))
+            super().__init__(path if made else out, *args, **(kwargs if made else kwargs | given))
             made.append(self)
 
     def stepped(world: World, *args, **kwargs):
         if not made:
-            made.append(recorder(out, world, overwrite=True))
+            made.append(recorder(out, world, **given))
         report = step(world, *args, **kwargs)
         if made and type(made[0]) is recorder and made[0].world is world:
             made[0].log()

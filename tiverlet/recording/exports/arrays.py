@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 
 
 def write(recording: "Replay", path: str) -> list[str]:
-    """Positions, times, masses, radii and curves, in an .npz file."""
+    """Positions, times, masses, radii, curves and quantities of the user's, in an .npz file."""
     stretch = only(recording, path, "array", ".csv")
     more: dict[str, Any] = {name: stretch.column(name) for name in ("mass", "radius")}
-    for name, (frames, values) in recording.curves.items():
+    for name, (frames, values) in (recording.curves | recording.quantities).items():
         if not re.fullmatch(r"\w+(/\w+)*", name):  # they become names of files in the archive
             raise ValueError(f"replay: {recording.path} has a curve with the name {plain(name)!r}; see .verify().")
         more |= {f"{name} frame": frames, f"{name} value": values}
