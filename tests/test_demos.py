@@ -50,6 +50,7 @@ def test_pay_finds_that_features_only_add(printed):
         ("wrecking", {"seconds": 2.5}, "before they were hit"),
         ("jelly", {"settings": [("CELLS", 4)]}, "of its height"),
         ("flag", {"settings": [("POINTS", (19, 13))], "seconds": 3.0}, "where the wind blew"),
+        ("galaxy", {"settings": [("STARS", 60)], "seconds": 3.0}, "energy kept"),
         ("stairs", {"built": {"rows": 2}, "seconds": 2.0}, "are down"),
         *((name, {}, f"{name}.rrd") for name in ("soft", "bead", "tidy", "ragdoll", "machine")),
     ],

@@ -395,6 +395,18 @@ if __name__ == "__main__":
     assert main(["run", "nobody"]) == 2 and "no demo of that name" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("frames", [0, 3])
+def test_a_world_without_particles_is_recorded(tmp_path, frames):
+    # Entries of its journal may have no bytes at all.
+    world = tv.World(tv.Particles(np.zeros((0, 3))), [tv.Gravity()])
+    with tv.Recorder(tmp_path / "a.rrd", world) as recorder:
+        for _ in range(frames):
+            world.step(1 / 60)
+            recorder.log()
+    recording = tv.replay(tmp_path / "a.rrd")
+    assert recording.verify() and len(recording.frames) == frames + 1 and recording.position(0).shape == (0, 3)
+
+
 def test_names_and_frames_of_pictures(falling, tmp_path, monkeypatch):
     taken = []
     monkeypatch.setattr(viewer, "launch", lambda *words, **options: subprocess.Popen(["true"], start_new_session=True))

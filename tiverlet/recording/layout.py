@@ -11,6 +11,8 @@ SCENE = "world/scene"  # the view looks at "world", so that a mirror at "world/s
 LEGEND = "legend/strain"
 WIDE = 5.0  # steps of the legend are so far apart, with a height of 1
 
+HALF, ASPECT = 0.52, 1.5  # the tangent of half of the angle that the viewer shows from top to bottom, 55 degrees; wide to high
+MARGIN = 1.06  # of what it takes
 SEEN = 1e-2, 1e4  # sizes of scenes [m] that the viewer shows as they are
 
 
@@ -33,6 +35,16 @@ def upright(up: np.ndarray) -> rr.components.ViewCoordinates:
     return getattr(rr.ViewCoordinates, f"RIGHT_HAND_{axis}_{'UP' if up.max() > -up.min() else 'DOWN'}")
 
 
+def distance(size: np.ndarray, way: np.ndarray, up: np.ndarray) -> float:
+    """How far from its middle, in lengths of `way`, an eye sees all of a box of this size [m] from there."""
+    back = way / np.linalg.norm(way)
+    right = np.cross(up, back)
+    right /= np.linalg.norm(right)
+    corners = np.stack(np.meshgrid(*np.stack([-size, size], axis=1) / 2), axis=-1).reshape(-1, 3)
+    across = np.maximum(np.abs(corners @ right) / ASPECT, np.abs(corners @ np.cross(back, right)))
+    return MARGIN * float((across / HALF + corners @ back).max()) / float(np.linalg.norm(way))
+
+
 def blueprint(
     low: np.ndarray, high: np.ndarray, legend: str | None, figures: dict[str, tuple[str, list[bool]]], up: np.ndarray
 ) -> rrb.Blueprint:
@@ -48,10 +60,11 @@ def blueprint(
         )
         view = rrb.Spatial2DView(origin="world", name="Scene", visual_bounds=bounds)
     else:
-        middle, far = (low + high) / 2, 1.05 * float(np.linalg.norm(size))
+        middle = (low + high) / 2
         k = int(np.argmax(np.abs(up)))  # to the right, up and back, in a turn that keeps the senses of the axes
         right, back = np.roll(np.eye(3)[0], k - 1), np.roll(np.eye(3)[2], k - 1)
-        eye = rrb.EyeControls3D(position=middle + far * (0.45 * right + 0.35 * up + 0.82 * back), look_target=middle, eye_up=up)
+        way = 0.45 * right + 0.35 * up + 0.82 * back
+        eye = rrb.EyeControls3D(position=middle + distance(size, way, up) * way, look_target=middle, eye_up=up)
         view = rrb.Spatial3DView(origin="world", name="Scene", eye_controls=eye, line_grid=rrb.LineGrid3D(visible=False))
     curves = [
         rrb.TimeSeriesView(

@@ -135,7 +135,7 @@ def thinned(messages: list[tuple[int, bytes]], stride: int) -> Iterator[tuple[in
             continue
         chunk = Chunk(message)
         rows = chunk.rows()
-        if entity == f"/{journal.JOURNAL}" and (not entries or entries[0][1].schema.equals(rows.schema)):
+        if entity == f"/{journal.JOURNAL}":
             entries.append((chunk, rows))
             continue
         rows = rows.take(np.flatnonzero(~np.isin(rows.column("frame").to_numpy(), gone[entity])))
@@ -168,6 +168,8 @@ def _store(kind: int, message: bytes) -> tuple | None:
 def _packed(entries: list[tuple[Chunk, Any]]) -> Iterator[bytes]:
     """Messages with rows of a journal: the first by itself, so that it is there as soon as can be, the others together."""
     pieces, size, mark = [], BATCH, ""
+    whole = max((rows.schema for _, rows in entries), key=len, default=None)  # entries without bytes have no column for them
+    entries = [(chunk, _with_all(rows, whole)) for chunk, rows in entries]
     for chunk, rows in entries:
         size += rows.nbytes
         if len(pieces) < 2 or size > BATCH:
@@ -179,6 +181,16 @@ def _packed(entries: list[tuple[Chunk, Any]]) -> Iterator[bytes]:
         yield piece[0][0].holding(rows)
 
 
+def _with_all(rows: Any, whole: Any) -> Any:
+    """Rows with all columns of a schema, empty where they have none."""
+    import pyarrow as pa
+
+    if rows.schema.equals(whole):
+        return rows
+    columns = [rows.column(f.name) if f.name in rows.schema.names else pa.nulls(len(rows), f.type) for f in whole]
+    return pa.RecordBatch.from_arrays(columns, schema=whole.with_metadata(rows.schema.metadata))
+
+
 def _in_runs(rows: Any, mark: str) -> tuple[Any, str]:
     """Rows of a journal with entries of frames that follow each other in one: a row takes 60 bytes beside its text.
 
@@ -187,7 +199,7 @@ def _in_runs(rows: Any, mark: str) -> tuple[Any, str]:
     import pyarrow as pa
 
     texts = [text for (text,) in rows.column("text").to_pylist()]
-    blobs = [bytes(blob or ()) for blob in rows.column("blob").to_pylist()]
+    blobs = [bytes(blob or ()) for blob in rows.column("blob").to_pylist()] if "blob" in rows.schema.names else [b""] * len(texts)
     firsts, together, marks = [], [], [mark]
     for k, text in enumerate(texts):
         alike = k and all(not blobs[j] and journal.is_frame(texts[j]) for j in (k - 1, k))

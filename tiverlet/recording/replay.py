@@ -13,7 +13,7 @@ from .. import checks
 from ..device.language import NAMES
 from ..shapes import Shape
 from ..step import checkpoint
-from . import exports, journal, rrd, scene
+from . import journal, rrd, scene
 from .curves import CURVES, OWN
 from .journal import Entry
 from .redraw import Redraw, compare
@@ -342,6 +342,8 @@ class Replay:
         other particles; FileNotFoundError where the folder is missing; ImportError for .glb, .gltf and .mp4 without
         tiverlet[export].
         """
+        from . import exports  # which imports rerun
+
         return exports.export(self, os.fspath(path), shape)
 
 
