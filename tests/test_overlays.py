@@ -11,6 +11,7 @@ import pytest
 import tiverlet as tv
 from tests.test_recorder import read
 from tiverlet.recording import messages, overlays, viewer, watch
+from tiverlet.recording.fill import Fill, outlines
 from tiverlet.recording.layout import SCENE_VIEW, unit
 from tiverlet.recording.picture import FLOWN, NEAR, framed
 
@@ -108,6 +109,61 @@ def test_strain_can_be_left_out(tmp_path):
         shades.append([packed >> 24, packed >> 16 & 255, packed >> 8 & 255])
         assert bool(column(tmp_path / f"{strain}.rrd", "legend/strain/scale", "LineStrips2D:strips")) == strain
     assert shades == [[255, 92, 48], [170, 172, 182]]
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.7])
+@pytest.mark.parametrize("shape", ["brick", "hexagon", "triangle"])
+def test_lines_fill_bodies_in_the_plane(shape, turn):
+    # Points within the body are on a line, but for those in sharp corners and at the very middle; and lines end where it does.
+    x = {
+        "brick": np.array([[0.0, 0], [2, 0], [2, 1], [0, 1]]),
+        "hexagon": np.stack([np.cos(np.arange(6) * np.pi / 3), np.sin(np.arange(6) * np.pi / 3)], axis=1),
+        "triangle": np.array([[0.0, 0], [1, 0], [0.5, 0.9]]),
+    }[shape]
+    world = tv.World(tv.Particles(x), [tv.Polygons([np.arange(len(x))[::-1]])])
+    fill = Fill(outlines(world), x, np.zeros((len(x), 3)), np.zeros(0, dtype=np.int64))
+    c, s = np.cos(turn), np.sin(turn)
+    there = x @ np.array([[c, s], [-s, c]]) + 5.0  # it has moved since
+    points, ends = fill.strips(there)
+    spread = np.random.default_rng(0).uniform(there.min(axis=0) - 0.3, there.max(axis=0) + 0.3, (4000, 2))
+    gap = np.full(len(spread), np.inf)
+    for k, radius in enumerate(fill.radii):
+        strip = points[ends[k] : ends[k + 1]]
+        assert (strip[0] == strip[-1]).all()
+        gap = np.minimum(gap, distance_to(strip, spread) - radius)
+    closed = np.concatenate([there, there[:1]])
+    inside, edge = winding(there, spread), distance_to(closed, spread)
+    assert (gap[inside] < 1e-6).mean() > 0.96
+    assert gap[~inside & (edge > 1e-6)].min() > -1e-6
+
+
+def distance_to(strip, points):
+    """The distance of points to a line strip."""
+    a, b = strip[:-1], strip[1:]
+    t = np.einsum("pij,ij->pi", points[:, None] - a, b - a) / np.maximum(np.einsum("ij,ij->i", b - a, b - a), 1e-30)
+    near = a + np.clip(t, 0, 1)[..., None] * (b - a)
+    return np.linalg.norm(points[:, None] - near, axis=2).min(axis=1)
+
+
+def winding(x, points):
+    """Which points are inside of a convex loop."""
+    a, b = x, np.roll(x, -1, axis=0)
+    side = (b - a)[:, 0] * (points[:, None] - a)[..., 1] - (b - a)[:, 1] * (points[:, None] - a)[..., 0]
+    return (side > 0).all(axis=1)
+
+
+def test_a_body_shows_the_worst_strain_of_its_links(tmp_path):
+    # Of a square of rods one is a tenth too long: the body is red. It is one body, so its diagonal is no line of its own.
+    x = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+    rods = tv.Distance([[0, 1], [1, 2], [2, 3], [3, 0], [0, 2]], [1, 1, 1, 1 / 1.2, 2**0.5])
+    with pytest.warns(UserWarning, match="off by 0.16"):
+        world = tv.World(tv.Particles(x, pinned=[0, 1, 2, 3]), [rods, tv.Polygons([[0, 1, 2, 3]])])
+    with tv.Recorder(tmp_path / "a.rrd", world) as recorder:
+        world.run(1 / 60, recorder=recorder)
+    assert tv.replay(tmp_path / "a.rrd").verify()
+    packed = column(tmp_path / "a.rrd", "world/scene/fill", "LineStrips2D:colors")[-1]
+    assert [packed[0] >> 24, packed[0] >> 16 & 255, packed[0] >> 8 & 255] == [255, 92, 48] and len(packed) == 3
+    assert not column(tmp_path / "a.rrd", "world/scene/particles", "LineStrips2D:strips")
 
 
 def test_a_view_frames_the_whole_run(tmp_path):

@@ -8,6 +8,7 @@ import resource
 import signal
 import struct
 import subprocess
+import sys
 import tempfile
 
 import numpy as np
@@ -366,6 +367,9 @@ def test_command_line(falling, tmp_path, monkeypatch, capsys):
     path = tmp_path / "a.rrd"
     path.write_bytes(falling.read_bytes())
     assert main(["replay", str(path), "--verify"]) == 0 and "all 11 frames come out" in capsys.readouterr().out
+    anew = "import sys; from tiverlet.__main__ import main; sys.exit(main(sys.argv[1:]))"  # where Taichi does not run yet
+    words = [sys.executable, "-c", anew, "replay", str(path), "--verify"]
+    assert "all 11 frames come out" in subprocess.run(words, capture_output=True, text=True, check=True).stdout
     wrong = rewrite(falling, tmp_path / "b.rrd", lambda text: text.replace('"g": 5.0', '"g": 5.5'))
     assert main(["replay", str(wrong), "--verify"]) == 1 and "first particle 0" in capsys.readouterr().out
     assert main(["replay", str(path), "--export", "csv"]) == 0 and (tmp_path / "a.csv").exists()

@@ -12,6 +12,7 @@ from ..constraints.distance import Link
 from ..features.feature import Batch
 from ..forces import Gravity
 from ..tools import golden_colors
+from .fill import Fill, outlines, within
 from .journal import PARTICLES
 from .layout import LEGEND, SCENE, WIDE
 from .lines import Lines
@@ -29,7 +30,7 @@ WALL = np.array([[92, 97, 112]], dtype=np.uint8)  # of surfaces of walls
 OPEN = (60, 63, 70)  # of a wall that is switched off
 HELD, PINS = (225, 228, 235), 200  # the marks of particles that are held, and up to how many are marked
 LABEL = (140, 144, 155)  # can be read on black and on white
-ABOVE = 40.0  # the order in which a plane is drawn: after particles (30)
+BELOW, ABOVE = 5.0, 40.0  # the order in which a plane is drawn: before lines (20) and particles (30), and after them
 FEW = 1500  # particles up to which contacts are drawn; finding them would take too much of the frame beyond
 TOUCH = 4  # one contact is drawn for so many particles, those that push most
 
@@ -106,9 +107,14 @@ class Drawing:
         number, row = (np.concatenate([[], *each]).astype(np.int64) for each in (
             [np.full(f.count, k) for k, f in found], [np.arange(f.count) for _, f in found]
         ))  # fmt: skip  # of the feature, and of the link in it
-        self._surface = None
+        self._surface, inside = None, np.zeros(0, dtype=np.int64)
         corners = np.zeros((0, 3), dtype=np.int64) if self._flat else triangles(world)
         under = np.isin(self._pairs, corners).all(axis=1)  # links that are not drawn as lines
+        loops = outlines(world) if self._flat else []
+        if loops:
+            inside, breaks = within(world, loops), np.isin(number, list(self._broken))
+            a, b = inside[self._pairs].T
+            under = (a >= 0) & (a == b) & ~breaks
         some = np.flatnonzero(~under)
         some = some[:: -(-len(some) // MANY) or 1]
         self._lines = Lines(self._pairs[some]) if len(some) else None
@@ -119,6 +125,12 @@ class Drawing:
             soft = np.isin(number, [k for k, f in found if np.any(getattr(f, "compliance", 0))])  # what is meant to give way
             under &= ~soft
             self._surface = Surface(corners, hues, self._pairs[under], upwards(world))
+        self._fill = None
+        if loops:
+            soft = np.isin(number, [k for k, f in found if np.any(getattr(f, "compliance", 0))])
+            under &= ~soft
+            self._fill = Fill(loops, world.position, hues, inside[self._pairs[under, 0]])
+            self.static(f"{self._root}/fill", self._strips.from_fields(radii=self._fill.radii, draw_order=BELOW))
         self._some, self._under = some, under
         self._tears = [(k, np.flatnonzero(number == k), row[number == k]) for k, _ in found if k in self._broken]
 
@@ -137,7 +149,7 @@ class Drawing:
                 self._surface.paint(hues)
         row = [self._points.from_fields(positions=x32, **colored)]
         self.bytes += x32.nbytes
-        if len(self._pairs) or self._surface:
+        if len(self._pairs) or self._surface or self._fill:
             row += self._link(x, x32)
         self._log(f"{self._root}/{PARTICLES}", *row)
         for k in turned:
@@ -171,12 +183,21 @@ class Drawing:
             self.bytes += shades.nbytes + x32.nbytes
         if self._lines:
             particles, ends, shades = self._lines.strips(level[self._some])
-            pa = self._pa
-            points = pa.FixedSizeListArray.from_arrays(pa.array(x32[particles].ravel()), type=self._strip.value_type)
-            strips = pa.ListArray.from_arrays(pa.array(ends.astype(np.int32)), points, type=self._strip)
-            row.append(self._strips.from_fields(strips=strips, colors=shades))
-            self.bytes += shades.nbytes + ends.nbytes + x32[:1].nbytes * len(particles)
+            row.append(self._strips.from_fields(strips=self._packed(x32[particles], ends), colors=shades))
+            self.bytes += shades.nbytes
+        if self._fill:
+            points, ends = self._fill.strips(x)
+            shades = self._fill.colors(level[self._under])
+            self._log(f"{self._root}/fill", self._strips.from_fields(strips=self._packed(points, ends), colors=shades))
+            self.bytes += shades.nbytes
         return row
+
+    def _packed(self, points: np.ndarray, ends: np.ndarray) -> Any:
+        """Strips of points (k, dim) in f32, the s-th from ends[s] to ends[s + 1], in rerun's own layout."""
+        self.bytes += points.nbytes + ends.nbytes
+        pa = self._pa
+        listed = pa.FixedSizeListArray.from_arrays(pa.array(points.ravel()), type=self._strip.value_type)
+        return pa.ListArray.from_arrays(pa.array(ends.astype(np.int32)), listed, type=self._strip)
 
     def _wall(self, k: int) -> None:
         """A wall or a path, where it is now."""

@@ -20,7 +20,7 @@ LEVEL = 9  # of LZ4: finds the points of lines among those of the particles, at 
 NOISE = 0.9  # what rerun's faster LZ4 leaves of noise: there is 1 % more to be found there, for 2 ms per 100 kB
 PACKED = 64  # entries of a journal in one row
 WRITTEN = "log_time"  # of rows of the layout: when they were written, which nothing looks at
-PARTS = ("particles", "contacts", "breaks")  # of the scene that are drawn in each frame, or in the one after, too
+PARTS = ("particles", "fill", "contacts", "velocities", "breaks")  # of the scene, drawn in each frame or in the one after, too
 
 
 class Chunk:

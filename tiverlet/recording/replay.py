@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import checks
+from ..device import runtime
 from ..device.language import NAMES
 from ..shapes import Shape
 from ..step import checkpoint
@@ -155,7 +156,7 @@ class Replay:
         In a world with contacts, what pairs carry along is part of the hash of states and of the end, but not of that of frames,
         where it shows in the next one.
         """
-        recorded, here = (_compiler(where) for where in (self.scene["environment"], scene.environment()))
+        recorded, here = _compiler(self.scene["environment"]), _compiler({"compiler": runtime.compiler()})
         if recorded != here and recorded in NAMES.values():
             raise RuntimeError(
                 f"replay: {self.path} was recorded with {recorded}, and {here} runs here, which makes other machine code: frames "

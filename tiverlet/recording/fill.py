@@ -1,0 +1,102 @@
+"""Bodies in the plane, filled: the viewer has no areas in 2D, but lines of any width."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..constraints import Area
+from ..contact import Polygons
+from .strain import LEVELS, LONGER, SHORTER
+from .surfaces import bodies
+
+if TYPE_CHECKING:
+    from ..world import World
+
+INSETS = np.array([0.2, 0.6, 0.9])  # of the way from the side of a body to its middle: where lines lie side by side
+HALF = np.array([0.2, 0.2, 0.15])  # and half of their widths
+SHADE = 0.6  # of the colour of a body, so that its particles and links show before it
+STEEP = 3.0  # how far a corner goes in, at most, for each step that its sides go in
+MANY = 600  # bodies that are filled; more are small to the eye
+
+
+def outlines(world: "World") -> list[np.ndarray]:
+    """Particles around each body in the plane, counterclockwise."""
+    found = []
+    for f in world.features:
+        if isinstance(f, Polygons):
+            found += [np.asarray(loop) for loop in f.loops]
+        elif isinstance(f, Area):
+            found += [f.members_of(c) for c in range(f.count)]
+    x, out = world.particles.position, {}
+    for loop in found:
+        a, b = x[loop], x[np.roll(loop, -1)]
+        out.setdefault(tuple(sorted(loop.tolist())), loop if _cross(a, b).sum() > 0 else loop[::-1])
+    return list(out.values())[:MANY]
+
+
+def within(world: "World", loops: list[np.ndarray]) -> np.ndarray:
+    """Of each particle the number of the loop that it is in, (n,), or -1: all of a body that has one, the corners of others."""
+    label, out = bodies(world), np.full(len(world.particles), -1)
+    labels = np.array([label[loop[0]] for loop in loops], dtype=np.int64)
+    for k, loop in enumerate(loops):
+        out[label == labels[k] if (labels == labels[k]).sum() == 1 else loop] = k
+    return out
+
+
+class Fill:
+    """Lines that fill bodies: their outlines, moved inwards step by step.
+
+    loops: particles around each body, counterclockwise. x: their places at first, which say how wide lines are. hues: (n, 3), of
+    particles. body: (m,), of each link within a body, whose strain shows in the colour, from 1 % on.
+    """
+
+    def __init__(self, loops: list[np.ndarray], x: np.ndarray, hues: np.ndarray, body: np.ndarray):
+        size = np.array([len(loop) for loop in loops])
+        self._corner = np.concatenate(loops)
+        first = np.cumsum(size) - size
+        k = np.arange(len(self._corner))
+        self._owner = np.repeat(np.arange(len(loops)), size)
+        self._next = np.where(k + 1 == (first + size)[self._owner], first[self._owner], k + 1)
+        self._before = np.empty_like(k)
+        self._before[self._next] = k
+        self._way = np.concatenate([[*range(a, a + n), a] for a, n in zip(first.tolist(), size.tolist(), strict=True)])
+        self._ends = np.concatenate([[0], np.cumsum(size + 1)])
+        p = x[self._corner]
+        middle = np.stack([np.bincount(self._owner, p[:, c]) / size for c in range(2)], axis=1)
+        depth = np.einsum("ij,ij->i", middle[self._owner] - p, self._inwards(p))
+        self._depth = np.maximum(np.minimum.reduceat(depth, first), 0.0)
+        self.radii = (self._depth * HALF[:, None]).ravel().astype(np.float32)
+        self._hues = SHADE * hues[self._corner[first]].astype(np.float64)
+        self._body = body
+
+    def _inwards(self, p: np.ndarray) -> np.ndarray:
+        """The normal of the side that begins at each corner."""
+        along = p[self._next] - p
+        length = np.linalg.norm(along, axis=1)
+        return np.stack([-along[:, 1], along[:, 0]], axis=1) / np.where(length > 0, length, 1)[:, None]
+
+    def strips(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of a frame: the points of all lines one after the other, (k, 2) in f32, and where each begins and ends, (s + 1,)."""
+        p = x[self._corner]
+        n = self._inwards(p)
+        m = n[self._before]
+        corner = (n + m) / np.maximum(1 + np.einsum("ij,ij->i", n, m), 2 / STEEP**2)[:, None]
+        step = corner * self._depth[self._owner, None]
+        points = np.concatenate([(p + inset * step)[self._way] for inset in INSETS])
+        turns = [self._ends[:-1] + k * self._ends[-1] for k in range(len(INSETS))]
+        return points.astype(np.float32), np.concatenate([*turns, [len(points)]])
+
+    def colors(self, level: np.ndarray) -> np.ndarray:
+        """RGBA as u32 of all lines. level: of the strain of each link, (m,); the worst in a body shows."""
+        hues, off = self._hues, level - LEVELS
+        if len(off):
+            most = np.zeros(len(hues), dtype=np.int64)
+            np.maximum.at(most, self._body, 2 * np.abs(off) + (off > 0))
+            share = np.maximum(0, 3 * (most >> 1) / LEVELS - 2)[:, None]
+            hues = hues + share * (np.where((most & 1)[:, None], LONGER, SHORTER) - hues)
+        rgb = np.rint(hues).astype(np.uint32)
+        return np.tile(rgb[:, 0] << 24 | rgb[:, 1] << 16 | rgb[:, 2] << 8 | np.uint32(255), len(INSETS))
+
+
+def _cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    return u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
