@@ -29,7 +29,7 @@ MANY = 5000  # links that are drawn as lines; of more, an even selection
 WALL = np.array([[92, 97, 112]], dtype=np.uint8)  # of surfaces of walls
 OPEN = (60, 63, 70)  # of a wall that is switched off
 HELD, PINS = (225, 228, 235), 200  # the marks of particles that are held, and up to how many are marked
-LABEL = (140, 144, 155)  # can be read on black and on white
+LABEL = (118, 122, 132)  # can be read on black and on white
 BELOW, ABOVE = 5.0, 40.0  # the order in which a plane is drawn: before lines (20) and particles (30), and after them
 FEW = 1500  # particles up to which contacts are drawn; finding them would take too much of the frame beyond
 TOUCH = 4  # one contact is drawn for so many particles, those that push most
@@ -90,11 +90,11 @@ class Drawing:
         scale = self._overlays.scale(bool(len(self._pairs)))
         if scale:
             hues, labels = scale
-            at = np.stack([WIDE * np.arange(len(hues)), np.zeros(len(hues))], axis=1)
+            at = np.stack([WIDE * np.arange(len(hues)), np.full(len(hues), -0.6)], axis=1)
             ends = np.stack([at - [0.45 * WIDE, 0.4], at + [0.45 * WIDE, -0.4]], axis=1)
             self.static(f"{LEGEND}/scale", self._rr.LineStrips2D(ends, colors=hues, radii=[-5.0]))
             self.static(
-                f"{LEGEND}/labels", self._rr.Points2D(at + [0, 0.5], colors=[LABEL], labels=labels, radii=[0], show_labels=True)
+                f"{LEGEND}/labels", self._rr.Points2D(at + [0, 0.1], colors=[LABEL], labels=labels, radii=[0], show_labels=True)
             )
 
     def _join(self, hues: np.ndarray) -> None:

@@ -12,8 +12,8 @@ from .surfaces import bodies
 if TYPE_CHECKING:
     from ..world import World
 
-INSETS = np.array([0.2, 0.6, 0.9])  # of the way from the side of a body to its middle: where lines lie side by side
-HALF = np.array([0.2, 0.2, 0.15])  # and half of their widths
+INSETS = np.array([0.2, 0.6, 0.9])  # of the way from the side of a body to its middle: where lines lie
+HALF = np.array([0.2, 0.3, 0.2])  # and half of their widths, which overlap, so that no seam shows
 SHADE = 0.6  # of the colour of a body, so that its particles and links show before it
 STEEP = 3.0  # how far a corner goes in, at most, for each step that its sides go in
 MANY = 600  # bodies that are filled; more are small to the eye

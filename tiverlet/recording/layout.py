@@ -81,7 +81,7 @@ def blueprint(
         visual_bounds=rrb.VisualBounds2D(x_range=[-0.6 * WIDE, 6.6 * WIDE], y_range=[-1.3, 1.5]),
     )  # fmt: skip
     side = rrb.Vertical(*curves, rrb.Tabs(*pages), row_shares=[*(1 for _ in curves), 1.6])
-    left = rrb.Vertical(view, scale, row_shares=[12, 1]) if legend else view
+    left = rrb.Vertical(view, scale, row_shares=[11, 1.3]) if legend else view
     whole = rrb.Horizontal(left, side, column_shares=[4, 1])
     _name(whole, "layout")
     view.id = SCENE_VIEW
