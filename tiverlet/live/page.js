@@ -89,13 +89,36 @@ function upload(name, data, kind = gl.ARRAY_BUFFER) {
   gl.bindBuffer(kind, buffers[name]);
   gl.bufferData(kind, data, gl.DYNAMIC_DRAW);
 }
-function attribute(where, name, width, each, stride = 0, offset = 0, norm = false) {
+function attribute(where, name, width, stride = 0, offset = 0, norm = false) {
   gl.bindBuffer(gl.ARRAY_BUFFER, buffers[name]);
   gl.enableVertexAttribArray(where);
   gl.vertexAttribPointer(where, width, norm ? gl.UNSIGNED_BYTE : gl.FLOAT, norm, stride, offset);
-  gl.vertexAttribDivisor(where, each);
 }
-upload("square", new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]));
+
+// Squares with all corners written out: in software each instance would take as long as a draw of its own.
+let room = 0;
+function fourfold(data, width) { // each row for all of its corners
+  const out = new data.constructor(4 * data.length);
+  for (let i = 0; i < data.length; i += width) {
+    for (let k = 0; k < 4; k++) for (let c = 0; c < width; c++) out[4 * i + k * width + c] = data[i + c];
+  }
+  return out;
+}
+function squares(count) {
+  if (count > room) {
+    room = 2 * count;
+    const corners = new Float32Array(8 * room), order = new Uint32Array(6 * room);
+    for (let i = 0; i < room; i++) {
+      corners.set([-1, -1, 1, -1, -1, 1, 1, 1], 8 * i);
+      order.set([4 * i, 4 * i + 1, 4 * i + 2, 4 * i + 2, 4 * i + 1, 4 * i + 3], 6 * i);
+    }
+    upload("corners", corners);
+    upload("order", order, gl.ELEMENT_ARRAY_BUFFER);
+  }
+  attribute(0, "corners", 2);
+  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, buffers.order);
+  gl.drawElements(gl.TRIANGLES, 6 * count, gl.UNSIGNED_INT, 0);
+}
 
 // The eye.
 
@@ -192,15 +215,14 @@ function use(made) {
 
 function drawLines(name, ends, colors, wide) {
   if (!ends.length) return;
-  upload(name, ends);
-  upload(name + ".color", colors);
+  upload(name, fourfold(ends, 6));
+  upload(name + ".color", fourfold(colors, 4));
   const where = use(lines);
   gl.uniform1f(where("wide"), wide);
-  attribute(0, "square", 2, 0);
-  attribute(1, name, 3, 1, 24, 0);
-  attribute(2, name, 3, 1, 24, 12);
-  attribute(3, name + ".color", 4, 1, 0, 0, true);
-  gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, ends.length / 6);
+  attribute(1, name, 3, 24, 0);
+  attribute(2, name, 3, 24, 12);
+  attribute(3, name + ".color", 4, 0, 0, true);
+  squares(ends.length / 6);
 }
 
 function draw() {
@@ -218,13 +240,13 @@ function draw() {
   gl.enable(gl.BLEND);
   gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
   const points = three(x), n = scene.radius.length;
-  upload("points", points);
 
   if (scene.triangles.length) {
     const where = use(faces);
     gl.uniform3f(where("eye"), ...place);
-    attribute(1, "points", 3, 0);
-    attribute(3, "color", 3, 0, 4, 0, true);
+    upload("points", points);
+    attribute(1, "points", 3);
+    attribute(3, "color", 3, 4, 0, true);
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, buffers.triangles);
     gl.drawElements(gl.TRIANGLES, 3 * scene.triangles.length, gl.UNSIGNED_INT, 0);
   }
@@ -234,7 +256,7 @@ function draw() {
       gl.uniform3f(where("eye"), ...place);
       upload("solid" + k, new Float32Array(wall.vertices));
       upload("sides" + k, new Uint32Array(wall.faces.flat()), gl.ELEMENT_ARRAY_BUFFER);
-      attribute(1, "solid" + k, 3, 0);
+      attribute(1, "solid" + k, 3);
       gl.disableVertexAttribArray(3);
       gl.vertexAttrib4f(3, ...(dark() ? [0.36, 0.38, 0.45, 1] : [0.78, 0.8, 0.84, 1]));
       gl.drawElements(gl.TRIANGLES, 3 * wall.faces.length, gl.UNSIGNED_INT, 0);
@@ -262,11 +284,11 @@ function draw() {
   drawLines("links", ends, colors, (show.strain ? 1.6 : 1.2) * devicePixelRatio);
 
   const where = use(discs);
-  attribute(0, "square", 2, 0);
-  attribute(1, "points", 3, 1);
-  attribute(2, show.particles ? "radius" : "seen", 1, 1);
-  attribute(3, "color", 4, 1, 4, 0, true);
-  gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, n);
+  upload("centers", fourfold(points, 3));
+  attribute(1, "centers", 3);
+  attribute(2, show.particles ? "radius" : "seen", 1);
+  attribute(3, "hues", 4, 0, 0, true);
+  squares(n);
   if (figures.target && figures.held < n) {
     gl.disable(gl.DEPTH_TEST);
     const line = new Float32Array([...at(figures.held), ...[...figures.target, 0].slice(0, 3)]);
@@ -308,11 +330,13 @@ function take(message) {
   $("title").textContent = scene.title;
   scene.loose = scene.links.map((_, k) => k).filter((k) => !(scene.covered[scene.links[k][0]] && scene.covered[scene.links[k][1]]));
   const dots = scene.radius.map((r) => r > 0 ? r : -3);
-  upload("radius", new Float32Array(dots));
+  upload("radius", fourfold(new Float32Array(dots), 1));
   // What is part of a surface is as dark as it is in 2D, and in 3D not seen, but for what is pinned.
   const under = (i) => scene.covered[i] && !scene.pinned[i];
-  upload("seen", new Float32Array(dots.map((r, i) => under(i) && (scene.dim === 3 || r < 0) ? 0 : r)));
-  upload("color", new Uint8Array(scene.color.flatMap((c, i) => [...c, under(i) && scene.dim === 2 ? 0 : 255])));
+  upload("seen", fourfold(new Float32Array(dots.map((r, i) => under(i) && (scene.dim === 3 || r < 0) ? 0 : r)), 1));
+  const hues = new Uint8Array(scene.color.flatMap((c, i) => [...c, under(i) && scene.dim === 2 ? 0 : 255]));
+  upload("color", hues);
+  upload("hues", fourfold(hues, 4));
   upload("triangles", new Uint32Array(scene.triangles.flat()), gl.ELEMENT_ARRAY_BUFFER);
   fit();
 }
