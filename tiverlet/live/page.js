@@ -2,7 +2,12 @@
 "use strict";
 
 const canvas = document.getElementById("view");
-const gl = canvas.getContext("webgl2", { antialias: true });
+const gl = canvas.getContext("webgl2", { antialias: !inSoftware() });
+function inSoftware() { // where smooth edges of faces cost a fifth of the frames; discs and lines are smooth by themselves
+  const probe = document.createElement("canvas").getContext("webgl2");
+  const told = probe && probe.getExtension("WEBGL_debug_renderer_info");
+  return /swiftshader|llvmpipe|software/i.test(told ? probe.getParameter(told.UNMASKED_RENDERER_WEBGL) : "");
+}
 const $ = (id) => document.getElementById(id);
 let scene = null, walls = [], figures = {}, x = null, held = null, dirty = true, frames = 0, fps = 0;
 const show = { strain: false, particles: false };
