@@ -43,6 +43,7 @@ class Moving(Collider):
     after TOUCHES of them (in a wedge), it stays at the last one.
     """
 
+    bulk = 1.5
     sweeps = poses = True
     dim = 0
     radius: Any = Knob(

@@ -27,6 +27,7 @@ class AngleLimit(Angle):
     """
 
     arity = 3
+    bulk = 3.0
     index_name = "triples"
     exchangeable = ((0, 2),)
     each = ("lower", "upper", "compliance", "damping", "break_at")

@@ -62,6 +62,7 @@ class PairContact(Feature):
     _finest = _listed = 0.0  # the smallest radius, and how far beyond touching pairs are listed now [m]
     table: Table  # bound to one world
     matters = True
+    bulk = 3.0
     room = 0  # entries of the list for each particle, at first, if that is more than discs have
     detects = False  # looks for all contacts once in each pass, before they are counted
     projects = False  # knows which pairs bear a load, see velocity_projection.py

@@ -26,17 +26,17 @@ GROUP = 16  # fields that one transfer kernel serves; Taichi unrolls the loop ov
 class Memory:
     """The fields of one world: declared first, then placed together, freed together.
 
-    `real` is ti.f32 or ti.f64; few: whether the world has few particles, see Compiler. Every method that touches the fields
-    checks first that they still exist.
+    `real` is ti.f32 or ti.f64; few: whether the world has few particles, long: whether its kernels are, see Compiler. Every
+    method that touches the fields checks first that they still exist.
     """
 
     kernels_read = ("real",)
 
-    def __init__(self, real, few: bool = False, compiler: Compiler | None = None):
+    def __init__(self, real, few: bool = False, long: bool = False, compiler: Compiler | None = None):
         if not patched:  # whose fields need a place once they are made
             layout.check_trees()
         self.real = real
-        self.compiler = compiler or Compiler(real, few)
+        self.compiler = compiler or Compiler(real, few, long)
         self.entries: list[Entry] = []
         self._named: Counter[str] = Counter()
         self._later: list[tuple[Entry, np.ndarray]] = []

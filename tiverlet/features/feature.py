@@ -78,6 +78,7 @@ class Feature(RecordsArguments):
     host_only: tuple[str, ...] = ("start", "changed", "moving", "new_force", "arguments")  # what kernels do not read of it
     compiled_for: tuple[str, ...] = ()  # properties that decide what its kernels consist of
     told_apart = True  # its share of the time that kernels take to compile is known by its name
+    bulk = 0.3  # of its code in the kernels, next to that of a Distance; see build.LONG
     changed = True
     moving = new_force = lets_go = afresh = False
     scene: Any = None  # Scene, from bind() on
@@ -202,6 +203,7 @@ class Batch(Feature):
     drives = False  # puts its particles in place instead of relaxing them
     transcends = False  # takes angles, cube roots or exponentials, which SPIR-V has for f32 only
     members: Any  # FixedSize or VariableSize: the particles of each constraint
+    bulk = 1.0
     each: tuple[str, ...] = ()  # its arrays with one row for each constraint, beside the indices
     index_name = "indices"  # the argument of __init__ that they are, as `listing` gives them
 

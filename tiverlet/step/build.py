@@ -39,6 +39,10 @@ ROOM = {True: (6.5, 14), False: (12, 32)}
 # particles (1200 with constraints) 0.55 and 0.35; of ropes with 205 (405) 0.18 and 0.18, with 820 (1620) 0.64 and 0.40.
 CROSSOVER = 1000
 STRETCH = 4  # times more or fewer of them, for which a world keeps its kernels
+# Kernels of so many times the code of a Distance in 2D are long. A hundred figures on stairs (13) took 13 to 17 s to compile when
+# Taichi simplified them and 5 s without, and frames took as long; discs, ropes and soft balls (6) 9.5 and 3.8 s, but frames a fifth
+# more.
+LONG = 10.0
 USUAL = 1 / 1200  # [s] substep: 20 of a frame of 1/60 s
 MANY = 200  # stiff links from which systems are worth their sums
 STEPS = 5  # of conjugate gradients: at equal time 5 to 20 leave about the same, and these take the least of a frame
@@ -97,7 +101,8 @@ def assemble(
     now = Scale(len(particles), len(particles) + sum(f.count for f in features if isinstance(f, Batch)))
     scale = scale if scale and scale.holds(now) else now
     path = _chosen(path, scale) if order == 2 else "fused"
-    memory = Memory(PRECISIONS[precision], scale.particles < FEW)
+    bulk = sum({type(f): f.bulk for f in features}.values()) * (1.5 if particles.dim == 3 else 1.0)
+    memory = Memory(PRECISIONS[precision], scale.particles < FEW, bulk > LONG)
     try:
         state = State(memory, particles, inv_mass, precision == "f32-compensated")
         return _bind(Scene(memory, state, particles, inv_mass, order=order), features, solver, path, scale)
