@@ -40,8 +40,8 @@ ROOM = {True: (6.5, 14), False: (12, 32)}
 CROSSOVER = 1000
 STRETCH = 4  # times more or fewer of them, for which a world keeps its kernels
 # Kernels of so many times the code of a Distance in 2D are long. A hundred figures on stairs (13) took 13 to 17 s to compile when
-# Taichi simplified them and 5 s without, and frames took as long; discs, ropes and soft balls (6) 9.5 and 3.8 s, but frames a fifth
-# more.
+# Taichi simplified them and 5 s without, and frames took as long; discs, ropes and soft balls (6) 9.5 and 3.8 s, but frames a
+# fifth more.
 LONG = 10.0
 USUAL = 1 / 1200  # [s] substep: 20 of a frame of 1/60 s
 MANY = 200  # stiff links from which systems are worth their sums
