@@ -55,7 +55,7 @@ def speed(
     with tempfile.TemporaryDirectory() as folder, Progress(disable=not progress) as bar:
         row = bar.add_task("speed", total=sum(map(len, ladder.values())))
         session.folder = folder
-        if yardstick and "pile" in names:
+        if yardstick and any(SCENES[name].in_c for name in names):
             session.compile()
         for name, sizes_ in ladder.items():
             for n in sizes_:
@@ -120,11 +120,11 @@ class Session:
         """Frames of a round."""
         return int(np.clip(WORK // (n * substeps), *FRAMES))
 
-    def turns(self, talkers: Sequence[processes.Talker], n: int, substeps: int) -> list[list[float]]:
+    def turns(self, talkers: Sequence[processes.Talker], n: int, substeps: int, settles: int = 0) -> list[list[float]]:
         """Seconds of a frame of each, see side_by_side()."""
         frames = self.frames(n, substeps)
         group = int(np.clip(TURN // (n * substeps), 6, frames))
-        return processes.side_by_side(talkers, frames, group, self.rounds, self.seconds)
+        return processes.side_by_side(talkers, frames, group, self.rounds, self.seconds, settles)
 
     def point(self, name: str, n: int) -> list[Run]:
         """A scene of one size, on all numbers of threads. Bits, and so work and quality, do not depend on these."""
@@ -139,11 +139,11 @@ class Session:
                 ours = stack.enter_context(processes.world(job, cache))
                 warm = ours.ask()
                 both = [ours]
-                if self.program and name == "pile":
+                if self.program and scene.in_c:
                     both.append(stack.enter_context(c_baseline.Yardstick(self.program, n, scene.substeps, threads)))
-                times = self.turns(both, n, scene.substeps)
+                times = self.turns(both, n, scene.substeps, scene.settles)
                 if not same:
-                    qualities = [processes.quality(talker, frames) for talker in both]
+                    qualities = [processes.quality(talker, frames, scene.settles) for talker in both]
                     work = warm["particles"] * scene.substeps
                     same = {**qualities[0], "traffic": {}, "times": {}}
                     for kernel, (moved, seconds) in ours.ask("traffic").items():

@@ -74,30 +74,44 @@ def paths(root: str = ROOT) -> str:
     return os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
 
 
-def side_by_side(talkers: Sequence[Talker], frames: int, group: int, rounds: int, seconds: float) -> list[list[float]]:
+def side_by_side(
+    talkers: Sequence[Talker], frames: int, group: int, rounds: int, seconds: float, settles: int = 0
+) -> list[list[float]]:  # fmt: skip
     """Seconds of a frame of each, in each round: a restart, then `frames` frames, in groups of `group` that take turns.
 
-    At most `rounds`, and none is begun after `seconds` [s] of the first one's, or five times that for the first three.
+    At most `rounds`, and none is begun after `seconds` [s] of the first one's, or five times that for the first three. settles:
+    frames after the only restart, where rounds go on from each other.
     """
+    if settles:
+        begin(talkers, settles)
     out: list[list[float]] = [[] for _ in talkers]
     spent = 0.0
     while len(out[0]) < rounds and spent < seconds * (1 if len(out[0]) >= 3 else 5):
-        for talker in talkers:
-            talker.ask("restart")
+        if not settles:
+            begin(talkers, 0)
         total = [0.0] * len(talkers)
-        for begin in range(0, frames, group):
+        for done in range(0, frames, group):
             for k, talker in enumerate(talkers):
                 sleep(REST)
-                total[k] += talker.ask(f"run {min(group, frames - begin)}")
+                total[k] += talker.ask(f"run {min(group, frames - done)}")
         spent += total[0]
         for times, t in zip(out, total, strict=True):
             times.append(t / frames)
     return out
 
 
-def quality(talker: Talker, frames: int, looks: int = 6) -> dict[str, float]:
-    """The mean overlap [diameters] and the worst relative violation in so many frames from the start, looked at now and then."""
-    talker.ask("restart")
+def begin(talkers: Sequence[Talker], settles: int) -> None:
+    """Back to the start, and so many frames that nobody times."""
+    for talker in talkers:
+        talker.ask("restart")
+        if settles:
+            talker.ask(f"run {settles}")
+
+
+def quality(talker: Talker, frames: int, settles: int = 0, looks: int = 6) -> dict[str, float]:
+    """The mean overlap [diameters] and the worst relative violation in so many frames from the start, or after so many, looked
+    at now and then."""
+    begin([talker], settles)
     seen = []
     for _ in range(looks):
         talker.ask(f"run {max(1, frames // looks)}")

@@ -13,7 +13,8 @@ class SpeedScene:
     """A scene of any size: build(n) -> (particles, features); of about n particles, where a scene cannot have just any number.
 
     sizes: those of a full report; quick: those of a quick one. needs: the files of features that it uses, without which the
-    package must run it all the same (None: not tried).
+    package must run it all the same (None: not tried). settles: frames that are run before any is timed. in_c: whether pile.c is
+    the same scene.
     """
 
     title: str
@@ -22,6 +23,8 @@ class SpeedScene:
     sizes: tuple[int, ...]
     quick: tuple[int, ...]
     needs: frozenset[str] | None = None
+    settles: int = 0
+    in_c: bool = False
 
 
 def scattered(k: np.ndarray) -> np.ndarray:
@@ -116,7 +119,10 @@ def mixed(n: int):
 LINE = 41  # particles of one of many ropes
 TEN = tuple(10**k for k in range(1, 7))
 SCENES = {
-    "pile": SpeedScene("discs that fall into a box", pile, 8, TEN, (100, 1000), frozenset({"gravity", "box", "contact"})),
+    "pile": SpeedScene(
+        "discs that fall into a box", pile, 8, TEN, (100, 1000), frozenset({"gravity", "box", "contact"}), in_c=True
+    ),
+    "settled": SpeedScene("the same discs at rest, after 400 frames", pile, 8, TEN[1:5], (100,), settles=400, in_c=True),
     "spheres": SpeedScene("spheres that fall into a box", lambda n: pile(n, 3), 8, TEN, (100, 1000)),
     "cloth": SpeedScene("a cloth that is held here and there", cloth, 20, TEN[1:5], (100, 400)),
     "ropes": SpeedScene("ropes of 40 links", ropes, 20, (10 * LINE, 100 * LINE, 1000 * LINE, 10_000 * LINE), (LINE, 10 * LINE)),
