@@ -10,9 +10,9 @@ import sys
 from typing import Any
 
 import numpy as np
-import taichi as ti
 
 import tiverlet as tv
+from tiverlet.device import ti
 
 STARS, CORE, SOFT = 360, 1.0, 0.1  # of each galaxy; mass of its core, G = 1; what rounds off close encounters
 mass: Any = None  # of all stars, a field that kernels read
