@@ -399,6 +399,32 @@ if __name__ == "__main__":
     assert main(["run", "nobody"]) == 2 and "no demo of that name" in capsys.readouterr().err
 
 
+def test_entries_that_passed_each_other_are_packed_in_order(falling):
+    # Those with and without bytes come in messages of their own: in another order they make the same journal.
+    there = messages.split(falling.read_bytes())
+    mine = [k for k, (kind, m) in enumerate(there) if kind == messages.CHUNK and _entity(m) == f"/{journal.JOURNAL}"]
+    assert len(mine) > 1
+    swapped = list(there)
+    swapped[mine[0]], swapped[mine[-1]] = there[mine[-1]], there[mine[0]]
+    assert _lines(messages.thinned(swapped, 1)) == _lines(messages.thinned(there, 1))
+
+
+def _entity(message):
+    return messages.Chunk(message).rows().schema.metadata[b"rerun:entity_path"].decode()
+
+
+def _lines(packed):
+    """The entries of a journal in the order of the file, whose checksums have to follow from each other."""
+    out, mark = [], ""
+    for m in (m for kind, m in packed if kind == messages.CHUNK and _entity(m) == f"/{journal.JOURNAL}"):
+        rows = messages.Chunk(m).rows()
+        for (text,), blob, (told,) in zip(*(rows.column(c).to_pylist() for c in ("text", "blob", "checksum")), strict=True):
+            mark = journal.checksum(mark, text, bytes(blob or ()))
+            assert mark == told
+            out += text.split("\n")
+    return out
+
+
 @pytest.mark.parametrize("frames", [0, 3])
 def test_a_world_without_particles_is_recorded(tmp_path, frames):
     # Entries of its journal may have no bytes at all.

@@ -169,7 +169,7 @@ def _packed(entries: list[tuple[Chunk, Any]]) -> Iterator[bytes]:
     """Messages with rows of a journal: the first by itself, so that it is there as soon as can be, the others together."""
     pieces, size, mark = [], BATCH, ""
     whole = max((rows.schema for _, rows in entries), key=len, default=None)  # entries without bytes have no column for them
-    entries = [(chunk, _with_all(rows, whole)) for chunk, rows in entries]
+    entries = _in_order([(chunk, _with_all(rows, whole)) for chunk, rows in entries])
     for chunk, rows in entries:
         size += rows.nbytes
         if len(pieces) < 2 or size > BATCH:
@@ -179,6 +179,18 @@ def _packed(entries: list[tuple[Chunk, Any]]) -> Iterator[bytes]:
     for piece in pieces:
         rows, mark = _in_runs(_together(piece), mark)
         yield piece[0][0].holding(rows)
+
+
+def _in_order(entries: list[tuple[Chunk, Any]]) -> list[tuple[Chunk, Any]]:
+    """The same rows by their ids: those with and without bytes come in messages of their own, and may have passed each other."""
+    ids = [rows.column(0).to_pylist() for _, rows in entries]
+    together = [one for part in ids for one in part]
+    if together == sorted(together):
+        return entries
+    single = []
+    for part, (chunk, rows) in zip(ids, entries, strict=True):
+        single += [(one, chunk, rows.slice(k, 1)) for k, one in enumerate(part)]
+    return [(chunk, row) for _, chunk, row in sorted(single, key=lambda one: one[0])]
 
 
 def _with_all(rows: Any, whole: Any) -> Any:
