@@ -76,7 +76,7 @@ class PairForce(Acceleration):
         """Two fields of accelerations; the list comes with join()."""
         self.scene, dev = scene, self.dev
         n, dim = scene.particles.count, scene.particles.dim
-        dev.state, dev.w, dev.dim, dev.n, dev.real = scene.state, scene.state.w, dim, scene.count, scene.real
+        dev.state, dev.w, dev.dim, dev.n = scene.state, scene.state.w, dim, scene.count
         dev.now = scene.memory.field("PairForce.acceleration", n, width=dim, state=True)
         dev.last = scene.memory.field("PairForce.acceleration_before", n, width=dim)
 
@@ -115,15 +115,20 @@ class PairForce(Acceleration):
         return out
 
     @ti.func
+    def near(self, r):
+        """Whether two particles that are r apart act on each other."""
+        rr = r.dot(r)
+        out = rr > 0
+        if ti.static(self.listed):
+            out = out and rr < self.dev.cutoff.radius * self.dev.cutoff.radius
+        return out
+
+    @ti.func
     def pull(self, i, j):
         """The acceleration of particle i by particle j, per 1 / m_i: worked out once for both, from the lower index."""
         r = self.dev.state.apart(i, j)
-        rr = r.dot(r)
         out = 0 * r
-        near = rr > 0
-        if ti.static(self.listed):
-            near = near and rr < self.dev.cutoff.radius * self.dev.cutoff.radius
-        if near:
+        if self.near(r):
             if i < j:
                 out = self.between(i, j, r)
             else:
@@ -155,11 +160,8 @@ class PairForce(Acceleration):
         """The share of particle i in the energy of a pair, at x - back d, f64: half, or all where the other one is held."""
         shift = back * (self.dev.state.d[i] - self.dev.state.d[j])
         r = self.dev.state.apart(i, j) - shift
-        rr, out = r.dot(r), ti.cast(0, ti.f64)
-        near = rr > 0
-        if ti.static(self.listed):
-            near = near and rr < self.dev.cutoff.radius * self.dev.cutoff.radius
-        if near:
+        out = ti.cast(0, ti.f64)
+        if self.near(r):
             low, high = ti.min(i, j), ti.max(i, j)
             way = ti.select(i < j, r, -r)
             if ti.static(self.potential_arity == 1):

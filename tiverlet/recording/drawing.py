@@ -9,7 +9,7 @@ from ..colliders import Ball, Box, Capsule, HalfSpace, Mesh, Polygon
 from ..colliders.collider import Collider
 from ..constraints import Path
 from ..constraints.distance import Link
-from ..features.feature import Batch
+from ..features.feature import Batch, Feature
 from ..forces import Gravity
 from ..tools import golden_colors
 from .fill import Fill, outlines, within
@@ -121,14 +121,11 @@ class Drawing:
         if not under.any():
             self._pairs, self._rest, number, row = (each[some] for each in (self._pairs, self._rest, number, row))
             some, under = np.arange(len(some)), np.zeros(len(some), dtype=bool)
+        under &= ~np.isin(number, [k for k, f in found if np.any(getattr(f, "compliance", 0))])  # what is meant to give way
         if len(corners):
-            soft = np.isin(number, [k for k, f in found if np.any(getattr(f, "compliance", 0))])  # what is meant to give way
-            under &= ~soft
             self._surface = Surface(corners, hues, self._pairs[under], upwards(world))
         self._fill = None
         if loops:
-            soft = np.isin(number, [k for k, f in found if np.any(getattr(f, "compliance", 0))])
-            under &= ~soft
             self._fill = Fill(loops, world.position, hues, inside[self._pairs[under, 0]])
             self.static(f"{self._root}/fill", self._strips.from_fields(radii=self._fill.radii, draw_order=BELOW))
         self._some, self._under = some, under
@@ -141,8 +138,9 @@ class Drawing:
         # All in one row: then LZ4 finds the points of lines and sheets among those of the particles.
         colored = {}
         if self._overlays.color:
-            known = self.hues is not None and len(self.hues) == len(x32)
-            hues = self.hues if known and self.hues is not None else np.full((len(x32), 3), 128, dtype=np.uint8)
+            hues = self.hues
+            if hues is None or len(hues) != len(x32):
+                hues = np.full((len(x32), 3), 128, dtype=np.uint8)
             colored = {"colors": hues}
             self.bytes += hues.nbytes
             if self._surface:
@@ -303,6 +301,20 @@ def links(world: "World | Parts") -> list[tuple[int, Batch]]:
     return [(k, f) for k, f in enumerate(world.features) if isinstance(f, Batch) and f.arity == 2 and f.count]
 
 
+def walled(features: Iterable[Feature], low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two corners [m], and what there is of walls and paths of finite size around them."""
+    for f in features:
+        if isinstance(f, (Ball, Capsule, Mesh, Path, Polygon)):
+            strips, thickness = f.outline(low, high)
+            if strips.size:
+                low = np.minimum(low, strips.min(axis=(0, 1)) - thickness)
+                high = np.maximum(high, strips.max(axis=(0, 1)) + thickness)
+        if isinstance(f, Box):
+            low = np.where(np.isfinite(f.lower), np.minimum(low, f.lower), low)
+            high = np.where(np.isfinite(f.upper), np.maximum(high, f.upper), high)
+    return low, high
+
+
 def bounds(world: "World") -> tuple[np.ndarray, np.ndarray]:
     """A box around what will be seen: the particles and where they can get to, as far as that is known beforehand: finite walls,
     the ground below, and around a place where a body hangs.
@@ -310,18 +322,11 @@ def bounds(world: "World") -> tuple[np.ndarray, np.ndarray]:
     x, r = world.position, world.particles.radius[:, None]
     low = (x - r).min(axis=0, initial=np.inf) if len(x) else np.zeros(world.particles.dim)
     high = (x + r).max(axis=0, initial=-np.inf) if len(x) else np.ones(world.particles.dim)
+    low, high = walled(world.features, low, high)
     for f in world.features:
-        if isinstance(f, (Ball, Capsule, Mesh, Path, Polygon)):
-            strips, thickness = f.outline(low, high)
-            if strips.size:
-                low = np.minimum(low, strips.min(axis=(0, 1)) - thickness)
-                high = np.maximum(high, strips.max(axis=(0, 1)) + thickness)
         if isinstance(f, HalfSpace) and len(x):
             foot = x - np.maximum(0, x @ f.normal - f.offset)[:, None] * f.normal
             low, high = np.minimum(low, foot.min(axis=0)), np.maximum(high, foot.max(axis=0))
-        if isinstance(f, Box):
-            low = np.where(np.isfinite(f.lower), np.minimum(low, f.lower), low)
-            high = np.where(np.isfinite(f.upper), np.maximum(high, f.upper), high)
     body, fixed = bodies(world), world.particles.inv_mass == 0
     for k in np.unique(body[fixed]):
         held, all_of_it = x[fixed & (body == k)], x[body == k]

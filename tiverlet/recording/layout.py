@@ -35,14 +35,22 @@ def upright(up: np.ndarray) -> rr.components.ViewCoordinates:
     return getattr(rr.ViewCoordinates, f"RIGHT_HAND_{axis}_{'UP' if up.max() > -up.min() else 'DOWN'}")
 
 
-def distance(size: np.ndarray, way: np.ndarray, up: np.ndarray) -> float:
-    """How far from its middle, in lengths of `way`, an eye sees all of a box of this size [m] from there."""
-    back = way / np.linalg.norm(way)
+def eye_axes(up: np.ndarray) -> np.ndarray:
+    """Of an eye in 3D, in front of the scene, aside and above: unit vectors to the right, up and out of the scene, (3, 3)."""
+    k = int(np.argmax(np.abs(up)))  # in a turn that keeps the senses of the axes
+    aside, front = np.roll(np.eye(3)[0], k - 1), np.roll(np.eye(3)[2], k - 1)
+    back = 0.45 * aside + 0.35 * up + 0.82 * front
+    back /= np.linalg.norm(back)
     right = np.cross(up, back)
     right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(back, right), back])
+
+
+def distance(size: np.ndarray, axes: np.ndarray) -> float:
+    """How far from its middle [m] an eye sees all of a box of this size [m]. axes: see eye_axes()."""
     corners = np.stack(np.meshgrid(*np.stack([-size, size], axis=1) / 2), axis=-1).reshape(-1, 3)
-    across = np.maximum(np.abs(corners @ right) / ASPECT, np.abs(corners @ np.cross(back, right)))
-    return MARGIN * float((across / HALF + corners @ back).max()) / float(np.linalg.norm(way))
+    right, above, back = axes @ corners.T
+    return MARGIN * float((np.maximum(np.abs(right) / ASPECT, np.abs(above)) / HALF + back).max())
 
 
 def blueprint(
@@ -61,10 +69,8 @@ def blueprint(
         view = rrb.Spatial2DView(origin="world", name="Scene", visual_bounds=bounds)
     else:
         middle = (low + high) / 2
-        k = int(np.argmax(np.abs(up)))  # to the right, up and back, in a turn that keeps the senses of the axes
-        right, back = np.roll(np.eye(3)[0], k - 1), np.roll(np.eye(3)[2], k - 1)
-        way = 0.45 * right + 0.35 * up + 0.82 * back
-        eye = rrb.EyeControls3D(position=middle + distance(size, way, up) * way, look_target=middle, eye_up=up)
+        axes = eye_axes(up)
+        eye = rrb.EyeControls3D(position=middle + distance(size, axes) * axes[2], look_target=middle, eye_up=up)
         view = rrb.Spatial3DView(origin="world", name="Scene", eye_controls=eye, line_grid=rrb.LineGrid3D(visible=False))
     curves = [
         rrb.TimeSeriesView(

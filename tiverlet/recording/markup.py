@@ -12,6 +12,7 @@ import numpy as np
 from ..colliders.collider import Collider
 from ..constraints import Path
 from .drawing import bounds, colors, links, upwards
+from .layout import eye_axes
 
 if TYPE_CHECKING:
     from ..features.feature import Feature
@@ -79,7 +80,7 @@ def of_replay(replay: "Replay") -> str:
 def picture(world: "World", x: np.ndarray) -> str:
     """Particles at x (n, dim), links, walls and paths as SVG; a scene in 3D as seen from the front and a little above."""
     low, high = bounds(world)
-    view = _view(world)
+    view = np.eye(2) if len(low) == 2 else eye_axes(upwards(world))
     some = np.arange(0, len(x), -(-len(x) // MANY) or 1)
     corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, len(low)) @ view.T
     left, top = corners.min(axis=0)[:2]
@@ -87,6 +88,7 @@ def picture(world: "World", x: np.ndarray) -> str:
     scale = SIZE / max(wide, tall)
 
     def place(points: np.ndarray) -> np.ndarray:
+        """Pixels."""
         flat = (points @ view.T)[..., :2]
         return np.stack([(flat[..., 0] - left) * scale, (tall - flat[..., 1] + top) * scale], axis=-1) + 2
 
@@ -104,20 +106,6 @@ def picture(world: "World", x: np.ndarray) -> str:
         parts.append(f"<circle cx='{a:.1f}' cy='{b:.1f}' r='{radii[i]:.1f}' fill='#{r:02x}{g:02x}{blue:02x}'/>")
     size = f"width='{wide * scale + 4:.0f}' height='{tall * scale + 4:.0f}'"
     return f"<svg xmlns='http://www.w3.org/2000/svg' {size}>{''.join(parts)}</svg>"
-
-
-def _view(world: "World") -> np.ndarray:
-    """Rows: to the right, up, and towards the eye."""
-    if world.particles.dim == 2:
-        return np.eye(2)
-    up = upwards(world)
-    k = int(np.argmax(np.abs(up)))
-    right, back = np.roll(np.eye(3)[0], k - 1), np.roll(np.eye(3)[2], k - 1)
-    eye = 0.45 * right + 0.35 * up + 0.82 * back
-    eye /= np.linalg.norm(eye)
-    side = np.cross(up, eye)
-    side /= np.linalg.norm(side)
-    return np.stack([side, np.cross(eye, side), eye])
 
 
 def _line(points: np.ndarray, color: str, width: float) -> str:

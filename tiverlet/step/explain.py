@@ -9,6 +9,7 @@ from ..colliders.collider import Collider
 from ..device import runtime
 from ..device.patches import patched
 from ..features.feature import Acceleration, Batch
+from ..neighbours.neighbour_search import NeighbourSearch
 from ..shapes.shape import morton
 from .build import reason
 from .step import REBOUNDS
@@ -101,8 +102,7 @@ def _present(world: "World") -> list[str]:
             out.append(f"{f!r}: in the loop over particles, last")
         elif world._runner.grid:
             grid = world._runner.grid
-            sizes = ", ".join(f"{size:.3g}" for size in grid.cells.sizes)
-            out.append(f"{f!r}: grid with cells of {sizes} m, neighbour list with a skin of {grid.skin:.3g} m")
+            out.append(f"{f!r}: {_listed(grid)}")
         else:
             out.append(f"{f!r}: nothing, since all radii are 0")
     return out or ["motion in a straight line"]
@@ -113,8 +113,13 @@ def _pairs(f: Acceleration) -> str:
     grid = f.dev.grid
     if not grid:
         return f"{f!r}: all pairs, before the loop over particles"
-    size = f"{grid.cells.sizes[0]:.3g}"
-    return f"{f!r}: before the loop over particles; grid with cells of {size} m, neighbour list with a skin of {grid.skin:.3g} m"
+    return f"{f!r}: before the loop over particles; {_listed(grid)}"
+
+
+def _listed(grid: NeighbourSearch) -> str:
+    """How near pairs are found."""
+    sizes = ", ".join(f"{size:.3g}" for size in grid.cells.sizes)
+    return f"grid with cells of {sizes} m, neighbour list with a skin of {grid.skin:.3g} m"
 
 
 def _absent(world: "World") -> list[str]:

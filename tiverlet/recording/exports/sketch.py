@@ -9,10 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ...colliders import Ball, Box, Capsule, Mesh, Polygon
 from ...colliders.collider import Collider
 from ...constraints import Path
-from ..drawing import OPEN, WALL, upwards
+from ..drawing import OPEN, WALL, upwards, walled
 from ..scene import Parts
 from ..surfaces import Surface
 from .geometry import Geometry
@@ -62,16 +61,7 @@ def extent(parts: Parts, frames: Sequence[np.ndarray]) -> tuple[np.ndarray, np.n
     r, x = parts.particles.radius[:, None], np.array(frames)
     low, high = ((x.astype(np.float64) + s * r).reshape(-1, x.shape[-1]) for s in (-1, 1))
     low, high = low.min(axis=0, initial=np.inf), high.max(axis=0, initial=-np.inf)
-    for f in parts.features:
-        if isinstance(f, Box):
-            low = np.where(np.isfinite(f.lower), np.minimum(low, f.lower), low)
-            high = np.where(np.isfinite(f.upper), np.maximum(high, f.upper), high)
-        if isinstance(f, (Ball, Capsule, Mesh, Path, Polygon)):
-            strips, thickness = f.outline(low, high)
-            if strips.size:
-                low = np.minimum(low, strips.min(axis=(0, 1)) - thickness)
-                high = np.maximum(high, strips.max(axis=(0, 1)) + thickness)
-    return low, high
+    return walled(parts.features, low, high)
 
 
 class Sketch:
