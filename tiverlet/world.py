@@ -11,6 +11,7 @@ import numpy as np
 from . import checks
 from .constraints.core.strength import BREAKS
 from .contact.initial_overlap import overlapping
+from .device.copies import Copies
 from .device.interrupts import whole
 from .features.arguments import meant
 from .features.feature import Acceleration, Feature
@@ -48,6 +49,8 @@ class World:
     Raises ValueError or TypeError, naming the argument, the index and the value, before anything is compiled.
     """
 
+    _copies: Copies | None = None
+
     def __init__(
         self, particles: Particles, features: Iterable[Feature] = (), *, substeps: int | str = 20, iterations: int = 1,
         solver: Solver | None = None, precision: str = "f32", path: str = "auto", order: int = 2,
@@ -62,9 +65,13 @@ class World:
                 contact.enable_shrink()  # before anything is compiled: later, the frame would be compiled again
 
     @staticmethod
-    def _of(particles: Particles, features: tuple[Feature, ...], starts: Sequence[Particles | None], **settings) -> "World":
-        """A world of features that came at different times, see _build()."""
+    def _of(
+        particles: Particles, features: tuple[Feature, ...], starts: Sequence[Particles | None], copies: Copies | None = None,
+        **settings,
+    ) -> "World":  # fmt: skip
+        """A world of features that came at different times, see _build(). copies: where it stands for many."""
         new = object.__new__(World)
+        new._copies = copies
         new._build(particles, features, starts, **settings)
         return new
 
@@ -76,7 +83,9 @@ class World:
         self._controller = StepController()
         self.substeps, self.iterations = substeps, iterations
         self._clock = Clock()
-        parts = assemble(particles, features, starts, len(particles), self._requested[0], precision, path, order)
+        parts = assemble(
+            particles, features, starts, len(particles), self._requested[0], precision, path, order, copies=self._copies
+        )
         self._install(particles, features, parts)
         self._handles: weakref.WeakSet[Handle] = weakref.WeakSet()
         self._last: StepReport | None = None

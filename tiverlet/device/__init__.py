@@ -12,6 +12,9 @@ if patched:
     syntax_cache.apply()
     sharing.apply()
     timing.apply()
+from . import copies
 from .patches.compiler import inline, record
+
+copies.apply()  # last, and whatever is patched: it is what subscripts mean
 
 __all__ = ["at", "inline", "record", "ti"]

@@ -21,6 +21,7 @@ class Entry:
     length: int  # elements; 0 for a single one
     kind: np.dtype
     state: bool  # part of the exact state, hence of hash() and clone()
+    copies: int = 0  # of which each has so many elements; 0 where it is one for all
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -28,8 +29,14 @@ class Entry:
         return (max(1, self.length),) + ((self.width,) if self.width else ())
 
     @property
+    def whole(self) -> tuple[int, ...]:
+        """Of the array that all copies are."""
+        first, *rest = self.shape
+        return (first * max(1, self.copies), *rest)
+
+    @property
     def bytes(self) -> int:
-        """Size in memory [bytes]."""
+        """Size in memory, of one copy [bytes]."""
         return self.kind.itemsize * max(1, self.width) * max(1, self.length)
 
 

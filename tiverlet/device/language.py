@@ -84,6 +84,11 @@ def place_field(field: Any, placed: Any, name: Any) -> None:
     field.__dict__.update(vars(placed), place_name=name)
 
 
+def plain_field(thing: Any) -> bool:
+    """Whether it is a field of numbers or of vectors."""
+    return type(thing) is _NUMBERS or type(thing) is _VECTORS
+
+
 def before_fields(check: Callable[[], None]) -> None:
     """Have `check` called before a field is made, by whoever makes it."""
     create: Any = impl.create_field_member

@@ -5,6 +5,7 @@ alive, when a field has no elements or when a child made by fork launches a kern
 these into an error that says what to do, so that no other module has to know.
 """
 
+import contextlib
 import weakref
 from collections import Counter
 from dataclasses import replace
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from . import language, layout, runtime
+from .copies import Copies
 from .host_copy import Entry, Transfer
 from .language import ti
 from .layout import Declared, Layout
@@ -26,16 +28,19 @@ GROUP = 16  # fields that one transfer kernel serves; Taichi unrolls the loop ov
 class Memory:
     """The fields of one world: declared first, then placed together, freed together.
 
-    `real` is ti.f32 or ti.f64; few: whether the world has few particles, long: whether its kernels are, see Compiler. Every
+    `real` is ti.f32 or ti.f64; few: whether the world has few particles, long: whether its kernels are, see Compiler. copies:
+    where there are many of the world; what is written, read, kept and put back is then that of the chosen one, or of all. Every
     method that touches the fields checks first that they still exist.
     """
 
     kernels_read = ("real",)
 
-    def __init__(self, real, few: bool = False, long: bool = False, compiler: Compiler | None = None):
+    def __init__(
+        self, real, few: bool = False, long: bool = False, compiler: Compiler | None = None, copies: Copies | None = None
+    ):
         if not patched:  # whose fields need a place once they are made
             layout.check_trees()
-        self.real = real
+        self.real, self.copies = real, copies
         self.compiler = compiler or Compiler(real, few, long)
         self.entries: list[Entry] = []
         self._named: Counter[str] = Counter()
@@ -51,27 +56,34 @@ class Memory:
         self._address = 0  # of the bytes
         self._room: Any = None  # the bytes, where they are not Taichi's own
         self._ends: Any = None  # frees it
+        if copies and copies.number is None:
+            copies.number = self.field("copy", None, kind=ti.i32, shared=True)
 
     def more(self) -> "Memory":
         """For more fields of the same world, which come and go by themselves."""
-        return Memory(self.real, compiler=self.compiler)
+        return Memory(self.real, compiler=self.compiler, copies=self.copies)
 
-    def field(self, name: str, length: int | None, *, width: int = 0, kind=None, values=None, state: bool = False) -> Any:
-        """Declare a field of `length` elements (None: a single one, of 0 dimensions) and give it its first values."""
+    def field(
+        self, name: str, length: int | None, *, width: int = 0, kind=None, values=None, state: bool = False, shared: bool = False
+    ) -> Any:
+        """Declare a field of `length` elements (None: a single one, of 0 dimensions) and give it its first values. shared: it
+        is one for all copies."""
         kind = self.real if kind is None else kind
         length = 0 if length is None else max(1, length)  # a field of 0 elements poisons the runtime
         made = layout.field(kind, width)
-        self._declare(name, made, length, width, kind, state)
+        self._declare(name, made, length, width, kind, state, shared)
         if values is not None and np.size(values):
             self._later.append((self.entries[-1], np.asarray(values, dtype=np.float64)))
         return made
 
-    def _declare(self, name: str, made: Any, length: int, width: int, kind: Any, state: bool) -> None:
-        self._declared.append(Declared(kind, width, length, self._apart and kind == ti.f64))
+    def _declare(self, name: str, made: Any, length: int, width: int, kind: Any, state: bool, shared: bool = False) -> None:
+        copies = 0 if shared or not self.copies else self.copies.count
+        in_all = max(1, length) * copies if copies else length
+        self._declared.append(Declared(kind, width, in_all, self._apart and kind == ti.f64))
         self._named[name] += 1
         same = self._named[name]
         name = f"{name} #{same}" if same > 1 else name  # two batches of a kind
-        self.entries.append(Entry(name, made, width, length, np.dtype(_NUMPY[kind]), state))
+        self.entries.append(Entry(name, made, width, length, np.dtype(_NUMPY[kind]), state, copies))
 
     def number(self, value: float, kind=None) -> Number:
         """A number that kernels find in a field, so that others share them: an integer, unless `kind` says so."""
@@ -83,9 +95,12 @@ class Memory:
         return known[-1]
 
     def set_number(self, number: Number) -> None:
-        """Write it, where it is on the device already."""
+        """Write it, where it is on the device already; in all copies, for kernels are made for all."""
         if self._layout:
-            self.write(number.field, [one._value for one in next(all for f, all in self._numbers.values() if f is number.field)])
+            with self.copies.all() if self.copies else contextlib.nullcontext():
+                values = self.read(number.field)
+                values[..., number.place] = number._value
+                self.write(number.field, values)
 
     def _declare_numbers(self) -> None:
         for kind, (field, known) in self._numbers.items():
@@ -99,6 +114,9 @@ class Memory:
             shared = layout.sharing()
             held = [one for one, _ in self.compiler.places]
             self._layout, self._which = layout.take(self._declared, [e.field for e in self.entries], held, shared)
+        for e in self.entries:
+            if e.copies and self.copies:
+                self.copies.add(e.field, max(1, e.length))
         address, room = self._layout.lend()
         self._ends = weakref.finalize(self, _end, self._layout, address, self.compiler)
         self._ends.atexit = False
@@ -112,8 +130,8 @@ class Memory:
 
     def lengthen(self, length: int) -> bool:
         """Give all fields so many elements, where they are. False where kernels would have to know: nothing was done then."""
-        if not (self._layout and self._layout.shared and length <= self._layout.room):
-            return False
+        if self.copies or not (self._layout and self._layout.shared and length <= self._layout.room):
+            return False  # copies begin elsewhere when those before are longer
         longer = [replace(d, length=length) for d in self._declared]
         self._declared, self._views = longer, {}
         self.entries = [replace(e, length=length) for e in self.entries]
@@ -127,9 +145,12 @@ class Memory:
         if not self._views and self._layout:
             self._layout.look()
             if self._layout.size:
-                wanted = [(k, e.shape, e.kind) for k, e in zip(self._which, self.entries, strict=True)]
+                wanted = [(k, e.whole, e.kind) for k, e in zip(self._which, self.entries, strict=True)]
                 views = self._layout.views(self._address, wanted)
-                self._views = {id(e): view for e, view in zip(self.entries, views, strict=False)}
+                for e, view in zip(self.entries, views, strict=False):
+                    self._views[id(e)] = view.reshape(e.copies, *e.shape) if e.copies else view  # which is the same bytes
+                if self.copies and views and self.entries[0].field is self.copies.number:
+                    self.copies.see(self._views[id(self.entries[0])])
         return self._views
 
     def check(self) -> None:
@@ -153,14 +174,20 @@ class Memory:
         self._layout, self._views, self._room = None, {}, None
         self.entries = self.entries if self._ends else []
 
+    def choose(self, copy: int | None) -> None:
+        """Take one of the copies, or all, see Copies."""
+        assert self.copies
+        if not self.copies.choose(copy):
+            self.write(self.copies.number, copy)
+
     def write(self, field, values) -> None:
-        """Overwrite a whole field."""
+        """Overwrite a whole field. Of all copies, where none is chosen: values are the same for all, or have one more axis."""
         self.check()
         if np.size(values):
             self._load([self._find(field)], [np.asarray(values, dtype=np.float64)])
 
     def read(self, field) -> np.ndarray:
-        """A copy of a whole field, in its own type."""
+        """A copy of a whole field, in its own type; with one more axis, the first, of all copies where none is chosen."""
         self.check()
         entry = self._find(field)
         return self._dump([entry])[0]
@@ -178,6 +205,21 @@ class Memory:
         if chosen:
             self._load(chosen, [state.get(e.name, np.zeros(1)) for e in chosen])
 
+    def take(self, other: "Memory") -> None:
+        """Give the chosen copy all that another memory holds in fields of the same names."""
+        self.check()
+        theirs = {e.name: e for e in other.entries}
+        ours = [e for e in self.entries if e.name in theirs]
+        self._load(ours, other._dump([theirs[e.name] for e in ours]))
+
+    def spread(self) -> None:
+        """Give all copies what the chosen one has."""
+        assert self.copies
+        some = [e for e in self.entries if e.copies]
+        values = self._dump(some)
+        with self.copies.all():
+            self._load(some, values)
+
     def _find(self, field) -> Entry:
         return next(e for e in self.entries if e.field is field)
 
@@ -185,7 +227,13 @@ class Memory:
         views = self._seen()
         if views:
             for e, a in zip(entries, arrays, strict=True):
-                views[id(e)][...] = np.broadcast_to(a, e.shape)
+                view = views[id(e)]
+                if not e.copies or self.copies.chosen is not None:  # type: ignore[union-attr]
+                    view, a = self._one(e, view), np.broadcast_to(a, e.shape)
+                view[...] = a
+            return
+        if self._all_of(entries):
+            self._each(entries, lambda k: self._load(entries, [_part(e, a, k) for e, a in zip(entries, arrays, strict=True)]))
             return
         # Every number that we hold (f32, f64, i32) is exact in f64, so one kernel and one flat array serve all.
         for k in range(0, len(entries), GROUP):
@@ -197,7 +245,9 @@ class Memory:
     def _dump(self, entries: list[Entry]) -> list[np.ndarray]:
         views = self._seen()
         if views:
-            return [views[id(e)].copy() for e in entries]
+            return [self._one(e, views[id(e)]).copy() for e in entries]
+        if self._all_of(entries):
+            return [np.stack(arrays) for arrays in zip(*self._each(entries, lambda k: self._dump(entries)), strict=True)]
         out = []
         for k in range(0, len(entries), GROUP):
             some = entries[k : k + GROUP]
@@ -207,6 +257,23 @@ class Memory:
                 self._transfer(some).dump(flat)
             parts = np.split(flat, np.cumsum(sizes)[:-1])
             out += [p.astype(e.kind).reshape(e.shape) for p, e in zip(parts, some, strict=True)]
+        return out
+
+    def _one(self, entry: Entry, view: np.ndarray) -> np.ndarray:
+        """The part of a field that is the chosen copy's; all of it where none is."""
+        return view if not entry.copies or self.copies.chosen is None else view[self.copies.chosen]  # type: ignore[union-attr]
+
+    def _all_of(self, entries: list[Entry]) -> bool:
+        """Whether fields are to be transferred for all copies."""
+        return bool(self.copies) and self.copies.chosen is None and any(e.copies for e in entries)  # type: ignore[union-attr]
+
+    def _each(self, entries: list[Entry], act: Any) -> list[Any]:
+        """Do something for one copy after the other."""
+        out = []
+        for k in range(self.copies.count):  # type: ignore[union-attr]
+            self.choose(k)
+            out.append(act(k))
+        self.choose(None)
         return out
 
     def _transfer(self, entries: list[Entry]) -> Transfer:
@@ -220,6 +287,11 @@ def _end(one: Layout, address: int, compiler: Compiler) -> None:
     """Free a place in a layout."""
     compiler.places.remove((one, address))
     one.destroy()
+
+
+def _part(entry: Entry, values: np.ndarray, copy: int) -> np.ndarray:
+    """The part of an array that is for one copy."""
+    return values[copy] if np.ndim(values) > len(entry.shape) else values
 
 
 _NUMPY = {ti.f32: np.float32, ti.f64: np.float64, ti.i32: np.int32, ti.u32: np.uint32}

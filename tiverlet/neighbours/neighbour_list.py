@@ -1,5 +1,6 @@
 """The neighbour list: where it is stored, and what pairs remember from one list to the next."""
 
+import contextlib
 import warnings
 from typing import Any
 
@@ -80,7 +81,8 @@ class NeighbourList:
             return False
         kept = []
         if self.store:
-            kept = [self.store.read(field) for field in self._fields()]
+            with self._of_all():
+                kept = [self.store.read(field) for field in self._fields()]
             self.store.destroy()
         self.store = self.memory.more()
         self.neighbour = self.store.field("grid.near", self.room, kind=ti.i32)
@@ -90,13 +92,15 @@ class NeighbourList:
             if piece.kept:
                 piece.old = self.store.field(f"grid.{piece.name}_aside", self.room, width=piece.width)
         self.store.place()
-        for field, values in zip(self._fields(), kept, strict=False):
-            self._write_old(field, values)
+        with self._of_all():
+            for field, values in zip(self._fields(), kept, strict=False):
+                self._write_padded(field, values)
         return True
 
     def grow(self) -> bool:
         """Make room for what the last build needed, and a quarter more. True if kernels have to be told."""
-        need = int(self.memory.read(self.need)[0])
+        with self._of_all():
+            need = int(self.memory.read(self.need).max())
         each = need * self.blocks / self.n
         if each > CROWDED:
             warnings.warn(
@@ -109,12 +113,21 @@ class NeighbourList:
         return new
 
     def _fields(self) -> list:
-        return [self.old_neighbour, *(piece.old for piece in self.transferred)]
+        """What has to outlive a new list: of a world alone, which has saved all for it, the old one; of one of many copies, also
+        the lists of those that go on with theirs."""
+        old = [self.old_neighbour, *(piece.old for piece in self.transferred)]
+        return [*old, self.neighbour, *(piece.field for piece in self.pair_data)] if self.memory.copies else old
 
-    def _write_old(self, field, values: np.ndarray) -> None:
-        """Write a field of the old list."""
-        room = np.zeros((self.room, *values.shape[1:]), dtype=values.dtype)
-        room[: len(values)] = values[: self.room]
+    def _of_all(self) -> contextlib.AbstractContextManager[None]:
+        """Meanwhile read and write what all copies have."""
+        return self.memory.copies.all() if self.memory.copies else contextlib.nullcontext()
+
+    def _write_padded(self, field, values: np.ndarray) -> None:
+        """Write a field of the list, with 0 where there are no values."""
+        axis = int(self.memory.copies is not None and self.memory.copies.chosen is None)  # that of the copies comes first
+        room = np.zeros((*values.shape[:axis], self.room, *values.shape[axis + 1 :]), dtype=values.dtype)
+        some = min(self.room, values.shape[axis])
+        np.moveaxis(room, axis, 0)[:some] = np.moveaxis(values, axis, 0)[:some]
         self.store.write(field, room)  # type: ignore[union-attr]
 
     def invalidate(self) -> None:
@@ -155,9 +168,9 @@ class NeighbourList:
         """Give what lasting_data() returned to the next list that is built."""
         if len(pairs) > self.room:
             self.allocate(len(pairs))
-        self._write_old(self.old_neighbour, pairs[:, 1].astype(np.int32))
+        self._write_padded(self.old_neighbour, pairs[:, 1].astype(np.int32))
         for piece in self.transferred:
-            self._write_old(piece.old, values[piece.name] if piece.lasting else np.zeros((1, *[piece.width] * (piece.width > 0))))
+            self._write_padded(piece.old, values[piece.name] if piece.lasting else np.zeros((1, *[piece.width] * (piece.width > 0))))
         counts = np.bincount(pairs[:, 0], minlength=max(1, self.n))
         self.memory.write(self.old_first, np.cumsum(counts) - counts)
         self.memory.write(self.old_number, counts)

@@ -11,6 +11,7 @@ from ..constraints.core.anchored import Anchored
 from ..constraints.core.scalar import LOST, Scalar
 from ..contact.pair_contact import PairContact
 from ..device import runtime, ti
+from ..device.copies import Copies
 from ..device.memory import Memory
 from ..device.patches.compiler import FEW
 from ..device.thread_team import PIECES, Team, size_of
@@ -26,6 +27,7 @@ from ..solvers.solver import Solver
 from . import high_order
 from .diagnostics import Diagnostics
 from .integrator import Forces, Verlet
+from .frames import Frames
 from .step import Step
 
 T = TypeVar("T", bound=Feature)
@@ -75,16 +77,18 @@ class Assembly:
     grid: NeighbourSearch | None
     step: Step
     diagnostics: Diagnostics
+    frames: Frames | None  # where there are copies
 
 
 def assemble(
     particles: Particles, features: tuple[Feature, ...], starts: Sequence[Particles | None], first: int,
-    solver: Solver | None, precision: str, path: str, order: int, scale: Scale | None = None,
+    solver: Solver | None, precision: str, path: str, order: int, scale: Scale | None = None, copies: Copies | None = None,
 ) -> Assembly:  # fmt: skip
     """Check the features against the particles and each other, then declare and place every field, in one tree.
 
     particles: as they are now. starts: for each feature how they were when it came; None if it comes now. first: from this
     number on particles come now. solver: None for the one that suits the structure. scale: of the world that this one follows.
+    copies: where there are to be many of it.
     """
     inv_mass = particles.inv_mass.copy()
     for feature, start in zip(features, starts, strict=True):
@@ -100,9 +104,9 @@ def assemble(
     check_architecture(precision, features)
     now = Scale(len(particles), len(particles) + sum(f.count for f in features if isinstance(f, Batch)))
     scale = scale if scale and scale.holds(now) else now
-    path = _chosen(path, scale) if order == 2 else "fused"
+    path = _chosen(path, scale) if order == 2 and not copies else "fused"
     bulk = sum({type(f): f.bulk for f in features}.values()) * (1.5 if particles.dim == 3 else 1.0)
-    memory = Memory(PRECISIONS[precision], scale.particles < FEW, bulk > LONG)
+    memory = Memory(PRECISIONS[precision], scale.particles < FEW, bulk > LONG, copies=copies)
     try:
         state = State(memory, particles, inv_mass, precision == "f32-compensated")
         return _bind(Scene(memory, state, particles, inv_mass, order=order), features, solver, path, scale)
@@ -157,8 +161,9 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     for pairs, each in lists:
         if pairs:
             pairs.allocate(len(particles) * each + 64)
+    frames = Frames(step, memory) if memory.copies else None
     memory.place()
-    return Assembly(scale, path, solver, memory, scene, batches, grid, step, diagnostics)
+    return Assembly(scale, path, solver, memory, scene, batches, grid, step, diagnostics, frames)
 
 
 def checked_features(features: Iterable[Feature]) -> tuple[Feature, ...]:

@@ -285,58 +285,13 @@ class Reporter:
         particles were moved before the first substep [m]. released: see Runner."""
         energy, residual, overlap, stiff, contacts, bad, fast, reach, broken, tension, turned, *extent = self.figures.tolist()
         stiff = max(stiff, self.fastest * h * h)
-        notes = {}
         first = int(bad) if bad < self.n else None
-        if first is not None:
-            notes["non-finite"] = (
-                f"The state of particle {first} is not finite (the first of them); go back and use a smaller step."
-            )
-        if reach >= self.farthest:
-            notes["out-of-range"] = (
-                f"A coordinate is out of range: it reached {reach:g} m, and beyond {self.farthest:g} m the precision fails."
-            )
-        if fast > 0:
-            notes["tunnelling-risk"] = (
-                "A particle moved by more than its own size in one substep and may have passed another; use more substeps."
-            )
-        if turned == FAR:
-            notes["turned"] = "A constraint turned by more than 41 degrees in one substep and is damped there; use more substeps."
-        if moved > 0:
-            notes["moved"] = (
-                f"Particles were off their rigid constraints by more than a fifth, and were moved by up to {moved:.3g} m "
-                "to where these are met. Place them there, or give the constraints other rest values, or compliance."
-            )
-        if tension > TENSEST:
-            need = np.ceil(substeps * np.sqrt(tension / STIFF))  # may be infinite
-            notes["softened"] = (
-                f"A tension makes particles vibrate too fast for the substep: omega h >= {np.sqrt(tension):.3g}, stable below 2. "
-                f"Its constraints give way instead. Use about {need:.7g} substeps."
-            )
-        elif tension == TENSEST:
-            notes["softened"] = (
-                "A load has hardly a direction to be carried in, as that of a straight rope between two pins: its constraints "
-                "give way and sag with h^2. Give them slack or compliance, or use more substeps."
-            )
-        if stiff > STIFF:
-            need = np.ceil(substeps * np.sqrt(stiff / STIFF)) + 1
-            notes["stiff-force"] = (
-                f"A force changes too fast for the substep: omega h = {np.sqrt(stiff):.3g}, stable below 2. "
-                f"Use at least {need:.7g} substeps."
-            )
-        if released > 0:
-            notes["unconverged"] = (
-                f"Large clusters or loops were off by {100 * released:.3g} % of their size when the substep became shorter, "
-                "which turns that into energy. Give all frames as many substeps, or these constraints compliance."
-            )
-        elif residual > UNCONVERGED:
-            need = np.ceil(substeps * residual / UNCONVERGED)  # of order h^2 under loads, h after impacts
-            if self.remedy is None:
-                self.remedy = self.solver.remedy(self.batches, self.scene.slots, self.scene.inv_mass)
-            other = f", or {self.remedy}" if self.remedy else ""
-            notes["unconverged"] = (
-                f"Constraints are not met: the worst is off by {100 * residual:.3g} % of its size. "
-                f"Use about {need:.7g} substeps{other}. Where neither helps, constraints contradict each other."
-            )
+        notes = {}
+        for flag, there in risks(
+            self.n, self.farthest, bad, reach, fast, turned, moved, tension, stiff, released, residual
+        ).items():  # fmt: skip
+            if there:
+                notes[flag] = self._note(flag, first, reach, moved, tension, stiff, released, residual, substeps)
         report = StepReport.of(
             {
                 "time": time,
@@ -358,3 +313,63 @@ class Reporter:
             }
         )
         return report, extent
+
+    def _note(self, flag, first, reach, moved, tension, stiff, released, residual, substeps) -> str:
+        """What a flag means, and what to do, with the figures of this frame."""
+        if flag == "non-finite":
+            return f"The state of particle {first} is not finite (the first of them); go back and use a smaller step."
+        if flag == "out-of-range":
+            return f"A coordinate is out of range: it reached {reach:g} m, and beyond {self.farthest:g} m the precision fails."
+        if flag == "tunnelling-risk":
+            return "A particle moved by more than its own size in one substep and may have passed another; use more substeps."
+        if flag == "turned":
+            return "A constraint turned by more than 41 degrees in one substep and is damped there; use more substeps."
+        if flag == "moved":
+            return (
+                f"Particles were off their rigid constraints by more than a fifth, and were moved by up to {moved:.3g} m "
+                "to where these are met. Place them there, or give the constraints other rest values, or compliance."
+            )
+        if flag == "softened" and tension > TENSEST:
+            need = np.ceil(substeps * np.sqrt(tension / STIFF))  # may be infinite
+            return (
+                f"A tension makes particles vibrate too fast for the substep: omega h >= {np.sqrt(tension):.3g}, stable below 2. "
+                f"Its constraints give way instead. Use about {need:.7g} substeps."
+            )
+        if flag == "softened":
+            return (
+                "A load has hardly a direction to be carried in, as that of a straight rope between two pins: its constraints "
+                "give way and sag with h^2. Give them slack or compliance, or use more substeps."
+            )
+        if flag == "stiff-force":
+            need = np.ceil(substeps * np.sqrt(stiff / STIFF)) + 1
+            return (
+                f"A force changes too fast for the substep: omega h = {np.sqrt(stiff):.3g}, stable below 2. "
+                f"Use at least {need:.7g} substeps."
+            )
+        if released > 0:
+            return (
+                f"Large clusters or loops were off by {100 * released:.3g} % of their size when the substep became shorter, "
+                "which turns that into energy. Give all frames as many substeps, or these constraints compliance."
+            )
+        need = np.ceil(substeps * residual / UNCONVERGED)  # of order h^2 under loads, h after impacts
+        if self.remedy is None:
+            self.remedy = self.solver.remedy(self.batches, self.scene.slots, self.scene.inv_mass)
+        other = f", or {self.remedy}" if self.remedy else ""
+        return (
+            f"Constraints are not met: the worst is off by {100 * residual:.3g} % of its size. "
+            f"Use about {need:.7g} substeps{other}. Where neither helps, constraints contradict each other."
+        )
+
+
+def risks(n, farthest, bad, reach, fast, turned, moved, tension, stiff, released, residual) -> dict[str, Any]:
+    """Which flags a frame has, in the order of their notes; of many frames, whose figures are arrays, arrays."""
+    return {
+        "non-finite": bad < n,
+        "out-of-range": reach >= farthest,
+        "tunnelling-risk": fast > 0,
+        "turned": turned == FAR,
+        "moved": moved > 0,
+        "softened": tension >= TENSEST,
+        "stiff-force": stiff > STIFF,
+        "unconverged": (released > 0) | (residual > UNCONVERGED),
+    }

@@ -16,6 +16,7 @@ from .clock import Clock
 from .diagnostics import STARTED, STEPPED, UNSTEPPED
 from .integrator import FREE, decay
 from .projection import project
+from .frames import Frames
 from .step import ACTIVE_THREADS, BEFORE, END, GIVE, HALT, ORIGIN, H, Moment, Span, frame
 
 LONG = 10_000_000  # particles and constraints, times passes, in a launch: it takes about a second
@@ -30,6 +31,7 @@ class Runner:
     def __init__(self, parts: Any, clock: Clock):
         self.memory, self.scene, self.batches, self.grid = parts.memory, parts.scene, parts.batches, parts.grid
         self.step, self.diagnostics, self.path, self.solver = parts.step, parts.diagnostics, parts.path, parts.solver
+        self.frames: Frames | None = parts.frames
         self.clock = clock
         self.moved = 0.0  # how far the coming frame has had to move a particle to where its constraints are met [m]
         self.released = 0.0  # the violation that its shorter substep turns into energy, as a share of its size
@@ -48,6 +50,9 @@ class Runner:
         """The kernels that are launched in every frame."""
         self.sheet = self.diagnostics.sheet
         self._fused = CachedLaunch(self.step, "fused", self.memory.compiler, self.sheet)
+        if self.frames:
+            self.frames = self.frames.of(self.step)
+            self._fused = self.frames.launch_one(self.sheet)
         self._measure = CachedLaunch(self.diagnostics, "measure", self.memory.compiler, self.sheet)
         self._data, self._given, self._reporter = self.sheet.data, self.sheet.data[H:], self.diagnostics.report
 

@@ -1,0 +1,120 @@
+"""Frames of many copies of a world, and many frames of each, in one launch."""
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ..device import runtime, ti
+from ..device.memory import Memory
+from ..device.patches.compiler import CachedLaunch
+from ..device.thread_team import LEAST
+from .diagnostics import STEPPED
+from .step import BEGIN, END, FIGURES, FIRST, FRESH, HALF, HALT, ORIGIN, RESUMED, SHEET, SINCE, START, TICK, Step, integer
+
+# What a launch is given: how many copies, how many frames each, the substeps of one; of how many frames one is kept on the track,
+# which of these is the first; whether figures are kept.
+COUNT, FRAMES, SUBSTEPS, EVERY, ROW, ROWS, KEEPS = range(7)
+PLAN = KEEPS + 1
+DATES = 4  # of a copy: when frames of the present length began [s], their length [s], how many there were; frames of the launch
+WRAP = 2.0**31  # substeps are counted up to it
+
+
+@ti.data_oriented
+class Frames:
+    """The kernel that takes copies from frame to frame, each on one thread, and what it is told and tells.
+
+    sheet: of each copy, see step.py. dates: see DATES.
+    """
+
+    kernels_read = ("step", "memory", "copies", "sheet", "dates", "next", "lanes", "spread")
+
+    def __init__(self, step: Step, memory: Memory):
+        assert memory.copies
+        self.step, self.memory, self.copies = step, memory, memory.copies
+        self.sheet = memory.field("frames.sheet", SHEET, kind=ti.f64)
+        self.dates = memory.field("frames.dates", DATES, kind=ti.f64)
+        self.next = memory.field("frames.next", None, kind=ti.i32, shared=True)
+        # On a CPU each thread takes one copy after the other, as it gets done; elsewhere each has one.
+        on_cpu = runtime.architecture() == "cpu"
+        self.lanes, self.spread = (runtime.cores(), LEAST) if on_cpu else (self.copies.count, 1)
+
+    def of(self, step: Step) -> "Frames":
+        """The same fields, for another Step."""
+        new = copy.copy(self)
+        new.step = step
+        return new
+
+    def launch_one(self, sheet: np.ndarray) -> Callable[[], None]:
+        """A launch of the chosen copy alone, for a frame as it stands on this sheet, as Step.fused takes and leaves it."""
+        plan, which = np.zeros(PLAN, dtype=np.int32), np.zeros(1, dtype=np.int32)
+        plan[COUNT] = plan[FRAMES] = 1
+        none = np.zeros(1)
+        launch = CachedLaunch(self, "run", self.memory.compiler, plan, which, none, none)
+
+        def launched() -> None:
+            which[0] = self.copies.chosen
+            self.memory.write(self.sheet, sheet)
+            self.memory.write(self.dates, 0.0)
+            launch()
+            self.memory.check()
+            sheet[:] = self.memory.read(self.sheet)
+
+        return launched
+
+    @ti.kernel
+    def run(
+        self, plan: ti.types.ndarray(ti.i32, 1), which: ti.types.ndarray(ti.i32, 1), figures: ti.types.ndarray(ti.f64, 1),  # type: ignore[valid-type]
+        track: ti.types.ndarray(ti.f64, 1),  # type: ignore[valid-type]
+    ):  # fmt: skip
+        """All frames of all copies that are listed."""
+        for _ in range(1):
+            self.next[None] = 0
+        for lane in range(self.lanes * self.spread):
+            if lane % self.spread == 0:
+                k = ti.atomic_add(self.next[None], 1)
+                while k < plan[COUNT]:
+                    self.go_through(which[k], plan, figures, track)
+                    k = ti.atomic_add(self.next[None], 1)
+
+    @ti.func
+    def go_through(self, w, plan: ti.template(), figures: ti.template(), track: ti.template()):  # type: ignore[valid-type]
+        """The frames of one copy, up to one that has to wait for a longer list."""
+        self.copies.enter(w)
+        f, waits = ti.cast(self.dates[3], ti.i32), 0
+        while f < plan[FRAMES] and waits == 0:
+            self.step.run(integer(self.sheet, FIRST), self.sheet)
+            waits = integer(self.sheet, HALT)
+            if waits == 0:
+                self.keep(w, f, plan, figures, track)
+                self.turn_over(plan)
+                f += 1
+        self.dates[3] = f
+
+    @ti.func
+    def keep(self, w, f, plan: ti.template(), figures: ti.template(), track: ti.template()):  # type: ignore[valid-type]
+        """What the frame came to, and where particles are after it."""
+        if plan[KEEPS] != 0:
+            for k in range(FIGURES):
+                figures[(w * plan[FRAMES] + f) * FIGURES + k] = self.sheet[k]
+        if plan[EVERY] > 0 and (f + 1) % plan[EVERY] == 0:
+            row = w * plan[ROWS] + plan[ROW] + (f + 1) // plan[EVERY] - 1
+            for i in range(self.step.n):
+                for a in ti.static(range(self.step.dim)):
+                    x = ti.cast(self.step.state.x[i][a], ti.f64)
+                    if ti.static(self.step.state.sums):
+                        x += self.step.state.low[i][a]
+                    track[(row * self.step.n + i) * self.step.dim + a] = x
+
+    @ti.func
+    def turn_over(self, plan: ti.template()):  # type: ignore[valid-type]
+        """The sheet for the next frame, as Clock.advance() and Runner.run() write it."""
+        self.dates[2] += 1
+        self.sheet[START] = self.sheet[END]
+        self.sheet[END] = self.dates[0] + self.dates[1] * (self.dates[2] + 1)
+        for k in ti.static((TICK, SINCE)):
+            count = self.sheet[k] + plan[SUBSTEPS]
+            self.sheet[k] = ti.select(count >= WRAP, count - WRAP, count)
+        self.sheet[FRESH], self.sheet[ORIGIN] = 0, STEPPED
+        self.sheet[BEGIN], self.sheet[HALF], self.sheet[RESUMED] = 0, 0, 0

@@ -1,0 +1,5 @@
+"""Many worlds at once."""
+
+from .worlds import Rollout, Worlds
+
+__all__ = ["Rollout", "Worlds"]

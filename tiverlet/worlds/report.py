@@ -1,0 +1,85 @@
+"""What frames of many worlds came to: a StepReport's figures, as arrays."""
+
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+
+from ..step_report import StepReport
+
+SUMS = ("energy_change", "broken")  # over frames
+LAST = ("time", "energy")
+FIRST = ("bad",)  # the first that is not -1
+
+
+@dataclass(frozen=True)
+class WorldsReport:
+    """The frames that worlds.step() or worlds.run() has just finished: of each world the worst figures, as in StepReport.
+
+    All are arrays with one value for each world. bad: -1 where all is finite. flags: by their names, whether each world has them;
+    names that no world has are left out. seconds: what all frames of all worlds took together, one number.
+    """
+
+    time: np.ndarray
+    residual: np.ndarray
+    overlap: np.ndarray
+    contacts: np.ndarray
+    energy: np.ndarray
+    energy_change: np.ndarray
+    bad: np.ndarray
+    broken: np.ndarray
+    turn: np.ndarray
+    tension: np.ndarray
+    flags: dict[str, np.ndarray]
+    substeps: int
+    iterations: int
+    seconds: float = field(default=0.0, compare=False)
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def clean(self) -> np.ndarray:
+        """Which worlds have no flag, (worlds,)."""
+        out = np.ones(len(self), dtype=bool)
+        for there in self.flags.values():
+            out &= ~there
+        return out
+
+    def of(self, k: int) -> StepReport:
+        """The report of one world, without the sentences that go with its flags; worlds[k].step() has these."""
+        k = range(len(self))[k]
+        figures: dict[str, Any] = {name: getattr(self, name)[k].item() for name in ARRAYS}
+        figures["bad"] = None if figures["bad"] < 0 else figures["bad"]
+        flags = frozenset(name for name, there in self.flags.items() if there[k])
+        return StepReport(substeps=self.substeps, iterations=self.iterations, flags=flags, seconds=self.seconds, **figures)
+
+    def worse(self, later: "WorldsReport") -> "WorldsReport":
+        """With later frames, the worst figures of both."""
+        out: dict[str, Any] = {}
+        for name in ARRAYS:
+            a, b = getattr(self, name), getattr(later, name)
+            if name in LAST:
+                out[name] = b
+            elif name in SUMS:
+                out[name] = a + b
+            elif name in FIRST:
+                out[name] = np.where(a < 0, b, a)
+            else:
+                out[name] = np.maximum(a, b)
+        none = np.zeros(len(self), dtype=bool)
+        names = [*self.flags, *(name for name in later.flags if name not in self.flags)]
+        flags = {name: self.flags.get(name, none) | later.flags.get(name, none) for name in names}
+        return WorldsReport(
+            **out, flags=flags, substeps=max(self.substeps, later.substeps), iterations=max(self.iterations, later.iterations),
+            seconds=self.seconds + later.seconds,
+        )  # fmt: skip
+
+    def __repr__(self) -> str:
+        said = [f"{len(self)} worlds", f"time = {self.time.max(initial=0.0):.6g}"]
+        said += [f"{name} <= {getattr(self, name).max(initial=0):.3g}" for name in ("residual", "overlap")]
+        said += [f"{name}: {there.sum()}" for name, there in self.flags.items()]
+        return f"WorldsReport({', '.join(said)})"
+
+
+ARRAYS = tuple(f.name for f in fields(WorldsReport) if f.type == "np.ndarray" or f.type is np.ndarray)

@@ -1,0 +1,451 @@
+"""Many worlds of one structure, stepped together, none of which knows of the others."""
+
+import contextlib
+from collections.abc import Iterable, Iterator, Sequence
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .. import checks
+from ..device.copies import Copies
+from ..device.interrupts import whole
+from ..device.patches import patched
+from ..device.patches.compiler import CachedLaunch
+from ..features.arguments import knobs_of, meant
+from ..features.feature import Feature
+from ..features.read_only import assign_whole, read_only
+from ..particles import Particles, in_range
+from ..step import checkpoint
+from ..step import frames as kernel
+from ..step.build import Scale
+from ..step.diagnostics import STARTED, STEPPED, TURNS, risks
+from ..step.step import BEGIN, END, FIGURES, FRESH, HALF, HALT, ITERATIONS, ORIGIN, PART, RESUMED, SINCE, START, TICK, UNTIL
+from ..step.step import SHEET, H
+from ..step.step import SUBSTEPS as STAGES
+from ..world import World
+from .clocks import NONE, Clocks
+from .report import WorldsReport
+
+WORK = 100_000_000  # particles and constraints, times passes, in a launch: it takes some seconds
+LOGGED = 1 << 22  # figures of frames that are kept at a time
+
+
+class Rollout(NamedTuple):
+    """What worlds.rollout() returns. time: (worlds, frames) [s]. position: (worlds, frames, n, dim) [m]."""
+
+    time: np.ndarray
+    position: np.ndarray
+    report: WorldsReport
+
+
+class Worlds:
+    """Copies of a world, or worlds that differ in numbers only, stepped in one launch.
+
+    worlds: a World, of which there are to be `count` copies in its present state; or several Worlds of the same structure: the
+    same features, solver, options and numbers of particles and constraints, with other masses, places, lengths, radii.
+
+    Each goes on to the bit as it would alone, on any number of threads; none knows of the others: what is wrong in one is flagged
+    for that one. worlds[k] is the k-th as a World of its own, in its present state. The worlds that it is made of stay as they are.
+
+    position, velocity: (worlds, n, dim). set() gives knobs other values in each world; what is assigned to a knob of
+    worlds.features is for all of them.
+
+    Raises ValueError or TypeError for worlds of different structure, and for substeps="auto": each would take its own time.
+    """
+
+    def __init__(self, worlds: World | Iterable[World], count: int | None = None):
+        sources = _checked(worlds, count)
+        first = sources[0]
+        if isinstance(worlds, World):
+            count = checks.integer("Worlds", "count", 1 if count is None else count, least=1)
+        else:
+            count = len(sources)
+        with whole:
+            sources = [_settled(world) for world in sources]
+            self._copies = Copies(count)
+            first = sources[0]
+            self._world = World._of(
+                first.particles, tuple(f.copy() for f in first.features), [f.start for f in first.features],
+                copies=self._copies, **(first.settings | {"path": "fused"}),
+            )  # fmt: skip
+            self._runner = self._world._runner
+            self._sources = [_Source(world) for world in sources]
+            _check_structure(self._world, sources)
+            self._given: dict[tuple[int, str], Any] = {}  # by feature and knob: what each world has of it
+            self._clocks = Clocks([world._clock for world in sources])
+            for k, world in enumerate(sources):
+                self._take(k, world)
+            if len(sources) < count:
+                for memory in self._runner.memories:
+                    memory.choose(0)
+                    memory.spread()
+                self._clocks = Clocks([self._clocks.of(0)] * count)
+            self._rest()
+            for f, *others in zip(self._world.features, *(world.features for world in sources), strict=True):
+                f.changed = f.new_force = False
+                f.moving = any(other.moving for other in others)
+        self._launches: dict[int, Any] = {}
+        self._last: WorldsReport | None = None
+        self._kept: tuple[list[dict], Clocks] | None = None
+
+    def _take(self, k: int, world: World) -> None:
+        """Give copy k what a world has."""
+        runner = self._runner
+        runner.memory.choose(k)
+        numbers = [(grid.capacity, grid.pitch) for grid in runner.step.grids]
+        runner.memory.take(world._runner.memory)
+        for grid, (capacity, pitch) in zip(runner.step.grids, numbers, strict=True):
+            grid.capacity_number.set(capacity)
+            grid.pitch_number.set(pitch)
+        self._world._clock = runner.clock = self._clocks.of(k)
+        checkpoint.put_back(self._world, checkpoint.keep(world))
+        self._clocks.put(k, runner.clock)
+
+    def _rest(self) -> None:
+        """No world is chosen."""
+        self._runner.memory.choose(None)
+        for (i, name), values in self._given.items():
+            self._world.features[i].__dict__[name] = values
+
+    @contextlib.contextmanager
+    def _at(self, k: int) -> Iterator[World]:
+        """Meanwhile the world stands for the k-th."""
+        world, runner = self._world, self._runner
+        runner.memory.choose(k)
+        world._clock = runner.clock = self._clocks.of(k)
+        self._sources[k if len(self._sources) > 1 else 0].put_on(world)
+        for (i, name), values in self._given.items():
+            world.features[i].__dict__[name] = values[k]
+        try:
+            yield world
+        finally:
+            self._clocks.put(k, world._clock)
+            self._rest()
+
+    # The step.
+
+    def step(self, dt: float) -> WorldsReport:
+        """Advance all of them by dt [s], see World.step()."""
+        dt = checks.number("Worlds.step", "dt", dt, above=0.0)
+        self._runner.memory.check()
+        with whole:
+            return self._advance(dt, 1, 0, None, 0)
+
+    def run(self, seconds: float, dt: float = 1 / 60, progress: bool = False) -> WorldsReport:
+        """Step all of them for `seconds` [s] in frames of dt [s], many in a launch; returns the worst figures of all frames."""
+        return self._frames("Worlds.run", seconds, dt, 0, None, progress)
+
+    def rollout(self, seconds: float, dt: float = 1 / 60, every: int = 1, progress: bool = False) -> Rollout:
+        """The same, with the track of all particles: where they are after each `every`-th frame, in f64."""
+        every = checks.integer("Worlds.rollout", "every", every, least=1)
+        frames = _frame_count("Worlds.rollout", seconds, dt)
+        n, dim = len(self._world.particles), self._world.particles.dim
+        size = len(self) * (frames // every) * n * dim
+        if size >= 2**31:
+            raise ValueError(
+                f"Worlds.rollout: the track would have {size} numbers, and can have {2**31 - 1}. Keep fewer frames, with `every`, "
+                "or make several rollouts."
+            )
+        position = np.zeros((len(self), frames // every, n, dim))
+        time = self._clocks.time[:, None] + dt * every * np.arange(1, frames // every + 1)
+        report = self._frames("Worlds.rollout", seconds, dt, every, position, progress)
+        return Rollout(time, position, report)
+
+    def _frames(
+        self, who: str, seconds: float, dt: float, every: int, track: np.ndarray | None, progress: bool
+    ) -> WorldsReport:
+        """Frames in launches of some of them."""
+        frames = _frame_count(who, seconds, dt)
+        self._runner.memory.check()
+        world = self._world
+        work = len(self) * world.substeps * world.iterations * self._runner.integrator.stages
+        work *= 1 + len(world.particles) + sum(b.count for b in self._runner.batches)
+        at_once = max(1, min(frames, WORK // work, LOGGED // (len(self) * FIGURES)))
+        at_once = max(every, at_once // every * every) if every else at_once
+        bar: Any = contextlib.nullcontext()
+        if progress:
+            from rich.progress import Progress  # noqa: PLC0415
+
+            bar = Progress()
+        worst, done = None, 0
+        with bar as shown:
+            task = shown.add_task(f"{len(self)} worlds", total=frames) if shown else None
+            while done < frames:
+                some = min(at_once, frames - done)
+                with whole:
+                    report = self._advance(dt, some, every, track, done // every if every else 0)
+                worst, done = report if worst is None else worst.worse(report), done + some
+                if shown:
+                    shown.update(task, completed=done)
+        assert worst
+        return worst
+
+    def _advance(self, dt: float, frames: int, every: int, track: np.ndarray | None, row: int) -> WorldsReport:
+        """Frames of all of them; where knobs are on their way in the first one, that one alone comes first."""
+        begun = perf_counter()
+        moved, released = self._begin(dt)
+        if frames > 1 and any(f.moving for f in self._world.features) and not every:
+            first = self._launch(dt, 1, 0, None, 0, moved, released, begun)
+            moved, released = self._begin(dt)
+            rest = self._launch(dt, frames - 1, 0, None, 0, moved, released, begun)
+            report = first.worse(rest)
+        else:
+            report = self._launch(dt, frames, every, track, row, moved, released, begun)
+        self._last = report
+        return report
+
+    def _begin(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
+        """Have all of them ready for substeps of this length, see Runner.begin(). Returns what that found of each: how far
+        particles were moved, and what a shorter substep released."""
+        world, runner, clocks = self._world, self._runner, self._clocks
+        self._upload()
+        substep = dt / world.substeps
+        h = substep * runner.integrator.first
+        ready = (clocks.h == h) & ~clocks.d_is_velocity & clocks.known & (clocks.first_moved == NONE)
+        begins = (clocks.h == h) & clocks.d_is_velocity & clocks.known & (clocks.first_moved == NONE)
+        clocks.since[begins] = 0
+        moved, released = np.zeros(len(self)), np.zeros(len(self))
+        for k in np.flatnonzero(~(ready | begins)):
+            with self._at(k):
+                runner.begin(substep, world.iterations)
+                moved[k], released[k] = runner.moved, runner.released
+        return moved, released
+
+    def _upload(self) -> None:
+        """Bring knobs to the device."""
+        world = self._world
+        changed = [f.changed for f in world.features]
+        moving = [f.moving for f in world.features]
+        if not any(changed) and not any(moving):
+            return
+        for f in world.features:
+            if f.changed and f.outgrown:
+                raise ValueError(
+                    f"Worlds: {f!r} has a knob that asks for what these kernels do not have, such as friction where there was "
+                    "none. Give the World that Worlds is made of a value other than 0 first."
+                )
+        for i, name in [key for key in self._given if changed[key[0]]]:
+            f = world.features[i]
+            if f.__dict__[name] is not self._given[i, name]:
+                del self._given[i, name]  # assigned for all
+        new_force, after = [f.new_force for f in world.features], moving
+        for k in range(len(self)):
+            with self._at(k):
+                for f, c, m, force in zip(world.features, changed, moving, new_force, strict=True):
+                    f.changed, f.moving, f.new_force = c, m, force
+                world._upload_parameters()
+                after = [f.moving for f in world.features]
+        for f, m in zip(world.features, after, strict=True):
+            f.changed = f.new_force = False
+            f.moving = m
+
+    def _launch(
+        self, dt: float, frames: int, every: int, track: np.ndarray | None, row: int, moved: np.ndarray, released: np.ndarray,
+        begun: float,
+    ) -> WorldsReport:  # fmt: skip
+        """Frames in one launch, and as many more as lists have to grow."""
+        world, runner, clocks = self._world, self._runner, self._clocks
+        substeps, iterations, stages = world.substeps, world.iterations, runner.integrator.stages
+        with runner.memory.compiler():
+            for semi_iteration in runner.semi_iterations:
+                semi_iteration.prepare(iterations)
+        clocks.count_frame(dt, np.ones(len(self), dtype=bool))
+        started = clocks.d_is_velocity & (substeps == 1)
+        sheets, dates = np.zeros((len(self), SHEET)), np.zeros((len(self), kernel.DATES))
+        sheets[:, H], sheets[:, START], sheets[:, TICK], sheets[:, SINCE] = clocks.h, clocks.time, clocks.tick, clocks.since
+        dates[:, :3] = clocks.frame
+        sheets[:, END] = dates[:, 0] + dates[:, 1] * (dates[:, 2] + 1)
+        sheets[:, FRESH], sheets[:, ORIGIN] = clocks.d_is_velocity, np.where(started, STARTED, STEPPED)
+        total = stages * substeps if runner.n else 0
+        sheets[:, STAGES], sheets[:, ITERATIONS] = total, runner.integrator.passes(iterations)
+        sheets[:, UNTIL], sheets[:, PART] = total + 1, sheets[:, ITERATIONS]
+        plan, which = np.zeros(kernel.PLAN, dtype=np.int32), np.arange(len(self), dtype=np.int32)
+        plan[kernel.COUNT], plan[kernel.FRAMES], plan[kernel.SUBSTEPS] = len(self), frames, substeps if runner.n else 0
+        plan[kernel.EVERY], plan[kernel.ROW], plan[kernel.KEEPS] = every, row, 1
+        plan[kernel.ROWS] = track.shape[1] if track is not None else 0
+        figures = np.zeros((len(self), frames, FIGURES))
+        flat = np.zeros(1) if track is None else track.reshape(-1)
+        own = runner.frames
+        memory = runner.memory
+        memory.write(own.sheet, sheets)
+        memory.write(own.dates, dates)
+        while True:
+            launch = CachedLaunch(runner.frames, "run", memory.compiler, plan, which, figures.reshape(-1), flat)
+            launch()
+            waiting = np.flatnonzero(memory.read(own.sheet)[:, HALT]) if runner.step.grids else which[:0]
+            if not len(waiting):
+                break
+            sheets = memory.read(own.sheet)
+            for k in waiting:
+                with self._at(k):
+                    runner.sheet[:] = sheets[k]
+                    sheets[k, RESUMED], sheets[k, BEGIN], sheets[k, HALF] = runner._stopped()
+                    runner.grow()
+                    runner.invalidate()
+            memory.write(own.sheet, sheets)
+            which[: len(waiting)] = waiting
+            plan[kernel.COUNT] = len(waiting)
+        before = clocks.energy.copy()
+        clocks.advance(substeps, frames, started)
+        runner.scene.h2_effective = runner.clock.h**2 * runner.integrator.h2_factor
+        return self._report(figures, before, moved, released, begun)
+
+    def _report(
+        self, figures: np.ndarray, before: np.ndarray, moved: np.ndarray, released: np.ndarray, begun: float
+    ) -> WorldsReport:
+        """The worst of the figures of all frames, (worlds, frames, FIGURES)."""
+        world, runner, clocks = self._world, self._runner, self._clocks
+        reporter, dim, n = runner.diagnostics.report, world.particles.dim, runner.n
+        energy, residual, overlap, stiff, contacts, bad, fast, reach, broken, tension, turned = np.moveaxis(figures[..., :11], 2, 0)
+        stiff = np.maximum(stiff, reporter.fastest * clocks.h[:, None] ** 2)
+        first = np.arange(figures.shape[1]) == 0
+        every = risks(
+            n, reporter.farthest, bad, reach, fast, turned, np.where(first, moved[:, None], 0.0), tension, stiff,
+            np.where(first, released[:, None], 0.0), residual,
+        )  # fmt: skip
+        clocks.softened = every["softened"][:, -1].copy()
+        wrong = bad < n
+        report = WorldsReport(
+            clocks.time.copy(), residual.max(1), overlap.max(1), contacts.max(1).astype(int), energy[:, -1].copy(),
+            np.where(clocks.known, energy[:, -1] - before, 0.0),
+            np.where(wrong.any(1), bad[np.arange(len(self)), wrong.argmax(1)], -1).astype(int), broken.sum(1).astype(int),
+            np.array(TURNS)[turned.max(1).astype(int)], tension.max(1),
+            {name: there.any(1) for name, there in every.items() if there.any()}, world.substeps, world.iterations,
+            perf_counter() - begun,
+        )  # fmt: skip
+        clocks.energy, clocks.known = energy[:, -1].copy(), np.ones(len(self), dtype=bool)
+        clocks.first_moved = np.full(len(self), NONE)
+        if runner.grid:
+            extent = figures[:, -1, 11 : 11 + dim]
+            runner.grid.fit(extent.max(0))
+        return report
+
+    # State.
+
+    def __len__(self) -> int:
+        return self._copies.count
+
+    def __getitem__(self, k: int) -> World:
+        """The k-th as a World of its own, in its present state: what is done to it shows in no other."""
+        with whole, self._at(range(len(self))[k]) as world:
+            copies = tuple(f.copy() for f in world.features)
+            for f in copies:
+                f.changed = f.new_force = False
+            settings = world.settings | {"path": "auto"}
+            new = World._of(world.particles, copies, [f.start for f in world.features], **settings)
+            checkpoint.transfer(world, new)
+            return new
+
+    def hash(self, k: int) -> str:
+        """That of the k-th, see World.hash()."""
+        with whole, self._at(range(len(self))[k]) as world:
+            return world.hash()
+
+    @property
+    def position(self) -> np.ndarray:
+        """Positions [m], (worlds, n, dim), a read-only copy in f64. Assign an array to move particles; velocities are kept."""
+        state, memory = self._runner.scene.state, self._runner.memory
+        out = memory.read(state.x).astype(np.float64, copy=False)
+        out = out + memory.read(state.low) if state.sums else out
+        return read_only(out[:, : self._runner.n], assign_whole("Worlds", "position"))
+
+    @property
+    def time(self) -> np.ndarray:
+        """Simulated time [s], (worlds,)."""
+        return self._clocks.time.copy()
+
+    @property
+    def last(self) -> WorldsReport | None:
+        """The report of the last step or run; None before the first."""
+        return self._last
+
+    @property
+    def features(self) -> tuple[Feature, ...]:
+        """What acts on the particles. A knob that is assigned here changes in all worlds, see set()."""
+        return self._world.features
+
+    def close(self) -> None:
+        """Free the memory on the device. Using the worlds afterwards raises RuntimeError."""
+        self._world.close()
+
+    def __enter__(self) -> "Worlds":
+        return self
+
+    def __exit__(self, *exc) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"Worlds({len(self)} x {self._world!r})"
+
+
+class _Source:
+    """A world that others are like: what Python knows of it, and differs from world to world."""
+
+    def __init__(self, world: World):
+        self.particles, self.inv_mass = world.particles, world._runner.scene.inv_mass
+        self.features = [{k: v for k, v in vars(f).items() if k not in (*f.kept_by_world, "dev")} for f in world.features]
+        self.starts = [f.start for f in world.features]
+
+    def put_on(self, world: World) -> None:
+        """Have another one look like it."""
+        world._particles = world._runner.scene.particles = self.particles
+        world._runner.scene.inv_mass = self.inv_mass
+        for f, known, start in zip(world.features, self.features, self.starts, strict=True):
+            f.__dict__.update(known)
+            f.start = start
+
+
+def _checked(worlds: Any, count: int | None) -> list[World]:
+    """The worlds that it is made of."""
+    several = [worlds] if isinstance(worlds, World) else [*worlds] if isinstance(worlds, Iterable) else None
+    if several is None:
+        raise TypeError(f"Worlds: worlds = {worlds!r} is a {type(worlds).__name__}; write a World and how many, or a list of them.")
+    if count is not None and not isinstance(worlds, World):
+        raise ValueError(f"Worlds: count = {count}, but it is for copies of one World; there are {len(several)}.")
+    if not several:
+        raise ValueError("Worlds: worlds is empty; there must be at least one.")
+    for k, world in enumerate(several):
+        if not isinstance(world, World):
+            raise TypeError(f"Worlds: worlds[{k}] = {world!r} is a {type(world).__name__}, not a World.")
+        world._runner.memory.check()
+        if world._controller.auto:
+            raise ValueError(f'Worlds: worlds[{k}] has substeps = "auto", but all go through the same substeps. Give a number.')
+    return several
+
+
+def _settled(world: World) -> World:
+    """The world, or its clone where something waits in it, with all knobs uploaded."""
+    waits = world.last is not None and any(f.changed or f.moving for f in world.features)
+    if waits or world.path != "fused":
+        world = world.clone(path="fused")
+    world._upload_parameters()
+    return world
+
+
+def _check_structure(like: World, worlds: Sequence[World]) -> None:
+    """Raise ValueError for a world that kernels of the first do not fit."""
+    first = _structure(worlds[0])
+    for k, world in enumerate(worlds[1:], 1):
+        for what, ours, theirs in zip(("settings", "features", "fields", "constants"), first, _structure(world), strict=True):
+            if ours != theirs:
+                raise ValueError(
+                    f"Worlds: worlds[{k}] has other {what} than worlds[0]: {theirs!r:.300}, and not {ours!r:.300}. They may differ in "
+                    "numbers only, not in how many particles and constraints there are, or in what acts."
+                )
+
+
+def _structure(world: World) -> tuple:
+    settings = {k: repr(v) for k, v in world.settings.items()}
+    features = [(type(f).__name__, {k: repr(v) for k, v in (vars(f.dev).get("built") or {}).items()}) for f in world.features]
+    fields = [(e.name, e.shape, str(e.kind)) for e in world._runner.memory.entries]
+    if not patched:
+        return settings, features, fields, None
+    from ..device.patches.sharing import Writing  # noqa: PLC0415
+
+    return settings, features, fields, Writing(world._runner.step).key
+
+
+def _frame_count(who: str, seconds: float, dt: float) -> int:
+    seconds = checks.number(who, "seconds", seconds, above=0.0)
+    return max(1, round(seconds / checks.number(who, "dt", dt, above=0.0)))
