@@ -10,7 +10,7 @@ import numpy as np
 import tiverlet as tv
 
 from . import functions
-from .scenes import Call, Event, Step, Structure, plain
+from .scenes import Call, Event, Set, Step, Structure, plain
 from .trials import Find, Refused, Trial, door, quiet
 
 
@@ -72,6 +72,42 @@ def by_clone(trial: Trial, events: list[Event]) -> None:
         quietly(events[half:], trial.world, trial.features)
         quietly(events[half:], twin, list(twin.features))
         same("a clone after some frames", trial.world.hash(), twin.hash())
+
+
+def by_copies(trial: Trial, events: list[Event]) -> None:
+    """A copy among many goes on as the world does alone, frame by frame and in one launch."""
+    half = len(events) // 2 + 1
+    trial.replay(events[:half])
+    later = [e for e in events[half:] if isinstance(e, Step) or (isinstance(e, Set) and e.of is not None)]
+    later += [e for e in events if isinstance(e, Step)][:2]
+    try:
+        with warnings.catch_warnings():
+            quiet()
+            many = tv.Worlds(trial.world, 3)
+    except Exception as error:  # noqa: BLE001
+        door(error)
+    with many:
+        many._clocks.known[1] = False  # one that is looked at by itself
+        same("a copy", trial.world.hash(), many.hash(1))
+        for event in later:
+            outgrown = isinstance(event, Set)
+            quietly([event], trial.world, trial.features)
+            try:
+                quietly([event], many, list(many.features))  # type: ignore[arg-type]
+            except Refused:
+                if outgrown:
+                    return
+                raise
+            for k in (0, 2):
+                same(f"copy {k}", trial.world.hash(), many.hash(k))
+        dt = next((e.dt for e in events if isinstance(e, Step)), 1 / 60)
+        with warnings.catch_warnings():
+            quiet()
+            many.run(3 * dt, dt)
+        for _ in range(3):
+            quietly([Step(dt)], trial.world, trial.features)
+        for k in range(3):
+            same(f"copy {k} after three frames in one launch", trial.world.hash(), many.hash(k))
 
 
 def by_recording(trial: Trial, events: list[Event]) -> None:
@@ -148,4 +184,4 @@ def by_questions(trial: Trial, events: list[Event]) -> None:
         raise Find("twin", f"near {near.tolist()}, nearest {index.tolist()} of {points.tolist()} within {radius}")
 
 
-WAYS = (by_path, by_threads, by_clone, by_recording, by_company, by_questions)
+WAYS = (by_path, by_threads, by_clone, by_copies, by_recording, by_company, by_questions)

@@ -186,6 +186,30 @@ class Memory:
         if np.size(values):
             self._load([self._find(field)], [np.asarray(values, dtype=np.float64)])
 
+    def write_some(self, field, values, some: np.ndarray) -> None:
+        """Overwrite a field of some copies; values: the same for all, or one row for each of them."""
+        self.check()
+        entry = self._find(field)
+        self._load_some([entry], [np.asarray(values)], some)
+
+    def restore_some(self, state: dict[str, np.ndarray], some: np.ndarray) -> None:
+        """Write back what state() returned of some copies; one row is for all of them."""
+        self.check()
+        chosen = [e for e in self.entries if e.state]
+        self._load_some(chosen, [state[e.name] for e in chosen], some)
+
+    def _load_some(self, entries: list[Entry], arrays: list[np.ndarray], some: np.ndarray) -> None:
+        views = self._seen()
+        if views:
+            for e, a in zip(entries, arrays, strict=True):
+                views[id(e)][some] = a
+            return
+        for k, copy in enumerate(some):
+            self.choose(int(copy))
+            parts = [a[k if len(a) > 1 else 0] if a.ndim > len(e.shape) else a for e, a in zip(entries, arrays, strict=True)]
+            self._load(entries, parts)
+        self.choose(None)
+
     def read(self, field) -> np.ndarray:
         """A copy of a whole field, in its own type; with one more axis, the first, of all copies where none is chosen."""
         self.check()

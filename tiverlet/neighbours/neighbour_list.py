@@ -170,7 +170,9 @@ class NeighbourList:
             self.allocate(len(pairs))
         self._write_padded(self.old_neighbour, pairs[:, 1].astype(np.int32))
         for piece in self.transferred:
-            self._write_padded(piece.old, values[piece.name] if piece.lasting else np.zeros((1, *[piece.width] * (piece.width > 0))))
+            self._write_padded(
+                piece.old, values[piece.name] if piece.lasting else np.zeros((1, *[piece.width] * (piece.width > 0)))
+            )
         counts = np.bincount(pairs[:, 0], minlength=max(1, self.n))
         self.memory.write(self.old_first, np.cumsum(counts) - counts)
         self.memory.write(self.old_number, counts)

@@ -26,8 +26,8 @@ from ..solvers.slots import Slots
 from ..solvers.solver import Solver
 from . import high_order
 from .diagnostics import Diagnostics
-from .integrator import Forces, Verlet
 from .frames import Frames
+from .integrator import Forces, Verlet
 from .step import Step
 
 T = TypeVar("T", bound=Feature)

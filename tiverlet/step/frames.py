@@ -2,7 +2,6 @@
 
 import copy
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -14,9 +13,9 @@ from .diagnostics import STEPPED
 from .step import BEGIN, END, FIGURES, FIRST, FRESH, HALF, HALT, ORIGIN, RESUMED, SHEET, SINCE, START, TICK, Step, integer
 
 # What a launch is given: how many copies, how many frames each, the substeps of one; of how many frames one is kept on the track,
-# which of these is the first; whether figures are kept.
-COUNT, FRAMES, SUBSTEPS, EVERY, ROW, ROWS, KEEPS = range(7)
-PLAN = KEEPS + 1
+# which of these is the first; whether figures are kept; how many copies, one beside the other, a thread takes at a time.
+COUNT, FRAMES, SUBSTEPS, EVERY, ROW, ROWS, KEEPS, GRAIN = range(8)
+PLAN = GRAIN + 1
 DATES = 4  # of a copy: when frames of the present length began [s], their length [s], how many there were; frames of the launch
 WRAP = 2.0**31  # substeps are counted up to it
 
@@ -46,10 +45,15 @@ class Frames:
         new.step = step
         return new
 
+    def grain(self, copies: int) -> int:
+        """How many of so many copies a thread is to take at a time: those that share lines of the cache would hold up each other,
+        and all threads are to be done at the same time."""
+        return min(64, max(1, copies // (8 * self.lanes)))
+
     def launch_one(self, sheet: np.ndarray) -> Callable[[], None]:
         """A launch of the chosen copy alone, for a frame as it stands on this sheet, as Step.fused takes and leaves it."""
         plan, which = np.zeros(PLAN, dtype=np.int32), np.zeros(1, dtype=np.int32)
-        plan[COUNT] = plan[FRAMES] = 1
+        plan[COUNT] = plan[FRAMES] = plan[GRAIN] = 1
         none = np.zeros(1)
         launch = CachedLaunch(self, "run", self.memory.compiler, plan, which, none, none)
 
@@ -73,10 +77,11 @@ class Frames:
             self.next[None] = 0
         for lane in range(self.lanes * self.spread):
             if lane % self.spread == 0:
-                k = ti.atomic_add(self.next[None], 1)
-                while k < plan[COUNT]:
-                    self.go_through(which[k], plan, figures, track)
-                    k = ti.atomic_add(self.next[None], 1)
+                first = ti.atomic_add(self.next[None], plan[GRAIN])
+                while first < plan[COUNT]:
+                    for k in range(first, ti.min(first + plan[GRAIN], plan[COUNT])):
+                        self.go_through(which[k], plan, figures, track)
+                    first = ti.atomic_add(self.next[None], plan[GRAIN])
 
     @ti.func
     def go_through(self, w, plan: ti.template(), figures: ti.template(), track: ti.template()):  # type: ignore[valid-type]

@@ -14,9 +14,9 @@ from ..step_report import StepReport
 from . import high_order, initial_violation
 from .clock import Clock
 from .diagnostics import STARTED, STEPPED, UNSTEPPED
+from .frames import Frames
 from .integrator import FREE, decay
 from .projection import project
-from .frames import Frames
 from .step import ACTIVE_THREADS, BEFORE, END, GIVE, HALT, ORIGIN, H, Moment, Span, frame
 
 LONG = 10_000_000  # particles and constraints, times passes, in a launch: it takes about a second

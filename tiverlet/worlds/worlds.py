@@ -15,13 +15,28 @@ from ..device.patches.compiler import CachedLaunch
 from ..features.arguments import knobs_of, meant
 from ..features.feature import Feature
 from ..features.read_only import assign_whole, read_only
-from ..particles import Particles, in_range
+from ..particles import in_range
 from ..step import checkpoint
 from ..step import frames as kernel
-from ..step.build import Scale
 from ..step.diagnostics import STARTED, STEPPED, TURNS, risks
-from ..step.step import BEGIN, END, FIGURES, FRESH, HALF, HALT, ITERATIONS, ORIGIN, PART, RESUMED, SINCE, START, TICK, UNTIL
-from ..step.step import SHEET, H
+from ..step.step import (
+    BEGIN,
+    END,
+    FIGURES,
+    FRESH,
+    HALF,
+    HALT,
+    ITERATIONS,
+    ORIGIN,
+    PART,
+    RESUMED,
+    SHEET,
+    SINCE,
+    START,
+    TICK,
+    UNTIL,
+    H,
+)
 from ..step.step import SUBSTEPS as STAGES
 from ..world import World
 from .clocks import NONE, Clocks
@@ -62,17 +77,17 @@ class Worlds:
         else:
             count = len(sources)
         with whole:
-            sources = [_settled(world) for world in sources]
+            self._originals = first.features  # by which the user may know those of the copies
+            sources = [world if world.path == "fused" else world.clone(path="fused") for world in sources]
             self._copies = Copies(count)
-            first = sources[0]
             self._world = World._of(
                 first.particles, tuple(f.copy() for f in first.features), [f.start for f in first.features],
                 copies=self._copies, **(first.settings | {"path": "fused"}),
             )  # fmt: skip
             self._runner = self._world._runner
-            self._sources = [_Source(world) for world in sources]
-            _check_structure(self._world, sources)
-            self._given: dict[tuple[int, str], Any] = {}  # by feature and knob: what each world has of it
+            _check_structure(sources)
+            self._sources = [_Source(world) for world in sources] if len(sources) > 1 else []
+            self._given = _other_knobs(sources)  # by feature and knob: what each world has of it
             self._clocks = Clocks([world._clock for world in sources])
             for k, world in enumerate(sources):
                 self._take(k, world)
@@ -82,12 +97,13 @@ class Worlds:
                     memory.spread()
                 self._clocks = Clocks([self._clocks.of(0)] * count)
             self._rest()
-            for f, *others in zip(self._world.features, *(world.features for world in sources), strict=True):
-                f.changed = f.new_force = False
-                f.moving = any(other.moving for other in others)
-        self._launches: dict[int, Any] = {}
+            self._waiting = [[_flags(f) for f in world.features] for world in sources]  # of each, for the first frame
+            for f, *each in zip(self._world.features, *self._waiting, strict=True):
+                f.changed, f.moving, f.new_force = (any(flags) for flags in zip(*each, strict=True))
+        self._set: dict[int, np.ndarray] = {}  # by feature, the worlds in which set() gave it other knobs
+        self._forced: set[Feature] = set()  # of these, whose forces changed
         self._last: WorldsReport | None = None
-        self._kept: tuple[list[dict], Clocks] | None = None
+        self._start: _Start | None = None  # what reset() returns to; from the first step on
 
     def _take(self, k: int, world: World) -> None:
         """Give copy k what a world has."""
@@ -114,7 +130,8 @@ class Worlds:
         world, runner = self._world, self._runner
         runner.memory.choose(k)
         world._clock = runner.clock = self._clocks.of(k)
-        self._sources[k if len(self._sources) > 1 else 0].put_on(world)
+        if self._sources:
+            self._sources[k].put_on(world)
         for (i, name), values in self._given.items():
             world.features[i].__dict__[name] = values[k]
         try:
@@ -152,9 +169,7 @@ class Worlds:
         report = self._frames("Worlds.rollout", seconds, dt, every, position, progress)
         return Rollout(time, position, report)
 
-    def _frames(
-        self, who: str, seconds: float, dt: float, every: int, track: np.ndarray | None, progress: bool
-    ) -> WorldsReport:
+    def _frames(self, who: str, seconds: float, dt: float, every: int, track: np.ndarray | None, progress: bool) -> WorldsReport:
         """Frames in launches of some of them."""
         frames = _frame_count(who, seconds, dt)
         self._runner.memory.check()
@@ -185,6 +200,8 @@ class Worlds:
         """Frames of all of them; where knobs are on their way in the first one, that one alone comes first."""
         begun = perf_counter()
         moved, released = self._begin(dt)
+        if self._start is None:
+            self._start = _Start(self)
         if frames > 1 and any(f.moving for f in self._world.features) and not every:
             first = self._launch(dt, 1, 0, None, 0, moved, released, begun)
             moved, released = self._begin(dt)
@@ -199,11 +216,12 @@ class Worlds:
         """Have all of them ready for substeps of this length, see Runner.begin(). Returns what that found of each: how far
         particles were moved, and what a shorter substep released."""
         world, runner, clocks = self._world, self._runner, self._clocks
+        drags = any(f.changed for f in runner.drags)  # what the clocks have of them is of other rates
         self._upload()
         substep = dt / world.substeps
         h = substep * runner.integrator.first
-        ready = (clocks.h == h) & ~clocks.d_is_velocity & clocks.known & (clocks.first_moved == NONE)
-        begins = (clocks.h == h) & clocks.d_is_velocity & clocks.known & (clocks.first_moved == NONE)
+        looked_at = clocks.known & (clocks.first_moved == NONE) & (clocks.h == h) & (not drags)
+        ready, begins = looked_at & ~clocks.d_is_velocity, looked_at & clocks.d_is_velocity
         clocks.since[begins] = 0
         moved, released = np.zeros(len(self)), np.zeros(len(self))
         for k in np.flatnonzero(~(ready | begins)):
@@ -213,32 +231,32 @@ class Worlds:
         return moved, released
 
     def _upload(self) -> None:
-        """Bring knobs to the device."""
-        world = self._world
-        changed = [f.changed for f in world.features]
-        moving = [f.moving for f in world.features]
-        if not any(changed) and not any(moving):
+        """Bring knobs to the device: those that were assigned for all, and those that were set for some."""
+        world, features = self._world, self._world.features
+        if not self._set and not any(f.changed or f.moving for f in features):
             return
-        for f in world.features:
+        for f in features:
             if f.changed and f.outgrown:
-                raise ValueError(
-                    f"Worlds: {f!r} has a knob that asks for what these kernels do not have, such as friction where there was "
-                    "none. Give the World that Worlds is made of a value other than 0 first."
-                )
-        for i, name in [key for key in self._given if changed[key[0]]]:
-            f = world.features[i]
-            if f.__dict__[name] is not self._given[i, name]:
+                _refuse_outgrown(f)
+        for i, name in [(i, name) for i, name in self._given if features[i].changed]:
+            if vars(features[i])[name] is not self._given[i, name]:
                 del self._given[i, name]  # assigned for all
-        new_force, after = [f.new_force for f in world.features], moving
-        for k in range(len(self)):
+        common, own = [_flags(f) for f in features], self._waiting if len(self._waiting) > 1 else None
+        some, self._waiting, still = self._set, [], np.zeros(len(features), dtype=bool)
+        self._set = {}
+        all_of_them = own is not None or any(changed or moving for changed, moving, _ in common)
+        for k in range(len(self)) if all_of_them else np.flatnonzero(np.any([*some.values()], axis=0)):
+            flags = own[k] if own else [
+                (changed or (i in some and bool(some[i][k])), moving, new_force) for i, (changed, moving, new_force) in enumerate(common)
+            ]  # fmt: skip
             with self._at(k):
-                for f, c, m, force in zip(world.features, changed, moving, new_force, strict=True):
-                    f.changed, f.moving, f.new_force = c, m, force
+                for f, (f.changed, f.moving, f.new_force) in zip(features, flags, strict=True):
+                    f.new_force = f.new_force or (f.changed and f in self._forced)
                 world._upload_parameters()
-                after = [f.moving for f in world.features]
-        for f, m in zip(world.features, after, strict=True):
+                still |= [f.moving for f in features]
+        self._forced.clear()
+        for f, f.moving in zip(features, still.tolist(), strict=True):
             f.changed = f.new_force = False
-            f.moving = m
 
     def _launch(
         self, dt: float, frames: int, every: int, track: np.ndarray | None, row: int, moved: np.ndarray, released: np.ndarray,
@@ -271,6 +289,7 @@ class Worlds:
         memory.write(own.sheet, sheets)
         memory.write(own.dates, dates)
         while True:
+            plan[kernel.GRAIN] = runner.frames.grain(plan[kernel.COUNT])
             launch = CachedLaunch(runner.frames, "run", memory.compiler, plan, which, figures.reshape(-1), flat)
             launch()
             waiting = np.flatnonzero(memory.read(own.sheet)[:, HALT]) if runner.step.grids else which[:0]
@@ -297,7 +316,9 @@ class Worlds:
         """The worst of the figures of all frames, (worlds, frames, FIGURES)."""
         world, runner, clocks = self._world, self._runner, self._clocks
         reporter, dim, n = runner.diagnostics.report, world.particles.dim, runner.n
-        energy, residual, overlap, stiff, contacts, bad, fast, reach, broken, tension, turned = np.moveaxis(figures[..., :11], 2, 0)
+        energy, residual, overlap, stiff, contacts, bad, fast, reach, broken, tension, turned = np.moveaxis(
+            figures[..., :11], 2, 0
+        )
         stiff = np.maximum(stiff, reporter.fastest * clocks.h[:, None] ** 2)
         first = np.arange(figures.shape[1]) == 0
         every = risks(
@@ -320,6 +341,84 @@ class Worlds:
             extent = figures[:, -1, 11 : 11 + dim]
             runner.grid.fit(extent.max(0))
         return report
+
+    # Knobs and states of some.
+
+    def set(self, feature: Feature, some: Any = None, **knobs: Any) -> None:
+        """Give knobs of a feature other values in each world, from the next frame on.
+
+        feature: one of those that the World was made of, or of worlds.features. knobs: by name, a value for each world, the first
+        axis of an array, or a list. some: indices or a Boolean mask of the worlds that they are for; all by default.
+
+        Raises ValueError or TypeError as an assignment to the knob does, and names the world.
+        """
+        i, f = self._feature(feature)
+        chosen = self._chosen("Worlds.set", some)
+        for name, values in knobs.items():
+            if name not in knobs_of(type(f)):
+                live = ", ".join(knobs_of(type(f))) or "nothing"
+                raise AttributeError(f"Worlds.set: {name} is no knob of {f!r}{meant(name, knobs_of(type(f)))}. Live are {live}.")
+            if np.ndim(values) == 0 or len(values) != len(chosen):
+                has = "one value" if np.ndim(values) == 0 else f"{len(values)} values"
+                raise ValueError(f"Worlds.set: {name} has {has}, but there are {len(chosen)} worlds. Give each its own.")
+            knob, before = getattr(type(f), name), vars(f)[name]
+            every = list(before) if (i, name) in self._given and before is self._given[i, name] else [before] * len(self)
+            for k, value in zip(chosen, values, strict=True):
+                try:
+                    vars(f)[name] = every[k] = knob.check(f, value)
+                    if f.outgrown:
+                        _refuse_outgrown(f)
+                except (ValueError, TypeError) as error:
+                    error.add_note(f"That is what Worlds.set was given for world {k}.")
+                    raise
+                finally:
+                    vars(f)[name] = before
+            vars(f)[name] = self._given[i, name] = _stacked(every)
+            mask = self._set.setdefault(i, np.zeros(len(self), dtype=bool))
+            mask[chosen] = True
+            if knob.force:
+                self._forced.add(f)
+
+    def reset(self, some: Any = None, position: Any = None, velocity: Any = None) -> None:
+        """Return to where they were before their first step: time, positions, velocities, all that the future depends on. Knobs
+        stay as they are.
+
+        some: indices or a Boolean mask of the worlds that return; all by default. position, velocity: (some, n, dim) or (n, dim),
+        where they go on from other ones.
+        """
+        chosen = self._chosen("Worlds.reset", some)
+        self._runner.memory.check()
+        with whole:
+            if self._start:
+                self._start.put_back(self, chosen)
+            if position is not None:
+                new = self.position.copy()
+                new[chosen] = self._per_particle("position", position, len(chosen))
+                self._place(new, chosen)
+            if velocity is not None:
+                v = self._per_particle("velocity", velocity, len(chosen))
+                self._start_from(v, chosen)
+
+    def _feature(self, feature: Feature) -> tuple[int, Feature]:
+        for i, (ours, theirs) in enumerate(zip(self._world.features, self._originals, strict=True)):
+            if feature is ours or feature is theirs:
+                return i, ours
+        raise ValueError(
+            f"Worlds.set: {feature!r} is none of these worlds. They have {', '.join(map(repr, self._world.features))}."
+        )
+
+    def _chosen(self, who: str, some: Any) -> np.ndarray:
+        """Numbers of worlds."""
+        if some is None:
+            return np.arange(len(self))
+        some = np.asarray(some)
+        if some.dtype == bool:
+            if some.shape != (len(self),):
+                raise ValueError(
+                    f"{who}: some has shape {some.shape}, but a mask of {len(self)} worlds has shape ({len(self)},)."
+                )
+            return np.flatnonzero(some)
+        return checks.indices(who, "some", np.atleast_1d(some), len(self))
 
     # State.
 
@@ -350,6 +449,79 @@ class Worlds:
         out = out + memory.read(state.low) if state.sums else out
         return read_only(out[:, : self._runner.n], assign_whole("Worlds", "position"))
 
+    @position.setter
+    def position(self, value) -> None:
+        self._runner.memory.check()
+        with whole:
+            self._place(self._per_particle("position", value, len(self)), np.arange(len(self)))
+
+    def _place(self, position: np.ndarray, chosen: np.ndarray) -> None:
+        """Move particles of some to (worlds, n, dim)."""
+        rows = position[chosen].reshape(-1, position.shape[2])
+        in_range("Worlds", "position", rows)
+        for contact in self._runner.step.contacts:
+            contact.check_range(rows)
+        for k in chosen[~self._clocks.d_is_velocity[chosen]]:
+            with self._at(k) as world, self._runner.memory.compiler():
+                self._runner.restart(world.iterations)
+        self._runner.scene.state.put(self._runner.memory, position)
+        self._clocks.known[chosen], self._clocks.first_moved[chosen] = False, 0
+        for grid in self._runner.step.grids:
+            self._runner.memory.write_some(grid.stale, 1, chosen)
+
+    @property
+    def velocity(self) -> np.ndarray:
+        """Velocities [m/s], (worlds, n, dim), a read-only copy in f64; of the order of the worlds. Assign to set them."""
+        out = np.zeros((len(self), self._runner.n, self._world.particles.dim))
+        with whole:
+            for k in range(len(self)):
+                with self._at(k) as world:
+                    out[k] = world.velocity
+        return read_only(out, assign_whole("Worlds", "velocity"))
+
+    @velocity.setter
+    def velocity(self, value) -> None:
+        self._runner.memory.check()
+        with whole:
+            self._start_from(self._per_particle("velocity", value, len(self)), np.arange(len(self)))
+
+    def _per_particle(self, name: str, value, count: int) -> np.ndarray:
+        """An array with a row for each particle of so many worlds; (n, dim) is for all of them."""
+        n, dim = self._runner.n, self._world.particles.dim
+        value, shape = np.asarray(value), (count, n, dim)
+        if value.shape not in (shape, shape[1:]):
+            raise ValueError(f"Worlds: {name} has shape {value.shape}, but it must be (worlds, n, dim) = {shape}, or (n, dim).")
+        value = checks.points("Worlds", name, np.broadcast_to(value, shape).reshape(-1, dim), dim=dim, count=count * n)
+        return value.reshape(shape)
+
+    def _start_from(self, velocity: np.ndarray, chosen: np.ndarray) -> None:
+        """Have some go on with these velocities, (some, n, dim)."""
+        clocks, memory, state = self._clocks, self._runner.memory, self._runner.scene.state
+        memory.write_some(state.d, velocity, chosen)
+        if state.carries:
+            memory.write_some(state.d_low, 0.0, chosen)
+        clocks.d_is_velocity[chosen], clocks.known[chosen], clocks.owed[chosen] = True, False, 0.0
+        for k in chosen:
+            clocks.parted.pop(int(k), None)
+
+    @property
+    def substeps(self) -> int:
+        """Substeps of a frame. Assign a number."""
+        return self._world.substeps
+
+    @substeps.setter
+    def substeps(self, value: int) -> None:
+        self._world.substeps = checks.integer("Worlds", "substeps", value, least=1)
+
+    @property
+    def iterations(self) -> int:
+        """Passes over the constraints in a substep. Assign a number."""
+        return self._world.iterations
+
+    @iterations.setter
+    def iterations(self, value: int) -> None:
+        self._world.iterations = value
+
     @property
     def time(self) -> np.ndarray:
         """Simulated time [s], (worlds,)."""
@@ -379,12 +551,50 @@ class Worlds:
         return f"Worlds({len(self)} x {self._world!r})"
 
 
+class _Start:
+    """The state of all of them before their first step; one for all where they are copies of each other."""
+
+    def __init__(self, worlds: Worlds):
+        runner, self.clocks = worlds._runner, worlds._clocks.copy()
+        self.values = {memory: memory.state() for memory in runner.memories}
+        for state in self.values.values():
+            for name, values in state.items():
+                if (values == values[:1]).all():
+                    state[name] = values[:1].copy()
+        self.pairs: list[Any] = []  # of each, with what they remember
+        if runner.grid:
+            for k in range(len(worlds)):
+                with worlds._at(k):
+                    self.pairs.append(runner.grid.lasting_data())
+                if not len(self.pairs[k][0]):
+                    self.pairs[k] = None
+
+    def put_back(self, worlds: Worlds, chosen: np.ndarray) -> None:
+        """Return to it."""
+        runner = worlds._runner
+        for memory, state in self.values.items():
+            memory.restore_some({name: v[chosen] if len(v) > 1 else v for name, v in state.items()}, chosen)
+        if runner.grid:
+            for field, value in ((runner.grid.old_number, 0), (runner.grid.old_saved, 1)):
+                runner.memory.write_some(field, value, chosen)
+            for k in chosen:
+                if self.pairs[k]:
+                    with worlds._at(k):
+                        runner.grid.restore(*self.pairs[k])
+        for grid in runner.step.grids:
+            runner.memory.write_some(grid.stale, 1, chosen)
+        worlds._clocks.return_to(self.clocks, chosen)
+
+
 class _Source:
-    """A world that others are like: what Python knows of it, and differs from world to world."""
+    """What Python knows of one of several worlds that are not copies of each other, but for the knobs."""
 
     def __init__(self, world: World):
         self.particles, self.inv_mass = world.particles, world._runner.scene.inv_mass
-        self.features = [{k: v for k, v in vars(f).items() if k not in (*f.kept_by_world, "dev")} for f in world.features]
+        skips = [{*f.kept_by_world, *knobs_of(type(f)), "dev"} for f in world.features]
+        self.features = [
+            {name: v for name, v in vars(f).items() if name not in skip} for f, skip in zip(world.features, skips, strict=True)
+        ]
         self.starts = [f.start for f in world.features]
 
     def put_on(self, world: World) -> None:
@@ -400,7 +610,9 @@ def _checked(worlds: Any, count: int | None) -> list[World]:
     """The worlds that it is made of."""
     several = [worlds] if isinstance(worlds, World) else [*worlds] if isinstance(worlds, Iterable) else None
     if several is None:
-        raise TypeError(f"Worlds: worlds = {worlds!r} is a {type(worlds).__name__}; write a World and how many, or a list of them.")
+        raise TypeError(
+            f"Worlds: worlds = {worlds!r} is a {type(worlds).__name__}; write a World and how many, or a list of them."
+        )
     if count is not None and not isinstance(worlds, World):
         raise ValueError(f"Worlds: count = {count}, but it is for copies of one World; there are {len(several)}.")
     if not several:
@@ -414,16 +626,38 @@ def _checked(worlds: Any, count: int | None) -> list[World]:
     return several
 
 
-def _settled(world: World) -> World:
-    """The world, or its clone where something waits in it, with all knobs uploaded."""
-    waits = world.last is not None and any(f.changed or f.moving for f in world.features)
-    if waits or world.path != "fused":
-        world = world.clone(path="fused")
-    world._upload_parameters()
-    return world
+def _refuse_outgrown(feature: Feature) -> None:
+    raise ValueError(
+        f"Worlds: a knob of {feature!r} asks for what these kernels do not have, such as friction where there was none. Give the "
+        "World that Worlds is made of a value other than 0 first."
+    )
 
 
-def _check_structure(like: World, worlds: Sequence[World]) -> None:
+def _flags(feature: Feature) -> tuple[bool, bool, bool]:
+    """What waits in it to be uploaded."""
+    return feature.changed, feature.moving, feature.new_force
+
+
+def _other_knobs(worlds: list[World]) -> dict[tuple[int, str], Any]:
+    """The knobs that are not the same in all of them: by the number of the feature and the name, the values."""
+    out: dict[tuple[int, str], Any] = {}
+    for i, alike in enumerate(zip(*(world.features for world in worlds), strict=True)):
+        for name in knobs_of(type(alike[0])):
+            values = [vars(f)[name] for f in alike if name in vars(f)]
+            if len(values) == len(worlds) and any(not np.array_equal(v, values[0]) for v in values):
+                out[i, name] = _stacked(values)
+    return out
+
+
+def _stacked(values: list[Any]) -> Any:
+    """An array of what each world has; a list of what makes none."""
+    try:
+        return np.array(values)
+    except ValueError:
+        return values
+
+
+def _check_structure(worlds: Sequence[World]) -> None:
     """Raise ValueError for a world that kernels of the first do not fit."""
     first = _structure(worlds[0])
     for k, world in enumerate(worlds[1:], 1):
