@@ -83,6 +83,21 @@ class Frames:
                         self.go_through(which[k], plan, figures, track)
                     first = ti.atomic_add(self.next[None], plan[GRAIN])
 
+    @ti.kernel
+    def velocities(
+        self, count: ti.i32, which: ti.types.ndarray(ti.i32, 1), given: ti.types.ndarray(ti.f64, 2),  # type: ignore[valid-type]
+        out: ti.types.ndarray(ti.f64, 1),  # type: ignore[valid-type]
+    ):  # fmt: skip
+        """Velocities of the copies that are listed, as the user sees them. given: the arguments of Step.velocities, of each."""
+        for k in range(count):
+            w = which[k]
+            self.copies.enter(w)
+            self.step.constraints.reactions(ti.cast(given[k, 2], self.step.real), ti.cast(given[k, 3], self.step.real))
+            for i in range(self.step.n):
+                v = self.step.velocity_of(i, given[k, 0], given[k, 1], given[k, 2])
+                for a in ti.static(range(self.step.dim)):
+                    out[(w * self.step.n + i) * self.step.dim + a] = v[a]
+
     @ti.func
     def go_through(self, w, plan: ti.template(), figures: ti.template(), track: ti.template()):  # type: ignore[valid-type]
         """The frames of one copy, up to one that has to wait for a longer list."""

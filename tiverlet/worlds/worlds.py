@@ -13,12 +13,12 @@ from ..device.interrupts import whole
 from ..device.patches import patched
 from ..device.patches.compiler import CachedLaunch
 from ..features.arguments import knobs_of, meant
-from ..features.feature import Feature
+from ..features.feature import Batch, Feature
 from ..features.read_only import assign_whole, read_only
 from ..particles import in_range
 from ..step import checkpoint
 from ..step import frames as kernel
-from ..step.diagnostics import STARTED, STEPPED, TURNS, risks
+from ..step.diagnostics import STARTED, STEPPED, TURNS, UNSTEPPED, risks
 from ..step.step import (
     BEGIN,
     END,
@@ -44,6 +44,9 @@ from .report import WorldsReport
 
 WORK = 100_000_000  # particles and constraints, times passes, in a launch: it takes some seconds
 LOGGED = 1 << 22  # figures of frames that are kept at a time
+
+
+DATA = (bool, int, float, str, np.ndarray, np.generic)  # what an attribute is that differs from world to world
 
 
 class Rollout(NamedTuple):
@@ -223,12 +226,37 @@ class Worlds:
         looked_at = clocks.known & (clocks.first_moved == NONE) & (clocks.h == h) & (not drags)
         ready, begins = looked_at & ~clocks.d_is_velocity, looked_at & clocks.d_is_velocity
         clocks.since[begins] = 0
-        moved, released = np.zeros(len(self)), np.zeros(len(self))
-        for k in np.flatnonzero(~(ready | begins)):
+        moved, released, jumped = np.zeros(len(self)), np.zeros(len(self)), np.zeros(len(self), dtype=bool)
+        some = np.flatnonzero(~(ready | begins))
+        for k in some:
             with self._at(k):
-                runner.begin(substep, world.iterations)
-                moved[k], released[k] = runner.moved, runner.released
+                runner.prepare(substep, world.iterations)
+                moved[k], released[k], jumped[k] = runner.moved, runner.released, runner.jumped
+        unknown = some[~clocks.known[some]]
+        if len(unknown):
+            energy, overlap = self._look(unknown)
+            clocks.energy[unknown], clocks.known[unknown] = energy, True
+            for k in unknown[(overlap > 0) & (clocks.first_moved[unknown] != NONE)]:
+                with self._at(k), runner.memory.compiler():
+                    runner.ease(int(clocks.first_moved[k]))
+        for contact in runner.step.contacts:
+            runner.memory.write_some(contact.dev.fast, 1, np.flatnonzero(jumped))
+        clocks.first_moved[some] = NONE
         return moved, released
+
+    def _look(self, some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Energies [J] and overlaps of some, in the state in which they are."""
+        clocks = self._clocks
+        sheets, dates = np.zeros((len(self), SHEET)), np.zeros((len(self), kernel.DATES))
+        sheets[:, H], sheets[:, START], sheets[:, END] = clocks.h, clocks.time, clocks.time
+        sheets[:, TICK], sheets[:, SINCE], sheets[:, FRESH] = clocks.tick, clocks.since, clocks.d_is_velocity
+        sheets[:, ORIGIN] = np.where(clocks.d_is_velocity, UNSTEPPED, np.where(clocks.started, STARTED, STEPPED))
+        sheets[:, ITERATIONS] = sheets[:, UNTIL] = sheets[:, PART] = 1
+        plan = np.zeros(kernel.PLAN, dtype=np.int32)
+        plan[kernel.FRAMES] = plan[kernel.KEEPS] = 1
+        figures = np.zeros((len(self), 1, FIGURES))
+        self._go(plan, some, sheets, dates, figures, np.zeros(1))
+        return figures[some, 0, 0], figures[some, 0, 2]
 
     def _upload(self) -> None:
         """Bring knobs to the device: those that were assigned for all, and those that were set for some."""
@@ -278,37 +306,41 @@ class Worlds:
         total = stages * substeps if runner.n else 0
         sheets[:, STAGES], sheets[:, ITERATIONS] = total, runner.integrator.passes(iterations)
         sheets[:, UNTIL], sheets[:, PART] = total + 1, sheets[:, ITERATIONS]
-        plan, which = np.zeros(kernel.PLAN, dtype=np.int32), np.arange(len(self), dtype=np.int32)
-        plan[kernel.COUNT], plan[kernel.FRAMES], plan[kernel.SUBSTEPS] = len(self), frames, substeps if runner.n else 0
+        plan = np.zeros(kernel.PLAN, dtype=np.int32)
+        plan[kernel.FRAMES], plan[kernel.SUBSTEPS] = frames, substeps if runner.n else 0
         plan[kernel.EVERY], plan[kernel.ROW], plan[kernel.KEEPS] = every, row, 1
         plan[kernel.ROWS] = track.shape[1] if track is not None else 0
         figures = np.zeros((len(self), frames, FIGURES))
         flat = np.zeros(1) if track is None else track.reshape(-1)
-        own = runner.frames
-        memory = runner.memory
-        memory.write(own.sheet, sheets)
-        memory.write(own.dates, dates)
-        while True:
-            plan[kernel.GRAIN] = runner.frames.grain(plan[kernel.COUNT])
-            launch = CachedLaunch(runner.frames, "run", memory.compiler, plan, which, figures.reshape(-1), flat)
-            launch()
-            waiting = np.flatnonzero(memory.read(own.sheet)[:, HALT]) if runner.step.grids else which[:0]
-            if not len(waiting):
-                break
-            sheets = memory.read(own.sheet)
-            for k in waiting:
+        self._go(plan, np.arange(len(self)), sheets, dates, figures, flat)
+        before = clocks.energy.copy()
+        clocks.advance(substeps, frames, started)
+        runner.scene.h2_effective = runner.clock.h**2 * runner.integrator.h2_factor
+        return self._report(figures, before, moved, released, begun)
+
+    def _go(
+        self, plan: np.ndarray, some: np.ndarray, sheets: np.ndarray, dates: np.ndarray, figures: np.ndarray, track: np.ndarray
+    ) -> None:
+        """Launch frames of some, and again those that had to wait for a longer list."""
+        runner, memory = self._runner, self._runner.memory
+        which = some.astype(np.int32)
+        memory.write(runner.frames.sheet, sheets)
+        memory.write(runner.frames.dates, dates)
+        while len(some):
+            plan[kernel.COUNT], plan[kernel.GRAIN] = len(some), runner.frames.grain(len(some))
+            which[: len(some)] = some
+            CachedLaunch(runner.frames, "run", memory.compiler, plan, which, figures.reshape(-1), track)()
+            if not runner.step.grids:
+                return
+            sheets = memory.read(runner.frames.sheet)
+            some = some[sheets[some, HALT] != 0]
+            for k in some:
                 with self._at(k):
                     runner.sheet[:] = sheets[k]
                     sheets[k, RESUMED], sheets[k, BEGIN], sheets[k, HALF] = runner._stopped()
                     runner.grow()
                     runner.invalidate()
-            memory.write(own.sheet, sheets)
-            which[: len(waiting)] = waiting
-            plan[kernel.COUNT] = len(waiting)
-        before = clocks.energy.copy()
-        clocks.advance(substeps, frames, started)
-        runner.scene.h2_effective = runner.clock.h**2 * runner.integrator.h2_factor
-        return self._report(figures, before, moved, released, begun)
+            memory.write(runner.frames.sheet, sheets)
 
     def _report(
         self, figures: np.ndarray, before: np.ndarray, moved: np.ndarray, released: np.ndarray, begun: float
@@ -472,9 +504,22 @@ class Worlds:
     @property
     def velocity(self) -> np.ndarray:
         """Velocities [m/s], (worlds, n, dim), a read-only copy in f64; of the order of the worlds. Assign to set them."""
-        out = np.zeros((len(self), self._runner.n, self._world.particles.dim))
+        runner, clocks = self._runner, self._clocks
+        runner.memory.check()
+        out = runner.memory.read(runner.scene.state.d)[:, : runner.n].astype(np.float64)
+        saved = runner.memory.read(runner.grid.old_saved)[:, 0] if runner.grid else np.zeros(len(self))
+        alone = ~clocks.d_is_velocity & ((saved != 0) | bool(runner.probe))
+        alone[list(clocks.parted)] = True
+        some = np.flatnonzero(~clocks.d_is_velocity & ~alone).astype(np.int32)
         with whole:
-            for k in range(len(self)):
+            if len(some):
+                given = np.zeros((len(some), 4))
+                for row, k in zip(given, some, strict=True):
+                    runner.clock = clocks.of(k)
+                    row[:] = runner.clock.h, runner.clock.time, *runner.shares()
+                with runner.memory.compiler():
+                    runner.frames.velocities(len(some), some, given, out.reshape(-1))
+            for k in np.flatnonzero(alone):
                 with self._at(k) as world:
                     out[k] = world.velocity
         return read_only(out, assign_whole("Worlds", "velocity"))
@@ -591,9 +636,9 @@ class _Source:
 
     def __init__(self, world: World):
         self.particles, self.inv_mass = world.particles, world._runner.scene.inv_mass
-        skips = [{*f.kept_by_world, *knobs_of(type(f)), "dev"} for f in world.features]
         self.features = [
-            {name: v for name, v in vars(f).items() if name not in skip} for f, skip in zip(world.features, skips, strict=True)
+            {name: v for name, v in vars(f).items() if isinstance(v, DATA) and name not in (*f.kept_by_world, *knobs_of(type(f)))}
+            for f in world.features
         ]
         self.starts = [f.start for f in world.features]
 
@@ -673,6 +718,7 @@ def _structure(world: World) -> tuple:
     settings = {k: repr(v) for k, v in world.settings.items()}
     features = [(type(f).__name__, {k: repr(v) for k, v in (vars(f.dev).get("built") or {}).items()}) for f in world.features]
     fields = [(e.name, e.shape, str(e.kind)) for e in world._runner.memory.entries]
+    fields += [f.indices.tobytes() for f in world.features if isinstance(f, Batch)]
     if not patched:
         return settings, features, fields, None
     from ..device.patches.sharing import Writing  # noqa: PLC0415
