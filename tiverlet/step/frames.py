@@ -13,8 +13,9 @@ from .diagnostics import STEPPED
 from .step import BEGIN, END, FIGURES, FIRST, FRESH, HALF, HALT, ORIGIN, RESUMED, SHEET, SINCE, START, TICK, Step, integer
 
 # What a launch is given: how many copies, how many frames each, the substeps of one; of how many frames one is kept on the track,
-# which of these is the first; whether figures are kept; how many copies, one beside the other, a thread takes at a time.
-COUNT, FRAMES, SUBSTEPS, EVERY, ROW, ROWS, KEEPS, GRAIN = range(8)
+# how many were made before, how many the track has room for; whether figures are kept; how many copies, one beside the other, a
+# thread takes at a time.
+COUNT, FRAMES, SUBSTEPS, EVERY, BEFORE, ROWS, KEEPS, GRAIN = range(8)
 PLAN = GRAIN + 1
 DATES = 4  # of a copy: when frames of the present length began [s], their length [s], how many there were; frames of the launch
 WRAP = 2.0**31  # substeps are counted up to it
@@ -118,8 +119,9 @@ class Frames:
         if plan[KEEPS] != 0:
             for k in range(FIGURES):
                 figures[(w * plan[FRAMES] + f) * FIGURES + k] = self.sheet[k]
-        if plan[EVERY] > 0 and (f + 1) % plan[EVERY] == 0:
-            row = w * plan[ROWS] + plan[ROW] + (f + 1) // plan[EVERY] - 1
+        made = plan[BEFORE] + f + 1
+        if plan[EVERY] > 0 and made % ti.max(1, plan[EVERY]) == 0:
+            row = w * plan[ROWS] + made // plan[EVERY] - 1
             for i in range(self.step.n):
                 for a in ti.static(range(self.step.dim)):
                     x = ti.cast(self.step.state.x[i][a], ti.f64)
