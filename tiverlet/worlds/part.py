@@ -5,6 +5,7 @@ import functools
 import os
 import pickle
 import threading
+import traceback
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -110,19 +111,19 @@ def _figures(job: Job, part: Part, tell: Callable[[int], None]) -> dict[str, np.
     from .worlds import Worlds
 
     with contextlib.ExitStack() as stack:
-        made: list[World] = []
+        made: dict[int, World] = {}
         for number, row in zip(part.numbers, part.rows, strict=True):
             tell(number)
             with _noted(f"sweep: raised by {named(number, row)}"):
                 world = job.make(**row)
                 if not isinstance(world, World):
                     raise TypeError(f"sweep: make returned {world!r}, a {type(world).__name__}, but a tv.World is needed.")
-                if any(world is other for other in made):
+                if id(world) in made:
                     raise ValueError("sweep: make returned the same World again. Make a new one for each call.")
-            made.append(stack.enter_context(world))
+            made[id(world)] = stack.enter_context(world)
         tell(-1)
         with _noted(f"sweep: raised by the worlds of {part}"):
-            worlds = Worlds(made)
+            worlds = Worlds(list(made.values()))
             stack.callback(worlds.close)
             return _checked(job.figures(worlds), len(part.rows))
 
@@ -161,8 +162,9 @@ def _noted(note: str) -> Iterator[None]:
 
 
 def _sendable(error: Exception) -> Exception:
-    """An exception that comes out of a pickle as it was; else one that says the same."""
-    with contextlib.suppress(Exception):
+    """An exception that comes out of a pickle as it was; else one that says the same. Where it was raised goes into a note."""
+    error.add_note("".join(["In the worker:\n", *traceback.format_tb(error.__traceback__)]).rstrip())
+    with contextlib.suppress(Exception):  # what it takes to make it again may be anything
         if type(pickle.loads(pickle.dumps(error))) is type(error):
             return error
     new = RuntimeError(f"{type(error).__name__}: {error}")
