@@ -235,7 +235,7 @@ def test_what_functions_raise_comes_out_of_processes():
 @pytest.mark.parametrize(
     "found, words",
     [
-        (lambda w: w.position, r"figures returned a ndarray, but a dict of arrays is needed"),
+        (lambda w: [0.0] * 6, r"figures returned a list, but a dict of arrays is needed"),
         (lambda w: {"y": 1.0}, r"'y' with shape \(\), but there are 6 worlds here"),
         (lambda w: {"y": np.zeros((2, 6))}, r"'y' with shape \(2, 6\), but there are 6 worlds"),
         (lambda w: {"y": [[0.0]] * 5 + [[0.0, 1.0]]}, "'y' with rows of different lengths"),
