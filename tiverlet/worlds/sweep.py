@@ -80,7 +80,7 @@ def sweep(
     progress = checks.flag("sweep", "progress", progress)
     job = Job(make, figures, settings(), built())
     workers, least = chosen(executor, job)
-    size = max(1, min(at_once, -(-len(rows) // least)))
+    size = _ceil(len(rows), least * _ceil(len(rows), least * at_once))  # as many parts for each process
     parts = [Part(first, rows[first : first + size]) for first in range(0, len(rows), size)]
     found: dict[int, dict[str, np.ndarray]] = {}
     repeated = []
@@ -121,6 +121,10 @@ def _done(parts: list[Part], workers: "Workers") -> Iterable[tuple[Part, dict[st
                 )
             warnings.warn(f"sweep: {part} is done again: {outcome.why}.", RuntimeWarning, stacklevel=3)
             todo.appendleft(part)
+
+
+def _ceil(a: int, b: int) -> int:
+    return -(-a // b)
 
 
 def _joined(parts: list[Part], found: dict[int, dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
