@@ -5,9 +5,6 @@ import pytest
 
 import tiverlet as tv
 from tiverlet.device import ti
-from tiverlet.device.copies import Copies
-from tiverlet.device.memory import Memory
-from tiverlet.worlds.report import ARRAYS
 
 from .rows import OTHERS, ROWS
 
@@ -21,7 +18,9 @@ def spring(x):
 
 def every_constraint(dim, k):
     """All constraints of this dimension, far from each other, each at corners that meet it, more or less."""
-    made = {name: (row.points, row.make) for name, row in ROWS.items()} | {name: (p, make) for name, (p, make, _) in OTHERS.items()}
+    made = {name: (row.points, row.make) for name, row in ROWS.items()} | {
+        name: (p, make) for name, (p, make, _) in OTHERS.items()
+    }
     x, features = [], []
     for name, (points, make) in made.items():
         m, d = points.shape
@@ -64,7 +63,12 @@ def bricks(k):
     x = np.concatenate([square + [0.3 * j * (1 + 0.1 * k), 1.05 * j + 0.05] for j in range(4)])
     bodies = np.arange(16).reshape(4, 4)
     sides = np.concatenate([np.stack([b, np.roll(b, 1)], 1) for b in bodies] + [b[[[0, 2], [1, 3]]] for b in bodies])
-    features = [tv.Gravity(9.81), tv.Distance(sides), tv.Polygons([*bodies], friction=0.4), tv.HalfSpace((0, 1), 0.0, friction=0.4)]
+    features = [
+        tv.Gravity(9.81),
+        tv.Distance(sides),
+        tv.Polygons([*bodies], friction=0.4),
+        tv.HalfSpace((0, 1), 0.0, friction=0.4),
+    ]
     return tv.World(tv.Particles(x), features, substeps=8)
 
 

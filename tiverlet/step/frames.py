@@ -59,6 +59,7 @@ class Frames:
         launch = CachedLaunch(self, "run", self.memory.compiler, plan, which, none, none)
 
         def launched() -> None:
+            assert self.copies.chosen is not None
             which[0] = self.copies.chosen
             self.memory.write(self.sheet, sheet)
             self.memory.write(self.dates, 0.0)
@@ -80,7 +81,7 @@ class Frames:
             if lane % self.spread == 0:
                 first = ti.atomic_add(self.next[None], plan[GRAIN])
                 while first < plan[COUNT]:
-                    for k in range(first, ti.min(first + plan[GRAIN], plan[COUNT])):
+                    for k in range(first, ti.min(first + plan[GRAIN], plan[COUNT])):  # type: ignore[arg-type]
                         self.go_through(which[k], plan, figures, track)
                     first = ti.atomic_add(self.next[None], plan[GRAIN])
 
