@@ -197,10 +197,10 @@ class Memory:
         self._load_some([entry], [np.asarray(values)], some)
 
     def restore_some(self, state: dict[str, np.ndarray], some: np.ndarray) -> None:
-        """Write back what state() returned of some copies; one row is for all of them."""
+        """Write back what state() returned of some copies; one row is for all of them; 0 to fields that were not there then."""
         self.check()
         chosen = [e for e in self.entries if e.state]
-        self._load_some(chosen, [state[e.name] for e in chosen], some)
+        self._load_some(chosen, [state.get(e.name, np.zeros(1)) for e in chosen], some)
 
     def _load_some(self, entries: list[Entry], arrays: list[np.ndarray], some: np.ndarray) -> None:
         views = self._seen()

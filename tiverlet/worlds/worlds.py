@@ -186,8 +186,9 @@ class Worlds:
                 "`every`, or make several rollouts."
             )
         position = np.zeros((len(self), frames // every, n, dim))
-        time = self._clocks.time[:, None] + dt * every * np.arange(1, frames // every + 1)
         report = self._frames("Worlds.rollout", seconds, dt, every, position, progress)
+        since, length, count = self._clocks.frame.T[:, :, None]
+        time = since + length * (count - frames + every * np.arange(1, frames // every + 1))
         return Rollout(time, position, report)
 
     def _frames(self, who: str, seconds: float, dt: float, every: int, track: np.ndarray | None, progress: bool) -> WorldsReport:
@@ -602,6 +603,11 @@ class Worlds:
         """What acts on the particles. A knob that is assigned here changes in all worlds, see set()."""
         return self._world.features
 
+    @property
+    def fields(self) -> dict[str, int]:
+        """Every field on the device, by name, and its size for all worlds [bytes]."""
+        return {e.name: e.bytes * max(1, e.copies) for memory in self._runner.memories for e in memory.entries}
+
     def close(self) -> None:
         """Free the memory on the device. Using the worlds afterwards raises RuntimeError."""
         self._world.close()
@@ -621,11 +627,10 @@ class _Start:
 
     def __init__(self, worlds: Worlds):
         runner, self.clocks = worlds._runner, worlds._clocks.copy()
-        self.values = {memory: memory.state() for memory in runner.memories}
-        for state in self.values.values():
-            for name, values in state.items():
-                if (values == values[:1]).all():
-                    state[name] = values[:1].copy()
+        self.values = {name: values for memory in runner.memories for name, values in memory.state().items()}
+        for name, values in self.values.items():
+            if (values == values[:1]).all():
+                self.values[name] = values[:1].copy()
         self.pairs: list[Any] = []  # of each, with what they remember
         if runner.grid:
             for k in range(len(worlds)):
@@ -637,8 +642,9 @@ class _Start:
     def put_back(self, worlds: Worlds, chosen: np.ndarray) -> None:
         """Return to it."""
         runner = worlds._runner
-        for memory, state in self.values.items():
-            memory.restore_some({name: v[chosen] if len(v) > 1 else v for name, v in state.items()}, chosen)
+        state = {name: values[chosen] if len(values) > 1 else values for name, values in self.values.items()}
+        for memory in runner.memories:
+            memory.restore_some(state, chosen)
         if runner.grid:
             for field, value in ((runner.grid.old_number, 0), (runner.grid.old_saved, 1)):
                 runner.memory.write_some(field, value, chosen)
