@@ -214,6 +214,12 @@ def test_knobs_are_for_one_some_or_all(taichi):
         for k in (1, 3):
             alone[k].features[2].target = places[k]
         both()
+        rods = many.features[1]
+        for length in (1.05, 1.0):
+            many.set(rods, rest=length + 0.01 * rng.uniform(size=(5, 2)))
+            for k, w in enumerate(alone):
+                w.features[1].rest = vars(rods)["rest"][k]
+            both()
         assert many[3].hash() == alone[3].hash() and many[3].features[0].g == alone[3].features[0].g
         for w in (many, *alone):
             w.features[0].g = 3.0

@@ -231,10 +231,11 @@ class Worlds:
         clocks.since[begins] = 0
         moved, released, jumped = np.zeros(len(self)), np.zeros(len(self)), np.zeros(len(self), dtype=bool)
         some = np.flatnonzero(~(ready | begins))
-        for k in some:
-            with self._at(k):
-                runner.prepare(substep, world.iterations)
-                moved[k], released[k], jumped[k] = runner.moved, runner.released, runner.jumped
+        with runner.memory.compiler():
+            for k in some:
+                with self._at(k):
+                    runner.prepare(substep, world.iterations)
+                    moved[k], released[k], jumped[k] = runner.moved, runner.released, runner.jumped
         unknown = some[~clocks.known[some]]
         if len(unknown):
             energy, overlap = self._look(unknown)
@@ -247,6 +248,25 @@ class Worlds:
         clocks.first_moved[some] = NONE
         self._start = self._start or _Start(self)
         return moved, released
+
+    def _upload_to_all(self) -> bool:
+        """Write knobs of all worlds in one go, where features can. False where each world has to be asked by itself."""
+        features = self._world.features
+        changed = [f for i, f in enumerate(features) if f.changed or i in self._set]
+        able = all(f.uploads_all and not f.new_force and f not in self._forced for f in changed)
+        able = able and all(f.uploads_all for f in features if f.moving) and len(self._waiting) <= 1
+        stacked = [values for (i, _), values in self._given.items() if features[i] in changed]
+        if not able or any(not isinstance(values, np.ndarray) or values.dtype == object for values in stacked):
+            return False
+        self._set, self._waiting = {}, []
+        for f in features:
+            if f.moving:
+                f.moving = False
+                f.end_motion()
+        for f in changed:
+            f.changed = False
+            f.upload()
+        return True
 
     def _look(self, some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Energies [J] and overlaps of some, in the state in which they are."""
@@ -273,6 +293,8 @@ class Worlds:
         for i, name in [(i, name) for i, name in self._given if features[i].changed]:
             if vars(features[i])[name] is not self._given[i, name]:
                 del self._given[i, name]  # assigned for all
+        if self._upload_to_all():
+            return
         common, own = [_flags(f) for f in features], self._waiting if len(self._waiting) > 1 else None
         some, self._waiting, still = self._set, [], np.zeros(len(features), dtype=bool)
         self._set = {}
@@ -401,17 +423,21 @@ class Worlds:
                 raise ValueError(f"Worlds.set: {name} has {has}, but there are {len(chosen)} worlds. Give each its own.")
             knob, before = getattr(type(f), name), vars(f)[name]
             every = list(before) if (i, name) in self._given and before is self._given[i, name] else [before] * len(self)
-            for k, value in zip(chosen, values, strict=True):
-                try:
-                    vars(f)[name] = every[k] = knob.check(f, value)
-                    if f.outgrown:
-                        _refuse_outgrown(f)
-                except (ValueError, TypeError) as error:
+            k = -1
+            try:
+                for k, value in zip(chosen, values, strict=True):
+                    every[k] = knob.check(f, value)
+                    if not f.uploads_all:
+                        _check_fits(f, name, every[k], before)
+                together = _stacked(every)
+                if f.uploads_all:
+                    k = -1
+                    _check_fits(f, name, together, before)
+            except (ValueError, TypeError) as error:
+                if k >= 0:
                     error.add_note(f"That is what Worlds.set was given for world {k}.")
-                    raise
-                finally:
-                    vars(f)[name] = before
-            vars(f)[name] = self._given[i, name] = _stacked(every)
+                raise
+            vars(f)[name] = self._given[i, name] = together
             mask = self._set.setdefault(i, np.zeros(len(self), dtype=bool))
             mask[chosen] = True
             if knob.force:
@@ -695,6 +721,16 @@ def _checked(worlds: Any, count: int | None) -> list[World]:
         if world._controller.auto:
             raise ValueError(f'Worlds: worlds[{k}] has substeps = "auto", but all go through the same substeps. Give a number.')
     return several
+
+
+def _check_fits(feature: Feature, name: str, value: Any, before: Any) -> None:
+    """Refuse what asks for other kernels."""
+    vars(feature)[name] = value
+    try:
+        if feature.outgrown:
+            _refuse_outgrown(feature)
+    finally:
+        vars(feature)[name] = before
 
 
 def _refuse_outgrown(feature: Feature) -> None:

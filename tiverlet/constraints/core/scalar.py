@@ -69,6 +69,7 @@ class Scalar(Batch):
 
     each = ("rest", "compliance", "damping", "break_at")
     rest_name = "rest"
+    uploads_all = True
     unit: float | None = None  # what residuals are relative to; None: the rest value
     precise = False  # whether exactly() measures to all the digits that positions have
     cusp = False  # whether any goal is f = 0, where gradients end: no direction at the start of the step means anything there
