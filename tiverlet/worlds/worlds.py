@@ -130,6 +130,9 @@ class Worlds:
         """Meanwhile fields are those of all worlds, and signals wait."""
         with whole, self._copies.all():
             self._runner.memory.check()
+            for i, name in [*self._given]:
+                if vars(self._world.features[i])[name] is not self._given[i, name]:
+                    del self._given[i, name]  # assigned for all since then
             yield
 
     @property
@@ -287,12 +290,10 @@ class Worlds:
         world, features = self._world, self._world.features
         if not self._set and not any(f.changed or f.moving for f in features):
             return
-        for f in features:
-            if f.changed and f.outgrown:
-                _refuse_outgrown(f)
-        for i, name in [(i, name) for i, name in self._given if features[i].changed]:
-            if vars(features[i])[name] is not self._given[i, name]:
-                del self._given[i, name]  # assigned for all
+        for f in [f for f in features if f.changed]:
+            with self._at(0):
+                if f.outgrown:
+                    _refuse_outgrown(f)
         if self._upload_to_all():
             return
         common, own = [_flags(f) for f in features], self._waiting if len(self._waiting) > 1 else None

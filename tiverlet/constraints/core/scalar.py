@@ -198,7 +198,7 @@ class Scalar(Batch):
     def outgrown(self) -> bool:
         """Whether others than before are to be relaxed alone, too: a world is what its knobs say, not how they came there."""
         solved = self.scene and self.acts and self.solvable_together
-        return super().outgrown or bool(solved and not np.array_equal(self._alone, self.relaxed_alone(self.scene)))
+        return super().outgrown or bool(solved and (self._alone != self.relaxed_alone(self.scene)).any())
 
     @property
     def limited(self) -> bool:
