@@ -1,5 +1,6 @@
 """Many worlds at once."""
 
+from .gradient import Gradient, gradient
 from .worlds import Rollout, Worlds
 
-__all__ = ["Rollout", "Worlds"]
+__all__ = ["Gradient", "Rollout", "Worlds", "gradient"]
