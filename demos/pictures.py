@@ -31,6 +31,7 @@ PICTURES = {
     "jelly": (90, ALL),
     "machine": (130, ALL),
     "net": (26, (0.2, 0.28, 0.8, 0.78)),
+    "pendulums": (90, ALL),
     "polygons": (400, ALL),
     "ragdoll": (80, (0.0, 0.2, 1.0, 1.0)),
     "soft": (60, (0.0, 0.4, 1.0, 1.0)),

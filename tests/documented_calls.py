@@ -47,3 +47,5 @@ body, (first, second) = tv.shapes.join(rope.moved((1, 0)), tv.shapes.ball((0, 0)
 ends = rope.links + first.start, body.loops, len(body), second.stop
 place = tv.mix(np.zeros(2), (1, 1), tv.smoothstep(0.0, 1.0, tv.golden(np.arange(5), dim=2)))
 hand = tv.approach(0.0, (1.0, 1.0), rate=6.0, dt=1 / 60), tv.golden_colors(3), tv.clamp(2.0, 0, 1)
+swept = tv.sweep(lambda x: tv.World(tv.Particles([(x, 1)])), {"x": np.arange(9)}, lambda worlds: {"end": worlds.position}, 4)
+ended, lost = swept["end"].mean(), [part.why for part in swept.repeated]

@@ -18,11 +18,12 @@ from .patches.compiler import inline
 class Copies:
     """count: how many there are. chosen: the one that the host reads and writes, and small kernels work on; None for all."""
 
-    host_only = ("count", "chosen")
+    host_only = ("count", "chosen", "closed")
 
     def __init__(self, count: int):
         self.count = count
         self.chosen: int | None = None
+        self.closed = False  # whether somebody who does not know of copies might read fields: Memory.check() refuses it
         self.number: Any = None  # a field of one number: the copy that is chosen
         self._strides: set[int] = set()  # of all fields
         self._now: tuple[Any, dict[int, Any]] = (None, {})  # a kernel, and where its copy begins in fields of each stride
@@ -62,11 +63,12 @@ class Copies:
     @contextlib.contextmanager
     def all(self) -> Iterator[None]:
         """Meanwhile the host reads and writes all of them: arrays have one more axis, the first."""
-        before, self.chosen = self.chosen, None
+        before = self.chosen, self.closed
+        self.chosen, self.closed = None, False
         try:
             yield
         finally:
-            self.chosen = before
+            self.chosen, self.closed = before
 
 
 def _of_copy(builder: Any, value: Any, *indices: Any, **options: Any) -> Any:

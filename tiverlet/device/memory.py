@@ -161,6 +161,10 @@ class Memory:
             )
         if not self._layout:
             raise RuntimeError("This world is closed; build a new one.")
+        if self.copies and self.copies.closed:
+            raise RuntimeError(
+                "This feature acts in many worlds, which differ. Ask each: worlds.each(lambda world: world.features[0].residual)."
+            )
         if runtime.forked():
             raise RuntimeError('This world was built before a fork and cannot run in the child; use "spawn".')
 

@@ -26,6 +26,7 @@ LLVM = ("cpu", "cuda")  # what LLVM compiles for; for the others Taichi writes S
 
 _started: dict = {}  # what init() was asked for, and by which process and thread
 trees = 0  # of fields that are alive, of this runtime; memory.py counts them
+share: int | None = None  # CPU threads where none are asked for; in a process that has only some of the cores for itself
 
 
 def init(arch: str = "cpu", threads: int | None = None, debug: bool = False, seed: int = 0) -> None:
@@ -55,6 +56,7 @@ def init(arch: str = "cpu", threads: int | None = None, debug: bool = False, see
         offer = ", ".join(map(repr, available()))
         raise RuntimeError(f'init: arch "{arch}" is not available on this machine. Available: {offer}.')
     running = _threads()
+    threads = threads or share
     options: dict[str, Any] = {} if threads is None else {"cpu_max_num_threads": threads}
     if arch == "cpu":  # where kernels are one task each; every thread that compiles has to load first what all kernels share
         options["num_compile_threads"] = 1  # 0 would be the thread that asks: one that did not start Taichi ends the process

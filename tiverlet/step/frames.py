@@ -13,8 +13,9 @@ from .diagnostics import STEPPED
 from .step import BEGIN, END, FIGURES, FIRST, FRESH, HALF, HALT, ORIGIN, RESUMED, SHEET, SINCE, START, TICK, Step, integer
 
 # What a launch is given: how many copies, how many frames each, the substeps of one; of how many frames one is kept on the track,
-# which of these is the first; whether figures are kept; how many copies, one beside the other, a thread takes at a time.
-COUNT, FRAMES, SUBSTEPS, EVERY, ROW, ROWS, KEEPS, GRAIN = range(8)
+# how many were made before, how many the track has room for; whether figures are kept; how many copies, one beside the other, a
+# thread takes at a time.
+COUNT, FRAMES, SUBSTEPS, EVERY, BEFORE, ROWS, KEEPS, GRAIN = range(8)
 PLAN = GRAIN + 1
 DATES = 4  # of a copy: when frames of the present length began [s], their length [s], how many there were; frames of the launch
 WRAP = 2.0**31  # substeps are counted up to it
@@ -58,6 +59,7 @@ class Frames:
         launch = CachedLaunch(self, "run", self.memory.compiler, plan, which, none, none)
 
         def launched() -> None:
+            assert self.copies.chosen is not None
             which[0] = self.copies.chosen
             self.memory.write(self.sheet, sheet)
             self.memory.write(self.dates, 0.0)
@@ -79,9 +81,24 @@ class Frames:
             if lane % self.spread == 0:
                 first = ti.atomic_add(self.next[None], plan[GRAIN])
                 while first < plan[COUNT]:
-                    for k in range(first, ti.min(first + plan[GRAIN], plan[COUNT])):
+                    for k in range(first, ti.min(first + plan[GRAIN], plan[COUNT])):  # type: ignore[arg-type]
                         self.go_through(which[k], plan, figures, track)
                     first = ti.atomic_add(self.next[None], plan[GRAIN])
+
+    @ti.kernel
+    def velocities(
+        self, count: ti.i32, which: ti.types.ndarray(ti.i32, 1), given: ti.types.ndarray(ti.f64, 2),  # type: ignore[valid-type]
+        out: ti.types.ndarray(ti.f64, 1),  # type: ignore[valid-type]
+    ):  # fmt: skip
+        """Velocities of the copies that are listed, as the user sees them. given: the arguments of Step.velocities, of each."""
+        for k in range(count):
+            w = which[k]
+            self.copies.enter(w)
+            self.step.constraints.reactions(ti.cast(given[k, 2], self.step.real), ti.cast(given[k, 3], self.step.real))
+            for i in range(self.step.n):
+                v = self.step.velocity_of(i, given[k, 0], given[k, 1], given[k, 2])
+                for a in ti.static(range(self.step.dim)):
+                    out[(w * self.step.n + i) * self.step.dim + a] = v[a]
 
     @ti.func
     def go_through(self, w, plan: ti.template(), figures: ti.template(), track: ti.template()):  # type: ignore[valid-type]
@@ -103,8 +120,9 @@ class Frames:
         if plan[KEEPS] != 0:
             for k in range(FIGURES):
                 figures[(w * plan[FRAMES] + f) * FIGURES + k] = self.sheet[k]
-        if plan[EVERY] > 0 and (f + 1) % plan[EVERY] == 0:
-            row = w * plan[ROWS] + plan[ROW] + (f + 1) // plan[EVERY] - 1
+        made = plan[BEFORE] + f + 1
+        if plan[EVERY] > 0 and made % ti.max(1, plan[EVERY]) == 0:
+            row = w * plan[ROWS] + made // plan[EVERY] - 1
             for i in range(self.step.n):
                 for a in ti.static(range(self.step.dim)):
                     x = ti.cast(self.step.state.x[i][a], ti.f64)

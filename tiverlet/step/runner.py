@@ -34,6 +34,7 @@ class Runner:
         self.frames: Frames | None = parts.frames
         self.clock = clock
         self.moved = 0.0  # how far the coming frame has had to move a particle to where its constraints are met [m]
+        self.jumped = False  # whether that was further than a particle is large
         self.released = 0.0  # the violation that its shorter substep turns into energy, as a share of its size
         self.interruptible = False  # what handlers of signals raise in the middle of a frame is followed by an undo
         # Asked in every frame, and Taichi looks at each attribute of what has kernels.
@@ -67,11 +68,24 @@ class Runner:
     def begin(self, substep: float, iterations: int) -> None:
         """Take a length [s] for the substep; with another one than before, displacements mean something else: start anew from
         velocities."""
-        h, clock, self.released = substep * self.integrator.first, self.clock, 0.0
+        if self.prepare(substep, iterations):
+            with self.memory.compiler():
+                if self.clock.energy is None:
+                    self.look()
+                    if self.asks_velocities:  # so that nobody waits later for its kernel to compile
+                        self._velocities()
+                        self.asks_velocities = False
+                    report = self.report()
+                    self.looked(report.energy, report.overlap)
+                self.placed()
+
+    def prepare(self, substep: float, iterations: int) -> bool:
+        """The first half of begin(): all but for what has to be seen first. Returns whether there is more to do."""
+        h, clock, self.released, self.jumped = substep * self.integrator.first, self.clock, 0.0, False
         drag = decay(sum(f.rate for f in self.drags), h) if self.drags else None
         known = clock.energy is not None and clock.first_moved is None
         if h == clock.h and drag == clock.drag and not clock.d_is_velocity and known:
-            return
+            return False
         with self.memory.compiler():
             if h != clock.h or drag != clock.drag:
                 clock.longest = max(clock.longest, clock.h if clock.first_moved is None else 0.0)
@@ -80,28 +94,29 @@ class Runner:
                     clock.longest = h
             if clock.d_is_velocity:
                 clock.since = 0
-            moved, self.moved = None, 0.0
+            self.moved = 0.0
             if clock.first_moved is not None and self.scene.slots:
                 moved = initial_violation.remove(self.scene, self.batches, clock.first_moved, self.stop_at_walls)
                 if moved is not None:
-                    self.moved = float(moved.max())
+                    self.moved, self.jumped = float(moved.max()), bool((moved > self.scene.particles.radius).any())
                     self.invalidate()
                 if self.scene.slots.system:
                     self.scene.slots.system.forget()
             self.set_substep(h, drag)
-            if clock.energy is None:
-                self.look()
-                if self.asks_velocities:  # so that nobody waits later for its kernel to compile
-                    self._velocities()
-                    self.asks_velocities = False
-                report = self.report()
-                clock.energy = report.energy
-                if report.overlap > 0 and clock.first_moved is not None:
-                    self.ease(clock.first_moved)
-            if moved is not None and (moved > self.scene.particles.radius).any():
-                for contact in self.step.contacts:  # for the report of the frame: others may have been passed
-                    self.memory.write(contact.dev.fast, 1)
-            clock.first_moved = None
+        return True
+
+    def looked(self, energy: float, overlap: float) -> None:
+        """The second half: what was seen of the state that frames start from."""
+        self.clock.energy = energy
+        if overlap > 0 and self.clock.first_moved is not None:
+            self.ease(self.clock.first_moved)
+
+    def placed(self) -> None:
+        """The end of it: particles are where they were placed, or where constraints had them go."""
+        if self.jumped:
+            for contact in self.step.contacts:  # for the report of the frame: others may have been passed
+                self.memory.write(contact.dev.fast, 1)
+        self.clock.first_moved = None
 
     def advance(self, dt: float, substeps: int, iterations: int) -> StepReport:
         """One frame from where begin() left off."""
@@ -156,10 +171,10 @@ class Runner:
     def _velocities(self) -> np.ndarray:
         """By the kernel, from displacements."""
         out = np.zeros((max(1, self.n), self.step.dim))
-        self.step.velocities(self.clock.h, self.clock.time, *self._shares(), out)
+        self.step.velocities(self.clock.h, self.clock.time, *self.shares(), out)
         return out
 
-    def _shares(self) -> tuple[float, float]:
+    def shares(self) -> tuple[float, float]:
         """What multipliers of the last substep are to be taken for: h^2 over what an acceleration added to the displacement. A
         start from velocities without what rigid constraints did in half a substep left that to them, too."""
         clock = self.clock

@@ -526,7 +526,12 @@ class Step:
         """
         self.constraints.reactions(ti.cast(firm64, self.real), ti.cast(soft64, self.real))
         for i in range(self.n):
-            h, time, firm = ti.cast(h64, self.real), ti.cast(t, self.real), ti.cast(firm64, self.real)
-            v = self.integrator.velocity_after(i, h, time, self.particles.reaction(i, h, time, firm))
+            v = self.velocity_of(i, h64, t, firm64)
             for k in ti.static(range(self.dim)):
                 out[i, k] = v[k]
+
+    @ti.func
+    def velocity_of(self, i, h64, t, firm64):
+        """That of one particle, once constraints have said what they did."""
+        h, time, firm = ti.cast(h64, self.real), ti.cast(t, self.real), ti.cast(firm64, self.real)
+        return self.integrator.velocity_after(i, h, time, self.particles.reaction(i, h, time, firm))

@@ -1,6 +1,8 @@
-"""Many worlds at once."""
+"""Many worlds: copies that are stepped together, their derivatives, and sweeps over processes and machines."""
 
 from .gradient import Gradient, gradient
+from .report import WorldsReport
+from .sweep import SweepResult, sweep
 from .worlds import Rollout, Worlds
 
-__all__ = ["Gradient", "Rollout", "Worlds", "gradient"]
+__all__ = ["Gradient", "Rollout", "SweepResult", "Worlds", "WorldsReport", "gradient", "sweep"]

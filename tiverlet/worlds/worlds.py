@@ -1,7 +1,8 @@
 """Many worlds of one structure, stepped together, none of which knows of the others."""
 
 import contextlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import zip_longest
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -13,12 +14,13 @@ from ..device.interrupts import whole
 from ..device.patches import patched
 from ..device.patches.compiler import CachedLaunch
 from ..features.arguments import knobs_of, meant
-from ..features.feature import Feature
+from ..features.feature import Batch, Feature
 from ..features.read_only import assign_whole, read_only
 from ..particles import in_range
 from ..step import checkpoint
 from ..step import frames as kernel
-from ..step.diagnostics import STARTED, STEPPED, TURNS, risks
+from ..step.diagnostics import STARTED, STEPPED, TURNS, UNSTEPPED, risks
+from ..step.integrator import FREE
 from ..step.step import (
     BEGIN,
     END,
@@ -46,6 +48,9 @@ WORK = 100_000_000  # particles and constraints, times passes, in a launch: it t
 LOGGED = 1 << 22  # figures of frames that are kept at a time
 
 
+DATA = (bool, int, float, str, np.ndarray, np.generic)  # what an attribute is that differs from world to world
+
+
 class Rollout(NamedTuple):
     """What worlds.rollout() returns. time: (worlds, frames) [s]. position: (worlds, frames, n, dim) [m]."""
 
@@ -61,7 +66,7 @@ class Worlds:
     same features, solver, options and numbers of particles and constraints, with other masses, places, lengths, radii.
 
     Each goes on to the bit as it would alone, on any number of threads; none knows of the others: what is wrong in one is flagged
-    for that one. worlds[k] is the k-th as a World of its own, in its present state. The worlds that it is made of stay as they are.
+    for that one. worlds[k] is the k-th as a World of its own, in its present state. What it is made of stays as it is.
 
     position, velocity: (worlds, n, dim). set() gives knobs other values in each world; what is assigned to a knob of
     worlds.features is for all of them.
@@ -86,6 +91,7 @@ class Worlds:
             )  # fmt: skip
             self._runner = self._world._runner
             _check_structure(sources)
+            self._fastest = np.array([world._runner.step.integrator.fastest for world in sources])
             self._sources = [_Source(world) for world in sources] if len(sources) > 1 else []
             self._given = _other_knobs(sources)  # by feature and knob: what each world has of it
             self._clocks = Clocks([world._clock for world in sources])
@@ -100,6 +106,7 @@ class Worlds:
             self._waiting = [[_flags(f) for f in world.features] for world in sources]  # of each, for the first frame
             for f, *each in zip(self._world.features, *self._waiting, strict=True):
                 f.changed, f.moving, f.new_force = (any(flags) for flags in zip(*each, strict=True))
+        self._copies.closed = True
         self._set: dict[int, np.ndarray] = {}  # by feature, the worlds in which set() gave it other knobs
         self._forced: set[Feature] = set()  # of these, whose forces changed
         self._last: WorldsReport | None = None
@@ -118,6 +125,19 @@ class Worlds:
         checkpoint.put_back(self._world, checkpoint.keep(world))
         self._clocks.put(k, runner.clock)
 
+    @contextlib.contextmanager
+    def _open(self) -> Iterator[None]:
+        """Meanwhile fields are those of all worlds, and signals wait."""
+        with whole, self._copies.all():
+            self._runner.memory.check()
+            yield
+
+    @property
+    def _kernels(self) -> kernel.Frames:
+        """Those that go through many; other ones after a list has grown."""
+        assert self._runner.frames
+        return self._runner.frames
+
     def _rest(self) -> None:
         """No world is chosen."""
         self._runner.memory.choose(None)
@@ -125,11 +145,13 @@ class Worlds:
             self._world.features[i].__dict__[name] = values
 
     @contextlib.contextmanager
-    def _at(self, k: int) -> Iterator[World]:
+    def _at(self, k: Any) -> Iterator[World]:
         """Meanwhile the world stands for the k-th."""
-        world, runner = self._world, self._runner
+        world, runner, k = self._world, self._runner, int(k)
         runner.memory.choose(k)
-        world._clock = runner.clock = self._clocks.of(k)
+        clock = world._clock = runner.clock = self._clocks.of(k)
+        share = (clock.drag or FREE)[2 if clock.started else 1]
+        runner.scene.h2_effective = clock.h**2 * runner.integrator.h2_factor * share
         if self._sources:
             self._sources[k].put_on(world)
         for (i, name), values in self._given.items():
@@ -145,9 +167,8 @@ class Worlds:
     def step(self, dt: float) -> WorldsReport:
         """Advance all of them by dt [s], see World.step()."""
         dt = checks.number("Worlds.step", "dt", dt, above=0.0)
-        self._runner.memory.check()
-        with whole:
-            return self._advance(dt, 1, 0, None, 0)
+        with self._open():
+            return self._launch(dt, 1, *self._begin(dt))
 
     def run(self, seconds: float, dt: float = 1 / 60, progress: bool = False) -> WorldsReport:
         """Step all of them for `seconds` [s] in frames of dt [s], many in a launch; returns the worst figures of all frames."""
@@ -161,8 +182,8 @@ class Worlds:
         size = len(self) * (frames // every) * n * dim
         if size >= 2**31:
             raise ValueError(
-                f"Worlds.rollout: the track would have {size} numbers, and can have {2**31 - 1}. Keep fewer frames, with `every`, "
-                "or make several rollouts."
+                f"Worlds.rollout: the track would have {size} numbers, and can have {2**31 - 1}. Keep fewer frames, with "
+                "`every`, or make several rollouts."
             )
         position = np.zeros((len(self), frames // every, n, dim))
         time = self._clocks.time[:, None] + dt * every * np.arange(1, frames // every + 1)
@@ -172,12 +193,10 @@ class Worlds:
     def _frames(self, who: str, seconds: float, dt: float, every: int, track: np.ndarray | None, progress: bool) -> WorldsReport:
         """Frames in launches of some of them."""
         frames = _frame_count(who, seconds, dt)
-        self._runner.memory.check()
         world = self._world
         work = len(self) * world.substeps * world.iterations * self._runner.integrator.stages
         work *= 1 + len(world.particles) + sum(b.count for b in self._runner.batches)
         at_once = max(1, min(frames, WORK // work, LOGGED // (len(self) * FIGURES)))
-        at_once = max(every, at_once // every * every) if every else at_once
         bar: Any = contextlib.nullcontext()
         if progress:
             from rich.progress import Progress  # noqa: PLC0415
@@ -187,30 +206,16 @@ class Worlds:
         with bar as shown:
             task = shown.add_task(f"{len(self)} worlds", total=frames) if shown else None
             while done < frames:
-                some = min(at_once, frames - done)
-                with whole:
-                    report = self._advance(dt, some, every, track, done // every if every else 0)
+                with self._open():
+                    moved, released = self._begin(dt)
+                    # Where a target is under way, the next frame ends it, and then the host is needed.
+                    some = 1 if any(f.moving for f in world.features) else min(at_once, frames - done)
+                    report = self._launch(dt, some, moved, released, every, track, done)
                 worst, done = report if worst is None else worst.worse(report), done + some
                 if shown:
                     shown.update(task, completed=done)
         assert worst
         return worst
-
-    def _advance(self, dt: float, frames: int, every: int, track: np.ndarray | None, row: int) -> WorldsReport:
-        """Frames of all of them; where knobs are on their way in the first one, that one alone comes first."""
-        begun = perf_counter()
-        moved, released = self._begin(dt)
-        if self._start is None:
-            self._start = _Start(self)
-        if frames > 1 and any(f.moving for f in self._world.features) and not every:
-            first = self._launch(dt, 1, 0, None, 0, moved, released, begun)
-            moved, released = self._begin(dt)
-            rest = self._launch(dt, frames - 1, 0, None, 0, moved, released, begun)
-            report = first.worse(rest)
-        else:
-            report = self._launch(dt, frames, every, track, row, moved, released, begun)
-        self._last = report
-        return report
 
     def _begin(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
         """Have all of them ready for substeps of this length, see Runner.begin(). Returns what that found of each: how far
@@ -223,12 +228,38 @@ class Worlds:
         looked_at = clocks.known & (clocks.first_moved == NONE) & (clocks.h == h) & (not drags)
         ready, begins = looked_at & ~clocks.d_is_velocity, looked_at & clocks.d_is_velocity
         clocks.since[begins] = 0
-        moved, released = np.zeros(len(self)), np.zeros(len(self))
-        for k in np.flatnonzero(~(ready | begins)):
+        moved, released, jumped = np.zeros(len(self)), np.zeros(len(self)), np.zeros(len(self), dtype=bool)
+        some = np.flatnonzero(~(ready | begins))
+        for k in some:
             with self._at(k):
-                runner.begin(substep, world.iterations)
-                moved[k], released[k] = runner.moved, runner.released
+                runner.prepare(substep, world.iterations)
+                moved[k], released[k], jumped[k] = runner.moved, runner.released, runner.jumped
+        unknown = some[~clocks.known[some]]
+        if len(unknown):
+            energy, overlap = self._look(unknown)
+            clocks.energy[unknown], clocks.known[unknown] = energy, True
+            for k in unknown[(overlap > 0) & (clocks.first_moved[unknown] != NONE)]:
+                with self._at(k), runner.memory.compiler():
+                    runner.ease(int(clocks.first_moved[k]))
+        for contact in runner.step.contacts:
+            runner.memory.write_some(contact.dev.fast, 1, np.flatnonzero(jumped))
+        clocks.first_moved[some] = NONE
+        self._start = self._start or _Start(self)
         return moved, released
+
+    def _look(self, some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Energies [J] and overlaps of some, in the state in which they are."""
+        clocks = self._clocks
+        sheets, dates = np.zeros((len(self), SHEET)), np.zeros((len(self), kernel.DATES))
+        sheets[:, H], sheets[:, START], sheets[:, END] = clocks.h, clocks.time, clocks.time
+        sheets[:, TICK], sheets[:, SINCE], sheets[:, FRESH] = clocks.tick, clocks.since, clocks.d_is_velocity
+        sheets[:, ORIGIN] = np.where(clocks.d_is_velocity, UNSTEPPED, np.where(clocks.started, STARTED, STEPPED))
+        sheets[:, ITERATIONS] = sheets[:, UNTIL] = sheets[:, PART] = 1
+        plan = np.zeros(kernel.PLAN, dtype=np.int32)
+        plan[kernel.FRAMES] = plan[kernel.KEEPS] = 1
+        figures = np.zeros((len(self), 1, FIGURES))
+        self._go(plan, some, sheets, dates, figures, np.zeros(1))
+        return figures[some, 0, 0], figures[some, 0, 2]
 
     def _upload(self) -> None:
         """Bring knobs to the device: those that were assigned for all, and those that were set for some."""
@@ -247,7 +278,8 @@ class Worlds:
         all_of_them = own is not None or any(changed or moving for changed, moving, _ in common)
         for k in range(len(self)) if all_of_them else np.flatnonzero(np.any([*some.values()], axis=0)):
             flags = own[k] if own else [
-                (changed or (i in some and bool(some[i][k])), moving, new_force) for i, (changed, moving, new_force) in enumerate(common)
+                (changed or bool(some[i][k] if i in some else False), moving, new_force)
+                for i, (changed, moving, new_force) in enumerate(common)
             ]  # fmt: skip
             with self._at(k):
                 for f, (f.changed, f.moving, f.new_force) in zip(features, flags, strict=True):
@@ -259,15 +291,16 @@ class Worlds:
             f.changed = f.new_force = False
 
     def _launch(
-        self, dt: float, frames: int, every: int, track: np.ndarray | None, row: int, moved: np.ndarray, released: np.ndarray,
-        begun: float,
+        self, dt: float, frames: int, moved: np.ndarray, released: np.ndarray, every: int = 0, track: np.ndarray | None = None,
+        before: int = 0,
     ) -> WorldsReport:  # fmt: skip
-        """Frames in one launch, and as many more as lists have to grow."""
+        """Frames in one launch, and as many more as lists have to grow. before: frames that are on the track already."""
         world, runner, clocks = self._world, self._runner, self._clocks
         substeps, iterations, stages = world.substeps, world.iterations, runner.integrator.stages
         with runner.memory.compiler():
             for semi_iteration in runner.semi_iterations:
                 semi_iteration.prepare(iterations)
+        begun = perf_counter()
         clocks.count_frame(dt, np.ones(len(self), dtype=bool))
         started = clocks.d_is_velocity & (substeps == 1)
         sheets, dates = np.zeros((len(self), SHEET)), np.zeros((len(self), kernel.DATES))
@@ -278,48 +311,52 @@ class Worlds:
         total = stages * substeps if runner.n else 0
         sheets[:, STAGES], sheets[:, ITERATIONS] = total, runner.integrator.passes(iterations)
         sheets[:, UNTIL], sheets[:, PART] = total + 1, sheets[:, ITERATIONS]
-        plan, which = np.zeros(kernel.PLAN, dtype=np.int32), np.arange(len(self), dtype=np.int32)
-        plan[kernel.COUNT], plan[kernel.FRAMES], plan[kernel.SUBSTEPS] = len(self), frames, substeps if runner.n else 0
-        plan[kernel.EVERY], plan[kernel.ROW], plan[kernel.KEEPS] = every, row, 1
+        plan = np.zeros(kernel.PLAN, dtype=np.int32)
+        plan[kernel.FRAMES], plan[kernel.SUBSTEPS] = frames, substeps if runner.n else 0
+        plan[kernel.EVERY], plan[kernel.BEFORE], plan[kernel.KEEPS] = every, before, 1
         plan[kernel.ROWS] = track.shape[1] if track is not None else 0
         figures = np.zeros((len(self), frames, FIGURES))
         flat = np.zeros(1) if track is None else track.reshape(-1)
-        own = runner.frames
-        memory = runner.memory
-        memory.write(own.sheet, sheets)
-        memory.write(own.dates, dates)
-        while True:
-            plan[kernel.GRAIN] = runner.frames.grain(plan[kernel.COUNT])
-            launch = CachedLaunch(runner.frames, "run", memory.compiler, plan, which, figures.reshape(-1), flat)
-            launch()
-            waiting = np.flatnonzero(memory.read(own.sheet)[:, HALT]) if runner.step.grids else which[:0]
-            if not len(waiting):
-                break
-            sheets = memory.read(own.sheet)
-            for k in waiting:
+        self._go(plan, np.arange(len(self)), sheets, dates, figures, flat)
+        energy = np.where(clocks.known, clocks.energy, np.nan)
+        clocks.advance(substeps, frames, started)
+        self._last = self._report(figures, energy, moved, released, perf_counter() - begun)
+        return self._last
+
+    def _go(
+        self, plan: np.ndarray, some: np.ndarray, sheets: np.ndarray, dates: np.ndarray, figures: np.ndarray, track: np.ndarray
+    ) -> None:
+        """Launch frames of some, and again those that had to wait for a longer list."""
+        runner, memory = self._runner, self._runner.memory
+        which = some.astype(np.int32)
+        memory.write(self._kernels.sheet, sheets)
+        memory.write(self._kernels.dates, dates)
+        while len(some):
+            plan[kernel.COUNT], plan[kernel.GRAIN] = len(some), self._kernels.grain(len(some))
+            which[: len(some)] = some
+            CachedLaunch(self._kernels, "run", memory.compiler, plan, which, figures.reshape(-1), track)()
+            if not runner.step.grids:
+                return
+            sheets = memory.read(self._kernels.sheet)
+            some = some[sheets[some, HALT] != 0]
+            for k in some:
                 with self._at(k):
                     runner.sheet[:] = sheets[k]
                     sheets[k, RESUMED], sheets[k, BEGIN], sheets[k, HALF] = runner._stopped()
                     runner.grow()
                     runner.invalidate()
-            memory.write(own.sheet, sheets)
-            which[: len(waiting)] = waiting
-            plan[kernel.COUNT] = len(waiting)
-        before = clocks.energy.copy()
-        clocks.advance(substeps, frames, started)
-        runner.scene.h2_effective = runner.clock.h**2 * runner.integrator.h2_factor
-        return self._report(figures, before, moved, released, begun)
+            memory.write(self._kernels.sheet, sheets)
 
     def _report(
-        self, figures: np.ndarray, before: np.ndarray, moved: np.ndarray, released: np.ndarray, begun: float
+        self, figures: np.ndarray, before: np.ndarray, moved: np.ndarray, released: np.ndarray, seconds: float
     ) -> WorldsReport:
-        """The worst of the figures of all frames, (worlds, frames, FIGURES)."""
+        """The worst of the figures of all frames, (worlds, frames, FIGURES). before: energies [J]."""
         world, runner, clocks = self._world, self._runner, self._clocks
         reporter, dim, n = runner.diagnostics.report, world.particles.dim, runner.n
         energy, residual, overlap, stiff, contacts, bad, fast, reach, broken, tension, turned = np.moveaxis(
             figures[..., :11], 2, 0
         )
-        stiff = np.maximum(stiff, reporter.fastest * clocks.h[:, None] ** 2)
+        stiff = np.maximum(stiff, (self._fastest * clocks.h**2)[:, None])
         first = np.arange(figures.shape[1]) == 0
         every = risks(
             n, reporter.farthest, bad, reach, fast, turned, np.where(first, moved[:, None], 0.0), tension, stiff,
@@ -329,11 +366,11 @@ class Worlds:
         wrong = bad < n
         report = WorldsReport(
             clocks.time.copy(), residual.max(1), overlap.max(1), contacts.max(1).astype(int), energy[:, -1].copy(),
-            np.where(clocks.known, energy[:, -1] - before, 0.0),
+            energy[:, -1] - before,
             np.where(wrong.any(1), bad[np.arange(len(self)), wrong.argmax(1)], -1).astype(int), broken.sum(1).astype(int),
             np.array(TURNS)[turned.max(1).astype(int)], tension.max(1),
             {name: there.any(1) for name, there in every.items() if there.any()}, world.substeps, world.iterations,
-            perf_counter() - begun,
+            seconds,
         )  # fmt: skip
         clocks.energy, clocks.known = energy[:, -1].copy(), np.ones(len(self), dtype=bool)
         clocks.first_moved = np.full(len(self), NONE)
@@ -387,12 +424,11 @@ class Worlds:
         where they go on from other ones.
         """
         chosen = self._chosen("Worlds.reset", some)
-        self._runner.memory.check()
-        with whole:
+        with self._open():
             if self._start:
                 self._start.put_back(self, chosen)
             if position is not None:
-                new = self.position.copy()
+                new = self._positions()
                 new[chosen] = self._per_particle("position", position, len(chosen))
                 self._place(new, chosen)
             if velocity is not None:
@@ -427,32 +463,47 @@ class Worlds:
 
     def __getitem__(self, k: int) -> World:
         """The k-th as a World of its own, in its present state: what is done to it shows in no other."""
-        with whole, self._at(range(len(self))[k]) as world:
+        with self._open(), self._at(range(len(self))[k]) as world:
             copies = tuple(f.copy() for f in world.features)
             for f in copies:
                 f.changed = f.new_force = False
             settings = world.settings | {"path": "auto"}
-            new = World._of(world.particles, copies, [f.start for f in world.features], **settings)
+            new = World._of(world.particles, copies, [f.start for f in world.features], None, **settings)
             checkpoint.transfer(world, new)
             return new
 
+    def each(self, ask: Callable[[World], Any]) -> list[Any]:
+        """What a function says of each, in order, such as lambda world: world.features[1].load.
+
+        It is given one World after the other to look at: positions, velocities, features, contacts, in their present state. It
+        must not step or change it, nor keep it; worlds[k] is for that.
+        """
+        out = []
+        with self._open():
+            for k in range(len(self)):
+                with self._at(k) as world:
+                    out.append(ask(world))
+        return out
+
     def hash(self, k: int) -> str:
         """That of the k-th, see World.hash()."""
-        with whole, self._at(range(len(self))[k]) as world:
+        with self._open(), self._at(range(len(self))[k]) as world:
             return world.hash()
 
     @property
     def position(self) -> np.ndarray:
         """Positions [m], (worlds, n, dim), a read-only copy in f64. Assign an array to move particles; velocities are kept."""
+        with self._open():
+            return read_only(self._positions(), assign_whole("Worlds", "position"))
+
+    def _positions(self) -> np.ndarray:
         state, memory = self._runner.scene.state, self._runner.memory
         out = memory.read(state.x).astype(np.float64, copy=False)
-        out = out + memory.read(state.low) if state.sums else out
-        return read_only(out[:, : self._runner.n], assign_whole("Worlds", "position"))
+        return (out + memory.read(state.low) if state.sums else out)[:, : self._runner.n]
 
     @position.setter
     def position(self, value) -> None:
-        self._runner.memory.check()
-        with whole:
+        with self._open():
             self._place(self._per_particle("position", value, len(self)), np.arange(len(self)))
 
     def _place(self, position: np.ndarray, chosen: np.ndarray) -> None:
@@ -472,17 +523,31 @@ class Worlds:
     @property
     def velocity(self) -> np.ndarray:
         """Velocities [m/s], (worlds, n, dim), a read-only copy in f64; of the order of the worlds. Assign to set them."""
-        out = np.zeros((len(self), self._runner.n, self._world.particles.dim))
-        with whole:
-            for k in range(len(self)):
-                with self._at(k) as world:
-                    out[k] = world.velocity
-        return read_only(out, assign_whole("Worlds", "velocity"))
+        with self._open():
+            return read_only(self._velocities(), assign_whole("Worlds", "velocity"))
+
+    def _velocities(self) -> np.ndarray:
+        runner, clocks = self._runner, self._clocks
+        out = runner.memory.read(runner.scene.state.d)[:, : runner.n].astype(np.float64)
+        saved = runner.memory.read(runner.grid.old_saved)[:, 0] if runner.grid else np.zeros(len(self))
+        alone = ~clocks.d_is_velocity & ((saved != 0) | bool(runner.probe))
+        alone[list(clocks.parted)] = True
+        some = np.flatnonzero(~clocks.d_is_velocity & ~alone).astype(np.int32)
+        if len(some):
+            given = np.zeros((len(some), 4))
+            for row, k in zip(given, some, strict=True):
+                runner.clock = clocks.of(int(k))
+                row[:] = runner.clock.h, runner.clock.time, *runner.shares()
+            with runner.memory.compiler():
+                self._kernels.velocities(len(some), some, given, out.reshape(-1))
+        for k in np.flatnonzero(alone):
+            with self._at(k) as world:
+                out[k] = world.velocity
+        return out
 
     @velocity.setter
     def velocity(self, value) -> None:
-        self._runner.memory.check()
-        with whole:
+        with self._open():
             self._start_from(self._per_particle("velocity", value, len(self)), np.arange(len(self)))
 
     def _per_particle(self, name: str, value, count: int) -> np.ndarray:
@@ -591,9 +656,9 @@ class _Source:
 
     def __init__(self, world: World):
         self.particles, self.inv_mass = world.particles, world._runner.scene.inv_mass
-        skips = [{*f.kept_by_world, *knobs_of(type(f)), "dev"} for f in world.features]
         self.features = [
-            {name: v for name, v in vars(f).items() if name not in skip} for f, skip in zip(world.features, skips, strict=True)
+            {name: v for name, v in vars(f).items() if isinstance(v, DATA) and name not in (*f.kept_by_world, *knobs_of(type(f)))}
+            for f in world.features
         ]
         self.starts = [f.start for f in world.features]
 
@@ -659,25 +724,47 @@ def _stacked(values: list[Any]) -> Any:
 
 def _check_structure(worlds: Sequence[World]) -> None:
     """Raise ValueError for a world that kernels of the first do not fit."""
+    rule = "They may differ in numbers only, not in how many particles and constraints there are, in what acts, or on what."
     first = _structure(worlds[0])
     for k, world in enumerate(worlds[1:], 1):
-        for what, ours, theirs in zip(("settings", "features", "fields", "constants"), first, _structure(world), strict=True):
-            if ours != theirs:
-                raise ValueError(
-                    f"Worlds: worlds[{k}] has other {what} than worlds[0]: {theirs!r:.300}, and not {ours!r:.300}. They may differ in "
-                    "numbers only, not in how many particles and constraints there are, or in what acts."
-                )
+        now = _structure(world)
+        for what in ("settings", "features", "fields"):
+            if now[what] != first[what]:
+                ours, theirs = _difference(first[what], now[what])
+                raise ValueError(f"Worlds: worlds[{k}] has {theirs}, where worlds[0] has {ours}. {rule}")
+        if now["indices"] != first["indices"]:
+            raise ValueError(f"Worlds: constraints of worlds[{k}] act on other particles than those of worlds[0]. {rule}")
+        if now["kernels"] != first["kernels"]:
+            raise ValueError(
+                f"Worlds: kernels of worlds[{k}] have other constants than those of worlds[0], as Jacobi(relaxation='auto') "
+                f"finds them for a scene, or functions of yours that know other values. {rule}"
+            )
 
 
-def _structure(world: World) -> tuple:
-    settings = {k: repr(v) for k, v in world.settings.items()}
-    features = [(type(f).__name__, {k: repr(v) for k, v in (vars(f.dev).get("built") or {}).items()}) for f in world.features]
-    fields = [(e.name, e.shape, str(e.kind)) for e in world._runner.memory.entries]
-    if not patched:
-        return settings, features, fields, None
-    from ..device.patches.sharing import Writing  # noqa: PLC0415
+def _difference(ours: list[Any], theirs: list[Any]) -> tuple[str, str]:
+    """The first items that are not the same."""
+    missing = object()
+    for a, b in zip_longest(ours, theirs, fillvalue=missing):
+        if a != b:
+            return tuple("nothing" if v is missing else " ".join(map(str, v)) for v in (a, b))  # type: ignore[return-value]
+    raise AssertionError("they are equal")
 
-    return settings, features, fields, Writing(world._runner.step).key
+
+def _structure(world: World) -> dict[str, Any]:
+    """What all of them must have in common."""
+    built = [(type(f).__name__, *(vars(f.dev).get("built") or {}).items()) for f in world.features]
+    out: dict[str, Any] = {
+        "settings": [(name, "=", repr(value)) for name, value in world.settings.items()],
+        "features": built,
+        "fields": [("a field", e.name, "of shape", e.shape) for e in world._runner.memory.entries],
+        "indices": [f.indices.tobytes() for f in world.features if isinstance(f, Batch)],
+        "kernels": None,
+    }
+    if patched:
+        from ..device.patches.sharing import Writing  # noqa: PLC0415
+
+        out["kernels"] = Writing(world._runner.step).key
+    return out
 
 
 def _frame_count(who: str, seconds: float, dt: float) -> int:

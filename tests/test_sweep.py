@@ -1,0 +1,376 @@
+"""tv.sweep: the same bits wherever and however its parts are done, and workers that die."""
+
+import contextlib
+import functools
+import importlib.util
+import json
+import multiprocessing
+import os
+import pathlib
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
+from typing import Any
+
+import dask.config
+import distributed
+import numpy as np
+import pytest
+
+import tiverlet as tv
+from tests.conftest import python
+from tests.test_docs import ROOT
+from tiverlet.device import runtime
+from tiverlet.worlds import part, workers
+
+G, SECONDS = 9.81, 0.25
+STARTS = {"angle": np.linspace(0.1, 3.0, 7), "length": np.linspace(0.5, 2.0, 7)}
+
+
+def pendulum(angle: float, length: float) -> tv.World:
+    """Two links, so that it is chaotic: any difference in the bits grows."""
+    bend = np.array([np.sin(angle), -np.cos(angle)]) * length
+    x = [[0, 0], bend, [bend[0] + length, bend[1]]]
+    return tv.World(tv.Particles(x, pinned=[0]), [tv.Gravity(G), tv.Distance([(0, 1), (1, 2)])], substeps=4)
+
+
+def ends(worlds) -> dict[str, Any]:
+    """Where and how fast they are in the end; which process has computed it, and on how many threads."""
+    worlds.run(SECONDS)
+    here = {"process": [os.getpid()] * len(worlds), "threads": [runtime.threads()] * len(worlds)}
+    return {"end": worlds.position, "speed": worlds.velocity} | here
+
+
+def same(a: tv.SweepResult, b: tv.SweepResult) -> bool:
+    return all(a[name].tobytes() == b[name].tobytes() and a[name].dtype == b[name].dtype for name in ("end", "speed"))
+
+
+@pytest.fixture(scope="module")
+def here() -> tv.SweepResult:
+    return tv.sweep(pendulum, STARTS, ends)
+
+
+def ball(speed: float, marker: str = "", always: bool = False) -> tv.World:
+    """Thrown upwards. With a marker, the first process that throws one at 2 m/s is killed; always: every one ends."""
+    if marker and speed == 2.0 and always:
+        os._exit(3)
+    if marker and speed == 2.0 and not os.path.exists(marker):
+        pathlib.Path(marker).touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return tv.World(tv.Particles([[0.0, 0.0]], velocity=(0, speed)), [tv.Gravity(G)])
+
+
+def height(worlds) -> dict[str, Any]:
+    """After a while."""
+    worlds.run(0.5)
+    return {"y": worlds.position[:, 0, 1]}
+
+
+SPEEDS = np.arange(6.0)
+HEIGHTS = SPEEDS * 0.5 - G * 0.5**2 / 2  # y = v t - g t^2 / 2
+
+
+@contextlib.contextmanager
+def pool(count: int):
+    with ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn")) as made:
+        yield made
+
+
+def test_figures_are_those_of_each_world_by_itself(here):
+    assert list(here) == ["end", "speed", "process", "threads"] and here["end"].shape == (7, 3, 2) and here.repeated == ()
+    for k in range(7):
+        with pendulum(*(float(v[k]) for v in STARTS.values())) as world:
+            world.run(SECONDS)
+            assert here["end"][k].tobytes() == world.position.tobytes()
+            assert here["speed"][k].tobytes() == world.velocity.tobytes()
+    assert repr(here).startswith("SweepResult(end: (7, 3, 2) float64, speed:")
+
+
+@pytest.mark.parametrize("at_once", [1, 3, 7])
+def test_parts_of_any_size_have_the_same_bits(here, at_once):
+    rows = [dict(zip(STARTS, row, strict=True)) for row in zip(*STARTS.values(), strict=True)]
+    assert same(here, tv.sweep(pendulum, rows, ends, at_once=at_once, progress=True))
+
+
+def test_processes_have_the_same_bits_and_share_the_cores(here, monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")  # for workers of executors; processes of its own know how many there are
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    found = tv.sweep(pendulum, STARTS, ends, executor=2)  # in 4 + 3, so that both have something to do
+    assert same(here, found) and len(set(found["process"]) - {os.getpid()}) == 2
+    assert set(found["threads"]) == {max(1, cores // 2)}
+    with pool(1) as executor:
+        found = tv.sweep(pendulum, STARTS, ends, executor, at_once=2)
+    assert same(here, found) and set(found["threads"]) == {3}
+
+
+class Backwards:
+    """An executor that does the last part first, and whose futures know only result()."""
+
+    def __init__(self):
+        self.calls = []
+
+    def submit(self, function, *args):
+        self.calls.append((function, args))
+        return Later(self, len(self.calls) - 1)
+
+
+class Later:
+    def __init__(self, executor, number):
+        self.executor, self.number = executor, number
+
+    @functools.cached_property
+    def outcome(self):
+        function, args = self.executor.calls[self.number]
+        return function(*args)
+
+    def result(self):
+        for later in range(len(self.executor.calls) - 1, self.number, -1):
+            function, args = self.executor.calls[later]
+            function(*args)
+        return self.outcome
+
+
+def test_the_order_of_parts_does_not_matter(here):
+    assert same(here, tv.sweep(pendulum, STARTS, ends, Backwards(), at_once=2))
+
+
+def test_dask_has_the_same_bits_and_survives_a_worker_that_dies(here, tmp_path):
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
+        # Threads of one worker would start Taichi in any of them.
+        distributed.LocalCluster(n_workers=1, threads_per_worker=2, processes=True, dashboard_address=None) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        found = tv.sweep(pendulum, STARTS, ends, client, at_once=2)
+        assert same(here, found) and os.getpid() not in found["process"]
+        assert same(here, tv.sweep(lambda **row: pendulum(**row), STARTS, lambda w: ends(w), client.get_executor(), at_once=4))
+        make = functools.partial(ball, marker=str(tmp_path / "died"))
+        with pytest.warns(RuntimeWarning, match=r"KilledWorker"):
+            found = tv.sweep(make, {"speed": SPEEDS}, height, client, at_once=3)
+    np.testing.assert_allclose(found["y"], HEIGHTS, atol=1e-6)
+    assert range(0, 3) in [r.numbers for r in found.repeated] and {r.by for r in found.repeated} == {"the executor"}
+
+
+def test_what_a_process_did_when_it_died_is_named_and_done_again(tmp_path):
+    make = functools.partial(ball, marker=str(tmp_path / "died"))
+    told = r"parameters 0 to 2, make\(speed=0.0\) to make\(speed=2.0\) is done again: worker process \d+ was ended by SIGKILL"
+    with pytest.warns(RuntimeWarning, match=rf"{told}.* in make\(speed=2.0\), number 2"):
+        found = tv.sweep(make, {"speed": SPEEDS}, height, executor=2)
+    np.testing.assert_allclose(found["y"], HEIGHTS, atol=1e-6)
+    (again,) = found.repeated
+    assert again.numbers == range(0, 3) and again.parameters[2] == {"speed": 2.0} and again.by == "another process"
+    assert "SIGKILL" in str(again) and "done again: 1 part" in repr(found)
+
+
+def test_what_a_pool_loses_is_done_by_other_processes(tmp_path):
+    make = functools.partial(ball, marker=str(tmp_path / "died"))
+    with pool(2) as executor, pytest.warns(RuntimeWarning, match="BrokenProcessPool"):
+        found = tv.sweep(make, {"speed": SPEEDS}, height, executor, at_once=1)
+    np.testing.assert_allclose(found["y"], HEIGHTS, atol=1e-6)
+    # What the pool was at when it broke: the part that ended it, and at most one more.
+    assert range(2, 3) in [r.numbers for r in found.repeated] and len(found.repeated) <= 2
+    assert {r.by for r in found.repeated} == {"another process"}
+    with pool(1) as executor:
+        executor.shutdown()
+        with pytest.raises(RuntimeError, match="after shutdown"):  # one that never worked is not replaced
+            tv.sweep(ball, {"speed": SPEEDS}, height, executor)
+
+
+def test_parameters_that_end_every_worker_are_named():
+    make = functools.partial(ball, marker="any", always=True)
+    told = r"parameters 2, make\(speed=2.0\) could not be done, because its worker died 3 times: .*exit code 3"
+    with pytest.warns(RuntimeWarning), pytest.raises(RuntimeError, match=told):
+        tv.sweep(make, {"speed": SPEEDS}, height, executor=1, at_once=1)
+
+
+class Unsendable(Exception):
+    """Comes out of no pickle."""
+
+    def __init__(self, a, b):
+        super().__init__(f"{a} and {b}")
+
+
+def wrong(speed: float, how: str = "") -> Any:
+    """What make() may do wrong."""
+    if how == "raise":
+        raise ArithmeticError("no")
+    if how == "unsendable":
+        raise Unsendable("one", "other")
+    return how if how else ball(speed)
+
+
+def wrong_figures(worlds) -> dict[str, Any]:
+    raise LookupError("nothing there")
+
+
+def raised(kind, *args) -> tuple[str, str]:
+    """What an exception of a sweep says, and its notes."""
+    with pytest.raises(kind) as caught:
+        tv.sweep(*args)
+    return str(caught.value), "".join(caught.value.__notes__)
+
+
+def test_what_functions_raise_comes_with_the_parameters():
+    text, note = raised(ArithmeticError, wrong, [{"speed": 1.0}, {"speed": 2.5, "how": "raise"}], height)
+    assert text == "no" and note == "sweep: raised by parameters 1, make(speed=2.5, how='raise')"
+    text, note = raised(LookupError, ball, {"speed": SPEEDS}, wrong_figures)
+    assert "nothing there" in text and "parameters 0 to 5, make(speed=0.0) to make(speed=5.0)" in note
+    text, note = raised(TypeError, wrong, [{"speed": 1.0, "how": "a word"}], height)
+    assert "make returned 'a word', a str, but a tv.World is needed" in text and "parameters 0" in note
+    with ball(1.0) as one:
+        text, note = raised(ValueError, lambda speed: one, {"speed": SPEEDS}, height)
+    assert "the same World again" in text and "parameters 1" in note
+
+
+def test_what_functions_raise_comes_out_of_processes():
+    rows = [{"speed": 1.0}, {"speed": 2.5, "how": "unsendable"}]
+    text, note = raised(RuntimeError, wrong, rows, height, 1)
+    assert text == "Unsendable: one and other" and "parameters 1, make(speed=2.5, how='unsendable')" in note
+    assert 'raise Unsendable("one", "other")' in note  # the line of the worker's traceback
+
+
+@pytest.mark.parametrize(
+    "found, words",
+    [
+        (lambda w: [0.0] * 6, r"figures returned a list, but a dict of arrays is needed"),
+        (lambda w: {"y": 1.0}, r"'y' with shape \(\), but there are 6 worlds here"),
+        (lambda w: {"y": np.zeros((2, 6))}, r"'y' with shape \(2, 6\), but there are 6 worlds"),
+        (lambda w: {"y": [[0.0]] * 5 + [[0.0, 1.0]]}, "'y' with rows of different lengths"),
+        (lambda w: {"y": [None] * 6}, "'y' with Python objects in it"),
+    ],
+)
+def test_figures_must_be_arrays_with_a_row_for_each_world(found, words):
+    with pytest.raises((TypeError, ValueError), match=words):
+        tv.sweep(ball, {"speed": SPEEDS}, found)
+
+
+def test_figures_must_be_the_same_in_all_parts():
+    lengths = iter((1, 2))
+    with pytest.raises(
+        ValueError, match=r"'y' with rows of shape \(2,\) for parameters 3 to 5.* but of shape \(1,\) for parameters 0"
+    ):
+        tv.sweep(ball, {"speed": SPEEDS}, lambda w: {"y": np.zeros((len(w), next(lengths)))}, at_once=3)
+    names = iter("ab")
+    with pytest.raises(ValueError, match=r"figures returned \['b'\] for parameters 3 to 5.*, but \['a'\] for"):
+        tv.sweep(ball, {"speed": SPEEDS}, lambda w: {next(names): np.zeros(len(w))}, at_once=3)
+
+
+SOME = {"speed": SPEEDS}
+
+
+@pytest.mark.parametrize(
+    "kind, words, arguments",
+    [
+        (TypeError, "make = 3 is a int, but a function is needed", (3, SOME, height)),
+        (TypeError, "figures = None is a NoneType, but a function is needed", (ball, SOME, None)),
+        (ValueError, "parameters are empty", (ball, {"speed": []}, height)),
+        (ValueError, "parameters are empty", (ball, [], height)),
+        (TypeError, "parameters = 3 is a int, but a dict of arrays or a list of dicts is needed", (ball, 3, height)),
+        (TypeError, r"parameters\[1\] = 3 is a int, but a dict such as", (ball, [{"speed": 1.0}, 3], height)),
+        (TypeError, r"\['speed'\] = 2.0 is a float, but a list .* write it into make", (ball, {"speed": 2.0}, height)),
+        (TypeError, r"parameters\['speed'\] = 'abc' is a str", (ball, {"speed": "abc"}, height)),
+        (TypeError, r"parameters has the key 1, a int, but names", (ball, {1: SPEEDS}, height)),
+        (ValueError, "equally long, but angle has 2, length has 3", (pendulum, {"angle": [1, 2], "length": [1, 2, 3]}, height)),
+        (TypeError, r"does not take parameters 0, make\(sped=0.0\): missing .*'speed'", (ball, {"sped": SPEEDS}, height)),
+        (TypeError, r"does not take parameters 1, make\(\)", (ball, [{"speed": 1.0}, {}], height)),
+        (ValueError, "at_once = 0, but it must be at least 1", (ball, SOME, height, None, 0)),
+        (TypeError, "progress = 1 is a int", (ball, SOME, height, None, 1, 1)),
+        (ValueError, "executor = 0, but it must be at least 1", (ball, SOME, height, 0)),
+        (TypeError, "executor = True is a bool", (ball, SOME, height, True)),
+        (TypeError, "'dask' is a str, but None, a number of processes or an object with submit", (ball, SOME, height, "dask")),
+        (TypeError, "is a class, not an object, but None", (ball, SOME, height, ProcessPoolExecutor)),
+        (TypeError, "threads of one process share one Taichi", (ball, SOME, height, ThreadPoolExecutor(1))),
+        (TypeError, "must be sent to other processes, but .*no lambda", (lambda speed: ball(speed), SOME, height, 2)),
+    ],
+)  # fmt: skip
+def test_arguments_are_checked_first(kind, words, arguments):
+    with pytest.raises(kind, match=words):
+        tv.sweep(*arguments)
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="needs fork")
+def test_pools_that_fork_are_refused():
+    with (
+        ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("fork")) as executor,
+        pytest.raises(
+            ValueError, match=r'hangs after a fork. Type executor=4 .* mp_context=multiprocessing.get_context\("spawn"\)'
+        ),
+    ):
+        tv.sweep(ball, SOME, height, executor)
+
+
+def test_workers_with_another_version_are_refused():
+    job = part.Job(ball, height, {}, "tiverlet 0.0.1 on Taichi 1.0")
+    outcome = part.compute_in_worker(workers.sent(job), part.Part(0, [{"speed": 1.0}]), 0)
+    assert isinstance(outcome, RuntimeError) and "but the sweep was started with tiverlet 0.0.1 on Taichi 1.0" in str(outcome)
+
+
+SCRIPT = """
+import json, sys
+import numpy as np
+import tiverlet as tv
+sys.path.insert(0, {root!r})
+from tests.test_sweep import STARTS, ends, pendulum
+
+if __name__ == "__main__":
+    from mpi4py.futures import MPIPoolExecutor
+    with MPIPoolExecutor() as executor:
+        found = tv.sweep(pendulum, STARTS, ends, executor, at_once=2)
+    print(json.dumps([found["end"].tobytes().hex(), sorted(set(found["process"].tolist()))]))
+"""
+
+
+@pytest.mark.skipif(not (importlib.util.find_spec("mpi4py") and shutil.which("mpiexec")), reason="needs mpi4py and mpiexec")
+def test_mpi_has_the_same_bits(here, tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT.format(root=str(ROOT)))
+    command = ["mpiexec", "-n", "3", sys.executable, "-m", "mpi4py.futures", str(script)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    end, processes = json.loads(done.stdout)
+    assert end == here["end"].tobytes().hex() and len(processes) == 2
+
+
+def test_the_page_runs_as_a_script():
+    # Its processes import it. test_docs.py runs what is above `if __name__`.
+    _, section = (ROOT / "tiverlet/worlds/README.md").read_text().split("## A sweep over machines")
+    code = re.findall(r"^```python\n(.*?)^```$", section.partition("\n## ")[0], re.S | re.M)
+    done = python("\n\n".join(code), fresh=True)
+    assert "SweepResult(" in done.stdout and done.stdout.rstrip().endswith("True")
+
+
+def test_a_prompt_is_told_where_to_write_its_functions():
+    # Processes import __main__ by its file; at a prompt there is none.
+    code = (
+        "import tiverlet as tv\ndef make(k):\n    pass\ndef figures(worlds):\n    pass\n"
+        "try:\n    tv.sweep(make, {'k': [1]}, figures, executor=1)\nexcept AttributeError as e:\n    print(e.__notes__)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert "Write them at the top of a file" in done.stdout, done.stderr
+
+
+def test_futures_that_are_cancelled_are_done_by_others():
+    # As when a cluster goes away: its futures are cancelled, and then it takes no more.
+    class Gone:
+        def __init__(self):
+            self.calls = 0
+
+        def submit(self, *args):
+            self.calls += 1
+            if self.calls > 2:
+                raise RuntimeError("gone")
+            future: Future = Future()
+            future.cancel()
+            future.set_running_or_notify_cancel()
+            return future
+
+    def make(speed):  # cannot be sent to processes, so that this one does it
+        return ball(speed)
+
+    with pytest.warns(RuntimeWarning, match="is done again: CancelledError"):
+        found = tv.sweep(make, {"speed": SPEEDS}, height, Gone(), at_once=3)
+    np.testing.assert_allclose(found["y"], HEIGHTS, atol=1e-6)
+    assert [r.by for r in found.repeated] == ["this process"] * 2

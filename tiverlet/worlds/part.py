@@ -1,0 +1,217 @@
+"""What is done with one part of a sweep, in this process or in a worker: make its worlds, and take figures of them."""
+
+import contextlib
+import functools
+import os
+import pickle
+import threading
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..device import runtime, ti
+from ..world import World
+
+Outcome = dict[str, np.ndarray] | Exception  # figures by name, or what the user's functions raised
+
+
+@dataclass(frozen=True)
+class Part:
+    """Consecutive parameters, whose worlds are stepped together. first: the number of the first."""
+
+    first: int
+    rows: list[dict[str, Any]]
+
+    @property
+    def numbers(self) -> range:
+        """Of its parameters, in the sweep."""
+        return range(self.first, self.first + len(self.rows))
+
+    def __str__(self) -> str:
+        if len(self.rows) == 1:
+            return named(self.first, self.rows[0])
+        return f"parameters {self.first} to {self.numbers[-1]}, {call(self.rows[0])} to {call(self.rows[-1])}"
+
+
+@dataclass(frozen=True)
+class Lost:
+    """What becomes of a part whose worker died. why: what is known about it."""
+
+    why: str
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is done with each part: functions and plain data, which can be sent to another process.
+
+    settings: of tv.init in the process that asks. built: what decides on the bits, and must be the same everywhere.
+    """
+
+    make: Callable[..., World]
+    figures: Callable[[Any], Mapping[str, Any]]
+    settings: dict[str, Any]
+    built: str
+
+
+def call(row: dict[str, Any]) -> str:
+    """The call of make() with these parameters, as one line."""
+    return f"make({', '.join(f'{name}={_short(value)}' for name, value in row.items())})"
+
+
+def named(number: int, row: dict[str, Any]) -> str:
+    """One set of parameters: its number and its call."""
+    return f"parameters {number}, {call(row)}"
+
+
+def compute(job: Job, part: Part, tell: Callable[[int], None] = lambda number: None) -> Outcome:
+    """The figures of a part; or the exception of the user's functions, with a note that names the parameters.
+
+    The exception is returned, so that one that is raised in a worker means that the worker itself failed. tell: is called with
+    the number of each world before it is made, and with -1 when all are.
+    """
+    try:
+        return _figures(job, part, tell)
+    except Exception as error:
+        return error
+
+
+def compute_in_worker(job: Job | bytes, part: Part, attempt: int, tell: Callable[[int], None] = lambda number: None) -> Outcome:
+    """The same in a process of an executor. attempt: makes the call another one, where results are kept by arguments.
+
+    Taichi belongs to the thread that started it. Executors whose workers have several threads would start it in any of them, so
+    one thread does all parts there.
+    """
+    if threading.current_thread() is threading.main_thread():
+        return _prepared(job, part, tell)
+    return _thread().submit(_prepared, job, part, tell).result()
+
+
+def _prepared(job: Job | bytes, part: Part, tell: Callable[[int], None]) -> Outcome:
+    try:
+        job = _loaded(job) if isinstance(job, bytes) else job
+        if job.built != built():
+            raise RuntimeError(
+                f"sweep: a worker has {built()}, but the sweep was started with {job.built}, so the bits could differ. "
+                "Install the same versions on all machines."
+            )
+        if ti.cfg is None:
+            runtime.share = runtime.share or _cores_of_worker()
+            if job.settings:
+                runtime.init(**job.settings)
+    except Exception as error:
+        return _sendable(error)
+    outcome = compute(job, part, tell)
+    return _sendable(outcome) if isinstance(outcome, Exception) else outcome
+
+
+def _figures(job: Job, part: Part, tell: Callable[[int], None]) -> dict[str, np.ndarray]:
+    from .worlds import Worlds
+
+    with contextlib.ExitStack() as stack:
+        made: dict[int, World] = {}
+        for number, row in zip(part.numbers, part.rows, strict=True):
+            tell(number)
+            with _noted(f"sweep: raised by {named(number, row)}"):
+                world = job.make(**row)
+                if not isinstance(world, World):
+                    raise TypeError(f"sweep: make returned {world!r}, a {type(world).__name__}, but a tv.World is needed.")
+                if id(world) in made:
+                    raise ValueError("sweep: make returned the same World again. Make a new one for each call.")
+            made[id(world)] = stack.enter_context(world)
+        tell(-1)
+        with _noted(f"sweep: raised by the worlds of {part}"):
+            worlds = Worlds(list(made.values()))
+            stack.callback(worlds.close)
+            return _checked(job.figures(worlds), len(part.rows))
+
+
+def _checked(found: Any, count: int) -> dict[str, np.ndarray]:
+    """Figures as arrays of their own, with one row for each world."""
+    if not isinstance(found, Mapping):
+        kind = type(found).__name__
+        raise TypeError(f'sweep: figures returned a {kind}, but a dict of arrays is needed, such as {{"end": worlds.position}}.')
+    out = {}
+    for name, value in found.items():
+        try:
+            array = np.array(value)
+        except ValueError:
+            raise ValueError(
+                f"sweep: figures returned {name!r} with rows of different lengths, but they must be equal."
+            ) from None
+        if array.dtype.hasobject:
+            raise TypeError(f"sweep: figures returned {name!r} with Python objects in it, but numbers or strings are needed.")
+        if not array.ndim or len(array) != count:
+            raise ValueError(
+                f"sweep: figures returned {name!r} with shape {array.shape}, but there are {count} worlds here and it must have "
+                "one row for each."
+            )
+        out[name] = array
+    return out
+
+
+@contextlib.contextmanager
+def _noted(note: str) -> Iterator[None]:
+    try:
+        yield
+    except Exception as error:
+        error.add_note(note)
+        raise
+
+
+def _sendable(error: Exception) -> Exception:
+    """An exception that comes out of a pickle as it was; else one that says the same. Where it was raised goes into a note."""
+    error.add_note("".join(["In the worker:\n", *traceback.format_tb(error.__traceback__)]).rstrip())
+    with contextlib.suppress(Exception):  # what it takes to make it again may be anything
+        if type(pickle.loads(pickle.dumps(error))) is type(error):
+            return error
+    new = RuntimeError(f"{type(error).__name__}: {error}")
+    for note in getattr(error, "__notes__", ()):
+        new.add_note(note)
+    return new
+
+
+def settings() -> dict[str, Any]:
+    """What tv.init was asked for in this process, without the threads, of which each worker has a share."""
+    if ti.cfg is None:
+        return {}
+    return {k: v for k, v in runtime.wanted().items() if k != "threads"} | {"arch": runtime.architecture()}
+
+
+def built() -> str:
+    """What decides on the bits: versions of tiverlet and of the compiler."""
+    from .. import __version__
+
+    return f"tiverlet {__version__} on {runtime.compiler()}"
+
+
+def _cores_of_worker() -> int:
+    """Threads of a worker of somebody else's: what it was told by the variable that all such tools set, else one."""
+    told = os.environ.get("OMP_NUM_THREADS", "")
+    return max(1, int(told)) if told.isdecimal() else 1
+
+
+def _short(value: Any) -> str:
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+@functools.lru_cache(1)
+def _loaded(job: bytes) -> Job:
+    try:
+        return pickle.loads(job)
+    except Exception as error:
+        error.add_note(
+            "sweep: a worker process could not import make or figures. Write them at the top of a file; processes do not see "
+            "what is defined in a notebook or a prompt."
+        )
+        raise
+
+
+@functools.cache
+def _thread() -> Any:
+    from concurrent.futures import ThreadPoolExecutor  # noqa: PLC0415
+
+    return ThreadPoolExecutor(1, "sweep")

@@ -1,0 +1,215 @@
+"""One scene with many parameters: worlds are made, stepped together and measured, here, in processes or on a cluster."""
+
+import inspect
+import warnings
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .. import checks
+from ..world import World
+from .part import Job, Lost, Part, built, named, settings
+
+if TYPE_CHECKING:
+    from .workers import Workers
+
+TRIES = 3  # how often a part is done whose worker dies
+
+
+@dataclass(frozen=True)
+class Repeated:
+    """A part that was done again, because its worker died.
+
+    numbers: of its parameters. parameters: their values. why: what is known of each death. by: who did it in the end.
+    """
+
+    numbers: range
+    parameters: list[dict[str, Any]]
+    why: tuple[str, ...]
+    by: str
+
+    def __str__(self) -> str:
+        return f"{Part(self.numbers.start, self.parameters)}: {'; '.join(self.why)}; done by {self.by}"
+
+
+class SweepResult(dict[str, np.ndarray]):
+    """Figures by name, as arrays with a leading axis of parameters, in their order.
+
+    repeated: what was done again, because a worker died; empty where none did. It has no influence on the figures.
+    """
+
+    def __init__(self, figures: Mapping[str, np.ndarray], repeated: Iterable[Repeated] = ()):
+        super().__init__(figures)
+        self.repeated = tuple(repeated)
+
+    def __repr__(self) -> str:
+        figures = ", ".join(f"{name}: {value.shape} {value.dtype}" for name, value in self.items())
+        again = f"; done again: {len(self.repeated)} parts" if self.repeated else ""
+        return f"SweepResult({figures}{again})"
+
+
+def sweep(
+    make: Callable[..., World], parameters: Mapping[str, Any] | Iterable[Mapping[str, Any]],
+    figures: Callable[[Any], Mapping[str, Any]], executor: Any = None, at_once: int = 256, progress: bool = False,
+) -> SweepResult:  # fmt: skip
+    """Figures of one scene for many parameters, here, in processes or on a cluster.
+
+    make: called as make(**row) for each set of parameters; returns a new World, all of the same structure. parameters: a dict of
+    equally long arrays or lists, or a list of dicts. figures: called with a Worlds of up to `at_once` worlds; steps them and
+    returns a dict of arrays with one row for each. Where it looks at each world by itself, the bits do not depend on executor,
+    on at_once, or on the order in which parts are done.
+
+    executor: None for this process; a number of processes, with a share of the cores each; or anything with submit(), as in
+    concurrent.futures: ProcessPoolExecutor (with "spawn"), Dask's Client, mpi4py's MPIPoolExecutor. A worker of those has as many
+    threads as OMP_NUM_THREADS says, else one. Processes import make and figures, which are to stand at the top of a file.
+    progress: show a bar.
+
+    A part whose worker dies is done again, at most three times in all, and is named in a warning and in .repeated; where an
+    executor takes no more parts, processes of our own do the rest. Raises RuntimeError, with the parameters, if that does not
+    help; ValueError or TypeError for arguments; and at once what make and figures raise, with a note of the parameters.
+    """
+    from rich.progress import Progress  # noqa: PLC0415
+
+    from .workers import chosen  # noqa: PLC0415
+
+    rows = _rows(make, parameters, figures)
+    at_once = checks.integer("sweep", "at_once", at_once, least=1)
+    progress = checks.flag("sweep", "progress", progress)
+    job = Job(make, figures, settings(), built())
+    workers, least = chosen(executor, job)
+    size = _ceil(len(rows), least * _ceil(len(rows), least * at_once))  # as many parts for each process
+    parts = [Part(first, rows[first : first + size]) for first in range(0, len(rows), size)]
+    found: dict[int, dict[str, np.ndarray]] = {}
+    repeated = []
+    with Progress(disable=not progress) as bar:
+        shown = bar.add_task("sweep", total=len(rows))
+        try:
+            for part, made, again in _done(parts, workers):
+                found[part.first] = made
+                repeated += [again] if again else []
+                bar.update(shown, advance=len(part.rows))
+        finally:
+            workers.close()
+    repeated.sort(key=lambda r: r.numbers.start)
+    return SweepResult(_joined(parts, found), repeated)
+
+
+def _done(parts: list[Part], workers: "Workers") -> Iterable[tuple[Part, dict[str, np.ndarray], Repeated | None]]:
+    """Each part with its figures, as they are done."""
+    todo, deaths, why = deque(parts), Counter(), {}
+    while todo or workers.busy:
+        while todo and workers.free:
+            workers.begin(todo.popleft())
+        for part, outcome in workers.finished():
+            if isinstance(outcome, Exception):
+                raise outcome
+            if not isinstance(outcome, Lost):
+                causes = why.get(part.first)
+                by = workers.name
+                yield part, outcome, Repeated(part.numbers, part.rows, tuple(causes), by) if causes else None
+                continue
+            deaths[part.first] += 1
+            why.setdefault(part.first, []).append(outcome.why)
+            if deaths[part.first] == TRIES:
+                raise RuntimeError(
+                    f"sweep: {part} could not be done, because its worker died {TRIES} times: {outcome.why}. Try these "
+                    "parameters with executor=1 and at_once=1 to see which of them it is; where memory is short, take a smaller "
+                    "at_once or fewer workers."
+                )
+            warnings.warn(f"sweep: {part} is done again: {outcome.why}.", RuntimeWarning, stacklevel=3)
+            todo.appendleft(part)
+
+
+def _ceil(a: int, b: int) -> int:
+    return -(-a // b)
+
+
+def _joined(parts: list[Part], found: dict[int, dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """The figures of all parts, in the order of the parameters."""
+    first = found[0]
+    for part in parts:
+        made = found[part.first]
+        if made.keys() != first.keys():
+            raise ValueError(f"sweep: figures returned {list(made)} for {part}, but {list(first)} for {parts[0]}.")
+        for name, value in made.items():
+            if value.shape[1:] != first[name].shape[1:]:
+                raise ValueError(
+                    f"sweep: figures returned {name!r} with rows of shape {value.shape[1:]} for {part}, but of shape "
+                    f"{first[name].shape[1:]} for {parts[0]}."
+                )
+    return {name: np.concatenate([found[part.first][name] for part in parts]) for name in first}
+
+
+def _rows(make: Any, parameters: Any, figures: Any) -> list[dict[str, Any]]:
+    """Each set of parameters, after a look at all arguments that are functions or parameters."""
+    for name, function in (("make", make), ("figures", figures)):
+        if not callable(function):
+            raise TypeError(f"sweep: {name} = {function!r} is a {type(function).__name__}, but a function is needed.")
+    rows = _columns(parameters) if isinstance(parameters, Mapping) else _dicts(parameters)
+    if not rows:
+        raise ValueError("sweep: parameters are empty, so there is nothing to do. Give at least one set.")
+    try:
+        signature = inspect.signature(make)
+    except ValueError:  # of a builtin
+        return rows
+    seen = set()
+    for k, row in enumerate(rows):
+        if (names := frozenset(row)) in seen:
+            continue
+        seen.add(names)
+        try:
+            signature.bind(**row)
+        except TypeError as why:
+            raise TypeError(f"sweep: make{signature} does not take {named(k, row)}: {why}.") from None
+    return rows
+
+
+def _columns(parameters: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Rows of a dict of columns."""
+    columns = {name: _column(name, values) for name, values in _names(parameters, "parameters").items()}
+    lengths = {name: len(values) for name, values in columns.items()}
+    if len(set(lengths.values())) > 1:
+        told = ", ".join(f"{name} has {length}" for name, length in lengths.items())
+        raise ValueError(
+            f"sweep: parameters must be equally long, but {told}. For all combinations of two, take np.meshgrid and ravel() both."
+        )
+    return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
+
+
+def _column(name: str, values: Any) -> list:
+    """A parameter's values, as Python's own numbers where they are numbers."""
+    if isinstance(values, Mapping) or not (isinstance(values, np.ndarray) or isinstance(values, Iterable)):
+        raise TypeError(
+            f"sweep: parameters[{name!r}] = {values!r} is a {type(values).__name__}, but a list or an array with one value for "
+            "each world is needed. For one that all share, write it into make."
+        )
+    return [_plain(v) for v in checks.rows("sweep", f"parameters[{name!r}]", values, "a list or an array")]
+
+
+def _dicts(parameters: Any) -> list[dict[str, Any]]:
+    """Rows of a list of dicts."""
+    rows = checks.rows("sweep", "parameters", parameters, "a dict of arrays or a list of dicts")
+    for k, row in enumerate(rows):
+        if not isinstance(row, Mapping):
+            kind = type(row).__name__
+            raise TypeError(
+                f'sweep: parameters[{k}] = {row!r} is a {kind}, but a dict such as {{"length": 1.0}} is needed, or a dict of '
+                "arrays for all."
+            )
+    return [{name: _plain(v) for name, v in _names(row, f"parameters[{k}]").items()} for k, row in enumerate(rows)]
+
+
+def _names(row: Mapping[Any, Any], where: str) -> Mapping[str, Any]:
+    for name in row:
+        if not isinstance(name, str):
+            kind = type(name).__name__
+            raise TypeError(f"sweep: {where} has the key {name!r}, a {kind}, but names of make's arguments are needed.")
+    return row
+
+
+def _plain(value: Any) -> Any:
+    """Python's own number instead of NumPy's, with the same value: figures do not depend on which of them was given."""
+    return value.item() if isinstance(value, np.generic) else value
