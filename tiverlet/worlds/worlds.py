@@ -141,8 +141,12 @@ class Worlds:
     def _rest(self) -> None:
         """No world is chosen."""
         self._runner.memory.choose(None)
+        self._show_knobs(None)
+
+    def _show_knobs(self, k: int | None) -> None:
+        """Features have the knobs of the k-th; None: of all, as they are to be seen."""
         for (i, name), values in self._given.items():
-            self._world.features[i].__dict__[name] = values
+            self._world.features[i].__dict__[name] = values if k is None else values[k]
 
     @contextlib.contextmanager
     def _at(self, k: Any) -> Iterator[World]:
@@ -154,8 +158,7 @@ class Worlds:
         runner.scene.h2_effective = clock.h**2 * runner.integrator.h2_factor * share
         if self._sources:
             self._sources[k].put_on(world)
-        for (i, name), values in self._given.items():
-            world.features[i].__dict__[name] = values[k]
+        self._show_knobs(k)
         try:
             yield world
         finally:
@@ -334,7 +337,11 @@ class Worlds:
         while len(some):
             plan[kernel.COUNT], plan[kernel.GRAIN] = len(some), self._kernels.grain(len(some))
             which[: len(some)] = some
-            CachedLaunch(self._kernels, "run", memory.compiler, plan, which, figures.reshape(-1), track)()
+            self._show_knobs(0)  # kernels are compiled for whether there is friction, which is the same in all
+            try:
+                CachedLaunch(self._kernels, "run", memory.compiler, plan, which, figures.reshape(-1), track)()
+            finally:
+                self._show_knobs(None)
             if not runner.step.grids:
                 return
             sheets = memory.read(self._kernels.sheet)
