@@ -461,7 +461,7 @@ class Worlds:
                     f"{who}: some has shape {some.shape}, but a mask of {len(self)} worlds has shape ({len(self)},)."
                 )
             return np.flatnonzero(some)
-        return checks.indices(who, "some", np.atleast_1d(some), len(self))
+        return checks.indices(who, "some", np.atleast_1d(some), len(self), things="worlds")
 
     # State.
 
@@ -479,15 +479,16 @@ class Worlds:
             checkpoint.transfer(world, new)
             return new
 
-    def each(self, ask: Callable[[World], Any]) -> list[Any]:
+    def each(self, ask: Callable[[World], Any], some: Any = None) -> list[Any]:
         """What a function says of each, in order, such as lambda world: world.features[1].load.
 
         It is given one World after the other to look at: positions, velocities, features, contacts, in their present state. It
-        must not step or change it, nor keep it; worlds[k] is for that.
+        must not step or change it, nor keep it; worlds[k] is for that. some: indices or a Boolean mask of those that are asked;
+        all by default.
         """
         out = []
         with self._open():
-            for k in range(len(self)):
+            for k in self._chosen("Worlds.each", some):
                 with self._at(k) as world:
                     out.append(ask(world))
         return out
