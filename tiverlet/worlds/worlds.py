@@ -144,8 +144,12 @@ class Worlds:
     def _rest(self) -> None:
         """No world is chosen."""
         self._runner.memory.choose(None)
+        self._show_knobs(None)
+
+    def _show_knobs(self, k: int | None) -> None:
+        """Features have the knobs of the k-th; None: of all, as they are to be seen."""
         for (i, name), values in self._given.items():
-            self._world.features[i].__dict__[name] = values
+            self._world.features[i].__dict__[name] = values if k is None else values[k]
 
     @contextlib.contextmanager
     def _at(self, k: Any) -> Iterator[World]:
@@ -157,8 +161,7 @@ class Worlds:
         runner.scene.h2_effective = clock.h**2 * runner.integrator.h2_factor * share
         if self._sources:
             self._sources[k].put_on(world)
-        for (i, name), values in self._given.items():
-            world.features[i].__dict__[name] = values[k]
+        self._show_knobs(k)
         try:
             yield world
         finally:
@@ -358,7 +361,11 @@ class Worlds:
         while len(some):
             plan[kernel.COUNT], plan[kernel.GRAIN] = len(some), self._kernels.grain(len(some))
             which[: len(some)] = some
-            CachedLaunch(self._kernels, "run", memory.compiler, plan, which, figures.reshape(-1), track)()
+            self._show_knobs(0)  # kernels are compiled for whether there is friction, which is the same in all
+            try:
+                CachedLaunch(self._kernels, "run", memory.compiler, plan, which, figures.reshape(-1), track)()
+            finally:
+                self._show_knobs(None)
             if not runner.step.grids:
                 return
             sheets = memory.read(self._kernels.sheet)
@@ -482,7 +489,7 @@ class Worlds:
                     f"{who}: some has shape {some.shape}, but a mask of {len(self)} worlds has shape ({len(self)},)."
                 )
             return np.flatnonzero(some)
-        return checks.indices(who, "some", np.atleast_1d(some), len(self))
+        return checks.indices(who, "some", np.atleast_1d(some), len(self), things="worlds")
 
     # State.
 
@@ -500,15 +507,16 @@ class Worlds:
             checkpoint.transfer(world, new)
             return new
 
-    def each(self, ask: Callable[[World], Any]) -> list[Any]:
+    def each(self, ask: Callable[[World], Any], some: Any = None) -> list[Any]:
         """What a function says of each, in order, such as lambda world: world.features[1].load.
 
         It is given one World after the other to look at: positions, velocities, features, contacts, in their present state. It
-        must not step or change it, nor keep it; worlds[k] is for that.
+        must not step or change it, nor keep it; worlds[k] is for that. some: indices or a Boolean mask of those that are asked;
+        all by default.
         """
         out = []
         with self._open():
-            for k in range(len(self)):
+            for k in self._chosen("Worlds.each", some):
                 with self._at(k) as world:
                     out.append(ask(world))
         return out
