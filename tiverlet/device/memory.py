@@ -28,20 +28,21 @@ GROUP = 16  # fields that one transfer kernel serves; Taichi unrolls the loop ov
 class Memory:
     """The fields of one world: declared first, then placed together, freed together.
 
-    `real` is ti.f32 or ti.f64; few: whether the world has few particles, long: whether its kernels are, see Compiler. copies:
-    where there are many of the world; what is written, read, kept and put back is then that of the chosen one, or of all. Every
-    method that touches the fields checks first that they still exist.
+    `real` is ti.f32 or ti.f64; few: whether the world has few particles, long: whether its kernels are, often: whether they run
+    often, see Compiler. copies: where there are many of the world; what is written, read, kept and put back is then that of the
+    chosen one, or of all. Every method that touches the fields checks first that they still exist.
     """
 
     kernels_read = ("real",)
 
     def __init__(
-        self, real, few: bool = False, long: bool = False, compiler: Compiler | None = None, copies: Copies | None = None
-    ):
+        self, real, few: bool = False, long: bool = False, often: bool = False, compiler: Compiler | None = None,
+        copies: Copies | None = None,
+    ):  # fmt: skip
         if not patched:  # whose fields need a place once they are made
             layout.check_trees()
         self.real, self.copies = real, copies
-        self.compiler = compiler or Compiler(real, few, long)
+        self.compiler = compiler or Compiler(real, few, long, often)
         self.entries: list[Entry] = []
         self._named: Counter[str] = Counter()
         self._later: list[tuple[Entry, np.ndarray]] = []
