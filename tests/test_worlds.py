@@ -278,7 +278,7 @@ def test_a_reset_starts_from_places_that_are_given(taichi):
 
 
 def test_worlds_of_the_same_structure_compile_nothing_more(taichi):
-    with tv.Worlds(pendulum(), 3) as many:
+    with tv.Worlds(pendulum(), 100) as many:
         many.run(0.1)
     with compiled() as names, tv.Worlds([pendulum(2.0, 3.0) for _ in range(700)]) as many:
         many.run(0.1)
