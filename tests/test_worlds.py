@@ -296,6 +296,38 @@ def test_fields_of_many_take_what_those_of_each_alone_do(taichi):
             assert told == 100 * (33 + 4) * 8 + 4
 
 
+class Tensor:
+    """What other libraries give: an array that speaks DLPack only."""
+
+    def __init__(self, array):
+        self.array = array
+
+    def __dlpack__(self, **options):
+        return self.array.__dlpack__(**options)
+
+    def __dlpack_device__(self):
+        return self.array.__dlpack_device__()
+
+
+def test_arrays_come_and_go_without_copies(taichi):
+    x = np.random.default_rng(0).uniform(size=(4, 3, 2))
+    with tv.Worlds(pendulum(), 4) as many:
+        many.position = Tensor(x)
+        many.velocity = Tensor(np.ones((3, 2)))
+        seen, d = many.view(), many.view("displacement")
+        np.testing.assert_array_equal(seen, x)
+        assert (d == 1).all()
+        taken = np.from_dlpack(seen)
+        assert taken.ctypes.data == seen.ctypes.data and not seen.flags.writeable
+        many.step(1 / 60)
+        np.testing.assert_array_equal(taken, many.position)
+        assert not np.array_equal(taken, x)
+        with pytest.raises(ValueError, match="read-only"):
+            seen[0] = 0
+        with pytest.raises(ValueError, match="one of 'position', 'displacement'"):
+            many.view("velocity")
+
+
 def test_what_makes_no_worlds_is_refused(taichi):
     for worlds, count, what in (
         ([], None, "is empty"), (3, None, "is a int"), ([pendulum(), 3], None, r"worlds\[1\] = 3"),

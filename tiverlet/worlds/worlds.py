@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .. import checks
+from ..device import runtime
 from ..device.copies import Copies
 from ..device.interrupts import whole
-from ..device.patches import patched
 from ..device.patches.compiler import CachedLaunch
 from ..features.arguments import knobs_of, meant
 from ..features.feature import Batch, Feature
@@ -44,7 +44,7 @@ from ..world import World
 from .clocks import NONE, Clocks
 from .report import WorldsReport
 
-WORK = 100_000_000  # particles and constraints, times passes, in a launch: it takes some seconds
+WORK = 30_000_000  # particles and constraints, times passes, in a launch: it takes about a second
 LOGGED = 1 << 22  # figures of frames that are kept at a time
 
 
@@ -537,6 +537,21 @@ class Worlds:
         out = memory.read(state.x).astype(np.float64, copy=False)
         return (out + memory.read(state.low) if state.sums else out)[:, : self._runner.n]
 
+    def view(self, name: str = "position") -> np.ndarray:
+        """The positions [m] of all, (worlds, n, dim), where the device has them: no copy, in their own precision, and always as
+        they are now. Read-only, and valid until close().
+
+        name: "position", or "displacement", what the last substep added (just after velocities were assigned: those). "position"
+        of "f32-compensated", and of "f32" where links are solved directly, lacks its low word. Others read it without a copy,
+        too: jnp.from_dlpack(worlds.view()), torch.from_dlpack(worlds.view()); nobody is to write there. On a GPU it is a copy.
+        """
+        state = self._runner.scene.state
+        known = {"position": state.x, "displacement": state.d}
+        if name not in known:
+            raise ValueError(f"Worlds.view: name = {name!r}, but it must be one of {', '.join(map(repr, known))}.")
+        with self._open():
+            return read_only(self._runner.memory.seen(known[name])[:, : self._runner.n], assign_whole("Worlds", "position"))
+
     @position.setter
     def position(self, value) -> None:
         with self._open():
@@ -589,6 +604,8 @@ class Worlds:
     def _per_particle(self, name: str, value, count: int) -> np.ndarray:
         """An array with a row for each particle of so many worlds; (n, dim) is for all of them."""
         n, dim = self._runner.n, self._world.particles.dim
+        if hasattr(value, "__dlpack__") and not isinstance(value, np.ndarray):  # of PyTorch, JAX and others
+            value = np.from_dlpack(value)
         value, shape = np.asarray(value), (count, n, dim)
         if value.shape not in (shape, shape[1:]):
             raise ValueError(f"Worlds: {name} has shape {value.shape}, but it must be (worlds, n, dim) = {shape}, or (n, dim).")
@@ -714,6 +731,10 @@ class _Source:
 
 def _checked(worlds: Any, count: int | None) -> list[World]:
     """The worlds that it is made of."""
+    if runtime.architecture() not in runtime.LLVM:
+        raise ValueError(
+            f"Worlds: they need an architecture for which LLVM compiles, not {runtime.architecture()}. Use tv.init(arch='cpu')."
+        )
     several = [worlds] if isinstance(worlds, World) else [*worlds] if isinstance(worlds, Iterable) else None
     if several is None:
         raise TypeError(
@@ -811,7 +832,7 @@ def _structure(world: World) -> dict[str, Any]:
         "indices": [f.indices.tobytes() for f in world.features if isinstance(f, Batch)],
         "kernels": None,
     }
-    if patched:
+    if world._runner.memory.shares:
         from ..device.patches.sharing import Writing  # noqa: PLC0415
 
         out["kernels"] = Writing(world._runner.step).key
