@@ -80,6 +80,8 @@ class Memory:
     def _declare(self, name: str, made: Any, length: int, width: int, kind: Any, state: bool, shared: bool = False) -> None:
         copies = 0 if shared or not self.copies else self.copies.count
         in_all = max(1, length) * copies if copies else length
+        if in_all >= 2**31:
+            raise MemoryError(f"{name} would have {in_all} elements, and can have {2**31 - 1}. Make fewer worlds at a time.")
         self._declared.append(Declared(kind, width, in_all, self._apart and kind == ti.f64))
         self._named[name] += 1
         same = self._named[name]

@@ -48,6 +48,7 @@ WORK = 30_000_000  # particles and constraints, times passes, in a launch: it ta
 LOGGED = 1 << 22  # figures of frames that are kept at a time
 
 
+LIVE = ("position", "velocity", "substeps", "iterations")
 DATA = (bool, int, float, str, np.ndarray, np.generic)  # what an attribute is that differs from world to world
 
 
@@ -663,6 +664,28 @@ class Worlds:
     def close(self) -> None:
         """Free the memory on the device. Using the worlds afterwards raises RuntimeError."""
         self._world.close()
+
+    def explain(self) -> str:
+        """What one of them is made of, as World.explain() says it, and what all of them take."""
+        bytes_in_all = sum(self.fields.values())
+        with self._open(), self._at(0) as world:
+            said = world.explain()
+        return (
+            f"{len(self)} worlds, all frames of each on one thread: {bytes_in_all} bytes, {bytes_in_all // len(self)} per world. "
+            f"Each: {said}"
+        )
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not name.startswith("_") and name not in LIVE:
+            guess = "" if hasattr(self, name) else meant(name, LIVE)
+            raise AttributeError(f"Worlds.{name} cannot be set{guess}. Live are {', '.join(LIVE)}, and knobs by set().")
+        object.__setattr__(self, name, value)
+
+    def __reduce_ex__(self, protocol):
+        raise TypeError(
+            "Worlds hold compiled kernels and memory of the device, so they cannot be copied or pickled. Make new ones: "
+            "tv.Worlds([worlds[k] for k in range(len(worlds))])."
+        )
 
     def __enter__(self) -> "Worlds":
         return self
