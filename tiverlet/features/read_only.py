@@ -24,7 +24,7 @@ class ReadOnly(np.ndarray):
         super().__setitem__(key, value)
 
     def __dlpack__(self, **options):
-        """For PyTorch, JAX and others, without a copy. Most of them know no read-only arrays, and take none that says it is one."""
+        """For PyTorch, JAX and others, without a copy. Most know no read-only arrays, and take none that says it is one."""
         plain = np.asarray(self).view()
         if isinstance(self.base, np.ndarray) and self.base.flags.writeable:
             plain.flags.writeable = True

@@ -49,6 +49,11 @@ class Diagnostics:
         self.stride = step.stride
         add = step.scene.memory.field
         self.blocks = BLOCKS if runtime.architecture() == "cpu" else BLOCKS**2
+        if (
+            step.scene.memory.copies
+        ):  # as few as hold one thing each: the sums are the same, and most of a small world is not this
+            most = max([step.scene.particles.count, *(b.members.count for b in step.batches)], default=1)
+            self.blocks = min(BLOCKS, 1 << max(2, (most - 1).bit_length()))
         self.parts = add("survey.figures", self.blocks, width=self.width, kind=ti.f64)
         self.low = add("survey.low", self.blocks, width=self.dim, kind=ti.f64)
         self.high = add("survey.high", self.blocks, width=self.dim, kind=ti.f64)
@@ -168,7 +173,7 @@ class Diagnostics:
     def filled(self):
         """How many blocks there is anything in, at most; the others would change no bit."""
         out = self.blocks
-        if ti.static(self.blocks == BLOCKS):
+        if ti.static(self.blocks <= BLOCKS):
             most = ti.cast(self.n, ti.i32)
             for f in ti.static(self.batches):
                 most = ti.max(most, f.count)
@@ -207,7 +212,7 @@ class Diagnostics:
         for _ in range(self.team.one(1, thread)):
             for k in range(FIGURES):
                 sheet[k] = 0  # what nobody writes comes back from a GPU as it was there
-            total, low, high = self.fold(0, self.blocks // BLOCKS, ti.min(filled, BLOCKS))
+            total, low, high = self.fold(0, max(1, self.blocks // BLOCKS), ti.min(filled, BLOCKS))
             for k in ti.static(range(6)):
                 sheet[k] = total[k]
             if ti.static(len(self.pair_forces) > 0):
