@@ -28,20 +28,21 @@ GROUP = 16  # fields that one transfer kernel serves; Taichi unrolls the loop ov
 class Memory:
     """The fields of one world: declared first, then placed together, freed together.
 
-    `real` is ti.f32 or ti.f64; few: whether the world has few particles, long: whether its kernels are, see Compiler. copies:
-    where there are many of the world; what is written, read, kept and put back is then that of the chosen one, or of all. Every
-    method that touches the fields checks first that they still exist.
+    `real` is ti.f32 or ti.f64; few: whether the world has few particles, long: whether its kernels are, often: whether they run
+    often, see Compiler. copies: where there are many of the world; what is written, read, kept and put back is then that of the
+    chosen one, or of all. Every method that touches the fields checks first that they still exist.
     """
 
     kernels_read = ("real",)
 
     def __init__(
-        self, real, few: bool = False, long: bool = False, compiler: Compiler | None = None, copies: Copies | None = None
-    ):
+        self, real, few: bool = False, long: bool = False, often: bool = False, compiler: Compiler | None = None,
+        copies: Copies | None = None,
+    ):  # fmt: skip
         if not patched:  # whose fields need a place once they are made
             layout.check_trees()
         self.real, self.copies = real, copies
-        self.compiler = compiler or Compiler(real, few, long)
+        self.compiler = compiler or Compiler(real, few, long, often)
         self.entries: list[Entry] = []
         self._named: Counter[str] = Counter()
         self._later: list[tuple[Entry, np.ndarray]] = []
@@ -197,10 +198,10 @@ class Memory:
         self._load_some([entry], [np.asarray(values)], some)
 
     def restore_some(self, state: dict[str, np.ndarray], some: np.ndarray) -> None:
-        """Write back what state() returned of some copies; one row is for all of them."""
+        """Write back what state() returned of some copies; one row is for all of them; 0 to fields that were not there then."""
         self.check()
         chosen = [e for e in self.entries if e.state]
-        self._load_some(chosen, [state[e.name] for e in chosen], some)
+        self._load_some(chosen, [state.get(e.name, np.zeros(1)) for e in chosen], some)
 
     def _load_some(self, entries: list[Entry], arrays: list[np.ndarray], some: np.ndarray) -> None:
         views = self._seen()

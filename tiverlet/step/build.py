@@ -45,6 +45,10 @@ STRETCH = 4  # times more or fewer of them, for which a world keeps its kernels
 # Taichi simplified them and 5 s without, and frames took as long; discs, ropes and soft balls (6) 9.5 and 3.8 s, but frames a
 # fifth more.
 LONG = 10.0
+# So many copies of a world run its kernels so often that those which are not middling are simplified, though the world is small:
+# frames of a double pendulum (1.3) take 8 to 13 % less, of 100 discs (3.6) 5 to 17 %, of discs, ropes and soft balls (6) 5 %, and
+# compile in 0.6 s, 0.7 to 1.4 s, and 7 to 14 s more.
+COPIES, MIDDLING = 100, 5.0
 USUAL = 1 / 1200  # [s] substep: 20 of a frame of 1/60 s
 MANY = 200  # stiff links from which systems are worth their sums
 STEPS = 5  # of conjugate gradients: at equal time 5 to 20 leave about the same, and these take the least of a frame
@@ -106,7 +110,8 @@ def assemble(
     scale = scale if scale and scale.holds(now) else now
     path = _chosen(path, scale) if order == 2 and not copies else "fused"
     bulk = sum({type(f): f.bulk for f in features}.values()) * (1.5 if particles.dim == 3 else 1.0)
-    memory = Memory(PRECISIONS[precision], scale.particles < FEW, bulk > LONG, copies=copies)
+    often = copies is not None and copies.count >= COPIES and bulk < MIDDLING
+    memory = Memory(PRECISIONS[precision], scale.particles < FEW, bulk > LONG, often, copies=copies)
     try:
         state = State(memory, particles, inv_mass, precision == "f32-compensated")
         return _bind(Scene(memory, state, particles, inv_mass, order=order), features, solver, path, scale)

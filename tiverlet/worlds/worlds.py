@@ -130,6 +130,9 @@ class Worlds:
         """Meanwhile fields are those of all worlds, and signals wait."""
         with whole, self._copies.all():
             self._runner.memory.check()
+            for i, name in [*self._given]:
+                if vars(self._world.features[i])[name] is not self._given[i, name]:
+                    del self._given[i, name]  # assigned for all since then
             yield
 
     @property
@@ -189,8 +192,9 @@ class Worlds:
                 "`every`, or make several rollouts."
             )
         position = np.zeros((len(self), frames // every, n, dim))
-        time = self._clocks.time[:, None] + dt * every * np.arange(1, frames // every + 1)
         report = self._frames("Worlds.rollout", seconds, dt, every, position, progress)
+        since, length, count = self._clocks.frame.T[:, :, None]
+        time = since + length * (count - frames + every * np.arange(1, frames // every + 1))
         return Rollout(time, position, report)
 
     def _frames(self, who: str, seconds: float, dt: float, every: int, track: np.ndarray | None, progress: bool) -> WorldsReport:
@@ -233,10 +237,11 @@ class Worlds:
         clocks.since[begins] = 0
         moved, released, jumped = np.zeros(len(self)), np.zeros(len(self)), np.zeros(len(self), dtype=bool)
         some = np.flatnonzero(~(ready | begins))
-        for k in some:
-            with self._at(k):
-                runner.prepare(substep, world.iterations)
-                moved[k], released[k], jumped[k] = runner.moved, runner.released, runner.jumped
+        with runner.memory.compiler():
+            for k in some:
+                with self._at(k):
+                    runner.prepare(substep, world.iterations)
+                    moved[k], released[k], jumped[k] = runner.moved, runner.released, runner.jumped
         unknown = some[~clocks.known[some]]
         if len(unknown):
             energy, overlap = self._look(unknown)
@@ -249,6 +254,25 @@ class Worlds:
         clocks.first_moved[some] = NONE
         self._start = self._start or _Start(self)
         return moved, released
+
+    def _upload_to_all(self) -> bool:
+        """Write knobs of all worlds in one go, where features can. False where each world has to be asked by itself."""
+        features = self._world.features
+        changed = [f for i, f in enumerate(features) if f.changed or i in self._set]
+        able = all(f.uploads_all and not f.new_force and f not in self._forced for f in changed)
+        able = able and all(f.uploads_all for f in features if f.moving) and len(self._waiting) <= 1
+        stacked = [values for (i, _), values in self._given.items() if features[i] in changed]
+        if not able or any(not isinstance(values, np.ndarray) or values.dtype == object for values in stacked):
+            return False
+        self._set, self._waiting = {}, []
+        for f in features:
+            if f.moving:
+                f.moving = False
+                f.end_motion()
+        for f in changed:
+            f.changed = False
+            f.upload()
+        return True
 
     def _look(self, some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Energies [J] and overlaps of some, in the state in which they are."""
@@ -269,12 +293,12 @@ class Worlds:
         world, features = self._world, self._world.features
         if not self._set and not any(f.changed or f.moving for f in features):
             return
-        for f in features:
-            if f.changed and f.outgrown:
-                _refuse_outgrown(f)
-        for i, name in [(i, name) for i, name in self._given if features[i].changed]:
-            if vars(features[i])[name] is not self._given[i, name]:
-                del self._given[i, name]  # assigned for all
+        for f in [f for f in features if f.changed]:
+            with self._at(0):
+                if f.outgrown:
+                    _refuse_outgrown(f)
+        if self._upload_to_all():
+            return
         common, own = [_flags(f) for f in features], self._waiting if len(self._waiting) > 1 else None
         some, self._waiting, still = self._set, [], np.zeros(len(features), dtype=bool)
         self._set = {}
@@ -407,17 +431,21 @@ class Worlds:
                 raise ValueError(f"Worlds.set: {name} has {has}, but there are {len(chosen)} worlds. Give each its own.")
             knob, before = getattr(type(f), name), vars(f)[name]
             every = list(before) if (i, name) in self._given and before is self._given[i, name] else [before] * len(self)
-            for k, value in zip(chosen, values, strict=True):
-                try:
-                    vars(f)[name] = every[k] = knob.check(f, value)
-                    if f.outgrown:
-                        _refuse_outgrown(f)
-                except (ValueError, TypeError) as error:
+            k = -1
+            try:
+                for k, value in zip(chosen, values, strict=True):
+                    every[k] = knob.check(f, value)
+                    if not f.uploads_all:
+                        _check_fits(f, name, every[k], before)
+                together = _stacked(every)
+                if f.uploads_all:
+                    k = -1
+                    _check_fits(f, name, together, before)
+            except (ValueError, TypeError) as error:
+                if k >= 0:
                     error.add_note(f"That is what Worlds.set was given for world {k}.")
-                    raise
-                finally:
-                    vars(f)[name] = before
-            vars(f)[name] = self._given[i, name] = _stacked(every)
+                raise
+            vars(f)[name] = self._given[i, name] = together
             mask = self._set.setdefault(i, np.zeros(len(self), dtype=bool))
             mask[chosen] = True
             if knob.force:
@@ -610,6 +638,11 @@ class Worlds:
         """What acts on the particles. A knob that is assigned here changes in all worlds, see set()."""
         return self._world.features
 
+    @property
+    def fields(self) -> dict[str, int]:
+        """Every field on the device, by name, and its size for all worlds [bytes]."""
+        return {e.name: e.bytes * max(1, e.copies) for memory in self._runner.memories for e in memory.entries}
+
     def close(self) -> None:
         """Free the memory on the device. Using the worlds afterwards raises RuntimeError."""
         self._world.close()
@@ -629,11 +662,10 @@ class _Start:
 
     def __init__(self, worlds: Worlds):
         runner, self.clocks = worlds._runner, worlds._clocks.copy()
-        self.values = {memory: memory.state() for memory in runner.memories}
-        for state in self.values.values():
-            for name, values in state.items():
-                if (values == values[:1]).all():
-                    state[name] = values[:1].copy()
+        self.values = {name: values for memory in runner.memories for name, values in memory.state().items()}
+        for name, values in self.values.items():
+            if (values == values[:1]).all():
+                self.values[name] = values[:1].copy()
         self.pairs: list[Any] = []  # of each, with what they remember
         if runner.grid:
             for k in range(len(worlds)):
@@ -645,8 +677,9 @@ class _Start:
     def put_back(self, worlds: Worlds, chosen: np.ndarray) -> None:
         """Return to it."""
         runner = worlds._runner
-        for memory, state in self.values.items():
-            memory.restore_some({name: v[chosen] if len(v) > 1 else v for name, v in state.items()}, chosen)
+        state = {name: values[chosen] if len(values) > 1 else values for name, values in self.values.items()}
+        for memory in runner.memories:
+            memory.restore_some(state, chosen)
         if runner.grid:
             for field, value in ((runner.grid.old_number, 0), (runner.grid.old_saved, 1)):
                 runner.memory.write_some(field, value, chosen)
@@ -697,6 +730,16 @@ def _checked(worlds: Any, count: int | None) -> list[World]:
         if world._controller.auto:
             raise ValueError(f'Worlds: worlds[{k}] has substeps = "auto", but all go through the same substeps. Give a number.')
     return several
+
+
+def _check_fits(feature: Feature, name: str, value: Any, before: Any) -> None:
+    """Refuse what asks for other kernels."""
+    vars(feature)[name] = value
+    try:
+        if feature.outgrown:
+            _refuse_outgrown(feature)
+    finally:
+        vars(feature)[name] = before
 
 
 def _refuse_outgrown(feature: Feature) -> None:

@@ -51,14 +51,15 @@ class Compiler:
     real: the type of their literals. Taichi rounds the literal 0.1 to its default type even next to f64 operands; a world of
     precision "f64" (and the user's own functions in it) must not lose half of the digits that way. few: whether they are
     for fewer than FEW particles. long: whether they are so long that Taichi, which simplifies in a time that grows with the
-    square of their length, would be at it for many seconds. Kernels compile at their first launch.
+    square of their length, would be at it for many seconds. often: whether they run so often that simplifying pays for few
+    particles, too. Kernels compile at their first launch.
     """
 
     kernels_read = ("real", "few", "lean", "thorough")
 
-    def __init__(self, real, few: bool = False, long: bool = False):
+    def __init__(self, real, few: bool = False, long: bool = False, often: bool = False):
         self.real, self.few = real, few
-        self.lean = LEAN | BRIEF if few or long else LEAN
+        self.lean = LEAN | BRIEF if (few and not often) or long else LEAN
         self.thorough = not lean  # once and for all, since what Taichi fails to compile may be tried again
         self.config: Any = None  # of Taichi, while kernels compile
         self._settings: dict[str, Any] = {}  # that Taichi was started with
