@@ -51,6 +51,7 @@ def test_pay_finds_that_features_only_add(printed):
         ("jelly", {"settings": [("CELLS", 4)]}, "of its height"),
         ("flag", {"settings": [("POINTS", (19, 13))], "seconds": 3.0}, "where the wind blew"),
         ("galaxy", {"settings": [("STARS", 60)], "seconds": 3.0}, "energy kept"),
+        ("fit", {"settings": [("THROWS", 400), ("ELITE", 30)]}, "caught in each round"),
         ("pendulums", {"settings": [("SECONDS", 4.0)], "side": 12}, "so a million take"),
         ("stairs", {"built": {"rows": 2}, "seconds": 2.0}, "are down"),
         *((name, {}, f"{name}.rrd") for name in ("soft", "bead", "tidy", "ragdoll", "machine")),

@@ -10,12 +10,12 @@ from .contact import Contact, Polygons
 from .device.runtime import init
 from .forces import Attractor, Drag, Force, Gravity, Hand, PairForce, Wind
 from .particles import Particles
-from .recording import Recorder, replay
+from .recording import Recorder, WorldsRecorder, replay
 from .solvers import Chebyshev, ConjugateGradient, Direct, Jacobi
 from .step_report import StepReport
 from .tools import approach, clamp, golden, golden_colors, golden_index, mix, smoothstep
 from .world import World
-from .worlds import SweepResult, Worlds, sweep
+from .worlds import SweepResult, Worlds, gradient, sweep
 
 if TYPE_CHECKING:
     from .live import play
@@ -24,8 +24,8 @@ __all__ = [
     "AngleLimit", "Area", "Attractor", "Ball", "Bend", "Box", "Capsule", "Chebyshev", "ConjugateGradient", "Constraint",
     "Contact", "Dihedral", "Direct", "Distance", "Drag", "Force", "Gravity", "HalfSpace", "Hand", "Jacobi", "Mesh", "PairForce",
     "Particles", "Path", "Pin", "Polygon", "Polygons", "Recorder", "Rope", "Sdf", "ShapeMatch", "Snap", "Spacer", "StepReport",
-    "SweepResult", "Volume", "Wind", "World", "Worlds", "approach", "clamp", "golden", "golden_colors", "golden_index", "init",
-    "measure", "mix", "play", "replay", "runtime", "shapes", "smoothstep", "sweep",
+    "SweepResult", "Volume", "Wind", "World", "Worlds", "WorldsRecorder", "approach", "clamp", "golden", "golden_colors",
+    "golden_index", "gradient", "init", "measure", "mix", "play", "replay", "runtime", "shapes", "smoothstep", "sweep",
 ]  # fmt: skip
 __version__ = "0.1.0"  # the only place that says it
 

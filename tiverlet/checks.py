@@ -95,13 +95,13 @@ def finite(who: str, name: str, array: np.ndarray) -> None:
         raise ValueError(f"{who}: {name}[{place}] = {array[at]}, but it must be finite.")
 
 
-def indices(who: str, name: str, value, count: int, *, arity: int | None = None) -> np.ndarray:
-    """Particle indices below `count`: (m,), or (m, arity) with distinct members in each row."""
+def indices(who: str, name: str, value, count: int, *, arity: int | None = None, things: str = "particles") -> np.ndarray:
+    """Indices of things below `count`: (m,), or (m, arity) with distinct members in each row."""
     array = plain(who, name, value)
     if array.size == 0:
         return np.zeros((0, arity) if arity else (0,), dtype=np.int32)
     if array.dtype.kind not in "iu":
-        raise TypeError(f"{who}: {name} has type {array.dtype}, but integers (particle indices) are needed.")
+        raise TypeError(f"{who}: {name} has type {array.dtype}, but integers (indices of {things}) are needed.")
     shape = f"(m, {arity})" if arity else "(m,)"
     if array.ndim != (2 if arity else 1) or (arity and array.shape[1] != arity):
         raise ValueError(f"{who}: {name} has shape {array.shape}, but {shape} is needed.")
@@ -110,7 +110,7 @@ def indices(who: str, name: str, value, count: int, *, arity: int | None = None)
     if rows.any():
         i = int(np.argmax(rows))
         least = int(array[i].min())
-        why = f"there are {count} particles (0 ... {count - 1})" if count < ANY else "particles are numbered from 0"
+        why = f"there are {count} {things} (0 ... {count - 1})" if count < ANY else f"{things} are numbered from 0"
         end = f"; count from the start, not {least} from the end" if least < 0 else ""
         raise ValueError(f"{who}: {name}[{i}] = {_show(array[i])}, but {why}{end}.")
     if arity:

@@ -86,6 +86,7 @@ class AngleLimit(Angle):
         if self.acts:
             self.scene.memory.write(self.dev.middle, self.middle)
 
+    uploads_all = False  # middle is of one
     unwrap = Scalar.unwrap  # a distance from the middle has one value
 
     @ti.func

@@ -147,7 +147,7 @@ class Path(Anchored):
     def end_motion(self) -> None:
         """The next frame starts from where this one went."""
         if self.acts:
-            self.scene.memory.write(self.dev.source, self.scene.memory.read(self.dev.target)[: self.count])
+            self.scene.memory.write(self.dev.source, self.scene.memory.read(self.dev.target))
 
     @ti.func
     def point(self, k, r):

@@ -126,7 +126,7 @@ class Pin(Anchored):
     def end_motion(self) -> None:
         """The next frame starts from the target."""
         if self.acts:
-            self.scene.memory.write(self.dev.source, self.scene.memory.read(self.dev.target)[: self.count])
+            self.scene.memory.write(self.dev.source, self.scene.memory.read(self.dev.target))
 
     @ti.func
     def aim(self, c, frame_fraction):

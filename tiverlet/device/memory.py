@@ -80,6 +80,8 @@ class Memory:
     def _declare(self, name: str, made: Any, length: int, width: int, kind: Any, state: bool, shared: bool = False) -> None:
         copies = 0 if shared or not self.copies else self.copies.count
         in_all = max(1, length) * copies if copies else length
+        if in_all >= 2**31:
+            raise MemoryError(f"{name} would have {in_all} elements, and can have {2**31 - 1}. Make fewer worlds at a time.")
         self._declared.append(Declared(kind, width, in_all, self._apart and kind == ti.f64))
         self._named[name] += 1
         same = self._named[name]
@@ -128,6 +130,11 @@ class Memory:
         if self._later:
             self._load([entry for entry, _ in self._later], [values for _, values in self._later])
             self._later.clear()
+
+    @property
+    def shares(self) -> bool:
+        """Whether worlds of the same structure have the same fields, by their places, and so the same kernels."""
+        return self._layout is not None and self._layout.shared
 
     def lengthen(self, length: int) -> bool:
         """Give all fields so many elements, where they are. False where kernels would have to know: nothing was done then."""
@@ -198,10 +205,10 @@ class Memory:
         self._load_some([entry], [np.asarray(values)], some)
 
     def restore_some(self, state: dict[str, np.ndarray], some: np.ndarray) -> None:
-        """Write back what state() returned of some copies; one row is for all of them."""
+        """Write back what state() returned of some copies; one row is for all of them; 0 to fields that were not there then."""
         self.check()
         chosen = [e for e in self.entries if e.state]
-        self._load_some(chosen, [state[e.name] for e in chosen], some)
+        self._load_some(chosen, [state.get(e.name, np.zeros(1)) for e in chosen], some)
 
     def _load_some(self, entries: list[Entry], arrays: list[np.ndarray], some: np.ndarray) -> None:
         views = self._seen()
@@ -220,6 +227,12 @@ class Memory:
         self.check()
         entry = self._find(field)
         return self._dump([entry])[0]
+
+    def seen(self, field) -> np.ndarray:
+        """The field itself as an array, where the host sees it; else a copy."""
+        self.check()
+        view = self._seen().get(id(self._find(field)))
+        return self.read(field) if view is None else view
 
     def state(self) -> dict[str, np.ndarray]:
         """Copies of the fields that make up the exact state, by name."""

@@ -76,6 +76,7 @@ class Feature(RecordsArguments):
 
     kept_by_world = ("scene", "start", "changed", "moving", "new_force", "arguments")
     host_only: tuple[str, ...] = ("start", "changed", "moving", "new_force", "arguments")  # what kernels do not read of it
+    uploads_all = False  # upload() and end_motion() do as well for many worlds, where knobs have one more axis, the first
     compiled_for: tuple[str, ...] = ()  # properties that decide what its kernels consist of
     told_apart = True  # its share of the time that kernels take to compile is known by its name
     bulk = 0.3  # of its code in the kernels, next to that of a Distance; see build.LONG

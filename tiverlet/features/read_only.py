@@ -23,6 +23,13 @@ class ReadOnly(np.ndarray):
             raise ValueError(self.advice)
         super().__setitem__(key, value)
 
+    def __dlpack__(self, **options):
+        """For PyTorch, JAX and others, without a copy. Most know no read-only arrays, and take none that says it is one."""
+        plain = np.asarray(self).view()
+        if isinstance(self.base, np.ndarray) and self.base.flags.writeable:
+            plain.flags.writeable = True
+        return plain.__dlpack__(**options)
+
     def copy(self, order="C") -> np.ndarray:
         """A plain array."""
         return np.array(self, order=order)

@@ -2,5 +2,6 @@
 
 from .recorder import Recorder
 from .replay import Replay, Verdict, replay
+from .side_by_side import WorldsRecorder
 
-__all__ = ["Recorder", "Replay", "Verdict", "replay"]
+__all__ = ["Recorder", "Replay", "Verdict", "WorldsRecorder", "replay"]

@@ -20,6 +20,7 @@ import copy
 import hashlib
 import json
 import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
@@ -38,6 +39,7 @@ GUARD = {"stuck", "substeps-capped"}  # flags that do not follow from the steps:
 JOURNAL = "tiverlet/journal"
 SCENE = "world/scene"
 PARTICLES = "particles"  # the end of the entities that have the positions of frames
+WORLDS = re.compile(r"worlds/\d{1,9}/")  # how entities of many worlds begin, see side_by_side.py
 Write = Callable[[str, np.ndarray, str], None]
 
 
@@ -214,6 +216,11 @@ def read(path: str, contents: rrd.Contents) -> tuple[list[Entry], str, int | Non
         except (ValueError, KeyError, TypeError, RecursionError):
             raise Changed(f"replay: {path} was changed after it was recorded: entry {number} of its journal is none.") from None
         rows.append((serials[0], ident, text, blob, mark))
+    if not rows and (some := sorted({int(e.split("/")[1]) for e in contents.entities if WORLDS.match(e)})):
+        raise ValueError(
+            f"replay: {path} shows worlds {', '.join(map(str, some))} side by side, and holds no state to go on from; "
+            "`rerun` shows it. Record one by itself, which has the same bits: tv.Recorder(path, worlds[k])."
+        )
     if not rows:
         why = (
             "is not a recording of tiverlet; `rerun` shows it"

@@ -53,12 +53,8 @@ def distance(size: np.ndarray, axes: np.ndarray) -> float:
     return MARGIN * float((np.maximum(np.abs(right) / ASPECT, np.abs(above)) / HALF + back).max())
 
 
-def blueprint(
-    low: np.ndarray, high: np.ndarray, legend: str | None, figures: dict[str, tuple[str, list[bool]]], up: np.ndarray
-) -> rrb.Blueprint:
-    """The scene on the left, curves and text on the right, for a scene within the corners low and high [m]. figures: see shown()
-    in curves.py. legend: the title of the scale of colours, None where there is none. up: against gravity.
-    """
+def scene_view(low: np.ndarray, high: np.ndarray, up: np.ndarray, origin: str = "world", name: str = "Scene") -> rrb.View:
+    """The view of a scene within the corners low and high [m]; up: against gravity. origin: below which entities it is."""
     size = np.maximum(high - low, 1e-9)
     if len(low) == 2:
         edge = 0.05 * size.max()
@@ -66,12 +62,27 @@ def blueprint(
             x_range=[float(low[0] - edge), float(high[0] + edge)],
             y_range=[float(-high[1] - edge), float(-low[1] + edge)],
         )
-        view = rrb.Spatial2DView(origin="world", name="Scene", visual_bounds=bounds)
+        return rrb.Spatial2DView(origin=origin, name=name, visual_bounds=bounds)
     else:
         middle = (low + high) / 2
         axes = eye_axes(up)
         eye = rrb.EyeControls3D(position=middle + distance(size, axes) * axes[2], look_target=middle, eye_up=up)
-        view = rrb.Spatial3DView(origin="world", name="Scene", eye_controls=eye, line_grid=rrb.LineGrid3D(visible=False))
+        return rrb.Spatial3DView(origin=origin, name=name, eye_controls=eye, line_grid=rrb.LineGrid3D(visible=False))
+
+
+def legend_view(title: str, origin: str = "legend") -> rrb.View:
+    """The scale of colours."""
+    bounds = rrb.VisualBounds2D(x_range=[-0.6 * WIDE, 6.6 * WIDE], y_range=[-1.3, 1.5])
+    return rrb.Spatial2DView(origin=origin, name=title, visual_bounds=bounds)
+
+
+def blueprint(
+    low: np.ndarray, high: np.ndarray, legend: str | None, figures: dict[str, tuple[str, list[bool]]], up: np.ndarray
+) -> rrb.Blueprint:
+    """The scene on the left, curves and text on the right, for a scene within the corners low and high [m]. figures: see shown()
+    in curves.py. legend: the title of the scale of colours, None where there is none. up: against gravity.
+    """
+    view = scene_view(low, high, up)
     curves = [
         rrb.TimeSeriesView(
             origin="figures",
@@ -82,15 +93,24 @@ def blueprint(
         for title, (end, those) in figures.items()
     ]
     pages = [rrb.TextDocumentView(origin="about", name="About"), rrb.TextLogView(origin="events", name="Events")]
-    scale = rrb.Spatial2DView(
-        origin="legend", name=legend,
-        visual_bounds=rrb.VisualBounds2D(x_range=[-0.6 * WIDE, 6.6 * WIDE], y_range=[-1.3, 1.5]),
-    )  # fmt: skip
     side = rrb.Vertical(*curves, rrb.Tabs(*pages), row_shares=[*(1 for _ in curves), 1.6])
-    left = rrb.Vertical(view, scale, row_shares=[11, 1.3]) if legend else view
+    left = rrb.Vertical(view, legend_view(legend), row_shares=[11, 1.3]) if legend else view
     whole = rrb.Horizontal(left, side, column_shares=[4, 1])
     _name(whole, "layout")
     view.id = SCENE_VIEW
+    return opened(whole)
+
+
+def grid(views: list[rrb.View], legend: rrb.View | None) -> rrb.Blueprint:
+    """Views side by side, above a scale of colours."""
+    side = rrb.Grid(*views)
+    whole = rrb.Vertical(side, legend, row_shares=[11, 1.0]) if legend else side
+    _name(whole, "grid")
+    return opened(whole)
+
+
+def opened(whole: rrb.Container) -> rrb.Blueprint:
+    """A layout with nothing around it but the time."""
     return rrb.Blueprint(
         whole,
         rrb.TimePanel(state="collapsed", timeline="time"),

@@ -17,6 +17,7 @@ from ..device import interrupts
 from ..step import checkpoint
 from ..step.explain import explain
 from ..world import World
+from ..worlds import Worlds
 from .journal import JOURNAL, Journal, brief, said
 from .overlays import Overlays, checked_color, checked_quantities
 from .picture import Picture, layout
@@ -68,6 +69,7 @@ class Recorder:
 
         if not isinstance(world, World):
             hint = "; write tv.Recorder(path, world)" if isinstance(path, World) else ""
+            hint = "; of many, tv.WorldsRecorder(path, worlds) draws some side by side" if isinstance(world, Worlds) else hint
             raise TypeError(f"Recorder: world = {world!r} is a {type(world).__name__}, but a tv.World is needed{hint}.")
         self._rr: Any = rr
         self.world = world
@@ -141,7 +143,7 @@ class Recorder:
         self.flush()  # so that a process that dies soon leaves something
         self._looked = perf_counter()
         if error := self._sink.error:
-            raise _told(error, f"Recorder: nothing could be written to {self.path}")
+            raise file_error(error, f"Recorder: nothing could be written to {self.path}")
         least = self._sink.bytes + RESERVE
         if self.budget is not None and self.budget < 2 * least:
             raise ValueError(
@@ -224,7 +226,7 @@ class Recorder:
         self._closing()
         gone = isinstance(error, FileNotFoundError)
         rest = "What was recorded is lost" if gone else "What the file holds can be replayed"
-        raise _told(error, f"Recorder: writing {self.path} failed at frame {self._calls}", f". {rest}") from None
+        raise file_error(error, f"Recorder: writing {self.path} failed at frame {self._calls}", f". {rest}") from None
 
     def _left(self) -> int:
         """What is left of the budget [bytes], after all that waits to be written, and the end."""
@@ -318,7 +320,7 @@ class Recorder:
             self._fail()
 
 
-def _told(error: Exception, what: str, rest: str = "") -> OSError:
+def file_error(error: Exception, what: str, rest: str = "") -> OSError:
     """The error of a file, with what it means."""
     if isinstance(error, OSError):
         return type(error)(error.errno, f"{what} ({error.strerror}){rest}")

@@ -49,6 +49,11 @@ class Diagnostics:
         self.stride = step.stride
         add = step.scene.memory.field
         self.blocks = BLOCKS if runtime.architecture() == "cpu" else BLOCKS**2
+        if (
+            step.scene.memory.copies
+        ):  # as few as hold one thing each: the sums are the same, and most of a small world is not this
+            most = max([step.scene.particles.count, *(b.members.count for b in step.batches)], default=1)
+            self.blocks = min(BLOCKS, 1 << max(2, (most - 1).bit_length()))
         self.parts = add("survey.figures", self.blocks, width=self.width, kind=ti.f64)
         self.low = add("survey.low", self.blocks, width=self.dim, kind=ti.f64)
         self.high = add("survey.high", self.blocks, width=self.dim, kind=ti.f64)
@@ -165,6 +170,17 @@ class Diagnostics:
         return figures, low, high
 
     @ti.func
+    def filled(self):
+        """How many blocks there is anything in, at most; the others would change no bit."""
+        out = self.blocks
+        if ti.static(self.blocks <= BLOCKS):
+            most = ti.cast(self.n, ti.i32)
+            for f in ti.static(self.batches):
+                most = ti.max(most, f.count)
+            out = ti.min(self.blocks, most)
+        return out
+
+    @ti.func
     def reduce_blocks(self, thread, h64, state_origin):
         """The sums behind residuals."""
         h, fresh = ti.cast(h64, self.step.real), ti.cast(state_origin == STARTED, ti.i32)
@@ -181,9 +197,8 @@ class Diagnostics:
     @ti.func
     def sum_up(self, thread, h64, t64, state_origin, sheet: ti.template()):  # type: ignore[valid-type]
         """By blocks, by blocks of these on a GPU, then by one thread."""
-        for k in range(
-            self.team.chunk_begin(self.blocks * self.stride, thread), self.team.chunk_end(self.blocks * self.stride, thread)
-        ):
+        filled = self.filled()
+        for k in range(self.team.chunk_begin(filled * self.stride, thread), self.team.chunk_end(filled * self.stride, thread)):
             if k % self.stride == 0:
                 h, t, b = ti.cast(h64, self.step.real), ti.cast(t64, self.step.real), k // self.stride
                 fresh, begin = ti.cast(state_origin == STARTED, ti.i32), ti.cast(state_origin == UNSTEPPED, ti.i32)
@@ -192,12 +207,12 @@ class Diagnostics:
         self.team.wait()
         if ti.static(self.blocks > BLOCKS):
             for k in range(BLOCKS):
-                self.parts[k * BLOCKS], self.low[k * BLOCKS], self.high[k * BLOCKS] = self.fold(k * BLOCKS, 1)
+                self.parts[k * BLOCKS], self.low[k * BLOCKS], self.high[k * BLOCKS] = self.fold(k * BLOCKS, 1, BLOCKS)
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread)):
             for k in range(FIGURES):
                 sheet[k] = 0  # what nobody writes comes back from a GPU as it was there
-            total, low, high = self.fold(0, self.blocks // BLOCKS)
+            total, low, high = self.fold(0, max(1, self.blocks // BLOCKS), ti.min(filled, BLOCKS))
             for k in ti.static(range(6)):
                 sheet[k] = total[k]
             if ti.static(len(self.pair_forces) > 0):
@@ -221,10 +236,10 @@ class Diagnostics:
                     self.step.slots.tension[None] = 0
 
     @ti.func
-    def fold(self, begin, step: ti.template()):  # type: ignore[valid-type]
-        """Of BLOCKS parts, `step` apart."""
+    def fold(self, begin, step: ti.template(), count):  # type: ignore[valid-type]
+        """Of so many parts, `step` apart."""
         total, low, high = self.nothing()
-        for b in range(BLOCKS):
+        for b in range(count):
             at = begin + b * step
             part = self.parts[at]
             total[0] += part[0]

@@ -1,7 +1,8 @@
-"""Many worlds: copies that are stepped together, and sweeps of parameters over processes and machines."""
+"""Many worlds: copies that are stepped together, their derivatives, and sweeps over processes and machines."""
 
+from .gradient import Gradient, gradient
 from .report import WorldsReport
 from .sweep import SweepResult, sweep
 from .worlds import Rollout, Worlds
 
-__all__ = ["Rollout", "SweepResult", "Worlds", "WorldsReport", "sweep"]
+__all__ = ["Gradient", "Rollout", "SweepResult", "Worlds", "WorldsReport", "gradient", "sweep"]

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .. import checks
+from ..device import runtime
 from ..device.copies import Copies
 from ..device.interrupts import whole
-from ..device.patches import patched
 from ..device.patches.compiler import CachedLaunch
 from ..features.arguments import knobs_of, meant
 from ..features.feature import Batch, Feature
@@ -44,10 +44,11 @@ from ..world import World
 from .clocks import NONE, Clocks
 from .report import WorldsReport
 
-WORK = 100_000_000  # particles and constraints, times passes, in a launch: it takes some seconds
+WORK = 30_000_000  # particles and constraints, times passes, in a launch: it takes about a second
 LOGGED = 1 << 22  # figures of frames that are kept at a time
 
 
+LIVE = ("position", "velocity", "substeps", "iterations")
 DATA = (bool, int, float, str, np.ndarray, np.generic)  # what an attribute is that differs from world to world
 
 
@@ -130,6 +131,9 @@ class Worlds:
         """Meanwhile fields are those of all worlds, and signals wait."""
         with whole, self._copies.all():
             self._runner.memory.check()
+            for i, name in [*self._given]:
+                if vars(self._world.features[i])[name] is not self._given[i, name]:
+                    del self._given[i, name]  # assigned for all since then
             yield
 
     @property
@@ -141,8 +145,12 @@ class Worlds:
     def _rest(self) -> None:
         """No world is chosen."""
         self._runner.memory.choose(None)
+        self._show_knobs(None)
+
+    def _show_knobs(self, k: int | None) -> None:
+        """Features have the knobs of the k-th; None: of all, as they are to be seen."""
         for (i, name), values in self._given.items():
-            self._world.features[i].__dict__[name] = values
+            self._world.features[i].__dict__[name] = values if k is None else values[k]
 
     @contextlib.contextmanager
     def _at(self, k: Any) -> Iterator[World]:
@@ -154,8 +162,7 @@ class Worlds:
         runner.scene.h2_effective = clock.h**2 * runner.integrator.h2_factor * share
         if self._sources:
             self._sources[k].put_on(world)
-        for (i, name), values in self._given.items():
-            world.features[i].__dict__[name] = values[k]
+        self._show_knobs(k)
         try:
             yield world
         finally:
@@ -186,8 +193,9 @@ class Worlds:
                 "`every`, or make several rollouts."
             )
         position = np.zeros((len(self), frames // every, n, dim))
-        time = self._clocks.time[:, None] + dt * every * np.arange(1, frames // every + 1)
         report = self._frames("Worlds.rollout", seconds, dt, every, position, progress)
+        since, length, count = self._clocks.frame.T[:, :, None]
+        time = since + length * (count - frames + every * np.arange(1, frames // every + 1))
         return Rollout(time, position, report)
 
     def _frames(self, who: str, seconds: float, dt: float, every: int, track: np.ndarray | None, progress: bool) -> WorldsReport:
@@ -230,10 +238,11 @@ class Worlds:
         clocks.since[begins] = 0
         moved, released, jumped = np.zeros(len(self)), np.zeros(len(self)), np.zeros(len(self), dtype=bool)
         some = np.flatnonzero(~(ready | begins))
-        for k in some:
-            with self._at(k):
-                runner.prepare(substep, world.iterations)
-                moved[k], released[k], jumped[k] = runner.moved, runner.released, runner.jumped
+        with runner.memory.compiler():
+            for k in some:
+                with self._at(k):
+                    runner.prepare(substep, world.iterations)
+                    moved[k], released[k], jumped[k] = runner.moved, runner.released, runner.jumped
         unknown = some[~clocks.known[some]]
         if len(unknown):
             energy, overlap = self._look(unknown)
@@ -246,6 +255,25 @@ class Worlds:
         clocks.first_moved[some] = NONE
         self._start = self._start or _Start(self)
         return moved, released
+
+    def _upload_to_all(self) -> bool:
+        """Write knobs of all worlds in one go, where features can. False where each world has to be asked by itself."""
+        features = self._world.features
+        changed = [f for i, f in enumerate(features) if f.changed or i in self._set]
+        able = all(f.uploads_all and not f.new_force and f not in self._forced for f in changed)
+        able = able and all(f.uploads_all for f in features if f.moving) and len(self._waiting) <= 1
+        stacked = [values for (i, _), values in self._given.items() if features[i] in changed]
+        if not able or any(not isinstance(values, np.ndarray) or values.dtype == object for values in stacked):
+            return False
+        self._set, self._waiting = {}, []
+        for f in features:
+            if f.moving:
+                f.moving = False
+                f.end_motion()
+        for f in changed:
+            f.changed = False
+            f.upload()
+        return True
 
     def _look(self, some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Energies [J] and overlaps of some, in the state in which they are."""
@@ -266,12 +294,12 @@ class Worlds:
         world, features = self._world, self._world.features
         if not self._set and not any(f.changed or f.moving for f in features):
             return
-        for f in features:
-            if f.changed and f.outgrown:
-                _refuse_outgrown(f)
-        for i, name in [(i, name) for i, name in self._given if features[i].changed]:
-            if vars(features[i])[name] is not self._given[i, name]:
-                del self._given[i, name]  # assigned for all
+        for f in [f for f in features if f.changed]:
+            with self._at(0):
+                if f.outgrown:
+                    _refuse_outgrown(f)
+        if self._upload_to_all():
+            return
         common, own = [_flags(f) for f in features], self._waiting if len(self._waiting) > 1 else None
         some, self._waiting, still = self._set, [], np.zeros(len(features), dtype=bool)
         self._set = {}
@@ -334,7 +362,11 @@ class Worlds:
         while len(some):
             plan[kernel.COUNT], plan[kernel.GRAIN] = len(some), self._kernels.grain(len(some))
             which[: len(some)] = some
-            CachedLaunch(self._kernels, "run", memory.compiler, plan, which, figures.reshape(-1), track)()
+            self._show_knobs(0)  # kernels are compiled for whether there is friction, which is the same in all
+            try:
+                CachedLaunch(self._kernels, "run", memory.compiler, plan, which, figures.reshape(-1), track)()
+            finally:
+                self._show_knobs(None)
             if not runner.step.grids:
                 return
             sheets = memory.read(self._kernels.sheet)
@@ -400,17 +432,21 @@ class Worlds:
                 raise ValueError(f"Worlds.set: {name} has {has}, but there are {len(chosen)} worlds. Give each its own.")
             knob, before = getattr(type(f), name), vars(f)[name]
             every = list(before) if (i, name) in self._given and before is self._given[i, name] else [before] * len(self)
-            for k, value in zip(chosen, values, strict=True):
-                try:
-                    vars(f)[name] = every[k] = knob.check(f, value)
-                    if f.outgrown:
-                        _refuse_outgrown(f)
-                except (ValueError, TypeError) as error:
+            k = -1
+            try:
+                for k, value in zip(chosen, values, strict=True):
+                    every[k] = knob.check(f, value)
+                    if not f.uploads_all:
+                        _check_fits(f, name, every[k], before)
+                together = _stacked(every)
+                if f.uploads_all:
+                    k = -1
+                    _check_fits(f, name, together, before)
+            except (ValueError, TypeError) as error:
+                if k >= 0:
                     error.add_note(f"That is what Worlds.set was given for world {k}.")
-                    raise
-                finally:
-                    vars(f)[name] = before
-            vars(f)[name] = self._given[i, name] = _stacked(every)
+                raise
+            vars(f)[name] = self._given[i, name] = together
             mask = self._set.setdefault(i, np.zeros(len(self), dtype=bool))
             mask[chosen] = True
             if knob.force:
@@ -454,7 +490,7 @@ class Worlds:
                     f"{who}: some has shape {some.shape}, but a mask of {len(self)} worlds has shape ({len(self)},)."
                 )
             return np.flatnonzero(some)
-        return checks.indices(who, "some", np.atleast_1d(some), len(self))
+        return checks.indices(who, "some", np.atleast_1d(some), len(self), things="worlds")
 
     # State.
 
@@ -472,15 +508,16 @@ class Worlds:
             checkpoint.transfer(world, new)
             return new
 
-    def each(self, ask: Callable[[World], Any]) -> list[Any]:
+    def each(self, ask: Callable[[World], Any], some: Any = None) -> list[Any]:
         """What a function says of each, in order, such as lambda world: world.features[1].load.
 
         It is given one World after the other to look at: positions, velocities, features, contacts, in their present state. It
-        must not step or change it, nor keep it; worlds[k] is for that.
+        must not step or change it, nor keep it; worlds[k] is for that. some: indices or a Boolean mask of those that are asked;
+        all by default.
         """
         out = []
         with self._open():
-            for k in range(len(self)):
+            for k in self._chosen("Worlds.each", some):
                 with self._at(k) as world:
                     out.append(ask(world))
         return out
@@ -500,6 +537,21 @@ class Worlds:
         state, memory = self._runner.scene.state, self._runner.memory
         out = memory.read(state.x).astype(np.float64, copy=False)
         return (out + memory.read(state.low) if state.sums else out)[:, : self._runner.n]
+
+    def view(self, name: str = "position") -> np.ndarray:
+        """The positions [m] of all, (worlds, n, dim), where the device has them: no copy, in their own precision, and always as
+        they are now. Read-only, and valid until close().
+
+        name: "position", or "displacement", what the last substep added (just after velocities were assigned: those). "position"
+        of "f32-compensated", and of "f32" where links are solved directly, lacks its low word. Others read it without a copy,
+        too: jnp.from_dlpack(worlds.view()), torch.from_dlpack(worlds.view()); nobody is to write there. On a GPU it is a copy.
+        """
+        state = self._runner.scene.state
+        known = {"position": state.x, "displacement": state.d}
+        if name not in known:
+            raise ValueError(f"Worlds.view: name = {name!r}, but it must be one of {', '.join(map(repr, known))}.")
+        with self._open():
+            return read_only(self._runner.memory.seen(known[name])[:, : self._runner.n], assign_whole("Worlds", "position"))
 
     @position.setter
     def position(self, value) -> None:
@@ -553,6 +605,8 @@ class Worlds:
     def _per_particle(self, name: str, value, count: int) -> np.ndarray:
         """An array with a row for each particle of so many worlds; (n, dim) is for all of them."""
         n, dim = self._runner.n, self._world.particles.dim
+        if hasattr(value, "__dlpack__") and not isinstance(value, np.ndarray):  # of PyTorch, JAX and others
+            value = np.from_dlpack(value)
         value, shape = np.asarray(value), (count, n, dim)
         if value.shape not in (shape, shape[1:]):
             raise ValueError(f"Worlds: {name} has shape {value.shape}, but it must be (worlds, n, dim) = {shape}, or (n, dim).")
@@ -602,9 +656,36 @@ class Worlds:
         """What acts on the particles. A knob that is assigned here changes in all worlds, see set()."""
         return self._world.features
 
+    @property
+    def fields(self) -> dict[str, int]:
+        """Every field on the device, by name, and its size for all worlds [bytes]."""
+        return {e.name: e.bytes * max(1, e.copies) for memory in self._runner.memories for e in memory.entries}
+
     def close(self) -> None:
         """Free the memory on the device. Using the worlds afterwards raises RuntimeError."""
         self._world.close()
+
+    def explain(self) -> str:
+        """What one of them is made of, as World.explain() says it, and what all of them take."""
+        bytes_in_all = sum(self.fields.values())
+        with self._open(), self._at(0) as world:
+            said = world.explain()
+        return (
+            f"{len(self)} worlds, all frames of each on one thread: {bytes_in_all} bytes, {bytes_in_all // len(self)} per world. "
+            f"Each: {said}"
+        )
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not name.startswith("_") and name not in LIVE:
+            guess = "" if hasattr(self, name) else meant(name, LIVE)
+            raise AttributeError(f"Worlds.{name} cannot be set{guess}. Live are {', '.join(LIVE)}, and knobs by set().")
+        object.__setattr__(self, name, value)
+
+    def __reduce_ex__(self, protocol):
+        raise TypeError(
+            "Worlds hold compiled kernels and memory of the device, so they cannot be copied or pickled. Make new ones: "
+            "tv.Worlds([worlds[k] for k in range(len(worlds))])."
+        )
 
     def __enter__(self) -> "Worlds":
         return self
@@ -621,11 +702,10 @@ class _Start:
 
     def __init__(self, worlds: Worlds):
         runner, self.clocks = worlds._runner, worlds._clocks.copy()
-        self.values = {memory: memory.state() for memory in runner.memories}
-        for state in self.values.values():
-            for name, values in state.items():
-                if (values == values[:1]).all():
-                    state[name] = values[:1].copy()
+        self.values = {name: values for memory in runner.memories for name, values in memory.state().items()}
+        for name, values in self.values.items():
+            if (values == values[:1]).all():
+                self.values[name] = values[:1].copy()
         self.pairs: list[Any] = []  # of each, with what they remember
         if runner.grid:
             for k in range(len(worlds)):
@@ -637,8 +717,9 @@ class _Start:
     def put_back(self, worlds: Worlds, chosen: np.ndarray) -> None:
         """Return to it."""
         runner = worlds._runner
-        for memory, state in self.values.items():
-            memory.restore_some({name: v[chosen] if len(v) > 1 else v for name, v in state.items()}, chosen)
+        state = {name: values[chosen] if len(values) > 1 else values for name, values in self.values.items()}
+        for memory in runner.memories:
+            memory.restore_some(state, chosen)
         if runner.grid:
             for field, value in ((runner.grid.old_number, 0), (runner.grid.old_saved, 1)):
                 runner.memory.write_some(field, value, chosen)
@@ -673,6 +754,10 @@ class _Source:
 
 def _checked(worlds: Any, count: int | None) -> list[World]:
     """The worlds that it is made of."""
+    if runtime.architecture() not in runtime.LLVM:
+        raise ValueError(
+            f"Worlds: they need an architecture for which LLVM compiles, not {runtime.architecture()}. Use tv.init(arch='cpu')."
+        )
     several = [worlds] if isinstance(worlds, World) else [*worlds] if isinstance(worlds, Iterable) else None
     if several is None:
         raise TypeError(
@@ -689,6 +774,16 @@ def _checked(worlds: Any, count: int | None) -> list[World]:
         if world._controller.auto:
             raise ValueError(f'Worlds: worlds[{k}] has substeps = "auto", but all go through the same substeps. Give a number.')
     return several
+
+
+def _check_fits(feature: Feature, name: str, value: Any, before: Any) -> None:
+    """Refuse what asks for other kernels."""
+    vars(feature)[name] = value
+    try:
+        if feature.outgrown:
+            _refuse_outgrown(feature)
+    finally:
+        vars(feature)[name] = before
 
 
 def _refuse_outgrown(feature: Feature) -> None:
@@ -760,7 +855,7 @@ def _structure(world: World) -> dict[str, Any]:
         "indices": [f.indices.tobytes() for f in world.features if isinstance(f, Batch)],
         "kernels": None,
     }
-    if patched:
+    if world._runner.memory.shares:
         from ..device.patches.sharing import Writing  # noqa: PLC0415
 
         out["kernels"] = Writing(world._runner.step).key

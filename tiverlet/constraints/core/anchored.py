@@ -29,6 +29,7 @@ class Anchored(Batch):
 
     arity = 1
     each = ("compliance", "damping")
+    uploads_all = True
     exclusive = False  # nothing else may hold its particles
     compliance = Knob(lambda f, v: f._compliance(v), "Inverse stiffness [m/N].", force=True)
     damping = Knob(lambda f, v: checks.per_item(repr(f), "damping", v, f.count, least=0.0), "Of the dashpot [N s/m].", force=True)

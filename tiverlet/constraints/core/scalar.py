@@ -69,6 +69,7 @@ class Scalar(Batch):
 
     each = ("rest", "compliance", "damping", "break_at")
     rest_name = "rest"
+    uploads_all = True
     unit: float | None = None  # what residuals are relative to; None: the rest value
     precise = False  # whether exactly() measures to all the digits that positions have
     cusp = False  # whether any goal is f = 0, where gradients end: no direction at the start of the step means anything there
@@ -197,7 +198,7 @@ class Scalar(Batch):
     def outgrown(self) -> bool:
         """Whether others than before are to be relaxed alone, too: a world is what its knobs say, not how they came there."""
         solved = self.scene and self.acts and self.solvable_together
-        return super().outgrown or bool(solved and not np.array_equal(self._alone, self.relaxed_alone(self.scene)))
+        return super().outgrown or bool(solved and (self._alone != self.relaxed_alone(self.scene)).any())
 
     @property
     def limited(self) -> bool:

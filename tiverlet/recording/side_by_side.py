@@ -1,0 +1,205 @@
+"""Some of many worlds in one recording, each in a view of its own."""
+
+import os
+import weakref
+from collections.abc import Iterable
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from .. import checks
+from ..device import interrupts
+from ..world import World
+from ..worlds import Worlds
+from . import scene
+from .overlays import Overlays
+from .recorder import BACKLOG, LOOK, SMALL, file_error
+from .sink import Sink
+
+MOST = 64  # views in a recording
+FEW = 9  # by default
+
+
+class WorldsRecorder:
+    """Writes some of many worlds to an .rrd file, side by side: a grid of views at one scale, one for each, all at the same time.
+
+        with tv.WorldsRecorder("four.rrd", worlds, [0, 250, 500, 999]) as recorder:
+            for _ in range(300):
+                worlds.step(1 / 60)
+                recorder.log()
+
+    path: the file; its folder must exist. worlds: what to record. chosen: the numbers of up to 64 of them; the first nine by
+    default. every: log only each so many frames. overwrite: whether a file that is there may be replaced. strain, forces,
+    velocities: what is drawn, as by Recorder. Where worlds are reset, the time of the recording goes on.
+
+    The file is a picture: it holds no states to go on from, and tv.replay refuses it. For these record one by itself, which has
+    the same bits: tv.Recorder(path, worlds[k]), and step that. Open the file with `rerun four.rrd`.
+
+    Raises ValueError and OSError where the file cannot be made, FileExistsError where there is one already, and OSError when it
+    cannot be written any further.
+    """
+
+    def __init__(
+        self, path, worlds: Worlds, chosen: Iterable[int] | None = None, every: int = 1, overwrite: bool = False, *,
+        strain: bool = True, forces: bool = False, velocities: bool = False,
+    ):  # fmt: skip
+        if not isinstance(worlds, Worlds):
+            hint = "; one World is for tv.Recorder(path, world)" if isinstance(worlds, World) else ""
+            raise TypeError(f"WorldsRecorder: worlds = {worlds!r} is a {type(worlds).__name__}, not a tv.Worlds{hint}.")
+        self.worlds, self.path = worlds, os.fspath(path)
+        numbers = range(min(FEW, len(worlds))) if chosen is None else chosen
+        self.chosen = checks.indices("WorldsRecorder", "chosen", np.asarray([*numbers]), len(worlds), things="worlds").tolist()
+        if not 0 < len(self.chosen) <= MOST or len({*self.chosen}) < len(self.chosen):
+            raise ValueError(f"WorldsRecorder: chosen = {self.chosen}, but it must be 1 to {MOST} numbers, each once.")
+        self.every = checks.integer("WorldsRecorder", "every", every, least=1)
+        flags = {"strain": strain, "forces": forces, "velocities": velocities}
+        overlays = Overlays(*[checks.flag("WorldsRecorder", name, value) for name, value in flags.items()], color=None)
+        folder = os.path.dirname(os.path.abspath(self.path))
+        if not os.path.isdir(folder):
+            raise ValueError(f"WorldsRecorder: the folder {folder} does not exist. Make it first: os.makedirs({folder!r}).")
+        self.frames = self._calls = self._flushed = 0
+        self._before = self._last = 0.0  # [s] that went by before worlds were reset; when the last frame was
+        self._looked = perf_counter()
+        with interrupts.whole:
+            self._open(overlays, overwrite)
+
+    def _open(self, overlays: Overlays, overwrite: bool) -> None:
+        from .drawing import bounds, links, upwards
+
+        def known(world: World) -> tuple:
+            return bounds(world), upwards(world), overlays.title(bool(links(world)))
+
+        each, self._ups, titles = zip(*self.worlds.each(known, self.chosen), strict=True)
+        self._title, corners = titles[0], np.array(each)  # (worlds, 2, dim)
+        self._extent = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
+        dim = corners.shape[2]
+        title = os.path.splitext(os.path.basename(self.path))[0]
+        opens = self._layout(*self._extent)
+        self._sink = Sink(self.path, f"tiverlet_worlds_{dim}d", opens, title, overwrite)
+        self._closing = weakref.finalize(self, self._sink.close)  # also when the process ends
+        try:
+            below = iter([_Below(f"worlds/{k}", self._sink.stream) for k in self.chosen])
+            self._views = self.worlds.each(lambda world: _View(world, next(below), self._extent, overlays), self.chosen)
+            self._draw()
+            self._sink.flush()
+            if error := self._sink.error:
+                raise file_error(error, f"WorldsRecorder: nothing could be written to {self.path}")
+        except BaseException:
+            self._closing()
+            self._sink.discard()
+            raise
+        self._sink.keep()
+
+    def __enter__(self) -> "WorldsRecorder":
+        return self
+
+    def __exit__(self, *exc) -> None:
+        self.close()
+
+    @interrupts.uncut
+    def log(self) -> None:
+        """Write the present frame, if it is one of `every`."""
+        if self._sink.forked() or self._sink.stream is None:
+            raise RuntimeError("WorldsRecorder: this recording is closed, or of another process; make a new one.")
+        self._calls += 1
+        if self._calls % self.every == 0:
+            self._draw()
+        bytes_drawn = sum(view.drawing.bytes for view in self._views)
+        if bytes_drawn - self._flushed > BACKLOG:
+            self._sink.flush()
+            self._flushed = bytes_drawn
+        if perf_counter() - self._looked > LOOK:
+            self._sink.check()
+            self._looked = perf_counter()
+        self._fail()
+
+    def _draw(self) -> None:
+        time = float(self.worlds.time[self.chosen].max())
+        self._before += self._last if time < self._last else 0.0
+        self._last = time
+        stream, views = self._sink.stream, iter(self._views)
+        stream.set_time("frame", sequence=self._calls)
+        stream.set_time("time", duration=self._before + time)
+        self.worlds.each(lambda world: next(views).frame(world), self.chosen)
+        self.frames += 1
+
+    def _layout(self, low: np.ndarray, high: np.ndarray) -> Any:
+        """How it opens in the viewer. low, high: corners of what is to be seen [m]."""
+        from .layout import grid, legend_view, scene_view, unit
+
+        scale = unit(*self._extent)
+        views = [
+            scene_view(scale * low, scale * high, up, f"worlds/{k}/world", f"World {k}")
+            for k, up in zip(self.chosen, self._ups, strict=True)
+        ]
+        return grid(views, legend_view(self._title, f"worlds/{self.chosen[0]}/legend") if self._title else None)
+
+    def _fail(self) -> None:
+        if error := self._sink.error:
+            self._closing()
+            raise file_error(error, f"WorldsRecorder: writing {self.path} failed at frame {self._calls}")
+
+    @interrupts.uncut
+    def close(self) -> None:
+        """Finish the file. Calling it twice does nothing."""
+        if self._sink.forked() or self._sink.stream is None:
+            return
+        from .picture import framed
+
+        low = np.min([view.low for view in self._views], axis=0)
+        high = np.max([view.high for view in self._views], axis=0)
+        self._sink.show(self._layout(*framed(self._extent, low, high)))
+        self._sink.flush()
+        self._sink.check()
+        if self._sink.bytes < SMALL:
+            self._sink.thin(1)
+        self._closing()
+        self._fail()
+
+
+class _View:
+    """One world among others: a Drawing below entities of its own."""
+
+    def __init__(self, world: World, stream: "_Below", extent: tuple[np.ndarray, np.ndarray], overlays: Overlays):
+        from .drawing import Drawing, upwards
+        from .layout import SCENE, transform, unit, upright
+
+        dim = world.particles.dim
+        self.drawing = Drawing(world, stream, extent, overlays)
+        self.low, self.high = np.full(dim, np.inf), np.full(dim, -np.inf)  # of all that was drawn
+        self._known: list[dict[str, Any]] = [{} for _ in world.features]
+        self._broken = 0
+        turn = [upright(upwards(world))] if dim == 3 else []
+        self.drawing.static(SCENE, transform(dim, unit(*extent)), *turn)
+        self.drawing.begin()
+
+    def frame(self, world: World) -> None:
+        """Draw its present state."""
+        self.drawing.world = world
+        now = [scene.knobs(f) for f in world.features]
+        turned = [i for i, (new, old) in enumerate(zip(now, self._known, strict=True)) if not old or not _equal(new, old)]
+        self._known = now
+        broken = sum(int(f.broken.sum()) for f in world.features if getattr(f, "breaks", False))  # type: ignore[attr-defined]
+        x, radius = world.position, world.particles.radius[:, None]
+        some = np.isfinite(x).all(axis=1)
+        if some.any():
+            self.low = np.minimum(self.low, (x - radius)[some].min(axis=0))
+            self.high = np.maximum(self.high, (x + radius)[some].max(axis=0))
+        self.drawing.frame(x, x.astype(np.float32), turned, broken != self._broken)
+        self._broken = broken
+
+
+class _Below:
+    """A rerun stream whose entities are below one."""
+
+    def __init__(self, root: str, stream: Any):
+        self._root, self._stream = root, stream
+
+    def log(self, entity: str, *what: Any, **options: Any) -> None:
+        """As rerun's."""
+        self._stream.log(f"{self._root}/{entity}", *what, **options)
+
+
+def _equal(one: dict[str, Any], other: dict[str, Any]) -> bool:
+    return one.keys() == other.keys() and all(np.array_equal(value, other[name]) for name, value in one.items())
