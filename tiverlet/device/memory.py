@@ -248,9 +248,10 @@ class Memory:
             self._load(chosen, [state.get(e.name, np.zeros(1)) for e in chosen])
 
     def take(self, other: "Memory") -> None:
-        """Give the chosen copy all that another memory holds in fields of the same names."""
+        """Give the chosen copy all that another memory holds in fields of the same names; sums of a frame are none of it, of which
+        there may be fewer here."""
         self.check()
-        theirs = {e.name: e for e in other.entries}
+        theirs = {e.name: e for e in other.entries if not e.name.startswith("survey.")}
         ours = [e for e in self.entries if e.name in theirs]
         self._load(ours, other._dump([theirs[e.name] for e in ours]))
 
