@@ -10,7 +10,7 @@ import pytest
 import tiverlet as tv
 from tiverlet.__main__ import main
 from tiverlet.report import speed
-from tiverlet.report.speed import SCENES, SpeedReport, c_baseline, counting, measure, peers, scenes, stripped, waits
+from tiverlet.report.speed import SCENES, SpeedReport, c_baseline, counting, measure, peers, scenes, stripped, waits, worlds
 
 
 @pytest.fixture(scope="module")
@@ -195,3 +195,51 @@ def test_command(capsys):
     assert "no scene 'pule'" in capsys.readouterr().err
     assert main(["report", "--list"]) == 0  # with no word more, the report on errors
     assert "D01_double_pendulum" in capsys.readouterr().out
+
+
+@pytest.fixture(scope="module")
+def batch():
+    """Many worlds, few of them."""
+    return worlds.worlds(threads=(1,), quick=True, peers=False)
+
+
+def test_worlds_are_measured_or_left_out(batch):
+    assert not batch.missing
+    assert {note for note in batch.notes if note.startswith("Left out")} == {
+        "Left out: mujoco, since it is not wanted.",
+        "Left out: newton, since it is not wanted.",
+    }
+    parts = [part for part in worlds.PARTS.values() if part.alone]
+    assert list(batch.tables) == [part.title for part in parts]
+    for part in parts:
+        heads, rows = batch.tables[part.title]
+        assert heads == ("threads", *part.heads) and rows and all(len(row) == len(heads) and row[0] == "1" for row in rows)
+    ladder = batch.tables[worlds.PARTS["ladder"].title][1]
+    assert [row[1:4] for row in ladder] == [
+        ("pendulum", "3", "1"),
+        ("pendulum", "3", "3"),
+        ("chain", "21", "3"),
+        ("pile", "10", "3"),
+    ]
+    assert all(float(row[4]) > 0 for row in ladder)
+    errors = [float(row[2]) for row in batch.tables[worlds.PARTS["pendulums"].title][1]]
+    assert errors[0] < 5e-5 and errors[-1] < 1e-10  # of order 2, of order 8
+    assert [row[7] for row in batch.tables[worlds.PARTS["costs"].title][1]] == ["1", "1"]  # kernels that one frame compiles
+    assert "Double pendulums" in str(batch) and "| pendulum |" in batch.markdown() and "tables" in json.loads(batch.json())
+
+
+def test_reference_of_double_pendulums():
+    # It has the energy of its start, and halving the step changes nothing.
+    times = np.arange(1, 46) / 15
+    x, finer = worlds.double_pendulum(times), worlds.double_pendulum(times, steps=32)
+    np.testing.assert_allclose(x, finer, atol=1e-12)
+    links = np.linalg.norm([x[:, 0], x[:, 1] - x[:, 0]], axis=2)
+    np.testing.assert_allclose(links, 1, atol=1e-14)
+
+
+def test_rate_for_an_error():
+    known = [(30, 16e-4), (60, 1e-4), (120, 1e-8), (240, 2e-8)]  # the last one rounds
+    assert worlds.rate_for(1e-4, known) == pytest.approx(60)
+    assert worlds.rate_for(4e-4, known) == pytest.approx(30 * 2**0.5)
+    assert worlds.rate_for(256e-4, known) == pytest.approx(15)
+    assert worlds.rate_for(1e-8 / 16, known) == pytest.approx(240)

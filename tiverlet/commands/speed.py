@@ -7,7 +7,7 @@ ABOUT = "speed, memory and starts; beside a pile in C, and other engines"
 
 def add(parser: argparse.ArgumentParser) -> None:
     """The arguments."""
-    parser.add_argument("scenes", nargs="*", help="pile, settled, spheres, cloth, ropes, rope, mixed; all without any")
+    parser.add_argument("scenes", nargs="*", help="pile, settled, spheres, cloth, ropes, rope, mixed; all without any; or worlds")
     parser.add_argument("--sizes", type=int, nargs="+", metavar="N", help="numbers of particles; default: a ladder of each scene")
     parser.add_argument("--threads", type=int, nargs="+", metavar="T", help="numbers of CPU threads; default 1, 2, 4, ... all")
     parser.add_argument("--arch", default="cpu", help="cpu, cuda, metal or vulkan (default cpu)")
@@ -26,21 +26,23 @@ def main(args: argparse.Namespace) -> int:
     """Measure, print, write; the status is 1 when something could not be measured."""
     from rich.console import Console
 
-    from ..report import speed
+    from ..report import SpeedReport, speed
     from ..report.speed import SCENES
+    from ..report.speed.worlds import TITLE, worlds
 
     console = Console()
     if args.list:
         for name, scene in SCENES.items():
             sizes = ", ".join(f"{n:,}" for n in scene.sizes)
             console.print(f"{name:8} {scene.title}, {scene.substeps} substeps; {sizes} particles", highlight=False)
+        console.print(f"{'worlds':8} {TITLE}", highlight=False)
         return 0
     if args.compilers:
         from ..report.speed.compilers import SIZES, compilers
 
         console.print(compilers(tuple(args.sizes or SIZES)))
         return 0
-    report = speed(
+    report = worlds(tuple(args.threads or ()), args.quick, args.peers) if args.scenes == ["worlds"] else speed(
         args.scenes or None, sizes=args.sizes, threads=args.threads, arch=args.arch, quick=args.quick, yardstick=args.yardstick,
         peers=args.peers, absent=args.absent, waits=args.waits, progress=console.is_terminal,
     )  # fmt: skip
@@ -49,6 +51,6 @@ def main(args: argparse.Namespace) -> int:
         if path:
             with open(path, "w", encoding="utf-8") as file:
                 file.write(text())
-    if args.plot:
+    if args.plot and isinstance(report, SpeedReport):
         report.plot(args.plot)
     return 1 if report.missing else 0
