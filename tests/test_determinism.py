@@ -51,7 +51,7 @@ import tiverlet as tv
 import article
 def results(path):
     scene = article.build(discs=140, path=path)
-    for _ in range(200):
+    for _ in range(120):
         article.lead(scene)
         scene.world.step(1 / 60)
     assert scene.world.last.contacts > 100
