@@ -1,7 +1,6 @@
 """One Taichi for the whole run, of the architecture TIVERLET_ARCH (cpu); worlds are closed after each test."""
 
 import contextlib
-import fcntl
 import functools
 import json
 import os
@@ -87,7 +86,10 @@ def keep_kernels() -> None:
     folder = pathlib.Path(ti.cfg.offline_cache_file_path)
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / "tests.lock", "w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+        if os.name == "posix":
+            import fcntl  # noqa: PLC0415
+
+            fcntl.flock(file, fcntl.LOCK_EX)
         ti.reset()
 
 
