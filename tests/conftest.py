@@ -1,6 +1,7 @@
 """One Taichi for the whole run, of the architecture TIVERLET_ARCH (cpu); worlds are closed after each test."""
 
 import contextlib
+import fcntl
 import functools
 import json
 import os
@@ -23,7 +24,8 @@ from tiverlet.report.accuracy.cases import entries, known
 from tiverlet.step import build
 
 # Taichi keeps kernels that it has compiled, by their content, and finds them when a worker comes by the same tests in the same
-# order: a second run takes half of the time or less. All of them are about as large as what it keeps by default, 100 MB.
+# order: a second run takes half of the time or less, see keep_kernels(). All of them are about as large as what it keeps by
+# default, 100 MB.
 os.environ.setdefault("TI_OFFLINE_CACHE_MAX_SIZE_OF_FILES", str(512 << 20))
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as it is in the background of a shell; tests send it
@@ -76,6 +78,19 @@ def compiled() -> Iterator[list[str]]:
         Kernel.materialize = materialize
 
 
+def keep_kernels() -> None:
+    """End Taichi, which writes what was compiled, one worker after the other.
+
+    Who writes has the folder for himself, for seconds. Another one that ends meanwhile gives up after a quarter of a second, and
+    what half of the tests had compiled was lost; so it was where xdist ended a worker that took longer than 10 s to end.
+    """
+    folder = pathlib.Path(ti.cfg.offline_cache_file_path)
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / "tests.lock", "w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        ti.reset()
+
+
 @pytest.fixture(scope="session", autouse=True)
 def taichi():
     tv.init(arch=ARCH)
@@ -89,6 +104,7 @@ def taichi():
     if server.cache_info().currsize:
         with server():  # which closes the pipes, so that it ends
             pass
+    keep_kernels()
 
 
 @pytest.fixture

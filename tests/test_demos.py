@@ -45,7 +45,7 @@ def test_pay_finds_that_features_only_add(printed):
         ("cradle", {}, "formula"),
         ("net", {"settings": [("CELLS", 12), ("STRENGTH", 20.0)]}, "times its weight"),
         ("hourglass", {"built": {"grains": 500}}, "through the neck"),
-        ("polygons", {}, "36 bodies"),
+        ("polygons", {"seconds": 4.0}, "36 bodies"),
         ("cloth", {"built": {"points": 23}}, "cloth.rrd"),
         ("wrecking", {"seconds": 2.5}, "before they were hit"),
         ("jelly", {"settings": [("CELLS", 4)]}, "of its height"),

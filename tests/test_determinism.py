@@ -51,7 +51,7 @@ import tiverlet as tv
 import article
 def results(path):
     scene = article.build(discs=140, path=path)
-    for _ in range(200):
+    for _ in range(120):
         article.lead(scene)
         scene.world.step(1 / 60)
     assert scene.world.last.contacts > 100
@@ -114,26 +114,27 @@ def test_a_large_pile_has_the_same_bits_on_all_paths_and_where_a_team_breaks_up(
 
 
 def test_all_paths_have_the_same_bits(world):
+    # In three dimensions see the next but one, and the fuzzer.
     n = 300
-    x = tv.golden(np.arange(n), dim=3) * [1.6, 3, 1.6]
+    x = tv.golden(np.arange(n), dim=2) * [4, 3]
     pairs = np.stack([np.arange(0, n - 1, 2), np.arange(1, n, 2)], axis=1)
     made = []
     for path in ("fused", "parallel", "launched"):
         features = [
             tv.Gravity(9.81), tv.Drag(0.1),
             tv.Distance(pairs, compliance=np.where(np.arange(n // 2) % 2, 1e-4, 0.0), damping=1.0),
-            tv.Rope(pairs[:20] + 100, 0.5), tv.Contact(), tv.Box((0, 0, 0), (1.6, 9, 1.6)), tv.HalfSpace((0.2, 1, 0.1), 0.1),
-            tv.Pin([0], (1, 1, 1), compliance=1e-3), tv.Pin([5], (1, 2, 1)),
+            tv.Rope(pairs[:20] + 100, 0.5), tv.Contact(), tv.Box((0, 0), (4, 9)), tv.HalfSpace((0.2, 1), 0.1),
+            tv.Pin([0], (1, 1), compliance=1e-3), tv.Pin([5], (1, 2)),
         ]  # fmt: skip
         w = world(
             tv.Particles(x, radius=0.08, mass=1 + np.arange(n) % 5), features, path=path,
             precision="f32-compensated", substeps=7, iterations=2,
         )  # fmt: skip
-        w.run(0.3)
+        w.run(0.1)
         w.substeps = 9
-        w.run(0.2)
+        w.run(0.1)
         made.append((w.hash(), w.last.energy, w.last.residual, w.last.overlap))
-        assert w.last.contacts > 20
+        assert w.last.contacts > 60
     assert made[0] == made[1] == made[2]
 
 

@@ -15,6 +15,8 @@ from tiverlet.recording.fill import Fill, outlines
 from tiverlet.recording.layout import SCENE_VIEW, unit
 from tiverlet.recording.picture import FLOWN, NEAR, framed
 
+pytestmark = pytest.mark.usefixtures("read_here")
+
 
 def stack(n=4):
     """Discs of 1 kg and 10 cm one on the other, touching."""

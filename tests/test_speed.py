@@ -16,8 +16,10 @@ from tiverlet.report.speed import SCENES, SpeedReport, c_baseline, counting, mea
 @pytest.fixture(scope="module")
 def report():
     """Two scenes of one size each, quickly, one of them by a copy of the package that lacks what it does not use."""
-    whole = speed(["pile"], sizes=[41], threads=[1], quick=True, peers=False, absent=False, waits=True)
-    rope = speed(["rope"], sizes=[41], threads=[1], quick=True, peers=False, yardstick=False, waits=False)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(measure, "BLOCK", 1 << 22)
+        whole = speed(["pile"], sizes=[41], threads=[1], quick=True, peers=False, absent=False, waits=True)
+        rope = speed(["rope"], sizes=[41], threads=[1], quick=True, peers=False, yardstick=False, waits=False)
     return replace(whole, runs=whole.runs + rope.runs, absent=rope.absent)
 
 

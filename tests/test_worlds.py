@@ -346,6 +346,7 @@ def test_what_makes_no_worlds_is_refused(taichi):
             (lambda: many.set(tv.Gravity(), g=[1.0] * 3), "none of these"),
             (lambda: many.set(many.features[0], g=[1.0, np.nan, 2.0]), "g"),
             (lambda: many.reset([4]), "some"),
+            (lambda: many.set(many.features[0], some=[1, 1], g=[1.0, 2.0]), "twice"),
             (lambda: many.reset([True]), "mask of 3"),
             (lambda: setattr(many, "position", np.zeros((2, 3, 2))), r"\(worlds, n, dim\)"),
             (lambda: many.step(0.0), "dt"),

@@ -248,8 +248,8 @@ class Memory:
             self._load(chosen, [state.get(e.name, np.zeros(1)) for e in chosen])
 
     def take(self, other: "Memory") -> None:
-        """Give the chosen copy all that another memory holds in fields of the same names; sums of a frame are none of it, of which
-        there may be fewer here."""
+        """Give the chosen copy all that another memory holds in fields of the same names, but for sums of a frame, of which there
+        may be fewer here."""
         self.check()
         theirs = {e.name: e for e in other.entries if not e.name.startswith("survey.")}
         ours = [e for e in self.entries if e.name in theirs]

@@ -10,7 +10,28 @@ from ..device.memory import Memory
 from ..device.patches.compiler import CachedLaunch
 from ..device.thread_team import LEAST
 from .diagnostics import STEPPED
-from .step import BEGIN, END, FIGURES, FIRST, FRESH, HALF, HALT, ORIGIN, RESUMED, SHEET, SINCE, START, TICK, Step, integer
+from .step import (
+    BEGIN,
+    END,
+    FIGURES,
+    FIRST,
+    FRESH,
+    HALF,
+    HALT,
+    ITERATIONS,
+    ORIGIN,
+    PART,
+    RESUMED,
+    SHEET,
+    SINCE,
+    START,
+    TICK,
+    UNTIL,
+    H,
+    Step,
+    integer,
+)  # fmt: skip
+from .step import SUBSTEPS as STAGES
 
 # What a launch is given: how many copies, how many frames each, the substeps of one; of how many frames one is kept on the track,
 # how many were made before, how many the track has room for; whether figures are kept; how many copies, one beside the other, a
@@ -19,6 +40,26 @@ COUNT, FRAMES, SUBSTEPS, EVERY, BEFORE, ROWS, KEEPS, GRAIN = range(8)
 PLAN = GRAIN + 1
 DATES = 4  # of a copy: when frames of the present length began [s], their length [s], how many there were; frames of the launch
 WRAP = 2.0**31  # substeps are counted up to it
+
+
+def sheets(h, start, end, tick, since, fresh, origin, substeps: int, passes: int) -> np.ndarray:
+    """What frames are given, one row for each copy, see Span: arrays with a value for each, and what is the same for all."""
+    out = np.zeros((len(h), SHEET))
+    for k, values in ((H, h), (START, start), (END, end), (TICK, tick), (SINCE, since), (FRESH, fresh), (ORIGIN, origin)):
+        out[:, k] = values
+    out[:, STAGES], out[:, ITERATIONS] = substeps, passes
+    out[:, UNTIL], out[:, PART] = substeps + 1, passes
+    return out
+
+
+def waits(some: np.ndarray) -> np.ndarray:
+    """Which rows are of frames that stopped to have a list grown."""
+    return some[:, HALT] != 0
+
+
+def resume(row: np.ndarray, resumed: int, begin: int, half: int) -> None:
+    """Have a frame go on there."""
+    row[RESUMED], row[BEGIN], row[HALF] = resumed, begin, half
 
 
 @ti.data_oriented

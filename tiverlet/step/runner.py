@@ -209,7 +209,7 @@ class Runner:
             )  # fmt: skip
             self._fused()
             if self._data[HALT]:
-                resumed, begin, half = self._stopped()
+                resumed, begin, half = self.stopped()
                 self.grow()
                 continue
             if begin == stages or (until > stages and part == passes):
@@ -221,7 +221,7 @@ class Runner:
                 until = min(stages + 1, until + max(1, some // passes))
             self.raise_signals()
 
-    def _stopped(self) -> tuple[int, int, int]:
+    def stopped(self) -> tuple[int, int, int]:
         """Where the frame stopped, for Span, when what it waits for is about to be done."""
         self.memory.write(self.step.halt, 0)
         resumed, begin, half = (int(v) for v in self._data[HALT:ACTIVE_THREADS])
@@ -232,7 +232,7 @@ class Runner:
         try:
             frame(self.launcher, span)
             while self.step.grids and self._data[HALT]:
-                span.resumed, span.begin, span.half = self._stopped()
+                span.resumed, span.begin, span.half = self.stopped()
                 self.list_neighbours()
                 frame(self.launcher, span)
         except BaseException:  # as signals raise

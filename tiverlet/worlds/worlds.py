@@ -21,33 +21,12 @@ from ..step import checkpoint
 from ..step import frames as kernel
 from ..step.diagnostics import STARTED, STEPPED, TURNS, UNSTEPPED, risks
 from ..step.integrator import FREE
-from ..step.step import (
-    BEGIN,
-    END,
-    FIGURES,
-    FRESH,
-    HALF,
-    HALT,
-    ITERATIONS,
-    ORIGIN,
-    PART,
-    RESUMED,
-    SHEET,
-    SINCE,
-    START,
-    TICK,
-    UNTIL,
-    H,
-)
-from ..step.step import SUBSTEPS as STAGES
 from ..world import World
 from .clocks import NONE, Clocks
 from .report import WorldsReport
 
 WORK = 30_000_000  # particles and constraints, times passes, in a launch: it takes about a second
 LOGGED = 1 << 22  # figures of frames that are kept at a time
-
-
 LIVE = ("position", "velocity", "substeps", "iterations")
 DATA = (bool, int, float, str, np.ndarray, np.generic)  # what an attribute is that differs from world to world
 
@@ -84,7 +63,7 @@ class Worlds:
             count = len(sources)
         with whole:
             self._originals = first.features  # by which the user may know those of the copies
-            sources = [world if world.path == "fused" else world.clone(path="fused") for world in sources]
+            sources = _alike(sources)
             self._copies = Copies(count)
             self._world = World._of(
                 first.particles, tuple(f.copy() for f in first.features), [f.start for f in first.features],
@@ -204,7 +183,7 @@ class Worlds:
         world = self._world
         work = len(self) * world.substeps * world.iterations * self._runner.integrator.stages
         work *= 1 + len(world.particles) + sum(b.count for b in self._runner.batches)
-        at_once = max(1, min(frames, WORK // work, LOGGED // (len(self) * FIGURES)))
+        at_once = max(1, min(frames, WORK // work, LOGGED // (len(self) * kernel.FIGURES)))
         bar: Any = contextlib.nullcontext()
         if progress:
             from rich.progress import Progress  # noqa: PLC0415
@@ -278,15 +257,14 @@ class Worlds:
     def _look(self, some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Energies [J] and overlaps of some, in the state in which they are."""
         clocks = self._clocks
-        sheets, dates = np.zeros((len(self), SHEET)), np.zeros((len(self), kernel.DATES))
-        sheets[:, H], sheets[:, START], sheets[:, END] = clocks.h, clocks.time, clocks.time
-        sheets[:, TICK], sheets[:, SINCE], sheets[:, FRESH] = clocks.tick, clocks.since, clocks.d_is_velocity
-        sheets[:, ORIGIN] = np.where(clocks.d_is_velocity, UNSTEPPED, np.where(clocks.started, STARTED, STEPPED))
-        sheets[:, ITERATIONS] = sheets[:, UNTIL] = sheets[:, PART] = 1
+        origin = np.where(clocks.d_is_velocity, UNSTEPPED, np.where(clocks.started, STARTED, STEPPED))
+        sheets = kernel.sheets(
+            clocks.h, clocks.time, clocks.time, clocks.tick, clocks.since, clocks.d_is_velocity, origin, substeps=0, passes=1
+        )  # fmt: skip
         plan = np.zeros(kernel.PLAN, dtype=np.int32)
         plan[kernel.FRAMES] = plan[kernel.KEEPS] = 1
-        figures = np.zeros((len(self), 1, FIGURES))
-        self._go(plan, some, sheets, dates, figures, np.zeros(1))
+        figures = np.zeros((len(self), 1, kernel.FIGURES))
+        self._go(plan, some, sheets, np.zeros((len(self), kernel.DATES)), figures, np.zeros(1))
         return figures[some, 0, 0], figures[some, 0, 2]
 
     def _upload(self) -> None:
@@ -310,13 +288,13 @@ class Worlds:
                 for i, (changed, moving, new_force) in enumerate(common)
             ]  # fmt: skip
             with self._at(k):
-                for f, (f.changed, f.moving, f.new_force) in zip(features, flags, strict=True):
-                    f.new_force = f.new_force or (f.changed and f in self._forced)
+                for f, (changed, moving, new_force) in zip(features, flags, strict=True):
+                    f.changed, f.moving, f.new_force = changed, moving, new_force or (changed and f in self._forced)
                 world._upload_parameters()
                 still |= [f.moving for f in features]
         self._forced.clear()
-        for f, f.moving in zip(features, still.tolist(), strict=True):
-            f.changed = f.new_force = False
+        for f, moving in zip(features, still.tolist(), strict=True):
+            f.changed, f.moving, f.new_force = False, moving, False
 
     def _launch(
         self, dt: float, frames: int, moved: np.ndarray, released: np.ndarray, every: int = 0, track: np.ndarray | None = None,
@@ -331,19 +309,17 @@ class Worlds:
         begun = perf_counter()
         clocks.count_frame(dt, np.ones(len(self), dtype=bool))
         started = clocks.d_is_velocity & (substeps == 1)
-        sheets, dates = np.zeros((len(self), SHEET)), np.zeros((len(self), kernel.DATES))
-        sheets[:, H], sheets[:, START], sheets[:, TICK], sheets[:, SINCE] = clocks.h, clocks.time, clocks.tick, clocks.since
+        dates = np.zeros((len(self), kernel.DATES))
         dates[:, :3] = clocks.frame
-        sheets[:, END] = dates[:, 0] + dates[:, 1] * (dates[:, 2] + 1)
-        sheets[:, FRESH], sheets[:, ORIGIN] = clocks.d_is_velocity, np.where(started, STARTED, STEPPED)
-        total = stages * substeps if runner.n else 0
-        sheets[:, STAGES], sheets[:, ITERATIONS] = total, runner.integrator.passes(iterations)
-        sheets[:, UNTIL], sheets[:, PART] = total + 1, sheets[:, ITERATIONS]
+        sheets = kernel.sheets(
+            clocks.h, clocks.time, dates[:, 0] + dates[:, 1] * (dates[:, 2] + 1), clocks.tick, clocks.since, clocks.d_is_velocity,
+            np.where(started, STARTED, STEPPED), stages * substeps if runner.n else 0, runner.integrator.passes(iterations),
+        )  # fmt: skip
         plan = np.zeros(kernel.PLAN, dtype=np.int32)
         plan[kernel.FRAMES], plan[kernel.SUBSTEPS] = frames, substeps if runner.n else 0
         plan[kernel.EVERY], plan[kernel.BEFORE], plan[kernel.KEEPS] = every, before, 1
         plan[kernel.ROWS] = track.shape[1] if track is not None else 0
-        figures = np.zeros((len(self), frames, FIGURES))
+        figures = np.zeros((len(self), frames, kernel.FIGURES))
         flat = np.zeros(1) if track is None else track.reshape(-1)
         self._go(plan, np.arange(len(self)), sheets, dates, figures, flat)
         energy = np.where(clocks.known, clocks.energy, np.nan)
@@ -370,11 +346,11 @@ class Worlds:
             if not runner.step.grids:
                 return
             sheets = memory.read(self._kernels.sheet)
-            some = some[sheets[some, HALT] != 0]
+            some = some[kernel.waits(sheets[some])]
             for k in some:
                 with self._at(k):
                     runner.sheet[:] = sheets[k]
-                    sheets[k, RESUMED], sheets[k, BEGIN], sheets[k, HALF] = runner._stopped()
+                    kernel.resume(sheets[k], *runner.stopped())
                     runner.grow()
                     runner.invalidate()
             memory.write(self._kernels.sheet, sheets)
@@ -490,7 +466,10 @@ class Worlds:
                     f"{who}: some has shape {some.shape}, but a mask of {len(self)} worlds has shape ({len(self)},)."
                 )
             return np.flatnonzero(some)
-        return checks.indices(who, "some", np.atleast_1d(some), len(self), things="worlds")
+        chosen = checks.indices(who, "some", np.atleast_1d(some), len(self), things="worlds")
+        if len(np.unique(chosen)) < len(chosen):
+            raise ValueError(f"{who}: some names a world twice: {some.tolist()}. Name each once.")
+        return chosen
 
     # State.
 
@@ -774,6 +753,22 @@ def _checked(worlds: Any, count: int | None) -> list[World]:
         if world._controller.auto:
             raise ValueError(f'Worlds: worlds[{k}] has substeps = "auto", but all go through the same substeps. Give a number.')
     return several
+
+
+def _alike(worlds: list[World]) -> list[World]:
+    """The worlds, or clones of those that are only compiled in another way: for a team of threads, or without what lets particles
+    part that overlap, where others have them."""
+    shrinks = [any(contact.shrinks for contact in world._runner.step.contacts) for world in worlds]
+    out = []
+    for world, has in zip(worlds, shrinks, strict=True):
+        lacks = any(shrinks) and not has
+        if lacks or world.path != "fused":
+            world = world.clone(path="fused")
+        if lacks:
+            world._runner.step.contacts[0].enable_shrink()
+            world._runner.renew()
+        out.append(world)
+    return out
 
 
 def _check_fits(feature: Feature, name: str, value: Any, before: Any) -> None:
