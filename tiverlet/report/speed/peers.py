@@ -11,6 +11,7 @@ import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from time import perf_counter
 from typing import Any
 
@@ -112,8 +113,8 @@ class Newton:
     STIFF = 1e6
 
     def __init__(self, particles, features, threads: int, setting: tuple[int, int]):
-        import newton  # pyright: ignore[reportMissingImports]
-        import warp as wp  # pyright: ignore[reportMissingImports]
+        newton: Any = import_module("newton")
+        wp: Any = import_module("warp")
 
         wp.config.quiet = True
         self.steps, iterations = setting
