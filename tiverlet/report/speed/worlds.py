@@ -64,7 +64,7 @@ SETTINGS = ((4, 10), (10, 10), (20, 20))  # of Newton: steps of a frame, iterati
 
 
 @dataclass(frozen=True)
-class WorldsReport(JupyterMixin):
+class WorldsSpeed(JupyterMixin):
     """Tables by title: heads, and rows of text. notes: what was left out, and why."""
 
     machine: str
@@ -101,7 +101,7 @@ class WorldsReport(JupyterMixin):
         return json.dumps(asdict(self), indent=1)
 
 
-def worlds(threads: tuple[int, ...] = (), quick: bool = False, peers: bool = True) -> WorldsReport:
+def worlds(threads: tuple[int, ...] = (), quick: bool = False, peers: bool = True) -> WorldsSpeed:
     """Measure. threads: numbers of CPU threads; 1 and all cores by default. quick: tiny sizes. peers: with MuJoCo and Newton,
     where they are installed."""
     from .measure import powers
@@ -126,7 +126,7 @@ def worlds(threads: tuple[int, ...] = (), quick: bool = False, peers: bool = Tru
                     continue
                 heads, before = tables.get(part.title, (("threads", *part.heads), ()))
                 tables[part.title] = heads, (*before, *((str(count), *row) for row in rows))
-    return WorldsReport(output.machine(), tables, (*notes, *LEGEND))
+    return WorldsSpeed(output.machine(), tables, (*notes, *LEGEND))
 
 
 def main(job: dict[str, Any]) -> None:
