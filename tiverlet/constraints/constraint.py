@@ -49,7 +49,7 @@ class Constraint(Scalar):
 
     index_name = "indices"
     exchangeable = ()
-    _size = 0.0  # of the scene [m]
+    _size = 0.0  # of what it acts on [m]
     _known: tuple[Any, Any, Any] = (None, None, None)  # positions, and values and gradients there
     rest = Knob(lambda f, v: checks.per_item(repr(f), "rest", v, f.count), "What function should be.")
 
@@ -98,7 +98,9 @@ class Constraint(Scalar):
             self._keep(origin=origin)
             high = origin.astype(np.float32).astype(np.float64)  # two words: in f32 too, the origin is where it was put
             self.dev.origin = [high.tolist(), (origin - high).tolist()]
-        self._keep(_size=particles.size)
+        mine = self.indices.ravel()  # others, wherever they are, change no bit
+        extent = float(np.ptp(particles.position[mine], axis=0).max()) if len(mine) else 0.0
+        self._keep(_size=extent or float(particles.radius[mine].max(initial=0.0)) or 1.0)
         self._keep(_known=(None, None, None))
         self.dev.fixed = int(self.origin is None)
         self.dev.gradient = NumericGradient(self.function, self.gradient, self.arity, particles.dim, self.dev.fixed)

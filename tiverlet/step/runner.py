@@ -100,7 +100,8 @@ class Runner:
                 if moved is not None:
                     self.moved, self.jumped = float(moved.max()), bool((moved > self.scene.particles.radius).any())
                     self.invalidate()
-                if self.scene.slots.system:
+                bare = clock.first_moved < self.n and not any((b.indices >= clock.first_moved).any() for b in self.batches)
+                if self.scene.slots.system and not bare:  # particles that came without constraints are nothing to it
                     self.scene.slots.system.forget()
             self.set_substep(h, drag)
         return True
