@@ -1,12 +1,13 @@
 """Many worlds in one launch: each has the bits that it has alone, whatever is in it, and knows nothing of the others."""
 
+import contextlib
 import copy
 
 import numpy as np
 import pytest
 
 import tiverlet as tv
-from tiverlet.device import ti
+from tiverlet.device import layout, ti
 
 from .conftest import compiled
 from .rows import OTHERS, ROWS
@@ -328,6 +329,19 @@ def test_arrays_come_and_go_without_copies(taichi):
             seen[0] = 0
         with pytest.raises(ValueError, match="one of 'position', 'displacement'"):
             many.view("velocity")
+
+
+def test_kernels_of_other_constants_are_refused_wherever_fields_are(taichi):
+    # The relaxation that Jacobi("auto") finds is compiled; other masses and places are not. Also where trees are not shared.
+    for around in (contextlib.nullcontext, layout.unshared):
+        with around():
+            relaxed = [cloth(tv.Jacobi("auto"), k) for k in range(2)]
+            assert relaxed[0]._runner.scene.slots.relaxation != relaxed[1]._runner.scene.slots.relaxation
+            with pytest.raises(ValueError, match="other constants"):
+                tv.Worlds(relaxed)
+            plain = [cloth(tv.Jacobi(), k) for k in range(2)]
+            with tv.Worlds(plain) as many:
+                assert len(many) == 2
 
 
 def test_what_makes_no_worlds_is_refused(taichi):

@@ -131,11 +131,6 @@ class Memory:
             self._load([entry for entry, _ in self._later], [values for _, values in self._later])
             self._later.clear()
 
-    @property
-    def shares(self) -> bool:
-        """Whether worlds of the same structure have the same fields, by their places, and so the same kernels."""
-        return self._layout is not None and self._layout.shared
-
     def lengthen(self, length: int) -> bool:
         """Give all fields so many elements, where they are. False where kernels would have to know: nothing was done then."""
         if self.copies or not (self._layout and self._layout.shared and length <= self._layout.room):

@@ -12,6 +12,7 @@ from .. import checks
 from ..device import runtime
 from ..device.copies import Copies
 from ..device.interrupts import whole
+from ..device.language import COMPILER
 from ..device.patches.compiler import CachedLaunch
 from ..features.arguments import knobs_of, meant
 from ..features.feature import Batch, Feature
@@ -850,11 +851,24 @@ def _structure(world: World) -> dict[str, Any]:
         "indices": [f.indices.tobytes() for f in world.features if isinstance(f, Batch)],
         "kernels": None,
     }
-    if world._runner.memory.shares:
-        from ..device.patches.sharing import Writing  # noqa: PLC0415
-
-        out["kernels"] = Writing(world._runner.step).key
+    if COMPILER == "taichi":  # whose inside is known
+        out["kernels"] = _written(world)
     return out
+
+
+def _written(world: World) -> Any:
+    """What kernels of a world are compiled from, where fields go by their numbers."""
+    from ..device.patches.sharing import Writing  # noqa: PLC0415
+
+    fields = [vars(e.field) for memory in world._runner.memories for e in memory.entries]
+    before = [known.get("place_name") for known in fields]
+    for k, known in enumerate(fields):
+        known["place_name"] = "field", k
+    try:
+        return Writing(world._runner.step).key
+    finally:
+        for known, name in zip(fields, before, strict=True):
+            known["place_name"] = name
 
 
 def _frame_count(who: str, seconds: float, dt: float) -> int:
