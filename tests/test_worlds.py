@@ -237,6 +237,18 @@ def test_knobs_are_for_one_some_or_all(taichi):
     assert world.time == 0 and gravity.g == 9.81
 
 
+def test_knobs_that_wait_for_other_kernels_are_there(taichi):
+    # A rest length of 0 has no direction, so its constraint leaves the system: assigned, and not stepped with yet.
+    world, alone = pendulum(), pendulum()
+    for w in (world, alone):
+        w.run(0.1)
+        w.features[1].rest = [1.0, 0.0]
+    with tv.Worlds(world, 2) as many:
+        many.run(0.1)
+        alone.run(0.1)
+        assert many.hash(0) == many.hash(1) == alone.hash()
+
+
 def test_a_target_is_reached_in_the_first_of_many_frames(taichi):
     # As in a world alone: a wall that moves in a frame stands in the next; so does a driven pin.
     def built():

@@ -325,7 +325,8 @@ class Worlds:
         self._go(plan, np.arange(len(self)), sheets, dates, figures, flat)
         energy = np.where(clocks.known, clocks.energy, np.nan)
         clocks.advance(substeps, frames, started)
-        self._last = self._report(figures, energy, moved, released, perf_counter() - begun)
+        with np.errstate(all="ignore"):  # energies may be infinite; flags say so
+            self._last = self._report(figures, energy, moved, released, perf_counter() - begun)
         return self._last
 
     def _go(
@@ -757,13 +758,14 @@ def _checked(worlds: Any, count: int | None) -> list[World]:
 
 
 def _alike(worlds: list[World]) -> list[World]:
-    """The worlds, or clones of those that are only compiled in another way: for a team of threads, or without what lets particles
-    part that overlap, where others have them."""
+    """The worlds, or clones of those that are only compiled in another way: for a team of threads, for knobs that they no longer
+    have, or without what lets particles part that overlap, where others have them."""
     shrinks = [any(contact.shrinks for contact in world._runner.step.contacts) for world in worlds]
     out = []
     for world, has in zip(worlds, shrinks, strict=True):
         lacks = any(shrinks) and not has
-        if lacks or world.path != "fused":
+        outgrown = any(f.changed and f.outgrown for f in world.features)  # knobs ask for other kernels, which clones get
+        if lacks or outgrown or world.path != "fused":
             world = world.clone(path="fused")
         if lacks:
             world._runner.step.contacts[0].enable_shrink()
