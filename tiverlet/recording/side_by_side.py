@@ -68,6 +68,7 @@ class WorldsRecorder:
         from .drawing import bounds, links, upwards
 
         def known(world: World) -> tuple:
+            """What one of them needs in the viewer: corners, what is up, the title of its colours."""
             return bounds(world), upwards(world), overlays.title(bool(links(world)))
 
         each, self._ups, titles = zip(*self.worlds.each(known, self.chosen), strict=True)

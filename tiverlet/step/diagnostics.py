@@ -49,9 +49,8 @@ class Diagnostics:
         self.stride = step.stride
         add = step.scene.memory.field
         self.blocks = BLOCKS if runtime.architecture() == "cpu" else BLOCKS**2
-        if (
-            step.scene.memory.copies
-        ):  # as few as hold one thing each: the sums are the same, and most of a small world is not this
+        if step.scene.memory.copies:
+            # As few as hold one thing each: the sums are the same, and small worlds a fifth as large.
             most = max([step.scene.particles.count, *(b.members.count for b in step.batches)], default=1)
             self.blocks = min(BLOCKS, 1 << max(2, (most - 1).bit_length()))
         self.parts = add("survey.figures", self.blocks, width=self.width, kind=ti.f64)

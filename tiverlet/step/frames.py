@@ -100,6 +100,7 @@ class Frames:
         launch = CachedLaunch(self, "run", self.memory.compiler, plan, which, none, none)
 
         def launched() -> None:
+            """From the sheet to the device, and back."""
             assert self.copies.chosen is not None
             which[0] = self.copies.chosen
             self.memory.write(self.sheet, sheet)

@@ -82,4 +82,4 @@ class WorldsReport:
         return f"WorldsReport({', '.join(said)})"
 
 
-ARRAYS = tuple(f.name for f in fields(WorldsReport) if f.type == "np.ndarray" or f.type is np.ndarray)
+ARRAYS = tuple(f.name for f in fields(WorldsReport) if f.type is np.ndarray)

@@ -321,6 +321,7 @@ def double_pendulum(times: np.ndarray, steps: int = 16, stages: int = 8) -> np.n
     h = times[0] / steps
 
     def slope(y):
+        """The time derivatives of angles and their rates, (stages, 4)."""
         a, b, w, v = y.T
         c, s = np.cos(a - b), np.sin(a - b)
         p, q = -2 * 9.81 * np.cos(a) - s * v * v, -9.81 * np.cos(b) + s * w * w
