@@ -237,6 +237,20 @@ def test_knobs_are_for_one_some_or_all(taichi):
     assert world.time == 0 and gravity.g == 9.81
 
 
+def test_one_that_is_taken_out_has_the_knobs_that_wait(taichi):
+    # A force that changed: velocities are taken by what it was, as a clone of the world alone does. The others go on alike.
+    world, alone = pendulum(), pendulum()
+    with tv.Worlds(world, 3) as many:
+        for w in (many, alone):
+            w.run(0.1)
+        many.set(world.features[0], some=[1], g=[3.0])
+        alone.features[0].g = 3.0
+        one, twin = many[1], alone.clone()
+        for w in (many, alone, one, twin):
+            w.run(0.1)
+        assert many.hash(1) == alone.hash() == one.hash() == twin.hash() and many.hash(0) == many.hash(2) != many.hash(1)
+
+
 def test_knobs_that_wait_for_other_kernels_are_there(taichi):
     # A rest length of 0 has no direction, so its constraint leaves the system: assigned, and not stepped with yet.
     world, alone = pendulum(), pendulum()

@@ -173,7 +173,7 @@ class State:
     def get(self, memory: Memory) -> np.ndarray:
         """A copy of the positions, low words added in f64."""
         out = memory.read(self.x).astype(np.float64, copy=False)
-        return (out + memory.read(self.low) if self.sums else out)[: self.count]
+        return (out + memory.read(self.low) if self.sums else out)[..., : self.count, :]
 
     def put(self, memory: Memory, position: np.ndarray) -> None:
         """Overwrite the positions."""

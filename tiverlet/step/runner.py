@@ -274,10 +274,13 @@ class Runner:
         if any([grid.grow() for grid in short]):
             self.renew()
 
-    def invalidate(self) -> None:
-        """Have lists of neighbours built anew in the next frame."""
+    def invalidate(self, some: np.ndarray | None = None) -> None:
+        """Have lists of neighbours built anew in the next frame; of some copies, where there are many."""
         for grid in self.step.grids:
-            grid.invalidate()
+            if some is None:
+                grid.invalidate()
+            else:
+                self.memory.write_some(grid.stale, 1, some)
 
     def ease(self, first: int) -> None:
         """Let particles part gently that the user put into each other, from number `first` on."""

@@ -86,7 +86,8 @@ class Worlds:
             self._rest()
             self._waiting = [[_flags(f) for f in world.features] for world in sources]  # of each, for the first frame
             for f, *each in zip(self._world.features, *self._waiting, strict=True):
-                f.changed, f.moving, f.new_force = (any(flags) for flags in zip(*each, strict=True))
+                changed, moving, new_force = (any(flags) for flags in zip(*each, strict=True))
+                _set_flags(f, (changed, moving, new_force))
         self._copies.closed = True
         self._set: dict[int, np.ndarray] = {}  # by feature, the worlds in which set() gave it other knobs
         self._forced: set[Feature] = set()  # of these, whose forces changed
@@ -268,34 +269,46 @@ class Worlds:
         self._go(plan, some, sheets, np.zeros((len(self), kernel.DATES)), figures, np.zeros(1))
         return figures[some, 0, 0], figures[some, 0, 2]
 
+    def _check_kernels(self) -> None:
+        """Refuse what was assigned for all and asks for other kernels; of one of them."""
+        for f in self._world.features:
+            if f.changed and f.outgrown:
+                _refuse_outgrown(f)
+
     def _upload(self) -> None:
         """Bring knobs to the device: those that were assigned for all, and those that were set for some."""
         world, features = self._world, self._world.features
         if not self._set and not any(f.changed or f.moving for f in features):
             return
-        for f in [f for f in features if f.changed]:
-            with self._at(0):
-                if f.outgrown:
-                    _refuse_outgrown(f)
+        with self._at(0):
+            self._check_kernels()
         if self._upload_to_all():
             return
-        common, own = [_flags(f) for f in features], self._waiting if len(self._waiting) > 1 else None
-        some, self._waiting, still = self._set, [], np.zeros(len(features), dtype=bool)
-        self._set = {}
-        all_of_them = own is not None or any(changed or moving for changed, moving, _ in common)
-        for k in range(len(self)) if all_of_them else np.flatnonzero(np.any([*some.values()], axis=0)):
-            flags = own[k] if own else [
-                (changed or bool(some[i][k] if i in some else False), moving, new_force)
-                for i, (changed, moving, new_force) in enumerate(common)
-            ]  # fmt: skip
-            with self._at(k):
-                for f, (changed, moving, new_force) in zip(features, flags, strict=True):
-                    f.changed, f.moving, f.new_force = changed, moving, new_force or (changed and f in self._forced)
+        all_of_them = len(self._waiting) > 1 or any(f.changed or f.moving for f in features)
+        still = np.zeros(len(features), dtype=bool)
+        for k in range(len(self)) if all_of_them else np.flatnonzero(np.any([*self._set.values()], axis=0)):
+            with self._at(k), self._flagged(k):
                 world._upload_parameters()
                 still |= [f.moving for f in features]
+        self._set, self._waiting = {}, []
         self._forced.clear()
         for f, moving in zip(features, still.tolist(), strict=True):
-            f.changed, f.moving, f.new_force = False, moving, False
+            _set_flags(f, (False, moving, False))
+
+    @contextlib.contextmanager
+    def _flagged(self, k: Any) -> Iterator[None]:
+        """Meanwhile features say what waits in them to be uploaded for the k-th, and not for all."""
+        features = self._world.features
+        common = [_flags(f) for f in features]
+        own = self._waiting[k] if len(self._waiting) > 1 else common
+        for i, (f, (changed, moving, new_force)) in enumerate(zip(features, own, strict=True)):
+            changed = changed or (i in self._set and bool(self._set[i][k]))
+            _set_flags(f, (changed, moving, new_force or (changed and f in self._forced)))
+        try:
+            yield
+        finally:
+            for f, flags in zip(features, common, strict=True):
+                _set_flags(f, flags)
 
     def _launch(
         self, dt: float, frames: int, moved: np.ndarray, released: np.ndarray, every: int = 0, track: np.ndarray | None = None,
@@ -442,7 +455,7 @@ class Worlds:
             if self._start:
                 self._start.put_back(self, chosen)
             if position is not None:
-                new = self._positions()
+                new = self._runner.scene.state.get(self._runner.memory)
                 new[chosen] = self._per_particle("position", position, len(chosen))
                 self._place(new, chosen)
             if velocity is not None:
@@ -480,14 +493,10 @@ class Worlds:
 
     def __getitem__(self, k: int) -> World:
         """The k-th as a World of its own, in its present state: what is done to it shows in no other."""
-        with self._open(), self._at(range(len(self))[k]) as world:
-            copies = tuple(f.copy() for f in world.features)
-            for f in copies:
-                f.changed = f.new_force = False
-            settings = world.settings | {"path": "auto"}
-            new = World._of(world.particles, copies, [f.start for f in world.features], None, **settings)
-            checkpoint.transfer(world, new)
-            return new
+        k = range(len(self))[k]
+        with self._open(), self._at(k) as world, self._flagged(k):
+            self._check_kernels()
+            return world.clone(path="auto")
 
     def each(self, ask: Callable[[World], Any], some: Any = None) -> list[Any]:
         """What a function says of each, in order, such as lambda world: world.features[1].load.
@@ -512,12 +521,7 @@ class Worlds:
     def position(self) -> np.ndarray:
         """Positions [m], (worlds, n, dim), a read-only copy in f64. Assign an array to move particles; velocities are kept."""
         with self._open():
-            return read_only(self._positions(), assign_whole("Worlds", "position"))
-
-    def _positions(self) -> np.ndarray:
-        state, memory = self._runner.scene.state, self._runner.memory
-        out = memory.read(state.x).astype(np.float64, copy=False)
-        return (out + memory.read(state.low) if state.sums else out)[:, : self._runner.n]
+            return read_only(self._runner.scene.state.get(self._runner.memory), assign_whole("Worlds", "position"))
 
     def view(self, name: str = "position") -> np.ndarray:
         """The positions [m] of all, (worlds, n, dim), where the device has them: no copy, in their own precision, and always as
@@ -550,8 +554,7 @@ class Worlds:
                 self._runner.restart(world.iterations)
         self._runner.scene.state.put(self._runner.memory, position)
         self._clocks.known[chosen], self._clocks.first_moved[chosen] = False, 0
-        for grid in self._runner.step.grids:
-            self._runner.memory.write_some(grid.stale, 1, chosen)
+        self._runner.invalidate(chosen)
 
     @property
     def velocity(self) -> np.ndarray:
@@ -683,17 +686,14 @@ class _Start:
 
     def __init__(self, worlds: Worlds):
         runner, self.clocks = worlds._runner, worlds._clocks.copy()
-        self.values = {name: values for memory in runner.memories for name, values in memory.state().items()}
+        self.values = checkpoint.state(worlds._world, pairs=False)
         for name, values in self.values.items():
             if (values == values[:1]).all():
                 self.values[name] = values[:1].copy()
-        self.pairs: list[Any] = []  # of each, with what they remember
-        if runner.grid:
-            for k in range(len(worlds)):
-                with worlds._at(k):
-                    self.pairs.append(runner.grid.lasting_data())
-                if not len(self.pairs[k][0]):
-                    self.pairs[k] = None
+        self.pairs: list[Any] = []  # of each, with what they remember; of copies that were not stepped yet, one for all
+        for k in range(len(worlds) if worlds._sources else 1) if runner.grid else ():
+            with worlds._at(k):
+                self.pairs.append(runner.grid.lasting_data())
 
     def put_back(self, worlds: Worlds, chosen: np.ndarray) -> None:
         """Return to it."""
@@ -705,11 +705,11 @@ class _Start:
             for field, value in ((runner.grid.old_number, 0), (runner.grid.old_saved, 1)):
                 runner.memory.write_some(field, value, chosen)
             for k in chosen:
-                if self.pairs[k]:
+                pairs = self.pairs[k if len(self.pairs) > 1 else 0]
+                if len(pairs[0]):
                     with worlds._at(k):
-                        runner.grid.restore(*self.pairs[k])
-        for grid in runner.step.grids:
-            runner.memory.write_some(grid.stale, 1, chosen)
+                        runner.grid.restore(*pairs)
+        runner.invalidate(chosen)
         worlds._clocks.return_to(self.clocks, chosen)
 
 
@@ -794,6 +794,10 @@ def _refuse_outgrown(feature: Feature) -> None:
 def _flags(feature: Feature) -> tuple[bool, bool, bool]:
     """What waits in it to be uploaded."""
     return feature.changed, feature.moving, feature.new_force
+
+
+def _set_flags(feature: Feature, flags: tuple[bool, bool, bool]) -> None:
+    feature.changed, feature.moving, feature.new_force = flags
 
 
 def _other_knobs(worlds: list[World]) -> dict[tuple[int, str], Any]:
