@@ -4,14 +4,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .spin import moments
+
 if TYPE_CHECKING:
     from .world import World
 
 
 def kinetic_energy(world: "World") -> float:
-    """Sum of m v^2 / 2 [J]; static particles have none."""
-    m = _mass(world)
-    return float(0.5 * np.sum(m * np.sum(world.velocity**2, axis=1)))
+    """Sum of m v^2 / 2 and of I omega^2 / 2 [J]; static particles have none."""
+    m, moment, spin = _mass(world), moments(world.particles), world.spin.reshape(len(world.particles), -1)
+    return float(0.5 * np.sum(m * np.sum(world.velocity**2, axis=1)) + 0.5 * np.sum(moment * np.sum(spin**2, axis=1)))
 
 
 def momentum(world: "World") -> np.ndarray:
@@ -20,12 +22,19 @@ def momentum(world: "World") -> np.ndarray:
 
 
 def angular_momentum(world: "World", about=None) -> np.ndarray:
-    """Sum of m (x - about) x v [kg m^2/s]: (1,) in 2D, (3,) in 3D; about the origin where no point is given."""
+    """Sum of m (x - about) x v + I omega [kg m^2/s]: (1,) in 2D, (3,) in 3D; about the origin where no point is given."""
     r = world.position - (0.0 if about is None else np.asarray(about))
     p = _mass(world)[:, None] * world.velocity
+    own = moments(world.particles) @ world.spin.reshape(len(r), -1)
     if r.shape[1] == 2:
-        return np.array([np.sum(r[:, 0] * p[:, 1] - r[:, 1] * p[:, 0])])
-    return np.cross(r, p).sum(axis=0)
+        return own + np.sum(r[:, 0] * p[:, 1] - r[:, 1] * p[:, 0])
+    return own + np.cross(r, p).sum(axis=0)
+
+
+def torque(world: "World") -> np.ndarray:
+    """Moments of contacts and walls on each particle that spins, in the last substep [N m]: (n,) in 2D, (n, 3) in 3D."""
+    out = world._runner.torque()
+    return out[:, 0] if world.particles.dim == 2 else out
 
 
 def center_of_mass(world: "World") -> np.ndarray:

@@ -24,6 +24,13 @@ class Particles:
     radius: number or (n,) [m], at least 0. A point (radius 0) touches discs and walls but not other points.
     pinned: indices or a Boolean mask of particles that stay where they are, whatever their mass.
     group: integer or (n,), for contact filters.
+    spin: angular velocity, a number or (n,) in 2D, counterclockwise, 0, (3,) or (n, 3) in 3D [rad/s]. Without it, particles do
+    not spin, and nothing is computed for it; 0 is for particles that do and start without. Friction turns them, see Contact;
+    what cannot move (pinned, or of infinite mass) keeps the spin that it has, as a driven roller does.
+    inertia: their moment of inertia in units of mass radius^2: "disc" (1/2; the default in 2D), "ring" (1), "sphere" (2/5; the
+    default in 3D), "shell" (2/3), or a number or (n,), above 0; inf for what no friction turns.
+    orientation: where they start from, an angle or (n,) in 2D [rad], 0, (4,) or (n, 4) unit quaternions (x, y, z, w) in 3D.
+    Without it nobody keeps track of how far they have turned.
 
     Raises ValueError or TypeError naming the first offending index. The arrays are read-only: mass, radius and links are
     structure, fixed when a world is built. To move particles, assign to world.position and world.velocity.
@@ -33,7 +40,8 @@ class Particles:
 
     def __init__(
         self, position: ArrayLike, *, velocity: ArrayLike = 0.0, mass: ArrayLike = 1.0, radius: ArrayLike = 0.0,
-        pinned: ArrayLike = (), group: ArrayLike = 0,
+        pinned: ArrayLike = (), group: ArrayLike = 0, spin: ArrayLike | None = None, inertia: str | ArrayLike | None = None,
+        orientation: ArrayLike | None = None,
     ):  # fmt: skip
         who = "Particles"
         self.position = checks.points(who, "position", position)
@@ -44,6 +52,7 @@ class Particles:
         self.radius = checks.per_item(who, "radius", radius, self.count, least=0.0)
         self.pinned = _pinned(who, pinned, self.count)
         self.group = _group(who, group, self.count)
+        self.spin, self.inertia, self.orientation = turning(self, spin, inertia, orientation)
         with np.errstate(divide="ignore"):
             self.inv_mass = np.where(self.pinned, 0.0, 1.0 / self.mass)
         self._fix()
@@ -62,6 +71,11 @@ class Particles:
         extent = float(np.ptp(self.position, axis=0).max()) if self.count else 0.0
         return extent or float(self.radius.max(initial=0.0)) or 1.0
 
+    @property
+    def spins(self) -> bool:
+        """Whether they spin."""
+        return self.spin is not None
+
     def regrouped(self, some: np.ndarray, added: "Particles | None" = None, position: np.ndarray | None = None) -> "Particles":
         """Those in the mask `some` and then `added` ones; position: where those are, if not where they were."""
         here = self.position[some] if position is None else position
@@ -71,8 +85,20 @@ class Particles:
             both = {name: np.concatenate([values, getattr(added, name)]) for name, values in both.items()}
         new = object.__new__(Particles)  # of what was checked when it came
         vars(new).update(both, count=len(both["position"]), dim=self.dim)
+        vars(new).update(self._turning_of(some, added))
         new._fix()
         return new
+
+    def _turning_of(self, some: np.ndarray, added: "Particles | None") -> dict[str, np.ndarray | None]:
+        """How those in the mask and the added ones spin; where only some do, the others do from now on, starting without."""
+        groups = [(self, some), *([(added, np.ones(len(added), dtype=bool))] if added is not None else [])]
+        out = {}
+        for name in TURNING:
+            given = [getattr(p, name) for p, _ in groups]
+            rows = [at_rest(name, p) if v is None else v for (p, _), v in zip(groups, given, strict=True)]
+            there = any(p.spins if name != "orientation" else p.orientation is not None for p, _ in groups)
+            out[name] = np.concatenate([v[mask] for v, (_, mask) in zip(rows, groups, strict=True)]) if there else None
+        return out
 
     def __setattr__(self, name: str, value) -> None:
         if getattr(self, "_fixed", False):
@@ -100,6 +126,76 @@ def in_range(who: str, name: str, position: np.ndarray) -> None:
             f"{who}: {name}[{i}, {k}] = {position[i, k]:g} m is out of range (at most {LARGEST:g} m). "
             "Shift the scene towards the origin or use larger units."
         )
+
+
+TURNING = ("spin", "inertia", "orientation")
+BODIES = {"disc": 0.5, "ring": 1.0, "sphere": 0.4, "shell": 2 / 3}  # I / (m r^2)
+
+
+def at_rest(name: str, particles: "Particles") -> np.ndarray:
+    """What particles have of TURNING that start without: no spin, the inertia of discs or spheres, not turned."""
+    n, flat = particles.count, particles.dim == 2
+    if name == "spin":
+        return np.zeros(n) if flat else np.zeros((n, 3))
+    if name == "inertia":
+        return np.full(n, BODIES["disc" if flat else "sphere"])
+    return np.zeros(n) if flat else np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
+
+
+def turning(particles: "Particles", spin, inertia, orientation) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray | None]:
+    """What was given of TURNING, checked, for each particle; None for all that there is not."""
+    who, n = "Particles", particles.count
+    if spin is None and inertia is None and orientation is None:
+        return None, None, None
+    rates = at_rest("spin", particles) if spin is None else spin_of(who, spin, particles)
+    if isinstance(inertia, str):
+        if inertia not in BODIES:
+            raise ValueError(f"{who}: inertia = {inertia!r}, but it must be a number or one of {', '.join(map(repr, BODIES))}.")
+        inertia = BODIES[inertia]
+    shares = at_rest("inertia", particles)
+    if inertia is not None:
+        shares = checks.per_item(who, "inertia", inertia, n, above=0.0, infinite=True)
+    return rates, shares, None if orientation is None else orientation_of(who, orientation, particles)
+
+
+def spin_of(who: str, spin, particles: "Particles") -> np.ndarray:
+    """Angular velocities of particles, checked: (n,) in 2D, (n, 3) in 3D [rad/s]. A point does not spin."""
+    n, zero = particles.count, at_rest("spin", particles)
+    if particles.dim == 2:
+        rates = checks.per_item(who, "spin", spin, n)
+    else:
+        array = checks.plain(who, "spin", spin)
+        if array.ndim == 0 and float(checks.number(who, "spin", spin)) != 0:
+            raise ValueError(f"{who}: spin = {spin}; a single number other than 0 has no axis. Give (0, 0, {spin}), for example.")
+        if array.ndim == 1 and array.shape != (0,):
+            array = np.broadcast_to(checks.vector(who, "spin", spin, 3), zero.shape)
+        rates = zero if array.ndim == 0 else checks.points(who, "spin", array, dim=3, count=n)
+    turned = (rates != 0).reshape(n, -1).any(axis=1) & (particles.radius == 0)
+    if turned.any():
+        i = int(np.argmax(turned))
+        raise ValueError(f"{who}: spin[{i}] = {rates[i]}, but particle {i} is a point (radius 0), which does not spin.")
+    return np.array(rates)
+
+
+def orientation_of(who: str, orientation, particles: "Particles") -> np.ndarray:
+    """How particles are turned, checked: angles (n,) in 2D [rad], unit quaternions (n, 4) in 3D."""
+    n, zero = particles.count, at_rest("orientation", particles)
+    if particles.dim == 2:
+        return np.array(checks.per_item(who, "orientation", orientation, n))
+    array = checks.plain(who, "orientation", orientation)
+    if array.ndim == 0:
+        if float(checks.number(who, "orientation", orientation)) != 0:
+            raise ValueError(f"{who}: orientation = {orientation}, but 0 or unit quaternions (x, y, z, w) are needed in 3D.")
+        return zero
+    if array.shape not in ((4,), (n, 4)):
+        raise ValueError(f"{who}: orientation has shape {array.shape}, but (4,) or ({n}, 4) is needed, quaternions (x, y, z, w).")
+    turned = np.broadcast_to(np.asarray(array, dtype=np.float64), (n, 4)).copy()
+    checks.finite(who, "orientation", turned)
+    length = np.linalg.norm(turned, axis=1)
+    if (abs(length - 1) > 1e-3).any():
+        i = int(np.argmax(abs(length - 1)))
+        raise ValueError(f"{who}: orientation[{i}] = {turned[i]} has length {length[i]:g}; a unit quaternion has 1.")
+    return turned / length[:, None]
 
 
 def _velocity(who: str, velocity, shape: tuple[int, int]) -> np.ndarray:
@@ -151,7 +247,7 @@ class State:
         self.compensated = compensated
         self.real, self.double = memory.real, memory.real == ti.f64
         self.count, self.dim = n, dim
-        self.starts = self.befores = self.keeps_wall_push = self.carries = False
+        self.starts = self.befores = self.keeps_wall_push = self.carries = self.spins = False
         self.x = memory.field("position", n, width=dim, values=particles.position, state=True)
         self.d = memory.field("displacement", n, width=dim, values=particles.velocity, state=True)
         self.w = Shared(memory, "inv_mass", inv_mass)

@@ -15,9 +15,9 @@ from .device.copies import Copies
 from .device.interrupts import whole
 from .features.arguments import meant
 from .features.feature import Acceleration, Feature
-from .features.read_only import assign_whole, read_only
+from .features.read_only import assign_whole, read_only, structure
 from .neighbours.queries import Contacts, PointSearch, near_by_all, nearest
-from .particles import Particles, in_range
+from .particles import Particles, at_rest, in_range, spin_of
 from .solvers.solver import Solver
 from .step import checkpoint, edit_scene
 from .step.adaptive import StepController
@@ -27,6 +27,8 @@ from .step.edit_scene import Handle
 from .step.explain import compiling, explain
 from .step.runner import Runner
 from .step_report import StepReport
+
+LIVE = ("position", "velocity", "spin", "substeps", "iterations")
 
 
 class World:
@@ -184,8 +186,11 @@ class World:
             self._start_from(self.velocity)
 
     def _start_from(self, velocity: np.ndarray) -> None:
-        clock = self._clock
-        self._runner.scene.state.start(self._runner.memory, velocity)
+        clock, state = self._clock, self._runner.scene.state
+        if state.spins and not clock.d_is_velocity:
+            with self._runner.memory.compiler():
+                self._runner.memory.write(state.spin.s, self._runner.spin())
+        state.start(self._runner.memory, velocity)
         clock.d_is_velocity, clock.energy, clock.owed, clock.parted = True, None, 0.0, None
 
     def _adapt(self) -> None:
@@ -292,6 +297,38 @@ class World:
             for watcher in self._watchers:
                 watcher.assigned("velocity", value)
             self._start_from(value)
+
+    @property
+    def spin(self) -> np.ndarray:
+        """Angular velocities [rad/s], (n,) in 2D, (n, 3) in 3D, a read-only copy in f64; second order. Assign to set them."""
+        state = self._runner.scene.state
+        if not state.spins:
+            return read_only(at_rest("spin", self._particles), assign_whole("World", "spin"))
+        self._runner.memory.check()
+        with whole, self._runner.memory.compiler():
+            return read_only(state.spin.to_rates(self._runner.spin()), assign_whole("World", "spin"))
+
+    @spin.setter
+    def spin(self, value) -> None:
+        if not self._particles.spins:
+            raise ValueError("World.spin: these particles do not spin. Make them with tv.Particles(..., spin=0).")
+        value = spin_of("World", value, self._particles)
+        self._runner.memory.check()
+        with whole:
+            for watcher in self._watchers:
+                watcher.assigned("spin", value)
+            self._let_go()
+            spin = self._runner.scene.state.spin
+            self._runner.memory.write(spin.s, spin.from_rates(value))
+            self._clock.energy = None
+
+    @property
+    def orientation(self) -> np.ndarray:
+        """How far particles are turned, a read-only copy: angles (n,) in 2D [rad], unit quaternions (n, 4) (x, y, z, w) in 3D."""
+        if self._particles.orientation is None:
+            raise ValueError("World.orientation: nobody keeps track of it. Make particles with tv.Particles(..., orientation=0).")
+        turned = self._runner.memory.read(self._runner.scene.state.spin.orientation)[: len(self._particles)]
+        return read_only(turned[:, 0] if self._particles.dim == 2 else turned, structure("World", "orientation"))
 
     def near(self, points, radius) -> np.ndarray:
         """The particles whose centers are within `radius` [m] of points: (m, 2), rows of `points` and particles, in order.
@@ -499,10 +536,10 @@ class World:
         self.close()
 
     def __setattr__(self, name: str, value) -> None:
-        if not name.startswith("_") and name not in ("position", "velocity", "substeps", "iterations"):
-            guess = "" if hasattr(self, name) else meant(name, ("position", "velocity", "substeps", "iterations"))
+        if not name.startswith("_") and name not in LIVE:
+            guess = "" if hasattr(self, name) else meant(name, LIVE)
             raise AttributeError(
-                f"World.{name} cannot be set{guess}. Live are position, velocity, substeps and iterations, and the knobs of the "
+                f"World.{name} cannot be set{guess}. Live are {', '.join(LIVE[:-1])} and {LIVE[-1]}, and the knobs of the "
                 "features; everything else is structure, fixed when the world is built."
             )
         object.__setattr__(self, name, value)

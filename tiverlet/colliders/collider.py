@@ -7,7 +7,7 @@ import numpy as np
 from .. import checks
 from ..device import ti
 from ..features.feature import Feature, Knob, Scene
-from ..features.material import friction_of, restitution_of
+from ..features.material import Bounce, as_given, friction_of, restitution_of
 from .surface import Surface
 
 SWEEPS = 8  # rounds over the walls, for particles that several of them push
@@ -33,16 +33,21 @@ class Collider(Feature):
     where it was at the start of the substep, to the bit, so it does not creep.
     restitution: 0 ... 1. The moment of the impact within the substep is solved for, with the acceleration in it; the particle
     leaves at restitution times its velocity then, and is placed where it would be at the end of the substep.
+    Of particles that spin, the displacement of the point that touches is taken back. friction = (static, dynamic, rolling,
+    twisting) then also resists rolling, by a moment of up to rolling * radius times the normal force, and spinning about the
+    normal, by up to twisting * radius times it; what these hold does not roll. restitution = (normal, tangential): in a bounce the
+    point that touches leaves across the normal at tangential times its velocity, as far as friction holds it; 0 grips, 1 is a
+    super ball (Garwin 1969).
     active: whether it is there, a gate that opens and closes. With True or False given it is a switch, which costs nothing to
     turn; None is always there, and costs the compiling of another scene when it is switched off for the first time. What is
     inside of a wall that comes back is left at push_out.
     """
 
-    friction = Knob(lambda f, v: _friction(f, v), "A number, or (static, dynamic).")
-    restitution = Knob(lambda f, v: restitution_of(repr(f), "restitution", v), "0 to 1.")
+    friction = Knob(lambda f, v: _friction(f, v), "A number, or (static, dynamic, rolling, twisting).")
+    restitution = Knob(lambda f, v: _restitution(f, v), "0 to 1, or (normal, tangential).")
     active = Knob(lambda f, v: checks.flag(repr(f), "active", v), "Whether it is there.")
     push_out = Knob(lambda f, v: checks.number(repr(f), "push_out", v, least=0.0), "[m/s].", compiled=True)
-    compiled_for = ("has_friction", "has_restitution", "has_switch")
+    compiled_for = ("has_friction", "has_restitution", "has_switch", "turns")
     host_only = ("widest",)
     _switch = False  # it was made with one
     _stands = True  # on the device
@@ -58,12 +63,22 @@ class Collider(Feature):
     @property
     def has_friction(self) -> bool:
         """Whether there is friction, or was when kernels were compiled."""
-        return friction_of(repr(self), "friction", self.friction)[0] > 0 or self._built("surface", "has_friction")
+        return self.turns or friction_of(repr(self), "friction", self.friction).static > 0 or self._built("surface", "has_friction")
 
     @property
     def has_restitution(self) -> bool:
         """Whether there is restitution, or was when kernels were compiled."""
-        return self.restitution > 0 or self._built("surface", "has_restitution")
+        return self._bounce.normal > 0 or self._built("surface", "has_restitution")
+
+    @property
+    def turns(self) -> bool:
+        """Whether it resists rolling, or bounces across the normal, or did when kernels were compiled."""
+        rub = friction_of(repr(self), "friction", self.friction)
+        return max(rub.rolling, rub.twisting, self._bounce.tangential) > 0 or self._built("surface", "turns")
+
+    @property
+    def _bounce(self) -> Bounce:
+        return restitution_of(repr(self), "restitution", self.restitution)
 
     @property
     def lets_go(self) -> bool:
@@ -81,13 +96,13 @@ class Collider(Feature):
         self.dev.state = scene.state
         self.dev.real = scene.real
         both = friction_of(repr(self), "friction", self.friction) if self.has_friction else None
-        restitution, active = self.restitution if self.has_restitution else None, self.active if self.has_switch else None
-        self.dev.surface = Surface(scene, repr(self), both, restitution, self.push_out, active)
+        restitution, active = self._bounce if self.has_restitution else None, self.active if self.has_switch else None
+        self.dev.surface = Surface(scene, repr(self), both, restitution, self.push_out, active, self.turns)
         self._stands = self.active
 
     def upload(self) -> None:
         """Write friction and restitution, and whether it is there."""
-        self.dev.surface.upload(friction_of(repr(self), "friction", self.friction), self.restitution, self.active)
+        self.dev.surface.upload(friction_of(repr(self), "friction", self.friction), self._bounce, self.active)
         self._stands = self.active
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
@@ -110,4 +125,9 @@ class Collider(Feature):
 
 def _friction(wall: Collider, value: Any) -> Any:
     friction_of(repr(wall), "friction", value)
-    return tuple(float(v) for v in value) if isinstance(value, (tuple, list)) else float(value)
+    return as_given(value)
+
+
+def _restitution(wall: Collider, value: Any) -> Any:
+    restitution_of(repr(wall), "restitution", value)
+    return as_given(value)

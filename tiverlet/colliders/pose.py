@@ -11,17 +11,21 @@ from .track import Track
 class Pose:
     """A point p of the collider's own frame is at position + R p in the world; R p is kept for the substep that is under way.
 
-    position: (dim,) [m]; rotation: an angle (2D) or a rotation vector (3D) [rad]: where the first frame starts.
+    position: (dim,) [m]; rotation: an angle (2D) or a rotation vector (3D) [rad]: where the first frame starts. turns: whether
+    somebody asks for `spin`, the angle or rotation vector of a substep [rad]; about another axis than before to first order.
     in_state: what it has in the exact state, by name.
     """
 
-    def __init__(self, scene: Scene, name: str, position: np.ndarray, rotation):
+    def __init__(self, scene: Scene, name: str, position: np.ndarray, rotation, turns: bool):
         self.dim, self.real = len(position), scene.real
         self.position = Track(scene.memory, f"{name}.position", position)
         self.rotation = Track(scene.memory, f"{name}.rotation", np.atleast_1d(rotation), kind=ti.f64)
         # Rows of R at the start and the end of the substep, and of their difference; and the position likewise.
         self.turn = scene.memory.field(f"{name}.turn", 3 * self.dim, width=self.dim)
         self.place = scene.memory.field(f"{name}.place", 3, width=self.dim)
+        self.turns = turns
+        if turns:
+            self.spin = scene.memory.field(f"{name}.spin", None, width=len(np.atleast_1d(rotation)))
         self.in_state = {"position": self.position.ends, "rotation": self.rotation.ends}
 
     def aim(self, position: np.ndarray, rotation) -> None:
@@ -46,6 +50,8 @@ class Pose:
             before = turn
         self.place[0], self.place[1] = self.position.at(frame_fraction[0]), self.position.at(frame_fraction[1])
         self.place[2] = self.position.step(frame_fraction)
+        if ti.static(self.turns):
+            self.spin[None] = ti.cast(self.rotation.step(ti.cast(frame_fraction, ti.f64)), self.real)
 
     @ti.func
     def matrix(self, rotation):

@@ -1,11 +1,12 @@
 """What happens to a particle that is inside of a collider: it is taken out, with friction and restitution."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..device import at, inline, ti
 
 if TYPE_CHECKING:
     from ..features.feature import Scene
+    from ..features.material import Bounce, Coefficients
 
 # How a collider confines: as it comes; only what is further out than rounding; of that, without friction and bounces.
 FIRST, AGAIN, GENTLY = range(3)
@@ -14,30 +15,45 @@ FIRST, AGAIN, GENTLY = range(3)
 class Surface:
     """How the surface of one collider answers on the device: friction, restitution, push_out; see Collider for what they mean.
 
-    friction: (static, dynamic), or None for a surface without. restitution: 0 to 1, or None. push_out: [m/s]. active: whether
-    it is there, or None for one without a switch.
+    friction: coefficients, or None for a surface without. restitution: 0 to 1, or None. push_out: [m/s]. active: whether
+    it is there, or None for one without a switch. turns: whether it resists rolling, or bounces across the normal. pose: of a
+    wall that may turn, or None.
     """
 
+    pose: Any = None
+
     def __init__(
-        self, scene: "Scene", name: str, friction: tuple[float, float] | None, restitution: float | None, push_out: float, active:
-        bool | None,
+        self, scene: "Scene", name: str, friction: "Coefficients | None", restitution: "Bounce | None", push_out: float, active:
+        bool | None, turns: bool,
     ):  # fmt: skip
-        self._memory, self.state, self.push_out = scene.memory, scene.state, push_out
+        self._memory, self.state, self.push_out, self.real = scene.memory, scene.state, push_out, scene.real
         self.has_friction, self.has_restitution = friction is not None, restitution is not None
-        if self.has_friction:
-            self.friction = scene.memory.field(f"{name}.friction", None, width=2, values=friction)
-        if self.has_restitution:
-            self.restitution = scene.memory.field(f"{name}.restitution", None, values=restitution)
+        self.spins, self.turns, self.radius = scene.state.spins and self.has_friction, turns, scene.radius
+        self.spin = scene.state.spin if scene.state.spins else None
+        if turns and not scene.state.spins:
+            raise ValueError(
+                f"{name}: resistance to rolling and tangential restitution are for particles that spin. Leave them out, or give "
+                "tv.Particles a spin."
+            )
+        if friction:
+            self.friction = scene.memory.field(f"{name}.friction", None, width=2, values=friction[:2])
+        if restitution:
+            self.restitution = scene.memory.field(f"{name}.restitution", None, values=restitution.normal)
+        if turns and friction:
+            values = friction.rolling, friction.twisting, restitution.tangential if restitution else 0.0
+            self.rolling = scene.memory.field(f"{name}.rolling", None, width=3, values=values)
         self.has_switch = active is not None
         if self.has_switch:
             self.active = scene.memory.field(f"{name}.active", None, kind=ti.i32, values=float(active or 0))
 
-    def upload(self, friction: tuple[float, float], restitution: float, active: bool) -> None:
+    def upload(self, friction: "Coefficients", restitution: "Bounce", active: bool) -> None:
         """Write these to the device, as far as kernels read them."""
         if self.has_friction:
-            self._memory.write(self.friction, friction)
+            self._memory.write(self.friction, friction[:2])
         if self.has_restitution:
-            self._memory.write(self.restitution, restitution)
+            self._memory.write(self.restitution, restitution.normal)
+        if self.turns:
+            self._memory.write(self.rolling, (friction.rolling, friction.twisting, restitution.tangential))
         if self.has_switch:
             self._memory.write(self.active, float(active))
 
@@ -98,7 +114,14 @@ class Surface:
                 self.state.wall_push[i] = self.state.wall_push[i] + change
             shift = (move + rise) * n
             stuck = False
-            if ti.static(self.has_friction):
+            if ti.static(self.spins):
+                if turn != GENTLY:
+                    high, _lift = self.bounced(i)
+                    held, rests = self.grip(i, n, d - leaving * n, after - leaving, rise > 0)
+                    stuck = rests and rise == 0 and not high
+                    change -= held
+                    shift -= held
+            elif ti.static(self.has_friction):
                 if turn != GENTLY:
                     slip = d - leaving * n
                     size, support = slip.norm(), after - leaving
@@ -123,6 +146,50 @@ class Surface:
         return shift
 
     @ti.func
+    def grip(self, i, n, across, support, bounces):
+        """What friction takes of the displacement `across` the normal of a particle that spins, for a normal displacement
+        `support`; its spin changes. And whether it stays where it is: it neither slides nor rolls.
+
+        Of the point that touches, d - s x n is taken back. Where the wall resists rolling, by up to a moment of rolling r N, both
+        are solved for together: what sticks stops, as long as that moment holds it; what rolls on does so against it.
+        """
+        k, s = self.spin.share.of(i), self.spin.s[i]
+        most, least = self.static() * support, self.dynamic() * support
+        slip = across - self.spin.surface(s, n)
+        if ti.static(self.turns):
+            if bounces:
+                slip *= 1 + self.rolling[None][2]
+        held = limited(slip / (1 + k), most, least)
+        if ti.static(self.turns):
+            row = self.rolling[None]
+            if row[0] > 0 and not bounces:
+                rolls = s - self.wall_turn(i)
+                rolls -= self.spin.along(rolls, n)
+                still = limited(across, most, least)
+                moment = self.spin.moment(n, still)
+                rolls += k * moment
+                resisted = limited(rolls, k * row[0] * support, k * row[0] * support)
+                held = still
+                if (resisted != rolls).any():
+                    held = limited((across - self.spin.surface(s - resisted, n)) / (1 + k), most, least)
+                s -= resisted
+            if row[1] > 0:
+                twist = self.spin.along(s - self.wall_turn(i), n)
+                s -= limited(twist, k * row[1] * support, k * row[1] * support)
+        s += k * self.spin.moment(n, held)
+        self.spin.s[i] = s
+        left = across - held
+        return held, left.dot(left) <= ti.static(2.0**-40) * slip.dot(slip) + ti.static(2.0**-80) * across.dot(across)
+
+    @ti.func
+    def wall_turn(self, i):
+        """How far the surface of particle i would turn if it turned with the wall [m]."""
+        out = 0 * self.spin.s[i]
+        if ti.static(self.pose is not None):
+            out = self.radius.of(i) * self.pose.spin[None]
+        return out
+
+    @ti.func
     def bounce(self, gap, leaving, before, after):
         """What is above the wall at the end of the substep, and the normal displacement that carries the velocity then.
 
@@ -141,3 +208,12 @@ class Surface:
                 rise = height
                 after = out + k * (1 - s) - k / 2
         return rise, after
+
+
+@ti.func
+def limited(v, most, least):
+    """A vector, if it is no longer than `most`; else it in the length `least`."""
+    size = v.norm()
+    if size > most:
+        v *= least / size
+    return v

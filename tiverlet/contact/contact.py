@@ -19,6 +19,7 @@ from .mass_splitting import MassSplitting, lesser
 from .narrow_phase import DiscGeometry
 from .pair_contact import PairContact
 from .restitution import Restitution
+from .spinning import Spinning
 from .velocity_projection import VelocityProjection
 
 RELAXATION = 1.25  # below 4/3, see Contact
@@ -56,7 +57,13 @@ class Contact(PairContact):
 
     Friction wants back the slip s of a pair, up to friction times the overlap: what a pair has moved across its normal since it
     touched, kept as long as it touches (Cundall and Strack 1979). Restitution gives the pair the normal velocity -e times the one
-    that it had before the substep, from the moment on when it met. Neither depends on h. Particles do not spin.
+    that it had before the substep, from the moment on when it met. Neither depends on h.
+
+    Particles that spin (see Particles) slide past each other by what the points that touch do, and turn as friction acts there.
+    friction = (static, dynamic, rolling, twisting) also resists rolling, by a moment of up to rolling * r times the normal force,
+    with r = r_i r_j / (r_i + r_j), and spinning about the normal, by up to twisting * r times it (Luding 2008). restitution =
+    (normal, tangential): in an impact the points that touch leave across the normal at -tangential times their velocity, as far
+    as friction holds it; 0 grips, 1 is a super ball (Walton 1993). Of particles that do not spin, friction is that of skaters.
 
     What is struck by several in one substep bounces off one after the other. Of the pairs that were struck, those take their turn
     that come first for both of their particles; then the next ones, on the new ways. Each impact is between two, so it keeps
@@ -81,6 +88,11 @@ class Contact(PairContact):
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Choose the skin, and refuse positions too far out for cells to be told apart."""
+        if self.wanted.turns and not particles.spins:
+            raise ValueError(
+                "Contact: resistance to rolling and tangential restitution are for particles that spin. Leave them out, or give "
+                "tv.Particles a spin."
+            )
         radius = particles.radius
         some = radius[radius > 0]
         auto = 0.75 * median(some) if len(some) else 1.0
@@ -101,12 +113,15 @@ class Contact(PairContact):
         # What parted the pair in the last substep, per inverse mass [kg m].
         dev.push = PairData("push", 0, lasting=True, marked=True)
         dev.slip = PairData("slip", dim, lasting=True)
+        dev.spins = scene.state.spins and dev.has_friction
+        dev.turn = PairData("turn", 2 * dim - 3, lasting=True) if dev.turns else None  # 1 in 2D, 3 in 3D
         dev.slack = PairData("slack", 0, lasting=True)  # of the overlap, what no push is for
         dev.impulse = PairData("given", 0, lasting=True)  # pushes and impacts in the last substep [kg m]
         struck, bouncing = PairData("struck", 0, lasting=False), [dev.slack] if dev.has_restitution else []
         pair_data = [
             dev.push,
             *([dev.slip] if dev.has_friction else []),
+            *([dev.turn] if dev.turn else []),
             *([*bouncing, struck, dev.impulse] if dev.has_restitution else []),
         ]
         dev.grid = NeighbourSearch(scene, self._listed, linked, self.table, pair_data, team, dev.move)
@@ -120,6 +135,8 @@ class Contact(PairContact):
         if dev.has_restitution:
             dev.restitution = Restitution(scene, dev.geometry, self.table, struck, dev.slack, dev.impulse)
             dev.hit = dev.restitution.hit
+        if dev.spins:
+            dev.spinning = Spinning(scene, self.table, dev.geometry, dev.splitting.weight, dev.turn)
         dev.projection = VelocityProjection(scene, dev.grid, dev.push, dev.splitting.weight, dev.restitution, dev.move, team)
         return dev.grid
 
@@ -138,6 +155,8 @@ class Contact(PairContact):
         """What the pairs of particle i want of it."""
         total, w = ti.Vector.zero(self.scene.real, self.dev.state.dim), self.dev.w.of(i)
         lift, forced = total, total
+        spin_change = ti.Vector.zero(self.scene.real, ti.static(2 * self.dev.state.dim - 3))
+        spin_forced = spin_change
         if ti.static(self.dev.has_restitution):
             if first != 0:
                 self.dev.restitution.clear(i, self.dev.splitting.weight[i])
@@ -176,15 +195,31 @@ class Contact(PairContact):
                         self.dev.impulse.field[e] = self.dev.impulse.field[e] + part
                     push += part
                     want = part * n
-                    if ti.static(self.dev.has_friction):
+                    if ti.static(self.dev.spins):
+                        tangential, turned = self.grip(i, j, e, n, part + given / shared, given > 0)
+                        want += tangential
+                        if ti.static(self.dev.has_restitution):
+                            if given > 0:  # it acts from the time of impact on
+                                lift -= w * self.dev.restitution.before_impact(i, j, n, overlap) * tangential
+                        spin_change += w * turned
+                        if final != 0:
+                            approach = -(self.dev.forces.before[i] - self.dev.forces.before[j]).dot(n)
+                            share = self.dev.forces.share(approach, part * alone) * w
+                            forced += share * tangential
+                            spin_forced += share * turned
+                    elif ti.static(self.dev.has_friction):
                         want -= self.held(i, j, n, part * shared + given, self.dev.slip.field[e]) / shared
                     total += w * want
-                    if ti.static(self.dev.has_friction):
+                    if ti.static(self.dev.has_friction and not self.dev.spins):
                         if final != 0:
                             approach = -(self.dev.forces.before[i] - self.dev.forces.before[j]).dot(n)
                             forced += self.dev.forces.share(approach, part * alone) * w * (want - part * n)
                     self.dev.push.field[e] = push
         self.dev.move[i] = total
+        if ti.static(self.dev.spins):
+            self.dev.spinning.change[i] = spin_change
+            if final != 0:
+                self.dev.forces.add_turn(i, spin_forced, first)
         if ti.static(self.dev.has_friction):
             if final != 0:
                 self.dev.forces.add(i, forced, first)
@@ -195,6 +230,21 @@ class Contact(PairContact):
     def held(self, i, j, n, normal, slip):
         """The part of a pair's slip, with the present displacements, that friction takes back for a normal displacement."""
         return self.dev.friction.held(i, j, n, normal, slip + self.dev.state.d[i] - self.dev.state.d[j])
+
+    @ti.func
+    def grip(self, i, j, e, n, pressed, bounces):
+        """What friction between particles that spin pushes i by, and turns its surface by, both per inverse mass, for a push
+        `pressed` along the normal."""
+        m, split_mass = self.dev.spinning.arm(i, j, n), self.dev.spinning.split_mass(i, j)
+        slip = self.dev.slip.field[e] + self.dev.spinning.slip(i, j, m)
+        if ti.static(self.dev.turns and self.dev.has_restitution):
+            if bounces:
+                slip *= 1 + self.table.of(i, j)[6]
+        push = -self.dev.friction.held(i, j, n, pressed * split_mass, slip) / split_mass
+        turned = self.dev.spinning.turned(i, m, push)
+        if ti.static(self.dev.turns):
+            turned += self.dev.spinning.resist(i, j, e, n, m, push, pressed)
+        return push, turned
 
     @ti.func
     def reaction(self, i):
@@ -232,6 +282,8 @@ class Contact(PairContact):
         """Move particle i as its pairs want."""
         if self.dev.w.of(i) > 0:  # what touches nothing moves by 0, without a branch
             self.dev.state.shift(i, self.dev.move[i])
+            if ti.static(self.dev.spins):
+                self.dev.state.spin.s[i] = self.dev.state.spin.s[i] + self.dev.spinning.change[i]
             if ti.static(self.dev.has_restitution):
                 self.dev.state.advance(i, self.dev.restitution.lift[i])
 
@@ -243,11 +295,22 @@ class Contact(PairContact):
             for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
                 j = self.dev.grid.neighbour[e]
                 overlap, n = self.dev.geometry.overlap(i, j, self.dev.geometry.contact_distance(i, j))
-                slip = 0 * self.dev.state.x[i]
+                slip, turn = 0 * self.dev.state.x[i], ti.Vector.zero(self.scene.real, ti.static(2 * self.dev.state.dim - 3))
                 if overlap > 0 and self.dev.push.field[e] > 0:
-                    pressed = self.dev.push.field[e] * (self.dev.splitting.weight[i] + self.dev.splitting.weight[j])
-                    slip = self.held(i, j, n, ti.max(overlap, pressed), self.dev.slip.field[e])
+                    shared = self.dev.splitting.weight[i] + self.dev.splitting.weight[j]
+                    pressed = self.dev.push.field[e] * shared
+                    if ti.static(self.dev.spins):
+                        pressed = ti.max(overlap, pressed) / shared
+                        reach = pressed * self.dev.spinning.split_mass(i, j)
+                        slip = self.dev.slip.field[e] + self.dev.spinning.slip(i, j, self.dev.spinning.arm(i, j, n))
+                        slip = self.dev.friction.held(i, j, n, reach, slip)
+                        if ti.static(self.dev.turns):
+                            turn = self.dev.spinning.left(i, j, e, n, pressed)
+                    else:
+                        slip = self.held(i, j, n, ti.max(overlap, pressed), self.dev.slip.field[e])
                 self.dev.slip.field[e] = slip
+                if ti.static(self.dev.turns):
+                    self.dev.turn.field[e] = turn
         if ti.static(self.dev.has_restitution):
             if self.dev.splitting.weight[i] > 0:
                 for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):

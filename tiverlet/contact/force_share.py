@@ -18,6 +18,10 @@ class ForceShare:
         if sums:
             self.sum = add("Contact.bond", n, width=dim, state=True)
             self.in_state["sum"] = self.sum
+        self.spins = sums and scene.state.spins
+        if self.spins:
+            self.turned = add("Contact.torque", n, width=scene.state.spin.axes, state=True)
+            self.in_state["turned"] = self.turned
 
     @ti.func
     def start(self, i, scale):
@@ -32,6 +36,14 @@ class ForceShare:
         both of a pair, which keeps momentum.
         """
         return ti.max(1 - ti.select(push > 0, ti.max(approach, 0) / push, ti.zero(push)) ** 2, 0)
+
+    @ti.func
+    def add_turn(self, i, turned, first):
+        """Add what forces of a pass turned the surface of particle i by; the first pass begins the sum."""
+        if first != 0:
+            self.turned[i] = turned
+        else:
+            self.turned[i] = self.turned[i] + turned
 
     @ti.func
     def add(self, i, moved, first):

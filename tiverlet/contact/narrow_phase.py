@@ -68,6 +68,8 @@ class DiscGeometry:
         A pair that came together in this substep has the normal that it had at the time of impact: |r0 + s d| = contact_distance,
         with r0 at the start and d the relative displacement; what is left of d along n is the overlap. This is exact for free
         flight, where the normal at the end is off by the way that a pair slides past each other.
+        A pair of particles that spin, and that touched before, has the normal at the start, about which its push has no moment:
+        so angular momentum is kept to rounding, and what rolls on another is second order.
         """
         r = self.state.apart(i, j)
         rr = r.dot(r)
@@ -88,6 +90,9 @@ class DiscGeometry:
                 s = ti.min(c / root, 1)
                 n = (r + s * d) / contact_distance
                 overlap = ti.max((s - 1) * d.dot(n), 0)
+        elif ti.static(self.state.spins):
+            if r.dot(r) > contact_distance * contact_distance * ti.static(SAME_PLACE):
+                n = r.normalized()
         return overlap, each, n
 
     @ti.func

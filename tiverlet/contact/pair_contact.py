@@ -58,7 +58,7 @@ class PairContact(Feature):
     restitution = Knob(lambda f, v: f._surface("restitution", v), "Of all pairs, or by pairs of groups.")
     skin = Knob(lambda f, v: _skin(v), "How far beyond touching pairs are listed [m].", compiled=True)
     push_out = Knob(lambda f, v: checks.number("Contact", "push_out", v, least=0.0), "[m/s].", compiled=True)
-    compiled_for = ("has_friction", "has_restitution", "uniform")
+    compiled_for = ("has_friction", "has_restitution", "turns", "uniform")
     _finest = _listed = 0.0  # the smallest radius, and how far beyond touching pairs are listed now [m]
     table: Table  # bound to one world
     matters = True
@@ -98,6 +98,11 @@ class PairContact(Feature):
         return self.wanted.has_restitution or vars(self.dev).get("has_restitution", False)
 
     @property
+    def turns(self) -> bool:
+        """Whether any pair resists rolling, or bounces across the normal, or did when kernels were compiled."""
+        return self.wanted.turns or vars(self.dev).get("turns", False)
+
+    @property
     def shrinks(self) -> bool:
         """Whether particles can be smaller than they are, in the kernels as they are."""
         return self.dev.geometry.shrinks
@@ -115,7 +120,7 @@ class PairContact(Feature):
         """What comes first when fields are declared."""
         dev = self.dev
         self.scene, dev.state, dev.w = scene, scene.state, scene.state.w
-        dev.has_friction, dev.has_restitution = self.has_friction, self.has_restitution
+        dev.has_friction, dev.has_restitution, dev.turns = self.has_friction, self.has_restitution, self.turns
 
     def upload(self) -> None:
         """Write friction and restitution."""

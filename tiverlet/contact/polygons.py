@@ -60,6 +60,8 @@ class Polygons(PairContact):
         """Turn all loops counterclockwise, and measure them; refuse flat ones, and particles deep inside of others."""
         if particles.dim != 2:
             raise ValueError("Polygons: bodies of particle loops are for 2D worlds; these particles are in 3D.")
+        if particles.spins:
+            raise ValueError("Polygons: it does not turn particles that spin. Leave out spin, or use tv.Contact for discs alone.")
         x = particles.position
         self.dev.outline = Outline(*laid(self.loops, x))
         refuse_deep(self.loops, self.dev.outline.body, x, 0)

@@ -62,6 +62,12 @@ class Restitution:
         return here + self.table.of(i, j)[2] * ti.max(a, 0), here, a
 
     @ti.func
+    def before_impact(self, i, j, n, overlap):
+        """The share of the substep that had passed when a pair met."""
+        here = -(self.state.d[i] - self.state.d[j]).dot(n)
+        return ti.select(overlap < here, 1 - overlap / here, 0 * here)
+
+    @ti.func
     def choose(self, i):
         """The first of the pairs of particle i that were struck and still come together, and what it does to i."""
         first, partner, most, w = -1, -1, 0 * self.weight[i], self.state.w.of(i)

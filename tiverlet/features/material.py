@@ -1,7 +1,7 @@
 """Friction and restitution: what users give, checked, and as tables for kernels."""
 
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -13,34 +13,63 @@ if TYPE_CHECKING:
     from .feature import Scene
 
 
-def friction_of(who: str, name: str, value: Any) -> tuple[float, float]:
-    """A coefficient of Coulomb friction, or (static, dynamic), as (static, dynamic)."""
-    both = value if isinstance(value, (tuple, list)) else (value, value)
-    if len(both) != 2:
-        raise ValueError(f"{who}: {name} = {value!r}, but a number or (static, dynamic) is needed.")
-    static = checks.number(who, f"{name} (static)", both[0], least=0.0)
-    dynamic = checks.number(who, f"{name} (dynamic)", both[1], least=0.0)
-    if dynamic > static:
+class Coefficients(NamedTuple):
+    """Of Coulomb friction: static and dynamic; and of the resistance to rolling and to twisting, see Contact."""
+
+    static: float
+    dynamic: float
+    rolling: float = 0.0
+    twisting: float = 0.0
+
+
+class Bounce(NamedTuple):
+    """Coefficients of restitution along the normal, and across it of what spins."""
+
+    normal: float
+    tangential: float = 0.0
+
+
+def friction_of(who: str, name: str, value: Any) -> Coefficients:
+    """A coefficient of Coulomb friction, or (static, dynamic), (static, dynamic, rolling) or (static, dynamic, rolling, twisting)."""
+    given = value if isinstance(value, (tuple, list)) else (value, value)
+    if not 2 <= len(given) <= 4:
+        raise ValueError(
+            f"{who}: {name} = {value!r}, but a number, (static, dynamic) or (static, dynamic, rolling, twisting) is needed."
+        )
+    out = Coefficients(
+        *(checks.number(who, f"{name} ({kind})", v, least=0.0) for kind, v in zip(Coefficients._fields, given, strict=False))
+    )
+    if out.dynamic > out.static:
         raise ValueError(f"{who}: {name} = {value!r}: dynamic friction must not exceed static friction.")
-    return static, dynamic
+    return out
 
 
-def restitution_of(who: str, name: str, value: Any) -> float:
-    """A coefficient of restitution, 0 (inelastic) to 1 (elastic)."""
-    return checks.number(who, name, value, least=0.0, most=1.0)
+def restitution_of(who: str, name: str, value: Any) -> Bounce:
+    """A coefficient of restitution, 0 (inelastic) to 1 (elastic), or (normal, tangential)."""
+    given = value if isinstance(value, (tuple, list)) else (value, 0.0)
+    if len(given) != 2:
+        raise ValueError(f"{who}: {name} = {value!r}, but a number or (normal, tangential) is needed.")
+    normal = checks.number(who, name, given[0], least=0.0, most=1.0)
+    return Bounce(normal, checks.number(who, f"{name} (tangential)", given[1], least=0.0, most=1.0))
+
+
+def as_given(value: Any) -> Any:
+    """A number or a tuple of numbers that was checked, as the user is to see it."""
+    return tuple(float(v) for v in value) if isinstance(value, (tuple, list)) else float(value)
 
 
 MOST = 1000  # groups of particles that are told apart
 
 
 class Table:
-    """For each pair of groups: static friction, dynamic friction, restitution, whether they touch; one row where `uniform`.
+    """For each pair of groups: static friction, dynamic friction, restitution, whether they touch; and of what spins (`turns`) the
+    resistance to rolling, to twisting, and the tangential restitution. One row where `uniform`.
 
     friction, restitution: one value for all, or a mapping from pairs of groups to values, with 0 for pairs that are not in it.
     touching: None for all, or the pairs of groups that touch.
     """
 
-    kernels_read = ("uniform", "has_friction", "has_restitution", "groups", "rank", "entries")
+    kernels_read = ("uniform", "has_friction", "has_restitution", "turns", "groups", "rank", "entries")
 
     def __init__(self, who: str, friction: Any, restitution: Any, touching: Iterable | None):
         self.who, self.friction, self.restitution = who, friction, restitution
@@ -51,12 +80,15 @@ class Table:
         single = not isinstance(friction, Mapping) and not isinstance(restitution, Mapping)
         self.uniform = single and touching is None
         values = friction.values() if isinstance(friction, Mapping) else [friction]
-        self.has_friction = any(friction_of(who, "friction", v)[0] > 0 for v in values)
+        rub = [friction_of(who, "friction", v) for v in values]
         values = restitution.values() if isinstance(restitution, Mapping) else [restitution]
-        self.has_restitution = any(restitution_of(who, "restitution", v) > 0 for v in values)
+        bounce = [restitution_of(who, "restitution", v) for v in values]
+        self.has_restitution = any(v.normal > 0 for v in bounce)
+        self.turns = any(v.rolling > 0 or v.twisting > 0 for v in rub) or any(v.tangential > 0 for v in bounce)
+        self.has_friction = any(v.static > 0 for v in rub) or self.turns
 
     def rows(self, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The rank of each particle's group, (n,), and the table, (ranks * ranks, 4)."""
+        """The rank of each particle's group, (n,), and the table, (ranks * ranks, 7)."""
         named = {k for given in (self.friction, self.restitution) if isinstance(given, Mapping) for pair in given for k in pair}
         named |= {k for pair in self.touching or () for k in pair}
         names, which, _ = distinct(group)
@@ -65,20 +97,23 @@ class Table:
         if m > MOST:
             raise ValueError(f"{self.who}: {len(at)} groups of particles are named, but there can be {MOST}.")
         rank = np.array([at.get(int(name), len(at)) for name in names], dtype=np.int64)[which]
-        table = np.zeros((m, m, 4))
+        table = np.zeros((m, m, 7))
         table[..., 3] = self.touching is None
         for a, b in self.touching or []:
             if a in at and b in at:
                 table[at[a], at[b], 3] = table[at[b], at[a], 3] = 1
-        for columns, given, parse in ((slice(0, 2), self.friction, friction_of), (2, self.restitution, restitution_of)):
+        for name, columns, given, parse in (
+            ("friction", [0, 1, 4, 5], self.friction, friction_of), ("restitution", [2, 6], self.restitution, restitution_of),
+        ):  # fmt: skip
             if not isinstance(given, Mapping):
-                table[..., columns] = parse(self.who, "friction" if parse is friction_of else "restitution", given)
+                table[..., columns] = parse(self.who, name, given)
                 continue
             for pair, value in given.items():
-                a, b = self._pair("friction" if parse is friction_of else "restitution", pair)
+                a, b = self._pair(name, pair)
                 if a in at and b in at:
-                    table[at[a], at[b], columns] = table[at[b], at[a], columns] = parse(self.who, f"value of {pair}", value)
-        return rank, table.reshape(m * m, 4)
+                    row = parse(self.who, f"value of {pair}", value)
+                    table[at[a], at[b], columns] = table[at[b], at[a], columns] = row
+        return rank, table.reshape(m * m, 7)
 
     def bind(self, scene: "Scene", asked: bool = False) -> None:
         """Declare the table and the groups, where they differ. asked: of() is asked even where all rows are 0."""
@@ -89,16 +124,19 @@ class Table:
         else:
             self.rank = scene.memory.field("Contact.group", len(rank), kind=ti.i32, values=rank)
         if self.has_friction or self.has_restitution or not self.uniform or asked:
-            self.entries = scene.memory.field("Contact.table", len(rows), width=4, values=rows)
+            self.width = 7 if self.turns else 4  # of a row on the device
+            self.entries = scene.memory.field("Contact.table", len(rows), width=self.width, values=rows[:, : self.width])
 
     def upload(self, scene: "Scene", other: "Table") -> None:
         """Write the values of another table, for the same kernels."""
         if "entries" in vars(self):
-            scene.memory.write(self.entries, other.rows(scene.particles.group)[1][: 1 if self.uniform else None])
+            rows = other.rows(scene.particles.group)[1][: 1 if self.uniform else None]
+            scene.memory.write(self.entries, rows[:, : self.width])
 
     @ti.func
     def of(self, i, j):
-        """Static friction, dynamic friction and restitution of particles i and j, and 1 if they touch."""
+        """Static friction, dynamic friction and restitution of particles i and j, 1 if they touch; and where it `turns` the
+        resistance to rolling, to twisting, and the tangential restitution."""
         row = 0
         if ti.static(not self.uniform):
             row = self.rank[i] * self.groups + self.rank[j]

@@ -288,7 +288,7 @@ class Replay:
             checkpoint.install(world, _kept(entry, world), entry.data["flags"])
             world._runner.scene.h2_effective = entry.data["reach"]
         elif entry.kind == "assigned":
-            if entry.data["name"] not in ("position", "velocity"):
+            if entry.data["name"] not in ("position", "velocity", "spin"):
                 raise ValueError(f"replay: {self.path} says that {plain(entry.data['name'])!r} was assigned.")
             setattr(world, entry.data["name"], entry.arrays["value"])
         if "now" in entry.data:

@@ -17,13 +17,13 @@ from ..device import runtime
 from ..device.language import is_kernel_function, undecorated
 from ..features.arguments import RecordsArguments, knobs_of
 from ..features.feature import Batch, Feature
-from ..particles import Particles
+from ..particles import TURNING, Particles
 from ..solvers.solver import Solver
 
 if TYPE_CHECKING:
     from ..world import World
 
-PARTICLES = ("position", "velocity", "mass", "radius", "pinned", "group")
+PARTICLES = ("position", "velocity", "mass", "radius", "pinned", "group", *TURNING)
 PUBLIC = {
     name: kind for module in (colliders, constraints, contact, forces, solvers) for name, kind in vars(module).items()
     if isinstance(kind, type) and issubclass(kind, RecordsArguments)
@@ -156,7 +156,7 @@ def describe(world: "World") -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     settings["solver"] = made(settings["solver"], "solver")
     p = world.particles
     scene = {
-        "particles": {name: encode(getattr(p, name), name, arrays, needs) for name in PARTICLES},
+        "particles": {name: encode(v, name, arrays, needs) for name in PARTICLES if (v := getattr(p, name)) is not None},
         "features": features, "settings": settings, "environment": environment(), "needs": needs.sources,
     }  # fmt: skip
     return scene, arrays

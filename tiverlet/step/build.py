@@ -18,6 +18,7 @@ from ..device.thread_team import PIECES, Team, size_of
 from ..features.feature import Acceleration, Batch, Feature, Scene
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles, Radii, State
+from ..spin import Spin
 from ..solvers.conjugate import ConjugateGradient
 from ..solvers.direct import Direct
 from ..solvers.elimination import plan_of
@@ -104,6 +105,10 @@ def assemble(
             feature.review(particles, inv_mass)
         else:
             feature.check_added(particles, first)
+    if particles.spins and order > 2:
+        raise ValueError(
+            f"World: order = {order}, but particles that spin are for order 2: only contacts and walls turn them. Leave out spin."
+        )
     runtime.ensure_started()
     check_architecture(precision, features)
     now = Scale(len(particles), len(particles) + sum(f.count for f in features if isinstance(f, Batch)))
@@ -114,6 +119,8 @@ def assemble(
     memory = Memory(PRECISIONS[precision], scale.particles < FEW, bulk > LONG, often, copies=copies)
     try:
         state = State(memory, particles, inv_mass, precision == "f32-compensated")
+        if particles.spins:
+            state.spin, state.spins = Spin(memory, particles, inv_mass), True
         return _bind(Scene(memory, state, particles, inv_mass, order=order), features, solver, path, scale)
     except BaseException:
         memory.destroy()

@@ -11,7 +11,7 @@ from . import clock
 if TYPE_CHECKING:
     from ..world import World
 
-CARRIED = ("Contact.push", "Contact.slip", "Contact.slack")  # by pairs, for the next substep
+CARRIED = ("Contact.push", "Contact.slip", "Contact.turn", "Contact.slack")  # by pairs, for the next substep
 TOLD = "Contact.given"  # by pairs, of the last substep, for reports
 LATE = {"Contact.shrunk"}  # made when it is needed
 
@@ -140,5 +140,9 @@ def transfer(old: "World", new: "World") -> None:
     ours.time, ours.tick, ours.since, ours.frame = theirs.time, theirs.tick, theirs.since, theirs.frame
     new._controller.memory = kept.controller
     new.position, new.velocity = old.position, old.velocity
+    if new._particles.spins:
+        new.spin = old.spin
+    if new._particles.orientation is not None:
+        new._runner.memory.write(new._runner.scene.state.spin.orientation, np.reshape(old.orientation, (len(old.particles), -1)))
     for broke, breaks in zip(old._runner.step.breakers, new._runner.step.breakers, strict=True):
         new._runner.memory.write(breaks.dev.strength.stamp, broke.stamps())

@@ -51,6 +51,8 @@ class ContactPass:
                         if ti.static(c.has_friction):
                             for i in range(low, high):
                                 c.dev.forces.add(i, ti.Vector.zero(self.real, self.dim), now.first)
+                                if ti.static(c.dev.forces.spins):
+                                    c.dev.forces.add_turn(i, 0 * c.dev.forces.turned[i], now.first)
             self.team.wait()
 
     @ti.func

@@ -75,7 +75,7 @@ class Diagnostics:
     def finite(self, x):
         """By the bits of the exponent: comparisons with NaN are not to be trusted in Taichi."""
         out = 1
-        for k in ti.static(range(self.dim)):
+        for k in ti.static(range(x.n)):
             if ti.static(self.single):
                 if ti.bit_cast(x[k], ti.u32) & ti.u32(0x7F800000) == ti.u32(0x7F800000):
                     out = 0
@@ -95,6 +95,8 @@ class Diagnostics:
             for f in ti.static(self.step.integrator.forces.all):
                 if ti.static(f.conservative):
                     out += f.potential(i, ti.cast(x, ti.f64) - back * d)
+            if ti.static(self.state.spins):
+                out += scale * scale * self.state.spin.energy(i)
             out /= self.state.w.of(i)
             for f in ti.static(self.measured):
                 out += f.energy(i, back)
@@ -140,7 +142,10 @@ class Diagnostics:
         size = (self.n + self.blocks - 1) // self.blocks
         for i in range(b * size, ti.min((b + 1) * size, self.n)):
             x = self.state.place(i)
-            if self.finite(x) == 0 or self.finite(self.state.d[i]) == 0:
+            sound = self.finite(x) != 0 and self.finite(self.state.d[i]) != 0
+            if ti.static(self.state.spins):
+                sound = sound and self.finite(self.state.spin.s[i]) != 0
+            if not sound:
                 figures[5] = ti.min(figures[5], ti.cast(i, ti.f64))
             else:
                 low, high = ti.min(low, ti.cast(x, ti.f64)), ti.max(high, ti.cast(x, ti.f64))

@@ -246,6 +246,10 @@ def _launch(world: Any, first: int) -> None:
     for field, rows in zip(fields, values, strict=True):
         rows[first:] = h * want
         memory.write(field, rows)
+    if state.spins:
+        rows = memory.read(state.spin.s).astype(np.float64)
+        rows[first:] = h * state.spin.from_rates(world._particles.spin)[first:]
+        memory.write(state.spin.s, rows)
     share = max(decay(sum(f.rate for f in integrator.forces.drags), h)[0], NOTHING)
     with world._runner.memory.compiler():
         seen = world._runner.velocity(world.iterations, touching=False)

@@ -37,8 +37,11 @@ class ParticlePass:
         self.contacts = [contact] if contact else []
         self.acts = bool(batches or contact or walls)
         self.rough = any(w.has_friction or w.has_restitution for w in walls)
+        self.turned_by_walls = scene.state.spins and any(w.has_friction for w in walls)
         if walls:
             self.wall_displacement = scene.memory.field("thrust", n, width=scene.particles.dim, state=True)
+        if self.turned_by_walls:
+            self.wall_turn = scene.memory.field("wall_turn", n, width=scene.state.spin.axes, state=True)
 
     @ti.func
     def piece(self, k, thread):
@@ -80,6 +83,10 @@ class ParticlePass:
             if now.damps != 0:
                 for i in range(first, end):
                     self.state.wall_push[i] = ti.zero(self.state.x[i])
+        if ti.static(self.state.spins):
+            if now.fresh != 0:
+                for i in range(first, end):
+                    self.state.spin.begin(i, now.h)
         self.integrator.advance(first, end, now)
         for c in ti.static(self.contacts):
             stale, fast = 0, 0
@@ -128,6 +135,12 @@ class ParticlePass:
                         self.wall_displacement[i] = -self.state.d[i]
                     else:
                         self.wall_displacement[i] = self.wall_displacement[i] - self.state.d[i]
+                if ti.static(self.turned_by_walls):
+                    for i in range(begin, end):
+                        if now.first != 0:
+                            self.wall_turn[i] = -self.state.spin.s[i]
+                        else:
+                            self.wall_turn[i] = self.wall_turn[i] - self.state.spin.s[i]
         if ti.static(len(self.walls) > 0 and self.few):
             for i in range(begin, end):
                 self.confine(i, now.h, now.frame_fraction)
@@ -151,6 +164,9 @@ class ParticlePass:
             if now.final != 0:
                 for i in range(begin, end):
                     self.wall_displacement[i] = self.wall_displacement[i] + self.state.d[i]
+                if ti.static(self.turned_by_walls):
+                    for i in range(begin, end):
+                        self.wall_turn[i] = self.wall_turn[i] + self.state.spin.s[i]
 
     @ti.func
     def confine(self, i, h, frame_fraction):
@@ -226,12 +242,13 @@ class ParticlePass:
 
     @ti.func
     def reaction(self, i, h, t, firm):
-        """h^2 times what constraints (from Slots), contacts and walls accelerated particle i by in the last substep.
+        """h^2 times what constraints (from Slots), contacts and walls accelerated particle i by in the last substep; and which part
+        of what walls did is in it.
 
         Walls count as far as they balance the rest: a body at rest has velocity 0, but one that has just bounced is not credited
         with half of the blow.
         """
-        reaction = 0 * self.state.d[i]
+        reaction, part = 0 * self.state.d[i], 1 + 0 * h
         if ti.static(self.held):
             reaction = self.slots.total_of(i)
         for c in ti.static(self.contacts):
@@ -242,6 +259,19 @@ class ParticlePass:
             limit = (h * h * self.forces.accelerate(i, self.state.place(i), v, t, self.forces.pull(t)) + reaction).norm()
             size = push.norm()
             if size > limit:
-                push *= limit / size
+                part = limit / size
+                push *= part
             reaction += push
-        return reaction
+        return reaction, part
+
+    @ti.func
+    def surface_velocity(self, i, h, t, firm):
+        """r omega of particle i at the end of the last substep: s / h, and half a substep of what forces turned it by."""
+        turned = 0 * self.state.spin.s[i]
+        for c in ti.static(self.contacts):
+            if ti.static(c.has_friction):
+                turned += c.dev.forces.turned[i]
+        if ti.static(self.turned_by_walls):
+            _reaction, part = self.reaction(i, h, t, firm)
+            turned += part * self.wall_turn[i]
+        return (self.state.spin.s[i] + firm / 2 * turned) / h

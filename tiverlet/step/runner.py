@@ -10,6 +10,7 @@ from ..contact.velocity_projection import EVERY
 from ..device.interrupts import whole
 from ..device.language import template
 from ..device.patches.compiler import CachedLaunch
+from ..spin import moments
 from ..step_report import StepReport
 from . import high_order, initial_violation
 from .clock import Clock
@@ -174,6 +175,26 @@ class Runner:
         out = np.zeros((max(1, self.n), self.step.dim))
         self.step.velocities(self.clock.h, self.clock.time, *self.shares(), out)
         return out
+
+    def spin(self) -> np.ndarray:
+        """Velocities r omega of the surfaces of particles, (n, axes) [m/s], likewise."""
+        clock, spin = self.clock, self.scene.state.spin
+        if clock.d_is_velocity:
+            return self.memory.read(spin.s).astype(np.float64)[: self.n]
+        if self.grid and self.memory.read(self.grid.old_saved)[0]:
+            self.list_neighbours()
+        out = np.zeros((max(1, self.n), spin.axes))
+        self.step.spins(clock.h, clock.time, *self.shares(), out)
+        return out[: self.n]
+
+    def torque(self) -> np.ndarray:
+        """Moments that contacts and walls had in the last substep, (n, axes) [N m]: I alpha, by r omega = s / h + r alpha h / 2."""
+        clock, particles = self.clock, self.scene.particles
+        if not self.scene.state.spins or clock.d_is_velocity:
+            return np.zeros((self.n, 2 * particles.dim - 3))
+        half = self.spin() - self.memory.read(self.scene.state.spin.s)[: self.n] / clock.h
+        r = particles.radius
+        return np.divide(moments(particles), r, out=np.zeros(len(r)), where=r > 0)[:, None] * half * (2 / clock.h)
 
     def shares(self) -> tuple[float, float]:
         """What multipliers of the last substep are to be taken for: h^2 over what an acceleration added to the displacement. A

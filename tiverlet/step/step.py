@@ -159,7 +159,8 @@ class Step:
         self.contacts = self.particles.contacts
         self.halves = 2 if batches and contact else 1  # of a pass, each with a list that is good
         self.has_restitution, self.projects_velocities = self.contact_pass.has_restitution, self.contact_pass.projects_velocities
-        self.finishes = self.contact_pass.remembers or bool(self.breakers)
+        self.orients = self.state.spins and self.state.spin.orients
+        self.finishes = self.contact_pass.remembers or bool(self.breakers) or self.orients
         self.hashes = bool(grid)
         self.pair_forces: list[Any] = integrator.forces.pairwise
         self.has_pair_forces = bool(self.pair_forces)
@@ -416,7 +417,7 @@ class Step:
 
     @ti.func
     def finish_substep(self, now):
-        """What bears too much breaks; contacts keep what friction and restitution need.
+        """What bears too much breaks; contacts keep what friction and restitution need; the orientation of what spins follows.
 
         A rigid constraint may find a whole kick in a start that follows another step, so loads are never taken for half a kick.
         """
@@ -424,6 +425,9 @@ class Step:
             for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
                 f.break_overloaded(c, self.integrator.h2_effective(now.h, 0), now.tick)
         self.contact_pass.finish(now.thread)
+        if ti.static(self.orients):
+            for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
+                self.state.spin.turn(i)
         self.team.wait()
 
     @ti.func
@@ -516,6 +520,18 @@ class Step:
             self.state.d[i] = self.integrator.velocity_after(i, h, ti.cast(t, self.real), force)
             if ti.static(self.state.carries):
                 self.state.d_low[i] = ti.zero(self.state.d[i])
+        if ti.static(self.state.spins):
+            for i in range(self.n):
+                self.state.spin.end(i, h)
+
+    @ti.kernel
+    def spins(self, h64: ti.f64, t: ti.f64, firm64: ti.f64, soft64: ti.f64, out: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
+        """The same of spins: velocities r omega of surfaces."""
+        self.constraints.reactions(ti.cast(firm64, self.real), ti.cast(soft64, self.real))
+        for i in range(self.n):
+            v = self.particles.surface_velocity(i, ti.cast(h64, self.real), ti.cast(t, self.real), ti.cast(firm64, self.real))
+            for k in ti.static(range(self.state.spin.axes)):
+                out[i, k] = v[k]
 
     @ti.kernel
     def velocities(self, h64: ti.f64, t: ti.f64, firm64: ti.f64, soft64: ti.f64, out: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
@@ -534,4 +550,5 @@ class Step:
     def velocity_of(self, i, h64, t, firm64):
         """That of one particle, once constraints have said what they did."""
         h, time, firm = ti.cast(h64, self.real), ti.cast(t, self.real), ti.cast(firm64, self.real)
-        return self.integrator.velocity_after(i, h, time, self.particles.reaction(i, h, time, firm))
+        reaction, _part = self.particles.reaction(i, h, time, firm)
+        return self.integrator.velocity_after(i, h, time, reaction)

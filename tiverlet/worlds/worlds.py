@@ -600,6 +600,9 @@ class Worlds:
     def _start_from(self, velocity: np.ndarray, chosen: np.ndarray) -> None:
         """Have some go on with these velocities, (some, n, dim)."""
         clocks, memory, state = self._clocks, self._runner.memory, self._runner.scene.state
+        for k in chosen[~clocks.d_is_velocity[chosen]] if state.spins else ():
+            with self._at(k), memory.compiler():
+                memory.write(state.spin.s, self._runner.spin())
         memory.write_some(state.d, velocity, chosen)
         if state.carries:
             memory.write_some(state.d_low, 0.0, chosen)

@@ -1,0 +1,104 @@
+"""Friction between particles that spin: at the point of contact, with resistance to rolling and twisting."""
+
+from typing import TYPE_CHECKING, Any
+
+from ..device import ti
+from ..features.material import Table
+from ..neighbours.neighbour_list import PairData
+
+if TYPE_CHECKING:
+    from ..features.feature import Scene
+    from .narrow_phase import DiscGeometry
+
+
+class Spinning:
+    """What the contacts of discs or spheres do to their spins s = r phi, see Spin.
+
+    With the arm m = (x_i - x_j) / (r_i + r_j) at the start of the substep, or where they met in it, the surfaces of a pair slide past each other by
+    u = d_i - d_j - (s_i + s_j) x m. A push P across the normal changes d_i by w_i P and s_i by -k_i w_i m x P, so u by
+    (w_i (1 + k_i) + w_j (1 + k_j)) P, and the moments of P about both middles and about the origin sum up to 0: with these arms
+    angular momentum, spin included, is kept as friction acts.
+
+    Rolling: by rho = a_j s_i - a_i s_j, with a = r / (r_i + r_j), surfaces have turned against each other; a moment T on i and -T
+    on j changes s_i by -a_j k_i w_i f and s_j by a_i k_j w_j f, where f = T (r_i + r_j) / (r_i r_j). It is taken back, with what
+    was left of it since the pair touched, by f up to `rolling` times the push; and its part about the normal up to `twisting`
+    times that (Luding 2008). Beside a flat wall, a_j = 1 and a_i = 0, it is the law of walls.
+
+    turn: what each pair has turned against each other, as far as it is held; None where nothing resists. change: the moves of
+    spins, (n,).
+    """
+
+    def __init__(self, scene: "Scene", table: Table, geometry: "DiscGeometry", weight: Any, turn: PairData | None):
+        self.state, self.real, self.radius = scene.state, scene.real, scene.radius
+        self.table, self.geometry, self.weight, self.turn = table, geometry, weight, turn
+        self.spin = scene.state.spin
+        n, add = scene.particles.count, scene.memory.field
+        self.change = add("Contact.spin_change", n, width=self.spin.axes)
+
+    @ti.func
+    def arm(self, i, j, n):
+        """The arm m of a pair that touches along the normal n."""
+        distance = self.radius.of(i) + self.radius.of(j)
+        r = self.state.apart(i, j) - (self.state.d[i] - self.state.d[j])
+        return ti.select(r.dot(r) > distance * distance, n, r / distance)
+
+    @ti.func
+    def slip(self, i, j, m):
+        """By how much the surfaces slide past each other."""
+        return self.state.d[i] - self.state.d[j] - self.spin.surface(self.spin.s[i] + self.spin.s[j], m)
+
+    @ti.func
+    def split_mass(self, i, j):
+        """What a push across the normal changes that by, with split masses."""
+        return self.weight[i] * (1 + self.spin.share.of(i)) + self.weight[j] * (1 + self.spin.share.of(j))
+
+    @ti.func
+    def turned(self, i, m, push):
+        """What a push across the normal, per inverse mass, changes s_i by, per inverse mass."""
+        return -self.spin.share.of(i) * self.spin.moment(m, push)
+
+    @ti.func
+    def rolled(self, i, j, s_i, s_j):
+        """rho of such spins."""
+        a = self.radius.of(i) / (self.radius.of(i) + self.radius.of(j))
+        return (1 - a) * s_i - a * s_j
+
+    @ti.func
+    def held(self, i, j, n, rolled, most, least):
+        """The part of a rotation rho that is taken back: at most so much about the normal, and about other axes."""
+        twist = self.spin.along(rolled, n)
+        return limited(rolled - twist, most) + limited(twist, least)
+
+    @ti.func
+    def resist(self, i, j, e, n, m, push, pressed):
+        """What resistance to rolling and twisting changes s_i by, per inverse mass, for a push `pressed` along the normal; after
+        what friction, `push`, has done to the pair by itself, as its masses are split."""
+        k_i, k_j = self.spin.share.of(i), self.spin.share.of(j)
+        a = self.radius.of(i) / (self.radius.of(i) + self.radius.of(j))
+        compliance = (1 - a) * (1 - a) * k_i * self.weight[i] + a * a * k_j * self.weight[j]
+        out = 0 * self.spin.s[i]
+        if compliance > 0:
+            moment = self.spin.moment(m, push)
+            s_i, s_j = self.spin.s[i] - k_i * self.weight[i] * moment, self.spin.s[j] - k_j * self.weight[j] * moment
+            rolled, row = self.turn.field[e] + self.rolled(i, j, s_i, s_j), self.table.of(i, j)
+            most = pressed * compliance
+            out = -(1 - a) * k_i / compliance * self.held(i, j, n, rolled, row[4] * most, row[5] * most)
+        return out
+
+    @ti.func
+    def left(self, i, j, e, n, pressed):
+        """At the end of a substep: what the pair has turned against each other, as far as it can be held."""
+        a = self.radius.of(i) / (self.radius.of(i) + self.radius.of(j))
+        compliance = (1 - a) * (1 - a) * self.spin.share.of(i) * self.weight[i] + a * a * self.spin.share.of(j) * self.weight[j]
+        rolled, row = self.turn.field[e] + self.rolled(i, j, self.spin.s[i], self.spin.s[j]), self.table.of(i, j)
+        most = pressed * compliance
+        return self.held(i, j, n, rolled, row[4] * most, row[5] * most)
+
+
+@ti.func
+def limited(v, most):
+    """A vector, no longer than `most`."""
+    size = v.norm()
+    if size > most:
+        v *= most / size
+    return v

@@ -1,0 +1,125 @@
+"""Particles that spin: what a world keeps of it on the device."""
+
+from typing import Any
+
+import numpy as np
+
+from .device import ti
+from .device.memory import Memory
+from .device.number import OnDevice
+from .particles import Particles, Shared, at_rest
+
+
+class Spin:
+    """The rotation of particles, as State is their motion.
+
+    s = r phi is how far the surface of a particle has turned in the last substep [m], with phi the angle (2D) or the rotation
+    vector (3D): a displacement as d is, and at a start a velocity, r omega. share: k = m r^2 / I, 2 for discs and 5/2 for spheres.
+    With these no radius is left in the laws of friction. An impulse h p [kg m] at the point -r n from the middle changes d by
+    p / m and s by -k n x p / m; the surface there moves by d - s x n, which changes by (1 + k) p / m across n.
+
+    Nothing but contacts and walls turns a particle, so between these s stays as it is: that is exact.
+
+    axes: 1 in 2D, 3 in 3D. orients: whether it is known how far particles have turned since the start.
+    """
+
+    count: Any = OnDevice()
+
+    def __init__(self, memory: Memory, particles: Particles, inv_mass: np.ndarray):
+        n, self.dim, self.real = particles.count, particles.dim, memory.real
+        self.axes = 1 if self.dim == 2 else 3
+        self.memory, self.count, self.radius = memory, memory.number(n), particles.radius
+        self.s = memory.field("spin", n, width=self.axes, values=self.from_rates(particles.spin), state=True)
+        self.share = Shared(memory, "spin_share", shares(particles, inv_mass))
+        self.orients = particles.orientation is not None
+        if self.orients:
+            turned = np.asarray(particles.orientation).reshape(n, -1)
+            self.orientation = memory.field("orientation", n, width=turned.shape[1], kind=ti.f64, values=turned, state=True)
+            inverse = np.divide(1, particles.radius, out=np.zeros(n), where=particles.radius > 0)
+            self.inverse_radius = Shared(memory, "inverse_radius", inverse)
+
+    def from_rates(self, rates: Any) -> np.ndarray:
+        """r omega [m/s] of angular velocities [rad/s], (n, axes)."""
+        return self.radius[:, None] * np.asarray(rates).reshape(-1, self.axes)
+
+    def to_rates(self, surface: np.ndarray) -> np.ndarray:
+        """Angular velocities [rad/s] of r omega [m/s]: (n,) in 2D, (n, 3) in 3D."""
+        r = self.radius[:, None]
+        out = np.divide(surface, r, out=np.zeros_like(surface), where=r > 0)
+        return out[:, 0] if self.axes == 1 else out
+
+    @ti.func
+    def surface(self, s, n):
+        """s x n: what a point at -r n moves less, and one at r n more, because the particle turns."""
+        out = ti.Vector.zero(self.real, self.dim)
+        if ti.static(self.dim == 2):
+            out = ti.Vector([-s[0] * n[1], s[0] * n[0]])
+        else:
+            out = s.cross(n)
+        return out
+
+    @ti.func
+    def moment(self, n, p):
+        """n x p."""
+        out = ti.Vector.zero(self.real, self.axes)
+        if ti.static(self.dim == 2):
+            out[0] = n[0] * p[1] - n[1] * p[0]
+        else:
+            out = n.cross(p)
+        return out
+
+    @ti.func
+    def along(self, s, n):
+        """The part of s about the axis n, which there is in 3D."""
+        out = 0 * s
+        if ti.static(self.dim == 3):
+            out = s.dot(n) * n
+        return out
+
+    @ti.func
+    def energy(self, i):
+        """I phi^2 / 2 of particle i, per mass [m^2], f64."""
+        k, s, out = self.share.of(i), self.s[i] * ti.cast(1, ti.f64), ti.cast(0, ti.f64)
+        if k > 0:
+            out = 0.5 * s.dot(s) / k
+        return out
+
+    @ti.func
+    def begin(self, i, h):
+        """At a start: from the velocity of the surface to its displacement."""
+        self.s[i] = h * self.s[i]
+
+    @ti.func
+    def end(self, i, h):
+        """And back."""
+        self.s[i] = self.s[i] / h
+
+    @ti.func
+    def turn(self, i):
+        """At the end of a substep: the orientation follows. In 3D q' = (phi / |phi| sin |phi| / 2, cos |phi| / 2) q."""
+        phi = self.inverse_radius.of(i) * self.s[i]
+        if ti.static(self.dim == 2):
+            self.orientation[i] = self.orientation[i] + ti.cast(phi, ti.f64)
+        else:
+            angle = phi.norm()
+            if angle > 0:
+                u, c, q = phi * (ti.sin(angle / 2) / angle), ti.cos(angle / 2), self.orientation[i]
+                v, v0, q0 = ti.cast(u, ti.f64), ti.cast(c, ti.f64), ti.Vector([q[0], q[1], q[2]])
+                turned = v0 * q0 + q[3] * v + v.cross(q0)
+                out = ti.Vector([turned[0], turned[1], turned[2], v0 * q[3] - v.dot(q0)])
+                self.orientation[i] = out / out.norm()
+
+
+def shares(particles: Particles, inv_mass: np.ndarray) -> np.ndarray:
+    """k = m r^2 / I of each particle, 0 for points and for what cannot move."""
+    inertia = at_rest("inertia", particles) if particles.inertia is None else np.asarray(particles.inertia)
+    return np.where((particles.radius > 0) & (inv_mass > 0), 1 / inertia, 0.0)
+
+
+def moments(particles: Particles) -> np.ndarray:
+    """Moments of inertia [kg m^2] of the particles that can move, (n,); 0 for others, and for those whose is infinite."""
+    if particles.inertia is None:
+        return np.zeros(particles.count)
+    there = (particles.inv_mass > 0) & np.isfinite(particles.inertia)
+    mass = np.where(there, particles.mass, 0.0)
+    return mass * particles.radius**2 * np.where(there, particles.inertia, 0.0)
