@@ -135,6 +135,9 @@ def rigid(features: list[Any], free: np.ndarray, x: np.ndarray) -> tuple[float, 
 def passive(structure: Structure) -> bool:
     """Whether nothing in it brings in energy."""
     driven = any({"speed", "at"} & set(f.args) for f in structure.features if f.name == "Path")
+    args = structure.particles.args
+    held = "pinned" in args or np.isinf(args.get("mass", 1.0)).any() or any(f.name in TETHERS for f in structure.features)
+    driven = driven or (held and bool(np.any(args.get("spin", 0.0))))  # rollers
     return not driven and all(f.name in (*PASSIVE, "Path", "Pin") for f in structure.features)
 
 

@@ -232,6 +232,7 @@ class Stage:
     size: float
     order: int
     taken: list[int]
+    spins: bool
 
 
 def chain(n):
@@ -371,20 +372,20 @@ def forces(draw, s: Stage) -> Call | None:
     return Call(kind, {"function": pick(draw, *own)})
 
 
-def surface(draw) -> dict[str, Any]:
+def surface(draw, s: Stage) -> dict[str, Any]:
     """Friction and restitution."""
     out: dict[str, Any] = {}
+    if s.spins or pick(draw, False, True):
+        out["friction"] = pick(draw, 0.5, 1e6, (0.6, 0.3), *([(0.5, 0.5, 0.1), (1.0, 0.5, 0.3, 0.2)] if s.spins else []))
     if pick(draw, False, True):
-        out["friction"] = pick(draw, 0.5, 1e6, (0.6, 0.3))
-    if pick(draw, False, True):
-        out["restitution"] = pick(draw, 0.5, 1.0)
+        out["restitution"] = pick(draw, 0.5, 1.0, *([(0.5, 0.5), (1.0, 1.0)] if s.spins else []))
     return out
 
 
 def walls(draw, s: Stage) -> Call | None:
     """Any."""
     low, high, mid = s.x.min(axis=0) - 0.5 * s.size, s.x.max(axis=0) + 0.5 * s.size, s.x.mean(axis=0)
-    reach, more = float(np.linalg.norm(high - low)), surface(draw)
+    reach, more = float(np.linalg.norm(high - low)), surface(draw, s)
     kinds = ["Box", "HalfSpace", "Ball", "Capsule", "Polygon" if s.dim == 2 else "Mesh"]
     kind = pick(draw, *kinds, *(["Sdf"] if s.size == 1 else []))
     up = np.eye(s.dim)[1]
@@ -421,8 +422,8 @@ def walls(draw, s: Stage) -> Call | None:
 
 def contacts(draw, s: Stage) -> Call | None:
     """Contact or Polygons."""
-    more = surface(draw)
-    if s.dim == 2 and s.n >= 6 and pick(draw, False, False, False, True):
+    more = surface(draw, s)
+    if s.dim == 2 and s.n >= 6 and not s.spins and pick(draw, False, False, False, True):
         half = s.n // 2
         return Call("Polygons", {"loops": [list(range(half)), list(range(half, s.n))]} | more)
     if pick(draw, False, False, True):
@@ -462,7 +463,13 @@ def structures(draw) -> Structure:
     args |= {"none": {}, "first": {"pinned": [0]}, "ends": {"pinned": [0, n - 1]}, "all": {"pinned": list(range(n))}}[pinned]
     if pick(draw, False, False, True):
         args["group"] = np.arange(n) % 2
-    stage = Stage(n, dim, x, size, order, list(args.get("pinned", [])))
+    spins = order == 2 and radius not in ("points", "apart") and pick(draw, False, False, True)
+    if spins:
+        args["spin"] = pick(draw, 0.0, 10.0, 1e4) * np.array([1.0] if dim == 2 else [0.6, -0.48, 0.64])
+        args["spin"] = args["spin"] * np.where(np.arange(n) % 3, 1.0, -0.5)[:, None]
+        args["spin"] = args["spin"][:, 0] if dim == 2 else args["spin"]
+        args |= pick(draw, {}, {"inertia": "ring"}, {"inertia": np.linspace(0.1, 2.0, n)}, {"orientation": 0.0})
+    stage = Stage(n, dim, x, size, order, list(args.get("pinned", [])), spins)
     kinds = [forces, links, corners, bodies, rails, forces, links] + ([walls, walls, contacts] if order == 2 else [])
     made = [kind(draw, stage) for kind in draw(st.lists(st.sampled_from(kinds), min_size=1, max_size=5))]
     calls, met = [], False
@@ -560,6 +567,8 @@ def happenings(draw, structure: Structure, regroup: bool = False) -> list[Event]
     if speed:
         rng = np.random.default_rng(draw(seeds))
         out.append(Set(None, "velocity", speed * scale(x) * rng.standard_normal(x.shape)))
+    if "spin" in structure.particles.args and pick(draw, False, False, True):
+        out.append(Set(None, "spin", -0.5 * structure.particles.args["spin"]))
     dt = pick(draw, 1 / 60, 1 / 60, 1 / 60, 1e-3, 0.1, 1e-6)
     for _ in range(draw(st.integers(1, 4))):
         out.append(Step(dt))

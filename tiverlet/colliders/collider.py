@@ -63,7 +63,9 @@ class Collider(Feature):
     @property
     def has_friction(self) -> bool:
         """Whether there is friction, or was when kernels were compiled."""
-        return self.turns or friction_of(repr(self), "friction", self.friction).static > 0 or self._built("surface", "has_friction")
+        return (
+            self.turns or friction_of(repr(self), "friction", self.friction).static > 0 or self._built("surface", "has_friction")
+        )
 
     @property
     def has_restitution(self) -> bool:

@@ -71,7 +71,7 @@ class Moving(Collider):
         """The pose at the ends of a frame and of the substep that is under way, and the shape."""
         Collider.bind(self, scene)
         self.dev.pose = Pose(scene, repr(self), self.position, self.rotation, self.dev.surface.turns)
-        self.dev.surface.pose = self.dev.pose
+        self.dev.surface.poses = [self.dev.pose]
         self.dev.shape = self.shape_on(scene)
         self.changed = False
 

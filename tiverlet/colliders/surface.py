@@ -16,11 +16,9 @@ class Surface:
     """How the surface of one collider answers on the device: friction, restitution, push_out; see Collider for what they mean.
 
     friction: coefficients, or None for a surface without. restitution: 0 to 1, or None. push_out: [m/s]. active: whether
-    it is there, or None for one without a switch. turns: whether it resists rolling, or bounces across the normal. pose: of a
-    wall that may turn, or None.
+    it is there, or None for one without a switch. turns: whether it resists rolling, or bounces across the normal. poses: of a
+    wall that may turn, its Pose; else none.
     """
-
-    pose: Any = None
 
     def __init__(
         self, scene: "Scene", name: str, friction: "Coefficients | None", restitution: "Bounce | None", push_out: float, active:
@@ -28,6 +26,7 @@ class Surface:
     ):  # fmt: skip
         self._memory, self.state, self.push_out, self.real = scene.memory, scene.state, push_out, scene.real
         self.has_friction, self.has_restitution = friction is not None, restitution is not None
+        self.poses: list[Any] = []
         self.spins, self.turns, self.radius = scene.state.spins and self.has_friction, turns, scene.radius
         self.spin = scene.state.spin if scene.state.spins else None
         if turns and not scene.state.spins:
@@ -185,8 +184,8 @@ class Surface:
     def wall_turn(self, i):
         """How far the surface of particle i would turn if it turned with the wall [m]."""
         out = 0 * self.spin.s[i]
-        if ti.static(self.pose is not None):
-            out = self.radius.of(i) * self.pose.spin[None]
+        for pose in ti.static(self.poses):
+            out = self.radius.of(i) * pose.spin[None]
         return out
 
     @ti.func

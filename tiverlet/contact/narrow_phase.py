@@ -182,11 +182,16 @@ class DiscGeometry:
         r = self.scene.particles.radius
         pairs, at = self.grid.entries()
         push = self.grid.read(self.impulse, at)
-        low = pairs[:, 0] < pairs[:, 1]
-        if self.grid.has_static:  # what is static does not keep what it gives: the other one of the pair does
-            back = np.lexsort(pairs[~low].T)  # (j, i) in the order of (i, j)
-            push[low] = np.maximum(push[low], push[~low][back])
-        pairs, push = pairs[low], push[low]
+        if self.grid.has_static:
+            # What is static does not keep what it gives, nor the pair in its list when it is far: the other one of the pair does.
+            n = len(self.scene.particles)
+            keys, which = np.unique(pairs.min(axis=1) * n + pairs.max(axis=1), return_inverse=True)
+            pairs, most = np.stack(np.divmod(keys, n), axis=1), np.zeros(len(keys))
+            np.maximum.at(most, which.ravel(), push)
+            push = most
+        else:
+            low = pairs[:, 0] < pairs[:, 1]
+            pairs, push = pairs[low], push[low]
         d = x[pairs[:, 0]] - x[pairs[:, 1]]
         length = np.linalg.norm(d, axis=1)
         overlap = r[pairs].sum(axis=1) - length

@@ -50,7 +50,12 @@ class Spinning:
     @ti.func
     def split_mass(self, i, j):
         """What a push across the normal changes that by, with split masses."""
-        return self.weight[i] * (1 + self.spin.share.of(i)) + self.weight[j] * (1 + self.spin.share.of(j))
+        out = 1 + self.spin.share.of(i)
+        if ti.static(self.spin.share.uniform):
+            out *= self.weight[i] + self.weight[j]
+        else:
+            out = out * self.weight[i] + (1 + self.spin.share.of(j)) * self.weight[j]
+        return out
 
     @ti.func
     def turned(self, i, m, push):

@@ -29,6 +29,7 @@ MANY = 5000  # links that are drawn as lines; of more, an even selection
 WALL = np.array([[92, 97, 112]], dtype=np.uint8)  # of surfaces of walls
 OPEN = (60, 63, 70)  # of a wall that is switched off
 HELD, PINS = (225, 228, 235), 200  # the marks of particles that are held, and up to how many are marked
+MARK, SPOT = (24, 26, 32), 0.5  # of particles that have turned; the radius of a spot that is a cap of the sphere
 LABEL = (118, 122, 132)  # can be read on black and on white
 BELOW, ABOVE = 5.0, 40.0  # the order in which a plane is drawn: before lines (20) and particles (30), and after them
 FEW = 1500  # particles up to which contacts are drawn; finding them would take too much of the frame beyond
@@ -86,7 +87,8 @@ class Drawing:
         held = np.flatnonzero(p.inv_mass == 0)
         if 0 < len(held) <= PINS:
             at = world.position[held].astype(np.float32)
-            self.static(f"{self._root}/held", self._points.from_fields(positions=at, radii=[-3.5], colors=[HELD], **self._above))
+            marks = self._points.from_fields(positions=at, radii=[-3.5], colors=[HELD], **self._above)
+            self._log(f"{self._root}/held", marks)  # not static: nothing clears that when a scene ends
         scale = self._overlays.scale(bool(len(self._pairs)))
         if scale:
             hues, labels = scale
@@ -156,6 +158,8 @@ class Drawing:
             self._load(x)
         elif self._contacts:
             self._contact()
+        if turns_shown(self.world):
+            self._mark(x)
         if self._overlays.velocities:
             way = (AHEAD * self.world.velocity).astype(np.float32)
             arrows = self._arrows.from_fields(origins=x32, vectors=way, colors=[ARROW], radii=[-0.7], **self._above)
@@ -164,6 +168,19 @@ class Drawing:
         if torn or self._torn:
             self._breaks(x)
             self._torn = torn
+
+    def _mark(self, x: np.ndarray) -> None:
+        """How far particles have turned: a line from the middle to the rim of a disc, two dots on a sphere."""
+        marks = marked(x, self.world.particles.radius, self.world.orientation)
+        at = marks.astype(np.float32)
+        if self._flat:
+            strips = self._packed(at.reshape(-1, 2), 2 * np.arange(len(at) + 1))
+            what = self._strips.from_fields(strips=strips, colors=[MARK], radii=[-1.0], draw_order=ABOVE)
+        else:
+            size = np.repeat(SPOT * self.world.particles.radius, 2)
+            what = self._points.from_fields(positions=at.reshape(-1, 3), radii=size, colors=[MARK])
+            self.bytes += at.nbytes
+        self._log(f"{self._root}/marks", what)
 
     def _link(self, x: np.ndarray, x32: np.ndarray) -> list[Any]:
         """Links, coloured by their strain; strips go to rerun in its own layout, which is ten times as fast."""
@@ -274,6 +291,23 @@ class Drawing:
         """A line in the list of events."""
         self._log("events", self._rr.TextLog(text, level=level))
         self.bytes += len(text)
+
+
+def turns_shown(world: "World") -> bool:
+    """Whether it is known how far particles have turned."""
+    return world.particles.orientation is not None
+
+
+def marked(x: np.ndarray, radius: np.ndarray, orientation: np.ndarray) -> np.ndarray:
+    """Where marks of particles that are turned like this are, (n, 2, dim): the ends of a line, or two places on the surface."""
+    if x.shape[1] == 2:
+        rim = x + radius[:, None] * np.stack([np.cos(orientation), np.sin(orientation)], axis=1)
+        return np.stack([x, rim], axis=1)
+    u, w = orientation[:, :3], orientation[:, 3:]
+    axis = np.zeros_like(u) + [1.0, 0.0, 0.0]
+    turned = axis + 2 * np.cross(u, np.cross(u, axis) + w * axis)
+    out = (1.02 - SPOT) * radius[:, None] * turned
+    return np.stack([x + out, x - out], axis=1)
 
 
 def upwards(world: "World | Parts") -> np.ndarray:

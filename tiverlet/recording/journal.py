@@ -38,6 +38,7 @@ FORMAT = 5
 GUARD = {"stuck", "substeps-capped"}  # flags that do not follow from the steps: the StepController knows what it tried in vain
 JOURNAL = "tiverlet/journal"
 SCENE = "world/scene"
+PARTED = "clock.parted"  # the array of the clock, see Clock
 PARTICLES = "particles"  # the end of the entities that have the positions of frames
 WORLDS = re.compile(r"worlds/\d{1,9}/")  # how entities of many worlds begin, see side_by_side.py
 Write = Callable[[str, np.ndarray, str], None]
@@ -161,7 +162,9 @@ class Journal:
         """Write the exact state; returns the size of the entry [bytes]."""
         kept, world = checkpoint.keep(self.world), self.world
         more = {"flags": checkpoint.flags(world), "reach": world._runner.scene.h2_effective}
-        return self.put(kind, {"clock": kept.clock, **more}, kept.values)
+        parted = kept.clock["_parted"]
+        arrays = kept.values if parted is None else kept.values | {PARTED: np.asarray(parted)}
+        return self.put(kind, {"clock": kept.clock | {"_parted": None}, **more}, arrays)
 
     def before(self) -> None:
         """A step begins: write down what was turned since the last one."""

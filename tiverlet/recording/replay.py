@@ -388,7 +388,9 @@ def _settle(world: "World", settings: list) -> None:
 
 
 def _kept(entry: Entry, world: "World") -> checkpoint.Checkpoint:
-    kept = checkpoint.Checkpoint(entry.arrays, entry.data["clock"], world._controller.memory)
+    values = {name: value for name, value in entry.arrays.items() if name != journal.PARTED}
+    clock = entry.data["clock"] | {"_parted": entry.arrays.get(journal.PARTED)}
+    kept = checkpoint.Checkpoint(values, clock, world._controller.memory)
     checkpoint.check(world, kept, entry.data["flags"])
     return kept
 

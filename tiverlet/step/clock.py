@@ -72,8 +72,11 @@ def hashed(kept: dict[str, Any]) -> list[Any]:
     return [*(kept[name] for name in HASHED), *later]
 
 
-def sound(kept: dict[str, Any], particles: int) -> bool:
+def sound(kept: dict[str, Any], particles: int, dim: int) -> bool:
     """Whether it can be that of a world of so many particles."""
+    parted = kept["_parted"]
+    if parted is not None and (np.shape(parted) != (particles, dim) or not np.isfinite(parted).all()):
+        return False
     right = [type(kept[name]) is int and 0 <= kept[name] < 2**31 for name in ("_tick", "_since")]
     right += [type(kept[name]) is bool for name in ("_fresh", "_started", "_softened")]
     numbers = [kept["_time"], kept["_h"], kept["_longest"], *kept["_frame"], kept["_energy"] or 0]

@@ -105,6 +105,8 @@ def _present(world: "World") -> list[str]:
             out.append(f"{f!r}: {_listed(grid)}")
         else:
             out.append(f"{f!r}: nothing, since all radii are 0")
+    if world.particles.spins:
+        out.append("spin: with friction" + (", and orientations" if world._runner.step.orients else ""))
     return out or ["motion in a straight line"]
 
 
@@ -128,6 +130,7 @@ def _absent(world: "World") -> list[str]:
         (not step.grid, "grid, neighbour list, contacts: no Contact between particles with radii"),
         (not step.batches, "slots and gathers: no constraint on particles that can move"),
         (not step.walls, "wall pass: no wall"),
+        (not world.particles.spins and bool(step.walls or step.grid), "spin: particles have none"),
         (not step.integrator.forces.all, "accelerations: no force"),
         (not step.integrator.decays, "exponential drag: no Drag or Wind"),
         (not step.integrator.uses_velocity, "second displacement: no force reads velocities"),
