@@ -3,7 +3,8 @@
     python demos/silo.py [silo.rrd]
 
 What to look for: lines as wide as the loads run from wall to wall, so that the floor bears less than half of the grains' weight
-once friction at the walls has been stirred up, by letting these rise a little (Janssen 1895); and once a gate opens in it, as much flows out each second, however high the silo is filled (Beverloo 1961).
+once friction at the walls has been stirred up, by letting these rise a little (Janssen 1895). When a gate opens in the floor, as
+much flows out each second, however high the silo is filled (Beverloo 1961).
 """
 
 import sys

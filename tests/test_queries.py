@@ -41,3 +41,14 @@ def test_contacts_are_arrays(world):
     d = x[pairs[:, 0]] - x[pairs[:, 1]]
     np.testing.assert_allclose(contacts.normal, d / np.linalg.norm(d, axis=1)[:, None], rtol=1e-12)
     assert len(world(tv.Particles(x, radius=radius)).contacts) == 0
+
+
+def test_contacts_of_a_pinned_particle_that_another_has_left(world):
+    # A pair that carries something stays on the list of the one that moves, however far it is; the pinned one keeps nothing.
+    start = tv.Particles([(0.0, 0.0), (0.15, 0.0), (0.0, 0.3)], radius=0.1, pinned=[0], velocity=[(0, 0), (400.0, 0), (0, 0)])
+    w = world(start, [tv.Contact(friction=0.5, restitution=1.0)], substeps=1)
+    for _ in range(3):
+        w.step(1 / 60)
+        found = w.contacts
+        assert (found.pairs[:, 0] < found.pairs[:, 1]).all()
+    assert tv.measure.kinetic_energy(w) > 0

@@ -478,3 +478,16 @@ def test_a_picture_without_a_window(falling, tmp_path, monkeypatch):
     assert first.shape == last.shape and first.shape[0] > 300
     assert (np.abs(first - last).max(axis=2) > 60).sum() > 50  # particles have moved, on a background that has not
     assert (np.abs(first - last).max(axis=2) < 20).mean() > 0.5
+
+
+def test_what_is_removed_from_a_pile_that_moves_is_recorded(world, tmp_path):
+    # Contacts that go leave their part in the velocities of what stays, an array of the clock's, until the next step.
+    start = tv.Particles([(0, 0.1), (0.3, 0.1), (0.25, 0.3)], radius=0.1)
+    w = world(start, [tv.Gravity(), tv.Box((-1, 0), (1, 2)), tv.Contact(friction=0.5)])
+    with tv.Recorder(tmp_path / "removed.rrd", w) as recorder:
+        for frame in range(6):
+            if frame == 4:
+                w.remove([0])
+            w.step(1 / 60)
+            recorder.log()
+    assert tv.replay(tmp_path / "removed.rrd").verify()

@@ -212,7 +212,7 @@ def test_a_swarm_keeps_angular_momentum_and_loses_energy(world):
 
 
 def test_rolling_resistance_holds_and_lets_go(world):
-    # A disc on an incline stays, to a digit, while rolling >= tan a; beyond it rolls with (sin a - rolling cos a) g / (1 + 1 / k).
+    # A disc on an incline stays, to a digit, while rolling >= tan a; beyond, it rolls with (sin a - rolling cos a) g k / (1 + k).
     r, k, angle = 0.1, 2.0, 0.2
     normal, down = slope(angle, 2)
     wall = tv.HalfSpace(normal, friction=(1.0, 1.0, np.tan(angle) + 0.01))

@@ -241,6 +241,7 @@ class State:
     """
 
     host_only = ("count",)
+    spin: Any  # where particles spin: the same for their rotation, see spin.py
 
     def __init__(self, memory: Memory, particles: Particles, inv_mass: np.ndarray, compensated: bool):
         n, dim = particles.count, particles.dim

@@ -14,7 +14,7 @@ class Spin:
     """The rotation of particles, as State is their motion.
 
     s = r phi is how far the surface of a particle has turned in the last substep [m], with phi the angle (2D) or the rotation
-    vector (3D): a displacement as d is, and at a start a velocity, r omega. share: k = m r^2 / I, 2 for discs and 5/2 for spheres.
+    vector (3D): a displacement as d is, and at a start a velocity, r omega. share: k = m r^2 / I, 2 for discs, 5/2 for spheres.
     With these no radius is left in the laws of friction. An impulse h p [kg m] at the point -r n from the middle changes d by
     p / m and s by -k n x p / m; the surface there moves by d - s x n, which changes by (1 + k) p / m across n.
 
@@ -105,8 +105,8 @@ class Spin:
             if angle > 0:
                 u, c, q = phi * (ti.sin(angle / 2) / angle), ti.cos(angle / 2), self.orientation[i]
                 v, v0, q0 = ti.cast(u, ti.f64), ti.cast(c, ti.f64), ti.Vector([q[0], q[1], q[2]])
-                turned = v0 * q0 + q[3] * v + v.cross(q0)
-                out = ti.Vector([turned[0], turned[1], turned[2], v0 * q[3] - v.dot(q0)])
+                turned = v0 * q0 + q[3] * v + v.cross(q0)  # type: ignore[operator]
+                out = ti.Vector([turned[0], turned[1], turned[2], v0 * q[3] - v.dot(q0)])  # type: ignore[operator]
                 self.orientation[i] = out / out.norm()
 
 

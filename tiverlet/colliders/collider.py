@@ -35,9 +35,9 @@ class Collider(Feature):
     leaves at restitution times its velocity then, and is placed where it would be at the end of the substep.
     Of particles that spin, the displacement of the point that touches is taken back. friction = (static, dynamic, rolling,
     twisting) then also resists rolling, by a moment of up to rolling * radius times the normal force, and spinning about the
-    normal, by up to twisting * radius times it; what these hold does not roll. restitution = (normal, tangential): in a bounce the
-    point that touches leaves across the normal at tangential times its velocity, as far as friction holds it; 0 grips, 1 is a
-    super ball (Garwin 1969).
+    normal, by up to twisting * radius times it; what these hold does not roll. restitution = (normal, tangential): in a bounce
+    the point that touches leaves across the normal at -tangential times its velocity, as far as friction holds it; 0 grips, 1 is
+    a super ball (Garwin 1969).
     active: whether it is there, a gate that opens and closes. With True or False given it is a switch, which costs nothing to
     turn; None is always there, and costs the compiling of another scene when it is switched off for the first time. What is
     inside of a wall that comes back is left at push_out.

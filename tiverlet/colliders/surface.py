@@ -28,7 +28,7 @@ class Surface:
         self.has_friction, self.has_restitution = friction is not None, restitution is not None
         self.poses: list[Any] = []
         self.spins, self.turns, self.radius = scene.state.spins and self.has_friction, turns, scene.radius
-        self.spin = scene.state.spin if scene.state.spins else None
+        self.spin: Any = scene.state.spin if scene.state.spins else None
         if turns and not scene.state.spins:
             raise ValueError(
                 f"{name}: resistance to rolling and tangential restitution are for particles that spin. Leave them out, or give "

@@ -4,7 +4,6 @@ from typing import TYPE_CHECKING, Any
 
 from ..device import ti
 from ..features.material import Table
-from ..neighbours.neighbour_list import PairData
 
 if TYPE_CHECKING:
     from ..features.feature import Scene
@@ -14,10 +13,10 @@ if TYPE_CHECKING:
 class Spinning:
     """What the contacts of discs or spheres do to their spins s = r phi, see Spin.
 
-    With the arm m = (x_i - x_j) / (r_i + r_j) at the start of the substep, or where they met in it, the surfaces of a pair slide past each other by
-    u = d_i - d_j - (s_i + s_j) x m. A push P across the normal changes d_i by w_i P and s_i by -k_i w_i m x P, so u by
-    (w_i (1 + k_i) + w_j (1 + k_j)) P, and the moments of P about both middles and about the origin sum up to 0: with these arms
-    angular momentum, spin included, is kept as friction acts.
+    With the arm m = (x_i - x_j) / (r_i + r_j) at the start of the substep, or where they met in it, the surfaces of a pair slide
+    past each other by u = d_i - d_j - (s_i + s_j) x m. A push P across the normal changes d_i by w_i P and s_i by
+    -k_i w_i m x P, so u by (w_i (1 + k_i) + w_j (1 + k_j)) P, and the moments of P about both middles and about the origin sum
+    up to 0: with these arms angular momentum, spin included, is kept as friction acts.
 
     Rolling: by rho = a_j s_i - a_i s_j, with a = r / (r_i + r_j), surfaces have turned against each other; a moment T on i and -T
     on j changes s_i by -a_j k_i w_i f and s_j by a_i k_j w_j f, where f = T (r_i + r_j) / (r_i r_j). It is taken back, with what
@@ -28,7 +27,7 @@ class Spinning:
     spins, (n,).
     """
 
-    def __init__(self, scene: "Scene", table: Table, geometry: "DiscGeometry", weight: Any, turn: PairData | None):
+    def __init__(self, scene: "Scene", table: Table, geometry: "DiscGeometry", weight: Any, turn: Any):
         self.state, self.real, self.radius = scene.state, scene.real, scene.radius
         self.table, self.geometry, self.weight, self.turn = table, geometry, weight, turn
         self.spin = scene.state.spin

@@ -30,7 +30,7 @@ class Bounce(NamedTuple):
 
 
 def friction_of(who: str, name: str, value: Any) -> Coefficients:
-    """A coefficient of Coulomb friction, or (static, dynamic), (static, dynamic, rolling) or (static, dynamic, rolling, twisting)."""
+    """A coefficient of Coulomb friction, or (static, dynamic), with rolling and twisting behind them or not."""
     given = value if isinstance(value, (tuple, list)) else (value, value)
     if not 2 <= len(given) <= 4:
         raise ValueError(
@@ -62,8 +62,8 @@ MOST = 1000  # groups of particles that are told apart
 
 
 class Table:
-    """For each pair of groups: static friction, dynamic friction, restitution, whether they touch; and of what spins (`turns`) the
-    resistance to rolling, to twisting, and the tangential restitution. One row where `uniform`.
+    """For each pair of groups: static friction, dynamic friction, restitution, whether they touch; and of what spins (`turns`)
+    the resistance to rolling, to twisting, and the tangential restitution. One row where `uniform`.
 
     friction, restitution: one value for all, or a mapping from pairs of groups to values, with 0 for pairs that are not in it.
     touching: None for all, or the pairs of groups that touch.

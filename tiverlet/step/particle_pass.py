@@ -242,8 +242,8 @@ class ParticlePass:
 
     @ti.func
     def reaction(self, i, h, t, firm):
-        """h^2 times what constraints (from Slots), contacts and walls accelerated particle i by in the last substep; and which part
-        of what walls did is in it.
+        """h^2 times what constraints (from Slots), contacts and walls accelerated particle i by in the last substep; and which
+        part of what walls did is in it.
 
         Walls count as far as they balance the rest: a body at rest has velocity 0, but one that has just bounced is not credited
         with half of the blow.

@@ -188,7 +188,7 @@ class Runner:
         return out[: self.n]
 
     def torque(self) -> np.ndarray:
-        """Moments that contacts and walls had in the last substep, (n, axes) [N m]: I alpha, by r omega = s / h + r alpha h / 2."""
+        """Moments of contacts and walls in the last substep, (n, axes) [N m]: I alpha, by r omega = s / h + r alpha h / 2."""
         clock, particles = self.clock, self.scene.particles
         if not self.scene.state.spins or clock.d_is_velocity:
             return np.zeros((self.n, 2 * particles.dim - 3))

@@ -10,6 +10,7 @@ from . import (  # noqa: F401  (they register their rows)
     motion,
     networks,
     sheets,
+    spinning,
     taut,
     touching,
 )
