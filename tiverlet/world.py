@@ -10,7 +10,9 @@ import numpy as np
 
 from . import checks
 from .constraints.core.strength import BREAKS
+from .contact.events import ContactEvents, no_events
 from .contact.initial_overlap import overlapping
+from .contact.pair_contact import PairContact
 from .device.copies import Copies
 from .device.interrupts import whole
 from .features.arguments import meant
@@ -91,6 +93,7 @@ class World:
         self._last: StepReport | None = None
         self._watchers: list[Any] = []  # recorders: told of what the user assigns, and before and after every step
         self._undo: tuple | None = None  # the state before a step that takes long, and flags of features
+        self._events: ContactEvents | None = None  # of the last frame, where the world was edited since then
 
     @property
     def _build_options(self) -> tuple[Solver | None, str, str, int, Scale]:
@@ -142,14 +145,14 @@ class World:
                 self._broken_off()
                 raise
             report.__dict__["seconds"] = perf_counter() - clock  # which is no part of what it says
-            self._last, self._clock.energy, self._undo = report, report.energy, None
+            self._last, self._clock.energy, self._undo, self._events = report, report.energy, None, None
             for watcher in self._watchers:
                 watcher.after(dt, report)
         return report
 
     def _broken_off(self) -> None:
         """A step ended with an exception: undo it, or tell recorders that the state is none that steps lead to."""
-        undo, self._undo = self._undo, None
+        undo, self._undo, self._events = self._undo, None, no_events(self._particles.dim)
         if undo:
             checkpoint.undo(self, *undo)
             return
@@ -337,6 +340,27 @@ class World:
             if contact.detects and self._runner.step.launched:
                 self._runner.look()  # which measures; elsewhere it makes the list, too
         return contact.found(self.position, self._clock.h or 1.0)
+
+    def events(self, groups: Iterable | None = None) -> ContactEvents:
+        """Which contacts began, ended and went on in the last step, with a Contact(events=True) or with sensors.
+
+        groups: only those between these pairs of groups, such as [(0, 1)]; None for all. Those of many steps have to be asked for
+        after each. Removing and adding particles keeps them, with the present indices; a clone has none before its first step.
+
+        Raises RuntimeError where nothing tells of events.
+        """
+        self._runner.memory.check()
+        if not any(isinstance(f, PairContact) and f.has_events for f in self._features):
+            raise RuntimeError("World.events: nothing tells of events here. Write tv.Contact(events=True), or give it sensors.")
+        return self._all_events().among(self._particles.group, groups)
+
+    def _all_events(self) -> ContactEvents:
+        """Those of the last step; none where nothing tells of them."""
+        out = self._events
+        for contact in self._runner.step.contacts:
+            if contact.dev.events and out is None:
+                out = contact.dev.events.read(self._clock.h or 1.0, self._clock.time)
+        return no_events(self._particles.dim) if out is None else out
 
     @property
     def broken(self) -> list[tuple[Feature, np.ndarray]]:

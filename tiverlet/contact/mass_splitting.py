@@ -77,7 +77,7 @@ class MassSplitting:
     @ti.func
     def any_contact(self, i):
         """1 if any pair of particle i touches, to the last digit: a difference is below 0 if and only if one is the lesser."""
-        same = ti.static(self.geometry.radius.uniform and not self.geometry.shrinks)
+        same = ti.static(self.geometry.radius.uniform and not self.geometry.shrinks and not self.geometry.senses)
         gap, begin = ti.cast(ti.math.inf, self.real), self.grid.first[i]
         for e in range(begin, begin + self.grid.number[i]):
             j = self.grid.neighbour[e]

@@ -6,6 +6,7 @@ import numpy as np
 
 from ..device import ti
 from ..features.feature import Scene
+from ..features.material import TOUCHES
 from ..neighbours.neighbour_list import PairData
 from ..neighbours.queries import Contacts
 
@@ -25,7 +26,7 @@ class DiscGeometry:
     def __init__(self, scene: Scene, grid: "NeighbourSearch", push_out: float = 0.0, impulse: PairData | None = None):
         self.scene, self.grid, self.push_out, self.impulse = scene, grid, push_out, impulse
         self.state, self.radius, self.real = scene.state, scene.radius, scene.real
-        self.shrinks, self.store = False, None
+        self.shrinks, self.store, self.senses = False, None, grid.table.senses
 
     @ti.func
     def contact_distance(self, i, j):
@@ -33,6 +34,14 @@ class DiscGeometry:
         contact_distance = self.radius.of(i) + self.radius.of(j)
         if ti.static(self.shrinks):
             contact_distance -= self.shrunk[i] + self.shrunk[j]
+        return self.without_sensors(i, j, contact_distance)
+
+    @ti.func
+    def without_sensors(self, i, j, contact_distance):
+        """A distance at which particles i and j touch, 0 where one of them only senses the other."""
+        if ti.static(self.senses):
+            if ti.cast(self.grid.table.of(i, j)[3], ti.i32) != TOUCHES:
+                contact_distance = 0 * contact_distance
         return contact_distance
 
     @ti.func
@@ -140,7 +149,7 @@ class DiscGeometry:
         for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
             j = self.grid.neighbour[e]
             if ti.max(i, j) >= first:
-                contact_distance = self.radius.of(i) + self.radius.of(j)
+                contact_distance = self.without_sensors(i, j, self.radius.of(i) + self.radius.of(j))
                 overlap, _ = self.overlap(i, j, contact_distance)
                 less = ti.max(less, overlap * self.radius.of(i) / contact_distance)
         self.shrunk[i] = less
@@ -162,7 +171,7 @@ class DiscGeometry:
             if j < i:  # and so are the rest
                 break
             a, b = self.radius.of(i), self.radius.of(j)
-            overlap = self.depth(i, j, a + b)
+            overlap = self.depth(i, j, self.without_sensors(i, j, a + b))
             if overlap > 0:
                 small = ti.min(a, b)
                 if small == 0:
@@ -182,6 +191,10 @@ class DiscGeometry:
             back = np.lexsort(pairs[~low].T)  # (j, i) in the order of (i, j)
             push[low] = np.maximum(push[low], push[~low][back])
         pairs, push = pairs[low], push[low]
+        if self.senses:
+            rank, table = self.grid.table.rows(self.scene.particles.group)
+            touch = table.reshape(rank.max() + 1, -1, 4)[rank[pairs[:, 0]], rank[pairs[:, 1]], 3] == TOUCHES
+            pairs, push = pairs[touch], push[touch]
         d = x[pairs[:, 0]] - x[pairs[:, 1]]
         length = np.linalg.norm(d, axis=1)
         overlap = r[pairs].sum(axis=1) - length

@@ -58,6 +58,7 @@ class PairContact(Feature):
     restitution = Knob(lambda f, v: f._surface("restitution", v), "Of all pairs, or by pairs of groups.")
     skin = Knob(lambda f, v: _skin(v), "How far beyond touching pairs are listed [m].", compiled=True)
     push_out = Knob(lambda f, v: checks.number("Contact", "push_out", v, least=0.0), "[m/s].", compiled=True)
+    events = Knob(lambda f, v: checks.flag("Contact", "events", v), "Whether World.events() tells of them.", compiled=True)
     compiled_for = ("has_friction", "has_restitution", "uniform")
     _finest = _listed = 0.0  # the smallest radius, and how far beyond touching pairs are listed now [m]
     table: Table  # bound to one world
@@ -69,18 +70,18 @@ class PairContact(Feature):
 
     def _surface(self, name: str, value):
         """Check what pairs are like, with what was said so far."""
-        if name == "groups" and value is not None:
+        if name in ("groups", "sensors") and value is not None:
             value = checks.rows("Contact", name, value, "a list of pairs of groups, such as [(0, 1)],")
         elif isinstance(value, list):
             value = tuple(value)
-        given = {"friction": 0.0, "restitution": 0.0, "groups": None} | vars(self) | {name: value}
-        Table("Contact", given["friction"], given["restitution"], given["groups"])
+        given = {"friction": 0.0, "restitution": 0.0, "groups": None, "sensors": ()} | vars(self) | {name: value}
+        Table("Contact", given["friction"], given["restitution"], given["groups"], given["sensors"])
         return value
 
     @property
     def wanted(self) -> Table:
         """What pairs are to be like."""
-        return Table("Contact", self.friction, self.restitution, vars(self).get("groups"))
+        return Table("Contact", self.friction, self.restitution, vars(self).get("groups"), vars(self).get("sensors", ()))
 
     @property
     def uniform(self) -> bool:
@@ -96,6 +97,11 @@ class PairContact(Feature):
     def has_restitution(self) -> bool:
         """Whether any pair has restitution, or had when kernels were compiled."""
         return self.wanted.has_restitution or vars(self.dev).get("has_restitution", False)
+
+    @property
+    def has_events(self) -> bool:
+        """Whether World.events() tells of anything."""
+        return self.events or bool(vars(self).get("sensors"))
 
     @property
     def shrinks(self) -> bool:
@@ -116,6 +122,8 @@ class PairContact(Feature):
         dev = self.dev
         self.scene, dev.state, dev.w = scene, scene.state, scene.state.w
         dev.has_friction, dev.has_restitution = self.has_friction, self.has_restitution
+        dev.reports = self.events  # of pairs that push each other
+        dev.has_events, dev.events = self.has_events, None  # an EventLog
 
     def upload(self) -> None:
         """Write friction and restitution."""

@@ -109,7 +109,7 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
     went = [f for f in before if f not in features or f.afresh]
     starts = {known: start.regrouped(some, added) for known, start in {id(f.start): f.start for f in before}.items()}
     starts = [None if f in came else starts[id(f.start)] for f in features]
-    parts, seen = None, None
+    parts, seen, events = None, None, world._all_events()
     if not world._clock.d_is_velocity and (world._clock.parted is not None or any(_loses(f, number, features) for f in before)):
         seen = world.velocity
     try:
@@ -146,6 +146,7 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
     world._install(particles, features, parts)
     world._runner.scene.h2_effective = h2_effective
     world._runner.memory.restore(state)
+    world._events = events.renumbered(number)
     if contact and contact in world._runner.step.contacts:
         _give_contacts(world, contact, old, number, some)
     drag, world._clock.drag = world._clock.drag, None

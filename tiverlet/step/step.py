@@ -423,7 +423,7 @@ class Step:
         for f in ti.static(self.breakers):
             for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
                 f.break_overloaded(c, self.integrator.h2_effective(now.h, 0), now.tick)
-        self.contact_pass.finish(now.thread)
+        self.contact_pass.finish(now)
         self.team.wait()
 
     @ti.func
