@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING
 
 from ..device import at, inline, ti
+from .wall_log import WallLog
 
 if TYPE_CHECKING:
     from ..features.feature import Scene
@@ -15,13 +16,14 @@ class Surface:
     """How the surface of one collider answers on the device: friction, restitution, push_out; see Collider for what they mean.
 
     friction: (static, dynamic), or None for a surface without. restitution: 0 to 1, or None. push_out: [m/s]. active: whether
-    it is there, or None for one without a switch.
+    it is there, or None for one without a switch. events: whether there is a `log` of what touches.
     """
 
     def __init__(
         self, scene: "Scene", name: str, friction: tuple[float, float] | None, restitution: float | None, push_out: float, active:
-        bool | None,
+        bool | None, events: bool = False,
     ):  # fmt: skip
+        self.has_log, self.log = events, WallLog(scene, name) if events else None
         self._memory, self.state, self.push_out = scene.memory, scene.state, push_out
         self.has_friction, self.has_restitution = friction is not None, restitution is not None
         if self.has_friction:
@@ -93,6 +95,8 @@ class Surface:
                 gap = -depth - leaving
                 if gap >= 0 and leaving < 0 and turn != GENTLY:
                     rise, after = self.bounce(gap, leaving, (self.state.before[i] - moved).dot(n), after)
+            if ti.static(self.has_log):
+                self.log.note(i, depth, n, after - leaving, -leaving)
             change = (after - leaving) * n
             if ti.static(self.state.keeps_wall_push):
                 self.state.wall_push[i] = self.state.wall_push[i] + change

@@ -9,105 +9,19 @@ Rows come in any order, and the host sorts them. Each is written by one particle
 any number of threads.
 """
 
-from collections.abc import Iterable
-from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .. import checks
 from ..device import ti
 from ..features.feature import Scene
 from ..features.material import SENSES, Table
 from ..neighbours.neighbour_list import Column, PairData
+from .touches import BEFORE, NEVER, ContactEvents, Touches, span
 
 if TYPE_CHECKING:
     from ..neighbours.neighbour_search import NeighbourSearch
     from .narrow_phase import DiscGeometry
-
-BEFORE, NEVER = 0, -1  # numbers of substeps, which count from 1: it touched when the frame began; not yet
-
-
-@dataclass(frozen=True)
-class Touches:
-    """Pairs that touched in a frame, each once, in the order of their indices.
-
-    pairs: (m, 2), i < j. point: (m, dim) [m], in the middle of the overlap. normal: (m, dim), from j to i; both as the pair met,
-    or where it touched before the frame as it touched last (once it has parted: as it is when the frame ends). impulse: (m,)
-    [N s] along the normal, the sum over the frame; i got impulse * normal in all, friction apart, and j the opposite. 0 for
-    sensors. speed: (m,) [m/s], the highest at which the pair came together where it met in this frame, before the impact; 0
-    where it did not meet. began: (m,) [s], when it first met in this frame; NaN where it touched before. ended: (m,) [s], when it
-    was apart again; NaN where it still touches. Times are those of the ends of substeps.
-    """
-
-    pairs: np.ndarray
-    point: np.ndarray
-    normal: np.ndarray
-    impulse: np.ndarray
-    speed: np.ndarray
-    began: np.ndarray
-    ended: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.pairs)
-
-    def __getitem__(self, rows: Any) -> "Touches":
-        """Some rows, by a mask, indices or a slice."""
-        return Touches(*(getattr(self, f.name)[rows] for f in fields(self)))
-
-
-@dataclass(frozen=True)
-class ContactEvents:
-    """What touched in the last frame.
-
-    A pair is in `begun` if it did not touch in the last substep before the frame, and in `ended` if it does not in the last one of
-    it; a ball that bounces within a frame is in both. It is in `lasting` if it touched before and after, whatever happened in
-    between: a speed above 0 tells that it met again. So (touching | begun) - ended is what touches now.
-    """
-
-    touches: Touches
-
-    @property
-    def begun(self) -> Touches:
-        """What did not touch before the frame."""
-        return self.touches[~np.isnan(self.touches.began)]
-
-    @property
-    def ended(self) -> Touches:
-        """What does not touch after it."""
-        return self.touches[~np.isnan(self.touches.ended)]
-
-    @property
-    def lasting(self) -> Touches:
-        """What touched before and after."""
-        return self.touches[np.isnan(self.touches.began) & np.isnan(self.touches.ended)]
-
-    def __len__(self) -> int:
-        return len(self.touches)
-
-    def among(self, group: np.ndarray, groups: Iterable | None) -> "ContactEvents":
-        """Those between pairs of groups. group: (n,), of each particle; groups: None for all."""
-        if groups is None:
-            return self
-        wanted = checks.rows("World.events", "groups", groups, "a list of pairs of groups, such as [(0, 1)],")
-        some, (a, b) = np.zeros(len(self), dtype=bool), group[self.touches.pairs.T]
-        for pair in wanted:
-            if not (isinstance(pair, (tuple, list)) and len(pair) == 2 and all(isinstance(k, (int, np.integer)) for k in pair)):
-                raise TypeError(f"World.events: groups has {pair!r}, but a pair of groups such as (0, 1) is needed.")
-            some |= ((a == pair[0]) & (b == pair[1])) | ((a == pair[1]) & (b == pair[0]))
-        return ContactEvents(self.touches[some])
-
-    def renumbered(self, number: np.ndarray) -> "ContactEvents":
-        """With new numbers of particles, in the same order; without what had one that goes, -1."""
-        pairs = number[self.touches.pairs]
-        return ContactEvents(replace(self.touches, pairs=pairs)[(pairs >= 0).all(axis=1)])
-
-
-def no_events(dim: int) -> ContactEvents:
-    """Nothing touched."""
-    pairs, vectors, numbers = np.zeros((0, 2), dtype=np.int64), np.zeros((0, dim)), np.zeros(0)
-    return ContactEvents(Touches(pairs, vectors, vectors, numbers, numbers, numbers, numbers))
-
 
 class EventLog:
     """The table of one world on the device, and who writes what to it.
@@ -239,9 +153,14 @@ class EventLog:
                         self.place(row, j, self.geometry.fallback_normal(i, j, r), self.radius.of(i) + self.radius.of(j))
                 self.touched.field[e] = ti.cast(last == self.substep[None], ti.i32)
 
+    @property
+    def made(self) -> Any:
+        """The field that is 0 where there are no events to tell of."""
+        return self.rows
+
     def forget(self) -> None:
         """Empty the table, for another state than that of a frame that has just been made."""
-        self.grid.memory.write(self.rows, 0)
+        self.grid.memory.write(self.made, 0)
 
     def read(self, h: float, time: float) -> ContactEvents:
         """What the last frame, of substeps h [s], which ended at `time` [s], came to."""
@@ -252,8 +171,5 @@ class EventLog:
         impulse, speed, normal, point = (value.astype(np.float64) for value in values)
         pairs = np.sort(pair, axis=1).astype(np.int64)
         normal[pair[:, 0] > pair[:, 1]] *= -1
-        began = np.where(when[:, 0] == BEFORE, np.nan, time - (substeps - when[:, 0]) * h)
-        ended = np.where(when[:, 1] == substeps, np.nan, time - (substeps - 1 - when[:, 1]) * h)
         order = np.lexsort(pairs.T[::-1])
-        out = Touches(pairs, point, normal, impulse / h, speed / h, began, ended)
-        return ContactEvents(out[order])
+        return ContactEvents(Touches(pairs, point, normal, impulse / h, speed / h, *span(when, substeps, h, time))[order])

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 CARRIED = ("Contact.push", "Contact.slip", "Contact.slack")  # by pairs, for the next substep
 TOLD = ("Contact.given", "Contact.touched")  # by pairs, of the last substep, for reports
+EVENTS = "events."  # names of what walls carry for reports begin so
 LATE = {"Contact.shrunk"}  # made when it is needed
 
 
@@ -35,7 +36,7 @@ class Checkpoint:
     def _lasting(self) -> dict[str, np.ndarray]:
         """Without what pairs carry for reports: a pair that has just bounced may be on the list or far off it, by the skin. And
         without a field that is made when it is needed, where nobody needs it."""
-        values = {name: v for name, v in self.values.items() if name not in LATE or v.any()}
+        values = {name: v for name, v in self.values.items() if (name not in LATE or v.any()) and not name.startswith(EVENTS)}
         if not any(name in values for name in TOLD):
             return values
         carried = [name for name in CARRIED if name in values]
@@ -86,9 +87,8 @@ def put_back(world: "World", kept: Checkpoint) -> None:
     if grid:
         pieces = {piece.name: kept.values[f"Contact.{piece.name}"] for piece in grid.lasting}
         grid.restore(kept.values["Contact.pairs"], pieces)
-    for contact in world._runner.step.contacts:
-        if contact.dev.events:
-            contact.dev.events.forget()
+    for log in world._runner.logs:
+        log.forget()
     world._runner.invalidate()
     if list(map(id, world._runner.memories)) != stores:
         world._runner.renew()  # there are new fields
