@@ -153,7 +153,7 @@ class World:
 
     def _broken_off(self) -> None:
         """A step ended with an exception: undo it, or tell recorders that the state is none that steps lead to."""
-        undo, self._undo, self._events = self._undo, None, (no_events(self._particles.dim),) * 2
+        undo, self._undo, self._events = self._undo, None, (none := no_events(self._particles.dim), none)
         if undo:
             checkpoint.undo(self, *undo)
             return

@@ -36,8 +36,9 @@ class Contact(PairContact):
     0 to 1, or such a mapping. groups: the pairs of groups that touch, None for all. skin: how far beyond touching pairs are
     listed [m], "auto" for 0.75 of the median radius; speed only, never the result. push_out: particles that overlap at the
     start, or after positions were assigned, part at this speed [m/s] at most: they act as if they were small enough to fit, and
-    grow back. events: whether World.events() tells which pairs met and parted. sensors: pairs of groups that do not touch; World.events()
-    tells which particles of the second group, the sensors, overlap with those of the first. It costs least where they are few.
+    grow back. events: whether World.events() tells which pairs met and parted. sensors: pairs of groups that do not touch;
+    World.events() tells which particles of the second group, the sensors, overlap with those of the first. It costs least where
+    sensors are few.
 
     A Jacobi pass: each pair wants C back along the current n, split by mass, p = C / (m_i w_i + m_j w_j), which conserves
     momentum. A particle has its mass split m times, where m bounds the eigenvalues of S, the sum of n n^T over its overlapping
@@ -184,7 +185,7 @@ class Contact(PairContact):
                             part = ti.zero(part)
                         self.dev.impulse.field[e] = self.dev.impulse.field[e] + part
                     if ti.static(self.dev.reports):
-                        self.dev.events.note(i, j, e, n, overlap, part, final)
+                        self.dev.events.note(i, j, e, n, part, final)
                     push += part
                     want = part * n
                     if ti.static(self.dev.has_friction):

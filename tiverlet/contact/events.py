@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from ..neighbours.neighbour_search import NeighbourSearch
     from .narrow_phase import DiscGeometry
 
+
 class EventLog:
     """The table of one world on the device, and who writes what to it.
 
@@ -87,34 +88,34 @@ class EventLog:
         self.speed.field[row] = 0
 
     @ti.func
-    def note(self, i, j, e, n, overlap, impulse, final):
+    def note(self, i, j, e, n, impulse, final):
         """Entry e of particle i, with j, touches in this pass, where both sides of a pair come by; one of them writes, and not
         one that does not move, which comes by never."""
         if i < j or not self.state.w.positive(j):
-            self.write(i, j, e, n, overlap, impulse, final)
+            self.write(i, j, e, n, impulse, final)
 
     @ti.func
-    def write(self, i, j, e, n, overlap, impulse, final):
+    def write(self, i, j, e, n, impulse, final):
         """Note a touch: its impulse [kg m]; where the pair meets, its speed, normal and point."""
         row, now = self.touched.field[e] - 1, self.substep[None]
         if row < 0:
             row = ti.atomic_add(self.rows[None], 1)
             self.enter(row, i, e, now, NEVER)
-            self.place(row, j, n, overlap)
+            self.place(row, i, j, n)
         began, last = self.when.field[row][0], self.when.field[row][1]
         if last < now - 1:
             approach = -(self.state.d[i] - self.state.d[j]).dot(n)
             self.speed.field[row] = ti.max(self.speed.field[row], approach)
         if final != 0 and began == BEFORE:
-            self.place(row, j, n, overlap)
+            self.place(row, i, j, n)
         self.when.field[row][1] = now
         self.impulse.field[row] = self.impulse.field[row] + impulse
 
     @ti.func
-    def place(self, row, j, n, overlap):
-        """Where the pair touches."""
+    def place(self, row, i, j, n):
+        """Where the pair touches: in the middle between the two surfaces along n."""
         self.normal.field[row] = n
-        self.point.field[row] = self.state.place(j) + (self.radius.of(j) - overlap / 2) * n
+        self.point.field[row] = (self.state.place(i) + self.state.place(j) + (self.radius.of(j) - self.radius.of(i)) * n) / 2
 
     @ti.func
     def note_impact(self, e, impulse, speed):
@@ -134,7 +135,7 @@ class EventLog:
                 if ti.cast(self.table.of(i, j)[3], ti.i32) == SENSES and (rank != self.table.rank[j] or i < j):
                     overlap, n = self.geometry.overlap(i, j, self.radius.of(i) + self.radius.of(j))
                     if overlap > 0:
-                        self.write(i, j, e, n, overlap, 0 * overlap, final)
+                        self.write(i, j, e, n, 0 * overlap, final)
 
     @ti.func
     def close(self, i):
@@ -148,9 +149,9 @@ class EventLog:
                     r = self.state.apart(i, j)
                     length = r.norm()
                     if length > 0:
-                        self.place(row, j, r / length, self.radius.of(i) + self.radius.of(j) - length)
+                        self.place(row, i, j, r / length)
                     else:
-                        self.place(row, j, self.geometry.fallback_normal(i, j, r), self.radius.of(i) + self.radius.of(j))
+                        self.place(row, i, j, self.geometry.fallback_normal(i, j, r))
                 self.touched.field[e] = ti.cast(last == self.substep[None], ti.i32)
 
     @property
@@ -172,4 +173,11 @@ class EventLog:
         pairs = np.sort(pair, axis=1).astype(np.int64)
         normal[pair[:, 0] > pair[:, 1]] *= -1
         order = np.lexsort(pairs.T[::-1])
-        return ContactEvents(Touches(pairs, point, normal, impulse / h, speed / h, *span(when, substeps, h, time))[order])
+        pairs, when, impulse, speed = pairs[order], when[order], impulse[order], speed[order]
+        # A pair has two rows where a particle of it moves that was held before the frame, when the other one wrote.
+        one = np.flatnonzero((np.diff(pairs, axis=0, prepend=-1) != 0).any(axis=1))
+        if len(one) < len(pairs):
+            when = np.stack([np.minimum.reduceat(when[:, 0], one), np.maximum.reduceat(when[:, 1], one)], axis=1)
+            impulse, speed = np.add.reduceat(impulse, one), np.maximum.reduceat(speed, one)
+        times, order = span(when, substeps, h, time), order[one]
+        return ContactEvents(Touches(pairs[one], point[order], normal[order], impulse / h, speed / h, *times))

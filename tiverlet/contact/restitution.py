@@ -1,10 +1,11 @@
 """Restitution of pairs of discs or spheres: impacts, one after the other."""
 
+from typing import Any
+
 from ..device import ti
 from ..features.feature import Scene
 from ..features.material import Table
 from ..neighbours.neighbour_list import PairData
-from .events import EventLog
 from .narrow_phase import DiscGeometry
 
 
@@ -12,12 +13,12 @@ class Restitution:
     """A pair leaves with -e times the normal velocity that it had before the substep, from the time of impact on, see Contact.
 
     struck: of its pairs, those that are struck in this substep. slack: of their overlap, what no push is for. impulse: pushes
-    and impacts of the last substep [kg m]. events: where impacts are noted, or None.
+    and impacts of the last substep [kg m]. events: an EventLog, or None.
     """
 
     def __init__(
         self, scene: Scene, geometry: DiscGeometry, table: Table, struck: PairData, slack: PairData, impulse: PairData,
-        events: EventLog | None,
+        events: Any,
     ):  # fmt: skip
         n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
         self.geometry, self.grid, self.table, self.state = geometry, geometry.grid, table, scene.state

@@ -15,9 +15,9 @@ BEFORE, NEVER = 0, -1  # numbers of substeps, which count from 1: it touched whe
 class Touches:
     """Pairs that touched in a frame, each once, in the order of their indices.
 
-    pairs: (m, 2), i < j. point: (m, dim) [m], in the middle of the overlap. normal: (m, dim), from j to i; both as the pair met,
-    or where it touched before the frame as it touched last (once it has parted: as it is when the frame ends). impulse: (m,)
-    [N s] along the normal, the sum over the frame; i got impulse * normal in all, friction apart, and j the opposite. 0 for
+    pairs: (m, 2), i < j. normal: (m, dim), from j to i. point: (m, dim) [m], in the middle between the two surfaces. Both as the
+    pair met; where it touched before the frame, as it touched last, or once it has parted as it is when the frame ends. impulse:
+    (m,) [N s] along the normal, the sum over the frame without friction; i got impulse * normal, and j the opposite. 0 for
     sensors. speed: (m,) [m/s], the highest at which the pair came together where it met in this frame, before the impact; 0
     where it did not meet. began: (m,) [s], when it first met in this frame; NaN where it touched before. ended: (m,) [s], when it
     was apart again; NaN where it still touches. Times are those of the ends of substeps.
@@ -46,9 +46,12 @@ class Touches:
 class ContactEvents:
     """What touched in the last frame.
 
-    A pair is in `begun` if it did not touch in the last substep before the frame, and in `ended` if it does not in the last one of
-    it; a ball that bounces within a frame is in both. It is in `lasting` if it touched before and after, whatever happened in
-    between: a speed above 0 tells that it met again. So (touching | begun) - ended is what touches now.
+    A pair is in `begun` if it did not touch in the last substep before the frame, and in `ended` if it does not in the last one
+    of it; a ball that bounces within a frame is in both. It is in `lasting` if it touched before and after, whatever happened in
+    between: a speed above 0 tells that it met again. So (touching | begun) - ended is what touches now. Each pair is in `touches`
+    once, so that sums count nothing twice.
+
+    A pair touches in a substep if it overlaps in it before it is pushed apart, and so does what is at rest under a load.
     """
 
     touches: Touches

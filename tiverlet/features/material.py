@@ -44,7 +44,7 @@ class Table:
 
     kernels_read = ("uniform", "has_friction", "has_restitution", "senses", "groups", "rank", "entries")
 
-    def __init__(self, who: str, friction: Any, restitution: Any, touching: Iterable | None, sensing: Iterable = ()):
+    def __init__(self, who: str, friction: Any, restitution: Any, touching: Iterable | None, sensing: Any = ()):
         self.who, self.friction, self.restitution = who, friction, restitution
         self.touching = None
         if touching is not None:
