@@ -326,9 +326,9 @@ def test_refused(world):
     with pytest.raises(TypeError, match="sensors has the key 3, but a pair of groups"):
         tv.Contact(sensors=[3])
     with pytest.raises(TypeError, match="events = 1 is a int, but True or False"):
-        tv.Contact(events=1)
+        tv.Contact(events=1)  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="HalfSpace: events = 'yes'"):
-        tv.HalfSpace((0, 1), events="yes")
+        tv.HalfSpace((0, 1), events="yes")  # type: ignore[arg-type]
     w = stage(world)
     with pytest.raises(TypeError, match=r"World.events: groups has 3"):
         w.events([3])

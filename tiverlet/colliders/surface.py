@@ -1,6 +1,6 @@
 """What happens to a particle that is inside of a collider: it is taken out, with friction and restitution."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..device import at, inline, ti
 from .wall_log import WallLog
@@ -23,7 +23,8 @@ class Surface:
         self, scene: "Scene", name: str, friction: tuple[float, float] | None, restitution: float | None, push_out: float, active:
         bool | None, events: bool = False,
     ):  # fmt: skip
-        self.has_log, self.log = events, WallLog(scene, name) if events else None
+        self.has_log = events
+        self.log: Any = WallLog(scene, name) if events else None
         self._memory, self.state, self.push_out = scene.memory, scene.state, push_out
         self.has_friction, self.has_restitution = friction is not None, restitution is not None
         if self.has_friction:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .. import checks
 from ..device import ti
 from ..device.thread_team import Team
 from ..features.feature import Batch, Knob, Scene
@@ -79,6 +80,7 @@ class Contact(PairContact):
         self.groups, self.sensors, self.restitution, self.friction = groups, sensors, restitution, friction
         self.skin, self.push_out, self.events = skin, push_out, events
 
+    events = Knob(lambda f, v: checks.flag("Contact", "events", v), "Whether World.events() tells of pairs.", compiled=True)
     sensors: Any = Knob(lambda f, v: f._surface("sensors", v), "The pairs of groups of which the second senses.", compiled=True)
     groups: Any = Knob(lambda f, v: f._surface("groups", v), "The pairs of groups that touch; None for all.", compiled=True)
     projects = True

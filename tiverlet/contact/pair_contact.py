@@ -58,7 +58,6 @@ class PairContact(Feature):
     restitution = Knob(lambda f, v: f._surface("restitution", v), "Of all pairs, or by pairs of groups.")
     skin = Knob(lambda f, v: _skin(v), "How far beyond touching pairs are listed [m].", compiled=True)
     push_out = Knob(lambda f, v: checks.number("Contact", "push_out", v, least=0.0), "[m/s].", compiled=True)
-    events = Knob(lambda f, v: checks.flag("Contact", "events", v), "Whether World.events() tells of them.", compiled=True)
     compiled_for = ("has_friction", "has_restitution", "uniform")
     _finest = _listed = 0.0  # the smallest radius, and how far beyond touching pairs are listed now [m]
     table: Table  # bound to one world
@@ -101,7 +100,7 @@ class PairContact(Feature):
     @property
     def has_events(self) -> bool:
         """Whether World.events() tells of anything."""
-        return self.events or bool(vars(self).get("sensors"))
+        return bool(vars(self).get("events") or vars(self).get("sensors"))
 
     @property
     def shrinks(self) -> bool:
@@ -122,8 +121,8 @@ class PairContact(Feature):
         dev = self.dev
         self.scene, dev.state, dev.w = scene, scene.state, scene.state.w
         dev.has_friction, dev.has_restitution = self.has_friction, self.has_restitution
-        dev.reports = self.events  # of pairs that push each other
-        dev.has_events, dev.events = self.has_events, None  # an EventLog
+        # `reports`: pairs that push each other are noted, not only what sensors overlap. `events`: an EventLog, or None.
+        dev.has_events, dev.reports, dev.events = self.has_events, bool(vars(self).get("events")), None
 
     def upload(self) -> None:
         """Write friction and restitution."""

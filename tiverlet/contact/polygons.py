@@ -54,7 +54,6 @@ class Polygons(PairContact):
         "auto", push_out: float = 1.0,
     ):  # fmt: skip
         self.restitution, self.friction, self.skin, self.push_out = restitution, friction, skin, push_out
-        self.events = False
         self.loops = checked(loops)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
