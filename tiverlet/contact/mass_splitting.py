@@ -36,6 +36,13 @@ class MassSplitting:
             out |= ti.cast(r.dot(r) < contact_distance * contact_distance, ti.u32) << ti.cast(
                 k, ti.u32
             )  # no branch: it would be taken at random
+        if ti.static(self.geometry.senses):
+            left = out
+            while left != 0:
+                bit = left & (~left + ti.u32(1))
+                left ^= bit
+                if self.geometry.pushes(i, self.grid.neighbour[begin + lowest_bit(bit)]) == 0:
+                    out ^= bit
         return out
 
     @ti.func
@@ -77,7 +84,7 @@ class MassSplitting:
     @ti.func
     def any_contact(self, i):
         """1 if any pair of particle i touches, to the last digit: a difference is below 0 if and only if one is the lesser."""
-        same = ti.static(self.geometry.radius.uniform and not self.geometry.shrinks and not self.geometry.senses)
+        same = ti.static(self.geometry.radius.uniform and not self.geometry.shrinks)
         gap, begin = ti.cast(ti.math.inf, self.real), self.grid.first[i]
         for e in range(begin, begin + self.grid.number[i]):
             j = self.grid.neighbour[e]

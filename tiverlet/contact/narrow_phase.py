@@ -34,15 +34,15 @@ class DiscGeometry:
         contact_distance = self.radius.of(i) + self.radius.of(j)
         if ti.static(self.shrinks):
             contact_distance -= self.shrunk[i] + self.shrunk[j]
-        return self.without_sensors(i, j, contact_distance)
+        return contact_distance
 
     @ti.func
-    def without_sensors(self, i, j, contact_distance):
-        """A distance at which particles i and j touch, 0 where one of them only senses the other."""
+    def pushes(self, i, j):
+        """1 if particles i and j push each other where they overlap, 0 where one of them only senses the other."""
+        out = 1
         if ti.static(self.senses):
-            if ti.cast(self.grid.table.of(i, j)[3], ti.i32) != TOUCHES:
-                contact_distance = 0 * contact_distance
-        return contact_distance
+            out = ti.cast(ti.cast(self.grid.table.of(i, j)[3], ti.i32) == TOUCHES, ti.i32)
+        return out
 
     @ti.func
     def depth(self, i, j, contact_distance):
@@ -148,8 +148,8 @@ class DiscGeometry:
         less = ti.select(first > 0, self.shrunk[i], ti.cast(0, self.real))
         for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
             j = self.grid.neighbour[e]
-            if ti.max(i, j) >= first:
-                contact_distance = self.without_sensors(i, j, self.radius.of(i) + self.radius.of(j))
+            if ti.max(i, j) >= first and self.pushes(i, j) != 0:
+                contact_distance = self.radius.of(i) + self.radius.of(j)
                 overlap, _ = self.overlap(i, j, contact_distance)
                 less = ti.max(less, overlap * self.radius.of(i) / contact_distance)
         self.shrunk[i] = less
@@ -171,7 +171,7 @@ class DiscGeometry:
             if j < i:  # and so are the rest
                 break
             a, b = self.radius.of(i), self.radius.of(j)
-            overlap = self.depth(i, j, self.without_sensors(i, j, a + b))
+            overlap = self.depth(i, j, (a + b) * self.pushes(i, j))
             if overlap > 0:
                 small = ti.min(a, b)
                 if small == 0:
