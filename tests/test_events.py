@@ -52,6 +52,23 @@ def test_a_bouncing_ball(world, dim, precision):
             assert abs(touch.point[0, 1] - height) < v * h
 
 
+def test_a_cradle(world):
+    # Equal elastic balls in a row that touch already: what the first one brings goes from one to the next, m v at v each time.
+    m, v, x = 1.5, 2.0, [[-0.5, 0], *([0.2 * k, 0] for k in range(4))]
+    moving = np.zeros((5, 2))
+    moving[0, 0] = v
+    w, seen = world(tv.Particles(x, radius=0.1, velocity=moving, mass=m), [tv.Contact(0, 1, events=True)], precision="f64"), {}
+    for _ in range(12):
+        w.step(1 / 60)
+        for touch in (w.events().touches[k : k + 1] for k in range(len(w.events()))):
+            if touch.impulse[0] > 0:
+                assert seen.setdefault(*rows(touch.pairs), touch) is touch
+    assert {*seen} == {(k, k + 1) for k in range(4)}
+    for touch in seen.values():
+        np.testing.assert_allclose([touch.impulse[0], touch.speed[0]], [m * v, v], rtol=1e-9)
+        np.testing.assert_allclose(touch.normal, [[-1, 0]], atol=1e-9)
+
+
 def cloud(dim, n, seed):
     """Discs or spheres of different sizes and masses that fall onto static ones."""
     rng = np.random.default_rng(seed)
@@ -190,10 +207,15 @@ def test_sensors_note_what_overlaps_and_touch_nothing(world, dim, settings):
 
 def test_the_same_events_on_all_paths(world):
     made = [stage(world, path=path) for path in ("fused", "parallel", "launched")]
-    count = 0
+    count, touching = 0, [set(), set()]
     for _ in range(25):
         for w in made:
             w.step(1 / 60)
+        for k, events in enumerate((made[0].events(), made[0].wall_events())):
+            begun, ended = rows(events.begun.pairs), rows(events.ended.pairs)
+            assert not begun & touching[k] and ended <= touching[k] | begun and touching[k] <= rows(events.touches.pairs)
+            touching[k] = (touching[k] | begun) - ended
+            assert rows(events.touches[np.isnan(events.touches.ended)].pairs) == touching[k]
         for w in made[1:]:
             count += equal(made[0].events(), w.events()) + equal(made[0].wall_events(), w.wall_events())
     assert count > 500
