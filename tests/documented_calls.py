@@ -35,6 +35,7 @@ new = world.add(tv.Particles([(0, 5)]), [tv.Pin([3], compliance=1e-3)])
 world.remove(new)
 world.remove([0, 1])
 found = world.near([(0, 0)], 0.5), world.nearest([(0, 0)]), world.contacts.pairs, world.broken, world.explain().splitlines()
+seen = world.events(groups=[(0, 1)]).begun.pairs, world.wall_events().ended.impulse.sum(), len(world.events().lasting)
 clone: tv.World = world.clone(precision="f64", substeps=100)
 with tv.Recorder("b.rrd", world, every=2, budget=1_000_000, overwrite=True) as recorder:
     recorder.log()

@@ -24,8 +24,8 @@ PATH = np.array([[-0.4, 0.3, 0.1], [0.1, -0.2, 0.0], [0.6, 0.4, 0.3]])
 WINGS = np.array([[0.0, -0.1, 0.0], [0.9, 0.1, 0.1], [0.3, 0.8, 0.2], [0.5, -0.6, 0.4]])
 SPRING, SPRINGS = {"compliance": 1e-2, "damping": 1.0, "break_at": 1e6}, {"compliance": 3e-2, "damping": 3.0, "break_at": 1e5}
 SOFT, SOFTER, RIGID = ({"compliance": a, "damping": b} for a, b in ((1e-2, 1.0), (1e-3, 3.0), (0.0, 0.0)))
-SURFACE = {"friction": 0.5, "restitution": 0.5, "push_out": 1.0, "active": True}
-SURFACES = {"friction": (0.2, 0.1), "restitution": 0.9, "push_out": 3.0, "active": False}
+SURFACE = {"friction": 0.5, "restitution": 0.5, "push_out": 1.0, "active": True, "events": False}
+SURFACES = {"friction": (0.2, 0.1), "restitution": 0.9, "push_out": 3.0, "active": False, "events": True}
 BLOCK = np.array([6.0, 0.0, 0.0])  # from the particles of one to those of the next
 LOCAL = ("center", "a", "b", "position", "target")  # settings that are places, given from the block
 
@@ -111,9 +111,10 @@ ROWS3 = {
     ),
     "Contact": (
         lambda i, x, **k: tv.Contact(**k), DISCS,
-        {"friction": {(0, 1): 0.5}, "restitution": {(0, 1): 0.5}, "skin": "auto", "groups": GROUPS, "push_out": 1.0},
+        {"friction": {(0, 1): 0.5}, "restitution": {(0, 1): 0.5}, "skin": "auto", "groups": GROUPS, "push_out": 1.0,
+        "events": False, "sensors": ()},
         {"friction": {(0, 0): 0.1, (0, 1): (0.3, 0.2)}, "restitution": {(0, 1): 0.9}, "skin": 0.2, "groups": [(0, 1)],
-        "push_out": 2.0},
+        "push_out": 2.0, "events": True, "sensors": [(1, 2)]},
     ),
     "Box": (
         lambda i, x, **k: tv.Box(**k), [[1, 8.78, 0], [1, 8.85, 1]],
@@ -237,7 +238,7 @@ def test_the_rows_have_every_feature():
     for name, like in LIKE.items():
         kind = getattr(tv, name)
         assert {*knobs_of(kind)} == {*knobs_of(like)} - (
-            {"groups"} if kind is tv.Polygons else set()
+            {"groups", "events", "sensors"} if kind is tv.Polygons else set()
         ) and kind.upload is like.upload
     assert knobs_of(tv.Force) == ()
 

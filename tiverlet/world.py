@@ -9,8 +9,11 @@ from typing import Any
 import numpy as np
 
 from . import checks
+from .colliders.collider import Collider
 from .constraints.core.strength import BREAKS
 from .contact.initial_overlap import overlapping
+from .contact.pair_contact import PairContact
+from .contact.touches import ContactEvents, joined, no_events
 from .device.copies import Copies
 from .device.interrupts import whole
 from .features.arguments import meant
@@ -93,6 +96,7 @@ class World:
         self._last: StepReport | None = None
         self._watchers: list[Any] = []  # recorders: told of what the user assigns, and before and after every step
         self._undo: tuple | None = None  # the state before a step that takes long, and flags of features
+        self._events: tuple[ContactEvents, ContactEvents] | None = None  # of the last frame, where the device has them no more
 
     @property
     def _build_options(self) -> tuple[Solver | None, str, str, int, Scale]:
@@ -144,14 +148,14 @@ class World:
                 self._broken_off()
                 raise
             report.__dict__["seconds"] = perf_counter() - clock  # which is no part of what it says
-            self._last, self._clock.energy, self._undo = report, report.energy, None
+            self._last, self._clock.energy, self._undo, self._events = report, report.energy, None, None
             for watcher in self._watchers:
                 watcher.after(dt, report)
         return report
 
     def _broken_off(self) -> None:
         """A step ended with an exception: undo it, or tell recorders that the state is none that steps lead to."""
-        undo, self._undo = self._undo, None
+        undo, self._undo, self._events = self._undo, None, (none := no_events(self._particles.dim), none)
         if undo:
             checkpoint.undo(self, *undo)
             return
@@ -374,6 +378,44 @@ class World:
             if contact.detects and self._runner.step.launched:
                 self._runner.look()  # which measures; elsewhere it makes the list, too
         return contact.found(self.position, self._clock.h or 1.0)
+
+    def events(self, groups: Iterable | None = None) -> ContactEvents:
+        """Which contacts of particles began, ended and went on in the last step, with a Contact(events=True) or with sensors.
+
+        groups: only those between these pairs of groups, such as [(0, 1)]; None for all. They are those of one step: ask after
+        each. Removing and adding particles keeps them, with the present indices; a clone has none before its first step.
+
+        Raises RuntimeError where nothing tells of events.
+        """
+        self._runner.memory.check()
+        if not any(isinstance(f, PairContact) and f.has_events for f in self._features):
+            raise RuntimeError("World.events: nothing tells of contacts. Write tv.Contact(events=True), or give it sensors.")
+        return self._all_events()[0].among(self._particles.group, groups)
+
+    def wall_events(self) -> ContactEvents:
+        """Which particles met, left and went on touching walls in the last step, of those with events=True: see events(). Pairs
+        are a particle and the number of the wall in world.features.
+
+        Raises RuntimeError where no wall tells of events.
+        """
+        self._runner.memory.check()
+        if not any(isinstance(f, Collider) and f.events for f in self._features):
+            raise RuntimeError("World.wall_events: no wall tells of them. Write, for one, tv.Box(lower, upper, events=True).")
+        return self._all_events()[1]
+
+    def _all_events(self) -> tuple[ContactEvents, ContactEvents]:
+        """Those of particles, and of walls; none where nothing tells of them."""
+        if self._events is not None:
+            return self._events
+        h, time, step = self._clock.h or 1.0, self._clock.time, self._runner.step
+        pairs, walls = no_events(self._particles.dim), [no_events(self._particles.dim).touches]
+        for contact in step.contacts:
+            if contact.dev.events:
+                pairs = contact.dev.events.read(h, time)
+        for number, f in enumerate(self._features):
+            if isinstance(f, Collider) and f.dev.log:
+                walls.append(f.dev.log.read(number, h, time))
+        return pairs, ContactEvents(joined(walls))
 
     @property
     def broken(self) -> list[tuple[Feature, np.ndarray]]:

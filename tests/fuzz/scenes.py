@@ -386,6 +386,7 @@ def walls(draw, s: Stage) -> Call | None:
     """Any."""
     low, high, mid = s.x.min(axis=0) - 0.5 * s.size, s.x.max(axis=0) + 0.5 * s.size, s.x.mean(axis=0)
     reach, more = float(np.linalg.norm(high - low)), surface(draw, s)
+    more |= {"events": True} if "restitution" in more else {}
     kinds = ["Box", "HalfSpace", "Ball", "Capsule", "Polygon" if s.dim == 2 else "Mesh"]
     kind = pick(draw, *kinds, *(["Sdf"] if s.size == 1 else []))
     up = np.eye(s.dim)[1]
@@ -430,7 +431,7 @@ def contacts(draw, s: Stage) -> Call | None:
         more["skin"] = pick(draw, 0.02, 1.0) * s.size
     if pick(draw, False, False, False, True):
         more["groups"] = [(0, 1)]
-    return Call("Contact", more)
+    return Call("Contact", more | ({"events": True} if "friction" in more else {}))
 
 
 @st.composite

@@ -19,7 +19,7 @@ class Ball(Collider):
 
     center: (dim,) [m], live: assign to it between frames, and the ball moves there during the next frame. radius: R [m], live: it
     changes at once, and what is inside then goes out at push_out. inside: keep particles in. friction, restitution, push_out,
-    active: see Collider.
+    active, events: see Collider.
 
     What passes through in one substep is caught on the way in: the moment when it met the surface is solved for, as for pairs.
     Nothing passes at any speed, nor can anything draw it through.
@@ -33,12 +33,12 @@ class Ball(Collider):
 
     def __init__(
         self, center, radius, inside: bool = False, *, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float =
-        1.0, active: bool | None = None,
+        1.0, active: bool | None = None, events: bool = False,
     ):  # fmt: skip
         self.center = center
         self.inside = bool(inside)
         self.radius = radius
-        self.surface(friction, restitution, push_out, active)
+        self.surface(friction, restitution, push_out, active, events)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the dimension, and that particles fit in."""

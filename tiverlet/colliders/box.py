@@ -50,11 +50,11 @@ class Box(Collider):
 
     def __init__(
         self, lower, upper, *, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float = 1.0, active: bool |
-        None = None,
+        None = None, events: bool = False,
     ):  # fmt: skip
         self.lower = lower
         self.upper = upper
-        self.surface(friction, restitution, push_out, active)
+        self.surface(friction, restitution, push_out, active, events)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the corners against the dimension and the widest particle."""

@@ -41,12 +41,14 @@ class Collider(Feature):
     active: whether it is there, a gate that opens and closes. With True or False given it is a switch, which costs nothing to
     turn; None is always there, and costs the compiling of another scene when it is switched off for the first time. What is
     inside of a wall that comes back is left at push_out.
+    events: whether World.wall_events() tells which particles met and left it.
     """
 
     friction = Knob(lambda f, v: _friction(f, v), "A number, or (static, dynamic, rolling, twisting).")
     restitution = Knob(lambda f, v: _restitution(f, v), "0 to 1, or (normal, tangential).")
     active = Knob(lambda f, v: checks.flag(repr(f), "active", v), "Whether it is there.")
     push_out = Knob(lambda f, v: checks.number(repr(f), "push_out", v, least=0.0), "[m/s].", compiled=True)
+    events = Knob(lambda f, v: checks.flag(repr(f), "events", v), "Whether World.wall_events() tells of it.", compiled=True)
     compiled_for = ("has_friction", "has_restitution", "has_switch", "turns")
     host_only = ("widest",)
     _switch = False  # it was made with one
@@ -55,9 +57,9 @@ class Collider(Feature):
     repeats = False  # one confine() may leave a particle that rubs or bounces where it has to be confined again
     poses = False  # has a pose(when) to be worked out once for each substep, before any confine()
 
-    def surface(self, friction: Any, restitution: Any, push_out: float, active: bool | None) -> None:
+    def surface(self, friction: Any, restitution: Any, push_out: float, active: bool | None, events: bool = False) -> None:
         """Check and keep the arguments that all walls have."""
-        self.friction, self.restitution, self.push_out = friction, restitution, push_out
+        self.friction, self.restitution, self.push_out, self.events = friction, restitution, push_out, events
         self._switch, self.active = active is not None, True if active is None else active
 
     @property
@@ -99,7 +101,8 @@ class Collider(Feature):
         self.dev.real = scene.real
         both = friction_of(repr(self), "friction", self.friction) if self.has_friction else None
         restitution, active = self._bounce if self.has_restitution else None, self.active if self.has_switch else None
-        self.dev.surface = Surface(scene, repr(self), both, restitution, self.push_out, active, self.turns)
+        self.dev.surface = Surface(scene, repr(self), both, restitution, self.push_out, active, self.turns, self.events)
+        self.dev.log = self.dev.surface.log
         self._stands = self.active
 
     def upload(self) -> None:

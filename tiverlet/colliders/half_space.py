@@ -16,7 +16,7 @@ class HalfSpace(Collider):
     C(x) = n . x - offset - radius >= 0, grad C = n.
 
     normal: (dim,), any length above 0; offset: [m] along the unit normal, from the origin. offset is live: assign to it between
-    frames, and the plane moves there during the next frame. friction, restitution, push_out, active: see Collider.
+    frames, and the plane moves there during the next frame. friction, restitution, push_out, active, events: see Collider.
 
     One-sided: a particle cannot pass at any speed, nor can anything draw it through.
     """
@@ -25,7 +25,7 @@ class HalfSpace(Collider):
 
     def __init__(
         self, normal, offset: ArrayLike = 0.0, *, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float = 1.0,
-        active: bool | None = None,
+        active: bool | None = None, events: bool = False,
     ):  # fmt: skip
         normal = np.asarray(normal, dtype=np.float64)
         normal = checks.vector("HalfSpace", "normal", normal, normal.size)
@@ -35,7 +35,7 @@ class HalfSpace(Collider):
         self.normal = normal / length
         self.normal.flags.writeable = False
         self.offset = offset
-        self.surface(friction, restitution, push_out, active)
+        self.surface(friction, restitution, push_out, active, events)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the normal's length."""

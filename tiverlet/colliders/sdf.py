@@ -30,7 +30,7 @@ class Sdf(Moving):
     function: a ti.func that takes a position [m] and returns the signed distance to the surface [m], negative inside of the
     solid. Its literals have the world's precision. gradient: a ti.func of the position that returns the gradient; None for
     central differences. radius: R [m], what the shape is thickened by. position, rotation: where the shape is put (see Moving);
-    live. friction, restitution, push_out, active: see Collider.
+    live. friction, restitution, push_out, active, events: see Collider.
 
         @ti.func
         def torus(p):
@@ -47,13 +47,13 @@ class Sdf(Moving):
     def __init__(
         self, function, gradient=None, *, radius: float = 0.0, position: ArrayLike = 0.0, rotation: ArrayLike = 0.0, friction:
         ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float = 1.0, active: bool |
-        None = None,
+        None = None, events: bool = False,
     ):  # fmt: skip
         self.function: Any = _taken("function", function)
         self.gradient: Any = gradient and _taken("gradient", gradient)
         self.radius = radius
         self.place(position, rotation)
-        self.surface(friction, restitution, push_out, active)
+        self.surface(friction, restitution, push_out, active, events)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the dimension, and refuse a function that is not finite, or not a distance, around the particles."""

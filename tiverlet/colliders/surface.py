@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 from ..device import at, inline, ti
+from .wall_log import WallLog
 
 if TYPE_CHECKING:
     from ..features.feature import Scene
@@ -17,13 +18,15 @@ class Surface:
 
     friction: coefficients, or None for a surface without. restitution: 0 to 1, or None. push_out: [m/s]. active: whether
     it is there, or None for one without a switch. turns: whether it resists rolling, or bounces across the normal. poses: of a
-    wall that may turn, its Pose; else none.
+    wall that may turn, its Pose; else none. events: whether there is a `log` of what touches.
     """
 
     def __init__(
         self, scene: "Scene", name: str, friction: "Coefficients | None", restitution: "Bounce | None", push_out: float, active:
-        bool | None, turns: bool,
+        bool | None, turns: bool, events: bool,
     ):  # fmt: skip
+        self.has_log = events
+        self.log: Any = WallLog(scene, name) if events else None
         self._memory, self.state, self.push_out, self.real = scene.memory, scene.state, push_out, scene.real
         self.has_friction, self.has_restitution = friction is not None, restitution is not None
         self.poses: list[Any] = []
@@ -108,6 +111,8 @@ class Surface:
                 gap = -depth - leaving
                 if gap >= 0 and leaving < 0 and turn != GENTLY:
                     rise, after = self.bounce(gap, leaving, (self.state.before[i] - moved).dot(n), after)
+            if ti.static(self.has_log):
+                self.log.note(i, depth, n, after - leaving, -leaving)
             change = (after - leaving) * n
             if ti.static(self.state.keeps_wall_push):
                 self.state.wall_push[i] = self.state.wall_push[i] + change

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .. import checks
 from ..device import ti
 from ..device.thread_team import Team
 from ..features.feature import Batch, Knob, Scene
@@ -13,6 +14,7 @@ from ..neighbours.neighbour_list import WORD, PairData, lowest_bit
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
 from ..tools import median
+from .events import EventLog
 from .force_share import ForceShare
 from .friction import Friction
 from .mass_splitting import MassSplitting, lesser
@@ -36,7 +38,9 @@ class Contact(PairContact):
     0 to 1, or such a mapping. groups: the pairs of groups that touch, None for all. skin: how far beyond touching pairs are
     listed [m], "auto" for 0.75 of the median radius; speed only, never the result. push_out: particles that overlap at the
     start, or after positions were assigned, part at this speed [m/s] at most: they act as if they were small enough to fit, and
-    grow back.
+    grow back. events: whether World.events() tells which pairs met and parted. sensors: pairs of groups that do not touch;
+    World.events() tells which particles of the second group, the sensors, overlap with those of the first. It costs least where
+    sensors are few.
 
     A Jacobi pass: each pair wants C back along the current n, split by mass, p = C / (m_i w_i + m_j w_j), which conserves
     momentum. A particle has its mass split m times, where m bounds the eigenvalues of S, the sum of n n^T over its overlapping
@@ -78,11 +82,13 @@ class Contact(PairContact):
 
     def __init__(
         self, friction: ArrayLike | Mapping = 0.0, restitution: ArrayLike | Mapping = 0.0, *, skin: float | str = "auto",
-        groups=None, push_out: float = 1.0,
+        groups=None, push_out: float = 1.0, events: bool = False, sensors=(),
     ):  # fmt: skip
-        self.groups, self.restitution, self.friction = groups, restitution, friction
-        self.skin, self.push_out = skin, push_out
+        self.groups, self.sensors, self.restitution, self.friction = groups, sensors, restitution, friction
+        self.skin, self.push_out, self.events = skin, push_out, events
 
+    events = Knob(lambda f, v: checks.flag("Contact", "events", v), "Whether World.events() tells of pairs.", compiled=True)
+    sensors: Any = Knob(lambda f, v: f._surface("sensors", v), "The pairs of groups of which the second senses.", compiled=True)
     groups: Any = Knob(lambda f, v: f._surface("groups", v), "The pairs of groups that touch; None for all.", compiled=True)
     projects = True
 
@@ -124,8 +130,13 @@ class Contact(PairContact):
             *([dev.turn] if dev.turn else []),
             *([*bouncing, struck, dev.impulse] if dev.has_restitution else []),
         ]
+        dev.events = EventLog(scene, self.table) if dev.has_events else None
+        if dev.events:
+            pair_data.append(dev.events.touched)
         dev.grid = NeighbourSearch(scene, self._listed, linked, self.table, pair_data, team, dev.move)
         dev.geometry = DiscGeometry(scene, dev.grid, self.push_out, dev.impulse if dev.has_restitution else dev.push)
+        if dev.events:
+            dev.events.bind(dev.grid, dev.geometry)
         skips = not scene.memory.compiler.few and not dev.has_restitution  # in relax() what bounces forgets the last impact
         dev.splitting = MassSplitting(scene, dev.geometry, dev.has_friction, skips, [dev.push, *bouncing], team)
         dev.forces = ForceShare(scene, sums=dev.has_friction, lasting=True)
@@ -133,7 +144,8 @@ class Contact(PairContact):
         dev.friction = Friction(self.table)
         dev.restitution = None
         if dev.has_restitution:
-            dev.restitution = Restitution(scene, dev.geometry, self.table, struck, dev.slack, dev.impulse)
+            noted = dev.events if dev.reports else None
+            dev.restitution = Restitution(scene, dev.geometry, self.table, struck, dev.slack, dev.impulse, noted)
             dev.hit = dev.restitution.hit
         if dev.spins:
             dev.spinning = Spinning(scene, self.table, dev.geometry, dev.splitting.weight, dev.turn)
@@ -193,6 +205,8 @@ class Contact(PairContact):
                         if not rests:
                             part = ti.zero(part)
                         self.dev.impulse.field[e] = self.dev.impulse.field[e] + part
+                    if ti.static(self.dev.reports):
+                        self.dev.events.note(i, j, e, n, part, final)
                     push += part
                     want = part * n
                     if ti.static(self.dev.spins):

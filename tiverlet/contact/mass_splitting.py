@@ -36,6 +36,13 @@ class MassSplitting:
             out |= ti.cast(r.dot(r) < contact_distance * contact_distance, ti.u32) << ti.cast(
                 k, ti.u32
             )  # no branch: it would be taken at random
+        if ti.static(self.geometry.senses):
+            left = out
+            while left != 0:
+                bit = left & (~left + ti.u32(1))
+                left ^= bit
+                if self.geometry.pushes(i, self.grid.neighbour[begin + lowest_bit(bit)]) == 0:
+                    out ^= bit
         return out
 
     @ti.func

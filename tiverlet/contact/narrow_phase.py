@@ -6,6 +6,7 @@ import numpy as np
 
 from ..device import ti
 from ..features.feature import Scene
+from ..features.material import TOUCHES
 from ..neighbours.neighbour_list import PairData
 from ..neighbours.queries import Contacts
 
@@ -25,7 +26,7 @@ class DiscGeometry:
     def __init__(self, scene: Scene, grid: "NeighbourSearch", push_out: float = 0.0, impulse: PairData | None = None):
         self.scene, self.grid, self.push_out, self.impulse = scene, grid, push_out, impulse
         self.state, self.radius, self.real = scene.state, scene.radius, scene.real
-        self.shrinks, self.store = False, None
+        self.shrinks, self.store, self.senses = False, None, grid.table.senses
 
     @ti.func
     def contact_distance(self, i, j):
@@ -34,6 +35,14 @@ class DiscGeometry:
         if ti.static(self.shrinks):
             contact_distance -= self.shrunk[i] + self.shrunk[j]
         return contact_distance
+
+    @ti.func
+    def pushes(self, i, j):
+        """1 if particles i and j push each other where they overlap, 0 where one of them only senses the other."""
+        out = 1
+        if ti.static(self.senses):
+            out = ti.cast(ti.cast(self.grid.table.of(i, j)[3], ti.i32) == TOUCHES, ti.i32)
+        return out
 
     @ti.func
     def depth(self, i, j, contact_distance):
@@ -144,7 +153,7 @@ class DiscGeometry:
         less = ti.select(first > 0, self.shrunk[i], ti.cast(0, self.real))
         for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
             j = self.grid.neighbour[e]
-            if ti.max(i, j) >= first:
+            if ti.max(i, j) >= first and self.pushes(i, j) != 0:
                 contact_distance = self.radius.of(i) + self.radius.of(j)
                 overlap, _ = self.overlap(i, j, contact_distance)
                 less = ti.max(less, overlap * self.radius.of(i) / contact_distance)
@@ -167,7 +176,7 @@ class DiscGeometry:
             if j < i:  # and so are the rest
                 break
             a, b = self.radius.of(i), self.radius.of(j)
-            overlap = self.depth(i, j, a + b)
+            overlap = self.depth(i, j, (a + b) * self.pushes(i, j))
             if overlap > 0:
                 small = ti.min(a, b)
                 if small == 0:
@@ -192,6 +201,10 @@ class DiscGeometry:
         else:
             low = pairs[:, 0] < pairs[:, 1]
             pairs, push = pairs[low], push[low]
+        if self.senses:
+            rank, table = self.grid.table.rows(self.scene.particles.group)
+            touch = table.reshape(rank.max() + 1, rank.max() + 1, -1)[rank[pairs[:, 0]], rank[pairs[:, 1]], 3] == TOUCHES
+            pairs, push = pairs[touch], push[touch]
         d = x[pairs[:, 0]] - x[pairs[:, 1]]
         length = np.linalg.norm(d, axis=1)
         overlap = r[pairs].sum(axis=1) - length

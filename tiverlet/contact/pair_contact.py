@@ -69,18 +69,18 @@ class PairContact(Feature):
 
     def _surface(self, name: str, value):
         """Check what pairs are like, with what was said so far."""
-        if name == "groups" and value is not None:
+        if name in ("groups", "sensors") and value is not None:
             value = checks.rows("Contact", name, value, "a list of pairs of groups, such as [(0, 1)],")
         elif isinstance(value, list):
             value = tuple(value)
-        given = {"friction": 0.0, "restitution": 0.0, "groups": None} | vars(self) | {name: value}
-        Table("Contact", given["friction"], given["restitution"], given["groups"])
+        given = {"friction": 0.0, "restitution": 0.0, "groups": None, "sensors": ()} | vars(self) | {name: value}
+        Table("Contact", given["friction"], given["restitution"], given["groups"], given["sensors"])
         return value
 
     @property
     def wanted(self) -> Table:
         """What pairs are to be like."""
-        return Table("Contact", self.friction, self.restitution, vars(self).get("groups"))
+        return Table("Contact", self.friction, self.restitution, vars(self).get("groups"), vars(self).get("sensors", ()))
 
     @property
     def uniform(self) -> bool:
@@ -103,6 +103,11 @@ class PairContact(Feature):
         return self.wanted.turns or vars(self.dev).get("turns", False)
 
     @property
+    def has_events(self) -> bool:
+        """Whether World.events() tells of anything."""
+        return bool(vars(self).get("events") or vars(self).get("sensors"))
+
+    @property
     def shrinks(self) -> bool:
         """Whether particles can be smaller than they are, in the kernels as they are."""
         return self.dev.geometry.shrinks
@@ -121,6 +126,8 @@ class PairContact(Feature):
         dev = self.dev
         self.scene, dev.state, dev.w = scene, scene.state, scene.state.w
         dev.has_friction, dev.has_restitution, dev.turns = self.has_friction, self.has_restitution, self.turns
+        # `reports`: pairs that push each other are noted, not only what sensors overlap. `events`: an EventLog, or None.
+        dev.has_events, dev.reports, dev.events = self.has_events, bool(vars(self).get("events")), None
 
     def upload(self) -> None:
         """Write friction and restitution."""

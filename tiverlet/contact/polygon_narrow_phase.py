@@ -446,7 +446,7 @@ def segments_cross(r, s, q):
 class Beside:
     """What the neighbour search asks which pairs to list: those of different bodies, as far as their groups touch."""
 
-    uniform = False
+    uniform = senses = False
     skin: Any = OnDevice()
 
     def __init__(self, geometry: PolygonGeometry, table: Table, skin: Number):

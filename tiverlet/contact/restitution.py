@@ -1,5 +1,7 @@
 """Restitution of pairs of discs or spheres: impacts, one after the other."""
 
+from typing import Any
+
 from ..device import ti
 from ..features.feature import Scene
 from ..features.material import Table
@@ -11,13 +13,17 @@ class Restitution:
     """A pair leaves with -e times the normal velocity that it had before the substep, from the time of impact on, see Contact.
 
     struck: of its pairs, those that are struck in this substep. slack: of their overlap, what no push is for. impulse: pushes
-    and impacts of the last substep [kg m].
+    and impacts of the last substep [kg m]. events: an EventLog, or None.
     """
 
-    def __init__(self, scene: Scene, geometry: DiscGeometry, table: Table, struck: PairData, slack: PairData, impulse: PairData):
+    def __init__(
+        self, scene: Scene, geometry: DiscGeometry, table: Table, struck: PairData, slack: PairData, impulse: PairData,
+        events: Any,
+    ):  # fmt: skip
         n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
         self.geometry, self.grid, self.table, self.state = geometry, geometry.grid, table, scene.state
-        self.struck, self.slack, self.impulse = struck, slack, impulse
+        self.struck, self.slack, self.impulse, self.events = struck, slack, impulse, events
+        self.has_events = events is not None
         self.weight = add("Contact.struck", n)  # the split mass of the first pass, 0 where nothing touched
         self.d_change = add("Contact.d_change", n, width=dim)
         self.lift = add("Contact.lift", n, width=dim)  # moves the position alone
@@ -95,7 +101,11 @@ class Restitution:
         if j >= 0:
             if self.partner[j] == i or self.state.w.of(j) == 0:
                 e, d_change = self.first[i], self.d_change[i]
-                self.impulse.field[e] = self.impulse.field[e] + d_change.norm() / self.state.w.of(i)
+                impulse = d_change.norm() / self.state.w.of(i)
+                self.impulse.field[e] = self.impulse.field[e] + impulse
+                if ti.static(self.has_events):
+                    given = impulse * (self.state.w.of(i) + self.state.w.of(j))
+                    self.events.note_impact(e, impulse, given / (1 + self.table.of(i, j)[2]))
                 self.state.d[i] = self.state.d[i] + d_change
                 self.state.before[i] = self.state.before[i] + d_change
                 self.state.advance(i, self.left[i] * d_change)

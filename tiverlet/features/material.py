@@ -59,6 +59,7 @@ def as_given(value: Any) -> Any:
 
 
 MOST = 1000  # groups of particles that are told apart
+TOUCHES, SENSES, SENSED = 1, 2, 3  # what a particle of a group does with one of another: push it, note it, be noted by it
 
 
 class Table:
@@ -66,19 +67,26 @@ class Table:
     the resistance to rolling, to twisting, and the tangential restitution. One row where `uniform`.
 
     friction, restitution: one value for all, or a mapping from pairs of groups to values, with 0 for pairs that are not in it.
-    touching: None for all, or the pairs of groups that touch.
+    touching: None for all, or the pairs of groups that touch. sensing: the pairs of groups of which the second notes what of the
+    first it overlaps, and does not push; they do not touch.
     """
 
-    kernels_read = ("uniform", "has_friction", "has_restitution", "turns", "groups", "rank", "entries")
+    kernels_read = ("uniform", "has_friction", "has_restitution", "turns", "senses", "groups", "rank", "entries")
 
-    def __init__(self, who: str, friction: Any, restitution: Any, touching: Iterable | None):
+    def __init__(self, who: str, friction: Any, restitution: Any, touching: Iterable | None, sensing: Any = ()):
         self.who, self.friction, self.restitution = who, friction, restitution
         self.touching = None
         if touching is not None:
             pairs = checks.rows(who, "groups", touching, "a list of pairs of groups, such as [(0, 1)],")
             self.touching = [self._pair("groups", p) for p in pairs]
+        pairs = checks.rows(who, "sensors", sensing, "a list of pairs of groups, such as [(0, 1)],")
+        self.sensing = [self._pair("sensors", p) for p in pairs]
+        self.senses = bool(self.sensing)
+        for a, b in self.sensing:
+            if {(a, b), (b, a)} & {*(self.touching or ())}:
+                raise ValueError(f"{who}: groups has {(a, b)}, which touch, and so has sensors; leave one of them out.")
         single = not isinstance(friction, Mapping) and not isinstance(restitution, Mapping)
-        self.uniform = single and touching is None
+        self.uniform = single and touching is None and not self.senses
         values = friction.values() if isinstance(friction, Mapping) else [friction]
         rub = [friction_of(who, "friction", v) for v in values]
         values = restitution.values() if isinstance(restitution, Mapping) else [restitution]
@@ -90,7 +98,7 @@ class Table:
     def rows(self, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The rank of each particle's group, (n,), and the table, (ranks * ranks, 7)."""
         named = {k for given in (self.friction, self.restitution) if isinstance(given, Mapping) for pair in given for k in pair}
-        named |= {k for pair in self.touching or () for k in pair}
+        named |= {k for pair in (*(self.touching or ()), *self.sensing) for k in pair}
         names, which, _ = distinct(group)
         at = {int(name): k for k, name in enumerate(name for name in names if name in named)}
         m = len(at) + (len(at) < len(names))  # all others are one
@@ -101,7 +109,10 @@ class Table:
         table[..., 3] = self.touching is None
         for a, b in self.touching or []:
             if a in at and b in at:
-                table[at[a], at[b], 3] = table[at[b], at[a], 3] = 1
+                table[at[a], at[b], 3] = table[at[b], at[a], 3] = TOUCHES
+        for a, b in self.sensing:
+            if a in at and b in at and table[at[a], at[b], 3] != SENSES:
+                table[at[a], at[b], 3], table[at[b], at[a], 3] = SENSED, SENSES
         for name, columns, given, parse in (
             ("friction", [0, 1, 4, 5], self.friction, friction_of), ("restitution", [2, 6], self.restitution, restitution_of),
         ):  # fmt: skip
@@ -135,8 +146,8 @@ class Table:
 
     @ti.func
     def of(self, i, j):
-        """Static friction, dynamic friction and restitution of particles i and j, 1 if they touch; and where it `turns` the
-        resistance to rolling, to twisting, and the tangential restitution."""
+        """Static friction, dynamic friction and restitution of particles i and j, and TOUCHES, SENSES or SENSED, or 0; and where
+        it `turns` the resistance to rolling, to twisting, and the tangential restitution."""
         row = 0
         if ti.static(not self.uniform):
             row = self.rank[i] * self.groups + self.rank[j]

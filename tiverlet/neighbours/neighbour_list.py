@@ -19,15 +19,25 @@ class PairData:
     """What each pair remembers: a number, or a vector of `width`.
 
     lasting: it is part of the state, beyond a substep. kept: it is transferred to the next list; what is not is computed anew.
-    marked: only pairs whose bit in NeighbourList.touching is set have other than 0. field, old: the data of the list, and of the
-    old one while a new one is built.
+    marked: only pairs whose bit in NeighbourList.touching is set have other than 0. kind: of the numbers; None for those of the
+    world. field, old: the data of the list, and of the old one while a new one is built.
     """
 
     field: Any
     old: Any
 
-    def __init__(self, name: str, width: int, lasting: bool, kept: bool = True, marked: bool = False):
-        self.name, self.width, self.lasting, self.kept, self.marked = name, width, lasting, kept, marked
+    def __init__(self, name: str, width: int, lasting: bool, kept: bool = True, marked: bool = False, kind: Any = None):
+        self.name, self.width, self.lasting, self.kept, self.marked, self.kind = name, width, lasting, kept, marked, kind
+
+
+class Column:
+    """A number for each row of a table that has room for as many rows as the list for pairs, or a vector of `width`. What is in
+    it stays where it is when the list is built anew, or grows."""
+
+    field: Any
+
+    def __init__(self, name: str, width: int = 0, kind: Any = None):
+        self.name, self.width, self.kind = name, width, kind
 
 
 class NeighbourList:
@@ -65,6 +75,7 @@ class NeighbourList:
         self.old_neighbour: Any = None  # of the old list, pairs with data other than 0, while a new one is built
         self.store: Memory | None = None
         self.room = 0  # entries of one list
+        self.columns: list[Column] = []  # of a table with as much room
 
     def __repr__(self) -> str:
         return "neighbour list"
@@ -88,9 +99,11 @@ class NeighbourList:
         self.neighbour = self.store.field("grid.near", self.room, kind=ti.i32)
         self.old_neighbour = self.store.field("grid.aside", self.room, kind=ti.i32)
         for piece in self.pair_data:
-            piece.field = self.store.field(f"grid.{piece.name}", self.room, width=piece.width)
+            piece.field = self.store.field(f"grid.{piece.name}", self.room, width=piece.width, kind=piece.kind)
             if piece.kept:
-                piece.old = self.store.field(f"grid.{piece.name}_aside", self.room, width=piece.width)
+                piece.old = self.store.field(f"grid.{piece.name}_aside", self.room, width=piece.width, kind=piece.kind)
+        for column in self.columns:
+            column.field = self.store.field(f"grid.{column.name}", self.room, width=column.width, kind=column.kind)
         self.store.place()
         with self._of_all():
             for field, values in zip(self._fields(), kept, strict=False):
@@ -115,7 +128,7 @@ class NeighbourList:
     def _fields(self) -> list:
         """What has to outlive a new list: of a world alone, which has saved all for it, the old one; of one of many copies, also
         the lists of those that go on with theirs."""
-        old = [self.old_neighbour, *(piece.old for piece in self.transferred)]
+        old = [self.old_neighbour, *(piece.old for piece in self.transferred), *(column.field for column in self.columns)]
         return [*old, self.neighbour, *(piece.field for piece in self.pair_data)] if self.memory.copies else old
 
     def _of_all(self) -> contextlib.AbstractContextManager[None]:

@@ -12,7 +12,8 @@ if TYPE_CHECKING:
     from ..world import World
 
 CARRIED = ("Contact.push", "Contact.slip", "Contact.turn", "Contact.slack")  # by pairs, for the next substep
-TOLD = "Contact.given"  # by pairs, of the last substep, for reports
+TOLD = ("Contact.given", "Contact.touched")  # by pairs, of the last substep, for reports
+EVENTS = "events."  # names of what walls carry for reports begin so
 LATE = {"Contact.shrunk"}  # made when it is needed
 
 
@@ -35,15 +36,15 @@ class Checkpoint:
     def _lasting(self) -> dict[str, np.ndarray]:
         """Without what pairs carry for reports: a pair that has just bounced may be on the list or far off it, by the skin. And
         without a field that is made when it is needed, where nobody needs it."""
-        values = {name: v for name, v in self.values.items() if name not in LATE or v.any()}
-        if TOLD not in values:
+        values = {name: v for name, v in self.values.items() if (name not in LATE or v.any()) and not name.startswith(EVENTS)}
+        if not any(name in values for name in TOLD):
             return values
         carried = [name for name in CARRIED if name in values]
         some = np.zeros(len(values["Contact.pairs"]), dtype=bool)
         for name in carried:
             some |= values[name].any(axis=tuple(range(1, values[name].ndim)))
         rows = {name: values[name][some] for name in ("Contact.pairs", *carried)}
-        return {name: rows.get(name, v) for name, v in values.items() if name != TOLD}
+        return {name: rows.get(name, v) for name, v in values.items() if name not in TOLD}
 
     def position(self, count: int) -> np.ndarray:
         """Positions [m] of `count` particles, in f64 where there is more than one word of f32."""
@@ -86,6 +87,8 @@ def put_back(world: "World", kept: Checkpoint) -> None:
     if grid:
         pieces = {piece.name: kept.values[f"Contact.{piece.name}"] for piece in grid.lasting}
         grid.restore(kept.values["Contact.pairs"], pieces)
+    for log in world._runner.logs:
+        log.forget()
     world._runner.invalidate()
     if list(map(id, world._runner.memories)) != stores:
         world._runner.renew()  # there are new fields

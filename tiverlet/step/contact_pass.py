@@ -21,7 +21,7 @@ class ContactPass:
         self.contacts, self.particles, self.team = particles.contacts, particles, team
         self.n, self.real, self.dim = scene.count, scene.real, scene.particles.dim
         self.has_restitution = bool(contact) and contact.has_restitution
-        self.remembers = bool(contact) and (contact.has_friction or contact.has_restitution)
+        self.remembers = bool(contact) and (contact.has_friction or contact.has_restitution or contact.has_events)
         self.projects_velocities = bool(contact) and contact.projects
         if self.has_restitution and team.launched:  # where nobody asks whether any pair bounces in a round
             self.bounces = scene.memory.field("Contact.bounces", None, kind=ti.i32)
@@ -34,6 +34,8 @@ class ContactPass:
                 for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
                     c.detect(i, now.first)
                 self.team.wait()
+            if ti.static(c.dev.has_events):
+                self.start_events(now)
             for k in range(self.team.dealt_count(self.particles.pieces, 1, now.thread)):
                 begin, end = self.particles.piece(k, now.thread)
                 for b in range(blocks(begin, end)):
@@ -87,12 +89,40 @@ class ContactPass:
                 self.team.wait()
 
     @ti.func
-    def finish(self, thread):
+    def start_events(self, now):
+        """Note which substep it is; as a frame begins, what touched before."""
+        for c in ti.static(self.contacts):
+            ti.loop_config(serialize=True)
+            for _ in range(self.team.one(1, now.thread)):
+                c.dev.events.start(now.s, now.first)
+            self.team.wait()
+            # A loop in a branch would be serial on a GPU.
+            pieces = self.particles.pieces * ti.cast(now.s == 0 and now.first != 0, ti.i32)
+            for k in range(self.team.dealt_count(pieces, 1, now.thread)):
+                begin, end = self.particles.piece(k, now.thread)
+                c.dev.events.open(begin, end)
+
+    @ti.func
+    def finish_events(self, now):
+        """Note what sensors overlap; as a frame ends, what touches."""
+        for c in ti.static(self.contacts):
+            if ti.static(c.dev.events.senses):
+                for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
+                    c.dev.events.sense(i, now.final)
+            n = self.n * now.final
+            for i in range(self.team.chunk_begin(n, now.thread), self.team.chunk_end(n, now.thread)):
+                c.dev.events.close(i)
+
+    @ti.func
+    def finish(self, now):
         """Keep the slip of friction, and what was left of bounces."""
+        thread = now.thread
         for c in ti.static(self.contacts):
             if ti.static(c.has_friction or c.has_restitution):
                 for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
                     c.finish_substep(i)
+            if ti.static(c.dev.has_events):
+                self.finish_events(now)
             self.team.wait()
             if ti.static(c.has_restitution):
                 ti.loop_config(serialize=True)

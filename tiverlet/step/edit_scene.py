@@ -109,7 +109,7 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
     went = [f for f in before if f not in features or f.afresh]
     starts = {known: start.regrouped(some, added) for known, start in {id(f.start): f.start for f in before}.items()}
     starts = [None if f in came else starts[id(f.start)] for f in features]
-    parts, seen = None, None
+    parts, seen, told = None, None, world._all_events()
     if not world._clock.d_is_velocity and (world._clock.parted is not None or any(_loses(f, number, features) for f in before)):
         seen = world.velocity
     try:
@@ -146,6 +146,8 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
     world._install(particles, features, parts)
     world._runner.scene.h2_effective = h2_effective
     world._runner.memory.restore(state)
+    walls = np.array([features.index(f) if f in features else -1 for f in before], dtype=np.int64)
+    world._events = told[0].renumbered(number, number), told[1].renumbered(number, walls)
     if contact and contact in world._runner.step.contacts:
         _give_contacts(world, contact, old, number, some)
     drag, world._clock.drag = world._clock.drag, None
@@ -199,7 +201,9 @@ def _carried(
         pair = [_fields(values, known) for values, known in zip((before, vars(feature)), names, strict=True)]
         for known, found in zip(owned, pair, strict=True):
             known.update(found.values())
-        moves += [(pair[0][key], pair[1][key], masks[feature]) for key in pair[0].keys() & pair[1].keys()]
+        for key in pair[0].keys() & pair[1].keys():
+            per_particle = getattr(vars(feature.dev)[key[0]], "per_particle", False)  # and not by how many rows there are
+            moves.append((pair[0][key], pair[1][key], (some,) if per_particle else masks[feature]))
     moves += [(name, name, (some,)) for name in (set(names[0].values()) - owned[0]) & (set(names[1].values()) - owned[1])]
     for before, after, choices in moves:
         rows = old[before]

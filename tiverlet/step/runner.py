@@ -330,6 +330,11 @@ class Runner:
             return self.diagnostics.residuals(batch, self.clock.h, self.clock.started)
 
     @property
+    def logs(self) -> list[Any]:
+        """Where events are noted."""
+        return [*(c.dev.events for c in self.step.contacts if c.dev.events), *self.step.wall_logs]
+
+    @property
     def memories(self) -> list[Any]:
         """The trees of fields: one from the start, others where a list or a need has grown."""
         grown = [*(grid.store for grid in self.step.grids), *(c.store for c in self.step.contacts)]

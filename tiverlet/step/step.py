@@ -149,6 +149,7 @@ class Step:
         self.n, self.dim, self.real = scene.count, scene.particles.dim, scene.real
         self.integrator, self.grid, self.walls, self.drivers, self.batches = integrator, grid, walls, drivers, batches
         self.posed = [w for w in walls if w.poses]
+        self.wall_logs: list[Any] = [w.dev.log for w in walls if w.dev.log]
         self.breakers: list[Any] = [b for b in batches if b.breaks]
         self.launched = team.launched
         # Iterations of a loop for each of few pieces of work: to each CPU thread Taichi gives LEAST of them, at least.
@@ -160,7 +161,8 @@ class Step:
         self.halves = 2 if batches and contact else 1  # of a pass, each with a list that is good
         self.has_restitution, self.projects_velocities = self.contact_pass.has_restitution, self.contact_pass.projects_velocities
         self.orients = self.state.spins and self.state.spin.orients
-        self.finishes = self.contact_pass.remembers or bool(self.breakers) or self.orients
+        keeps = self.contact_pass.remembers or bool(self.breakers)
+        self.finishes = keeps or self.orients or bool(self.wall_logs)
         self.hashes = bool(grid)
         self.pair_forces: list[Any] = integrator.forces.pairwise
         self.has_pair_forces = bool(self.pair_forces)
@@ -331,6 +333,13 @@ class Step:
             ti.loop_config(serialize=True)
             for _ in range(self.team.one(1, now.thread)):
                 w.pose(now.frame_fraction)
+        for log in ti.static(self.wall_logs):
+            ti.loop_config(serialize=True)
+            for _ in range(self.team.one(1, now.thread)):
+                log.substep[None] = now.s + 1
+            n = self.n * ti.cast(now.s == 0, ti.i32)
+            for i in range(self.team.chunk_begin(n, now.thread), self.team.chunk_end(n, now.thread)):
+                log.open(i)
         self.particles.integrate(now)
         self.team.wait()
         self.team.watch(now.thread)
@@ -417,17 +426,22 @@ class Step:
 
     @ti.func
     def finish_substep(self, now):
-        """What bears too much breaks; contacts keep what friction and restitution need; the orientation of what spins follows.
+        """What bears too much breaks; contacts keep what friction and restitution need; the orientation of what spins follows; as
+        a frame ends, walls keep what touches them.
 
         A rigid constraint may find a whole kick in a start that follows another step, so loads are never taken for half a kick.
         """
         for f in ti.static(self.breakers):
             for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
                 f.break_overloaded(c, self.integrator.h2_effective(now.h, 0), now.tick)
-        self.contact_pass.finish(now.thread)
+        self.contact_pass.finish(now)
         if ti.static(self.orients):
             for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
                 self.state.spin.turn(i)
+        for log in ti.static(self.wall_logs):
+            n = self.n * now.final
+            for i in range(self.team.chunk_begin(n, now.thread), self.team.chunk_end(n, now.thread)):
+                log.close(i)
         self.team.wait()
 
     @ti.func

@@ -712,6 +712,8 @@ class _Start:
                 if len(pairs[0]):
                     with worlds._at(k):
                         runner.grid.restore(*pairs)
+        for log in runner.logs:
+            runner.memory.write_some(log.made, 0, chosen)
         runner.invalidate(chosen)
         worlds._clocks.return_to(self.clocks, chosen)
 

@@ -1,0 +1,359 @@
+"""Contact events: against closed forms, what NumPy finds from positions, and momentum."""
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+
+COLUMNS = ("pairs", "point", "normal", "impulse", "speed", "began", "ended")
+
+
+def equal(one, two):
+    """Whether events are the same, to the bit."""
+    for name in COLUMNS:
+        np.testing.assert_array_equal(getattr(one.touches, name), getattr(two.touches, name))
+    return len(one)
+
+
+def rows(pairs):
+    """As a set."""
+    return {tuple(map(int, pair)) for pair in pairs}
+
+
+@pytest.mark.parametrize(("dim", "precision"), [(2, "f64"), (3, "f32")])
+def test_a_bouncing_ball(world, dim, precision):
+    # Dropped from H onto a static ball, and onto a floor: after k bounces v_k = e^k sqrt(2 g H), at t_k = t_0 (1 + 2 (e + ... +
+    # e^k)). A bounce is over in less than two substeps, so each begins and ends in the same frame. What comes together in a
+    # substep is the velocity at its middle, off by g h / 2 at most; with what it leaves is taken from the one before, which adds
+    # up to e g h in each bounce.
+    H, e, g, m, r, frame, substeps = 0.5, 0.8, 9.81, 2.0, 0.05, 1 / 60, 20
+    h = frame / substeps
+    x = np.zeros((3, dim))
+    x[1:, 1], x[2, 0] = [2 * r + H, r + H], 1.0
+    w = world(
+        tv.Particles(x, radius=r, mass=[np.inf, m, m]),
+        [tv.Gravity(g), tv.Contact(restitution=e, events=True), tv.HalfSpace(np.eye(dim)[1], 0.0, restitution=e, events=True)],
+        substeps=substeps, precision=precision,
+    )  # fmt: skip
+    seen, t0, v0 = [[], []], np.sqrt(2 * H / g), np.sqrt(2 * g * H)
+    for _ in range(120):
+        w.step(frame)
+        for k, events in enumerate((w.events(), w.wall_events())):
+            assert rows(events.begun.pairs) == rows(events.ended.pairs) == rows(events.touches.pairs) and not len(events.lasting)
+            seen[k] += [events.touches] if len(events) else []
+    for k, (pair, normal, height) in enumerate((((0, 1), -1, r), ((2, 2), 1, 0.0))):
+        assert len(seen[k]) == 5
+        for n, touch in enumerate(seen[k]):
+            v, t = e**n * v0, t0 * (1 + 2 * sum(e**i for i in range(1, n + 1)))
+            assert rows(touch.pairs) == {pair} and abs(touch.normal[0, 1] - normal) < 1e-6
+            assert abs(touch.speed[0] - v) < (1 + n) * g * h
+            assert abs(touch.impulse[0] - m * (1 + e) * v) < (1 + n) * m * (1 + e) * g * h
+            assert abs(touch.began[0] - t) < (1 + n) * 2 * h and abs(touch.ended[0] - touch.began[0] - h) < 0.6 * h
+            assert abs(touch.point[0, 1] - height) < v * h
+
+
+def test_a_cradle(world):
+    # Equal elastic balls in a row that touch already: what the first one brings goes from one to the next, m v at v each time.
+    m, v, x = 1.5, 2.0, [[-0.5, 0], *([0.2 * k, 0] for k in range(4))]
+    moving = np.zeros((5, 2))
+    moving[0, 0] = v
+    w, seen = world(tv.Particles(x, radius=0.1, velocity=moving, mass=m), [tv.Contact(0, 1, events=True)], precision="f64"), {}
+    for _ in range(12):
+        w.step(1 / 60)
+        for touch in (w.events().touches[k : k + 1] for k in range(len(w.events()))):
+            if touch.impulse[0] > 0:
+                assert seen.setdefault(rows_in(touch.pairs)[0], touch) is touch
+    assert {*seen} == {(k, k + 1) for k in range(4)}
+    for touch in seen.values():
+        np.testing.assert_allclose([touch.impulse[0], touch.speed[0]], [m * v, v], rtol=1e-9)
+        np.testing.assert_allclose(touch.normal, [[-1, 0]], atol=1e-9)
+
+
+def cloud(dim, n, seed):
+    """Discs or spheres of different sizes and masses that fall onto static ones."""
+    rng = np.random.default_rng(seed)
+    m = int(np.ceil(n ** (1 / dim)))
+    x = np.stack(np.meshgrid(*[np.arange(m)] * dim, indexing="ij"), axis=-1).reshape(-1, dim)[:n] * 0.21
+    mass = 1.0 + rng.uniform(size=n)
+    mass[x[:, 1] == 0] = np.inf
+    return tv.Particles(x, radius=rng.uniform(0.08, 0.1, n), mass=mass, velocity=rng.uniform(-2, 2, (n, dim)))
+
+
+def brute(x, old, v, gravity, h, particles):
+    """Where free flight leads, who touches there, along which normals, at which speeds; whether it is clear who just met: others
+    had parted to the last digit."""
+    free = np.isfinite(particles.mass)[:, None]
+    ahead = np.where(free, x + v * h + gravity * h**2 / 2 if old is None else 2 * x - old + gravity * h**2, x)
+    i, j = np.triu_indices(len(x), 1)
+    R = particles.radius[i] + particles.radius[j]
+    some = (np.linalg.norm(ahead[i] - ahead[j], axis=1) < R) & (free[i] | free[j])[:, 0]
+    i, j, R = i[some], j[some], R[some]
+    r, d = x[i] - x[j], (ahead - x)[i] - (ahead - x)[j]
+    # |r + s d| = R, for what was apart: the time of impact, and the normal then.
+    a, b, c = (d**2).sum(1), (r * d).sum(1), (r**2).sum(1) - R**2
+    with np.errstate(all="ignore"):
+        s = np.where(c > 0, (-b - np.sqrt(b**2 - a * c)) / a, 1.0)
+    n = r + s[:, None] * d
+    n /= np.linalg.norm(n, axis=1)[:, None]
+    return ahead, np.stack([i, j], axis=1), n, -(d * n).sum(1) / h, np.abs(c) > 1e-9
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_what_brute_force_finds(world, dim):
+    # With one substep in a frame: x_(n+1) = 2 x_n - x_(n-1) + g h^2 (Verlet) says where free flight leads; the pairs that overlap
+    # there touch. What they get along their normals is all that particles are off it: m (x_(n+1) - ahead) / h = sum J n. Then the
+    # same in frames of 6 substeps, before velocities are first projected (after 32). Impulses are sums, speeds the highest.
+    particles, h, gravity = cloud(dim, 60, dim), 1 / 200, np.zeros(dim)
+    gravity[1] = -9.81
+    made = [(tv.Gravity(9.81), tv.Contact(events=True)) for _ in range(2)]
+    single, whole = (world(particles, some, substeps=k, precision="f64") for some, k in zip(made, (1, 6), strict=True))
+    old, before, counts = None, set(), np.zeros(4, dtype=int)
+    for _ in range(5):
+        start, impulses, speeds, first, last, met = before, {}, {}, {}, {}, {}
+        for s in range(6):
+            x = single.position
+            ahead, pairs, n, speed, clear = brute(x, old, particles.velocity, gravity, h, particles)
+            single.step(h)
+            events, now = single.events(), rows(pairs)
+            assert rows(events.begun.pairs) == now - before and rows(events.ended.pairs) == before - now
+            assert rows(events.lasting.pairs) == now & before
+            got = events.touches[np.isnan(events.touches.ended)]
+            np.testing.assert_array_equal(got.pairs, pairs)
+            np.testing.assert_allclose(got.normal[clear], n[clear], atol=1e-9)
+            (i, j), r = pairs.T, particles.radius
+            point = (ahead[i] + ahead[j] + (r[j] - r[i])[:, None] * got.normal) / 2
+            np.testing.assert_allclose(got.point, point, atol=1e-9)
+            momentum = np.zeros_like(x)
+            for k, sign in ((0, 1), (1, -1)):
+                np.add.at(momentum, pairs[:, k], sign * got.impulse[:, None] * got.normal)
+            free = np.isfinite(particles.mass)
+            want = (single.position - ahead)[free] * particles.mass[free, None] / h
+            np.testing.assert_allclose(momentum[free], want, atol=1e-9)
+            for k, pair in enumerate(map(tuple, pairs.tolist())):
+                impulses[pair] = impulses.get(pair, 0.0) + got.impulse[k]
+                speeds[pair] = max(speeds.get(pair, 0.0), got.speed[k])
+                met.setdefault(pair, got.normal[k])
+                last[pair] = s
+                if pair not in start:
+                    first.setdefault(pair, s)
+            meets = [pair not in before for pair in rows_in(pairs)]
+            np.testing.assert_allclose(got.speed[clear], np.where(meets, np.maximum(speed, 0), 0)[clear], atol=1e-9)
+            old, before = x, now
+        whole.step(6 * h)
+        np.testing.assert_allclose(whole.position, single.position, atol=1e-12)
+        events = whole.events()
+        assert rows_in(events.touches.pairs) == sorted({*impulses, *start})
+        assert rows(events.begun.pairs) == {*first} and rows(events.ended.pairs) == ({*first} | start) - before
+        assert rows(events.lasting.pairs) == start & before
+        begin = whole.time - 6 * h
+        for k, pair in enumerate(rows_in(events.touches.pairs)):
+            row = events.touches[k : k + 1]
+            np.testing.assert_allclose(row.impulse, impulses.get(pair, 0.0), atol=1e-9)
+            np.testing.assert_allclose(row.speed, speeds.get(pair, 0.0), atol=1e-9)
+            np.testing.assert_allclose(row.began, begin + (first[pair] + 1) * h if pair in first else np.nan)
+            np.testing.assert_allclose(row.ended, np.nan if pair in before else begin + (last.get(pair, -1) + 2) * h)
+            if pair in first:
+                np.testing.assert_allclose(row.normal[0], met[pair], atol=1e-9)
+        both = rows(events.begun.pairs) & rows(events.ended.pairs)
+        counts += [len(events.begun), len(events.ended), len(events.lasting), len(both)]
+    assert (counts > [60, 30, 10, 5]).all(), counts
+
+
+def rows_in(pairs):
+    """As a list."""
+    return [tuple(pair) for pair in pairs.tolist()]
+
+
+def stage(world, sensing=True, events=True, dim=2, **settings):
+    """Discs or spheres that rub and bounce in a box, among them sensors, some held, of twice their size."""
+    m = 9 if dim == 2 else 5
+    x = (np.stack(np.meshgrid(*[np.arange(m)] * dim, indexing="ij"), axis=-1).reshape(-1, dim) + 0.5) / m * 1.9 - 0.95
+    k = np.arange(len(x))
+    group = np.where(k % 10 == 9, 3, 0)
+    more = {"events": events, **({"sensors": [(0, 3)]} if sensing else {"groups": [(0, 0), (3, 3)]})}
+    return world(
+        tv.Particles(x, radius=np.where(group == 3, 0.1, 0.05), group=group, pinned=np.flatnonzero(k % 20 == 19)),
+        [tv.Gravity(5.0), tv.Box([-1] * dim, [1] * dim, restitution=0.3, events=events), tv.Contact(0.3, 0.4, **more)],
+        **({"substeps": 5} | settings),
+    )
+
+
+@pytest.mark.parametrize(("dim", "settings"), [(2, {"precision": "f64", "iterations": 2}), (3, {"precision": "f32-compensated"})])
+def test_sensors_note_what_overlaps_and_touch_nothing(world, dim, settings):
+    # The same bits as with groups that do not touch, and no events; what is in sensors is what overlaps where particles are. Also
+    # without events of contacts.
+    w = stage(world, dim=dim, **settings)
+    alone = stage(world, events=False, dim=dim, **settings) if dim == 2 else w.clone()
+    plain = stage(world, False, False, dim, **settings)
+    group, radius, free = w.particles.group, w.particles.radius, ~w.particles.pinned
+    i, j = np.triu_indices(len(w.particles), 1)
+    some = (group[i] != group[j]) & (free[i] | free[j])
+    i, j, count = i[some], j[some], 0
+    for _ in range(40):
+        assert w.step(1 / 60).contacts == alone.step(1 / 60).contacts == plain.step(1 / 60).contacts
+        equal(alone.events([(0, 3)]), w.events([(0, 3)]))
+        assert dim == 3 or len(alone.events()) == len(alone.events([(0, 3)]))
+        seen, x = w.events(groups=[(3, 0)]).touches, w.position
+        inside = np.linalg.norm(x[i] - x[j], axis=1) < radius[i] + radius[j]
+        np.testing.assert_array_equal(seen.pairs[np.isnan(seen.ended)], np.stack([i, j], axis=1)[inside])
+        assert (seen.impulse == 0).all()
+        count += len(seen)
+    assert count > 20 and w.hash() == alone.hash() == plain.hash() and rows(w.contacts.pairs) == rows(plain.contacts.pairs)
+    assert len(w.events()) > len(w.events([(0, 0), (3, 3)])) > 0
+    if dim == 2:
+        with pytest.raises(RuntimeError, match="World.wall_events: no wall"):
+            alone.wall_events()
+
+
+def test_the_same_events_on_all_paths(world):
+    made = [stage(world, path=path) for path in ("fused", "parallel", "launched")]
+    count, touching = 0, [set(), set()]
+    for _ in range(25):
+        for w in made:
+            w.step(1 / 60)
+        for k, events in enumerate((made[0].events(), made[0].wall_events())):
+            begun, ended = rows(events.begun.pairs), rows(events.ended.pairs)
+            assert not begun & touching[k] and ended <= touching[k] | begun and touching[k] <= rows(events.touches.pairs)
+            touching[k] = (touching[k] | begun) - ended
+            assert rows(events.touches[np.isnan(events.touches.ended)].pairs) == touching[k]
+        for w in made[1:]:
+            count += equal(made[0].events(), w.events()) + equal(made[0].wall_events(), w.wall_events())
+    assert count > 500
+
+
+def test_a_heap_leans_on_what_is_below(world):
+    # At rest: what all that is above a place weighs goes through the contacts and walls below it. In a second a disc on a static
+    # one on the floor gets m g t, and so does the floor from it: with both, twice that.
+    m, g = 3.0, 9.81
+    x = [[0.0, 0.1], [0.0, 0.29999]]
+    w = world(
+        tv.Particles(x, radius=0.1, mass=m), [tv.Gravity(g), tv.Contact(events=True), tv.Box([-0.1, 0], [0.1, 1], events=True)]
+    )
+    w.run(0.5)
+    total = np.zeros(2)
+    for _ in range(30):
+        w.step(1 / 60)
+        assert len(w.events().lasting) == len(w.events()) == 1 and w.events().touches.speed[0] == 0
+        walls = w.wall_events().lasting
+        assert rows(walls.pairs) == {(0, 2)} and len(w.wall_events()) == 1
+        np.testing.assert_allclose(walls.point, [[0, 0]], atol=1e-4)
+        total += w.events().touches.impulse[0], walls.impulse[0]
+    np.testing.assert_allclose(total, [m * g / 2, m * g], rtol=1e-3)
+
+
+def test_recorded_cloned_edited(world, tmp_path):
+    path = tmp_path / "events.rrd"
+    w, count = stage(world), 0
+    w.run(0.2)
+    with tv.Recorder(path, w) as recorder:
+        for _ in range(3):
+            w.step(1 / 60)
+            recorder.log()
+    again, copy, many = tv.replay(path).world(3), w.clone(), tv.Worlds(w, 2)
+    assert not len(copy.events()) and not len(copy.wall_events())
+    for other in (again, copy, w, many):
+        other.step(1 / 60)
+    for other in (again, copy):
+        count += equal(other.events(), w.events()) + equal(other.wall_events(), w.wall_events())
+    for of_one in many.each(lambda world: (world.events(), world.wall_events())):
+        count += equal(of_one[0], w.events()) + equal(of_one[1], w.wall_events())
+    assert count > 20 and len(w.events().lasting)
+    many.reset()
+    assert not any(map(len, many.each(lambda world: world.events())))
+    again.close()
+    many.close()
+    # What is removed takes its events along, and the others have new numbers; what touched goes on touching.
+    before, walls = w.events(), w.wall_events()
+    gone = [0, 7, int(before.touches.pairs[1, 0])]
+    w.add(tv.Particles([[0.0, 3.0]]))
+    number = np.delete(np.arange(len(w.particles)), gone)
+    w.remove(gone, [w.features[0]])
+    now, then = rows(number[w.events().touches.pairs]), rows(before.touches.pairs)
+    assert now == {pair for pair in then if not {*pair} & {*gone}} < then
+    assert rows(w.wall_events().touches.pairs) == {
+        (int(np.searchsorted(number, i)), 0) for i, _ in rows(walls.touches.pairs) if i not in gone
+    }
+    touched = [rows(events.touches[np.isnan(events.touches.ended)].pairs) for events in (w.events(), w.wall_events())]
+    w.step(1 / 60)
+    for events, known in zip((w.events(), w.wall_events()), touched, strict=True):
+        assert rows(events.touches[np.isnan(events.touches.began)].pairs) == known != set()
+
+
+def test_what_is_held_and_let_go(world):
+    # Of a pair only the particle that moves writes; when the other one is let go, it goes on as one contact.
+    pin = tv.Pin([0], (0.0, 0.0))
+    w = world(
+        tv.Particles([[0.0, 0.0], [0.0, 0.19999]], radius=0.1),
+        [tv.Gravity(9.81), tv.Contact(events=True), pin, tv.Box((-1, -0.1), (1, 1))],
+    )
+    w.run(0.1)
+    assert rows(w.events().lasting.pairs) == {(0, 1)}
+    np.testing.assert_allclose(w.events().touches.normal, [[0, -1]], atol=1e-6)
+    w.remove(features=[pin])
+    for _ in range(2):
+        w.step(1 / 60)
+        assert rows(w.events().lasting.pairs) == {(0, 1)} and len(w.events()) == 1
+        np.testing.assert_allclose(w.events().touches.impulse, 9.81 / 60, rtol=0.3)
+
+
+def test_nothing_is_lost_where_lists_grow(world):
+    # 60 sensors, all within each other, and discs that rush among them in one frame: more pairs than there is room for at first.
+    k = np.arange(60)
+    x = np.concatenate([0.01 * tv.golden(k, dim=2), [[-3.0, 0.0], [3.5, 0.25]]])
+    v = np.concatenate([np.zeros((60, 2)), [[120.0, 0.0], [-120.0, 0.0]]])
+    group = np.where(np.arange(62) < 60, 1, 0)
+    w = world(
+        tv.Particles(x, radius=np.where(group, 0.5, 0.1), velocity=v, group=group),
+        [tv.Contact(sensors=[(0, 1), (1, 1)])],
+        substeps=100,
+    )
+    room = w._runner.grid.room
+    w.step(1 / 20)
+    assert w._runner.grid.room > room
+    assert len(w.events([(1, 1)]).begun) == 60 * 59 // 2 and not len(w.events([(1, 1)]).ended)
+    through = w.events([(0, 1)])
+    assert rows(through.begun.pairs) == rows(through.ended.pairs) == {(i, j) for i in range(60) for j in (60, 61)}
+    # On a chord of a disc of radius 0.6, at 120 m/s; times are those of substeps, and the speed is along the normal then.
+    (i, j), began, ended = through.touches.pairs.T, through.touches.began, through.touches.ended
+    r, chord = x[i] - x[j] - began[:, None] * v[j], 2 * np.sqrt(0.6**2 - (x[i, 1] - x[j, 1]) ** 2)
+    np.testing.assert_allclose(ended - began, chord / 120, atol=1.01 / 2000)
+    np.testing.assert_allclose(through.touches.speed, (r * v[j]).sum(1) / np.linalg.norm(r, axis=1), rtol=1e-4)
+
+
+def test_absent_and_switched(world):
+    w = stage(world, sensing=False, events=False)
+    assert not any("event" in name or "touched" in name for name in w.fields)
+    with pytest.raises(RuntimeError, match=r"World.events: .*tv.Contact\(events=True\)"):
+        w.events()
+    twin = stage(world)
+    assert any("event" in name for name in twin.fields) and not len(twin.events())
+    w.run(0.3)
+    twin.run(0.3)
+    assert w.hash() == twin.hash() and len(twin.events())
+    w.features[2].events = True
+    w.step(1 / 60)
+    twin.step(1 / 60)
+    both = [(0, 0), (3, 3)]
+    touches = twin.events(both).touches
+    assert rows(w.events().begun.pairs) == rows(touches[(touches.impulse > 0) | ~np.isnan(touches.began)].pairs)
+    w.step(1 / 60)
+    twin.step(1 / 60)
+    equal(w.events(), twin.events(both))
+    assert w.hash() == twin.hash()
+    none = world(tv.Particles(np.zeros((0, 2)), radius=0.1), [tv.Contact(events=True, sensors=[(0, 1)])])
+    none.step(1 / 60)
+    assert not len(none.events()) and not len(none.events([(0, 1)]).begun)
+
+
+def test_refused(world):
+    with pytest.raises(ValueError, match=r"groups has \(0, 1\).* sensors"):
+        tv.Contact(groups=[(1, 0)], sensors=[(0, 1)])
+    with pytest.raises(TypeError, match="sensors has the key 3, but a pair of groups"):
+        tv.Contact(sensors=[3])
+    with pytest.raises(TypeError, match="events = 1 is a int, but True or False"):
+        tv.Contact(events=1)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="HalfSpace: events = 'yes'"):
+        tv.HalfSpace((0, 1), events="yes")  # type: ignore[arg-type]
+    w = stage(world)
+    with pytest.raises(TypeError, match=r"World.events: groups has 3"):
+        w.events([3])

@@ -1,0 +1,183 @@
+"""Contact events: what began to touch, went on touching, or ended in a frame, and what sensors noted.
+
+Contacts come and go within a frame, so each is noted where it is solved, in the pass and on the device. A pair that touches has a
+row in a table; its number stands in the pair's data (`touched`), which keeps the pair on the neighbour list until the frame ends,
+wherever it goes. The table has as much room as the list, and a pair has one row, so nothing can be lost. Between frames `touched`
+is 1 for pairs that touched in the last substep: that alone is carried on, by clones, recordings and edits.
+
+Rows come in any order, and the host sorts them. Each is written by one particle of the pair, in a fixed order: the same bits on
+any number of threads.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..device import ti
+from ..features.feature import Scene
+from ..features.material import SENSES, Table
+from ..neighbours.neighbour_list import Column, PairData
+from .touches import BEFORE, NEVER, ContactEvents, Touches, span
+
+if TYPE_CHECKING:
+    from ..neighbours.neighbour_search import NeighbourSearch
+    from .narrow_phase import DiscGeometry
+
+
+class EventLog:
+    """The table of one world on the device, and who writes what to it.
+
+    touched: data of each pair, on the
+    side that writes its row: during a frame the number of the row, from 1 on, and 0 without one; between frames 1 where it
+    touched in the last substep. Columns: pair, the particle that writes and the other; when, the substeps in which it began to
+    touch and touched last; impulse [kg m]; speed [m], what it came together in a substep; normal, from the other; point [m].
+    """
+
+    grid: "NeighbourSearch"
+    geometry: "DiscGeometry"
+
+    def __init__(self, scene: Scene, table: Table):
+        dim, add = scene.particles.dim, scene.memory.field
+        self.state, self.radius, self.table, self.senses = scene.state, scene.radius, table, table.senses
+        self.touched = PairData("touched", 0, lasting=True, kind=ti.i32)
+        self.pair, self.when = Column("events.pair", 2, ti.i32), Column("events.when", 2, ti.i32)
+        self.impulse, self.speed = Column("events.impulse"), Column("events.speed")
+        self.normal, self.point = Column("events.normal", dim), Column("events.point", dim)
+        self.rows = add("events.rows", None, kind=ti.i32)
+        self.substep = add("events.substep", None, kind=ti.i32)  # of the frame, from 1 on
+        if self.senses:
+            _, rows = table.rows(scene.particles.group)
+            ranks = round(len(rows) ** 0.5)
+            some = (rows[:, 3].reshape(ranks, ranks) == SENSES).any(axis=1)
+            self.is_sensor = add("events.is_sensor", ranks, kind=ti.i32, values=some)
+
+    def bind(self, grid: "NeighbourSearch", geometry: "DiscGeometry") -> None:
+        """Have the columns made with the list."""
+        self.grid, self.geometry = grid, geometry
+        grid.columns = [self.pair, self.when, self.impulse, self.speed, self.normal, self.point]
+
+    @ti.func
+    def start(self, s, first):
+        """One thread, as a pass of substep s begins: note which one it is; a frame begins with an empty table."""
+        self.substep[None] = s + 1
+        if s == 0 and first != 0:
+            self.rows[None] = 0
+
+    @ti.func
+    def open(self, begin, end):
+        """As a frame begins: a row for each pair of some particles that touched when the last one ended."""
+        number = 0
+        for i in range(begin, end):
+            for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
+                number += ti.cast(self.touched.field[e] != 0, ti.i32)
+        if number > 0:
+            row = ti.atomic_add(self.rows[None], number)
+            for i in range(begin, end):
+                for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
+                    if self.touched.field[e] != 0:
+                        self.enter(row, i, e, BEFORE, BEFORE)
+                        row += 1
+
+    @ti.func
+    def enter(self, row, i, e, began, last):
+        """Begin a row."""
+        self.touched.field[e] = row + 1
+        self.pair.field[row] = [i, self.grid.neighbour[e]]
+        self.when.field[row] = [began, last]
+        self.impulse.field[row] = 0
+        self.speed.field[row] = 0
+
+    @ti.func
+    def note(self, i, j, e, n, impulse, final):
+        """Entry e of particle i, with j, touches in this pass, where both sides of a pair come by; one of them writes, and not
+        one that does not move, which comes by never."""
+        if i < j or not self.state.w.positive(j):
+            self.write(i, j, e, n, impulse, final)
+
+    @ti.func
+    def write(self, i, j, e, n, impulse, final):
+        """Note a touch: its impulse [kg m]; where the pair meets, its speed, normal and point."""
+        row, now = self.touched.field[e] - 1, self.substep[None]
+        if row < 0:
+            row = ti.atomic_add(self.rows[None], 1)
+            self.enter(row, i, e, now, NEVER)
+            self.place(row, i, j, n)
+        began, last = self.when.field[row][0], self.when.field[row][1]
+        if last < now - 1:
+            approach = -(self.state.d[i] - self.state.d[j]).dot(n)
+            self.speed.field[row] = ti.max(self.speed.field[row], approach)
+        if final != 0 and began == BEFORE:
+            self.place(row, i, j, n)
+        self.when.field[row][1] = now
+        self.impulse.field[row] = self.impulse.field[row] + impulse
+
+    @ti.func
+    def place(self, row, i, j, n):
+        """Where the pair touches: in the middle between the two surfaces along n."""
+        self.normal.field[row] = n
+        self.point.field[row] = (self.state.place(i) + self.state.place(j) + (self.radius.of(j) - self.radius.of(i)) * n) / 2
+
+    @ti.func
+    def note_impact(self, e, impulse, speed):
+        """Entry e, whose pair touches, got an impulse [kg m] in an impact, at a speed [m]; one side has the row."""
+        row = self.touched.field[e] - 1
+        if row >= 0:
+            self.impulse.field[row] = self.impulse.field[row] + impulse
+            self.speed.field[row] = ti.max(self.speed.field[row], speed)
+
+    @ti.func
+    def sense(self, i, final):
+        """At the end of a substep, what particle i overlaps as a sensor."""
+        rank = self.table.rank[i]
+        if self.is_sensor[rank] != 0:
+            for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
+                j = self.grid.neighbour[e]
+                if ti.cast(self.table.of(i, j)[3], ti.i32) == SENSES and (rank != self.table.rank[j] or i < j):
+                    overlap, n = self.geometry.overlap(i, j, self.radius.of(i) + self.radius.of(j))
+                    if overlap > 0:
+                        self.write(i, j, e, n, 0 * overlap, final)
+
+    @ti.func
+    def close(self, i):
+        """As a frame ends: keep which pairs of particle i touch."""
+        for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
+            row = self.touched.field[e] - 1
+            if row >= 0:
+                began, last = self.when.field[row][0], self.when.field[row][1]
+                if began == BEFORE and last != self.substep[None]:
+                    j = self.grid.neighbour[e]
+                    r = self.state.apart(i, j)
+                    length = r.norm()
+                    if length > 0:
+                        self.place(row, i, j, r / length)
+                    else:
+                        self.place(row, i, j, self.geometry.fallback_normal(i, j, r))
+                self.touched.field[e] = ti.cast(last == self.substep[None], ti.i32)
+
+    @property
+    def made(self) -> Any:
+        """The field that is 0 where there are no events to tell of."""
+        return self.rows
+
+    def forget(self) -> None:
+        """Empty the table, for another state than that of a frame that has just been made."""
+        self.grid.memory.write(self.made, 0)
+
+    def read(self, h: float, time: float) -> ContactEvents:
+        """What the last frame, of substeps h [s], which ended at `time` [s], came to."""
+        memory, store = self.grid.memory, self.grid.store
+        assert store
+        count, substeps = int(memory.read(self.rows)[0]), int(memory.read(self.substep)[0])
+        pair, when, *values = (store.read(column.field)[:count] for column in self.grid.columns)
+        impulse, speed, normal, point = (value.astype(np.float64) for value in values)
+        pairs = np.sort(pair, axis=1).astype(np.int64)
+        normal[pair[:, 0] > pair[:, 1]] *= -1
+        order = np.lexsort(pairs.T[::-1])
+        pairs, when, impulse, speed = pairs[order], when[order], impulse[order], speed[order]
+        # A pair has two rows where a particle of it moves that was held before the frame, when the other one wrote.
+        one = np.flatnonzero((np.diff(pairs, axis=0, prepend=-1) != 0).any(axis=1))
+        if len(one) < len(pairs):
+            when = np.stack([np.minimum.reduceat(when[:, 0], one), np.maximum.reduceat(when[:, 1], one)], axis=1)
+            impulse, speed = np.add.reduceat(impulse, one), np.maximum.reduceat(speed, one)
+        times, order = span(when, substeps, h, time), order[one]
+        return ContactEvents(Touches(pairs[one], point[order], normal[order], impulse / h, speed / h, *times))
