@@ -48,6 +48,8 @@ class Collider(Feature):
     _stands = True  # on the device
     sweeps = False  # needs the exact position at the start of the substep
     repeats = False  # one confine() may leave a particle that rubs or bounces where it has to be confined again
+    dim = 0  # 2 or 3; 0 while it is not known
+    inside = False  # particles are kept inside of it
     poses = False  # has a pose(when) to be worked out once for each substep, before any confine()
 
     def surface(self, friction: Any, restitution: Any, push_out: float, active: bool | None) -> None:
@@ -69,6 +71,11 @@ class Collider(Feature):
     def lets_go(self) -> bool:
         """Whether it bore what it no longer will."""
         return self._stands and not self.active
+
+    @property
+    def stands(self) -> bool:
+        """Whether it is there, as the last frame had it."""
+        return self.active if self.scene is None else self._stands
 
     @property
     def has_switch(self) -> bool:
@@ -97,6 +104,21 @@ class Collider(Feature):
     def solid(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """For pictures of a 3D scene between two corners: vertices (v, 3) and triangles (t, 3); none where lines say more."""
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
+
+    def clearance(self, points: np.ndarray) -> np.ndarray:
+        """C(x) of points (k, dim): how far they are from the wall [m], negative inside of it, (k,).
+
+        In a world, the wall is where the last frame took it: a place that is assigned is where it goes in the next one.
+        """
+        raise NotImplementedError
+
+    def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+        """How far balls of a radius [m] go until the wall stops them, and its normals there.
+
+        origin: (k, dim) [m]. direction: (k, dim), unit. Returns the lengths (k,) [m], inf where nothing is met, and unit normals
+        (k, dim), against the direction: where clearance() falls to `radius` from above. A wall lets out what starts in it.
+        """
+        raise NotImplementedError
 
     @ti.func
     def may_touch(self, i, radius):

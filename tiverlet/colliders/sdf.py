@@ -12,6 +12,7 @@ from ..device.patches.compiler import Compiler
 from ..features.feature import Scene
 from ..particles import Particles
 from ..tools import golden
+from .march import march
 from .moving import Moving
 from .pose import rotation_matrix
 from .shape import Shape
@@ -19,6 +20,7 @@ from .shape import Shape
 MARCH = 64  # steps along a way; what has not come to its end by then stays where it is
 FINE = 1 / 64  # of a way: closer than that, the surface is taken for its tangent plane
 SAMPLES = 4096  # places where the function is looked at before it is used
+SLOPE = 1e-6  # of the largest coordinate: the step of differences at a surface
 STEEP, FLAT = 1.1, 0.9  # bounds of the gradient that pass for 1
 
 
@@ -59,7 +61,7 @@ class Sdf(Moving):
         """Check the dimension, and refuse a function that is not finite, or not a distance, around the particles."""
         Moving.prepare(self, particles, inv_mass)
         runtime.ensure_started()
-        self.dev.probe = _Probe(self)
+        self.dev.probe = _Probe(self, self.dim)
         x = particles.position
         if not len(x):
             return
@@ -111,6 +113,32 @@ class Sdf(Moving):
                 local = (grid.reshape(-1, self.dim) - self.position) @ rotation_matrix(self.rotation)
                 out.append(contour(grid, self.dev.probe.value(local).reshape(129, 129) - self.radius))
         return np.concatenate(out), 0.0
+
+    def clearance(self, points: np.ndarray) -> np.ndarray:
+        """What the function says, less the radius."""
+        position, turn = self.frame(points.shape[1])
+        return self._probe(points.shape[1]).value((points - position) @ turn) - self.radius
+
+    def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+        """By sphere tracing, see march(); the normal is the gradient."""
+        position, turn = self.frame(origin.shape[1])
+        probe = self._probe(origin.shape[1])
+        o, d, radius = (origin - position) @ turn, direction @ turn, self.radius + radius
+        distance, normal = march(probe.value, o, d, radius), np.full(o.shape, np.nan)
+        met = distance < np.inf
+        x = o[met] + distance[met, None] * d[met]
+        step = SLOPE * (float(np.abs(x).max(initial=0.0)) or 1.0)
+        slope = probe.gradient(x) if self.gradient else probe.slope(x, step)
+        size = np.linalg.norm(slope, axis=1)[:, None]
+        normal[met] = np.where(size > 0, slope / np.where(size > 0, size, 1.0), -d[met]) @ turn.T
+        return distance, normal
+
+    def _probe(self, dim: int) -> "_Probe":
+        """The function on the host; outside of any world, too, where it acts in any dimension."""
+        if "probe" not in vars(self.dev):
+            runtime.ensure_started()
+            self.dev.probe = _Probe(self, dim)
+        return self.dev.probe
 
 
 class FunctionShape(Shape):
@@ -217,10 +245,10 @@ class FunctionShape(Shape):
 class _Probe:
     """The function at many places, in Python and f64."""
 
-    def __init__(self, wall: Sdf):
+    def __init__(self, wall: Sdf, dim: int):
         self.compiler = Compiler(ti.f64)
         self.wall: Any = wall
-        self.dim = wall.dim
+        self.dim = dim
 
     def value(self, points: np.ndarray) -> np.ndarray:
         """The function at points (n, dim) of the wall's frame, (n,)."""

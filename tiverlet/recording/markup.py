@@ -11,7 +11,8 @@ import numpy as np
 
 from ..colliders.collider import Collider
 from ..constraints import Path
-from .drawing import bounds, colors, links, upwards
+from ..features.links import links
+from .drawing import bounds, colors, upwards
 from .layout import eye_axes
 
 if TYPE_CHECKING:
