@@ -352,8 +352,7 @@ class World:
         Raises ValueError or TypeError naming the first value that makes no sense.
         """
         self._runner.memory.check()
-        with whole:
-            return ray(self, origin, direction, reach, radius, groups, skip, features)
+        return ray(self, origin, direction, reach, radius, groups, skip, features)
 
     def inside(self, shape: Collider, part: str = "center") -> np.ndarray:
         """The particles that are inside of a shape, in order, (m,).
@@ -364,8 +363,7 @@ class World:
         part of it, "touching".
         """
         self._runner.memory.check()
-        with whole:
-            return inside(self, shape, part)
+        return inside(self, shape, part)
 
     @property
     def contacts(self) -> Contacts:
