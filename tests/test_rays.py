@@ -108,7 +108,7 @@ def tube(x):
     return np.hypot(np.hypot(x[:, 0], x[:, 2]) - 0.7, x[:, 1]) - 0.2
 
 
-def prove(hits, origin, direction, gap, radius=0.0, tolerance=1e-9, reach=8.0, samples=600):
+def prove(hits, origin, direction, gap, radius=0.0, tolerance=1e-9, reach=8.0, samples=400):
     """Each ray meets the place where gap(x) - radius first falls to 0 from above, and normals are its gradient."""
     d = direction / np.linalg.norm(direction, axis=1)[:, None]
     s = np.linspace(0, reach, samples)
@@ -147,7 +147,7 @@ def test_walls_are_met_where_their_distance_falls_to_zero(world, dim):
     # Before and after a frame in which they move; balls of a radius, too; and starts that are inside of the wall.
     made = [make() for make, _, _ in WALLS[dim]]
     w = world(tv.Particles(np.full((1, dim), 0.05), radius=0.01, pinned=[0]), made, precision="f64", substeps=1)
-    o, d = bundle(dim, 150, 1)
+    o, d = bundle(dim, 120, 1)
     before = [w.ray(o, d, features=[wall], groups=()) for wall in made]
     for wall, (_, knobs, _) in zip(made, WALLS[dim], strict=True):
         for name, value in knobs.items():

@@ -4,12 +4,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..geometry.bounding_tree import BoundingTree, ahead, apart
+from ..geometry.bounding_tree import BoundingTree, ahead, apart, beyond
 from ..geometry.intervals import ROUNDING, dot, entry, rounded, rounding, triangle
 from ..geometry.nearest import away, on_facet
 
 if TYPE_CHECKING:
     from .facets import Facets
+
+PIECES = 1 << 12  # of a solid on the way out of it, at most
 
 
 class FacetSolid:
@@ -71,37 +73,59 @@ class FacetSolid:
         return self._tree.first(len(origin), np.full(len(origin), np.inf), ahead(origin, direction, 0.0), enter)
 
     def _thick(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-        """The same: the first facet whose surroundings are entered, by rays that start outside of the solid."""
+        """The same, of the facets whose surroundings are entered first; what starts in the solid goes out of it before."""
+        start = self._way_out(origin, direction, radius)
+        distance, f = np.full(len(origin), np.inf), np.full(len(origin), -1)
+        some = start < np.inf
+        o, d = origin[some] + start[some, None] * direction[some], direction[some]
         corners = self._facets.corners
 
         def enter(q: np.ndarray, f: np.ndarray) -> np.ndarray:
             """Where ray q[i] comes near facet f[i]."""
-            o, c = origin[q], corners[f]
-            return entry(rounded(o, direction[q], c, radius), rounding(o, c[:, 0], c[:, 1]) + ROUNDING * radius)
+            c = corners[f]
+            return entry(rounded(o[q], d[q], c, radius), rounding(o[q], c[:, 0], c[:, 1]) + ROUNDING * radius)
 
-        distance, f = self._tree.first(len(origin), np.full(len(origin), np.inf), ahead(origin, direction, radius), enter)
-        close = rounding(origin) + ROUNDING * (self._size + radius)
-        for k in np.flatnonzero(self.clearance(origin) < radius - close):
-            distance[k], f[k] = self._from_inside(origin[k], direction[k], radius, close[k])
+        more, f[some] = self._tree.first(len(o), np.full(len(o), np.inf), ahead(o, d, radius), enter)
+        distance[some] = start[some] + more
         return distance, f
 
-    def _from_inside(self, origin: np.ndarray, direction: np.ndarray, radius: float, close: float) -> tuple[float, int]:
-        """Where a ray that starts in the solid comes in again: after the first gap in the intervals of it that are solid."""
+    def _way_out(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> np.ndarray:
+        """How far rays go until they are out of the solid that they start in: 0 outside of it, inf where there is no way out."""
+        close = rounding(origin) + ROUNDING * (self._size + radius)
+        t, going = np.zeros(len(origin)), np.arange(len(origin))
+        if not (self._facets.closed and self._facets.inside):
+            low, high = self._facets.corners.min(axis=(0, 1)), self._facets.corners.max(axis=(0, 1))
+            going = np.flatnonzero(((origin > low - radius) & (origin < high + radius)).all(axis=1))
+        for _ in range(PIECES):
+            x = origin[going] + t[going, None] * direction[going]
+            gap = self.clearance(x)
+            within = gap < radius - close[going]
+            going, x, deep = going[within], x[within], gap[within] < close[going][within] - radius
+            if not len(going):
+                break
+            step = self._step_out(x, direction[going], radius, close[going], deep)
+            t[going] += step
+            going = going[(step > 0) & (step < np.inf)]
+        return t
+
+    def _step_out(self, x: np.ndarray, d: np.ndarray, radius: float, close: np.ndarray, deep: np.ndarray) -> np.ndarray:
+        """From places in the solid to the end of the surroundings of facets that they are in; if deep, to the next facet."""
         corners = self._facets.corners
-        o, d = np.broadcast_to(origin, (len(corners), len(origin))), np.broadcast_to(direction, (len(corners), len(origin)))
-        enter, leave = rounded(o, d, corners, radius)
-        number = np.arange(len(corners))
-        if self._facets.closed:
-            t = np.unique(triangle(o, d, corners)[0])
-            ends = np.concatenate([[0.0], t[(t > 0) & (t < np.inf)], [np.inf]])
-            far = ends[-2] + self._size
-            middle = np.append((ends[:-2] + ends[1:-1]) / 2, far)
-            behind = self.clearance(origin + middle[:, None] * direction) < 0
-            enter, leave = np.append(enter, ends[:-1][behind]), np.append(leave, ends[1:][behind])
-            number = np.append(number, np.full(int(behind.sum()), -1))
-        there = leave > close
-        order = np.argsort(enter[there], kind="stable")
-        enter, leave, number = enter[there][order], leave[there][order], number[there][order]
-        until = np.maximum.accumulate(np.append(0.0, leave))[:-1]
-        again = np.flatnonzero((enter > until + close) & (number >= 0))
-        return (float(enter[again[0]]), int(number[again[0]])) if len(again) else (np.inf, -1)
+        to_boxes, out_of_boxes = ahead(x, d, 0.0), beyond(x, d, radius)
+
+        def bound(q: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+            """Of boxes around facets."""
+            return np.where(deep[q][:, None], to_boxes(q, low, high), out_of_boxes(q, low, high))
+
+        def value(q: np.ndarray, f: np.ndarray) -> np.ndarray:
+            """Where ray q[i] passes facet f[i]; or the negative of where it leaves the surroundings, to find the last one."""
+            out, some = np.full(len(q), np.inf), deep[q]
+            enter, _ = triangle(x[q[some]], d[q[some]], corners[f[some]])
+            out[some] = np.where(enter > close[q[some]], enter, np.inf)
+            some = ~some
+            enter, leave = rounded(x[q[some]], d[q[some]], corners[f[some]], radius)
+            out[some] = np.where((enter <= close[q[some]]) & (leave > close[q[some]]), -leave, np.inf)
+            return out
+
+        step, f = self._tree.first(len(x), np.full(len(x), np.inf), bound, value)
+        return np.where(f >= 0, np.abs(step), np.where(deep, np.inf, 0.0))

@@ -12,7 +12,6 @@ from ..device.patches.compiler import Compiler
 from ..features.feature import Scene
 from ..particles import Particles
 from ..tools import golden
-from .march import march
 from .moving import Moving
 from .pose import rotation_matrix
 from .shape import Shape
@@ -20,6 +19,10 @@ from .shape import Shape
 MARCH = 64  # steps along a way; what has not come to its end by then stays where it is
 FINE = 1 / 64  # of a way: closer than that, the surface is taken for its tangent plane
 SAMPLES = 4096  # places where the function is looked at before it is used
+CAST = 1 << 14  # steps along a ray; one that grazes a plane at less than 1e-3 may miss it
+STRIDE = 2.0**-16  # of the size of the scene: the shortest step of a ray; nothing that is as thin is seen from its side
+SKIN = 2.0**-40  # of the size of the scene: rays that start no deeper than that are outside
+AWAY = 1e16  # [m] where no particle can be
 SLOPE = 1e-6  # of the largest coordinate: the step of differences at a surface
 STEEP, FLAT = 1.1, 0.9  # bounds of the gradient that pass for 1
 
@@ -120,11 +123,11 @@ class Sdf(Moving):
         return self._probe(points.shape[1]).value((points - position) @ turn) - self.radius
 
     def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-        """By sphere tracing, see march(); the normal is the gradient."""
+        """By sphere tracing; the normal is the gradient."""
         position, turn = self.frame(origin.shape[1])
         probe = self._probe(origin.shape[1])
         o, d, radius = (origin - position) @ turn, direction @ turn, self.radius + radius
-        distance, normal = march(probe.value, o, d, radius), np.full(o.shape, np.nan)
+        distance, normal = probe.cast(o, d, radius), np.full(o.shape, np.nan)
         met = distance < np.inf
         x = o[met] + distance[met, None] * d[met]
         step = SLOPE * (float(np.abs(x).max(initial=0.0)) or 1.0)
@@ -257,6 +260,13 @@ class _Probe:
             self._value(np.ascontiguousarray(points, dtype=np.float64), out)
         return out
 
+    def cast(self, points: np.ndarray, direction: np.ndarray, radius: float) -> np.ndarray:
+        """How far rays go until the function falls to `radius` from above, (n,) [m], inf where it does not in CAST steps."""
+        out = np.zeros(len(points))
+        with self.compiler():
+            self._cast(np.ascontiguousarray(points), np.ascontiguousarray(direction), radius, out)
+        return out
+
     def slope(self, points: np.ndarray, step: float) -> np.ndarray:
         """Its central differences, (n, dim)."""
         moves = np.concatenate([np.eye(self.dim), -np.eye(self.dim)]) * step
@@ -278,6 +288,45 @@ class _Probe:
     def _value(self, points: ti.types.ndarray(ti.f64, 2), out: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
         for i in range(points.shape[0]):
             out[i] = self.wall.function(self._point(points, i))
+
+    @ti.kernel
+    def _cast(
+        self, points: ti.types.ndarray(ti.f64, 2), direction: ti.types.ndarray(ti.f64, 2), radius: ti.f64,
+        out: ti.types.ndarray(ti.f64, 1),
+    ):  # type: ignore[valid-type]  # fmt: skip
+        """Steps as long as there is nothing for certain (Hart 1996), out of the solid first where a ray starts in it; then the
+        step in which the surface was passed is halved until nothing is left of it."""
+        for i in range(points.shape[0]):
+            o, d = self._point(points, i), self._point(direction, i)
+            size = ti.abs(o).max()  # type: ignore[reportOptionalCall]
+            t, low, high, fine, found = 0 * size, 0 * size, 0 * size - 1, 0 * size, 0 * size + np.inf
+            outside, going = False, True
+            for k in range(CAST):
+                if going:
+                    gap = self.wall.function(o + t * d) - radius
+                    if high >= 0:
+                        if gap > 0:
+                            low = t
+                        else:
+                            high = t
+                    else:
+                        if k == 0:
+                            size = ti.max(size, ti.max(ti.abs(gap), radius))
+                            if size == 0:
+                                size = 1
+                            fine = size * STRIDE
+                        if outside and gap <= 0:
+                            high = t
+                        else:
+                            outside = gap > 0 or (k == 0 and gap >= -size * SKIN)
+                            low = t
+                            t += ti.max(ti.abs(gap), fine)
+                            going = t < AWAY
+                    if high >= 0:
+                        t = (low + high) / 2
+                        if not low < t < high:
+                            found, going = low, False
+            out[i] = found
 
     @ti.kernel
     def _gradient(self, points: ti.types.ndarray(ti.f64, 2), out: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]

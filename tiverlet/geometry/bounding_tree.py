@@ -8,6 +8,7 @@ WIDE = 4  # children of a node, and boxes in a leaf
 FEW = 1 << 13  # pairs of a question and a box that are all looked at, in less time than a tree is made
 ONCE = 2  # questions for which no tree pays, however many boxes there are
 CHUNK = 1 << 14  # questions that go through the tree together
+TINY = 1e-300  # component of a direction that stands for 0: what is beside a slab stays there
 SLACK = 2.0**-40  # of the largest coordinate: boxes are larger by so much, for what rounds
 
 Answer = tuple[np.ndarray, np.ndarray]
@@ -22,7 +23,8 @@ class BoundingTree:
     """
 
     def __init__(self, low: np.ndarray, high: np.ndarray):
-        self.low, self.high, self.count = low, high, len(low)
+        slack = SLACK * max(np.abs(low).max(initial=0.0), np.abs(high).max(initial=0.0))
+        self.low, self.high, self.count = low - slack, high + slack, len(low)
         self._first = -1  # leaf, once the tree is made
 
     def first(self, questions: int, most: np.ndarray, bound: Callable, value: Callable) -> Answer:
@@ -39,13 +41,18 @@ class BoundingTree:
         chunks = [np.arange(q, min(q + step, questions)) for q in range(0, questions, step)]
         if not all_of_them and self._first < 0:
             self._grow()
-        answers = [self._compare(q, most[q], value) if all_of_them else self._descend(q, most[q], bound, value) for q in chunks]
+        answers = [
+            self._compare(q, most[q], bound, value) if all_of_them else self._descend(q, most[q], bound, value) for q in chunks
+        ]
         return np.concatenate([a for a, _ in answers]), np.concatenate([b for _, b in answers])
 
-    def _compare(self, some: np.ndarray, most: np.ndarray, value: Callable) -> Answer:
+    def _compare(self, some: np.ndarray, most: np.ndarray, bound: Callable, value: Callable) -> Answer:
         """All boxes."""
-        q, b = np.repeat(some, self.count), np.tile(np.arange(self.count), len(some))
-        values = value(q, b).reshape(len(some), self.count)
+        with np.errstate(over="ignore"):
+            near = bound(some, self.low[None], self.high[None])
+        values = np.full(near.shape, np.inf)
+        q, b = np.nonzero((near <= most[:, None]) & (near < np.inf))
+        values[q, b] = value(some[q], b)
         at = values.argmin(axis=1)
         best = values[np.arange(len(some)), at]
         found = (best <= most) & (best < np.inf)
@@ -60,9 +67,8 @@ class BoundingTree:
         order = np.argsort(_morton(self.low / 2 + self.high / 2), kind="stable")
         self._items = np.full(WIDE ** (depth + 1), -1)
         self._items[: self.count] = order
-        slack = SLACK * max(np.abs(self.low).max(), np.abs(self.high).max())
         low, high = (np.full((len(self._items), dim), np.nan) for _ in range(2))
-        low[: self.count], high[: self.count] = self.low[order] - slack, self.high[order] + slack
+        low[: self.count], high[: self.count] = self.low[order], self.high[order]
         lows, highs = [], []
         for _ in range(depth + 1):
             low, high = np.fmin.reduce(low.reshape(-1, WIDE, dim), axis=1), np.fmax.reduce(high.reshape(-1, WIDE, dim), axis=1)
@@ -118,16 +124,26 @@ class BoundingTree:
 
 def ahead(origin: np.ndarray, direction: np.ndarray, extra: float) -> Callable:
     """A bound for rays: how far it is to a box that is larger by `extra` [m]."""
-    # A component of 0 takes no part; of 1e-300, it is far outside or inside all along.
-    inverse = 1.0 / np.where(np.abs(direction) < 1e-300, 1e-300, direction)
+    inverse = 1.0 / np.where(np.abs(direction) < TINY, TINY, direction)
     extra = extra + SLACK * np.abs(origin).max(axis=1)
 
     def bound(q: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         """Where the slabs of all axes are entered, if that is before any is left."""
-        o, i, e = origin[q][:, None], inverse[q][:, None], extra[q][:, None, None]
-        one, two = (low - e - o) * i, (high + e - o) * i
-        enter, leave = np.minimum(one, two).max(axis=-1), np.maximum(one, two).min(axis=-1)
+        enter, leave = _slabs(origin[q], inverse[q], extra[q], low, high)
         return np.where((enter <= leave) & (leave >= 0), np.maximum(enter, 0.0), np.inf)
+
+    return bound
+
+
+def beyond(origin: np.ndarray, direction: np.ndarray, extra: float) -> Callable:
+    """A bound for rays in boxes that are larger by `extra` [m]: the negative of how far it is until one is left."""
+    inverse = 1.0 / np.where(np.abs(direction) < TINY, TINY, direction)
+    extra = extra + SLACK * np.abs(origin).max(axis=1)
+
+    def bound(q: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """Where the first slab of a box is left, of those that the ray starts in."""
+        enter, leave = _slabs(origin[q], inverse[q], extra[q], low, high)
+        return np.where((enter <= 0) & (leave >= 0), -leave, np.inf)
 
     return bound
 
@@ -143,6 +159,13 @@ def apart(points: np.ndarray) -> Callable:
         return np.where(distance >= 0, distance, np.inf)
 
     return bound
+
+
+def _slabs(origin, inverse, extra, low, high) -> tuple[np.ndarray, np.ndarray]:
+    """Where rays enter the last slab of boxes (k, b, dim), and where they leave the first."""
+    o, i, e = origin[:, None], inverse[:, None], extra[:, None, None]
+    one, two = (low - e - o) * i, (high + e - o) * i
+    return np.minimum(one, two).max(axis=-1), np.maximum(one, two).min(axis=-1)
 
 
 def _morton(middle: np.ndarray) -> np.ndarray:
