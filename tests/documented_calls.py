@@ -35,6 +35,8 @@ new = world.add(tv.Particles([(0, 5)]), [tv.Pin([3], compliance=1e-3)])
 world.remove(new)
 world.remove([0, 1])
 found = world.near([(0, 0)], 0.5), world.nearest([(0, 0)]), world.contacts.pairs, world.broken, world.explain().splitlines()
+hits = world.ray((0, 0), (1, 0)), world.ray([(0, 0), (1, 1)], (0, -1), 3.0, radius=0.1, groups=[0], skip=[0], features=features)
+there = hits[0].met, hits[1].distance.min(), world.inside(tv.Box((0, 0), (1, 1))), world.inside(tv.Ball((0, 0), 1.0), "whole")
 clone: tv.World = world.clone(precision="f64", substeps=100)
 with tv.Recorder("b.rrd", world, every=2, budget=1_000_000, overwrite=True) as recorder:
     recorder.log()
