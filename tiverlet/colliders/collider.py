@@ -19,9 +19,9 @@ class Collider(Feature):
     """Keeps each particle by itself on one side of a wall, with the last word in every iteration.
 
     Subclasses give confine(), which finds how deep a particle is and calls dev.surface.press(): that of the Surface that each
-    holds. One-sided: what entered in this substep is taken back whole, at any speed, whether it flew in or constraints, contacts,
-    friction or a bounce off another wall took it there. Depth from before (a bad start) is left at `push_out` [m/s], and gives no
-    more velocity than that.
+    holds; and for questions of the host, clearance() and cast(). One-sided: what entered in this substep is taken back whole, at
+    any speed, whether it flew in or constraints, contacts, friction or a bounce off another wall took it there. Depth from before
+    (a bad start) is left at `push_out` [m/s], and gives no more velocity than that.
 
     Where one correction may lead into a wall again (several walls, a box in whose corners particles bounce), corrections take
     turns until none changes anything: SWEEPS rounds as they come, then ROUNDS without friction and bounces, which are projections

@@ -137,8 +137,8 @@ class Sdf(Moving):
         return distance, normal
 
     def _probe(self, dim: int) -> "_Probe":
-        """The function on the host; outside of any world, too, where it acts in any dimension."""
-        if "probe" not in vars(self.dev):
+        """The function on the host; outside of any world, too, for as many dimensions as it is asked about."""
+        if "probe" not in vars(self.dev) or self.dev.probe.dim != dim:
             runtime.ensure_started()
             self.dev.probe = _Probe(self, dim)
         return self.dev.probe

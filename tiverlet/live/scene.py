@@ -10,9 +10,8 @@ from ..colliders.collider import Collider
 from ..constraints import Path
 from ..constraints.distance import Link
 from ..features.feature import Batch
-from ..features.links import links
 from ..forces import Hand
-from ..recording.drawing import bounds, colors, upwards
+from ..recording.drawing import bounds, colors, links, upwards
 from ..recording.surfaces import covered, triangles
 
 if TYPE_CHECKING:

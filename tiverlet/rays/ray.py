@@ -7,9 +7,7 @@ import numpy as np
 
 from .. import checks
 from ..colliders.collider import Collider
-from ..contact.polygons import Polygons
 from ..features.feature import Feature
-from ..features.links import links
 from ..particles import in_range
 from .hits import Hits
 from .targets import Rods
@@ -120,16 +118,10 @@ def _seen(world: "World", x: np.ndarray, groups: Any, skip: Any) -> np.ndarray:
 def _rods(world: "World", some: set[int], seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Links whose particles both are seen: pairs (m, 2), and the numbers of feature and link (m, 2)."""
     pairs, numbers = [np.zeros((0, 2), dtype=np.int64)], [np.zeros((0, 2), dtype=np.int64)]
-    for f, feature in links(world):
-        if f in some:
-            whole = np.flatnonzero(~feature.broken)
-            pairs.append(feature.indices[whole])
-            numbers.append(np.stack([np.full(len(whole), f), whole], axis=1))
-    for f, feature in enumerate(world.features):
-        if f in some and isinstance(feature, Polygons) and feature.loops:
-            ends = np.concatenate([np.stack([loop, np.roll(loop, -1)], axis=1) for loop in feature.loops])
-            pairs.append(ends)
-            numbers.append(np.stack([np.full(len(ends), f), np.arange(len(ends))], axis=1))
+    for f in sorted(some):
+        ends, which = world.features[f].rods()
+        pairs.append(ends)
+        numbers.append(np.stack([np.full(len(ends), f), which], axis=1))
     both, number = np.concatenate(pairs), np.concatenate(numbers)
     there = seen[both].all(axis=1)
     return both[there], number[there]

@@ -10,7 +10,6 @@ from ..colliders.collider import Collider
 from ..constraints import Path
 from ..constraints.distance import Link
 from ..features.feature import Batch, Feature
-from ..features.links import links
 from ..forces import Gravity
 from ..tools import golden_colors
 from .fill import Fill, outlines, within
@@ -295,6 +294,11 @@ def colors(world: "World | Parts") -> np.ndarray:
     hues = golden_colors(len(body))[body]
     hues[world.particles.inv_mass == 0] = (140, 140, 150)
     return hues
+
+
+def links(world: "World | Parts") -> list[tuple[int, Batch]]:
+    """The features that are drawn as lines between two particles, with their numbers."""
+    return [(k, f) for k, f in enumerate(world.features) if isinstance(f, Batch) and f.arity == 2 and f.count]
 
 
 def walled(features: Iterable[Feature], low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -11,8 +11,7 @@ import numpy as np
 
 from ..colliders.collider import Collider
 from ..constraints import Path
-from ..features.links import links
-from .drawing import bounds, colors, upwards
+from .drawing import bounds, colors, links, upwards
 from .layout import eye_axes
 
 if TYPE_CHECKING:

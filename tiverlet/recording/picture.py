@@ -105,9 +105,8 @@ def layout(
     """How it opens in the viewer. seen: the corners of what is to be seen [m], and how many times its size; None for what is
     known beforehand. own: quantities of the user's that have curves.
     """
-    from ..features.links import links
     from .curves import OWN, shown
-    from .drawing import bounds, upwards
+    from .drawing import bounds, links, upwards
     from .layout import blueprint, unit
 
     (low, high), scale = seen or (bounds(world), unit(*bounds(world)))

@@ -65,8 +65,7 @@ class WorldsRecorder:
             self._open(overlays, overwrite)
 
     def _open(self, overlays: Overlays, overwrite: bool) -> None:
-        from ..features.links import links
-        from .drawing import bounds, upwards
+        from .drawing import bounds, links, upwards
 
         def known(world: World) -> tuple:
             """What one of them needs in the viewer: corners, what is up, the title of its colours."""

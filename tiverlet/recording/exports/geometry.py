@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...features.links import links
 from ...shapes import Shape
-from ..drawing import colors, upwards
+from ..drawing import colors, links, upwards
 from ..scene import Parts
 from ..surfaces import covered, triangles
 
