@@ -281,6 +281,20 @@ def test_floors_met_at_their_surface_or_along_it(wall):
     np.testing.assert_allclose(distance, 2.0, rtol=1e-6)
 
 
+def test_a_sheet_has_two_sides():
+    # Without thickness; where a ray starts on it, it is not met, whichever way it goes.
+    for sheet in (
+        tv.Polygon([(-1, 0), (1, 0)], closed=False),
+        tv.Mesh([(-1, 0, -1), (1, 0, -1), (0, 0, 2)], [(0, 1, 2)], closed=False),
+    ):
+        o, d = np.zeros((6, sheet.dim)), np.zeros((6, sheet.dim))
+        o[:, 1], d[:, 1] = (2, -2, 0, 0, 2, 3), (-1, 1, 1, -1, 1, -1)
+        o[5, 0] = 1.5  # beside it
+        distance, normal = sheet.cast(o, d, 0.0)
+        assert distance.tolist() == [2, 2, np.inf, np.inf, np.inf, np.inf] and normal[:2, 1].tolist() == [1, -1]
+        np.testing.assert_allclose(sheet.cast(o[:5], d[:5], 0.5)[0], [1.5, 1.5, np.inf, np.inf, np.inf], atol=1e-12)
+
+
 def test_points_and_thin_lines(world):
     # In 2D a link between points is met, also in its joints and along axes; in 3D by a ball only. A point is met head on.
     x = np.array([(0, 0), (1, 0.3), (2, 0.1), (3, 0.7)])
