@@ -208,11 +208,12 @@ def test_the_tree_and_brute_force_find_the_same(dim):
     rng = np.random.default_rng(4)
     n, k = 3000, 300
     center, radius = rng.uniform(-1, 1, (n, dim)), 10.0 ** rng.uniform(-4, (-1.3, -0.9)[dim - 2], n)
-    center[0], center[1:40] = 1e9, center[40]
+    center[0], center[1:40], radius[1:41] = 1e9, center[40], 0.05
     o, d = rng.uniform(-1, 1, (k, dim)), rng.normal(size=(k, dim))
     d[:50] = np.eye(dim)[rng.integers(0, dim, 50)]
     o[:25] = np.round(o[:25], 1)
     d /= np.linalg.norm(d, axis=1)[:, None]
+    o[50:60] = center[40] - 0.0501 * d[50:60]  # just before the disc that is there forty times
     most = np.where(np.arange(k) % 3 == 0, 0.3, np.inf)
 
     def value(q, i):
@@ -225,7 +226,7 @@ def test_the_tree_and_brute_force_find_the_same(dim):
     every[every > most[:, None]] = np.inf
     np.testing.assert_array_equal(distance, every.min(axis=1))
     np.testing.assert_array_equal(which, np.where(every.min(axis=1) < np.inf, every.argmin(axis=1), NONE))
-    assert 0.2 < (which >= 0).mean() < 1
+    assert (which[50:60] == 1).all() and 0.2 < (which >= 0).mean() < 1
 
 
 def test_nothing_slips_between_facets():
@@ -341,6 +342,17 @@ def test_who_counts(world):
     assert links.broken[0] and first(groups=()) is None and first(skip=[0, 1]) == ("particle", 4)
     w.remove([0])
     assert first(skip=[0]) == ("particle", 3)
+
+
+def test_of_things_at_the_same_distance_the_first_counts(world):
+    # Two discs in one place, the rod between them and to another one of the same radius, and a floor and a slab at their top.
+    slab = tv.Box((-9, -9), (9, 9)), tv.HalfSpace((0, 1), 1.0), tv.Capsule((-5, 0), (5, 0), 1.0)
+    x = tv.Particles([(0, 0), (0, 0), (3, 0)], radius=1.0)
+    w = world(x, [*slab, tv.Distance([(0, 2), (1, 2)])], precision="f64", solver=tv.Jacobi())
+    hits = w.ray([(0, 3), (1, 3), (3.5, 3), (-2, 3)], (0, -1))
+    assert hits.distance.tolist() == [2, 2, 2, 2] and hits.particle.tolist() == [0, NONE, NONE, NONE]
+    assert hits.link.tolist() == [[NONE, NONE], [3, 0], [NONE, NONE], [NONE, NONE]] and hits.wall.tolist() == [NONE, NONE, 1, 1]
+    assert w.ray((0, 3), (0, -1), 2.0, skip=[0]).particle == 1 and w.ray((0, 3), (0, -1), groups=(), features=slab[2:]).wall == 2
 
 
 def test_edges_of_polygons_are_links(world):
