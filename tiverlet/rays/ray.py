@@ -43,11 +43,10 @@ def ray(
         return nearer, which[nearer]
 
     index = np.flatnonzero(seen)
-    nearer, which = meet(Rods(x[index], x[index], world.particles.radius[index] + radius))
+    nearer, which = meet(Rods(world.particles.radius[index] + radius, x[index]))
     particle[nearer] = index[which]
     pairs, number = _rods(world, some, seen)
-    a, b = x[pairs[:, 0]], x[pairs[:, 1]]
-    nearer, which = meet(Rods(a, b, world.particles.radius[pairs].min(axis=1) + radius))
+    nearer, which = meet(Rods(world.particles.radius[pairs].min(axis=1) + radius, x[pairs[:, 0]], x[pairs[:, 1]]))
     particle[nearer], link[nearer] = -1, number[which]
     for f, feature in enumerate(world.features):
         if f in some and isinstance(feature, Collider) and feature.stands and k:

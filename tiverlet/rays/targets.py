@@ -8,14 +8,15 @@ from ..geometry.nearest import away, on_segment
 
 
 class Rods:
-    """m rods with round ends from a to b, (m, dim) [m], of a radius (m,) [m]. Discs and spheres are rods of no length.
+    """m rods with round ends from a to b, (m, dim) [m], of a radius (m,) [m]; without b, discs and spheres around a.
 
     They are convex, so a ray that starts inside of one has left it for good.
     """
 
-    def __init__(self, a: np.ndarray, b: np.ndarray, radius: np.ndarray):
+    def __init__(self, radius: np.ndarray, a: np.ndarray, b: np.ndarray | None = None):
+        self._discs = b is None
+        b = a if b is None else b
         self._a, self._b, self._radius = a, b, radius
-        self._round = a is b
         reach = radius[:, None]
         self._tree = BoundingTree(np.minimum(a, b) - reach, np.maximum(a, b) + reach)
 
@@ -25,7 +26,7 @@ class Rods:
         def value(q: np.ndarray, i: np.ndarray) -> np.ndarray:
             """Where ray q[.] enters rod i[.]."""
             o, d, a, b, radius = origin[q], direction[q], self._a[i], self._b[i], self._radius[i]
-            way = ball(o, d, a, radius) if self._round else capsule(o, d, a, b, radius)
+            way = ball(o, d, a, radius) if self._discs else capsule(o, d, a, b, radius)
             return entry(way, rounding(o, a, b))
 
         return self._tree.first(len(origin), most, ahead(origin, direction, 0.0), value)
