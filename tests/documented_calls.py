@@ -36,6 +36,8 @@ world.remove(new)
 world.remove([0, 1])
 found = world.near([(0, 0)], 0.5), world.nearest([(0, 0)]), world.contacts.pairs, world.broken, world.explain().splitlines()
 seen = world.events(groups=[(0, 1)]).begun.pairs, world.wall_events().ended.impulse.sum(), len(world.events().lasting)
+hits = world.ray((0, 0), (1, 0)), world.ray([(0, 0), (1, 1)], (0, -1), 3.0, radius=0.1, groups=[0], skip=[0], features=features)
+there = hits[0].met, hits[1].distance.min(), world.inside(tv.Box((0, 0), (1, 1))), world.inside(tv.Ball((0, 0), 1.0), "whole")
 clone: tv.World = world.clone(precision="f64", substeps=100)
 with tv.Recorder("b.rrd", world, every=2, budget=1_000_000, overwrite=True) as recorder:
     recorder.log()

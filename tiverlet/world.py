@@ -21,6 +21,7 @@ from .features.feature import Acceleration, Feature
 from .features.read_only import assign_whole, read_only, structure
 from .neighbours.queries import Contacts, PointSearch, near_by_all, nearest
 from .particles import Particles, at_rest, in_range, spin_of
+from .rays import Hits, inside, ray
 from .solvers.solver import Solver
 from .step import checkpoint, edit_scene
 from .step.adaptive import StepController
@@ -363,6 +364,46 @@ class World:
             self._runner.grid.finest if self._runner.grid else 2 * float(np.abs(position).max() + np.abs(points).max(initial=1.0))
         )
         return nearest(self.near, position, points, start)
+
+    def ray(
+        self, origin, direction, reach=np.inf, *, radius: float = 0.0, groups=None, skip=(), features: Iterable[Feature] | None =
+        None,
+    ) -> Hits:  # fmt: skip
+        """What rays meet first: a particle, a link between two particles, or a wall; see Hits.
+
+        origin, direction: (dim,) or (k, dim) [m], as many of both or one for all; a direction has any length above 0. reach:
+        number or (k,) [m], how far a ray goes. radius: [m] of a ball that is cast instead of a line, to see whether it gets
+        through; then distance is the way of its center, and point is where it touches. groups: particles of this group, or of
+        these, count; None for all, () for none. skip: particles that are not there for the ray, by indices, a mask or a handle.
+        Links count where both of their particles do. features: walls, and what has links, that count, such as [floor]; None for
+        all, () for none.
+
+        A particle is its disc or sphere; a point (radius 0) is met where a ray goes through it within rounding. A link is a rod
+        with the smaller of the radii of its ends, so that a rope is as thick as it looks; between points it is a line, which in
+        3D no ray meets without a radius. Links are all that pictures draw as lines and that are not broken, and the edges of
+        Polygons, numbered from body to body. Walls are where they are at world.time: a place that was assigned since is where
+        they go in the next frame. Those that are not active are not there.
+
+        A ray meets what it comes into from outside. It does not meet what it starts in, so one from the center of a particle
+        needs no skip; walls let out what is in them, and are met where they would hold a particle. A ray that starts on a
+        surface and goes in meets it at 0. Of what is met at the same distance, particles come first, then links, then walls, in
+        order.
+
+        Raises ValueError or TypeError naming the first value that makes no sense.
+        """
+        self._runner.memory.check()
+        return ray(self, origin, direction, reach, radius, groups, skip, features)
+
+    def inside(self, shape: Collider, part: str = "center") -> np.ndarray:
+        """The particles that are inside of a shape, in order, (m,).
+
+        shape: a Box, Ball, Capsule, Polygon or Mesh, which need not act in the world: what it encloses, whether as a wall it
+        keeps particles out or in; a HalfSpace, behind the plane; or an Sdf, where the function is negative. One that acts in a
+        world is where it is at that world's time. part: what has to be inside: the "center", the "whole" disc or sphere, or any
+        part of it, "touching".
+        """
+        self._runner.memory.check()
+        return inside(self, shape, part)
 
     @property
     def contacts(self) -> Contacts:

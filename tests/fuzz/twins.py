@@ -174,6 +174,9 @@ def by_questions(trial: Trial, events: list[Event]) -> None:
     blur = 1e-5 * (np.abs(x).max() + radius)
     try:
         near, (index, distance) = w.near(points, radius), w.nearest(points)
+        ways = tv.golden(np.arange(7, 12), dim=x.shape[1]) - 0.5
+        hits, held = w.ray(points, ways, features=()), w.inside(tv.Ball(points[0], radius))
+        first = w.ray(points, ways).distance
         w.explain(), w.contacts, repr(w)
     except Exception as error:  # noqa: BLE001
         door(error)
@@ -182,6 +185,16 @@ def by_questions(trial: Trial, events: list[Event]) -> None:
     wrong = (got != (apart <= radius)) & (np.abs(apart - radius) > blur)
     if wrong.any() or np.abs(distance - apart.min(axis=1)).max() > blur:
         raise Find("twin", f"near {near.tolist()}, nearest {index.tolist()} of {points.tolist()} within {radius}")
+    wrong = (np.isin(np.arange(len(x)), held) != (apart[0] <= radius)) & (np.abs(apart[0] - radius) > blur)
+    # A ray passes a center at the distance h, and is in its disc along 2 sqrt(r^2 - h^2). None is met before the first of them.
+    along = np.einsum("kid,kd->ki", x - points[:, None], ways / np.linalg.norm(ways, axis=1)[:, None])
+    h, r = np.sqrt(np.maximum(apart**2 - along**2, 0)), w.particles.radius
+    enter = along - np.sqrt(np.maximum(r**2 - h**2, 0))
+    late = hits.distance > np.where((h <= r - blur) & (enter > blur), enter, np.inf).min(axis=1) + blur
+    met = hits.particle >= 0
+    off = np.abs(np.linalg.norm(hits.point[met] - x[hits.particle[met]], axis=1) - r[hits.particle[met]])
+    if wrong.any() or late.any() or (off > blur).any() or (first > hits.distance).any():
+        raise Find("twin", f"inside {held.tolist()}, rays from {points.tolist()} along {ways.tolist()}: {hits}, {first}")
 
 
 WAYS = (by_path, by_threads, by_clone, by_copies, by_recording, by_company, by_questions)

@@ -6,6 +6,8 @@ from numpy.typing import ArrayLike
 from .. import checks
 from ..device import ti
 from ..features.feature import Knob, Scene
+from ..geometry.intervals import ball, entry, exit_of, rounding
+from ..geometry.nearest import away
 from ..particles import Particles
 from .collider import TOUCH, Collider
 from .round import rounded
@@ -25,7 +27,6 @@ class Ball(Collider):
     Nothing passes at any speed, nor can anything draw it through.
     """
 
-    dim = 0
     center = Knob(lambda f, v: checks.vector("Ball", "center", v, f.dim or len(np.atleast_1d(v))), "Middle of the ball [m].")
 
     radius = Knob(lambda f, v: f._size(v), "Of the ball [m].", device="size")
@@ -96,6 +97,25 @@ class Ball(Collider):
         if self.dim != 3 or self.inside:
             return Collider.solid(self, low, high)
         return rounded(self.center, self.center, self.radius)
+
+    def clearance(self, points: np.ndarray) -> np.ndarray:
+        """|x - center| - R outside, the opposite inside."""
+        gap = np.linalg.norm(points - self._middle, axis=1) - self.radius
+        return -gap if self.inside else gap
+
+    def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+        """Into the ball, or out of it."""
+        center = self._middle
+        way = ball(origin, direction, center, self.radius + (-radius if self.inside else radius))
+        close = rounding(origin, center[None])
+        distance = exit_of(way, close) if self.inside else entry(way, close)
+        r = origin + np.where(distance < np.inf, distance, np.nan)[:, None] * direction - center
+        return distance, away(-r if self.inside else r, np.zeros_like(r), direction, np.zeros_like(r), close)
+
+    @property
+    def _middle(self) -> np.ndarray:
+        """The center, where it is now."""
+        return self.center if self.scene is None else self.dev.center.now
 
     @ti.func
     def confine(self, i, radius, h, frame_fraction, turn):

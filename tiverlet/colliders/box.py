@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 from .. import checks
 from ..device import ti
 from ..features.feature import Knob, Scene
+from ..geometry.intervals import box, exit_of, rounding
 from ..particles import Particles
 from .collider import Collider
 
@@ -42,8 +43,7 @@ class Box(Collider):
     One-sided: a particle cannot leave at any speed, nor can anything draw it out.
     """
 
-    dim = 0
-    poses = True
+    inside = poses = True
     widest = 0.0
     lower = Knob(_corner("lower"), "Lower corner [m].")
     upper = Knob(_corner("upper"), "Upper corner [m].")
@@ -114,6 +114,36 @@ class Box(Collider):
         if not edges:
             return Collider.outline(self, low, high)
         return corners[np.array(edges)], 0.0
+
+    def clearance(self, points: np.ndarray) -> np.ndarray:
+        """The distance to the nearest side; outside, to the nearest point of the box."""
+        lower, upper = self._corners
+        off = np.maximum(np.maximum(lower - points, points - upper), 0.0)
+        within = np.minimum(points - lower, upper - points).min(axis=1)
+        return np.where((off > 0).any(axis=1), -np.linalg.norm(off, axis=1), within)
+
+    def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+        """Out of the box, at the side that is first."""
+        lower, upper = self._corners
+        lower, upper = lower + radius, upper - radius
+        finite = (np.where(np.isfinite(side), side, 0.0)[None] for side in (lower, upper))
+        close = rounding(origin, *finite)
+        distance = exit_of(box(origin, direction, lower, upper, close), close)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            sides = np.where(direction > 0, upper - origin, lower - origin) / direction
+        first = np.where(direction == 0, np.inf, sides).argmin(axis=1)
+        normal = np.zeros(origin.shape)
+        rows = np.arange(len(origin))
+        normal[rows, first] = -np.sign(direction[rows, first])
+        return distance, normal
+
+    @property
+    def _corners(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper, where they are now."""
+        if self.scene is None:
+            return self.lower, self.upper
+        sides = self.scene.memory.read(self.dev.sides)[:, 1].astype(np.float64)
+        return sides[: self.dim], sides[self.dim :]
 
     @ti.func
     def pose(self, frame_fraction):

@@ -6,6 +6,8 @@ from numpy.typing import ArrayLike
 from .. import checks
 from ..device import ti
 from ..features.feature import Knob, Scene
+from ..geometry.intervals import capsule, entry, rounding
+from ..geometry.nearest import away, on_segment
 from ..particles import Particles
 from .collider import TOUCH, Collider
 from .round import rounded
@@ -30,7 +32,6 @@ class Capsule(Collider):
     to where it meets the surface (sphere tracing, Hart 1996). Nothing can be drawn through either.
     """
 
-    dim = 0
     a, b = _end("a"), _end("b")
     radius = Knob(lambda f, v: checks.number("Capsule", "radius", v, above=0.0), "Of the rod [m].", device="size")
 
@@ -74,6 +75,24 @@ class Capsule(Collider):
     def solid(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The rod."""
         return rounded(self.a, self.b, self.radius) if len(self.a) == 3 else Collider.solid(self, low, high)
+
+    def clearance(self, points: np.ndarray) -> np.ndarray:
+        """The distance to the axis, less the radius."""
+        a, b = self._ends
+        return np.linalg.norm(points - on_segment(points, a[None], b[None])[0], axis=1) - self.radius
+
+    def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+        """Into the rod."""
+        a, b = (np.broadcast_to(end, origin.shape) for end in self._ends)
+        close = rounding(origin, a, b)
+        distance = entry(capsule(origin, direction, a, b, self.radius + radius), close)
+        x = origin + np.where(distance < np.inf, distance, np.nan)[:, None] * direction
+        return distance, away(x, on_segment(x, a, b)[0], direction, b - a, close)
+
+    @property
+    def _ends(self) -> tuple[np.ndarray, np.ndarray]:
+        """a and b, where they are now."""
+        return (self.a, self.b) if self.scene is None else (self.dev.a.now, self.dev.b.now)
 
     @ti.func
     def nearest(self, x, a, b):

@@ -19,9 +19,9 @@ class Collider(Feature):
     """Keeps each particle by itself on one side of a wall, with the last word in every iteration.
 
     Subclasses give confine(), which finds how deep a particle is and calls dev.surface.press(): that of the Surface that each
-    holds. One-sided: what entered in this substep is taken back whole, at any speed, whether it flew in or constraints, contacts,
-    friction or a bounce off another wall took it there. Depth from before (a bad start) is left at `push_out` [m/s], and gives no
-    more velocity than that.
+    holds; and for questions of the host, clearance() and cast(). One-sided: what entered in this substep is taken back whole, at
+    any speed, whether it flew in or constraints, contacts, friction or a bounce off another wall took it there. Depth from before
+    (a bad start) is left at `push_out` [m/s], and gives no more velocity than that.
 
     Where one correction may lead into a wall again (several walls, a box in whose corners particles bounce), corrections take
     turns until none changes anything: SWEEPS rounds as they come, then ROUNDS without friction and bounces, which are projections
@@ -55,6 +55,8 @@ class Collider(Feature):
     _stands = True  # on the device
     sweeps = False  # needs the exact position at the start of the substep
     repeats = False  # one confine() may leave a particle that rubs or bounces where it has to be confined again
+    dim = 0  # 2 or 3; 0 while it is not known
+    inside = False  # particles are kept inside of it
     poses = False  # has a pose(when) to be worked out once for each substep, before any confine()
 
     def surface(self, friction: Any, restitution: Any, push_out: float, active: bool | None, events: bool = False) -> None:
@@ -90,6 +92,11 @@ class Collider(Feature):
         return self._stands and not self.active
 
     @property
+    def stands(self) -> bool:
+        """Whether it is there, as the last frame had it."""
+        return self.active if self.scene is None else self._stands
+
+    @property
     def has_switch(self) -> bool:
         """Whether it can be switched off, by the kernels as they are or are to be."""
         return self._switch or not self.active or self._built("surface", "has_switch")
@@ -117,6 +124,21 @@ class Collider(Feature):
     def solid(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """For pictures of a 3D scene between two corners: vertices (v, 3) and triangles (t, 3); none where lines say more."""
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
+
+    def clearance(self, points: np.ndarray) -> np.ndarray:
+        """C(x) of points (k, dim): how far they are from the wall [m], negative inside of it, (k,).
+
+        In a world, the wall is where the last frame took it: a place that is assigned is where it goes in the next one.
+        """
+        raise NotImplementedError
+
+    def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+        """How far balls of a radius [m] go until the wall stops them, and its normals there.
+
+        origin: (k, dim) [m]. direction: (k, dim), unit. Returns the lengths (k,) [m], inf where nothing is met, and unit normals
+        (k, dim), against the direction: where clearance() falls to `radius` from above. A wall lets out what starts in it.
+        """
+        raise NotImplementedError
 
     @ti.func
     def may_touch(self, i, radius):

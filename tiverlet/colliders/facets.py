@@ -1,6 +1,7 @@
 """Shapes made of facets: segments in 2D, triangles in 3D."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -9,6 +10,7 @@ from ..features.feature import Scene
 from ..particles import Particles
 from .collider import TOUCH
 from .facet_grid import FacetGrid
+from .facet_solid import FacetSolid
 from .shape import Shape
 
 NEWTON = 16  # steps to the moment of a touch; only what grazes needs more than 3
@@ -34,6 +36,19 @@ class Facets:
     def normals(self) -> np.ndarray:
         """Outward unit normals of the facets, (m, dim)."""
         return facet_normals(self.corners)
+
+    @cached_property
+    def _solid(self) -> FacetSolid:
+        """For questions of the host; made when the first is asked."""
+        return FacetSolid(self)
+
+    def clearance(self, points: np.ndarray) -> np.ndarray:
+        """How far points of this frame are from the facets, negative behind them, (k,) [m]."""
+        return self._solid.clearance(points)
+
+    def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+        """As Collider.cast(), in this frame; radius: with what the facets are thickened by."""
+        return self._solid.cast(origin, direction, radius)
 
     def check_thickness(self, who: str, particles: Particles, radius: float) -> None:
         """Refuse points that meet a wall without thickness: a point on it would have no side."""

@@ -6,6 +6,7 @@ from numpy.typing import ArrayLike
 from .. import checks
 from ..device import ti
 from ..features.feature import Knob, Scene
+from ..geometry.intervals import entry, rounding, slab
 from ..particles import Particles
 from .collider import Collider
 
@@ -74,6 +75,22 @@ class HalfSpace(Collider):
         ends = self.outline(low, high)[0]
         corners = np.array([ends[0, 0], ends[1, 0], ends[0, 1], ends[1, 1]])
         return corners, np.array([[0, 1, 2], [0, 2, 3]])
+
+    def clearance(self, points: np.ndarray) -> np.ndarray:
+        """n . x - offset."""
+        return points @ self.normal - self._plane
+
+    def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+        """Down to the plane."""
+        end = self._plane + radius
+        close = rounding(origin, np.array([[end]]))
+        way = slab(origin @ self.normal, direction @ self.normal, -np.inf, end, close)
+        return entry(way, close), np.tile(self.normal, (len(origin), 1))
+
+    @property
+    def _plane(self) -> float:
+        """The offset, where the plane is now [m]."""
+        return float(self.offset if self.scene is None else self.scene.memory.read(self.dev.offset)[0, 1])  # type: ignore[arg-type]
 
     @ti.func
     def confine(self, i, radius, h, frame_fraction, turn):

@@ -125,6 +125,17 @@ class Mesh(Moving):
         """Its facets."""
         return FacetShape(self.facets, scene, repr(self), self.radius)
 
+    def clearance(self, points: np.ndarray) -> np.ndarray:
+        """The distance to the facets, less what they are thickened by."""
+        position, turn = self.frame(self.dim)
+        return self.facets.clearance((points - position) @ turn) - self.radius
+
+    def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+        """In the frame of the facets."""
+        position, turn = self.frame(self.dim)
+        distance, normal = self.facets.cast((origin - position) @ turn, direction @ turn, self.radius + radius)
+        return distance, normal @ turn.T
+
     @property
     def normals(self) -> np.ndarray:
         """Outward unit normals of the faces, (m, 3)."""

@@ -45,7 +45,6 @@ class Moving(Collider):
 
     bulk = 1.5
     sweeps = poses = True
-    dim = 0
     radius: Any = Knob(
         lambda f, v: checks.number(repr(f), "radius", v, least=0.0), "It is rounded by so much [m].", compiled=True
     )
@@ -88,6 +87,13 @@ class Moving(Collider):
     def placed(self, points: np.ndarray) -> np.ndarray:
         """Where points (..., dim) of the wall's frame are in the world, for pictures."""
         return points @ rotation_matrix(self.rotation).T + self.position
+
+    def frame(self, dim: int) -> tuple[np.ndarray, np.ndarray]:
+        """Its position (dim,) [m] and rotation matrix, where it is now; in a world, or for as many dimensions."""
+        position, rotation = np.asarray(self.position), self.rotation
+        if self.scene is not None:
+            position, rotation = self.dev.pose.position.now, self.dev.pose.rotation.now
+        return position, rotation_matrix(rotation) if np.any(rotation) else np.eye(dim)
 
     @ti.func
     def pose(self, frame_fraction):

@@ -19,6 +19,11 @@ from .shape import Shape
 MARCH = 64  # steps along a way; what has not come to its end by then stays where it is
 FINE = 1 / 64  # of a way: closer than that, the surface is taken for its tangent plane
 SAMPLES = 4096  # places where the function is looked at before it is used
+CAST = 1 << 14  # steps along a ray; one that grazes a plane at less than 1e-3 may miss it
+STRIDE = 2.0**-16  # of the size of the scene: the shortest step of a ray; nothing that is as thin is seen from its side
+SKIN = 2.0**-40  # of the size of the scene: rays that start no deeper than that are outside
+AWAY = 1e16  # [m] where no particle can be
+SLOPE = 1e-6  # of the largest coordinate: the step of differences at a surface
 STEEP, FLAT = 1.1, 0.9  # bounds of the gradient that pass for 1
 
 
@@ -59,7 +64,7 @@ class Sdf(Moving):
         """Check the dimension, and refuse a function that is not finite, or not a distance, around the particles."""
         Moving.prepare(self, particles, inv_mass)
         runtime.ensure_started()
-        self.dev.probe = _Probe(self)
+        self.dev.probe = _Probe(self, self.dim)
         x = particles.position
         if not len(x):
             return
@@ -111,6 +116,32 @@ class Sdf(Moving):
                 local = (grid.reshape(-1, self.dim) - self.position) @ rotation_matrix(self.rotation)
                 out.append(contour(grid, self.dev.probe.value(local).reshape(129, 129) - self.radius))
         return np.concatenate(out), 0.0
+
+    def clearance(self, points: np.ndarray) -> np.ndarray:
+        """What the function says, less the radius."""
+        position, turn = self.frame(points.shape[1])
+        return self._probe(points.shape[1]).value((points - position) @ turn) - self.radius
+
+    def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+        """By sphere tracing; the normal is the gradient."""
+        position, turn = self.frame(origin.shape[1])
+        probe = self._probe(origin.shape[1])
+        o, d, radius = (origin - position) @ turn, direction @ turn, self.radius + radius
+        distance, normal = probe.cast(o, d, radius), np.full(o.shape, np.nan)
+        met = distance < np.inf
+        x = o[met] + distance[met, None] * d[met]
+        step = SLOPE * (float(np.abs(x).max(initial=0.0)) or 1.0)
+        slope = probe.gradient(x) if self.gradient else probe.slope(x, step)
+        size = np.linalg.norm(slope, axis=1)[:, None]
+        normal[met] = np.where(size > 0, slope / np.where(size > 0, size, 1.0), -d[met]) @ turn.T
+        return distance, normal
+
+    def _probe(self, dim: int) -> "_Probe":
+        """The function on the host; outside of any world, too, for as many dimensions as it is asked about."""
+        if "probe" not in vars(self.dev) or self.dev.probe.dim != dim:
+            runtime.ensure_started()
+            self.dev.probe = _Probe(self, dim)
+        return self.dev.probe
 
 
 class FunctionShape(Shape):
@@ -217,16 +248,23 @@ class FunctionShape(Shape):
 class _Probe:
     """The function at many places, in Python and f64."""
 
-    def __init__(self, wall: Sdf):
+    def __init__(self, wall: Sdf, dim: int):
         self.compiler = Compiler(ti.f64)
         self.wall: Any = wall
-        self.dim = wall.dim
+        self.dim = dim
 
     def value(self, points: np.ndarray) -> np.ndarray:
         """The function at points (n, dim) of the wall's frame, (n,)."""
         out = np.zeros(len(points))
         with self.compiler():
             self._value(np.ascontiguousarray(points, dtype=np.float64), out)
+        return out
+
+    def cast(self, points: np.ndarray, direction: np.ndarray, radius: float) -> np.ndarray:
+        """How far rays go until the function falls to `radius` from above, (n,) [m], inf where it does not in CAST steps."""
+        out = np.zeros(len(points))
+        with self.compiler():
+            self._cast(np.ascontiguousarray(points), np.ascontiguousarray(direction), radius, out)
         return out
 
     def slope(self, points: np.ndarray, step: float) -> np.ndarray:
@@ -250,6 +288,45 @@ class _Probe:
     def _value(self, points: ti.types.ndarray(ti.f64, 2), out: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
         for i in range(points.shape[0]):
             out[i] = self.wall.function(self._point(points, i))
+
+    @ti.kernel
+    def _cast(
+        self, points: ti.types.ndarray(ti.f64, 2), direction: ti.types.ndarray(ti.f64, 2), radius: ti.f64,
+        out: ti.types.ndarray(ti.f64, 1),
+    ):  # type: ignore[valid-type]  # fmt: skip
+        """Steps as long as there is nothing for certain (Hart 1996), out of the solid first where a ray starts in it; then the
+        step in which the surface was passed is halved until nothing is left of it."""
+        for i in range(points.shape[0]):
+            o, d = self._point(points, i), self._point(direction, i)
+            size = ti.abs(o).max()  # type: ignore[reportOptionalCall]
+            t, low, high, fine, found = 0 * size, 0 * size, 0 * size - 1, 0 * size, 0 * size + np.inf
+            outside, going = False, True
+            for k in range(CAST):
+                if going:
+                    gap = self.wall.function(o + t * d) - radius
+                    if high >= 0:
+                        if gap > 0:
+                            low = t
+                        else:
+                            high = t
+                    else:
+                        if k == 0:
+                            size = ti.max(size, ti.max(ti.abs(gap), radius))
+                            if size == 0:
+                                size = 1
+                            fine = size * STRIDE
+                        if outside and gap <= 0:
+                            high = t
+                        else:
+                            outside = gap > 0 or (k == 0 and gap >= -size * SKIN)
+                            low = t
+                            t += ti.max(ti.abs(gap), fine)
+                            going = t < AWAY
+                    if high >= 0:
+                        t = (low + high) / 2
+                        if not low < t < high:
+                            found, going = low, False
+            out[i] = found
 
     @ti.kernel
     def _gradient(self, points: ti.types.ndarray(ti.f64, 2), out: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]

@@ -25,6 +25,11 @@ class Track:
         """Stay where the last frame ended."""
         self._memory.write(self.ends, [self._memory.read(self.ends)[1]] * 2)
 
+    @property
+    def now(self) -> np.ndarray:
+        """Where the last frame ended, (dim,)."""
+        return self._memory.read(self.ends)[1].astype(np.float64)
+
     @ti.func
     def at(self, frame_fraction):
         """Where it is at the fraction `when` of the frame; what stands is where it stands, to the bit."""

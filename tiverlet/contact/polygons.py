@@ -85,6 +85,13 @@ class Polygons(PairContact):
         self._keep(loops=[number[loop].astype(np.int32) for loop in whole])
         self.arguments = {**self.arguments, "loops": self.loops}
 
+    def rods(self) -> tuple[np.ndarray, np.ndarray]:
+        """Their edges, numbered from body to body."""
+        if not self.loops:
+            return PairContact.rods(self)
+        ends = np.concatenate([np.stack([loop, np.roll(loop, -1)], axis=1) for loop in self.loops])
+        return ends, np.arange(len(ends))
+
     def join(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
         """Declare the fields, among them the neighbour list's, which is returned."""
         n, add, dev = scene.particles.count, scene.memory.field, self.dev

@@ -145,6 +145,10 @@ class Feature(RecordsArguments):
     def remap_indices(self, number: np.ndarray, count: int) -> None:
         """Take the new numbers of its particles, of which there are `count` now, and leave out what had one that goes."""
 
+    def rods(self) -> tuple[np.ndarray, np.ndarray]:
+        """What rays meet of it between two particles: these, (k, 2), and which of its links that is, (k,)."""
+        return np.zeros((0, 2), dtype=np.int64), np.zeros(0, dtype=np.int64)
+
     def __repr__(self) -> str:
         return type(self).__name__
 
@@ -286,6 +290,13 @@ class Batch(Feature):
     def select(self, some: np.ndarray, number: np.ndarray) -> None:
         """Keep the particles of these constraints, by their new numbers."""
         self._keep(members=self.members.remapped(some, number))
+
+    def rods(self) -> tuple[np.ndarray, np.ndarray]:
+        """What has two corners, which pictures draw as lines, and is not broken."""
+        if self.arity != 2:
+            return Feature.rods(self)
+        whole = np.flatnonzero(~self.broken)
+        return self.indices[whole], whole
 
     def excluded_pairs(self, particles: "Particles") -> np.ndarray:
         """Pairs of particles that may overlap, (k, 2), because this batch says where they are to each other."""

@@ -9,6 +9,7 @@ from . import (  # noqa: F401  (they register their rows)
     linked,
     motion,
     networks,
+    rays,
     sheets,
     spinning,
     taut,

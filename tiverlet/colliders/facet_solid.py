@@ -1,0 +1,131 @@
+"""What facets enclose, as the host sees it: which points are inside, and where rays come in."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..geometry.bounding_tree import BoundingTree, ahead, apart, beyond
+from ..geometry.intervals import ROUNDING, dot, entry, rounded, rounding, triangle
+from ..geometry.nearest import away, on_facet
+
+if TYPE_CHECKING:
+    from .facets import Facets
+
+PIECES = 1 << 12  # of a solid on the way out of it, at most
+
+
+class FacetSolid:
+    """Facets in the frame of the collider that holds them, in a tree; the solid is what is behind them, or near to them."""
+
+    def __init__(self, facets: "Facets"):
+        self._facets = facets
+        self._tree = BoundingTree(facets.corners.min(axis=1), facets.corners.max(axis=1))
+        self._normals, self._size = facets.normals, float(np.abs(facets.corners).max())
+
+    def clearance(self, points: np.ndarray) -> np.ndarray:
+        """The distance of points to the facets, (k,) [m]; negative behind them where they are closed.
+
+        Behind is where the mean normal of the nearest facet, edge or corner points away from (Baerentzen and Aanaes 2005).
+        """
+        corners = self._facets.corners
+
+        def distance(q: np.ndarray, f: np.ndarray) -> np.ndarray:
+            """Of point q[i] to facet f[i]."""
+            r = points[q] - on_facet(points[q], corners[f])[0]
+            return np.sqrt(dot(r, r))
+
+        length, f = self._tree.first(len(points), np.full(len(points), np.inf), apart(points), distance)
+        if self._facets.closed and len(points):
+            at, part = on_facet(points, corners[f])
+            facing = np.where((part < 0)[:, None], self._normals[f], self._facets.facing[self._facets.features[f, part]])
+            length = np.where(dot(points - at, facing) < 0, -length, length)
+        return length
+
+    def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+        """How far rays go until they come within `radius` of the facets from outside, (k,) [m], and the normals, (k, dim)."""
+        distance, f = self._bare(origin, direction) if radius == 0 else self._thick(origin, direction, radius)
+        met = f >= 0
+        d, corners = direction[met], self._facets.corners[f[met]]
+        normal = np.full(origin.shape, np.nan)
+        if radius == 0:
+            n = self._normals[f[met]]
+            normal[met] = np.where((dot(n, d) > 0)[:, None], -n, n)
+        else:
+            x = origin[met] + distance[met, None] * d
+            normal[met] = away(x, on_facet(x, corners)[0], d, np.zeros_like(d), np.zeros(len(d)))
+        return distance, normal
+
+    def _bare(self, origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Distances, and which facets: of closed ones those that are seen from in front."""
+        corners, closed = self._facets.corners, self._facets.closed
+
+        def enter(q: np.ndarray, f: np.ndarray) -> np.ndarray:
+            """Where ray q[i] passes facet f[i]."""
+            o, d, c = origin[q], direction[q], corners[f]
+            t, _ = triangle(o, d, c)
+            slope = dot(d, self._normals[f])
+            with np.errstate(divide="ignore"):
+                close = rounding(o, c[:, 0], c[:, 1]) / np.abs(slope)
+            if not closed:
+                return entry((t, t), close)
+            return np.where((t >= -close) & (slope < 0), np.maximum(t, 0.0), np.inf)
+
+        return self._tree.first(len(origin), np.full(len(origin), np.inf), ahead(origin, direction, 0.0), enter)
+
+    def _thick(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+        """The same, of the facets whose surroundings are entered first; what starts in the solid goes out of it before."""
+        start = self._way_out(origin, direction, radius)
+        distance, f = np.full(len(origin), np.inf), np.full(len(origin), -1)
+        some = start < np.inf
+        o, d = origin[some] + start[some, None] * direction[some], direction[some]
+        corners = self._facets.corners
+
+        def enter(q: np.ndarray, f: np.ndarray) -> np.ndarray:
+            """Where ray q[i] comes near facet f[i]."""
+            c = corners[f]
+            return entry(rounded(o[q], d[q], c, radius), rounding(o[q], c[:, 0], c[:, 1]) + ROUNDING * radius)
+
+        more, f[some] = self._tree.first(len(o), np.full(len(o), np.inf), ahead(o, d, radius), enter)
+        distance[some] = start[some] + more
+        return distance, f
+
+    def _way_out(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> np.ndarray:
+        """How far rays go until they are out of the solid that they start in: 0 outside of it, inf where there is no way out."""
+        close = rounding(origin) + ROUNDING * (self._size + radius)
+        t, going = np.zeros(len(origin)), np.arange(len(origin))
+        if not (self._facets.closed and self._facets.inside):
+            low, high = self._facets.corners.min(axis=(0, 1)), self._facets.corners.max(axis=(0, 1))
+            going = np.flatnonzero(((origin > low - radius) & (origin < high + radius)).all(axis=1))
+        for _ in range(PIECES):
+            x = origin[going] + t[going, None] * direction[going]
+            gap = self.clearance(x)
+            within = gap < radius - close[going]
+            going, x, deep = going[within], x[within], gap[within] < close[going][within] - radius
+            if not len(going):
+                break
+            step = self._step_out(x, direction[going], radius, close[going], deep)
+            t[going] += step
+            going = going[(step > 0) & (step < np.inf)]
+        return t
+
+    def _step_out(self, x: np.ndarray, d: np.ndarray, radius: float, close: np.ndarray, deep: np.ndarray) -> np.ndarray:
+        """From places in the solid to the end of the surroundings of facets that they are in; if deep, to the next facet."""
+        corners = self._facets.corners
+        to_boxes, out_of_boxes = ahead(x, d, 0.0), beyond(x, d, radius)
+
+        def bound(q: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+            """Of boxes around facets."""
+            return np.where(deep[q][:, None], to_boxes(q, low, high), out_of_boxes(q, low, high))
+
+        def value(q: np.ndarray, f: np.ndarray) -> np.ndarray:
+            """Where ray q[i] passes facet f[i]; or the negative of where it leaves the surroundings, to find the last one."""
+            out, some = np.full(len(q), np.inf), deep[q]
+            enter, _ = triangle(x[q[some]], d[q[some]], corners[f[some]])
+            out[some] = np.where(enter > close[q[some]], enter, np.inf)
+            some = ~some
+            enter, leave = rounded(x[q[some]], d[q[some]], corners[f[some]], radius)
+            out[some] = np.where((enter <= close[q[some]]) & (leave > close[q[some]]), -leave, np.inf)
+            return out
+
+        step, f = self._tree.first(len(x), np.full(len(x), np.inf), bound, value)
+        return np.where(f >= 0, np.abs(step), np.where(deep, np.inf, 0.0))

@@ -1,0 +1,180 @@
+"""Which of many boxes to look at first, for many questions at once: a bounding volume hierarchy."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+WIDE = 4  # children of a node, and boxes in a leaf
+FEW = 1 << 13  # pairs of a question and a box that are all looked at, in less time than a tree is made
+ONCE = 2  # questions for which no tree pays, however many boxes there are
+CHUNK = 1 << 14  # questions that go through the tree together
+TINY = 1e-300  # component of a direction that stands for 0: what is beside a slab stays there
+SLACK = 2.0**-40  # of the largest coordinate: boxes are larger by so much, for what rounds
+
+Answer = tuple[np.ndarray, np.ndarray]
+
+
+class BoundingTree:
+    """Boxes from low to high, (m, dim) each, none of them empty.
+
+    Boxes are sorted along a Morton curve through the ranks of their middles: ranks, so that one that is far away harms no other.
+    Four of them make a leaf, and four nodes one of the level above. All questions go down at the same time, each by its own
+    stack, to what is nearest first.
+    """
+
+    def __init__(self, low: np.ndarray, high: np.ndarray):
+        slack = SLACK * max(np.abs(low).max(initial=0.0), np.abs(high).max(initial=0.0))
+        self.low, self.high, self.count = low - slack, high + slack, len(low)
+        self._first = -1  # leaf, once the tree is made
+
+    def first(self, questions: int, most: np.ndarray, bound: Callable, value: Callable) -> Answer:
+        """For each question the least value of all boxes, at most most[q], and which box has it; (inf, -1) where none has one.
+
+        bound(q, low, high): for questions q (k,) and boxes around several of them, (k, ..., dim): no more than the values in
+        there, inf where there are none. value(q, b): of question q[i] and box b[i]. Of equal ones the box of the lower number is
+        taken, whichever way it is found.
+        """
+        if not self.count or not questions:
+            return np.full(questions, np.inf), np.full(questions, -1)
+        all_of_them = questions <= ONCE or questions * self.count <= FEW
+        step = max(1, FEW // self.count) if all_of_them else CHUNK
+        chunks = [np.arange(q, min(q + step, questions)) for q in range(0, questions, step)]
+        if not all_of_them and self._first < 0:
+            self._grow()
+        answers = [
+            self._compare(q, most[q], bound, value) if all_of_them else self._descend(q, most[q], bound, value) for q in chunks
+        ]
+        return np.concatenate([a for a, _ in answers]), np.concatenate([b for _, b in answers])
+
+    def _compare(self, some: np.ndarray, most: np.ndarray, bound: Callable, value: Callable) -> Answer:
+        """All boxes."""
+        with np.errstate(over="ignore"):
+            near = bound(some, self.low[None], self.high[None])
+        values = np.full(near.shape, np.inf)
+        q, b = np.nonzero((near <= most[:, None]) & (near < np.inf))
+        values[q, b] = value(some[q], b)
+        at = values.argmin(axis=1)
+        best = values[np.arange(len(some)), at]
+        found = (best <= most) & (best < np.inf)
+        return np.where(found, best, np.inf), np.where(found, at, -1)
+
+    def _grow(self) -> None:
+        """Sort the boxes, and make the nodes from the leaves up; what is missing in the last ones is NaN, which nothing meets."""
+        dim = self.low.shape[1]
+        depth = 0
+        while WIDE ** (depth + 1) < self.count:
+            depth += 1
+        order = np.argsort(_morton(self.low / 2 + self.high / 2), kind="stable")
+        self._items = np.full(WIDE ** (depth + 1), -1)
+        self._items[: self.count] = order
+        low, high = (np.full((len(self._items), dim), np.nan) for _ in range(2))
+        low[: self.count], high[: self.count] = self.low[order], self.high[order]
+        lows, highs = [], []
+        for _ in range(depth + 1):
+            low, high = np.fmin.reduce(low.reshape(-1, WIDE, dim), axis=1), np.fmax.reduce(high.reshape(-1, WIDE, dim), axis=1)
+            lows.append(low)
+            highs.append(high)
+        self._low, self._high = np.concatenate(lows[::-1]), np.concatenate(highs[::-1])
+        self._first, self._depth = (WIDE**depth - 1) // (WIDE - 1), depth
+
+    def _descend(self, some: np.ndarray, most: np.ndarray, bound: Callable, value: Callable) -> Answer:
+        """Through the tree."""
+        best, found = most.astype(float), np.full(len(some), -1)
+        room = (WIDE - 1) * self._depth + 2
+        node, least = np.zeros((len(some), room), dtype=np.int32), np.full((len(some), room), -np.inf)
+        top = np.ones(len(some), dtype=np.int32)
+        going = np.arange(len(some))
+        while len(going):
+            top[going] -= 1
+            here, enough = node[going, top[going]], least[going, top[going]] <= best[going]
+            leaf = here >= self._first
+            rows = going[leaf & enough]
+            if len(rows):
+                self._look(rows, here[leaf & enough], some, best, found, value)
+            rows, here = going[~leaf & enough], here[~leaf & enough]
+            if len(rows):
+                children = WIDE * here[:, None] + np.arange(1, WIDE + 1)
+                with np.errstate(invalid="ignore", over="ignore"):
+                    near = bound(some[rows], self._low[children], self._high[children])
+                    near = np.where(near <= best[rows, None], near, np.inf)
+                order = np.argsort(-near, axis=1, kind="stable")
+                for k in range(WIDE):
+                    pick = order[:, k]
+                    at = np.arange(len(rows))
+                    wanted = near[at, pick] < np.inf
+                    r, at, pick = rows[wanted], at[wanted], pick[wanted]
+                    node[r, top[r]], least[r, top[r]] = children[at, pick], near[at, pick]
+                    top[r] += 1
+            going = going[top[going] > 0]
+        return np.where(found >= 0, best, np.inf), found
+
+    def _look(self, rows, here, some, best, found, value) -> None:
+        """At the boxes of one leaf for each row."""
+        items = self._items[WIDE * (here - self._first)[:, None] + np.arange(WIDE)]
+        there = items >= 0
+        values = np.full(items.shape, np.inf)
+        values[there] = value(np.broadcast_to(some[rows][:, None], items.shape)[there], items[there])
+        least = values.min(axis=1)
+        number = np.where(values == least[:, None], np.where(there, items, self.count), self.count).min(axis=1)
+        before = found[rows]
+        better = (least < best[rows]) | ((least == best[rows]) & ((before < 0) | (number < before)))
+        better &= least < np.inf
+        best[rows[better]], found[rows[better]] = least[better], number[better]
+
+
+def ahead(origin: np.ndarray, direction: np.ndarray, extra: float) -> Callable:
+    """A bound for rays: how far it is to a box that is larger by `extra` [m]."""
+    inverse = 1.0 / np.where(np.abs(direction) < TINY, TINY, direction)
+    extra = extra + SLACK * np.abs(origin).max(axis=1)
+
+    def bound(q: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """Where the slabs of all axes are entered, if that is before any is left."""
+        enter, leave = _slabs(origin[q], inverse[q], extra[q], low, high)
+        return np.where((enter <= leave) & (leave >= 0), np.maximum(enter, 0.0), np.inf)
+
+    return bound
+
+
+def beyond(origin: np.ndarray, direction: np.ndarray, extra: float) -> Callable:
+    """A bound for rays in boxes that are larger by `extra` [m]: the negative of how far it is until one is left."""
+    inverse = 1.0 / np.where(np.abs(direction) < TINY, TINY, direction)
+    extra = extra + SLACK * np.abs(origin).max(axis=1)
+
+    def bound(q: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """Where the first slab of a box is left, of those that the ray starts in."""
+        enter, leave = _slabs(origin[q], inverse[q], extra[q], low, high)
+        return np.where((enter <= 0) & (leave >= 0), -leave, np.inf)
+
+    return bound
+
+
+def apart(points: np.ndarray) -> Callable:
+    """A bound for points: how far they are from a box."""
+
+    def bound(q: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """The length of what is missing along the axes."""
+        x = points[q][:, None]
+        off = np.maximum(np.maximum(low - x, x - high), 0.0)
+        distance = np.sqrt((off * off).sum(axis=-1))
+        return np.where(distance >= 0, distance, np.inf)
+
+    return bound
+
+
+def _slabs(origin, inverse, extra, low, high) -> tuple[np.ndarray, np.ndarray]:
+    """Where rays enter the last slab of boxes (k, b, dim), and where they leave the first."""
+    o, i, e = origin[:, None], inverse[:, None], extra[:, None, None]
+    one, two = (low - e - o) * i, (high + e - o) * i
+    return np.minimum(one, two).max(axis=-1), np.maximum(one, two).min(axis=-1)
+
+
+def _morton(middle: np.ndarray) -> np.ndarray:
+    """Numbers whose order is that of a curve which stays close: the bits of the ranks along the axes, one after the other."""
+    out = np.zeros(len(middle), dtype=np.int64)
+    ranks = [np.unique(middle[:, k], return_inverse=True)[1].ravel() for k in range(middle.shape[1])]
+    bits = min(62 // middle.shape[1], len(middle).bit_length())
+    for k, rank in enumerate(ranks):
+        rank = rank * ((1 << bits) - 1) // max(1, int(rank.max()))
+        for b in range(bits):
+            out |= ((rank >> b) & 1) << (b * middle.shape[1] + k)
+    return out

@@ -1,0 +1,154 @@
+"""Where a straight line is inside of convex things: from one distance along it to another, (inf, -inf) where it misses.
+
+A line is origin + t direction, of unit direction; origins and directions are (m, dim), and so is what they are compared with,
+row by row. What a line only grazes, within rounding, it enters and leaves in the same place.
+"""
+
+import numpy as np
+
+ROUNDING = 2.0**-44  # of the largest length that a result is made of: sums of some terms, each within 2^-53 of its own
+PARALLEL = 2.0**-96  # square of the sine of an angle that is nothing but rounding
+
+Interval = tuple[np.ndarray, np.ndarray]
+
+
+def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Of rows."""
+    return np.einsum("...i,...i->...", a, b)
+
+
+def rounding(*vectors: np.ndarray) -> np.ndarray:
+    """What it amounts to in results that are made of these rows [m]."""
+    size = np.abs(vectors[0]).max(axis=-1)
+    for v in vectors[1:]:
+        size = np.maximum(size, np.abs(v).max(axis=-1))
+    return ROUNDING * size
+
+
+def entry(interval: Interval, close: np.ndarray) -> np.ndarray:
+    """How far a ray goes until it enters, inf where it does not.
+
+    It does not enter what it starts inside of. A start on the surface, within `close`, enters at 0 if the way leads in; not where
+    the thing ends there, as what has no thickness does.
+    """
+    enter, leave = interval
+    with np.errstate(invalid="ignore"):
+        return np.where((enter >= -close) & (leave > close), np.maximum(enter, 0.0), np.inf)
+
+
+def exit_of(interval: Interval, close: np.ndarray) -> np.ndarray:
+    """How far a ray goes until it leaves, into what is all around, inf where it does not; 0 where it leaves at its start."""
+    enter, leave = interval
+    with np.errstate(invalid="ignore"):
+        return np.where((leave >= -close) & (enter < leave), np.maximum(leave, 0.0), np.inf)
+
+
+def union(*intervals: Interval) -> Interval:
+    """Of pieces of one convex thing."""
+    enter, leave = intervals[0]
+    for a, b in intervals[1:]:
+        enter, leave = np.minimum(enter, a), np.maximum(leave, b)
+    return enter, leave
+
+
+def common(*intervals: Interval) -> Interval:
+    """What all of them have."""
+    enter, leave = intervals[0]
+    for a, b in intervals[1:]:
+        enter, leave = np.maximum(enter, a), np.minimum(leave, b)
+    return _unless(enter > leave, enter, leave)
+
+
+def ball(origin: np.ndarray, direction: np.ndarray, center: np.ndarray, radius) -> Interval:
+    """Within `radius` of a center; a radius below 0 leaves nothing."""
+    m = origin - center
+    middle = -dot(m, direction)
+    return _chord(middle, m + middle[:, None] * direction, np.ones(len(m)), radius, rounding(m, origin))
+
+
+def capsule(origin: np.ndarray, direction: np.ndarray, a: np.ndarray, b: np.ndarray, radius) -> Interval:
+    """Within `radius` of the segment from a to b: a cylinder and two balls."""
+    axis = b - a
+    length = np.sqrt(dot(axis, axis))
+    u = axis / np.where(length > 0, length, 1.0)[:, None]
+    m = origin - a
+    along, speed = dot(m, u), dot(direction, u)
+    mp, dp = m - along[:, None] * u, direction - speed[:, None] * u
+    square = dot(dp, dp)
+    lies = square <= PARALLEL
+    square = np.where(lies, 1.0, square)
+    middle = np.where(lies, 0.0, -dot(mp, dp) / square)
+    close = rounding(m, origin, axis)
+    enter, leave = _chord(middle, mp + middle[:, None] * np.where(lies[:, None], 0.0, dp), square, radius, close)
+    within = enter <= leave
+    enter, leave = np.where(lies & within, -np.inf, enter), np.where(lies & within, np.inf, leave)
+    rod = common((enter, leave), slab(along, speed, -close, length + close))
+    return union(rod, ball(origin, direction, a, radius), ball(origin, direction, b, radius))
+
+
+def slab(place: np.ndarray, speed: np.ndarray, low, high, close: np.ndarray | float = 0.0) -> Interval:
+    """Where low <= place + t speed <= high; these may be infinite. What is as near to one of them as `close` begins there."""
+    stands = speed == 0
+    inverse = 1.0 / np.where(stands, 1.0, speed)
+    below, above = low - place, high - place
+    below, above = np.where(np.abs(below) <= close, 0.0, below), np.where(np.abs(above) <= close, 0.0, above)
+    one, two = below * inverse, above * inverse
+    inside = (below <= 0) & (above >= 0)
+    enter = np.where(stands, np.where(inside, -np.inf, np.inf), np.minimum(one, two))
+    leave = np.where(stands, np.where(inside, np.inf, -np.inf), np.maximum(one, two))
+    return _unless((enter > leave) | (below > above), enter, leave)
+
+
+def box(origin: np.ndarray, direction: np.ndarray, low: np.ndarray, high: np.ndarray, close: np.ndarray) -> Interval:
+    """Between two corners (dim,)."""
+    return common(*(slab(origin[:, k], direction[:, k], low[k], high[k], close) for k in range(origin.shape[1])))
+
+
+def triangle(origin: np.ndarray, direction: np.ndarray, corners: np.ndarray) -> Interval:
+    """The one place of a facet, corners (m, dim, dim), segments in 2D: found so that lines cannot pass between neighbours.
+
+    On which side of a corner (2D) or an edge (3D) a line passes is worked out alike for all facets that have it, to the bit.
+    """
+    if origin.shape[1] == 2:
+        sides = _turn(direction[:, None], corners - origin[:, None])
+        sides = np.stack([sides[:, 0], -sides[:, 1]], axis=1)
+        edge = corners[:, 1] - corners[:, 0]
+        normal = np.stack([edge[:, 1], -edge[:, 0]], axis=1)
+    else:
+        r = corners - origin[:, None]
+        sides = dot(direction[:, None], np.cross(r, r[:, [1, 2, 0]]))  # cross(b, a) is -cross(a, b) to the bit
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    across = dot(normal, direction)
+    hit = ((sides >= 0).all(axis=1) | (sides <= 0).all(axis=1)) & (across != 0)
+    t = dot(normal, corners[:, 0] - origin) / np.where(hit, across, 1.0)
+    return _unless(~hit, t, t)
+
+
+def rounded(origin: np.ndarray, direction: np.ndarray, corners: np.ndarray, radius) -> Interval:
+    """Within `radius` of a facet, corners (m, dim, dim): capsules around its edges, and in 3D the prism between them."""
+    if origin.shape[1] == 2:
+        return capsule(origin, direction, corners[:, 0], corners[:, 1], radius)
+    edges = [capsule(origin, direction, corners[:, k], corners[:, (k + 1) % 3], radius) for k in range(3)]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.sqrt(dot(normal, normal))[:, None]
+    high = np.broadcast_to(radius, len(origin))
+    sides = [slab(dot(origin - corners[:, 0], normal), dot(direction, normal), -high, high)]
+    for k in range(3):
+        out = np.cross(corners[:, (k + 1) % 3] - corners[:, k], normal)
+        sides.append(slab(dot(origin - corners[:, k], out), dot(direction, out), -np.inf, np.zeros(len(origin))))
+    return union(common(*sides), *edges)
+
+
+def _chord(middle: np.ndarray, off: np.ndarray, square: np.ndarray, radius, close: np.ndarray) -> Interval:
+    """Where a line of speed sqrt(square) is within `radius` of a center that it passes at `middle`, with `off` in between."""
+    h = np.sqrt(dot(off, off))
+    half = np.sqrt(np.maximum((radius - h) * (radius + h), 0.0) / square)
+    return _unless((h > radius + close) | (np.asarray(radius) < 0), middle - half, middle + half)
+
+
+def _turn(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+
+
+def _unless(missed: np.ndarray, enter: np.ndarray, leave: np.ndarray) -> Interval:
+    return np.where(missed, np.inf, enter), np.where(missed, -np.inf, leave)

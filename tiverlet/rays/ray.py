@@ -1,0 +1,126 @@
+"""What rays meet first."""
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .. import checks
+from ..colliders.collider import Collider
+from ..features.feature import Feature
+from ..particles import in_range
+from .hits import Hits
+from .targets import Rods
+
+if TYPE_CHECKING:
+    from ..world import World
+
+WHO = "World.ray"
+
+
+def ray(
+    world: "World", origin: Any, direction: Any, reach: Any, radius: Any, groups: Any, skip: Any,
+    features: Iterable[Feature] | None,
+) -> Hits:  # fmt: skip
+    """See World.ray()."""
+    single, origin, direction = _rays(origin, direction, world.particles.dim)
+    most = checks.per_item(WHO, "reach", reach, len(origin), least=0.0, infinite=True)
+    radius = checks.number(WHO, "radius", radius, least=0.0)
+    some, x = _taken(world, features), np.asarray(world.position)
+    seen = _seen(world, x, groups, skip)
+    k, dim = origin.shape
+    best, normal = most.copy(), np.full((k, dim), np.nan)
+    particle, link, wall = np.full(k, -1), np.full((k, 2), -1), np.full(k, -1)
+    there = np.zeros(k, dtype=bool)
+
+    def meet(rods: Rods) -> tuple[np.ndarray, np.ndarray]:
+        """Rays that meet one of these before anything else, as far as is known, and which."""
+        distance, which = rods.first(origin, direction, best)
+        nearer = (which >= 0) & ((distance < best) | ~there)
+        best[nearer], there[nearer] = distance[nearer], True
+        at = origin[nearer] + distance[nearer, None] * direction[nearer]
+        normal[nearer] = rods.normal(at, direction[nearer], which[nearer])
+        return nearer, which[nearer]
+
+    index = np.flatnonzero(seen)
+    nearer, which = meet(Rods(world.particles.radius[index] + radius, x[index]))
+    particle[nearer] = index[which]
+    pairs, number = _rods(world, some, seen)
+    nearer, which = meet(Rods(world.particles.radius[pairs].min(axis=1) + radius, x[pairs[:, 0]], x[pairs[:, 1]]))
+    particle[nearer], link[nearer] = -1, number[which]
+    for f, feature in enumerate(world.features):
+        if f in some and isinstance(feature, Collider) and feature.stands and k:
+            distance, out = feature.cast(origin, direction, radius)
+            nearer = (distance < np.inf) & ((distance < best) | ((distance == best) & ~there))
+            best[nearer], normal[nearer], there[nearer] = distance[nearer], out[nearer], True
+            particle[nearer], link[nearer], wall[nearer] = -1, -1, f
+    distance = np.where(there, best, np.inf)
+    at = np.where(there, best, np.nan)[:, None]
+    point = origin + at * direction - radius * normal
+    found = (distance, point, normal, particle, link, wall)
+    return Hits(*(array[0] if single else array for array in found))
+
+
+def _rays(origin: Any, direction: Any, dim: int) -> tuple[bool, np.ndarray, np.ndarray]:
+    """Whether it is one ray; origins and unit directions, (k, dim)."""
+    (one_x, x), (one_d, d) = _places("origin", origin, dim), _places("direction", direction, dim)
+    k = len(d) if one_x else len(x)
+    if not one_d and len(d) != k:
+        raise ValueError(f"{WHO}: there are {k} origins and {len(d)} directions; give as many of both, or one for all.")
+    in_range(WHO, "origin", x)
+    size = np.abs(d).max(axis=1, keepdims=True)
+    if (size == 0).any():
+        where = "" if one_d else f"[{int(np.argmin(size))}]"
+        raise ValueError(f"{WHO}: direction{where} = 0 has no direction; give a vector of any length above 0, such as (0, -1).")
+    d = d / size  # whose square neither overflows nor vanishes
+    d = d / np.linalg.norm(d, axis=1, keepdims=True)
+    return one_x and one_d, np.broadcast_to(x, (k, dim)), np.broadcast_to(d, (k, dim))
+
+
+def _places(name: str, value: Any, dim: int) -> tuple[bool, np.ndarray]:
+    """Whether it is one vector, and all of them, (k, dim)."""
+    array = checks.plain(WHO, name, value)
+    if array.ndim == 1:
+        return True, checks.vector(WHO, name, array, dim)[None]
+    return False, checks.points(WHO, name, array, dim=dim)
+
+
+def _taken(world: "World", features: Iterable[Feature] | None) -> set[int]:
+    """The numbers of the features that count."""
+    if features is None:
+        return set(range(len(world.features)))
+    numbers = {id(f): k for k, f in enumerate(world.features)}
+    some = checks.rows(WHO, "features", features, "a list of features of the world")
+    for k, f in enumerate(some):
+        if id(f) not in numbers:
+            raise ValueError(f"{WHO}: features[{k}] = {f!r} does not act in this world; take them from world.features.")
+    return {numbers[id(f)] for f in some}
+
+
+def _seen(world: "World", x: np.ndarray, groups: Any, skip: Any) -> np.ndarray:
+    """Which particles rays can meet, Boolean (n,)."""
+    seen = np.asarray(np.isfinite(x).all(axis=1))
+    if groups is not None:
+        wanted = np.atleast_1d(checks.plain(WHO, "groups", groups))
+        if wanted.size and (wanted.dtype.kind not in "iu" or wanted.ndim != 1):
+            raise TypeError(f"{WHO}: groups = {groups!r}, but a group (an integer), a list of groups or None is needed.")
+        seen = seen & np.isin(world.particles.group, wanted)
+    some = np.atleast_1d(checks.plain(WHO, "skip", skip))
+    if some.dtype == bool:
+        if some.shape != seen.shape:
+            raise ValueError(f"{WHO}: skip has shape {some.shape}, but a mask of shape {seen.shape} is needed.")
+        return seen & ~some
+    seen[checks.indices(WHO, "skip", some, len(seen))] = False
+    return seen
+
+
+def _rods(world: "World", some: set[int], seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Links whose particles both are seen: pairs (m, 2), and the numbers of feature and link (m, 2)."""
+    pairs, numbers = [np.zeros((0, 2), dtype=np.int64)], [np.zeros((0, 2), dtype=np.int64)]
+    for f in sorted(some):
+        ends, which = world.features[f].rods()
+        pairs.append(ends)
+        numbers.append(np.stack([np.full(len(ends), f), which], axis=1))
+    both, number = np.concatenate(pairs), np.concatenate(numbers)
+    there = seen[both].all(axis=1)
+    return both[there], number[there]
