@@ -10,6 +10,7 @@ from ..particles import Particles
 from .core.angle import TURN, Angle, dihedral_angle, dihedral_angles, dihedral_reach, path_angle, path_angles, path_reach
 from .core.drive import Drive, largest_load
 
+SETTLE = 0.1  # [s] how long a servo takes for the last e-th of its way
 PLACED = 0.2  # [rad] from where on hinges that were placed elsewhere go on from there
 
 
@@ -24,8 +25,8 @@ class Motor(Angle):
     hinges: (m, 3) particle indices, the corner in the middle, of joints in a plane: a wheel turns by i - j - k where i is on the
     frame, j the hub and k on the wheel. (m, 4) of hinges in 3D: the two ends of the axis, then a particle of either side.
     speed: number or (m,) [rad/s]; positive to the left in 2D. 0 holds: a brake of dry friction, if the torque is finite. Live.
-    angle: number or (m,) [rad]; where to turn to, by the shorter way, at most at |speed|, and to stay: a servo. Live. None: turn
-    for ever. It cannot be given later.
+    angle: number or (m,) [rad]; where to turn to, by the shorter way, and to stay: a servo, which turns at |speed|, and at most at
+    the angle that is left in 0.1 s. Live. None: turn for ever; it cannot be given later.
     torque: the largest, number or (m,) [N m]. Live. 0 lets the hinge run free. None that is given is one that meets any load, so
     a stop in its way bears whatever it takes.
     compliance: number or (m,) [rad/(N m)] of a spring between the motor and the hinge; 0 is rigid. damping: [N m s/rad] beside
@@ -71,7 +72,11 @@ class Motor(Angle):
     @property
     def rest(self) -> np.ndarray:
         """Where the rest angles are now [rad], (m,)."""
-        return self.dev.drive.values()[: self.count] if "drive" in vars(self.dev) else self._begin
+        if "drive" in vars(self.dev):
+            return self.dev.drive.values()[: self.count]
+        if "_begin" not in self.__dict__:
+            raise AttributeError("Motor has no rest before it is in a world.")
+        return self._begin
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the indices and angles against the dimension, and start from where hinges are."""
@@ -99,7 +104,7 @@ class Motor(Angle):
         """Towards the angle, or on and on."""
         largest = self.torque if self.capped else None
         endless, period = not (self.serves or self.dev.ends), 0.0 if self.dev.ends else TURN
-        return Drive(scene, "Motor", self._begin, *self._course(), largest, endless, period)
+        return Drive(scene, "Motor", self._begin, *self._course(), largest, endless, period, SETTLE * self.serves)
 
     def _course(self) -> tuple[np.ndarray, np.ndarray]:
         """Where rest angles go to, and how fast."""

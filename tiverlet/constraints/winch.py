@@ -61,7 +61,11 @@ class Winch(Link):
     @property
     def rest(self) -> np.ndarray:
         """The lengths now [m], (m,)."""
-        return self.dev.drive.values()[: self.count] if "drive" in vars(self.dev) else self.length
+        if "drive" in vars(self.dev):
+            return self.dev.drive.values()[: self.count]
+        if "length" not in self.__dict__:
+            raise AttributeError("Winch has no length before it is in a world, unless it is given.")
+        return self.length
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the indices, and take lengths that were not given."""
@@ -81,7 +85,7 @@ class Winch(Link):
 
     def drive_of(self, scene: Scene) -> Drive:
         """From end to end."""
-        return Drive(scene, "Winch", self.length, *self._course(), self.force if self.capped else None, False, 0.0)
+        return Drive(scene, "Winch", self.length, *self._course(), self.force if self.capped else None, False, 0.0, 0.0)
 
     def _course(self) -> tuple[np.ndarray, np.ndarray]:
         """Where lengths go to, and how fast."""

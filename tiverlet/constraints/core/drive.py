@@ -22,8 +22,9 @@ def largest_load(batch: "Batch", name: str, value: Any) -> np.ndarray:
 class Drive:
     """The moving rest values of a batch on the device, and the largest loads against which they move.
 
-    In a substep h the rest value goes `pace` h towards `goal`, or for ever where the drive is `endless` (pace then has a sign),
-    so that the constraint, whatever it is, is a rest value that moves evenly. The multiplier is clamped to
+    In a substep h the rest value goes `pace` h towards `goal`, or for ever where the drive is `endless` (pace then has a sign).
+    With a time to `settle` it nears the goal at no more than distance / settle: a body that has to be stopped by a limited load
+    would else go past the goal, and come back as fast, for ever. The multiplier is clamped to
 
         |lam| <= largest h^2
 
@@ -35,17 +36,17 @@ class Drive:
     Runner.shares), so a drive that was at work may do twice as much there.
 
     The rest value is kept in f64, where slow motion is not lost in rounding. start: where it begins, (m,). largest: (m,), or None
-    where all are infinite, which costs nothing. period: of the values that mean the same, 0 for none. in_state: what it has in
-    the exact state, by name.
+    where all are infinite, which costs nothing. period: of the values that mean the same, 0 for none. settle: [s]. in_state: what
+    it has in the exact state, by name.
     """
 
     def __init__(
         self, scene: "Scene", name: str, start: np.ndarray, goal: np.ndarray, pace: np.ndarray, largest: np.ndarray | None,
-        endless: bool, period: float,
+        endless: bool, period: float, settle: float,
     ):  # fmt: skip
         add, m = scene.memory.field, len(start)
         self._memory, self.real = scene.memory, scene.real
-        self.endless, self.period, self.capped = endless, period, largest is not None
+        self.endless, self.period, self.settle, self.capped = endless, period, settle, largest is not None
         self.target = add(f"{name}.target", m, kind=ti.f64, values=start, state=True)
         self.goal = add(f"{name}.goal", m, kind=ti.f64, values=np.clip(goal, -LARGEST, LARGEST))
         self.pace = add(f"{name}.pace", m, kind=ti.f64, values=pace)
@@ -101,14 +102,23 @@ class Drive:
                 start = ti.cast(f, ti.f64) + slack
         way = pace * h
         if ti.static(not self.endless):
-            reach = ti.abs(pace) * h
-            way = ti.max(-reach, ti.min(reach, self.near(self.goal[c] - start, 0 * start)))
+            reach, way = ti.abs(pace) * h, self.near(self.goal[c] - start, 0 * start)
+            if ti.static(self.settle > 0):
+                way *= h / (h + ti.static(self.settle))
+            way = ti.max(-reach, ti.min(reach, way))
         lag = ti.cast(f, ti.f64) - start
         if (lag > STALL * size and way < 0) or (ti.static(side == 0) and lag < -STALL * size and way > 0):
             way = 0 * way
         self.target[c] = self.near(start + way, 0 * start)
         self.step[c] = ti.cast(way, self.real)
         return ti.cast(self.target[c], self.real)
+
+    @ti.func
+    def clamp_force(self, c, force):
+        """A force, at most the largest."""
+        if ti.static(self.capped):
+            force = ti.max(-self.largest[c], ti.min(self.largest[c], force))
+        return force
 
     @ti.func
     def clamp(self, c, lam):

@@ -177,7 +177,7 @@ class Enclosed(Scalar):
             Scalar.push_spring_force(self, c, h)
         else:
             f, f0, w, W, turn, extent, move = self.total(c)
-            self.dev.change[c], self.dev.astray[c] = h * h * self.force(c, f, f0, w, h), 1
+            self.dev.change[c], self.dev.astray[c] = h * h * self.spring_force(c, f, f0, w, h), 1
 
     @ti.func
     def push_reaction(self, c, firm, soft):

@@ -631,12 +631,12 @@ class Scalar(Batch):
             f0, _ = self.measure(c, self.corners(c, 1))
         for k in ti.static(range(self.arity)):
             w += self.dev.w.of(self.member(c, k)) * g[k, :].dot(g[k, :])
-        force = self.force(c, f, self.unwrap(f0, f), w, h)
+        force = self.spring_force(c, f, self.unwrap(f0, f), w, h)
         for k in ti.static(range(self.arity)):
             self.push(c, k, h * h * self.dev.w.of(self.member(c, k)) * force * g[k, :])
 
     @ti.func
-    def force(self, c, f, f0, w, h):
+    def spring_force(self, c, f, f0, w, h):
         """F of push_spring_force(), from f now and a substep ago."""
         force = ti.cast(0, self.dev.real)
         if ti.static(self.dev.spring.soft):
@@ -650,6 +650,8 @@ class Scalar(Batch):
                 if ti.static(self.dev.spring.damped):
                     if ti.static(self.side == 0) or C != 0:
                         force -= resolved * self.dev.spring.damping[c] * (f - f0) / h
+                if ti.static(self.driven):
+                    force = self.dev.drive.clamp_force(c, force)
         return force
 
     @ti.func
