@@ -20,7 +20,8 @@ features = [
     tv.Pin([0]), tv.Pin([0], (0, 0), compliance=1e-3, damping=0.1), tv.Pin(np.arange(3), np.zeros((3, 2)), compliance=np.ones(3)),
     tv.Area([[0, 1, 2]], pressure=2.0, compliance=[0.1]), tv.Volume([(0, 1, 2, 3)], pressure=[1.5]),
     tv.ShapeMatch([np.arange(4), [4, 5]], compliance=[5e-5, 0.0], damping=[5.0, 0.0], creep=0.1, yield_strain=[0.1, 0.2]),
-    tv.Motor([(0, 1, 2)], 3.0, torque=0.5), tv.Motor([(0, 1, 2, 3)], [1.0], angle=np.pi), tv.Winch(links, -0.1, longest=2.0, force=[5, 6]),
+    tv.Motor([(0, 1, 2)], 3.0, torque=0.5), tv.Motor([(0, 1, 2, 3)], [1.0], angle=np.pi),
+    tv.Winch(links, -0.1, longest=2.0, force=[5, 6]),
     tv.Path([0, 1], [(0, 0), (1, 0)], closed=False, speed=1.0), tv.Snap(np.arange(3), 0.1, origin=(0.0, 0.05), compliance=0.05),
 ]  # fmt: skip
 particles = tv.Particles([(0, 1), (1, 1), (2, 1)], mass=[1, 2, np.inf], radius=0.1, velocity=(0, 1), pinned=[0])

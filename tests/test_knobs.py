@@ -77,7 +77,8 @@ ROWS3 = {
     ),
     "Dihedral": (lambda i, x, **k: tv.Dihedral([i], **k), WINGS, ANGLE | SPRING, {"rest": 0.7} | SPRINGS),
     "Motor": (
-        lambda i, x, **k: tv.Motor([i], **k), PATH, {"speed": 1.0, "torque": 5.0} | SPRING, {"speed": -2.0, "torque": 0.3} | SPRINGS,
+        lambda i, x, **k: tv.Motor([i], **k), PATH, {"speed": 1.0, "torque": 5.0} | SPRING,
+        {"speed": -2.0, "torque": 0.3} | SPRINGS,
     ),
     "Motor, angle": (
         lambda i, x, **k: tv.Motor([i], **k), WINGS, {"speed": 3.0, "angle": 1.0, "torque": 5.0} | SPRING,

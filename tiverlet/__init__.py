@@ -6,8 +6,22 @@ from .device import runtime  # first: it sets what Taichi reads when it is impor
 from . import measure, shapes
 from .colliders import Ball, Box, Capsule, HalfSpace, Mesh, Polygon, Sdf
 from .constraints import (
-    AngleLimit, Area, Bend, Constraint, Dihedral, Distance, Motor, Path, Pin, Rope, ShapeMatch, Snap, Spacer, Volume, Winch,
-)  # fmt: skip
+    AngleLimit,
+    Area,
+    Bend,
+    Constraint,
+    Dihedral,
+    Distance,
+    Motor,
+    Path,
+    Pin,
+    Rope,
+    ShapeMatch,
+    Snap,
+    Spacer,
+    Volume,
+    Winch,
+)
 from .contact import Contact, Polygons
 from .device.runtime import init
 from .forces import Attractor, Drag, Force, Gravity, Hand, PairForce, Wind

@@ -117,7 +117,9 @@ def rigid(features: list[Any], free: np.ndarray, x: np.ndarray) -> tuple[float, 
             continue
         if not isinstance(f, Scalar) or not f.arity or f.collapses or (f.compliance > 0).any():
             whole = False
-        if not isinstance(f, Scalar):
+        if isinstance(f, Scalar) and f.driven:
+            whole = False
+        if not isinstance(f, Scalar) or f.driven:
             continue
         C = f.violation(x)
         C = np.maximum(f.side * C, 0) if f.side else np.abs(C)
@@ -145,7 +147,7 @@ def closed(structure: Structure) -> bool:
     return not held and not any(f.name in (*PULLS, *WALLS, *TETHERS) for f in structure.features)
 
 
-INNER = ("Distance", "Rope", "Spacer", "Bend", "AngleLimit", "Dihedral", "Area", "Volume", "ShapeMatch")
+INNER = ("Distance", "Rope", "Winch", "Spacer", "Bend", "Motor", "AngleLimit", "Dihedral", "Area", "Volume", "ShapeMatch")
 
 
 def central(structure: Structure) -> bool:

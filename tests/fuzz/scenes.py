@@ -313,6 +313,27 @@ def corners(draw, s: Stage) -> Call | None:
     return Call(kind, {"triples": triples, "rest": pick(draw, None, 0.0, 1.0)} | more)
 
 
+def drives(draw, s: Stage) -> Call | None:
+    """Motor or Winch."""
+    k, speed, most = np.arange(s.n), pick(draw, 1.0, -3.0, 0.0, 100.0), pick(draw, 1.0, 1.0, float("inf"), 0.0, 1e-3, 1e4)
+    kind = pick(draw, "Motor", "Winch")
+    if kind == "Winch":
+        if s.n < 2:
+            return None
+        pairs = chain(s.n)
+        return Call(
+            kind, {"pairs": pairs, "speed": speed * s.size, "length": 0.3 * s.size, "force": most} | springs(draw, s, len(pairs))
+        )
+    arity = 4 if s.dim == 3 and pick(draw, True, False) else 3
+    if s.n < arity:
+        return None
+    hinges = np.stack([k[1:-2], k[2:-1], k[:-3], k[3:]] if arity == 4 else [k[:-2], k[1:-1], k[2:]], axis=1)
+    args: dict[str, Any] = {"hinges": hinges, "speed": speed, "torque": most}
+    if pick(draw, False, True):
+        args["angle"] = pick(draw, 0.5, 3.0, 0.0)
+    return Call(kind, args | springs(draw, s, len(hinges)))
+
+
 def bodies(draw, s: Stage) -> Call | None:
     """Area, Volume, ShapeMatch."""
     if s.n < 3:
@@ -463,7 +484,7 @@ def structures(draw) -> Structure:
     if pick(draw, False, False, True):
         args["group"] = np.arange(n) % 2
     stage = Stage(n, dim, x, size, order, list(args.get("pinned", [])))
-    kinds = [forces, links, corners, bodies, rails, forces, links] + ([walls, walls, contacts] if order == 2 else [])
+    kinds = [forces, links, corners, bodies, rails, forces, links] + ([walls, walls, contacts, drives] if order == 2 else [])
     made = [kind(draw, stage) for kind in draw(st.lists(st.sampled_from(kinds), min_size=1, max_size=5))]
     calls, met = [], False
     for call in made:
@@ -487,6 +508,8 @@ KNOBS = {  # a knob and what it may be turned to, from what it was: (value, size
     "Drag": ("rate", (0.0, 5.0, 1e5)),
     "Wind": ("rate", (0.0, 5.0, 1e5)),
     "Attractor": ("strength", (0.0, 1.0, -10.0)),
+    "Motor": ("torque", (0.0, 1.0, float("inf"))),
+    "Winch": ("speed", (0.0, 1.0, -3.0)),
 }
 MOVES = {"HalfSpace": "offset", "Ball": "center", "Capsule": "a", "Polygon": "position", "Mesh": "position", "Sdf": "position"}
 RESTS = ("Distance", "Rope", "Spacer")

@@ -1,5 +1,7 @@
 """Hinges that turn by themselves."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -25,8 +27,8 @@ class Motor(Angle):
     hinges: (m, 3) particle indices, the corner in the middle, of joints in a plane: a wheel turns by i - j - k where i is on the
     frame, j the hub and k on the wheel. (m, 4) of hinges in 3D: the two ends of the axis, then a particle of either side.
     speed: number or (m,) [rad/s]; positive to the left in 2D. 0 holds: a brake of dry friction, if the torque is finite. Live.
-    angle: number or (m,) [rad]; where to turn to, by the shorter way, and to stay: a servo, which turns at |speed|, and at most at
-    the angle that is left in 0.1 s. Live. None: turn for ever; it cannot be given later.
+    angle: number or (m,) [rad]; where to turn to, by the shorter way, and to stay: a servo, which turns at |speed|, and at
+    most at the angle that is left in 0.1 s. Live. None: turn for ever; it cannot be given later.
     torque: the largest, number or (m,) [N m]. Live. 0 lets the hinge run free. None that is given is one that meets any load, so
     a stop in its way bears whatever it takes.
     compliance: number or (m,) [rad/(N m)] of a spring between the motor and the hinge; 0 is rigid. damping: [N m s/rad] beside
@@ -61,7 +63,9 @@ class Motor(Angle):
 
     def _angle(self, value) -> np.ndarray:
         if not self.serves:
-            raise ValueError("Motor: angle cannot be set: it turns at a speed. Make a Motor with angle=... for one that holds it.")
+            raise ValueError(
+                "Motor: angle cannot be set: it turns at a speed. Make a Motor with angle=... for one that holds it."
+            )
         return checks.per_item("Motor", "angle", value, self.count, least=-TURN, most=TURN)
 
     @property
@@ -106,7 +110,7 @@ class Motor(Angle):
         endless, period = not (self.serves or self.dev.ends), 0.0 if self.dev.ends else TURN
         return Drive(scene, "Motor", self._begin, *self._course(), largest, endless, period, SETTLE * self.serves)
 
-    def _course(self) -> tuple[np.ndarray, np.ndarray]:
+    def _course(self) -> tuple[Any, Any]:
         """Where rest angles go to, and how fast."""
         end = np.where(self.speed > 0, np.pi, 0.0)
         return self.angle if self.serves else end, self.speed

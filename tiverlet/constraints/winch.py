@@ -1,5 +1,7 @@
 """Ropes that are wound up and paid out."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -31,20 +33,17 @@ class Winch(Link):
 
     side = 1
     driven = True
-    cusp = False  # no length is 0
     each = ("speed", "length", "shortest", "longest", "force", "compliance", "damping", "break_at")
     compiled_for = (*Link.compiled_for, "capped")
     uploads_all = False  # goals are of one
     speed = Knob(lambda f, v: checks.per_item("Winch", "speed", v, f.count), "Change of length [m/s].")
     shortest = Knob(lambda f, v: checks.per_item("Winch", "shortest", v, f.count, above=0.0), "Least length [m].")
-    longest = Knob(
-        lambda f, v: checks.per_item("Winch", "longest", v, f.count, above=0.0, infinite=True), "Largest length [m]."
-    )
+    longest = Knob(lambda f, v: checks.per_item("Winch", "longest", v, f.count, above=0.0, infinite=True), "Largest length [m].")
     force = Knob(lambda f, v: largest_load(f, "force", v), "The largest pull [N].")
 
     def __init__(
-        self, pairs, speed: ArrayLike = 0.0, *, length=None, shortest=None, longest: ArrayLike = np.inf, force: ArrayLike = np.inf,
-        compliance: ArrayLike = 0.0, damping: ArrayLike = 0.0, break_at=None,
+        self, pairs, speed: ArrayLike = 0.0, *, length=None, shortest=None, longest: ArrayLike = np.inf, force:
+        ArrayLike = np.inf, compliance: ArrayLike = 0.0, damping: ArrayLike = 0.0, break_at=None,
     ):  # fmt: skip
         self.setup(pairs, None, compliance, damping, break_at)
         if length is not None:
@@ -52,6 +51,11 @@ class Winch(Link):
         if shortest is not None:
             self.shortest = shortest
         self.speed, self.longest, self.force = speed, longest, force
+
+    @property
+    def cusp(self) -> bool:
+        """No length is 0."""
+        return False
 
     @property
     def capped(self) -> bool:
@@ -87,7 +91,7 @@ class Winch(Link):
         """From end to end."""
         return Drive(scene, "Winch", self.length, *self._course(), self.force if self.capped else None, False, 0.0, 0.0)
 
-    def _course(self) -> tuple[np.ndarray, np.ndarray]:
+    def _course(self) -> tuple[Any, Any]:
         """Where lengths go to, and how fast."""
         return np.where(self.speed > 0, self.longest, self.shortest), np.abs(self.speed)
 

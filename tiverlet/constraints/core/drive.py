@@ -41,7 +41,7 @@ class Drive:
     """
 
     def __init__(
-        self, scene: "Scene", name: str, start: np.ndarray, goal: np.ndarray, pace: np.ndarray, largest: np.ndarray | None,
+        self, scene: "Scene", name: str, start: np.ndarray, goal: np.ndarray, pace: np.ndarray, largest: Any,
         endless: bool, period: float, settle: float,
     ):  # fmt: skip
         add, m = scene.memory.field, len(start)

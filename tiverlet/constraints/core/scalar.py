@@ -251,7 +251,9 @@ class Scalar(Batch):
         self.dev.converges = self.solvable_together and (self.dev.in_system or bool(scene.slots.semi_iteration))
         if self.dev.converges:
             self.dev.inverse_size = add(f"{name}.close", m, values=self.inverse_size(self.start.position))
-        self.dev.steps = bool(self.dev.converges and scene.slots.semi_iteration and self.dev.outside and not (self.side or self.driven))
+        self.dev.steps = bool(
+            self.dev.converges and scene.slots.semi_iteration and self.dev.outside and not (self.side or self.driven)
+        )
         if self.dev.steps:
             self.dev.step = add(f"{name}.step", m)
 
@@ -498,7 +500,8 @@ class Scalar(Batch):
     def motion(self, c, n, together):
         """The motion u along n in this substep, its weight W, the largest move by a multiplier of 1, the largest move squared.
 
-        u is relative to the rest value, where that moves. together: 1 where the mass is split between all constraints, though some are solved together.
+        u is relative to the rest value, where that moves.
+        together: 1 where the mass is split between all constraints, though some are solved together.
         """
         u, W, longest, fastest = (
             ti.cast(0, self.dev.real),
