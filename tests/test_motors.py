@@ -231,55 +231,39 @@ def test_a_winch_stops_at_its_ends(world):
     assert slack.position[1, 1] == pytest.approx(-1.0, abs=1e-6)
 
 
-def machine(substeps=7, **settings):
-    """Everything that has a drive, in 3D, in motion, with contacts."""
-    x = np.array([[0, 0, 0], [0, 0, 1], [1, 0, 0.5], [-1, 0, 0.5], [0, -1, 0.5], [0.3, -1.6, 0.6]], dtype=float)
+def machine(**settings):
+    """A door that turns, and a weight that it winds up by two ropes, in 3D."""
+    x = np.array([[0, 0, 0], [0, 0, 1], [1, 0, 0.5], [-1, 0, 0.5], [0, -1, 0.5]], dtype=float)
     features = [
         tv.Motor([[0, 1, 2, 3]], 5.0, torque=1.0),
-        tv.Motor([[2, 1, 4]], 2.0, angle=1.0, torque=3.0, compliance=1e-3, damping=0.1),
-        tv.Winch([[4, 5], [3, 5]], [-0.5, 0.2], force=[5.0, np.inf], break_at=50.0),
+        tv.Winch([[4, 2], [3, 4]], [-0.5, 0.2], force=[5.0, np.inf]),
         tv.Distance([[0, 2], [1, 2], [0, 3], [1, 3]]),
         tv.Gravity((0, -G, 0)),
     ]
-    start = tv.Particles(x, mass=1 + np.arange(6) % 2, radius=0.05, pinned=[0, 1])
-    return tv.World(start, features, substeps=substeps, **settings)
+    return tv.World(tv.Particles(x, mass=1 + np.arange(5) % 2, pinned=[0, 1]), features, substeps=7, **settings)
 
 
-@pytest.mark.parametrize("precision", ["f32", "f64"])
-def test_drives_have_the_same_bits_on_every_path_and_survive_edits(precision, tmp_path):
+def test_drives_have_the_same_bits_on_every_path_and_survive_edits():
     def drive(world):
+        motor, winch = world.features[:2]
         for frame in range(12):
             if frame == 4:
-                world.features[0].torque = 0.2
-                world.features[1].angle = 0.5
-            if frame == 6:
-                world.features[2].speed = [0.3, -0.3]
+                motor.torque, winch.speed = 0.2, [0.3, -0.3]
             world.step(1 / 60)
         return world.hash()
 
-    with machine(precision=precision) as fused, machine(precision=precision, path="parallel") as parallel:
+    with machine() as fused, machine(path="parallel") as parallel:
         with thread_team.launching():
-            launched = machine(precision=precision, path="parallel")
+            launched = machine(path="parallel")
         want = drive(fused)
         assert drive(parallel) == want == drive(launched)
         launched.close()
-        twin = fused.clone()
-        with tv.Recorder(tmp_path / "a.rrd", fused) as recorder:
-            fused.run(0.1, recorder=recorder)
-            handle = fused.add(tv.Particles([[9.0, 9.0, 9.0]]))
-            fused.run(0.05, recorder=recorder)
-            fused.remove(handle)
-            fused.features[0].torque = np.inf
-            fused.run(0.05, recorder=recorder)
-        twin.run(0.1)
-        twin.remove(twin.add(tv.Particles([[9.0, 9.0, 9.0]])))
-        twin.close()
-        assert tv.replay(tmp_path / "a.rrd").verify()
-        door, arm, winch = fused.features[:3]
-        assert isinstance(door, tv.Motor) and isinstance(arm, tv.Motor) and isinstance(winch, tv.Winch)
-        rest = door.rest[0], arm.rest[0]
-        fused.remove(particles=[5])  # and the winches
-        assert (door.rest[0], arm.rest[0]) == rest and winch.count == 0 and not fused.step(1 / 60).flags
+        door, winch = fused.features[:2]
+        assert isinstance(door, tv.Motor) and isinstance(winch, tv.Winch)
+        rest = door.rest[0]
+        fused.remove(particles=[4])  # and the ropes
+        assert door.rest[0] == rest and winch.count == 0 and not fused.step(1 / 60).flags
+        assert door.rest[0] != rest and abs(door.violation(fused.position)[0]) < 0.1
 
 
 def test_many_worlds_have_drives_of_their_own():
