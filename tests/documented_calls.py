@@ -11,7 +11,7 @@ features = [
     tv.Hand((0, 0)), tv.Hand((0, 0), 3, rate=10), tv.Contact(), tv.Contact(friction=0.3), tv.Contact(friction=(0.5, 0.4)),
     tv.Contact(friction={(0, 1): 0.5}, restitution={(0, 0): 0.9}, groups=[(0, 1)], skin=0.1),
     tv.Polygons([range(4), [4, 5, 6]], friction=(0.5, 0.4)), tv.Box((0, 0), (np.inf, 2), friction=(0.5, 0.4), restitution=0.5),
-    tv.HalfSpace((0, 1), 0.5, friction=0.2), tv.Ball((0, 0), 1.0, inside=True), tv.Capsule((0, 0), (1, 0), 0.1),
+    tv.HalfSpace((0, 1), 0.5, friction=0.2), tv.Ball((0, 0), 1.0, inside=True), tv.Capsule((0, 0), (1, 0), 0.1, one_way=(0, 1)),
     tv.Polygon([(0, 0), (1, 0), (0, 1)], position=(1.0, 2.0), rotation=0.5, radius=0.01),
     tv.Mesh(np.zeros((3, 3)), [(0, 1, 2)], rotation=(0, 0, 1), position=np.zeros(3)), tv.Distance([(0, 1)]),
     tv.Distance(links, 0.5), tv.Distance(links, rest=[0.5, 0.6], compliance=[1e-3, 0.0], damping=np.zeros(2), break_at=10.0),

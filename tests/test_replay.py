@@ -55,7 +55,8 @@ def flat(precision="f32", **settings):
         tv.Path([n + 6], [(-0.5, 0.3), (0.5, 0.2)], smooth=False), tv.Snap([n + 7], 0.1, compliance=0.01),
         tv.Constraint(spacing, [(n + 2, n + 3)], rest=0.2), tv.Contact(friction={(0, 1): 0.3}, groups=[(0, 1), (0, 0)]),
         tv.Box((-2, 0), (2, np.inf), friction=(0.4, 0.3)), tv.HalfSpace((0.1, 1), -0.5), tv.Ball((0.5, -0.2), 0.3),
-        tv.Capsule((1.5, 0.1), (1.8, 0.3), 0.05), tv.Polygon([(-2, -1), (2, -1), (2, 4), (-2, 4)], inside=True), tv.Sdf(bowl),
+        tv.Capsule((1.5, 0.1), (1.8, 0.3), 0.05, one_way=(0, 1)),
+        tv.Polygon([(-2, -1), (2, -1), (2, 4), (-2, 4)], inside=True), tv.Sdf(bowl),
     ]  # fmt: skip
     particles = tv.Particles(
         position, mass=0.1 + 0.01 * np.arange(len(position)), radius=0.03, group=np.arange(len(position)) % 2, velocity=(0.2, 0)
@@ -69,7 +70,8 @@ def solid(precision="f64", **settings):
     vertices = np.array([[-2, 0, -2], [2, 0, -2], [2, 0, 2], [-2, 0, 2]], dtype=float)
     features = [
         tv.Gravity((0, -9.81, 0)), tv.Distance([(0, 1), (0, 2), (0, 3), (1, 2), (2, 3), (1, 4)], compliance=1e-5),
-        tv.Volume([(0, 1, 2, 3)], compliance=1e-4), tv.Motor([(0, 1, 2, 3)], 1.0, torque=0.5, compliance=0.1),
+        tv.Volume([(0, 1, 2, 3)], compliance=1e-4), tv.Dihedral([(0, 1, 2, 3)], compliance=0.1),
+        tv.Motor([(0, 1, 2, 3)], 1.0, torque=0.5, compliance=0.1),
         tv.Mesh(vertices, [(0, 2, 1), (0, 3, 2)], closed=False, restitution=0.3), tv.Contact(),
     ]  # fmt: skip
     settings = {"solver": tv.ConjugateGradient(7), "substeps": 5, **settings}

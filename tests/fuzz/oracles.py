@@ -58,6 +58,8 @@ def convex(p: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 def gap(wall: Any, p: np.ndarray, r: np.ndarray) -> np.ndarray:
     """How far particles are from a wall as it stands, negative inside of it, (n,)."""
+    if wall.one_way is not None:  # which any may be inside of
+        return np.full(len(p), np.inf)
     name = type(wall).__name__
     if name == "Box":
         return np.minimum((p - wall.lower).min(axis=1), (wall.upper - p).min(axis=1)) - r

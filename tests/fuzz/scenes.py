@@ -409,6 +409,8 @@ def walls(draw, s: Stage) -> Call | None:
     kinds = ["Box", "HalfSpace", "Ball", "Capsule", "Polygon" if s.dim == 2 else "Mesh"]
     kind = pick(draw, *kinds, *(["Sdf"] if s.size == 1 else []))
     up = np.eye(s.dim)[1]
+    if kind in ("Capsule", "Polygon", "Mesh") and pick(draw, False, False, True):
+        more["one_way"] = pick(draw, up, -up, up + 0.3)
     if kind == "Box":
         return Call(kind, {"lower": low, "upper": high} | more)
     if kind == "HalfSpace":

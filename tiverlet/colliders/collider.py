@@ -36,6 +36,10 @@ class Collider(Feature):
     active: whether it is there, a gate that opens and closes. With True or False given it is a switch, which costs nothing to
     turn; None is always there, and costs the compiling of another scene when it is switched off for the first time. What is
     inside of a wall that comes back is left at push_out.
+    one_way: a direction along which particles pass, for platforms: (0, 1) holds what comes from above, and lets through what
+    comes from below. Particles are held where they touch with a normal to that side; what was inside of the wall at the start of
+    the substep, however it came there, is let through until it is free. Fixed, and turned with the wall. Nothing is remembered of
+    a particle but where it is. Capsule, Polygon and Mesh take it; None is a wall for both sides.
     """
 
     friction = Knob(lambda f, v: _friction(f, v), "A number, or (static, dynamic).")
@@ -44,16 +48,29 @@ class Collider(Feature):
     push_out = Knob(lambda f, v: checks.number(repr(f), "push_out", v, least=0.0), "[m/s].", compiled=True)
     compiled_for = ("has_friction", "has_restitution", "has_switch")
     host_only = ("widest",)
+    one_way: Any = None  # unit vector along which particles pass
     _switch = False  # it was made with one
     _stands = True  # on the device
     sweeps = False  # needs the exact position at the start of the substep
     repeats = False  # one confine() may leave a particle that rubs or bounces where it has to be confined again
     poses = False  # has a pose(when) to be worked out once for each substep, before any confine()
 
-    def surface(self, friction: Any, restitution: Any, push_out: float, active: bool | None) -> None:
-        """Check and keep the arguments that all walls have."""
+    def surface(
+        self, friction: Any, restitution: Any, push_out: float, active: bool | None, one_way: Any = None, dim: int = 0
+    ) -> None:
+        """Check and keep the arguments that all walls have; one_way in dim axes."""
         self.friction, self.restitution, self.push_out = friction, restitution, push_out
+        if one_way is not None:
+            self.one_way = self._direction(one_way, dim)
         self._switch, self.active = active is not None, True if active is None else active
+
+    def _direction(self, one_way: Any, dim: int) -> np.ndarray:
+        """one_way, checked, as a unit vector."""
+        way = checks.vector(repr(self), "one_way", one_way, dim)
+        length = float(np.linalg.norm(way))
+        if length == 0:
+            raise ValueError(f"{self!r}: one_way = 0 has no direction; {(0, 1, 0)[:dim]} lets particles pass upwards.")
+        return way / length
 
     @property
     def has_friction(self) -> bool:
@@ -82,7 +99,7 @@ class Collider(Feature):
         self.dev.real = scene.real
         both = friction_of(repr(self), "friction", self.friction) if self.has_friction else None
         restitution, active = self.restitution if self.has_restitution else None, self.active if self.has_switch else None
-        self.dev.surface = Surface(scene, repr(self), both, restitution, self.push_out, active)
+        self.dev.surface = Surface(scene, repr(self), both, restitution, self.push_out, active, self.one_way)
         self._stands = self.active
 
     def upload(self) -> None:

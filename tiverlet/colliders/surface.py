@@ -1,6 +1,6 @@
 """What happens to a particle that is inside of a collider: it is taken out, with friction and restitution."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..device import at, inline, ti
 
@@ -9,18 +9,19 @@ if TYPE_CHECKING:
 
 # How a collider confines: as it comes; only what is further out than rounding; of that, without friction and bounces.
 FIRST, AGAIN, GENTLY = range(3)
+ON = 1e-3  # of its distance from the middle of a wall: what is no deeper inside than this lies on it
 
 
 class Surface:
     """How the surface of one collider answers on the device: friction, restitution, push_out; see Collider for what they mean.
 
     friction: (static, dynamic), or None for a surface without. restitution: 0 to 1, or None. push_out: [m/s]. active: whether
-    it is there, or None for one without a switch.
+    it is there, or None for one without a switch. one_way: unit vector along which it lets particles pass, or None.
     """
 
     def __init__(
         self, scene: "Scene", name: str, friction: tuple[float, float] | None, restitution: float | None, push_out: float, active:
-        bool | None,
+        bool | None, one_way: Any = None,
     ):  # fmt: skip
         self._memory, self.state, self.push_out = scene.memory, scene.state, push_out
         self.has_friction, self.has_restitution = friction is not None, restitution is not None
@@ -28,7 +29,9 @@ class Surface:
             self.friction = scene.memory.field(f"{name}.friction", None, width=2, values=friction)
         if self.has_restitution:
             self.restitution = scene.memory.field(f"{name}.restitution", None, values=restitution)
-        self.has_switch = active is not None
+        self.has_switch, self.is_one_way = active is not None, one_way is not None
+        if self.is_one_way:
+            self.one_way = scene.memory.field(f"{name}.one_way", None, width=len(one_way), values=one_way)
         if self.has_switch:
             self.active = scene.memory.field(f"{name}.active", None, kind=ti.i32, values=float(active or 0))
 
@@ -67,6 +70,19 @@ class Surface:
             high, lift = self.bounced(i)
             if high:
                 out += lift
+        return out
+
+    @ti.func
+    def lets_through(self, i, n, start_depth, contact_distance):
+        """Whether particle i passes: it touches with a normal n that is not towards the side of the wall on which it is held, or
+        it is on its way, that is, further inside at the start of the substep than what lies there.
+
+        n: in the frame in which one_way is given. contact_distance: of its center from what the wall is made of [m].
+        """
+        out = False
+        if ti.static(self.is_one_way):
+            on = 4 * self.state.digits(i) + ti.static(ON) * contact_distance
+            out = n.dot(self.one_way[None]) <= 0 or start_depth > on
         return out
 
     @ti.func
