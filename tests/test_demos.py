@@ -54,7 +54,7 @@ def test_pay_finds_that_features_only_add(printed):
         ("fit", {"settings": [("THROWS", 400), ("ELITE", 30)]}, "caught in each round"),
         ("pendulums", {"settings": [("SECONDS", 4.0)], "side": 12}, "so a million take"),
         ("stairs", {"built": {"rows": 2}, "seconds": 2.0}, "are down"),
-        *((name, {}, f"{name}.rrd") for name in ("soft", "bead", "tidy", "ragdoll", "machine")),
+        *((name, {}, f"{name}.rrd") for name in ("soft", "bead", "tidy", "ragdoll", "machine", "buggy")),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
