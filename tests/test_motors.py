@@ -159,6 +159,29 @@ def test_a_servo_goes_to_its_angle_and_stays(world):
     assert flat.rest[0] == pytest.approx(np.pi)
 
 
+def test_a_servo_that_rests_is_a_bend(world):
+    # Rigid, and with a spring that gives way by far more than a rigid hinge may be off; where a spring bears more than the largest
+    # torque, it slips.
+    for compliance in (0.0, 0.1):
+        options = {"compliance": compliance, "damping": 4.0 if compliance else 0.0}
+        ends = []
+        for hinge in (
+            tv.Bend([[0, 1, 2]], 0.0, **options),
+            tv.Motor([[0, 1, 2]], 1.0, angle=0.0, **options),
+            tv.Motor([[0, 1, 2]], 1.0, angle=0.0, torque=14.0, **options),
+        ):
+            start = tv.Particles([[-1.0, 0.0], [0.0, 0.0], [ARM, 0.0]], mass=2.0, pinned=[0, 1])
+            w = world(start, [hinge, tv.Distance([[1, 2]]), tv.Gravity(G)], precision="f64")
+            w.run(0.5)
+            ends.append(w.position)
+        np.testing.assert_allclose(ends[1], ends[0], atol=1e-12)
+        np.testing.assert_allclose(ends[2], ends[0], atol=1e-12)
+    weak, motor = wheel(world, 1.0, gravity=G, angle=0.0, torque=8.0, compliance=0.1, damping=4.0)
+    weak.run(3.0)
+    assert motor.load[0] == pytest.approx(-8.0, rel=1e-3) or G * 2.0 * ARM * np.cos(turned(weak)) < 8.0
+    assert turned(weak) < -0.5 and abs(motor.violation(weak.position)[0]) < 1.01 * 0.1 * 8.0
+
+
 def test_a_stalled_motor_winds_nothing_up(world):
     # Held for a second by a stop that gives way then: it goes on at its speed, and catches nothing up.
     stop = tv.HalfSpace((0, -1), -ARM / 2)  # at 30 degrees

@@ -11,7 +11,8 @@ if TYPE_CHECKING:
     from ...features.feature import Batch, Scene
 
 LARGEST = 1e30  # what stands for infinity on the device, whose compilers take numbers to be finite
-STALL = 0.25  # of its size: a violation from where on the rest value waits for the constraint to follow
+STALL = 0.25  # of its size: a violation that no spring bears, from where on the rest value waits for the constraint to follow
+APART = 0.45  # of a period: further away, a value is nearer to the next one that means the same
 
 
 def largest_load(batch: "Batch", name: str, value: Any) -> np.ndarray:
@@ -80,11 +81,10 @@ class Drive:
         return value
 
     @ti.func
-    def advance(self, c, f, side: ti.template(), stiff, lam, h, h2_effective, size, fresh):  # type: ignore[valid-type]
+    def advance(self, c, f, side: ti.template(), W, alpha, lam, h, h2_effective, size, fresh):  # type: ignore[valid-type]
         """The rest value at the end of a substep that starts at f.
 
-        side: see Scalar. stiff: the violation that bears a multiplier of 1. lam: the multiplier of the last substep. size: of the
-        constraint.
+        side, W: see Scalar. alpha: compliance. lam: the multiplier of the last substep. size: of the constraint.
         """
         old, pace = self.target[c], self.pace[c]
         lag = ti.cast(f, ti.f64) - old
@@ -92,10 +92,10 @@ class Drive:
         start = ti.cast(f, ti.f64) - lag  # where the rest value is, next to f
         if ti.static(self.capped):
             most = self.largest[c] * h2_effective
-            if fresh != 0 and lam != 0:
+            if fresh != 0 and lam != 0 and alpha == 0:
                 most *= 2
             self.most[c] = most
-            slack = ti.cast(stiff * most, ti.f64)
+            slack = ti.cast(W * most, ti.f64) + ti.cast(alpha * (most / h2_effective), ti.f64)
             if lag > slack:
                 start = ti.cast(f, ti.f64) - slack
             elif ti.static(side == 0) and lag < -slack:
@@ -106,8 +106,11 @@ class Drive:
             if ti.static(self.settle > 0):
                 way *= h / (h + ti.static(self.settle))
             way = ti.max(-reach, ti.min(reach, way))
+        stall = ti.cast(STALL * size + alpha / h2_effective * ti.abs(lam), ti.f64)
+        if ti.static(self.period > 0):
+            stall = ti.min(stall, ti.static(APART * self.period))
         lag = ti.cast(f, ti.f64) - start
-        if (lag > STALL * size and way < 0) or (ti.static(side == 0) and lag < -STALL * size and way > 0):
+        if (lag > stall and way < 0) or (ti.static(side == 0) and lag < -stall and way > 0):
             way = 0 * way
         self.target[c] = self.near(start + way, 0 * start)
         self.step[c] = ti.cast(way, self.real)

@@ -439,11 +439,11 @@ class Scalar(Batch):
             n, both = g, here
         if ti.static(self.driven):
             if first != 0:
-                stiff = ti.max(here, both)
+                alpha = ti.cast(0, self.dev.real)
                 if ti.static(self.dev.spring.soft):
-                    stiff += self.dev.spring.alpha[c] / h2_effective
+                    alpha = self.dev.spring.alpha[c]
                 self.dev.rest[c] = self.dev.drive.advance(
-                    c, f0, self.side, stiff, self.dev.lam[c], h, h2_effective, self.residual_scale(c), fresh
+                    c, f0, self.side, ti.max(here, both), alpha, self.dev.lam[c], h, h2_effective, self.residual_scale(c), fresh
                 )
             f0 = self.unwrap(f0, self.dev.rest[c])
             f = self.unwrap(f, f0)
