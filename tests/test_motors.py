@@ -26,7 +26,7 @@ def turned(w, since=0.0):
     return (np.arctan2(x[1], x[0]) - since + np.pi) % (2 * np.pi) - np.pi
 
 
-@pytest.mark.parametrize("solver", [None, tv.Direct(), tv.ConjugateGradient(4)], ids=str)
+@pytest.mark.parametrize("solver", [tv.Jacobi(), tv.Direct()], ids=str)
 def test_a_limited_torque_accelerates_and_the_speed_is_then_met(world, solver):
     # I w' = T up to w = speed: angle T t^2 / 2 I, then speed (t - t1 / 2) with t1 = I speed / T. Second order.
     inertia, torque, speed = 2.0 * ARM**2, 1.0, 3.0
@@ -45,7 +45,7 @@ def test_a_limited_torque_accelerates_and_the_speed_is_then_met(world, solver):
     assert turned(w, begin + speed) == pytest.approx(0, abs=1e-9) and abs(motor.load[0]) < 1e-6
 
 
-@pytest.mark.parametrize("precision", ["f32", "f32-compensated", "f64"])
+@pytest.mark.parametrize("precision", ["f32", "f64"])
 def test_a_wheel_turns_for_ever_however_slowly(world, precision):
     # Through +-pi again and again, and at 2^-24 of a turn in a substep, which a rest angle in f32 would lose.
     for speed, seconds in ((50.0, 4.0), (1e-3, 4.0)):
@@ -95,13 +95,12 @@ def test_a_brake_is_dry_friction(world):
     assert w.run(0.5).energy == pytest.approx(1.0, abs=1e-5)  # (h v / r)^2 = 3e-6: that of the link
 
 
-@pytest.mark.parametrize("torque", [0.3, np.inf])
-def test_a_motor_gives_no_momentum(world, torque):
-    # Nor angular momentum: its gradients sum to 0, and so do their moments. To rounding, over two seconds; 2D and 3D.
+def test_a_motor_gives_no_momentum(world):
+    # Nor angular momentum: its gradients sum to 0, and so do their moments. To rounding, over a second; 2D and 3D.
     rng = np.random.default_rng(0)
-    for points, hinges, links in (
-        ([[-1, 0.1], [0, 0], [0.7, 0.4]], [[0, 1, 2]], [[0, 1], [1, 2]]),
-        ([[0, 0, 0], [0, 0, 1], [1, 0, 0.4], [-0.8, 0.3, 0.5]], [[0, 1, 2, 3]], [[0, 1], [0, 2], [1, 2], [0, 3], [1, 3]]),
+    for torque, points, hinges, links in (
+        (0.3, [[-1, 0.1], [0, 0], [0.7, 0.4]], [[0, 1, 2]], [[0, 1], [1, 2]]),
+        (np.inf, [[0, 0, 0], [0, 0, 1], [1, 0, 0.4], [-0.8, 0.3, 0.5]], [[0, 1, 2, 3]], [[0, 1], [0, 2], [1, 2], [0, 3], [1, 3]]),
     ):
         x, m = np.array(points, dtype=float), 1 + np.arange(len(points))
         motor = tv.Motor(hinges, 4.0, torque=torque)
@@ -120,15 +119,13 @@ def test_a_motor_gives_no_momentum(world, torque):
             assert motor.violation(w.position)[0] == pytest.approx(0, abs=1e-2)
 
 
-@pytest.mark.parametrize("torque", [1.0, np.inf])
-def test_hinges_in_space_turn_for_ever(world, torque):
+def test_hinges_in_space_turn_for_ever(world):
     # A door of two links about a fixed axis: its angle passes pi as any other.
     x = [[0, 0, 0], [0, 0, 1.0], [1, 0, 0.5], [-1, 0, 0.5]]
-    motor = tv.Motor([[0, 1, 2, 3]], 5.0, torque=torque)
+    motor = tv.Motor([[0, 1, 2, 3]], 5.0, torque=1.0)
     w = world(tv.Particles(x, pinned=[0, 1, 2]), [motor, tv.Distance([[0, 3], [1, 3]])], precision="f64", substeps=10)
     w.run(0.5)
-    if torque == 1.0:  # I = m r^2 = 1
-        assert np.pi - abs(np.arctan2(*w.position[3, [1, 0]])) == pytest.approx(0.5**2 / 2, rel=1e-4)
+    assert np.pi - abs(np.arctan2(*w.position[3, [1, 0]])) == pytest.approx(0.5**2 / 2, rel=1e-4)  # I = m r^2 = 1
     w.run(6.0)
     a = w.position[3]
     w.run(1.0)
@@ -160,22 +157,18 @@ def test_a_servo_goes_to_its_angle_and_stays(world):
 
 
 def test_a_servo_that_rests_is_a_bend(world):
-    # Rigid, and with a spring that gives way by far more than a rigid hinge may be off; where a spring bears more than the largest
-    # torque, it slips.
-    for compliance in (0.0, 0.1):
-        options = {"compliance": compliance, "damping": 4.0 if compliance else 0.0}
-        ends = []
-        for hinge in (
-            tv.Bend([[0, 1, 2]], 0.0, **options),
-            tv.Motor([[0, 1, 2]], 1.0, angle=0.0, **options),
-            tv.Motor([[0, 1, 2]], 1.0, angle=0.0, torque=14.0, **options),
-        ):
-            start = tv.Particles([[-1.0, 0.0], [0.0, 0.0], [ARM, 0.0]], mass=2.0, pinned=[0, 1])
-            w = world(start, [hinge, tv.Distance([[1, 2]]), tv.Gravity(G)], precision="f64")
-            w.run(0.5)
-            ends.append(w.position)
-        np.testing.assert_allclose(ends[1], ends[0], atol=1e-12)
-        np.testing.assert_allclose(ends[2], ends[0], atol=1e-12)
+    # With a spring that gives way by far more than a rigid hinge may be off; where that bears more than the largest torque, it
+    # slips.
+    ends = []
+    for hinge in (
+        tv.Bend([[0, 1, 2]], 0.0, compliance=0.1, damping=4.0),
+        tv.Motor([[0, 1, 2]], 1.0, angle=0.0, torque=[14.0], compliance=0.1, damping=4.0),
+    ):
+        start = tv.Particles([[-1.0, 0.0], [0.0, 0.0], [ARM, 0.0]], mass=2.0, pinned=[0, 1])
+        w = world(start, [hinge, tv.Distance([[1, 2]]), tv.Gravity(G)], precision="f64")
+        w.run(0.5)
+        ends.append(w.position)
+    np.testing.assert_allclose(ends[1], ends[0], atol=1e-12)
     weak, motor = wheel(world, 1.0, gravity=G, angle=0.0, torque=8.0, compliance=0.1, damping=4.0)
     weak.run(3.0)
     assert motor.load[0] == pytest.approx(-8.0, rel=1e-3) or G * 2.0 * ARM * np.cos(turned(weak)) < 8.0
