@@ -290,12 +290,22 @@ def test_many_worlds_have_drives_of_their_own():
         return tv.World(start, [tv.Motor([[0, 1, 2]], speed, torque=5.0), tv.Distance([[1, 2]])], substeps=5)
 
     many = tv.Worlds([one(speed) for speed in speeds])
-    for _ in range(30):
-        many.step(1 / 60)
+    motor = many.features[0]
+    assert isinstance(motor, tv.Motor)
+    many.run(0.2)
+    motor.torque = 1.0  # for all
+    many.run(0.2)
+    many.set(motor, speed=-speeds[:, None])
+    many.run(0.2)
     for k, speed in enumerate(speeds):
         with one(speed) as alone:
-            for _ in range(30):
-                alone.step(1 / 60)
+            mine = alone.features[0]
+            assert isinstance(mine, tv.Motor)
+            alone.run(0.2)
+            mine.torque = 1.0
+            alone.run(0.2)
+            mine.speed = -speed
+            alone.run(0.2)
             np.testing.assert_array_equal(many.position[k], alone.position)
     many.close()
 
