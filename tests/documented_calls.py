@@ -11,7 +11,7 @@ features = [
     tv.Hand((0, 0)), tv.Hand((0, 0), 3, rate=10), tv.Contact(), tv.Contact(friction=0.3), tv.Contact(friction=(0.5, 0.4)),
     tv.Contact(friction={(0, 1): 0.5}, restitution={(0, 0): 0.9}, groups=[(0, 1)], skin=0.1),
     tv.Polygons([range(4), [4, 5, 6]], friction=(0.5, 0.4)), tv.Box((0, 0), (np.inf, 2), friction=(0.5, 0.4), restitution=0.5),
-    tv.HalfSpace((0, 1), 0.5, friction=0.2), tv.Ball((0, 0), 1.0, inside=True), tv.Capsule((0, 0), (1, 0), 0.1),
+    tv.HalfSpace((0, 1), 0.5, friction=0.2), tv.Ball((0, 0), 1.0, inside=True), tv.Capsule((0, 0), (1, 0), 0.1, one_way=(0, 1)),
     tv.Polygon([(0, 0), (1, 0), (0, 1)], position=(1.0, 2.0), rotation=0.5, radius=0.01),
     tv.Mesh(np.zeros((3, 3)), [(0, 1, 2)], rotation=(0, 0, 1), position=np.zeros(3)), tv.Distance([(0, 1)]),
     tv.Distance(links, 0.5), tv.Distance(links, rest=[0.5, 0.6], compliance=[1e-3, 0.0], damping=np.zeros(2), break_at=10.0),
@@ -20,6 +20,8 @@ features = [
     tv.Pin([0]), tv.Pin([0], (0, 0), compliance=1e-3, damping=0.1), tv.Pin(np.arange(3), np.zeros((3, 2)), compliance=np.ones(3)),
     tv.Area([[0, 1, 2]], pressure=2.0, compliance=[0.1]), tv.Volume([(0, 1, 2, 3)], pressure=[1.5]),
     tv.ShapeMatch([np.arange(4), [4, 5]], compliance=[5e-5, 0.0], damping=[5.0, 0.0], creep=0.1, yield_strain=[0.1, 0.2]),
+    tv.Motor([(0, 1, 2)], 3.0, torque=0.5), tv.Motor([(0, 1, 2, 3)], [1.0], angle=np.pi),
+    tv.Winch(links, -0.1, longest=2.0, force=[5, 6]),
     tv.Path([0, 1], [(0, 0), (1, 0)], closed=False, speed=1.0), tv.Snap(np.arange(3), 0.1, origin=(0.0, 0.05), compliance=0.05),
 ]  # fmt: skip
 particles = tv.Particles([(0, 1), (1, 1), (2, 1)], mass=[1, 2, np.inf], radius=0.1, velocity=(0, 1), pinned=[0])

@@ -95,6 +95,13 @@ OTHERS = {
     "Snap": (LINK[:1], lambda c: tv.Snap(c[:, 0], 0.3, compliance=1e-2), "a vector with unit gradients: none is degenerate"),
     "Path": (PATH[:1], lambda c: tv.Path(c[:, 0], PATH), "a vector across a curve; see test_paths.py for ends, corners, loops"),
     "Path, driven": (PATH[:1], lambda c: tv.Path(c[:, 0], PATH, speed=0.3), "puts particles in place, and solves nothing"),
+    "Motor": (
+        PATH[:, :2],
+        lambda c: tv.Motor(c, 2.0, torque=0.3, compliance=1e-3),
+        "its rest angle moves; see test_motors.py for what it does in degenerate places, too",
+    ),
+    "Motor of quads": (WINGS, lambda c: tv.Motor(c, 2.0, angle=0.1), "the same with the gradients of Dihedral"),
+    "Winch": (LINK, lambda c: tv.Winch(c, -0.3, force=5.0), "its length moves; it is a Rope otherwise"),
     "ShapeMatch": (
         WINGS[:, :2],
         lambda c: tv.ShapeMatch(c, compliance=1e-3),

@@ -57,7 +57,7 @@ def test_pay_finds_that_features_only_add(printed):
         ("silo", {"settings": [("GRAINS", 250), ("SETTLED", 2.5)], "seconds": 4.5}, "of the weight"),
         ("drum", {"settings": [("GRAINS", 150), ("RADIUS", 0.05)], "seconds": 4.0}, "the heap leans"),
         ("billiards", {}, "all at rest"),
-        *((name, {}, f"{name}.rrd") for name in ("soft", "bead", "tidy", "ragdoll", "machine")),
+        *((name, {}, f"{name}.rrd") for name in ("soft", "bead", "tidy", "ragdoll", "machine", "buggy")),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )

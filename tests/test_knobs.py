@@ -76,6 +76,18 @@ ROWS3 = {
         {"lower": 0.2, "upper": 0.5} | SPRINGS
     ),
     "Dihedral": (lambda i, x, **k: tv.Dihedral([i], **k), WINGS, ANGLE | SPRING, {"rest": 0.7} | SPRINGS),
+    "Motor": (
+        lambda i, x, **k: tv.Motor([i], **k), PATH, {"speed": 1.0, "torque": 5.0} | SPRING,
+        {"speed": -2.0, "torque": 0.3} | SPRINGS,
+    ),
+    "Motor, angle": (
+        lambda i, x, **k: tv.Motor([i], **k), WINGS, {"speed": 3.0, "angle": 1.0, "torque": 5.0} | SPRING,
+        {"speed": 1.0, "angle": 2.0, "torque": 0.3} | SPRINGS,
+    ),
+    "Winch": (
+        lambda i, x, **k: tv.Winch([i], **k), LINK, {"speed": -0.5, "shortest": 0.3, "longest": 1.0, "force": 9.0} | SPRING,
+        {"speed": -2.0, "shortest": 0.1, "longest": 2.0, "force": 3.0} | SPRINGS,
+    ),
     "Area": (lambda i, x, **k: tv.Area([i], **k), PATH, AREA | SPRING, {"rest": 0.4, "pressure": 1.3} | SPRINGS),
     "Volume": (lambda i, x, **k: tv.Volume([i], **k), WINGS, AREA | SPRING, {"rest": 0.4, "pressure": 1.3} | SPRINGS),
     "Volume, surface": (
@@ -164,6 +176,8 @@ ELSEWHERE = {
     ("Box", "lower"),
 }  # nothing is there
 
+GOES_ON = ("Path, speed", "Motor", "Motor, angle", "Winch")  # from where they have got to, wherever particles are put
+
 
 class Scene:
     """One world of all rows."""
@@ -219,6 +233,7 @@ class Scene:
 GROUPED = {
     "forces": ["Gravity", "Drag", "Wind", "Attractor", "Hand"],
     "links": ["Distance", "Bend", "AngleLimit"],
+    "drives": ["Motor", "Motor, angle", "Winch"],
     "bodies": ["Area", "ShapeMatch"],
     "tethers": ["Pin", "Pin, driven", "Snap", "Path", "Path, at", "Path, speed"],
     "contact": ["Contact"],
@@ -250,7 +265,8 @@ def test_every_setting_is_live(world, group):
     memory, before = scene.world._runner.memory, scene.go()
     fields = scene.world.fields
     some = np.ones(len(before), dtype=bool)
-    some[scene.indices.get("Path, speed", [])] = False  # which goes on from where it is
+    for name in GOES_ON:
+        some[scene.indices.get(name, [])] = False
 
     # Each one by itself changes the motion of its particles, compiles nothing, and leaves no trace when it is set back.
     for name, (_, _, old, new) in rows.items():

@@ -48,13 +48,15 @@ def flat(precision="f32", **settings):
         tv.Force(swirl), tv.PairForce(crowding, 0.3),
         tv.Distance(rope.links[:3], compliance=1e-4, damping=0.01, break_at=50.0), tv.Rope(rope.links[3:], length=0.21),
         tv.Distance(blob.links + b.start), tv.Bend(blob.bends[:2] + b.start, compliance=0.1), tv.Spacer([(n, n + 1)], 0.05),
-        tv.AngleLimit([(n + 1, n + 2, n + 3)], -0.5, 0.5), tv.Area([i.tolist() for i in ball.loops], pressure=1.1),
+        tv.AngleLimit([(n + 1, n + 2, n + 3)], -0.5, 0.5), tv.Winch([(n, n + 2)], -0.2, force=2.0),
+        tv.Area([i.tolist() for i in ball.loops], pressure=1.1),
         tv.Area(blob.faces[:3] + b.start, compliance=1e-3), tv.ShapeMatch([np.arange(c.start, c.stop)], compliance=1e-3),
         tv.Pin([0], compliance=1e-4), tv.Pin([n + 4], (-0.8, 0.3)), tv.Path([n + 5], [(-1, 0.3), (0, 0.4), (1, 0.3)], at=0.4),
         tv.Path([n + 6], [(-0.5, 0.3), (0.5, 0.2)], smooth=False), tv.Snap([n + 7], 0.1, compliance=0.01),
         tv.Constraint(spacing, [(n + 2, n + 3)], rest=0.2), tv.Contact(friction={(0, 1): 0.3}, groups=[(0, 1), (0, 0)]),
         tv.Box((-2, 0), (2, np.inf), friction=(0.4, 0.3)), tv.HalfSpace((0.1, 1), -0.5), tv.Ball((0.5, -0.2), 0.3),
-        tv.Capsule((1.5, 0.1), (1.8, 0.3), 0.05), tv.Polygon([(-2, -1), (2, -1), (2, 4), (-2, 4)], inside=True), tv.Sdf(bowl),
+        tv.Capsule((1.5, 0.1), (1.8, 0.3), 0.05, one_way=(0, 1)),
+        tv.Polygon([(-2, -1), (2, -1), (2, 4), (-2, 4)], inside=True), tv.Sdf(bowl),
     ]  # fmt: skip
     particles = tv.Particles(
         position, mass=0.1 + 0.01 * np.arange(len(position)), radius=0.03, group=np.arange(len(position)) % 2, velocity=(0.2, 0)
@@ -69,6 +71,7 @@ def solid(precision="f64", **settings):
     features = [
         tv.Gravity((0, -9.81, 0)), tv.Distance([(0, 1), (0, 2), (0, 3), (1, 2), (2, 3), (1, 4)], compliance=1e-5),
         tv.Volume([(0, 1, 2, 3)], compliance=1e-4), tv.Dihedral([(0, 1, 2, 3)], compliance=0.1),
+        tv.Motor([(0, 1, 2, 3)], 1.0, torque=0.5, compliance=0.1),
         tv.Mesh(vertices, [(0, 2, 1), (0, 3, 2)], closed=False, restitution=0.3), tv.Contact(),
     ]  # fmt: skip
     settings = {"solver": tv.ConjugateGradient(7), "substeps": 5, **settings}

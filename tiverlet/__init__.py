@@ -5,7 +5,23 @@ from typing import TYPE_CHECKING, Any
 from .device import runtime  # first: it sets what Taichi reads when it is imported  # isort: skip
 from . import measure, shapes
 from .colliders import Ball, Box, Capsule, HalfSpace, Mesh, Polygon, Sdf
-from .constraints import AngleLimit, Area, Bend, Constraint, Dihedral, Distance, Path, Pin, Rope, ShapeMatch, Snap, Spacer, Volume
+from .constraints import (
+    AngleLimit,
+    Area,
+    Bend,
+    Constraint,
+    Dihedral,
+    Distance,
+    Motor,
+    Path,
+    Pin,
+    Rope,
+    ShapeMatch,
+    Snap,
+    Spacer,
+    Volume,
+    Winch,
+)
 from .contact import Contact, Polygons
 from .device.runtime import init
 from .forces import Attractor, Drag, Force, Gravity, Hand, PairForce, Wind
@@ -22,10 +38,11 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AngleLimit", "Area", "Attractor", "Ball", "Bend", "Box", "Capsule", "Chebyshev", "ConjugateGradient", "Constraint",
-    "Contact", "Dihedral", "Direct", "Distance", "Drag", "Force", "Gravity", "HalfSpace", "Hand", "Jacobi", "Mesh", "PairForce",
-    "Particles", "Path", "Pin", "Polygon", "Polygons", "Recorder", "Rope", "Sdf", "ShapeMatch", "Snap", "Spacer", "StepReport",
-    "SweepResult", "Volume", "Wind", "World", "Worlds", "WorldsRecorder", "approach", "clamp", "golden", "golden_colors",
-    "golden_index", "gradient", "init", "measure", "mix", "play", "replay", "runtime", "shapes", "smoothstep", "sweep",
+    "Contact", "Dihedral", "Direct", "Distance", "Drag", "Force", "Gravity", "HalfSpace", "Hand", "Jacobi", "Mesh", "Motor",
+    "PairForce", "Particles", "Path", "Pin", "Polygon", "Polygons", "Recorder", "Rope", "Sdf", "ShapeMatch", "Snap", "Spacer",
+    "StepReport", "SweepResult", "Volume", "Winch", "Wind", "World", "Worlds", "WorldsRecorder", "approach", "clamp", "golden",
+    "golden_colors", "golden_index", "gradient", "init", "measure", "mix", "play", "replay", "runtime", "shapes", "smoothstep",
+    "sweep",
 ]  # fmt: skip
 __version__ = "0.1.0"  # the only place that says it
 

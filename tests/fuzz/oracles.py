@@ -58,6 +58,8 @@ def convex(p: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 def gap(wall: Any, p: np.ndarray, r: np.ndarray) -> np.ndarray:
     """How far particles are from a wall as it stands, negative inside of it, (n,)."""
+    if wall.one_way is not None:  # which any may be inside of
+        return np.full(len(p), np.inf)
     name = type(wall).__name__
     if name == "Box":
         return np.minimum((p - wall.lower).min(axis=1), (wall.upper - p).min(axis=1)) - r
@@ -117,7 +119,9 @@ def rigid(features: list[Any], free: np.ndarray, x: np.ndarray) -> tuple[float, 
             continue
         if not isinstance(f, Scalar) or not f.arity or f.collapses or (f.compliance > 0).any():
             whole = False
-        if not isinstance(f, Scalar):
+        if isinstance(f, Scalar) and f.driven:
+            whole = False
+        if not isinstance(f, Scalar) or f.driven:
             continue
         C = f.violation(x)
         C = np.maximum(f.side * C, 0) if f.side else np.abs(C)
@@ -148,7 +152,7 @@ def closed(structure: Structure) -> bool:
     return not held and not any(f.name in (*PULLS, *WALLS, *TETHERS) for f in structure.features)
 
 
-INNER = ("Distance", "Rope", "Spacer", "Bend", "AngleLimit", "Dihedral", "Area", "Volume", "ShapeMatch")
+INNER = ("Distance", "Rope", "Winch", "Spacer", "Bend", "Motor", "AngleLimit", "Dihedral", "Area", "Volume", "ShapeMatch")
 
 
 def central(structure: Structure) -> bool:

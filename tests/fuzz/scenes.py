@@ -314,6 +314,27 @@ def corners(draw, s: Stage) -> Call | None:
     return Call(kind, {"triples": triples, "rest": pick(draw, None, 0.0, 1.0)} | more)
 
 
+def drives(draw, s: Stage) -> Call | None:
+    """Motor or Winch."""
+    k, speed, most = np.arange(s.n), pick(draw, 1.0, -3.0, 0.0, 100.0), pick(draw, 1.0, 1.0, float("inf"), 0.0, 1e-3, 1e4)
+    kind = pick(draw, "Motor", "Winch")
+    if kind == "Winch":
+        if s.n < 2:
+            return None
+        pairs = chain(s.n)
+        return Call(
+            kind, {"pairs": pairs, "speed": speed * s.size, "length": 0.3 * s.size, "force": most} | springs(draw, s, len(pairs))
+        )
+    arity = 4 if s.dim == 3 and pick(draw, True, False) else 3
+    if s.n < arity:
+        return None
+    hinges = np.stack([k[1:-2], k[2:-1], k[:-3], k[3:]] if arity == 4 else [k[:-2], k[1:-1], k[2:]], axis=1)
+    args: dict[str, Any] = {"hinges": hinges, "speed": speed, "torque": most}
+    if pick(draw, False, True):
+        args["angle"] = pick(draw, 0.5, 3.0, 0.0)
+    return Call(kind, args | springs(draw, s, len(hinges)))
+
+
 def bodies(draw, s: Stage) -> Call | None:
     """Area, Volume, ShapeMatch."""
     if s.n < 3:
@@ -390,6 +411,8 @@ def walls(draw, s: Stage) -> Call | None:
     kinds = ["Box", "HalfSpace", "Ball", "Capsule", "Polygon" if s.dim == 2 else "Mesh"]
     kind = pick(draw, *kinds, *(["Sdf"] if s.size == 1 else []))
     up = np.eye(s.dim)[1]
+    if kind in ("Capsule", "Polygon", "Mesh") and pick(draw, False, False, True):
+        more["one_way"] = pick(draw, up, -up, up + 0.3)
     if kind == "Box":
         return Call(kind, {"lower": low, "upper": high} | more)
     if kind == "HalfSpace":
@@ -471,7 +494,7 @@ def structures(draw) -> Structure:
         args["spin"] = args["spin"][:, 0] if dim == 2 else args["spin"]
         args |= pick(draw, {}, {"inertia": "ring"}, {"inertia": np.linspace(0.1, 2.0, n)}, {"orientation": 0.0})
     stage = Stage(n, dim, x, size, order, list(args.get("pinned", [])), spins)
-    kinds = [forces, links, corners, bodies, rails, forces, links] + ([walls, walls, contacts] if order == 2 else [])
+    kinds = [forces, links, corners, bodies, rails, forces, links] + ([walls, walls, contacts, drives] if order == 2 else [])
     made = [kind(draw, stage) for kind in draw(st.lists(st.sampled_from(kinds), min_size=1, max_size=5))]
     calls, met = [], False
     for call in made:
@@ -495,6 +518,8 @@ KNOBS = {  # a knob and what it may be turned to, from what it was: (value, size
     "Drag": ("rate", (0.0, 5.0, 1e5)),
     "Wind": ("rate", (0.0, 5.0, 1e5)),
     "Attractor": ("strength", (0.0, 1.0, -10.0)),
+    "Motor": ("torque", (0.0, 1.0, float("inf"))),
+    "Winch": ("speed", (0.0, 1.0, -3.0)),
 }
 MOVES = {"HalfSpace": "offset", "Ball": "center", "Capsule": "a", "Polygon": "position", "Mesh": "position", "Sdf": "position"}
 RESTS = ("Distance", "Rope", "Spacer")

@@ -26,7 +26,7 @@ class Capsule(Collider):
     C(x) = |x - q| - (R + r) >= 0 with q the nearest point of the segment; grad C = (x - q) / |x - q|.
 
     a, b: (dim,) [m], live: the ends move to what is assigned during the next frame. radius: R [m], above 0,
-    live: it changes at once. friction, restitution, push_out, active, events: see Collider.
+    live: it changes at once. friction, restitution, push_out, active, events, one_way: see Collider.
 
     What passes through in one substep is caught on the way in, however thin the rod: the path, as seen from the rod, is followed
     to where it meets the surface (sphere tracing, Hart 1996). Nothing can be drawn through either.
@@ -37,11 +37,11 @@ class Capsule(Collider):
 
     def __init__(
         self, a, b, radius, *, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float = 1.0, active: bool |
-        None = None, events: bool = False,
+        None = None, events: bool = False, one_way=None,
     ):  # fmt: skip
         self.a, self.b = a, b
         self.radius = radius
-        self.surface(friction, restitution, push_out, active, events)
+        self.surface(friction, restitution, push_out, active, events, one_way, len(self.a))
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the dimension."""
@@ -145,4 +145,5 @@ class Capsule(Collider):
             if s < 1:
                 _t, _gap, n = self.nearest(x - (1 - s) * d, a, b)
                 depth = (s - 1) * d.dot(n)
-        self.dev.surface.press(i, depth, start_depth, n, moved, h, turn)
+        if not self.dev.surface.lets_through(i, n, start_depth, contact_distance):
+            self.dev.surface.press(i, depth, start_depth, n, moved, h, turn)

@@ -42,6 +42,10 @@ class Collider(Feature):
     turn; None is always there, and costs the compiling of another scene when it is switched off for the first time. What is
     inside of a wall that comes back is left at push_out.
     events: whether World.wall_events() tells which particles met and left it.
+    one_way: a direction along which particles pass, for platforms: (0, 1) holds what comes from above, and lets through what
+    comes from below. Particles are held where they touch with a normal to that side; what was inside of the wall at the start of
+    the substep, however it came there, is let through until it is free. Fixed, and turned with the wall. Nothing is remembered of
+    a particle but where it is. Capsule, Polygon and Mesh take it; None is a wall for both sides.
     """
 
     friction = Knob(lambda f, v: _friction(f, v), "A number, or (static, dynamic, rolling, twisting).")
@@ -51,6 +55,7 @@ class Collider(Feature):
     events = Knob(lambda f, v: checks.flag(repr(f), "events", v), "Whether World.wall_events() tells of it.", compiled=True)
     compiled_for = ("has_friction", "has_restitution", "has_switch", "turns")
     host_only = ("widest",)
+    one_way: Any = None  # unit vector along which particles pass
     _switch = False  # it was made with one
     _stands = True  # on the device
     sweeps = False  # needs the exact position at the start of the substep
@@ -59,10 +64,23 @@ class Collider(Feature):
     inside = False  # particles are kept inside of it
     poses = False  # has a pose(when) to be worked out once for each substep, before any confine()
 
-    def surface(self, friction: Any, restitution: Any, push_out: float, active: bool | None, events: bool = False) -> None:
-        """Check and keep the arguments that all walls have."""
+    def surface(
+        self, friction: Any, restitution: Any, push_out: float, active: bool | None, events: bool = False, one_way: Any = None,
+        dim: int = 0,
+    ) -> None:  # fmt: skip
+        """Check and keep the arguments that all walls have; one_way in dim axes."""
         self.friction, self.restitution, self.push_out, self.events = friction, restitution, push_out, events
+        if one_way is not None:
+            self.one_way = self._direction(one_way, dim)
         self._switch, self.active = active is not None, True if active is None else active
+
+    def _direction(self, one_way: Any, dim: int) -> np.ndarray:
+        """one_way, checked, as a unit vector."""
+        way = checks.vector(repr(self), "one_way", one_way, dim)
+        length = float(np.linalg.norm(way))
+        if length == 0:
+            raise ValueError(f"{self!r}: one_way = 0 has no direction; {(0, 1, 0)[:dim]} lets particles pass upwards.")
+        return way / length
 
     @property
     def has_friction(self) -> bool:
@@ -108,7 +126,9 @@ class Collider(Feature):
         self.dev.real = scene.real
         both = friction_of(repr(self), "friction", self.friction) if self.has_friction else None
         restitution, active = self._bounce if self.has_restitution else None, self.active if self.has_switch else None
-        self.dev.surface = Surface(scene, repr(self), both, restitution, self.push_out, active, self.turns, self.events)
+        self.dev.surface = Surface(
+            scene, repr(self), both, restitution, self.push_out, active, self.turns, self.events, self.one_way
+        )
         self.dev.log = self.dev.surface.log
         self._stands = self.active
 

@@ -22,7 +22,7 @@ class Mesh(Moving):
     vertices: (m, 3) [m]. faces: (k, 3) vertices of each triangle, either way round: they are turned alike here, and outwards.
     inside: keep particles in. closed: False for a sheet, a thin wall with two sides. radius: R [m], what the faces are thickened
     by; a sheet that points (particles of radius 0) meet needs some. position, rotation: where the vertices are put (see Moving);
-    live. friction, restitution, push_out, active, events: see Collider.
+    live. friction, restitution, push_out, active, events, one_way: see Collider.
 
     Nothing passes, at any speed of the particle or of the wall. The cost for a particle grows with the faces around it, not with
     those of the mesh. Raises ValueError for faces of no area, and for a closed mesh with an edge that does not have two faces.
@@ -33,7 +33,7 @@ class Mesh(Moving):
     def __init__(
         self, vertices, faces, inside: bool = False, *, closed: bool = True, radius: float = 0.0, position: ArrayLike = 0.0,
         rotation: ArrayLike = 0.0, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float = 1.0, active: bool |
-        None = None, events: bool = False,
+        None = None, events: bool = False, one_way=None,
     ):  # fmt: skip
         vertices = checks.points("Mesh", "vertices", vertices, dim=3)
         faces = checks.indices("Mesh", "faces", faces, len(vertices), arity=3).astype(int)
@@ -56,7 +56,7 @@ class Mesh(Moving):
         for array in (vertices, faces):
             array.flags.writeable = False
         self.place(position, rotation)
-        self.surface(friction, restitution, push_out, active, events)
+        self.surface(friction, restitution, push_out, active, events, one_way, 3)
         self.facets = self._joined()
 
     def _outward(self, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -123,11 +123,14 @@ class Moving(Collider):
                 if s > 1:
                     going = False
                 elif k < TOUCHES:
-                    touched = True
                     start_depth = ti.select(s > 0, ti.min(depth, 0), depth + e.dot(n))
-                    shift = self.dev.surface.press(i, depth, start_depth, self.dev.pose.outward(1, n), moved, h, turn)
-                    a += s * e
-                    e += self.dev.pose.inward(1, shift) - s * e
+                    if self.dev.surface.lets_through(i, n, start_depth, contact_distance):
+                        going = False
+                    else:
+                        touched = True
+                        shift = self.dev.surface.press(i, depth, start_depth, self.dev.pose.outward(1, n), moved, h, turn)
+                        a += s * e
+                        e += self.dev.pose.inward(1, shift) - s * e
         if ti.static(self.dev.shape.guesses):
             if touched and not self.dev.shape.astray(first, contact_distance - 8 * close, close):
                 going = going or self.dev.shape.astray(a + e, contact_distance, close)

@@ -21,7 +21,7 @@ class Polygon(Moving):
     vertices: (m, 2) [m], in order, either way round; concave outlines are fine. inside: keep particles in. closed: False for a
     line from the first vertex to the last, a thin wall with two sides. radius: R [m], what the outline is thickened by; a line
     that points (particles of radius 0) meet needs some. position, rotation: where the vertices are put (see Moving); live.
-    friction, restitution, push_out, active, events: see Collider.
+    friction, restitution, push_out, active, events, one_way: see Collider.
 
     Nothing passes, at any speed of the particle or of the wall. Raises ValueError for edges of no length, and for a closed
     outline that has no area or meets itself.
@@ -32,7 +32,7 @@ class Polygon(Moving):
     def __init__(
         self, vertices, inside: bool = False, *, closed: bool = True, radius: float = 0.0, position: ArrayLike = 0.0, rotation:
         ArrayLike = 0.0, friction: ArrayLike = 0.0, restitution: ArrayLike = 0.0, push_out: float = 1.0, active: bool |
-        None = None, events: bool = False,
+        None = None, events: bool = False, one_way=None,
     ):  # fmt: skip
         vertices = checks.points("Polygon", "vertices", vertices, dim=2)
         self.closed, self.inside = bool(closed), bool(inside)
@@ -61,7 +61,7 @@ class Polygon(Moving):
         self.vertices = vertices
         self.vertices.flags.writeable = False
         self.place(position, rotation)
-        self.surface(friction, restitution, push_out, active, events)
+        self.surface(friction, restitution, push_out, active, events, one_way, 2)
         along = vertices[j] - vertices[i]
         along /= np.linalg.norm(along, axis=1)[:, None]
         features = np.stack([i, j], axis=1)

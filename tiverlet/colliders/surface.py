@@ -11,6 +11,7 @@ if TYPE_CHECKING:
 
 # How a collider confines: as it comes; only what is further out than rounding; of that, without friction and bounces.
 FIRST, AGAIN, GENTLY = range(3)
+ON = 1e-3  # of its distance from the middle of a wall: what is no deeper inside than this lies on it
 
 
 class Surface:
@@ -18,12 +19,13 @@ class Surface:
 
     friction: coefficients, or None for a surface without. restitution: 0 to 1, or None. push_out: [m/s]. active: whether
     it is there, or None for one without a switch. turns: whether it resists rolling, or bounces across the normal. poses: of a
-    wall that may turn, its Pose; else none. events: whether there is a `log` of what touches.
+    wall that may turn, its Pose; else none. events: whether there is a `log` of what touches. one_way: unit vector along which it
+    lets particles pass, or None.
     """
 
     def __init__(
         self, scene: "Scene", name: str, friction: "Coefficients | None", restitution: "Bounce | None", push_out: float, active:
-        bool | None, turns: bool, events: bool,
+        bool | None, turns: bool, events: bool, one_way: Any,
     ):  # fmt: skip
         self.has_log = events
         self.log: Any = WallLog(scene, name) if events else None
@@ -44,7 +46,9 @@ class Surface:
         if turns and friction:
             values = friction.rolling, friction.twisting, restitution.tangential if restitution else 0.0
             self.rolling = scene.memory.field(f"{name}.rolling", None, width=3, values=values)
-        self.has_switch = active is not None
+        self.has_switch, self.is_one_way = active is not None, one_way is not None
+        if self.is_one_way:
+            self.one_way = scene.memory.field(f"{name}.one_way", None, width=len(one_way), values=one_way)
         if self.has_switch:
             self.active = scene.memory.field(f"{name}.active", None, kind=ti.i32, values=float(active or 0))
 
@@ -85,6 +89,19 @@ class Surface:
             high, lift = self.bounced(i)
             if high:
                 out += lift
+        return out
+
+    @ti.func
+    def lets_through(self, i, n, start_depth, contact_distance):
+        """Whether particle i passes: it touches with a normal n that is not towards the side of the wall on which it is held, or
+        it is on its way, that is, further inside at the start of the substep than what lies there.
+
+        n: in the frame in which one_way is given. contact_distance: of its center from what the wall is made of [m].
+        """
+        out = False
+        if ti.static(self.is_one_way):
+            on = 4 * self.state.digits(i) + ti.static(ON) * contact_distance
+            out = n.dot(self.one_way[None]) <= 0 or start_depth > on
         return out
 
     @ti.func

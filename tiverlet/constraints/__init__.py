@@ -6,6 +6,7 @@ from .bend import Bend
 from .constraint import Constraint
 from .dihedral import Dihedral
 from .distance import Distance
+from .motor import Motor
 from .path import Path
 from .pin import Pin
 from .rope import Rope
@@ -13,6 +14,7 @@ from .shape_match import ShapeMatch
 from .snap import Snap
 from .spacer import Spacer
 from .volume import Volume
+from .winch import Winch
 
 __all__ = [
     "AngleLimit",
@@ -21,6 +23,7 @@ __all__ = [
     "Constraint",
     "Dihedral",
     "Distance",
+    "Motor",
     "Path",
     "Pin",
     "Rope",
@@ -28,4 +31,5 @@ __all__ = [
     "Snap",
     "Spacer",
     "Volume",
+    "Winch",
 ]

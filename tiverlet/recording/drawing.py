@@ -105,7 +105,8 @@ class Drawing:
         found = links(world)
         none = np.zeros((0, 2), dtype=np.int64)
         self._pairs = np.concatenate([none, *(f.indices for _, f in found)])
-        self._rest = np.concatenate([[], *(f.rest if isinstance(f, Link) else np.full(f.count, np.nan) for _, f in found)])
+        lengths = [f.rest if isinstance(f, Link) and not f.driven else np.full(f.count, np.nan) for _, f in found]
+        self._rest = np.concatenate([[], *lengths])
         number, row = (np.concatenate([[], *each]).astype(np.int64) for each in (
             [np.full(f.count, k) for k, f in found], [np.arange(f.count) for _, f in found]
         ))  # fmt: skip  # of the feature, and of the link in it

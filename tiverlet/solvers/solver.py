@@ -58,7 +58,8 @@ class Solver(RecordsArguments):
 
     def remedy(self, batches: list[Batch], slots, inv_mass: np.ndarray) -> str:
         """The setting that meets constraints better, as the user writes it; "" where only more substeps do."""
-        alone = [b for b in batches if isinstance(b, Scalar) and b.solvable_together and not b.side and (slots.rows(b) < 0).any()]
+        some = [b for b in batches if isinstance(b, Scalar) and b.solvable_together and not (b.side or b.driven)]
+        alone = [b for b in some if (slots.rows(b) < 0).any()]
         if not alone:
             return ""
         rows = len(plan_of(alone, inv_mass, WIDTH).rows)

@@ -66,6 +66,8 @@ def refuse(order: int, features: tuple[Feature, ...], precision: str, path: str)
                 why = "is one-sided: where it starts to act, motion has no derivatives of that order"
             elif (f.damping > 0).any():
                 why = "has damping, so that the substep is not reversible"
+            elif f.driven:
+                why = "moves on its own, up to a largest load: there motion has no derivatives of that order"
             elif f.breaks:
                 why = "can break, where motion has no derivatives of that order"
             elif not f.arity:

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from ..constraints.core.scalar import Scalar
 from ..contact.initial_overlap import overlapping
 from ..contact.velocity_projection import EVERY
 from ..device.interrupts import whole
@@ -41,6 +42,7 @@ class Runner:
         # Asked in every frame, and Taichi looks at each attribute of what has kernels.
         step = self.step
         self.n, self.launched, self.team, self.integrator = step.n, step.launched, step.team, step.integrator
+        self.driven = [b for b in self.batches if isinstance(b, Scalar) and b.driven]
         self.semi_iterations, self.drags = step.constraints.semi_iterations, step.integrator.forces.drags
         self.probe = high_order.Probe(step) if self.scene.order > 2 else None
         self.passes_at_once = max(1, LONG // (1 + self.n + sum(b.count for b in self.batches)))  # in a launch
@@ -97,6 +99,8 @@ class Runner:
                 clock.since = 0
             self.moved = 0.0
             if clock.first_moved is not None and self.scene.slots:
+                for b in self.driven:
+                    b.placed(self.scene.state.get(self.memory), clock.first_moved)
                 moved = initial_violation.remove(self.scene, self.batches, clock.first_moved, self.stop_at_walls)
                 if moved is not None:
                     self.moved, self.jumped = float(moved.max()), bool((moved > self.scene.particles.radius).any())

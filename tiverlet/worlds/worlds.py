@@ -279,6 +279,7 @@ class Worlds:
         """Bring knobs to the device: those that were assigned for all, and those that were set for some."""
         world, features = self._world, self._world.features
         if not self._set and not any(f.changed or f.moving for f in features):
+            self._waiting = []  # nor in any of the worlds that these were made of
             return
         with self._at(0):
             self._check_kernels()

@@ -1,4 +1,4 @@
-"""What constraints on an angle share, and the angle of a path."""
+"""What constraints on an angle share, the angle of a path, and that between two triangles."""
 
 import numpy as np
 
@@ -30,7 +30,7 @@ class Angle(Scalar):
     @ti.func
     def reach(self, c, q):
         """The shorter of the two legs of a path."""
-        return ti.min((q[1, :] - q[0, :]).norm(), (q[2, :] - q[1, :]).norm())
+        return path_reach(q)
 
     @ti.func
     def faint(self):
@@ -90,3 +90,49 @@ def path_angle(q, axis, mirrored, faint):
             g, k = n.cross(u), n.cross(v)
         g, k = g / ti.sqrt(aa), k / ti.sqrt(bb)
     return f, ti.Matrix.rows([g, -(g + k), k])
+
+
+def dihedral_angles(i: np.ndarray, j: np.ndarray, k: np.ndarray, l: np.ndarray) -> np.ndarray:  # noqa: E741
+    """What dihedral_angle() measures, of corners (m, 3) [m]: (m,) [rad]."""
+    e, a, b = (end - i for end in (j, k, l))
+    e = e / np.maximum(np.linalg.norm(e, axis=1, keepdims=True), 1e-300)
+    p, q = (r - e * (r * e).sum(axis=1, keepdims=True) for r in (a, b))
+    return np.arctan2((e * np.cross(p, q)).sum(axis=1), -(p * q).sum(axis=1))
+
+
+@ti.func
+def dihedral_angle(q):
+    """The angle between two triangles with a common edge, of corners (i, j, k, l) of which i is at the origin: the ends of the
+    edge, then the wings; and its gradients. None where an edge or a triangle has no size.
+
+    f = atan2(e . (p x q), -p . q) in (-pi, pi]: 0 where flat, pi where folded, positive where the wings fold towards the side of
+    e x p. e: unit vector of the edge x_j - x_i; p, q: unit vectors at right angles to it towards the wings x_k and x_l, at
+    distances P and Q from it, with feet at the fractions s and t of the edge (Bergou et al. 2006, eq. 7 ff.).
+
+        grad_k f = e x p / P,   grad_l f = -e x q / Q,
+        grad_j f = -(s grad_k f + t grad_l f),   grad_i f = -((1 - s) grad_k f + (1 - t) grad_l f)
+    """
+    edge, a, b = q[1, :], q[2, :], q[3, :]
+    ee = edge.dot(edge)
+    f, g = ti.zero(ee), 0 * q
+    if ee > SHORT:
+        e, s, t = edge / ti.sqrt(ee), a.dot(edge) / ee, b.dot(edge) / ee
+        p, r = a - s * edge, b - t * edge
+        pp, rr = p.dot(p), r.dot(r)
+        if pp > SHORT and rr > SHORT:
+            f = ti.atan2(e.dot(p.cross(r)), -p.dot(r))
+            k, l = e.cross(p) / pp, -e.cross(r) / rr  # noqa: E741
+            g = ti.Matrix.rows([-((1 - s) * k + (1 - t) * l), -(s * k + t * l), k, l])
+    return f, g
+
+
+@ti.func
+def path_reach(q):
+    """The shorter of the two legs of a path: how far a corner may move before its angle is no longer what gradients say."""
+    return ti.min((q[1, :] - q[0, :]).norm(), (q[2, :] - q[1, :]).norm())
+
+
+@ti.func
+def dihedral_reach(q):
+    """The same of two triangles: the shortest way from an end of the edge to another corner."""
+    return ti.min(q[1, :].norm(), ti.min(q[2, :].norm(), q[3, :].norm()))

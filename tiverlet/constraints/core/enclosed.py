@@ -157,7 +157,7 @@ class Enclosed(Scalar):
             violation, A, alpha, lam, W = self.equation(c, f, f0, w, W, h, h2_effective, first, fresh)
             if ti.static(self.dev.limited):
                 violation -= A * self.postpone(c, f0, W, frame_fraction[1] - frame_fraction[0], first)
-            new, left = self.jacobi_update(violation, A, alpha, lam, W, turn)
+            new, left = self.jacobi_update(c, violation, A, alpha, lam, W, turn)
             new = self.limit_collapse(c, lam, new, extent, move)
             self.dev.lam[c], self.dev.change[c], self.dev.astray[c] = new, new - lam, turn == FAR
 
@@ -177,7 +177,7 @@ class Enclosed(Scalar):
             Scalar.push_spring_force(self, c, h)
         else:
             f, f0, w, W, turn, extent, move = self.total(c)
-            self.dev.change[c], self.dev.astray[c] = h * h * self.force(c, f, f0, w, h), 1
+            self.dev.change[c], self.dev.astray[c] = h * h * self.spring_force(c, f, f0, w, h), 1
 
     @ti.func
     def push_reaction(self, c, firm, soft):
@@ -197,7 +197,7 @@ class Enclosed(Scalar):
         else:
             f, f0, w, W, turn, extent, move = self.total(c)
             violation, A, alpha, lam, W = self.equation(c, f, f0, w, W, h, h2_effective, 0, fresh)
-            new, left = self.jacobi_update(violation, A, alpha, lam, W, turn)
+            new, left = self.jacobi_update(c, violation, A, alpha, lam, W, turn)
             if w == 0:  # collapsed, or static
                 for e in range(self.dev.corners.starts[c], self.dev.corners.starts[c + 1]):
                     if self.dev.w.of(self.dev.corners.members[e]) > 0 and self.dev.strength.holds(c):

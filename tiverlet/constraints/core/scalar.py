@@ -10,6 +10,7 @@ from ...device import ti
 from ...features.feature import FAR, Batch, Knob, Scene
 from ...features.members import FixedSize
 from ...tools import distinct
+from .drive import Drive
 from .spring import Spring, stiff
 from .strength import Strength, strength_of
 
@@ -74,6 +75,7 @@ class Scalar(Batch):
     precise = False  # whether exactly() measures to all the digits that positions have
     cusp = False  # whether any goal is f = 0, where gradients end: no direction at the start of the step means anything there
     curved = False  # whether f is so curved that Newton's step from afar means nothing
+    driven = False  # whether rest values move by themselves: what drive_of() gives, see Drive
     collapses = 0  # the power of a length that f is, where gradients vanish with the size of the body; else 0
 
     def setup(self, indices, rest, compliance, damping, break_at=None) -> None:
@@ -200,6 +202,13 @@ class Scalar(Batch):
         solved = self.scene and self.acts and self.solvable_together
         return super().outgrown or bool(solved and (self._alone != self.relaxed_alone(self.scene)).any())
 
+    def drive_of(self, scene: Scene) -> Drive:
+        """What moves the rest values, where the batch is driven."""
+        raise NotImplementedError
+
+    def placed(self, position: np.ndarray, first: int) -> None:
+        """Where the batch is driven: particles from number `first` on were placed where they are, (n, dim)."""
+
     @property
     def limited(self) -> bool:
         """Whether steps of the batch have to be limited, or had to be when kernels were compiled: f is curved, and some rigid."""
@@ -219,7 +228,9 @@ class Scalar(Batch):
         scale = self.unit or (float(np.abs(start).mean()) if np.any(start) else self.start.size)
         self.dev.scale = scene.memory.number(scale, scene.real)
         name, m, add = repr(self), self.count, scene.memory.field
-        self.dev.rest = add(f"{name}.rest", m, values=self.goal)
+        self.dev.rest = add(f"{name}.rest", m, values=self.goal, state=self.driven)
+        if self.driven:
+            self.dev.drive = self.drive_of(scene)
         self.dev.lam = add(f"{name}.multiplier", m, state=True)
         compliance, damping = self.compliance if self.soft else None, self.damping if self.damped else None
         self.dev.spring = Spring(scene, name, compliance, damping, start)
@@ -240,14 +251,17 @@ class Scalar(Batch):
         self.dev.converges = self.solvable_together and (self.dev.in_system or bool(scene.slots.semi_iteration))
         if self.dev.converges:
             self.dev.inverse_size = add(f"{name}.close", m, values=self.inverse_size(self.start.position))
-        self.dev.steps = bool(self.dev.converges and scene.slots.semi_iteration and self.dev.outside and self.side == 0)
+        self.dev.steps = bool(
+            self.dev.converges and scene.slots.semi_iteration and self.dev.outside and not (self.side or self.driven)
+        )
         if self.dev.steps:
             self.dev.step = add(f"{name}.step", m)
 
     def upload(self) -> None:
         """Write new rest values, stiffnesses and strengths."""
         if self.acts:
-            self.scene.memory.write(self.dev.rest, self.goal)
+            if not self.driven:
+                self.scene.memory.write(self.dev.rest, self.goal)
             self.dev.spring.upload(self.compliance, self.damping)
             self.dev.strength.upload(self.break_at)
 
@@ -348,8 +362,8 @@ class Scalar(Batch):
                 A, now, last = self.dev.spring.law(c, h, w, fresh)
                 alpha = self.dev.spring.alpha[c] / h2_effective
                 if first != 0:
-                    rest = self.dev.rest[c]
-                    B = now * self.bounded(f0 - rest) + last * self.bounded(self.unwrap(self.dev.spring.last[c], f0) - rest)
+                    f_last = self.unwrap(self.dev.spring.last[c], f0)
+                    B = now * self.bounded(self.violation_then(c, f0, 1)) + last * self.bounded(self.violation_then(c, f_last, 2))
                     self.dev.spring.history[c] = B
                     self.dev.spring.last[c] = f0
                 else:
@@ -360,11 +374,26 @@ class Scalar(Batch):
         return A * C + B + alpha * lam, A, alpha, lam, W
 
     @ti.func
+    def violation_then(self, c, f, ago: ti.template()):  # type: ignore[valid-type]
+        """f - rest with the rest value of `ago` substeps ago."""
+        C = f - self.dev.rest[c]
+        if ti.static(self.driven):
+            C += ago * self.dev.drive.step[c]
+        return C
+
+    @ti.func
+    def clamped(self, c, lam):
+        """A multiplier, at most what the drive can do."""
+        if ti.static(self.driven):
+            lam = self.dev.drive.clamp(c, lam)
+        return lam
+
+    @ti.func
     def postpone(self, c, f0, W, share, first):
         """What of the violation is left for later substeps, see the class. share: of the frame, that the substep is; 0: none."""
         out = ti.cast(0, self.dev.real)
         if first != 0:
-            C = self.bounded(f0 - self.dev.rest[c])
+            C = self.bounded(self.violation_then(c, f0, 1))
             borne = W * ti.abs(self.dev.lam[c])
             if ti.static(not self.collapses):
                 borne = ti.min(borne, BORNE * self.residual_scale(c))
@@ -408,6 +437,16 @@ class Scalar(Batch):
                 lost = lost or ti.abs(self.bounded(f0 - self.dev.rest[c])) * self.dev.inverse_size[c] > LOST
         if lost:
             n, both = g, here
+        if ti.static(self.driven):
+            if first != 0:
+                alpha = ti.cast(0, self.dev.real)
+                if ti.static(self.dev.spring.soft):
+                    alpha = self.dev.spring.alpha[c]
+                self.dev.rest[c] = self.dev.drive.advance(
+                    c, f0, self.side, ti.max(here, both), alpha, self.dev.lam[c], h, h2_effective, self.residual_scale(c), fresh
+                )
+            f0 = self.unwrap(f0, self.dev.rest[c])
+            f = self.unwrap(f, f0)
         violation, A, alpha, lam, W = self.equation(c, f, f0, w, both, h, h2_effective, first, fresh)
         if ti.static(self.dev.limited):
             violation -= A * self.postpone(c, f0, W, share, first)
@@ -422,13 +461,14 @@ class Scalar(Batch):
         return out
 
     @ti.func
-    def jacobi_update(self, violation, A, alpha, lam, W, turn):
+    def jacobi_update(self, c, violation, A, alpha, lam, W, turn):
         """The multiplier of a Jacobi pass, and the size of the violation that it removes."""
         new, size = lam, ti.cast(0, self.dev.real)
         if W > 0:
             new = lam - self.dev.slots.relaxation * violation / (A * W + alpha)
             if ti.static(self.side != 0):
                 new = -self.bounded(-new)
+            new = self.clamped(c, new)
             size = ti.abs(new - lam) * (A * W + alpha) / self.dev.slots.relaxation
             if new != lam:
                 self.dev.slots.note_turn(turn)
@@ -460,6 +500,7 @@ class Scalar(Batch):
     def motion(self, c, n, together):
         """The motion u along n in this substep, its weight W, the largest move by a multiplier of 1, the largest move squared.
 
+        u is relative to the rest value, where that moves.
         together: 1 where the mass is split between all constraints, though some are solved together.
         """
         u, W, longest, fastest = (
@@ -477,6 +518,8 @@ class Scalar(Batch):
             W += split * n[k, :].dot(n[k, :])
             longest = ti.max(longest, self.dev.w.of(i) * n[k, :].norm())
             fastest = ti.max(fastest, move.norm_sqr())
+        if ti.static(self.driven):
+            u -= self.dev.drive.step[c]
         return u, W, longest, fastest
 
     @ti.func
@@ -507,7 +550,7 @@ class Scalar(Batch):
                 start, weight, new = lam, W, lam
                 if ti.static(self.dev.limited):
                     if W > 0:
-                        new, _ = self.jacobi_update(violation, A, alpha, lam, W, 0)
+                        new, _ = self.jacobi_update(c, violation, A, alpha, lam, W, 0)
                         new, far = self.limit_step(c, lam, new, n, frame_fraction[1] - frame_fraction[0], 1)
                         if far:  # the others follow: a row without a weight goes back by its multiplier
                             start, weight = lam - new, 0 * W
@@ -526,7 +569,7 @@ class Scalar(Batch):
                     self.dev.slots.note_turn(turn)
         if ti.static(self.dev.outside):
             if self.outside_systems(c):
-                new, _ = self.jacobi_update(violation, A, alpha, lam, W, turn)
+                new, _ = self.jacobi_update(c, violation, A, alpha, lam, W, turn)
                 if ti.static(self.collapses > 0):
                     move = ti.cast(0, self.dev.real)
                     for k in ti.static(range(self.arity)):
@@ -545,6 +588,7 @@ class Scalar(Batch):
                 if ti.static(self.dev.limited):
                     if W > 0:
                         new, _ = self.limit_step(c, lam, new, n, frame_fraction[1] - frame_fraction[0], 0)
+                        new = self.clamped(c, new)
                         step = new - lam
                 if ti.static(self.dev.steps):
                     self.dev.step[c] = step
@@ -590,12 +634,12 @@ class Scalar(Batch):
             f0, _ = self.measure(c, self.corners(c, 1))
         for k in ti.static(range(self.arity)):
             w += self.dev.w.of(self.member(c, k)) * g[k, :].dot(g[k, :])
-        force = self.force(c, f, self.unwrap(f0, f), w, h)
+        force = self.spring_force(c, f, self.unwrap(f0, f), w, h)
         for k in ti.static(range(self.arity)):
             self.push(c, k, h * h * self.dev.w.of(self.member(c, k)) * force * g[k, :])
 
     @ti.func
-    def force(self, c, f, f0, w, h):
+    def spring_force(self, c, f, f0, w, h):
         """F of push_spring_force(), from f now and a substep ago."""
         force = ti.cast(0, self.dev.real)
         if ti.static(self.dev.spring.soft):
@@ -609,6 +653,8 @@ class Scalar(Batch):
                 if ti.static(self.dev.spring.damped):
                     if ti.static(self.side == 0) or C != 0:
                         force -= resolved * self.dev.spring.damping[c] * (f - f0) / h
+                if ti.static(self.driven):
+                    force = self.dev.drive.clamp_force(c, force)
         return force
 
     @ti.func
@@ -628,7 +674,7 @@ class Scalar(Batch):
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
         """The violation that is left, relative to the rest value (to the batch's mean f where that is 0)."""
         violation, A, alpha, lam, W, _, _, _, _ = self.linearise(c, h, h2_effective, 0 * h, 0, fresh)
-        _, left = self.jacobi_update(violation, A, alpha, lam, W, 0)
+        _, left = self.jacobi_update(c, violation, A, alpha, lam, W, 0)
         if ti.static(self.collapses > 0):
             f, g = self.measure(c, self.corners(c, 0))
             if g.norm_sqr() == 0 and self.dev.strength.holds(c):

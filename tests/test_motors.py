@@ -1,0 +1,327 @@
+"""Motors and winches: speeds that are met, torques and forces that are exact, and what they do to momentum and energy."""
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+from tiverlet.device import thread_team
+
+from .conftest import order
+
+ARM, G = 0.5, 9.81
+
+
+def wheel(world, speed, mass=2.0, pinned=(0, 1), gravity=0.0, **settings):
+    """A mass on an arm of 0.5 m about a hub that does not move: I = m r^2. Returns the world and its motor."""
+    world_settings = {k: settings.pop(k) for k in ("substeps", "solver", "precision", "iterations") if k in settings}
+    motor = tv.Motor([[0, 1, 2]], speed, **settings)
+    start = tv.Particles([[-1.0, 0.0], [0.0, 0.0], [ARM, 0.0]], mass=mass, pinned=list(pinned))
+    features = [motor, tv.Distance([[1, 2]]), tv.Gravity(gravity)]
+    return world(start, features, **{"substeps": 20, "precision": "f64"} | world_settings), motor
+
+
+def turned(w, since=0.0):
+    """The angle of the arm, from `since` on [rad], in (-pi, pi]."""
+    x = w.position[2] - w.position[1]
+    return (np.arctan2(x[1], x[0]) - since + np.pi) % (2 * np.pi) - np.pi
+
+
+@pytest.mark.parametrize("solver", [tv.Jacobi(), tv.Direct()], ids=str)
+def test_a_limited_torque_accelerates_and_the_speed_is_then_met(world, solver):
+    # I w' = T up to w = speed: angle T t^2 / 2 I, then speed (t - t1 / 2) with t1 = I speed / T. Second order.
+    inertia, torque, speed = 2.0 * ARM**2, 1.0, 3.0
+    t1, errors = inertia * speed / torque, []
+    for substeps in (5, 10, 20, 40):
+        w, motor = wheel(world, speed, torque=torque, substeps=substeps, solver=solver)
+        w.run(0.5)
+        errors.append(turned(w) - torque * 0.5**2 / 2 / inertia)
+        assert motor.load[0] == pytest.approx(-torque, rel=1e-9) and motor.residual[0] == 0
+        assert np.linalg.norm(w.velocity[2]) == pytest.approx(ARM * torque * 0.5 / inertia, rel=1e-4)
+    assert order(np.abs(errors)) == pytest.approx(2, abs=0.1)
+    w.run(3.0)
+    assert turned(w, speed * (3.5 - t1 / 2)) == pytest.approx(0, abs=1e-3)
+    begin = turned(w)
+    w.run(1.0)
+    assert turned(w, begin + speed) == pytest.approx(0, abs=1e-9) and abs(motor.load[0]) < 1e-6
+
+
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+def test_a_wheel_turns_for_ever_however_slowly(world, precision):
+    # Through +-pi again and again, and at 2^-24 of a turn in a substep, which a rest angle in f32 would lose.
+    for speed, seconds in ((50.0, 4.0), (1e-3, 4.0)):
+        w, _ = wheel(world, speed, precision=precision)
+        w.run(1.0)
+        begin = turned(w)
+        w.run(seconds)
+        assert turned(w, begin + speed * seconds) == pytest.approx(0, abs=1e-9 if precision == "f64" else 2e-6)
+
+
+@pytest.mark.parametrize("substeps", [2, 20, 200])
+def test_a_lever_lifts_what_its_torque_can(world, substeps):
+    # From horizontal, I a = T - m g r cos a: it goes up if and only if T > m g r; with more than enough it holds its speed.
+    most = 2.0 * G * ARM
+    for torque, up in ((1.01 * most, True), (0.99 * most, False)):
+        w, motor = wheel(world, 1.0, torque=torque, gravity=G, substeps=substeps)
+        w.run(0.2)
+        start = torque / (2.0 * ARM**2) - G / ARM
+        assert (turned(w) > 0) == up and turned(w) == pytest.approx(start * 0.2**2 / 2, rel=0.02)
+    w, motor = wheel(world, 1.0, gravity=G, substeps=substeps)
+    w.run(1.0)  # below the limit: cos 1 of it, and the work is that of the weight and the speed that it got
+    assert turned(w) == pytest.approx(1.0, abs=20 / (60 * substeps) ** 2 * G / ARM)
+    assert motor.load[0] == pytest.approx(-most * np.cos(1.0), rel=20 / (60 * substeps))
+
+
+def test_the_energy_is_torque_times_speed(world):
+    # Sum of -load dt speed over a second of spinning up, at rest first: m (r w)^2 / 2, while torque is at its limit all the time.
+    w, motor = wheel(world, 100.0, torque=1.0)
+    energies, angles = [], []
+    for _ in range(60):
+        energies.append(w.step(1 / 60).energy)
+        angles.append(turned(w))
+    assert np.ptp(energies - np.unwrap(angles)) < 1e-3 * energies[-1] and energies[-1] == pytest.approx(1.0, rel=1e-2)
+
+
+def test_a_brake_is_dry_friction(world):
+    # m (r w)' = -T / r until it rests, then it holds, and no frame brings energy in.
+    w, motor = wheel(world, 0.0, torque=0.5)
+    w.velocity = [[0, 0], [0, 0], [0, 1.0]]
+    energies = np.array([w.step(1 / 60).energy for _ in range(90)])
+    t = np.arange(1, 91) / 60
+    speed = np.maximum(1.0 - 0.5 * t / ARM / 2.0, 0)
+    np.testing.assert_allclose(energies[:55], speed[:55] ** 2, atol=2e-3)
+    assert (np.diff(energies) <= 1e-12).all()
+    motor.torque = 0.0  # it runs free
+    w.position, w.velocity = w.particles.position, [[0, 0], [0, 0], [0, 1.0]]
+    assert w.run(0.5).energy == pytest.approx(1.0, abs=1e-5)  # (h v / r)^2 = 3e-6: that of the link
+
+
+def test_a_motor_gives_no_momentum(world):
+    # Nor angular momentum: its gradients sum to 0, and so do their moments. To rounding, over a second; 2D and 3D.
+    rng = np.random.default_rng(0)
+    for torque, points, hinges, links in (
+        (0.3, [[-1, 0.1], [0, 0], [0.7, 0.4]], [[0, 1, 2]], [[0, 1], [1, 2]]),
+        (np.inf, [[0, 0, 0], [0, 0, 1], [1, 0, 0.4], [-0.8, 0.3, 0.5]], [[0, 1, 2, 3]], [[0, 1], [0, 2], [1, 2], [0, 3], [1, 3]]),
+    ):
+        x, m = np.array(points, dtype=float), 1 + np.arange(len(points))
+        motor = tv.Motor(hinges, 4.0, torque=torque)
+        w = world(tv.Particles(x, velocity=rng.normal(size=x.shape), mass=m), [motor, tv.Distance(links)], precision="f64")
+        seen = []
+        for _ in range(60):
+            w.step(1 / 60)
+            p, v = w.position, w.velocity
+            moment = np.einsum("n,na,nb->ab", m, p, v)
+            seen.append(np.append(m @ v, moment - moment.T))
+        assert np.ptp(seen, axis=0).max() < 1e-12
+        if torque == np.inf:
+            before = motor.rest[0]
+            w.run(0.5)
+            assert (motor.rest[0] - before - 2.0 + np.pi) % (2 * np.pi) == pytest.approx(np.pi, abs=1e-9)
+            assert motor.violation(w.position)[0] == pytest.approx(0, abs=1e-2)
+
+
+def test_hinges_in_space_turn_for_ever(world):
+    # A door of two links about a fixed axis: its angle passes pi as any other.
+    x = [[0, 0, 0], [0, 0, 1.0], [1, 0, 0.5], [-1, 0, 0.5]]
+    motor = tv.Motor([[0, 1, 2, 3]], 5.0, torque=1.0)
+    w = world(tv.Particles(x, pinned=[0, 1, 2]), [motor, tv.Distance([[0, 3], [1, 3]])], precision="f64", substeps=10)
+    w.run(0.5)
+    assert np.pi - abs(np.arctan2(*w.position[3, [1, 0]])) == pytest.approx(0.5**2 / 2, rel=1e-4)  # I = m r^2 = 1
+    w.run(6.0)
+    a = w.position[3]
+    w.run(1.0)
+    turn = np.arctan2(*w.position[3, [1, 0]]) - np.arctan2(a[1], a[0])
+    assert (turn + 5.0 + np.pi) % (2 * np.pi) == pytest.approx(np.pi, abs=1e-6) and abs(motor.load[0]) < 1e-3
+
+
+def test_a_servo_goes_to_its_angle_and_stays(world):
+    # By the shorter way, through pi; under a load it lags by what bears it, 2 w m g r h^2 in one pass, at most.
+    for torque in (np.inf, 20.0):
+        w, motor = wheel(world, 3.0, angle=2.5, torque=torque, gravity=G, mass=1.0)
+        w.run(0.5)
+        assert turned(w) == pytest.approx(1.5, abs=0.02 if torque == np.inf else 0.2)
+        w.run(2.0)
+        assert turned(w, 2.5) == pytest.approx(0, abs=1e-4) and motor.rest[0] == pytest.approx(2.5, abs=1e-6)
+        motor.angle = -2.5
+        w.run(1.0)
+        assert abs(turned(w)) > 2.4 and motor.load[0] == pytest.approx(-G * ARM * np.cos(2.5), rel=0.05)
+        w.run(1.0)
+        assert turned(w, -2.5) == pytest.approx(0, abs=1e-4)
+    flat = tv.Motor([[0, 1, 2]], 1.0)  # in space its angle ends at pi, where it waits
+    x = [[-1, 0, 0], [0, 0, 0], [1, 0.5, 0]]
+    w = world(tv.Particles(x, pinned=[0, 1]), [flat, tv.Distance([[1, 2]])], precision="f64")
+    w.run(1.0)
+    assert flat.rest_of(w.position)[0] == pytest.approx(1 + np.arctan2(0.5, 1), abs=1e-6)
+    for _ in range(60):
+        assert w.run(0.1).energy < 1.0
+    assert flat.rest[0] == pytest.approx(np.pi)
+
+
+def test_a_servo_that_rests_is_a_bend(world):
+    # With a spring that gives way by far more than a rigid hinge may be off; where that bears more than the largest torque, it
+    # slips.
+    ends = []
+    for hinge in (
+        tv.Bend([[0, 1, 2]], 0.0, compliance=0.1, damping=4.0),
+        tv.Motor([[0, 1, 2]], 1.0, angle=0.0, torque=[14.0], compliance=0.1, damping=4.0),
+    ):
+        start = tv.Particles([[-1.0, 0.0], [0.0, 0.0], [ARM, 0.0]], mass=2.0, pinned=[0, 1])
+        w = world(start, [hinge, tv.Distance([[1, 2]]), tv.Gravity(G)], precision="f64")
+        w.run(0.5)
+        ends.append(w.position)
+    np.testing.assert_allclose(ends[1], ends[0], atol=1e-12)
+    weak, motor = wheel(world, 1.0, gravity=G, angle=0.0, torque=8.0, compliance=0.1, damping=4.0)
+    weak.run(3.0)
+    assert motor.load[0] == pytest.approx(-8.0, rel=1e-3) or G * 2.0 * ARM * np.cos(turned(weak)) < 8.0
+    assert turned(weak) < -0.5 and abs(motor.violation(weak.position)[0]) < 1.01 * 0.1 * 8.0
+
+
+def test_a_stalled_motor_winds_nothing_up(world):
+    # Held for a second by a stop that gives way then: it goes on at its speed, and catches nothing up.
+    stop = tv.HalfSpace((0, -1), -ARM / 2)  # at 30 degrees
+    w, motor = wheel(world, 2.0, torque=1.0)
+    w.add(features=[stop])
+    w.run(1.0)
+    assert turned(w) == pytest.approx(np.pi / 6, abs=1e-6) and motor.load[0] == pytest.approx(-1.0, rel=1e-6)
+    assert motor.rest[0] - turned(w) < 2e-3
+    w.remove(features=[stop])
+    speeds = []
+    for _ in range(120):
+        w.step(1 / 60)
+        speeds.append(np.linalg.norm(w.velocity[2]) / ARM)
+    assert max(speeds) < 2.0 + 1e-2 and speeds[-1] == pytest.approx(2.0, abs=1e-5)
+    w.position, w.velocity = [[-1, 0], [0, 0], [0, -ARM]], np.zeros((3, 2))  # it goes on from where it was placed
+    report = w.step(1 / 60)
+    assert abs(turned(w, -np.pi / 2)) < 2.0 / 60 + 1e-6 and "moved" not in report.flags
+
+
+def hoist(world, speed, substeps=20, solver=None, **options):
+    """A weight of 2 kg that hangs on 2 m of rope."""
+    winch = tv.Winch([[0, 1]], speed, **options)
+    start = tv.Particles([[0.0, 0.0], [0.0, -2.0]], mass=2.0, pinned=[0])
+    return world(start, [tv.Gravity(G), winch], substeps=substeps, solver=solver, precision="f64"), winch
+
+
+@pytest.mark.parametrize("substeps", [1, 20])
+def test_a_winch_lifts_at_its_speed(world, substeps):
+    w, winch = hoist(world, -0.5, substeps)
+    for frame in range(60):
+        w.step(1 / 60)
+        assert w.position[1, 1] == pytest.approx(-2.0 + 0.5 * (frame + 1) / 60, abs=1e-9)
+    assert winch.load[0] == pytest.approx(2.0 * G, rel=1e-9) and winch.rest[0] == pytest.approx(1.5)
+    winch.speed = 0.5
+    w.run(1.0)
+    assert w.position[1, 1] == pytest.approx(-2.0, abs=1e-9)
+
+
+def test_a_winch_lifts_what_its_force_can(world):
+    # m a = F - m g up to the speed v, which is reached at t1 = v / a: v (t - t1 / 2) then. Below m g it lets the weight down.
+    errors, force, v = [], 40.0, 0.5
+    t1 = v / (force / 2.0 - G)
+    for substeps in (5, 10, 20, 40):
+        w, winch = hoist(world, -v, substeps, force=force)
+        w.run(0.5)
+        errors.append(w.position[1, 1] + 2.0 - v * (0.5 - t1 / 2))
+    assert np.abs(errors).max() < 4e-4 * 5 and abs(errors[-1]) < abs(errors[0]) / 4
+    for force, sign in ((2 * G + 0.1, 1), (2 * G - 0.1, -1)):
+        w, winch = hoist(world, -v, force=force)
+        w.run(1.0)
+        assert w.position[1, 1] + 2.0 == pytest.approx(sign * 0.05 / 2, rel=1e-6) and winch.load[0] == pytest.approx(force)
+    winch.force = 100.0  # it holds what fell, where it is, and goes on
+    w.run(1.0)
+    begin = w.position[1, 1]
+    w.run(0.5)
+    assert w.position[1, 1] - begin == pytest.approx(0.25, abs=1e-6) and winch.load[0] == pytest.approx(2 * G, rel=1e-6)
+
+
+def test_a_winch_stops_at_its_ends(world):
+    w, winch = hoist(world, -1.0, shortest=1.5, longest=2.25)
+    w.run(2.0)
+    assert w.position[1, 1] == pytest.approx(-1.5, abs=1e-9) and winch.load[0] == pytest.approx(2 * G, rel=1e-6)
+    winch.speed = 2.0
+    w.run(2.0)
+    assert w.position[1, 1] == pytest.approx(-2.25, abs=1e-9) and winch.rest[0] == 2.25
+    slack, winch = hoist(world, -1.0, length=3.0)  # which pulls once the slack is in
+    slack.run(0.1)
+    assert slack.position[1, 1] == pytest.approx(-2.0 - G * 0.1**2 / 2, abs=1e-9) and winch.load[0] == 0
+    slack.run(1.9)
+    assert slack.position[1, 1] == pytest.approx(-1.0, abs=1e-6)
+
+
+def machine(**settings):
+    """A door that turns, and a weight that it winds up by two ropes, in 3D."""
+    x = np.array([[0, 0, 0], [0, 0, 1], [1, 0, 0.5], [-1, 0, 0.5], [0, -1, 0.5]], dtype=float)
+    features = [
+        tv.Motor([[0, 1, 2, 3]], 5.0, torque=1.0),
+        tv.Winch([[4, 2], [3, 4]], [-0.5, 0.2], force=[5.0, np.inf]),
+        tv.Distance([[0, 2], [1, 2], [0, 3], [1, 3]]),
+        tv.Gravity((0, -G, 0)),
+    ]
+    return tv.World(tv.Particles(x, mass=1 + np.arange(5) % 2, pinned=[0, 1]), features, substeps=7, **settings)
+
+
+def test_drives_have_the_same_bits_on_every_path_and_survive_edits():
+    def drive(world):
+        motor, winch = world.features[:2]
+        for frame in range(12):
+            if frame == 4:
+                motor.torque, winch.speed = 0.2, [0.3, -0.3]
+            world.step(1 / 60)
+        return world.hash()
+
+    with machine() as fused, machine(path="parallel") as parallel:
+        with thread_team.launching():
+            launched = machine(path="parallel")
+        want = drive(fused)
+        assert drive(parallel) == want == drive(launched)
+        launched.close()
+        door, winch = fused.features[:2]
+        assert isinstance(door, tv.Motor) and isinstance(winch, tv.Winch)
+        rest = door.rest[0]
+        fused.remove(particles=[4])  # and the ropes
+        assert door.rest[0] == rest and winch.count == 0 and not fused.step(1 / 60).flags
+        assert door.rest[0] != rest and abs(door.violation(fused.position)[0]) < 0.1
+
+
+def test_many_worlds_have_drives_of_their_own():
+    speeds = np.array([1.0, 2.0, -3.0])
+
+    def one(speed):
+        start = tv.Particles([[-1.0, 0], [0, 0], [ARM, 0]], pinned=[0, 1])
+        return tv.World(start, [tv.Motor([[0, 1, 2]], speed, torque=5.0), tv.Distance([[1, 2]])], substeps=5)
+
+    many = tv.Worlds([one(speed) for speed in speeds])
+    motor = many.features[0]
+    assert isinstance(motor, tv.Motor)
+    many.run(0.2)
+    motor.torque = 1.0  # for all
+    many.run(0.2)
+    many.set(motor, speed=-speeds[:, None])
+    many.run(0.2)
+    for k, speed in enumerate(speeds):
+        with one(speed) as alone:
+            mine = alone.features[0]
+            assert isinstance(mine, tv.Motor)
+            alone.run(0.2)
+            mine.torque = 1.0
+            alone.run(0.2)
+            mine.speed = -speed
+            alone.run(0.2)
+            np.testing.assert_array_equal(many.position[k], alone.position)
+    many.close()
+
+
+def test_bad_arguments_are_refused(world):
+    x = tv.Particles(np.eye(3))
+    for wrong, message in (
+        (lambda: tv.Motor([[0, 1]], 1.0), r"Motor: hinges has shape \(1, 2\), but \(m, 3\)"),
+        (lambda: tv.Motor([[0, 1, 2]], np.inf), r"Motor: speed\[0\] = inf"),
+        (lambda: tv.Motor([[0, 1, 2]], 1.0, torque=-1.0), r"Motor: torque\[0\] = -1"),
+        (lambda: setattr(tv.Motor([[0, 1, 2]], 1.0), "angle", 1.0), "Motor: angle cannot be set: it turns at a speed"),
+        (lambda: world(x, [tv.Motor([[0, 1, 2]], 1.0, angle=-1.0)]), r"angle \(of triples in 3D\)"),
+        (lambda: world(tv.Particles(np.zeros((4, 2))), [tv.Motor([[0, 1, 2, 3]], 1.0)]), "no hinge of four particles in 2D"),
+        (lambda: tv.Winch([[0, 1]], length=0.0), r"Winch: length\[0\] = 0"),
+        (lambda: world(tv.Particles(np.zeros((2, 2))), [tv.Winch([[0, 1]])]), "are in the same place"),
+        (lambda: world(x, [tv.Motor([[0, 1, 2]], 1.0)], order=4, precision="f64"), "moves on its own"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            wrong()

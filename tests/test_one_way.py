@@ -1,0 +1,80 @@
+"""Walls that hold what comes from one side, and let through what comes from the other."""
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+
+G, R, THICK = 9.81, 0.05, 0.1
+BOARD = np.array([[-2, -THICK], [2, -THICK], [2, THICK], [-2, THICK]])
+WALLS = {  # platforms along y = 0, and how high their tops are
+    "Capsule": (lambda **k: tv.Capsule((-2, 0), (2, 0), THICK, **k), THICK),
+    "Polygon": (lambda **k: tv.Polygon(BOARD, **k), THICK),
+    "line": (lambda **k: tv.Polygon([[-2, 0], [0, 0], [2, 0]], closed=False, **k), 0.0),
+}
+# By the height at which they start and the speed: onto it; up through it, to land; up into it, to fall back; inside of it; fast.
+START = np.array([1.0, -0.8, -0.8, 0.02, 3.0, -3.0])
+SPEED = np.array([0.0, 5.0, np.sqrt(2 * G * 0.8), 0.0, -80.0, 80.0])
+STAYS = np.array([True, True, False, False, True, False])
+
+
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+@pytest.mark.parametrize("name", WALLS)
+def test_what_comes_from_below_passes_and_what_comes_from_above_lands(world, name, precision):
+    # What passes is as free as without the wall: y0 + v t - g t^2 / 2, to rounding, in any number of substeps.
+    make, top = WALLS[name]
+    x = np.stack([np.linspace(-1.5, 1.5, len(START)), START], axis=1)
+    start = tv.Particles(x, velocity=np.stack([0 * SPEED, SPEED], axis=1), radius=R)
+    w = world(start, [tv.Gravity(G), make(one_way=(0, 3), friction=0.5)], precision=precision)
+    for substeps in (1, 20):
+        w.position, w.velocity, w.substeps, t = start.position, start.velocity, substeps, 0.0
+        for frame in range(120):
+            w.step(1 / 60)
+            t += 1 / 60
+            free = START + SPEED * t - G * t**2 / 2
+            going = ~STAYS | (np.arange(6) == 1) & (SPEED - G * t > 0)
+            np.testing.assert_allclose(w.position[going, 1], free[going], atol=1e-9 if precision == "f64" else 2e-4)
+            if frame > 60:
+                np.testing.assert_allclose(w.position[STAYS, 1], top + R, atol=1e-12 if precision == "f64" else 2e-6)
+        assert (w.position[[2, 3], 1] < -10).all()
+
+
+def test_a_platform_that_moves_and_turns(world):
+    # It takes along what stands on it, up and down, and passes by what hangs in its way from below; its direction turns with it.
+    lift = tv.Polygon(BOARD, position=(0.0, 0.0), one_way=(0, 1), friction=0.8)
+    x = np.array([[0.0, THICK + R], [1.0, 1.0], [-1.0, -0.4]])
+    w = world(tv.Particles(x, radius=R, pinned=[2]), [tv.Gravity(G), lift], precision="f64")
+    for speed in (0.5, -0.5, 0.0):
+        for _ in range(60):
+            lift.position = lift.position + [0, speed / 60]
+            w.step(1 / 60)
+        assert w.position[0] == pytest.approx([0.0, lift.position[1] + THICK + R], abs=1e-9)
+        assert w.position[1] == pytest.approx([1.0, lift.position[1] + THICK + R], abs=1e-9)
+    lift.rotation = np.pi  # upside down it holds nothing
+    w.run(1.0)
+    assert (w.position[:2, 1] < -3).all() and not w.step(1 / 60).flags
+
+
+def test_a_sheet_in_space(world):
+    corners = np.array([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]], dtype=float)
+    sheet = tv.Mesh(corners, [(0, 2, 1), (0, 3, 2)], closed=False, one_way=(0, 1, 0))
+    rope = tv.shapes.rope((-0.4, 0.3, 0.0), (0.4, 0.3, 0.1), points=6)
+    x = np.concatenate([rope.position, rope.position - [0, 0.6, 0.3]])
+    v = np.repeat([[0.0, 0, 0], [0, 4.0, 0]], 6, axis=0)
+    w = world(
+        tv.Particles(x, velocity=v, radius=0.02),
+        [tv.Gravity(G), tv.Distance(np.concatenate([rope.links, rope.links + 6])), sheet],
+    )
+    w.run(0.3)
+    assert (w.position[6:, 1] > 0.1).all()  # the one that was thrown is through
+    w.run(2.0)
+    assert w.position[:, 1] == pytest.approx(0.02, abs=1e-5)  # both lie on it
+
+
+def test_bad_directions_are_refused():
+    for wrong, message in (
+        (lambda: tv.Capsule((0, 0), (1, 0), 0.1, one_way=(0, 0)), "one_way = 0 has no direction"),
+        (lambda: tv.Polygon(BOARD, one_way=(0, 1, 0)), r"one_way has shape \(3,\), but 2 numbers"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            wrong()

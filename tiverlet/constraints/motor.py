@@ -1,0 +1,148 @@
+"""Hinges that turn by themselves."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .. import checks
+from ..device import ti
+from ..features.feature import Knob, Scene
+from ..particles import Particles
+from .core.angle import TURN, Angle, dihedral_angle, dihedral_angles, dihedral_reach, path_angle, path_angles, path_reach
+from .core.drive import Drive, largest_load
+
+SETTLE = 0.1  # [s] how long a servo takes for the last e-th of its way
+PLACED = 0.2  # [rad] from where on hinges that were placed elsewhere go on from there
+
+
+class Motor(Angle):
+    """Motors: the angle of a hinge turns at a given speed, or to a given angle, with a largest torque.
+
+    C(x) = f(x) - rest with the angle f [rad] and its gradients of Bend (triples) or Dihedral (quads). In a substep h the rest
+    angle turns by speed h, or as much towards `angle`. Its multiplier is clamped, |lam| <= torque h^2: below the largest torque
+    the speed is met, at it the torque is; see core.drive.Drive. All torques are between its particles, so a motor moves no center
+    of mass and gives no angular momentum.
+
+    hinges: (m, 3) particle indices, the corner in the middle, of joints in a plane: a wheel turns by i - j - k where i is on the
+    frame, j the hub and k on the wheel. (m, 4) of hinges in 3D: the two ends of the axis, then a particle of either side.
+    speed: number or (m,) [rad/s]; positive to the left in 2D. 0 holds: a brake of dry friction, if the torque is finite. Live.
+    angle: number or (m,) [rad]; where to turn to, by the shorter way, and to stay: a servo, which turns at |speed|, and at
+    most at the angle that is left in 0.1 s. Live. None: turn for ever; it cannot be given later.
+    torque: the largest, number or (m,) [N m]. Live. 0 lets the hinge run free. None that is given is one that meets any load, so
+    a stop in its way bears whatever it takes.
+    compliance: number or (m,) [rad/(N m)] of a spring between the motor and the hinge; 0 is rigid. damping: [N m s/rad] beside
+    it. break_at: moment beyond which it breaks, number or (m,) [N m].
+
+    In 3D the angle of triples lies in [0, pi], where a motor comes to its end; take quads for more.
+    `load` is the moment of the hinge against increasing angles [N m]: -load is the torque of the motor, and -load times the speed
+    its power. `rest` is where the rest angle is now [rad]: under a load the angle lags by what bears it, as in a Bend.
+    """
+
+    index_name = "hinges"
+    driven = True
+    each = ("speed", "angle", "torque", "compliance", "damping", "break_at")
+    compiled_for = (*Angle.compiled_for, "capped")
+    uploads_all = False  # goals are of one
+    speed = Knob(lambda f, v: checks.per_item("Motor", "speed", v, f.count), "Angular velocity [rad/s].")
+    angle = Knob(lambda f, v: f._angle(v), "Where to turn to [rad].")
+    torque = Knob(lambda f, v: largest_load(f, "torque", v), "The largest torque [N m].")
+
+    def __init__(
+        self, hinges, speed: ArrayLike, *, angle=None, torque: ArrayLike = np.inf, compliance: ArrayLike = 0.0, damping:
+        ArrayLike = 0.0, break_at=None,
+    ):  # fmt: skip
+        hinges = np.asarray(hinges)
+        self.arity = 4 if hinges.ndim == 2 and hinges.shape[1] == 4 else 3
+        self.exchangeable = ((0, 1), (2, 3)) if self.arity == 4 else ((0, 2),)
+        self.serves = angle is not None
+        self.setup(hinges, None, compliance, damping, break_at)
+        self.speed, self.torque = speed, torque
+        if angle is not None:
+            self.angle = angle
+
+    def _angle(self, value) -> np.ndarray:
+        if not self.serves:
+            raise ValueError(
+                "Motor: angle cannot be set: it turns at a speed. Make a Motor with angle=... for one that holds it."
+            )
+        return checks.per_item("Motor", "angle", value, self.count, least=-TURN, most=TURN)
+
+    @property
+    def capped(self) -> bool:
+        """Whether any torque is limited, or was when kernels were compiled."""
+        return bool(np.isfinite(self.torque).any()) or self._built("drive", "capped")
+
+    @property
+    def rest(self) -> np.ndarray:
+        """Where the rest angles are now [rad], (m,)."""
+        if "drive" in vars(self.dev):
+            return self.dev.drive.values()[: self.count]
+        if "_begin" not in self.__dict__:
+            raise AttributeError("Motor has no rest before it is in a world.")
+        return self._begin
+
+    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Check the indices and angles against the dimension, and start from where hinges are."""
+        self.check_indices(particles)
+        if particles.dim == 2 and self.arity == 4:
+            raise ValueError("Motor: there is no hinge of four particles in 2D. Use triples (i, j, k), the joint in the middle.")
+        if self.serves and particles.dim == 3 and self.arity == 3:
+            checks.per_item("Motor", "angle (of triples in 3D)", self.angle, self.count, least=0.0, most=np.pi)
+        self._begin = self.rest_of(particles.position)
+
+    def rest_of(self, position: np.ndarray) -> np.ndarray:
+        """The angles at the given positions."""
+        return (dihedral_angles if self.arity == 4 else path_angles)(*(position[n] for n in self.indices.T))
+
+    def bind(self, scene: Scene) -> None:
+        """Whether angles end at 0 and pi."""
+        self.dev.ends = scene.state.dim == 3 and self.arity == 3
+        Angle.bind(self, scene)
+
+    def relaxed_alone(self, scene: Scene) -> np.ndarray:
+        """A multiplier that is clamped cannot be eliminated."""
+        return self.acts_as_force(scene) | np.isfinite(self.torque)
+
+    def drive_of(self, scene: Scene) -> Drive:
+        """Towards the angle, or on and on."""
+        largest = self.torque if self.capped else None
+        endless, period = not (self.serves or self.dev.ends), 0.0 if self.dev.ends else TURN
+        return Drive(scene, "Motor", self._begin, *self._course(), largest, endless, period, SETTLE * self.serves)
+
+    def _course(self) -> tuple[Any, Any]:
+        """Where rest angles go to, and how fast."""
+        end = np.where(self.speed > 0, np.pi, 0.0)
+        return self.angle if self.serves else end, self.speed
+
+    def upload(self) -> None:
+        """Write new speeds, angles and torques."""
+        Angle.upload(self)
+        if self.acts:
+            self.dev.drive.upload(*self._course(), self.torque)
+
+    def placed(self, position: np.ndarray, first: int) -> None:
+        """Go on from where hinges were placed."""
+        far = (np.abs(self.violation(position)) > PLACED) & (self.indices >= first).any(axis=1)
+        if far.any():
+            self.dev.drive.put(np.where(far, self.rest_of(position), self.rest))
+
+    @ti.func
+    def reach(self, c, q):
+        """As in Bend and Dihedral."""
+        out = ti.cast(0, self.dev.real)
+        if ti.static(self.arity == 4):
+            out = dihedral_reach(q)
+        else:
+            out = path_reach(q)
+        return out
+
+    @ti.func
+    def measure(self, c, q):
+        """See path_angle() and dihedral_angle()."""
+        f, g = ti.cast(0, self.dev.real), 0 * q
+        if ti.static(self.arity == 4):
+            f, g = dihedral_angle(q)
+        else:
+            f, g = path_angle(q, 0 * q[0, :], False, self.faint())
+        return f, g

@@ -1,0 +1,102 @@
+"""Ropes that are wound up and paid out."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .. import checks
+from ..features.feature import Knob, Scene
+from ..particles import Particles
+from .core.drive import Drive, largest_load
+from .distance import Link
+
+SHORTEST = 1e-2  # of its initial length: what remains of a rope, where nothing else is said
+
+
+class Winch(Link):
+    """Winches: ropes whose length changes at a given speed, with a largest force.
+
+    C(x) = |x_i - x_j| - rest <= 0, gradients as in Distance; the multiplier may only pull. In a substep h the length `rest` grows
+    by speed h, between `shortest` and `longest`. The pull is clamped, lam <= force h^2: below the largest force the speed is met,
+    beyond it the rope runs out; see core.drive.Drive.
+
+    pairs: (m, 2) particle indices.
+    speed: number or (m,) [m/s]; positive pays out, negative winds up, 0 holds. Live.
+    length: number or (m,) [m] at the start, above 0; None takes the initial distances.
+    shortest, longest: number or (m,) [m], where it stops by itself; shortest is above 0, None for a hundredth of `length`. Live.
+    force: the largest, number or (m,) [N]. Live. 0 lets the rope run free. None that is given is one that meets any load.
+    compliance: number or (m,) [m/N] and damping [N s/m] of the taut rope. break_at: tension beyond which it breaks, [N].
+
+    `load` is the tension [N], `rest` the length now [m].
+    """
+
+    side = 1
+    driven = True
+    each = ("speed", "length", "shortest", "longest", "force", "compliance", "damping", "break_at")
+    compiled_for = (*Link.compiled_for, "capped")
+    uploads_all = False  # goals are of one
+    speed = Knob(lambda f, v: checks.per_item("Winch", "speed", v, f.count), "Change of length [m/s].")
+    shortest = Knob(lambda f, v: checks.per_item("Winch", "shortest", v, f.count, above=0.0), "Least length [m].")
+    longest = Knob(lambda f, v: checks.per_item("Winch", "longest", v, f.count, above=0.0, infinite=True), "Largest length [m].")
+    force = Knob(lambda f, v: largest_load(f, "force", v), "The largest pull [N].")
+
+    def __init__(
+        self, pairs, speed: ArrayLike = 0.0, *, length=None, shortest=None, longest: ArrayLike = np.inf, force:
+        ArrayLike = np.inf, compliance: ArrayLike = 0.0, damping: ArrayLike = 0.0, break_at=None,
+    ):  # fmt: skip
+        self.setup(pairs, None, compliance, damping, break_at)
+        if length is not None:
+            self.length = checks.per_item("Winch", "length", length, self.count, above=0.0)
+        if shortest is not None:
+            self.shortest = shortest
+        self.speed, self.longest, self.force = speed, longest, force
+
+    @property
+    def cusp(self) -> bool:
+        """No length is 0."""
+        return False
+
+    @property
+    def capped(self) -> bool:
+        """Whether any pull is limited, or was when kernels were compiled."""
+        return bool(np.isfinite(self.force).any()) or self._built("drive", "capped")
+
+    @property
+    def rest(self) -> np.ndarray:
+        """The lengths now [m], (m,)."""
+        if "drive" in vars(self.dev):
+            return self.dev.drive.values()[: self.count]
+        if "length" not in self.__dict__:
+            raise AttributeError("Winch has no length before it is in a world, unless it is given.")
+        return self.length
+
+    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Check the indices, and take lengths that were not given."""
+        self.check_indices(particles)
+        if "length" not in self.__dict__:
+            self._keep(length=self.rest_of(particles.position))
+            if (self.length == 0).any():
+                i = int(np.argmax(self.length == 0))
+                pair = tuple(int(v) for v in self.indices[i])
+                raise ValueError(f"Winch: pairs[{i}] = {pair} are in the same place, so the rope has no length. Give length=...")
+        if "shortest" not in self.__dict__:
+            self.shortest = SHORTEST * self.length
+
+    def relaxed_alone(self, scene: Scene) -> np.ndarray:
+        """A multiplier that is clamped cannot be eliminated."""
+        return self.acts_as_force(scene) | np.isfinite(self.force)
+
+    def drive_of(self, scene: Scene) -> Drive:
+        """From end to end."""
+        return Drive(scene, "Winch", self.length, *self._course(), self.force if self.capped else None, False, 0.0, 0.0)
+
+    def _course(self) -> tuple[Any, Any]:
+        """Where lengths go to, and how fast."""
+        return np.where(self.speed > 0, self.longest, self.shortest), np.abs(self.speed)
+
+    def upload(self) -> None:
+        """Write new speeds, ends and forces."""
+        Link.upload(self)
+        if self.acts:
+            self.dev.drive.upload(*self._course(), self.force)
