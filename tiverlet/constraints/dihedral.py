@@ -39,8 +39,8 @@ class Dihedral(Angle):
 
     def rest_of(self, position: np.ndarray) -> np.ndarray:
         """The angles at the given positions."""
-        i, j, k, l = self.indices.T  # noqa: E741
-        e, a, b = (position[n] - position[i] for n in (j, k, l))
+        x = self.placed(position)
+        e, a, b = (x[:, k] - x[:, 0] for k in (1, 2, 3))
         e = e / np.maximum(np.linalg.norm(e, axis=1, keepdims=True), 1e-300)
         p, q = (r - e * (r * e).sum(axis=1, keepdims=True) for r in (a, b))
         return np.arctan2((e * np.cross(p, q)).sum(axis=1), -(p * q).sum(axis=1))

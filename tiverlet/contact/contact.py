@@ -181,7 +181,7 @@ class Contact(PairContact):
                     total += w * want
                     if ti.static(self.dev.has_friction):
                         if final != 0:
-                            approach = -(self.dev.forces.before[i] - self.dev.forces.before[j]).dot(n)
+                            approach = -self.dev.state.slid(self.dev.forces.before[i] - self.dev.forces.before[j], i, j).dot(n)
                             forced += self.dev.forces.share(approach, part * alone) * w * (want - part * n)
                     self.dev.push.field[e] = push
         self.dev.move[i] = total
@@ -194,7 +194,7 @@ class Contact(PairContact):
     @ti.func
     def held(self, i, j, n, normal, slip):
         """The part of a pair's slip, with the present displacements, that friction takes back for a normal displacement."""
-        return self.dev.friction.held(i, j, n, normal, slip + self.dev.state.d[i] - self.dev.state.d[j])
+        return self.dev.friction.held(i, j, n, normal, self.dev.state.slid(slip + self.dev.state.d[i] - self.dev.state.d[j], i, j))
 
     @ti.func
     def reaction(self, i):
@@ -211,7 +211,7 @@ class Contact(PairContact):
                     length = r.norm()
                     if push > 0 and length > 0:
                         n = r / length
-                        approach = -(self.dev.forces.before[i] - self.dev.forces.before[j]).dot(n)
+                        approach = -self.dev.state.slid(self.dev.forces.before[i] - self.dev.forces.before[j], i, j).dot(n)
                         total += self.dev.forces.share(approach, push * (w + self.dev.w.of(j))) * w * push * n
         if ti.static(self.dev.has_friction):
             total += self.dev.forces.sum[i]

@@ -78,7 +78,7 @@ class DiscGeometry:
         if rr <= contact_distance * contact_distance * ti.static(SAME_PLACE):
             overlap, n = contact_distance, self.fallback_normal(i, j, r)
             each = 1 / shared
-        d = self.state.d[i] - self.state.d[j]
+        d = self.state.slid(self.state.d[i] - self.state.d[j], i, j)
         r -= d
         c = r.dot(r) - contact_distance * contact_distance
         if c > 0:
@@ -182,7 +182,8 @@ class DiscGeometry:
             back = np.lexsort(pairs[~low].T)  # (j, i) in the order of (i, j)
             push[low] = np.maximum(push[low], push[~low][back])
         pairs, push = pairs[low], push[low]
-        d = x[pairs[:, 0]] - x[pairs[:, 1]]
+        box = self.scene.periodic
+        d = x[pairs[:, 0]] - x[pairs[:, 1]] if box is None else box.difference(x[pairs[:, 0]], x[pairs[:, 1]])
         length = np.linalg.norm(d, axis=1)
         overlap = r[pairs].sum(axis=1) - length
         some = (overlap > 0) | (push > 0)

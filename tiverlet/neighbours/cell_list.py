@@ -20,6 +20,7 @@ from ..device import runtime, ti
 from ..device.number import OnDevice
 from ..device.prefix_sum import Sums
 from ..tools import distinct
+from .periodic import GRADIENT
 
 if TYPE_CHECKING:
     from ..device.thread_team import Team
@@ -57,6 +58,9 @@ class CellList:
         self.bits = np.maximum(2 * dim, np.ceil(np.log2(np.maximum(2 * counts, 1)))).astype(int)
         offsets = np.concatenate([[0], np.cumsum(1 << self.bits)])
         self.buckets = scene.memory.number(int(offsets[-1]))
+        self.images, self._lengths = scene.state.images, np.full(dim, np.inf)
+        if self.images:  # a table has each cell of a periodic axis once
+            self._lengths = scene.periodic.lengths
         self._shapes = self.shapes(np.ptp(scene.particles.position, axis=0))
         self.sums = Sums(self.buckets + 2, team)
         self.edge = add("grid.edge", self.sums.room, kind=ti.i32)
@@ -64,6 +68,8 @@ class CellList:
         if self.state.compensated:
             self.low = add("grid.place_low", n, width=dim)
         self.shape = add("grid.shape", self.levels, width=dim, kind=ti.i32, values=self._shapes)
+        if self.images:
+            self.count = add("grid.cells", self.levels, width=dim, kind=ti.i32, values=self.counts(self._shapes))
         if self.levels > 1:
             self.level = add("grid.level", n, kind=ti.i32, values=level)
             self.per_meter = add("grid.cells_per_meter", self.levels, values=1 / self.sizes)
@@ -72,6 +78,7 @@ class CellList:
     def shapes(self, extent: np.ndarray) -> np.ndarray:
         """Bits of each axis of each table, (levels, dim): at least 2, the rest where there are most cells per bucket."""
         out = np.full((self.levels, self.dim), 2)
+        extent = np.where(np.isfinite(self._lengths), self._lengths, extent)
         for m in range(self.levels):
             cells = np.nan_to_num(extent / self.sizes[m], nan=1.0, posinf=1e30)
             for _ in range(self.bits[m] - 2 * self.dim):
@@ -85,7 +92,15 @@ class CellList:
         if changed:
             self._shapes = shapes
             self.memory.write(self.shape, shapes)
+            if self.images:
+                self.memory.write(self.count, self.counts(shapes))
         return changed
+
+    def counts(self, shapes: np.ndarray) -> np.ndarray:
+        """Cells of each table along periodic axes, (levels, dim), 1 along others: no smaller than they have to be, and no more
+        than the table has buckets for, so that none has to share one with its neighbour."""
+        fitting = np.floor(np.where(np.isfinite(self._lengths), self._lengths, 0.0) / self.sizes[:, None])
+        return np.maximum(1, np.minimum(fitting, 2.0**shapes)).astype(int)
 
     @ti.func
     def level_of(self, i):
@@ -98,7 +113,11 @@ class CellList:
     @ti.func
     def cell_of(self, i, m):
         """The cell of particle i at level m."""
-        return ti.floor(self.state.x[i] * self.scale(m), ti.i32)
+        cell = ti.floor(self.state.x[i] * self.scale(m), ti.i32)
+        if ti.static(bool(self.images)):
+            for k in ti.static(self.images.axes):
+                cell[k] = self.images.cell(self.state.x[i], k, 0, self.count[m][k])
+        return cell
 
     @ti.func
     def scale(self, m):
@@ -153,22 +172,49 @@ class CellList:
         r = self.state.x[i] - self.place[k]
         if ti.static(self.state.compensated):
             r += self.state.low[i] - self.low[k]
-        return r
+        return self.state.nearest(r)
 
     @ti.func
-    def row(self, cell, m, r):
-        """Row r of the 3^(dim - 1) around a cell at level m: its first bucket, how far along its three cells begin, the mask of
-        their axis, and 3 where they stand side by side, 1 where the torus wraps between them."""
-        mask = (1 << self.shape[m][0]) - 1
-        at, rest = cell, r
+    def row(self, i, cell, m, r):
+        """Row r of the 3^(dim - 1) around a cell at level m, of particle i: its first bucket, how far along its three cells
+        begin, how many there are before the first one comes again, into how many parts they fall, and how many cells stand side
+        by side in each: 3, or 1 where the torus wraps between them."""
+        at, rest, along, turn, parts = cell, r, 1 << self.shape[m][0], 0, 3
         for k in ti.static(range(1, self.dim)):
-            at[k] += rest % 3 - 1
+            side = rest % 3
+            at[k] += side - 1
             rest = rest // 3
+            if ti.static(bool(self.images) and k in self.images.axes):
+                count = self.count[m][k]
+                if side >= count:  # of two cells, or one, all are there
+                    parts = 0
+                if at[k] < 0 or at[k] >= count:
+                    way = ti.select(at[k] < 0, -1, 1)
+                    at[k] -= way * count
+                    if ti.static(self.images.sheared and k == GRADIENT):
+                        turn = way
+        first = cell[0]
+        if ti.static(bool(self.images) and 0 in self.images.axes):
+            along = self.count[m][0]
+            parts = ti.min(parts, along)
+            if ti.static(self.images.sheared):
+                first = self.images.cell(self.state.x[i], 0, turn, along)
+                if self.count[m][GRADIENT] < 3 and parts > 0:  # the next row is met on both sides, at two places
+                    parts = along
         at[0] = 0
-        low, span = (cell[0] - 1) & mask, 1
-        if low + 2 <= mask:
-            span = 3
-        return self.bucket(at, m), low, mask, span
+        low, span = self.along(first - 1, along), 1
+        if low + 2 < along and parts == 3:
+            span, parts = 3, 1
+        return self.bucket(at, m), low, along, parts, span
+
+    @ti.func
+    def along(self, cell, count):
+        """A cell of a row that closes after so many."""
+        if ti.static(bool(self.images) and 0 in self.images.axes):
+            cell = ti.select(cell < 0, cell + count, ti.select(cell < count, cell, cell - count))
+        else:
+            cell &= count - 1
+        return cell
 
 
 def most_levels() -> int:

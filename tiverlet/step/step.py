@@ -149,6 +149,7 @@ class Step:
         self.n, self.dim, self.real = scene.count, scene.particles.dim, scene.real
         self.integrator, self.grid, self.walls, self.drivers, self.batches = integrator, grid, walls, drivers, batches
         self.posed = [w for w in walls if w.poses]
+        self.sheared = bool(scene.state.images and scene.state.images.sheared)
         self.breakers: list[Any] = [b for b in batches if b.breaks]
         self.launched = team.launched
         # Iterations of a loop for each of few pieces of work: to each CPU thread Taichi gives LEAST of them, at least.
@@ -330,6 +331,11 @@ class Step:
             ti.loop_config(serialize=True)
             for _ in range(self.team.one(1, now.thread)):
                 w.pose(now.frame_fraction)
+        if ti.static(self.sheared):
+            ti.loop_config(serialize=True)
+            for _ in range(self.team.one(1, now.thread)):
+                self.state.images.slide(now.h)
+            self.team.wait()
         self.particles.integrate(now)
         self.team.wait()
         self.team.watch(now.thread)
