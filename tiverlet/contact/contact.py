@@ -194,7 +194,8 @@ class Contact(PairContact):
     @ti.func
     def held(self, i, j, n, normal, slip):
         """The part of a pair's slip, with the present displacements, that friction takes back for a normal displacement."""
-        return self.dev.friction.held(i, j, n, normal, self.dev.state.slid(slip + self.dev.state.d[i] - self.dev.state.d[j], i, j))
+        moved = self.dev.state.slid(slip + self.dev.state.d[i] - self.dev.state.d[j], i, j)
+        return self.dev.friction.held(i, j, n, normal, moved)
 
     @ti.func
     def reaction(self, i):

@@ -76,7 +76,8 @@ class Feature(RecordsArguments):
     anew, `moving` that a target is under way."""
 
     kept_by_world = ("scene", "start", "periodic", "changed", "moving", "new_force", "arguments")
-    host_only: tuple[str, ...] = ("start", "periodic", "changed", "moving", "new_force", "arguments")  # what kernels do not read of it
+    # What kernels do not read of it.
+    host_only: tuple[str, ...] = ("start", "periodic", "changed", "moving", "new_force", "arguments")
     uploads_all = False  # upload() and end_motion() do as well for many worlds, where knobs have one more axis, the first
     compiled_for: tuple[str, ...] = ()  # properties that decide what its kernels consist of
     told_apart = True  # its share of the time that kernels take to compile is known by its name

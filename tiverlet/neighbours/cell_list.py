@@ -20,7 +20,7 @@ from ..device import runtime, ti
 from ..device.number import OnDevice
 from ..device.prefix_sum import Sums
 from ..tools import distinct
-from .periodic import GRADIENT
+from .periodic import FLOW, GRADIENT
 
 if TYPE_CHECKING:
     from ..device.thread_team import Team
@@ -59,7 +59,8 @@ class CellList:
         offsets = np.concatenate([[0], np.cumsum(1 << self.bits)])
         self.buckets = scene.memory.number(int(offsets[-1]))
         self.images, self._lengths = scene.state.images, np.full(dim, np.inf)
-        if self.images:  # a table has each cell of a periodic axis once
+        self.axes, self.sheared = (self.images.axes, self.images.sheared) if self.images else ((), False)
+        if self.images:
             self._lengths = scene.periodic.lengths
         self._shapes = self.shapes(np.ptp(scene.particles.position, axis=0))
         self.sums = Sums(self.buckets + 2, team)
@@ -97,10 +98,12 @@ class CellList:
         return changed
 
     def counts(self, shapes: np.ndarray) -> np.ndarray:
-        """Cells of each table along periodic axes, (levels, dim), 1 along others: no smaller than they have to be, and no more
-        than the table has buckets for, so that none has to share one with its neighbour."""
-        fitting = np.floor(np.where(np.isfinite(self._lengths), self._lengths, 0.0) / self.sizes[:, None])
-        return np.maximum(1, np.minimum(fitting, 2.0**shapes)).astype(int)
+        """Cells of each table along periodic axes, (levels, dim), 1 along others: no smaller than they have to be. Where there
+        are more than buckets, a multiple of these, so that the three cells around the end of the box have different ones."""
+        most = np.where(np.isfinite(self._lengths), self._lengths, 0.0) / self.sizes[:, None]
+        fitting, buckets = np.minimum(most, 2.0**30), 2.0**shapes
+        each = np.where(fitting < buckets, 1.0, buckets)
+        return np.maximum(1, np.floor(fitting / each) * each).astype(int)
 
     @ti.func
     def level_of(self, i):
@@ -114,10 +117,20 @@ class CellList:
     def cell_of(self, i, m):
         """The cell of particle i at level m."""
         cell = ti.floor(self.state.x[i] * self.scale(m), ti.i32)
-        if ti.static(bool(self.images)):
-            for k in ti.static(self.images.axes):
-                cell[k] = self.images.cell(self.state.x[i], k, 0, self.count[m][k])
+        for k in ti.static(self.axes):
+            cell[k] = self.images.cell(self.state.x[i], k, 0, self.count[m][k])
         return cell
+
+    @ti.func
+    def around(self, point, radius, m, k: ti.template()):  # type: ignore[valid-type]
+        """The first of the cells along periodic axis k in which particles within `radius` of a point in the box may be, and how
+        many there are, with one more on each side; of a sheared box all along FLOW."""
+        count, size = self.count[m][k], self.images.length[None][k]
+        low = ti.floor((point[k] - radius) / size * count, ti.i32) - 1
+        number = ti.floor((point[k] + radius) / size * count, ti.i32) + 2 - low
+        if ti.static(self.sheared and k == FLOW):
+            number = count
+        return low, ti.min(number, count, 1 << self.shape[m][k])
 
     @ti.func
     def scale(self, m):
@@ -177,44 +190,45 @@ class CellList:
     @ti.func
     def row(self, i, cell, m, r):
         """Row r of the 3^(dim - 1) around a cell at level m, of particle i: its first bucket, how far along its three cells
-        begin, how many there are before the first one comes again, into how many parts they fall, and how many cells stand side
-        by side in each: 3, or 1 where the torus wraps between them."""
-        at, rest, along, turn, parts = cell, r, 1 << self.shape[m][0], 0, 3
+        begin, into how many parts they fall, and how many cells stand side by side in each: 3, or 1 where the torus wraps
+        between them."""
+        at, rest, turn, parts, mask = cell, r, 0, 3, (1 << self.shape[m][0]) - 1
         for k in ti.static(range(1, self.dim)):
             side = rest % 3
             at[k] += side - 1
             rest = rest // 3
-            if ti.static(bool(self.images) and k in self.images.axes):
+            if ti.static(k in self.axes):
                 count = self.count[m][k]
                 if side >= count:  # of two cells, or one, all are there
                     parts = 0
                 if at[k] < 0 or at[k] >= count:
                     way = ti.select(at[k] < 0, -1, 1)
                     at[k] -= way * count
-                    if ti.static(self.images.sheared and k == GRADIENT):
+                    if ti.static(self.sheared and k == GRADIENT):
                         turn = way
-        first = cell[0]
-        if ti.static(bool(self.images) and 0 in self.images.axes):
-            along = self.count[m][0]
-            parts = ti.min(parts, along)
-            if ti.static(self.images.sheared):
-                first = self.images.cell(self.state.x[i], 0, turn, along)
-                if self.count[m][GRADIENT] < 3 and parts > 0:  # the next row is met on both sides, at two places
-                    parts = along
+        if ti.static(self.sheared):
+            at[0] = self.images.cell(self.state.x[i], 0, turn, self.count[m][0])
+        low, span = at[0] - 1, 1
         at[0] = 0
-        low, span = self.along(first - 1, along), 1
-        if low + 2 < along and parts == 3:
-            span, parts = 3, 1
-        return self.bucket(at, m), low, along, parts, span
+        if ti.static(0 in self.axes):
+            count = self.count[m][0]
+            low = ti.select(low < 0, low + count, low)
+            if low + 2 < count and (low & mask) + 2 <= mask and parts > 0:
+                span, parts = 3, 1
+            parts = ti.min(parts, count)
+            if ti.static(self.sheared):
+                if self.count[m][GRADIENT] < 3 and parts > 0:  # the next row is met on both sides, at two places
+                    span, parts = 1, ti.min(count, mask + 1)
+        elif (low & mask) + 2 <= mask:
+            span, parts = 3, parts // 3
+        return self.bucket(at, m), low, parts, span
 
     @ti.func
-    def along(self, cell, count):
-        """A cell of a row that closes after so many."""
-        if ti.static(bool(self.images) and 0 in self.images.axes):
-            cell = ti.select(cell < 0, cell + count, ti.select(cell < count, cell, cell - count))
-        else:
-            cell &= count - 1
-        return cell
+    def along(self, cell, m):
+        """Where in its row the bucket of a cell stands, which may be one beyond the end of the box."""
+        if ti.static(0 in self.axes):
+            cell = ti.select(cell < self.count[m][0], cell, cell - self.count[m][0])
+        return cell & ((1 << self.shape[m][0]) - 1)
 
 
 def most_levels() -> int:

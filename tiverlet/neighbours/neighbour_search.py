@@ -183,9 +183,9 @@ class NeighbourSearch(NeighbourList):
         for m in range(own + 1):
             cell = self.cells.cell_of(i, m)
             for r in range(ti.static(3 ** (self.dim - 1))):
-                base, low, along, parts, span = self.cells.row(i, cell, m, r)
+                base, low, parts, span = self.cells.row(i, cell, m, r)
                 for part in range(parts):
-                    b = base + self.cells.along(low + part, along)
+                    b = base + self.cells.along(low + part, m)
                     for e in range(self.cells.edge[b + 1], self.cells.edge[b + span + 1]):
                         j = self.cells.sorted[e]
                         listed = self.listed(i, j, self.cells.apart(i, e))

@@ -142,7 +142,7 @@ class Periodic(Feature):
         if len(self.low) != particles.dim:
             raise ValueError(f"Periodic: low has {len(self.low)} coordinates, but the particles are in {particles.dim}D.")
         if self.sheared and not {FLOW, GRADIENT} <= set(self.axes):
-            raise ValueError(f"Periodic: shear = {self.shear:g} needs a box that is periodic along x and y, not axes {self.axes}.")
+            raise ValueError(f"Periodic: shear = {self.shear:g} needs a box that is periodic along x and y, not {self.axes}.")
 
     @property
     def sheared(self) -> bool:
@@ -216,7 +216,7 @@ class Periodic(Feature):
         return out
 
     def ghosts(self, position: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
-        """Images of particles within `reach` [m] of the box: their numbers, and where they are; first all in the box, in order."""
+        """Images of particles within `reach` [m] of the box: their numbers, and where they are; first those in it, in order."""
         x = self.wrap(position)
         found, places = [np.arange(len(x))], [x]
         along = 2 if self.offset else 1  # the next box along y begins anywhere along x

@@ -32,18 +32,18 @@ def refuse_misfits(box: Periodic, particles: Particles, features: tuple[Feature,
         if isinstance(feature, Collider):
             _refuse_wall(box, feature)
         if isinstance(feature, Link) and feature.count:
-            _refuse(box, repr(feature), f"its longest link, {int(feature.goal.argmax())}, holds", feature.goal.max(), "links")
+            _refuse(box, repr(feature), f"link {int(feature.goal.argmax())} holds particles", feature.goal.max(), "links", True)
         if isinstance(feature, Batch) and isinstance(feature, (Area, Constraint, ShapeMatch, Volume)) and feature.arity != 1:
             _refuse_torn(box, feature)
 
 
-def _refuse(box: Periodic, who: str, what: str, far: float, smaller: str) -> None:
-    """What reaches half a box."""
+def _refuse(box: Periodic, who: str, what: str, far: float, smaller: str, half: bool = False) -> None:
+    """What reaches further than half a box; or just so far, where `half`."""
     k = int(np.argmin(box.lengths))
-    if 2 * far > box.shortest:
+    if 2 * far > box.shortest or (half and 2 * far == box.shortest):
         raise ValueError(
-            f"Periodic: along {AXES[k]} the box is {box.shortest:g} m long, but {who}: {what} up to {far:g} m apart, and would meet "
-            f"two images of the same particle. Make the box at least {2 * far:g} m long there, or {smaller} smaller."
+            f"Periodic: along {AXES[k]} the box is {box.shortest:g} m long, but {who}: {what} up to {far:g} m apart, and would "
+            f"meet two images of the same particle. Make the box longer than {2 * far:g} m there, or {smaller} smaller."
         )
 
 
@@ -70,6 +70,6 @@ def _refuse_torn(box: Periodic, batch: Batch) -> None:
     if far.any():
         e, k = (int(v) for v in np.argwhere(far)[0])
         raise ValueError(
-            f"Periodic: {batch!r}: particle {batch.indices.ravel()[e]} of number {owner[e]} is more than half a box from its first "
-            f"one along {AXES[k]}. Give unwrapped positions, which keep a body together; it may reach out of the box."
+            f"Periodic: {batch!r}: particle {batch.indices.ravel()[e]} of number {owner[e]} is more than half a box from its "
+            f"first one along {AXES[k]}. Give unwrapped positions, which keep a body together; it may reach out of the box."
         )
