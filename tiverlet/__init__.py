@@ -24,9 +24,10 @@ if TYPE_CHECKING:
 __all__ = [
     "AngleLimit", "Area", "Attractor", "Ball", "Bend", "Box", "Capsule", "Chebyshev", "ConjugateGradient", "Constraint",
     "Contact", "Dihedral", "Direct", "Distance", "Drag", "Force", "Gravity", "HalfSpace", "Hand", "Jacobi", "Mesh", "PairForce",
-    "Particles", "Path", "Periodic", "Pin", "Polygon", "Polygons", "Recorder", "Rope", "Sdf", "ShapeMatch", "Snap", "Spacer", "StepReport",
-    "SweepResult", "Volume", "Wind", "World", "Worlds", "WorldsRecorder", "approach", "clamp", "golden", "golden_colors",
-    "golden_index", "gradient", "init", "measure", "mix", "play", "replay", "runtime", "shapes", "smoothstep", "sweep",
+    "Particles", "Path", "Periodic", "Pin", "Polygon", "Polygons", "Recorder", "Rope", "Sdf", "ShapeMatch", "Snap", "Spacer",
+    "StepReport", "SweepResult", "Volume", "Wind", "World", "Worlds", "WorldsRecorder", "approach", "clamp", "golden",
+    "golden_colors", "golden_index", "gradient", "init", "measure", "mix", "play", "replay", "runtime", "shapes", "smoothstep",
+    "sweep",
 ]  # fmt: skip
 __version__ = "0.1.0"  # the only place that says it
 

@@ -26,6 +26,7 @@ class Images:
         self.axes, self.sheared, self.real = box.axes, box.sheared, scene.real
         self.length = add("Periodic.length", None, width=dim, values=box.away(np.eye(dim, dtype=int)).diagonal())
         self.per_length = add("Periodic.per_length", None, width=dim, values=1 / box.lengths)
+        self.near = add("Periodic.near", None, values=(1 - 2.0**-20) * box.shortest**2 / 4)
         self.middle = add("Periodic.middle", None, width=dim, values=box.middle)
         self.in_state: dict[str, Any] = {}
         if self.sheared:
@@ -42,7 +43,14 @@ class Images:
 
     @ti.func
     def nearest(self, r):
-        """The least of the differences x_i - x_j + whole boxes."""
+        """The least of the differences x_i - x_j + whole boxes; of most pairs it is r itself, which is told at once."""
+        if r.dot(r) > self.near[None]:
+            r = self.reduced(r)
+        return r
+
+    @ti.func
+    def reduced(self, r):
+        """The same, in steps."""
         if ti.static(self.sheared):
             k = self.turns(r, GRADIENT)
             r[GRADIENT] -= k * self.length[None][GRADIENT]

@@ -475,7 +475,8 @@ class Scalar(Batch):
         )
         for k in ti.static(range(self.arity)):
             i = self.member(c, k)
-            move, split = self.dev.state.slid(self.dev.state.d[i] - self.dev.state.d[self.member(c, 0)], i, self.member(c, 0)), self.dev.slots.split[i]
+            j, split = self.member(c, 0), self.dev.slots.split[i]
+            move = self.dev.state.slid(self.dev.state.d[i] - self.dev.state.d[j], i, j)
             if together != 0:
                 split = self.dev.w.of(i) * (self.dev.slots.begin[i + 1] - self.dev.slots.begin[i])
             u += n[k, :].dot(move)
