@@ -1,5 +1,6 @@
 """Periodic boxes: every particle has images, a box away along each periodic axis, and others meet the nearest of them."""
 
+import contextlib
 from collections.abc import Sequence
 from itertools import product
 from typing import Any
@@ -122,7 +123,7 @@ class Periodic(Feature):
 
     compiled_for = ("sheared",)
     host_only = ("low", "high")
-    uploads_all = False
+    _last = 0.0, 0.0
     shear = Knob(lambda f, v: checks.number("Periodic", "shear", v), "Rate of the shear [1/s].")
     bulk = 0.1
 
@@ -177,8 +178,35 @@ class Periodic(Feature):
     @property
     def strain(self) -> float:
         """How far the shear has come: the integral of its rate."""
+        return self._come[0]
+
+    @property
+    def _come(self) -> tuple[float, float]:
+        """The strain, and where the image one box further along y is along x [m]."""
         images = vars(self.dev).get("images")
-        return float(self.scene.memory.read(images.strain)[0]) if images and images.sheared else 0.0
+        if images and images.sheared:
+            with contextlib.suppress(RuntimeError):  # there is none before its world is complete, nor after it is closed
+                read = self.scene.memory.read
+                self._last = float(read(images.strain)[0]), float(read(images.shift)[0, 0])
+        return self._last
+
+    def continued(self, other: "Periodic") -> None:
+        """Take over the strain of the same box in another world."""
+        if self.dev.images.sheared:
+            strain, offset = other._come
+            self.scene.memory.write(self.dev.images.strain, strain)
+            self.scene.memory.write(self.dev.images.shift, [offset, 0.0])
+
+    def copy(self) -> "Periodic":
+        """Without the strain, which belongs to a world."""
+        new: Any = super().copy()
+        new._last = 0.0, 0.0
+        return new
+
+    def release(self) -> None:
+        """What is found out while the world is built anew is found out where images are now."""
+        self._last = self._come
+        super().release()
 
     def bind(self, scene: Scene) -> None:
         """Lengths, and where images are."""
@@ -196,8 +224,16 @@ class Periodic(Feature):
     @property
     def offset(self) -> float:
         """How far along x the image is that is one box further along y [m]."""
-        images = vars(self.dev).get("images")
-        return float(self.scene.memory.read(images.shift)[0, 0]) if images and images.sheared else 0.0
+        return self._come[1]
+
+    def outline(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """For pictures of a scene between two corners: the edges of the box, (m, 2, dim); along axes that are not periodic it
+        ends with the scene."""
+        some = np.isfinite(self.lengths)
+        ends = np.stack([np.where(some, self.low, low), np.where(some, self.high, high)])
+        corners = np.array(list(product((0, 1), repeat=len(some))))
+        pairs = [(a, b) for a in corners for b in corners if (b - a).sum() == 1 and (b >= a).all()]
+        return np.array([[ends[a, range(len(a))], ends[b, range(len(b))]] for a, b in pairs])
 
     def boxes(self, position: ArrayLike) -> np.ndarray:
         """How many boxes along each axis positions (n, dim) are away from the box, (n, dim) integers: the image flags of LAMMPS.

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..neighbours.periodic import Periodic
 from . import clock
 
 if TYPE_CHECKING:
@@ -140,5 +141,8 @@ def transfer(old: "World", new: "World") -> None:
     ours.time, ours.tick, ours.since, ours.frame = theirs.time, theirs.tick, theirs.since, theirs.frame
     new._controller.memory = kept.controller
     new.position, new.velocity = old.position, old.velocity
+    for ours, theirs in zip(new.features, old.features, strict=True):
+        if isinstance(ours, Periodic):
+            ours.continued(theirs)
     for broke, breaks in zip(old._runner.step.breakers, new._runner.step.breakers, strict=True):
         new._runner.memory.write(breaks.dev.strength.stamp, broke.stamps())
