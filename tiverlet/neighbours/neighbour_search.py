@@ -53,16 +53,19 @@ class NeighbourSearch(NeighbourList):
         self.dim, self.state, self.radius = dim, scene.state, scene.radius
         self.table = table
         number, real = scene.memory.number, scene.real
+        radius = scene.particles.radius if radius is None else radius
+        reach = 0 * radius if reach is None else reach
+        self.sheared = bool(self.state.images and self.state.images.sheared)
+        if self.sheared:  # within half of its height the nearest image along y is the nearest one
+            skin = min(skin, float(scene.periodic.lengths[GRADIENT]) / 2 - 2 * radius.max() - reach.max())
         self.skin, self.too_far = number(skin, real), number((STALE * skin) ** 2, real)
         self._extent: Sequence[float] = [-1.0] * dim
-        radius = scene.particles.radius if radius is None else radius
-        self.cells = CellList(scene, radius, 0 * radius if reach is None else reach, skin, team, scratch)
+        self.cells = CellList(scene, radius, reach, skin, team, scratch)
         self.several_levels = self.cells.levels > 1
         self.counts = self.several_levels or team.launched  # before it lists
         self.serial = not self.counts or (team.size == 1 and not team.launched)  # one thread makes a list, in order
         self.blocks = number(max(1, -(-n // team.piece)) if team.size > 1 and not self.counts else 1)
         self.origin = add("grid.built_at", n, width=dim)
-        self.sheared = bool(self.state.images and self.state.images.sheared)
         if self.sheared:
             self.strain = add("grid.built_strain", None, kind=ti.f64)
             self.farthest = number(float(self.cells.sizes.max()), real)

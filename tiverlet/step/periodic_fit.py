@@ -13,6 +13,7 @@ from ..neighbours.periodic import Periodic
 from ..particles import Particles
 
 AXES = "xyz"
+SPARE = 2.2  # contact distances, that a sheared box is long at least
 
 
 def refuse_misfits(box: Periodic, particles: Particles, features: tuple[Feature, ...]) -> None:
@@ -38,12 +39,12 @@ def refuse_misfits(box: Periodic, particles: Particles, features: tuple[Feature,
 
 
 def _refuse(box: Periodic, who: str, what: str, far: float, smaller: str, half: bool = False) -> None:
-    """What reaches further than half a box; or just so far, where `half`."""
-    k = int(np.argmin(box.lengths))
-    if 2 * far > box.shortest or (half and 2 * far == box.shortest):
+    """What reaches further than half a box; or just so far, where `half`. Where images slide, lists need room for their skin."""
+    k, least = int(np.argmin(box.lengths)), (SPARE if box.sheared else 2) * far
+    if least > box.shortest or (half and least == box.shortest):
         raise ValueError(
             f"Periodic: along {AXES[k]} the box is {box.shortest:g} m long, but {who}: {what} up to {far:g} m apart, and would "
-            f"meet two images of the same particle. Make the box longer than {2 * far:g} m there, or {smaller} smaller."
+            f"meet two images of the same particle. Make the box longer than {least:g} m there, or {smaller} smaller."
         )
 
 
