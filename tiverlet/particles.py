@@ -191,6 +191,8 @@ class State:
     @inline
     def apart(self, i, j):
         """x_i - x_j, with the low words where there are any; in a periodic box that of the nearest images."""
+        if self.images and self.compensated:  # the difference of what is boxes apart is not known in f32
+            return ti.cast(self.between(i, j), self.real)
         r = at(self.x, i) - at(self.x, j)
         return self.nearest(r + (at(self.low, i) - at(self.low, j)) if self.compensated else r)
 

@@ -183,9 +183,14 @@ class CellList:
     def apart(self, i, k):
         """From the k-th of the sorted particles to particle i, as State.apart() has it."""
         r = self.state.x[i] - self.place[k]
-        if ti.static(self.state.compensated):
+        if ti.static(self.state.compensated and len(self.axes) > 0):
+            far = ti.cast(self.state.x[i], ti.f64) - ti.cast(self.place[k], ti.f64)
+            r = ti.cast(self.state.nearest(far + (self.state.low[i] - self.low[k])), self.real)
+        elif ti.static(self.state.compensated):
             r += self.state.low[i] - self.low[k]
-        return self.state.nearest(r)
+        elif ti.static(len(self.axes) > 0):
+            r = self.state.nearest(r)
+        return r
 
     @ti.func
     def row(self, i, cell, m, r):

@@ -25,16 +25,18 @@ class Images:
     def __init__(self, scene: Scene, box: "Periodic"):
         add, dim = scene.memory.field, scene.particles.dim
         self.axes, self.sheared, self.real = box.axes, box.sheared, scene.real
-        self.length = add("Periodic.length", None, width=dim, values=box.away(np.eye(dim, dtype=int)).diagonal())
-        self.per_length = add("Periodic.per_length", None, width=dim, values=1 / box.lengths)
-        self.near = add("Periodic.near", None, values=(1 - 2.0**-20) * box.shortest**2 / 4)
+        kind = ti.f64 if scene.state.compensated else scene.real  # whose differences are
+        self.length = add("Periodic.length", None, width=dim, kind=kind, values=box.away(np.eye(dim, dtype=int)).diagonal())
+        self.per_length = add("Periodic.per_length", None, width=dim, kind=kind, values=1 / box.lengths)
+        self.near = add("Periodic.near", None, kind=kind, values=(1 - 2.0**-20) * box.shortest**2 / 4)
         self.middle = add("Periodic.middle", None, width=dim, values=box.middle)
+        self.kind = kind
         self.in_state: dict[str, Any] = {}
         if self.sheared:
             self.rate = add("Periodic.rate", None, kind=ti.f64, values=box.shear)
             self.strain = add("Periodic.strain", None, kind=ti.f64, state=True)
             # How far the next image along GRADIENT is along FLOW, and how far it slid in the last substep [m].
-            self.shift = add("Periodic.shift", None, width=2, state=True)
+            self.shift = add("Periodic.shift", None, width=2, kind=kind, state=True)
             self.in_state = {"strain": self.strain, "shift": self.shift}
 
     @ti.func
@@ -95,7 +97,7 @@ class Images:
         height, length = ti.cast(self.length[None][GRADIENT], ti.f64), ti.cast(self.length[None][FLOW], ti.f64)
         offset = self.strain[None] * height
         offset -= ti.floor(offset / length + 0.5) * length
-        self.shift[None] = ti.Vector([ti.cast(offset, self.real), ti.cast(step * height, self.real)])
+        self.shift[None] = ti.cast(ti.Vector([offset, step * height]), self.kind)
 
 
 class Periodic(Feature):
