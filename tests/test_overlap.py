@@ -19,7 +19,7 @@ def test_overlap_is_what_comparing_all_pairs_finds():
         free = rng.random(n) < 0.8
         pairs, _ = tv.measure.overlapping(x, radius)
         want = bool(free[pairs].any())
-        scene: Any = Some(particles=Some(position=x, radius=radius), inv_mass=free * 2.0)
+        scene: Any = Some(periodic=None, particles=Some(position=x, radius=radius), inv_mass=free * 2.0)
         assert overlapping(scene, []) == want
         seen[want] += 1
     assert min(seen) > 30

@@ -25,6 +25,7 @@ from .constraints import (
 from .contact import Contact, Polygons
 from .device.runtime import init
 from .forces import Attractor, Drag, Force, Gravity, Hand, PairForce, Wind
+from .neighbours import Periodic
 from .particles import Particles
 from .recording import Recorder, WorldsRecorder, replay
 from .solvers import Chebyshev, ConjugateGradient, Direct, Jacobi
@@ -39,8 +40,9 @@ if TYPE_CHECKING:
 __all__ = [
     "AngleLimit", "Area", "Attractor", "Ball", "Bend", "Box", "Capsule", "Chebyshev", "ConjugateGradient", "Constraint",
     "Contact", "Dihedral", "Direct", "Distance", "Drag", "Force", "Gravity", "HalfSpace", "Hand", "Jacobi", "Mesh", "Motor",
-    "PairForce", "Particles", "Path", "Pin", "Polygon", "Polygons", "Recorder", "Rope", "Sdf", "ShapeMatch", "Snap", "Spacer",
-    "StepReport", "SweepResult", "Volume", "Winch", "Wind", "World", "Worlds", "WorldsRecorder", "approach", "clamp", "golden",
+    "PairForce", "Particles", "Path", "Periodic", "Pin", "Polygon", "Polygons", "Recorder", "Rope", "Sdf", "ShapeMatch", "Snap",
+    "Spacer", "StepReport", "SweepResult", "Volume", "Winch", "Wind", "World", "Worlds", "WorldsRecorder", "approach", "clamp",
+    "golden",
     "golden_colors", "golden_index", "gradient", "init", "measure", "mix", "play", "replay", "runtime", "shapes", "smoothstep",
     "sweep",
 ]  # fmt: skip

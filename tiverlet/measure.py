@@ -4,9 +4,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .neighbours.queries import between
 from .spin import moments
 
 if TYPE_CHECKING:
+    from .neighbours import Periodic
     from .world import World
 
 
@@ -47,14 +49,25 @@ def strain(world: "World", pairs, rest) -> np.ndarray:
     """(|x_i - x_j| - rest) / rest of each pair, (m,)."""
     i, j = np.asarray(pairs).T
     x = world.position
-    return np.linalg.norm(x[i] - x[j], axis=1) / np.asarray(rest) - 1
+    return np.linalg.norm(between(x[i], x[j], world._runner.scene.periodic), axis=1) / np.asarray(rest) - 1
 
 
-def overlapping(position: np.ndarray, radius, skin: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def overlapping(
+    position: np.ndarray, radius, skin: float = 0.0, periodic: "Periodic | None" = None
+) -> tuple[np.ndarray, np.ndarray]:
     """All pairs of discs or spheres that overlap, or lack less than `skin` [m] of it: pairs (m, 2) with i < j, in order, and how
-    deep they overlap, with the skin (m,) [m]. By a sweep along x, which has nothing in common with how a World finds contacts."""
+    deep they overlap, with the skin (m,) [m]. periodic: the box, in which images count too. By a sweep along x, which has nothing
+    in common with how a World finds contacts."""
     position = np.asarray(position, dtype=np.float64)
     radius = np.broadcast_to(np.asarray(radius, dtype=np.float64), (len(position),))
+    if periodic is not None:
+        number, image = periodic.ghosts(position, 2 * float(radius.max(initial=0.0)) + skin)
+        pairs, deep = overlapping(image, radius[number], skin)
+        some = (pairs < len(position)).any(axis=1)
+        both, row = np.unique(np.sort(number[pairs[some]], axis=1), axis=0, return_inverse=True)
+        deepest = np.zeros(len(both))
+        np.maximum.at(deepest, row.ravel(), deep[some])
+        return both[both[:, 0] != both[:, 1]], deepest[both[:, 0] != both[:, 1]]
     order = np.argsort(position[:, 0], kind="stable")
     x, r = position[order], radius[order]
     ends = np.searchsorted(x[:, 0], x[:, 0] + r + (r.max(initial=0.0) + skin), side="right")

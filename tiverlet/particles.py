@@ -249,6 +249,7 @@ class State:
         self.real, self.double = memory.real, memory.real == ti.f64
         self.count, self.dim = n, dim
         self.starts = self.befores = self.keeps_wall_push = self.carries = self.spins = False
+        self.images: Any = None  # where the world has a periodic box, see neighbours/periodic.py
         self.x = memory.field("position", n, width=dim, values=particles.position, state=True)
         self.d = memory.field("displacement", n, width=dim, values=particles.velocity, state=True)
         self.w = Shared(memory, "inv_mass", inv_mass)
@@ -286,9 +287,11 @@ class State:
 
     @inline
     def apart(self, i, j):
-        """x_i - x_j, with the low words where there are any."""
+        """x_i - x_j, with the low words where there are any; in a periodic box that of the nearest images."""
+        if self.images and self.compensated:  # the difference of what is boxes apart is not known in f32
+            return ti.cast(self.between(i, j), self.real)
         r = at(self.x, i) - at(self.x, j)
-        return r + (at(self.low, i) - at(self.low, j)) if self.compensated else r
+        return self.nearest(r + (at(self.low, i) - at(self.low, j)) if self.compensated else r)
 
     @ti.func
     def between(self, i, j):
@@ -296,7 +299,27 @@ class State:
         r = ti.cast(self.x[i], ti.f64) - ti.cast(self.x[j], ti.f64)
         if ti.static(self.sums):
             r += ti.cast(self.low[i], ti.f64) - ti.cast(self.low[j], ti.f64)
-        return r
+        return self.nearest(r)
+
+    @inline
+    def nearest(self, r):
+        """A difference of places, between nearest images in a periodic box."""
+        return self.images.nearest(r) if self.images else r
+
+    @inline
+    def around(self, x, middle):
+        """Of a place, the image nearest to another one in a periodic box."""
+        return middle + self.images.nearest(x - middle) if self.images else x
+
+    @inline
+    def inside(self, x):
+        """Of a place, the image in a periodic box."""
+        return self.images.inside(x) if self.images else x
+
+    @inline
+    def slid(self, moved, i, j):
+        """How much further particle i moved than particle j did, as images of a box that may be sheared."""
+        return self.images.slid(moved, at(self.x, i) - at(self.x, j)) if self.images and self.images.sheared else moved
 
     @inline
     def place(self, i):

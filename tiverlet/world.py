@@ -339,15 +339,17 @@ class World:
         """The particles whose centers are within `radius` [m] of points: (m, 2), rows of `points` and particles, in order.
 
         points: (k, dim) [m]. radius: number or (k,), at least 0. With a Contact in the world its grid is used; without, all are
-        compared.
+        compared. In a periodic box the nearest image of each particle counts.
         """
         points = checks.points("World.near", "points", points, dim=self._particles.dim)
         radius = checks.per_item("World.near", "radius", radius, len(points), least=0.0)
         self._runner.memory.check()
         if not len(points) or not len(self._particles):
             return np.zeros((0, 2), dtype=np.int64)
+        box = self._runner.scene.periodic
+        points = points if box is None else box.wrap(points)
         if not self._runner.grid:
-            return near_by_all(self.position, points, radius)
+            return near_by_all(self.position, points, radius, box)
         with whole:
             self._runner.list_neighbours()
             with self._runner.memory.compiler():
@@ -363,7 +365,7 @@ class World:
         start = (
             self._runner.grid.finest if self._runner.grid else 2 * float(np.abs(position).max() + np.abs(points).max(initial=1.0))
         )
-        return nearest(self.near, position, points, start)
+        return nearest(self.near, position, points, start, self._runner.scene.periodic)
 
     def ray(
         self, origin, direction, reach=np.inf, *, radius: float = 0.0, groups=None, skip=(), features: Iterable[Feature] | None =

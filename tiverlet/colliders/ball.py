@@ -121,7 +121,7 @@ class Ball(Collider):
     def confine(self, i, radius, h, frame_fraction, turn):
         """The surface where it was met, or where it is nearest."""
         center, moved = self.dev.center.at(frame_fraction[1]), self.dev.center.step(frame_fraction)
-        r = self.dev.state.place(i) - center
+        r = self.dev.state.nearest(self.dev.state.place(i) - center)
         own = ti.cast(self.radius, self.dev.real)
         depth, n = self.nearest(r, own, radius)
         d = self.dev.surface.path(i, moved)

@@ -123,7 +123,8 @@ class Capsule(Collider):
     def confine(self, i, radius, h, frame_fraction, turn):
         """The surface where it was met, or where it is nearest."""
         a, b = self.dev.a.at(frame_fraction[1]), self.dev.b.at(frame_fraction[1])
-        x, contact_distance = self.dev.state.place(i), ti.cast(self.radius, self.dev.real) + radius
+        middle, contact_distance = (a + b) / 2, ti.cast(self.radius, self.dev.real) + radius
+        x = self.dev.state.around(self.dev.state.place(i), middle)
         t, length, n = self.nearest(x, a, b)
         depth = contact_distance - length
         moved = self.dev.a.step(frame_fraction) * (1 - t) + self.dev.b.step(frame_fraction) * t

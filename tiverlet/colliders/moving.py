@@ -106,7 +106,7 @@ class Moving(Collider):
 
         The wall moves by what its point under the start of the particle moves, so what sticks rides along and does not creep.
         """
-        start, contact_distance = self.dev.state.begin(i), radius + ti.cast(self.radius, self.dev.real)
+        start, contact_distance = self.dev.state.inside(self.dev.state.begin(i)), radius + ti.cast(self.radius, self.dev.real)
         first = self.dev.pose.inward(0, start - self.dev.pose.place[0])
         moved = self.dev.pose.place[2] + self.dev.pose.outward(2, first)
         e = self.dev.pose.inward(1, self.dev.state.d[i] - moved)

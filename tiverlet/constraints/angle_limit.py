@@ -68,7 +68,7 @@ class AngleLimit(Angle):
 
     def rest_of(self, position: np.ndarray) -> np.ndarray:
         """How far the angles are from the middle."""
-        f = path_angles(*(position[n] for n in self.indices.T)) - self.middle
+        f = path_angles(*np.moveaxis(self.placed(position), 1, 0)) - self.middle
         return np.abs(f - TURN * np.round(f / TURN))
 
     def violation(self, position: np.ndarray) -> np.ndarray:

@@ -34,7 +34,7 @@ class Bend(Angle):
 
     def rest_of(self, position: np.ndarray) -> np.ndarray:
         """The angles at the given positions."""
-        return path_angles(*(position[n] for n in self.indices.T))
+        return path_angles(*np.moveaxis(self.placed(position), 1, 0))
 
     def bind(self, scene: Scene) -> None:
         """In 3D, the normals as they were last."""

@@ -34,7 +34,8 @@ class Dihedral(Angle):
 
     def rest_of(self, position: np.ndarray) -> np.ndarray:
         """The angles at the given positions."""
-        return dihedral_angles(*(position[n] for n in self.indices.T))
+        x = self.placed(position)
+        return dihedral_angles(*(x[:, k] for k in range(4)))
 
     @ti.func
     def reach(self, c, q):

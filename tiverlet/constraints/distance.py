@@ -22,8 +22,8 @@ class Link(Scalar):
 
     def rest_of(self, position: np.ndarray) -> np.ndarray:
         """Lengths of the links."""
-        i, j = self.indices.T
-        return np.linalg.norm(position[i] - position[j], axis=1)
+        x = self.placed(position)
+        return np.linalg.norm(x[:, 0] - x[:, 1], axis=1)
 
     @property
     def cusp(self) -> bool:
@@ -32,8 +32,8 @@ class Link(Scalar):
 
     def gradients(self, position: np.ndarray) -> np.ndarray:
         """As in measure()."""
-        i, j = self.indices.T
-        r = position[i] - position[j]
+        x = self.placed(position)
+        r = x[:, 0] - x[:, 1]
         length = np.linalg.norm(r, axis=1, keepdims=True)
         n = np.divide(r, length, out=np.eye(1, r.shape[1]).repeat(len(r), axis=0), where=length > 0)
         return np.stack([n, -n], axis=1)

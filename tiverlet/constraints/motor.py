@@ -93,7 +93,8 @@ class Motor(Angle):
 
     def rest_of(self, position: np.ndarray) -> np.ndarray:
         """The angles at the given positions."""
-        return (dihedral_angles if self.arity == 4 else path_angles)(*(position[n] for n in self.indices.T))
+        x = self.placed(position)
+        return (dihedral_angles if self.arity == 4 else path_angles)(*(x[:, k] for k in range(self.arity)))
 
     def bind(self, scene: Scene) -> None:
         """Whether angles end at 0 and pi."""
@@ -121,7 +122,7 @@ class Motor(Angle):
         if self.acts:
             self.dev.drive.upload(*self._course(), self.torque)
 
-    def placed(self, position: np.ndarray, first: int) -> None:
+    def start_at(self, position: np.ndarray, first: int) -> None:
         """Go on from where hinges were placed."""
         far = (np.abs(self.violation(position)) > PLACED) & (self.indices >= first).any(axis=1)
         if far.any():

@@ -217,7 +217,8 @@ class Contact(PairContact):
                                 lift -= w * self.dev.restitution.before_impact(i, j, n, overlap) * tangential
                         spin_change += w * turned
                         if final != 0:
-                            approach = -(self.dev.forces.before[i] - self.dev.forces.before[j]).dot(n)
+                            before = self.dev.forces.before[i] - self.dev.forces.before[j]
+                            approach = -self.dev.state.slid(before, i, j).dot(n)
                             share = self.dev.forces.share(approach, part * alone) * w
                             forced += share * tangential
                             spin_forced += share * turned
@@ -226,7 +227,7 @@ class Contact(PairContact):
                     total += w * want
                     if ti.static(self.dev.has_friction and not self.dev.spins):
                         if final != 0:
-                            approach = -(self.dev.forces.before[i] - self.dev.forces.before[j]).dot(n)
+                            approach = -self.dev.state.slid(self.dev.forces.before[i] - self.dev.forces.before[j], i, j).dot(n)
                             forced += self.dev.forces.share(approach, part * alone) * w * (want - part * n)
                     self.dev.push.field[e] = push
         self.dev.move[i] = total
@@ -243,7 +244,8 @@ class Contact(PairContact):
     @ti.func
     def held(self, i, j, n, normal, slip):
         """The part of a pair's slip, with the present displacements, that friction takes back for a normal displacement."""
-        return self.dev.friction.held(i, j, n, normal, slip + self.dev.state.d[i] - self.dev.state.d[j])
+        moved = self.dev.state.slid(slip + self.dev.state.d[i] - self.dev.state.d[j], i, j)
+        return self.dev.friction.held(i, j, n, normal, moved)
 
     @ti.func
     def grip(self, i, j, e, n, pressed, bounces):
@@ -275,7 +277,7 @@ class Contact(PairContact):
                     length = r.norm()
                     if push > 0 and length > 0:
                         n = r / length
-                        approach = -(self.dev.forces.before[i] - self.dev.forces.before[j]).dot(n)
+                        approach = -self.dev.state.slid(self.dev.forces.before[i] - self.dev.forces.before[j], i, j).dot(n)
                         total += self.dev.forces.share(approach, push * (w + self.dev.w.of(j))) * w * push * n
         if ti.static(self.dev.has_friction):
             total += self.dev.forces.sum[i]

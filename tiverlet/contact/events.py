@@ -104,7 +104,7 @@ class EventLog:
             self.place(row, i, j, n)
         began, last = self.when.field[row][0], self.when.field[row][1]
         if last < now - 1:
-            approach = -(self.state.d[i] - self.state.d[j]).dot(n)
+            approach = -self.state.slid(self.state.d[i] - self.state.d[j], i, j).dot(n)
             self.speed.field[row] = ti.max(self.speed.field[row], approach)
         if final != 0 and began == BEFORE:
             self.place(row, i, j, n)

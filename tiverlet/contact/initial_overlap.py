@@ -16,17 +16,22 @@ def overlapping(scene: Scene, batches: list[Batch], first: int = 0) -> bool | No
     rounds; what is linked never touches. None where finding out would take long.
     """
     x, radius, free = scene.particles.position, scene.particles.radius, scene.inv_mass > 0
+    count, number = len(x), np.arange(len(x))
+    if scene.periodic is not None:  # particles and their images side by side
+        number, x = scene.periodic.ghosts(x, 2 * float(radius.max(initial=0.0)))
+        radius, free = radius[number], free[number]
     close = 2.0**-20 * float(np.abs(x).max(initial=0.0) + radius.max(initial=0.0))
-    pairs = _by_all(x, radius, first) if (len(x) - first) * len(x) <= FEW else _by_cells(x, radius)
+    begin = first if len(x) == count else 0
+    pairs = _by_all(x, radius, begin) if (len(x) - begin) * len(x) <= FEW else _by_cells(x, radius)
     if pairs is None:
         return None
-    i, j = pairs[(pairs >= first).any(axis=1)].T
+    i, j = pairs[(number[pairs] >= first).any(axis=1)].T
     near = ((x[i] - x[j]) ** 2).sum(axis=1) < np.maximum(radius[i] + radius[j] - close, 0) ** 2
-    pairs = np.stack([i, j], axis=1)[near & (free[i] | free[j])]
+    pairs = number[np.stack([i, j], axis=1)[near & (free[i] | free[j])]]
     if not len(pairs):
         return False
     linked = np.concatenate([*(b.excluded_pairs(b.start) for b in batches), pairs[:0]])
-    some, without = (np.sort(p, axis=1).astype(np.int64) @ [len(x), 1] for p in (pairs, linked))
+    some, without = (np.sort(p, axis=1).astype(np.int64) @ [count, 1] for p in (pairs, linked))
     return not np.isin(some, without).all()
 
 

@@ -8,7 +8,7 @@ from ..device import ti
 from ..features.feature import Scene
 from ..features.material import TOUCHES
 from ..neighbours.neighbour_list import PairData
-from ..neighbours.queries import Contacts
+from ..neighbours.queries import Contacts, between
 
 if TYPE_CHECKING:
     from ..neighbours.neighbour_search import NeighbourSearch
@@ -89,7 +89,7 @@ class DiscGeometry:
         if rr <= contact_distance * contact_distance * ti.static(SAME_PLACE):
             overlap, n = contact_distance, self.fallback_normal(i, j, r)
             each = 1 / shared
-        d = self.state.d[i] - self.state.d[j]
+        d = self.state.slid(self.state.d[i] - self.state.d[j], i, j)
         r -= d
         c = r.dot(r) - contact_distance * contact_distance
         if c > 0:
@@ -205,7 +205,7 @@ class DiscGeometry:
             rank, table = self.grid.table.rows(self.scene.particles.group)
             touch = table.reshape(rank.max() + 1, rank.max() + 1, -1)[rank[pairs[:, 0]], rank[pairs[:, 1]], 3] == TOUCHES
             pairs, push = pairs[touch], push[touch]
-        d = x[pairs[:, 0]] - x[pairs[:, 1]]
+        d = between(x[pairs[:, 0]], x[pairs[:, 1]], self.scene.periodic)
         length = np.linalg.norm(d, axis=1)
         overlap = r[pairs].sum(axis=1) - length
         some = (overlap > 0) | (push > 0)

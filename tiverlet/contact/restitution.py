@@ -63,14 +63,14 @@ class Restitution:
     @ti.func
     def target(self, i, j, n):
         """What takes a pair from coming together to leaving; how far it comes together in this substep, and without forces."""
-        a = -(self.state.before[i] - self.state.before[j]).dot(n)
-        here = -(self.state.d[i] - self.state.d[j]).dot(n)
+        a = -self.state.slid(self.state.before[i] - self.state.before[j], i, j).dot(n)
+        here = -self.state.slid(self.state.d[i] - self.state.d[j], i, j).dot(n)
         return here + self.table.of(i, j)[2] * ti.max(a, 0), here, a
 
     @ti.func
     def before_impact(self, i, j, n, overlap):
         """The share of the substep that had passed when a pair met."""
-        here = -(self.state.d[i] - self.state.d[j]).dot(n)
+        here = -self.state.slid(self.state.d[i] - self.state.d[j], i, j).dot(n)
         return ti.select(overlap < here, 1 - overlap / here, 0 * here)
 
     @ti.func

@@ -38,13 +38,14 @@ class Spinning:
     def arm(self, i, j, n):
         """The arm m of a pair that touches along the normal n."""
         distance = self.radius.of(i) + self.radius.of(j)
-        r = self.state.apart(i, j) - (self.state.d[i] - self.state.d[j])
+        r = self.state.apart(i, j) - self.state.slid(self.state.d[i] - self.state.d[j], i, j)
         return ti.select(r.dot(r) > distance * distance, n, r / distance)
 
     @ti.func
     def slip(self, i, j, m):
         """By how much the surfaces slide past each other."""
-        return self.state.d[i] - self.state.d[j] - self.spin.surface(self.spin.s[i] + self.spin.s[j], m)
+        moved = self.state.slid(self.state.d[i] - self.state.d[j], i, j)
+        return moved - self.spin.surface(self.spin.s[i] + self.spin.s[j], m)
 
     @ti.func
     def split_mass(self, i, j):

@@ -96,7 +96,7 @@ class VelocityProjection:
         for e in range(first, first + self.number[i]):
             j = self.grid.old_neighbour[e]
             r = self.state.apart(i, j)
-            want -= self.push.old[e] * (self.state.d[i] - self.state.d[j]).dot(r) * r
+            want -= self.push.old[e] * self.state.slid(self.state.d[i] - self.state.d[j], i, j).dot(r) * r
         if ti.static(self.state.keeps_wall_push):
             wall_push = self.state.wall_push[i]
             size = wall_push.dot(wall_push)

@@ -46,7 +46,7 @@ BENT, FAR = 1, 2  # how far a constraint turned in a substep: by more than 26 de
 class Scene:
     """What a feature is bound to: the memory to declare fields in, and the particles they act on."""
 
-    host_only = ("inv_mass", "residuals", "h2_effective")
+    host_only = ("inv_mass", "residuals", "h2_effective", "periodic")
 
     memory: Memory
     state: "State"
@@ -56,6 +56,7 @@ class Scene:
     slots: Any = None  # where constraints leave their moves
     residuals: Any = None  # batch -> what the last substep left of each of its violations
     order: int = 2  # of the substep in h
+    periodic: Any = None  # the Periodic of the world
     h2_effective: float = 0.0  # [s^2] what an acceleration added to the displacement in the last substep, see Batch.relax
 
     @functools.cached_property
@@ -74,8 +75,9 @@ class Feature(RecordsArguments):
     that it changes a force, `lets_go` that it no longer bears what it bore, `afresh` that it begins anew where the world is built
     anew, `moving` that a target is under way."""
 
-    kept_by_world = ("scene", "start", "changed", "moving", "new_force", "arguments")
-    host_only: tuple[str, ...] = ("start", "changed", "moving", "new_force", "arguments")  # what kernels do not read of it
+    kept_by_world = ("scene", "start", "periodic", "changed", "moving", "new_force", "arguments")
+    # What kernels do not read of it.
+    host_only: tuple[str, ...] = ("start", "periodic", "changed", "moving", "new_force", "arguments")
     uploads_all = False  # upload() and end_motion() do as well for many worlds, where knobs have one more axis, the first
     compiled_for: tuple[str, ...] = ()  # properties that decide what its kernels consist of
     told_apart = True  # its share of the time that kernels take to compile is known by its name
@@ -83,6 +85,7 @@ class Feature(RecordsArguments):
     changed = True
     moving = new_force = lets_go = afresh = False
     scene: Any = None  # Scene, from bind() on
+    periodic: Any = None  # the Periodic of its world, from before prepare() on
     start: Any = None  # Particles, as they were when it came: what it takes from them is what it took then, when bound again too
 
     @functools.cached_property
@@ -135,7 +138,7 @@ class Feature(RecordsArguments):
 
     def release(self) -> None:
         """Forget the world that it acted in."""
-        for name in ("scene", "start", "changed", "moving", "new_force", "dev"):
+        for name in ("scene", "start", "periodic", "changed", "moving", "new_force", "dev"):
             self.__dict__.pop(name, None)
 
     def kept_mask(self, number: np.ndarray) -> tuple[np.ndarray, ...]:

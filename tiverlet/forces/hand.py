@@ -29,8 +29,9 @@ class Hand(Acceleration):
     It is a critically damped spring, so the particle comes to a target at rest without swinging, in a few times 1 / rate,
     whatever its mass; where others hang on it, they weigh it down. A Pin with compliance holds many, but always the same ones.
 
-    target: (dim,) [m]. particle: its number, -1 for none. rate: [1/s], at least 0; the step resolves it while h times the rate
-    is well below 1. All live: assign between frames, at no compile cost. A particle that is pinned stays where it is.
+    target: (dim,) [m]; in a periodic box its nearest image. particle: its number, -1 for none. rate: [1/s], at least 0; the step
+    resolves it while h times the rate is well below 1. All live: assign between frames, at no compile cost. A particle that is
+    pinned stays where it is.
     """
 
     uses_velocity = True
@@ -56,7 +57,7 @@ class Hand(Acceleration):
 
     def bind(self, scene: Scene) -> None:
         """Which particle, where to, how fast."""
-        self.scene = scene
+        self.scene, self.dev.state = scene, scene.state
         self.dev.particle = scene.memory.field("Hand.particle", None, kind=ti.i32, values=self.particle)
         self.dev.target = scene.memory.field("Hand.target", None, width=self.dim, values=self.target)
         self.dev.rate = scene.memory.field("Hand.rate", None, values=self.rate)
@@ -73,13 +74,13 @@ class Hand(Acceleration):
         """-rate^2 (x - target) - 2 rate v."""
         out, rate = 0 * x, self.dev.rate[None]
         if i == self.dev.particle[None]:
-            out = -rate * (rate * (x - self.dev.target[None]) + 2 * v)
+            out = -rate * (rate * self.dev.state.nearest(x - self.dev.target[None]) + 2 * v)
         return out
 
     @ti.func
     def potential(self, i, x):
         """rate^2 |x - target|^2 / 2."""
-        out, r = 0 * x[0], x - self.dev.target[None]
+        out, r = 0 * x[0], self.dev.state.nearest(x - self.dev.target[None])
         if i == self.dev.particle[None]:
             out = self.dev.rate[None] ** 2 * r.dot(r) / 2
         return out

@@ -158,7 +158,7 @@ class PairForce(Acceleration):
     @ti.func
     def energy_between(self, i, j, back):
         """The share of particle i in the energy of a pair, at x - back d, f64: half, or all where the other one is held."""
-        shift = back * (self.dev.state.d[i] - self.dev.state.d[j])
+        shift = back * self.dev.state.slid(self.dev.state.d[i] - self.dev.state.d[j], i, j)
         r = self.dev.state.apart(i, j) - shift
         out = ti.cast(0, ti.f64)
         if self.near(r):

@@ -12,6 +12,7 @@ from ..constraints.distance import Link
 from ..features.feature import Batch
 from ..forces import Hand
 from ..recording.drawing import bounds, colors, links, upwards
+from ..recording.images import InBox
 from ..recording.surfaces import covered, triangles
 
 if TYPE_CHECKING:
@@ -81,4 +82,5 @@ def frame(world: "World", figures: dict[str, Any]) -> bytes:
     """Where it is: the length of the figures as JSON (u32, little-endian), they themselves, and positions in f32."""
     text = json.dumps(figures).encode()
     text += b" " * (-len(text) % 4)
-    return len(text).to_bytes(4, "little") + text + world.position.astype("<f4").tobytes()
+    places = InBox().places(world, world.position)
+    return len(text).to_bytes(4, "little") + text + places.astype("<f4").tobytes()

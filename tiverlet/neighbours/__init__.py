@@ -1,1 +1,5 @@
-"""Which particles are near: cell list, search, neighbour list, queries."""
+"""Which particles are near: periodic boxes, cell list, search, neighbour list, queries."""
+
+from .periodic import Periodic
+
+__all__ = ["Periodic"]

@@ -20,6 +20,7 @@ from ..device import runtime, ti
 from ..device.number import OnDevice
 from ..device.prefix_sum import Sums
 from ..tools import distinct
+from .periodic import FLOW, GRADIENT
 
 if TYPE_CHECKING:
     from ..device.thread_team import Team
@@ -57,6 +58,10 @@ class CellList:
         self.bits = np.maximum(2 * dim, np.ceil(np.log2(np.maximum(2 * counts, 1)))).astype(int)
         offsets = np.concatenate([[0], np.cumsum(1 << self.bits)])
         self.buckets = scene.memory.number(int(offsets[-1]))
+        self.images, self._lengths = scene.state.images, np.full(dim, np.inf)
+        self.axes, self.sheared = (self.images.axes, self.images.sheared) if self.images else ((), False)
+        if self.images:
+            self._lengths = scene.periodic.lengths
         self._shapes = self.shapes(np.ptp(scene.particles.position, axis=0))
         self.sums = Sums(self.buckets + 2, team)
         self.edge = add("grid.edge", self.sums.room, kind=ti.i32)
@@ -64,6 +69,8 @@ class CellList:
         if self.state.compensated:
             self.low = add("grid.place_low", n, width=dim)
         self.shape = add("grid.shape", self.levels, width=dim, kind=ti.i32, values=self._shapes)
+        if self.images:
+            self.count = add("grid.cells", self.levels, width=dim, kind=ti.i32, values=self.counts(self._shapes))
         if self.levels > 1:
             self.level = add("grid.level", n, kind=ti.i32, values=level)
             self.per_meter = add("grid.cells_per_meter", self.levels, values=1 / self.sizes)
@@ -72,6 +79,7 @@ class CellList:
     def shapes(self, extent: np.ndarray) -> np.ndarray:
         """Bits of each axis of each table, (levels, dim): at least 2, the rest where there are most cells per bucket."""
         out = np.full((self.levels, self.dim), 2)
+        extent = np.where(np.isfinite(self._lengths), self._lengths, extent)
         for m in range(self.levels):
             cells = np.nan_to_num(extent / self.sizes[m], nan=1.0, posinf=1e30)
             for _ in range(self.bits[m] - 2 * self.dim):
@@ -85,7 +93,17 @@ class CellList:
         if changed:
             self._shapes = shapes
             self.memory.write(self.shape, shapes)
+            if self.images:
+                self.memory.write(self.count, self.counts(shapes))
         return changed
+
+    def counts(self, shapes: np.ndarray) -> np.ndarray:
+        """Cells of each table along periodic axes, (levels, dim), 1 along others: no smaller than they have to be. Where there
+        are more than buckets, a multiple of these, so that the three cells around the end of the box have different ones."""
+        most = np.where(np.isfinite(self._lengths), self._lengths, 0.0) / self.sizes[:, None]
+        fitting, buckets = np.minimum(most, 2.0**30), 2.0**shapes
+        each = np.where(fitting < buckets, 1.0, buckets)
+        return np.maximum(1, np.floor(fitting / each) * each).astype(int)
 
     @ti.func
     def level_of(self, i):
@@ -98,7 +116,21 @@ class CellList:
     @ti.func
     def cell_of(self, i, m):
         """The cell of particle i at level m."""
-        return ti.floor(self.state.x[i] * self.scale(m), ti.i32)
+        cell = ti.floor(self.state.x[i] * self.scale(m), ti.i32)
+        for k in ti.static(self.axes):
+            cell[k] = self.images.cell(self.state.x[i], k, 0, self.count[m][k])
+        return cell
+
+    @ti.func
+    def around(self, point, radius, m, k: ti.template()):  # type: ignore[valid-type]
+        """The first of the cells along periodic axis k in which particles within `radius` of a point in the box may be, and how
+        many there are, with one more on each side; of a sheared box all along FLOW."""
+        count, size = self.count[m][k], self.images.length[None][k]
+        low = ti.floor((point[k] - radius) / size * count, ti.i32) - 1
+        number = ti.floor((point[k] + radius) / size * count, ti.i32) + 2 - low
+        if ti.static(self.sheared and k == FLOW):
+            number = count
+        return low, ti.min(number, count, 1 << self.shape[m][k])
 
     @ti.func
     def scale(self, m):
@@ -151,24 +183,57 @@ class CellList:
     def apart(self, i, k):
         """From the k-th of the sorted particles to particle i, as State.apart() has it."""
         r = self.state.x[i] - self.place[k]
-        if ti.static(self.state.compensated):
+        if ti.static(self.state.compensated and len(self.axes) > 0):
+            far = ti.cast(self.state.x[i], ti.f64) - ti.cast(self.place[k], ti.f64)
+            r = ti.cast(self.state.nearest(far + (self.state.low[i] - self.low[k])), self.real)
+        elif ti.static(self.state.compensated):
             r += self.state.low[i] - self.low[k]
+        elif ti.static(len(self.axes) > 0):
+            r = self.state.nearest(r)
         return r
 
     @ti.func
-    def row(self, cell, m, r):
-        """Row r of the 3^(dim - 1) around a cell at level m: its first bucket, how far along its three cells begin, the mask of
-        their axis, and 3 where they stand side by side, 1 where the torus wraps between them."""
-        mask = (1 << self.shape[m][0]) - 1
-        at, rest = cell, r
+    def row(self, i, cell, m, r):
+        """Row r of the 3^(dim - 1) around a cell at level m, of particle i: its first bucket, how far along its three cells
+        begin, into how many parts they fall, and how many cells stand side by side in each: 3, or 1 where the torus wraps
+        between them."""
+        at, rest, turn, parts, mask = cell, r, 0, 3, (1 << self.shape[m][0]) - 1
         for k in ti.static(range(1, self.dim)):
-            at[k] += rest % 3 - 1
+            side = rest % 3
+            at[k] += side - 1
             rest = rest // 3
+            if ti.static(k in self.axes):
+                count = self.count[m][k]
+                if side >= count:  # of two cells, or one, all are there
+                    parts = 0
+                if at[k] < 0 or at[k] >= count:
+                    way = ti.select(at[k] < 0, -1, 1)
+                    at[k] -= way * count
+                    if ti.static(self.sheared and k == GRADIENT):
+                        turn = way
+        if ti.static(self.sheared):
+            at[0] = self.images.cell(self.state.x[i], 0, turn, self.count[m][0])
+        low, span = at[0] - 1, 1
         at[0] = 0
-        low, span = (cell[0] - 1) & mask, 1
-        if low + 2 <= mask:
-            span = 3
-        return self.bucket(at, m), low, mask, span
+        if ti.static(0 in self.axes):
+            count = self.count[m][0]
+            low = ti.select(low < 0, low + count, low)
+            if low + 2 < count and (low & mask) + 2 <= mask and parts > 0:
+                span, parts = 3, 1
+            parts = ti.min(parts, count)
+            if ti.static(self.sheared):
+                if self.count[m][GRADIENT] < 3 and parts > 0:  # the next row is met on both sides, at two places
+                    span, parts = 1, ti.min(count, mask + 1)
+        elif (low & mask) + 2 <= mask:
+            span, parts = 3, parts // 3
+        return self.bucket(at, m), low, parts, span
+
+    @ti.func
+    def along(self, cell, m):
+        """Where in its row the bucket of a cell stands, which may be one beyond the end of the box."""
+        if ti.static(0 in self.axes):
+            cell = ti.select(cell < self.count[m][0], cell, cell - self.count[m][0])
+        return cell & ((1 << self.shape[m][0]) - 1)
 
 
 def most_levels() -> int:

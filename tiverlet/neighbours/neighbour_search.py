@@ -20,8 +20,10 @@ from ..features.feature import Scene
 from ..tools import distinct
 from .cell_list import CellList, add_to
 from .neighbour_list import NeighbourList, PairData
+from .periodic import FLOW, GRADIENT
 
 FARTHEST = 1 << 22  # cells from the origin: beyond it, f32 cannot tell a cell from the next
+STALE = 0.49  # of the skin: a list is good until something has moved so far
 APPEND, COUNT, FILL = range(3)  # what a scan of the cells around a particle does with the neighbours that it finds
 
 
@@ -36,6 +38,7 @@ class NeighbourSearch(NeighbourList):
 
     skin: Any = OnDevice()
     too_far: Any = OnDevice()  # the square of the way after which the list is stale
+    farthest: Any = OnDevice()  # how far apart pairs are listed [m], at most
 
     def __init__(
         self, scene: Scene, skin: float, linked: np.ndarray, table: Any, pair_data: list[PairData], team: Team, scratch: Any,
@@ -50,15 +53,22 @@ class NeighbourSearch(NeighbourList):
         self.dim, self.state, self.radius = dim, scene.state, scene.radius
         self.table = table
         number, real = scene.memory.number, scene.real
-        self.skin, self.too_far = number(skin, real), number((0.49 * skin) ** 2, real)
-        self._extent: Sequence[float] = [-1.0] * dim
         radius = scene.particles.radius if radius is None else radius
-        self.cells = CellList(scene, radius, 0 * radius if reach is None else reach, skin, team, scratch)
+        reach = 0 * radius if reach is None else reach
+        self.sheared = bool(self.state.images and self.state.images.sheared)
+        if self.sheared:  # within half of its height the nearest image along y is the nearest one
+            skin = min(skin, float(scene.periodic.lengths[GRADIENT]) / 2 - 2 * radius.max() - reach.max())
+        self.skin, self.too_far = number(skin, real), number((STALE * skin) ** 2, real)
+        self._extent: Sequence[float] = [-1.0] * dim
+        self.cells = CellList(scene, radius, reach, skin, team, scratch)
         self.several_levels = self.cells.levels > 1
         self.counts = self.several_levels or team.launched  # before it lists
         self.serial = not self.counts or (team.size == 1 and not team.launched)  # one thread makes a list, in order
         self.blocks = number(max(1, -(-n // team.piece)) if team.size > 1 and not self.counts else 1)
         self.origin = add("grid.built_at", n, width=dim)
+        if self.sheared:
+            self.strain = add("grid.built_strain", None, kind=ti.f64)
+            self.farthest = number(float(self.cells.sizes.max()), real)
         self.has_static = bool((scene.inv_mass == 0).any())  # whether there are pairs that cannot move
         self.linked = len(linked) > 0
         if self.linked:
@@ -85,8 +95,14 @@ class NeighbourSearch(NeighbourList):
     @ti.func
     def moved_too_far(self, i):
         """1 if the list is stale: once a particle has moved by half the skin."""
-        r = self.state.x[i] - self.origin[i]
-        return ti.select(r.dot(r) <= self.too_far, 0, 1)  # 1 for NaN
+        r, limit = self.state.x[i] - self.origin[i], self.too_far
+        if ti.static(self.sheared):
+            # Beside what all are strained by: that takes pairs apart by no more than the strain of the farthest that are listed.
+            strain = ti.cast(self.state.images.strain[None] - self.strain[None], self.real)
+            r[FLOW] -= strain * self.origin[i][GRADIENT]
+            left = ti.max(self.skin - ti.abs(strain) * self.farthest, 0)
+            limit = ti.static(STALE**2) * left * left
+        return ti.select(r.dot(r) <= limit, 0, 1)  # 1 for NaN
 
     @ti.func
     def build(self, thread):
@@ -104,6 +120,8 @@ class NeighbourSearch(NeighbourList):
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread)):
             self.stale[None] = 0
+            if ti.static(self.sheared):
+                self.strain[None] = self.state.images.strain[None]
             if self.need[None] <= self.capacity:
                 self.old_saved[None] = 0
         self.team.wait()
@@ -168,9 +186,9 @@ class NeighbourSearch(NeighbourList):
         for m in range(own + 1):
             cell = self.cells.cell_of(i, m)
             for r in range(ti.static(3 ** (self.dim - 1))):
-                base, low, mask, span = self.cells.row(cell, m, r)
-                for part in range(3 // span):
-                    b = base + ((low + part) & mask)
+                base, low, parts, span = self.cells.row(i, cell, m, r)
+                for part in range(parts):
+                    b = base + self.cells.along(low + part, m)
                     for e in range(self.cells.edge[b + 1], self.cells.edge[b + span + 1]):
                         j = self.cells.sorted[e]
                         listed = self.listed(i, j, self.cells.apart(i, e))

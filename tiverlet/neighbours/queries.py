@@ -9,6 +9,7 @@ from ..device import ti
 
 if TYPE_CHECKING:
     from .neighbour_search import NeighbourSearch
+    from .periodic import Periodic
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,8 @@ class PointSearch:
             scale = self.cells.scale(m)
             low = ti.floor((point - radius) * scale, ti.i32) - 1  # one more on each side for what has rounded across
             count = ti.floor((point + radius) * scale, ti.i32) + 2 - low
+            for k in ti.static(self.cells.axes):
+                low[k], count[k] = self.cells.around(point, radius, m, k)
             total = 1
             for k in ti.static(range(self.dim)):
                 count[k] = ti.min(count[k], 1 << self.cells.shape[m][k])  # round the torus once
@@ -59,10 +62,12 @@ class PointSearch:
                 for k in ti.static(range(self.dim)):
                     cell[k] += rest % count[k]
                     rest = rest // count[k]
+                for k in ti.static(self.cells.axes):
+                    cell[k] = cell[k] % self.cells.count[m][k]
                 b = self.cells.bucket(cell, m)
                 for e in range(self.cells.edge[b + 1], self.cells.edge[b + 2]):
                     i = self.cells.sorted[e]
-                    r = self.state.place(i) - point
+                    r = self.state.nearest(self.state.place(i) - point)
                     if r.dot(r) <= radius * radius:
                         if ti.static(fill):
                             out[at + number, 0], out[at + number, 1] = row, i
@@ -95,20 +100,28 @@ class PointSearch:
         return out[np.lexsort((out[:, 1], out[:, 0]))].astype(np.int64)
 
 
-def near_by_all(position: np.ndarray, points: np.ndarray, radius: np.ndarray) -> np.ndarray:
+def between(a: np.ndarray, b: np.ndarray, box: "Periodic | None") -> np.ndarray:
+    """a - b, in a periodic box of nearest images."""
+    return a - b if box is None else box.difference(a, b)
+
+
+def near_by_all(position: np.ndarray, points: np.ndarray, radius: np.ndarray, box: "Periodic | None" = None) -> np.ndarray:
     """The same by comparing each point with each particle, for worlds without contacts."""
-    rows = [np.flatnonzero(((position - p) ** 2).sum(axis=1) <= r * r) for p, r in zip(points, radius, strict=True)]
+    found = ((between(position, p, box) ** 2).sum(axis=1) <= r * r for p, r in zip(points, radius, strict=True))
+    rows = [np.flatnonzero(some) for some in found]
     return np.array([(k, i) for k, row in enumerate(rows) for i in row], dtype=np.int64).reshape(-1, 2)
 
 
-def nearest(find, position: np.ndarray, points: np.ndarray, start: float) -> tuple[np.ndarray, np.ndarray]:
+def nearest(
+    find, position: np.ndarray, points: np.ndarray, start: float, box: "Periodic | None" = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Index of and distance to the particle nearest to each point: look within `start`, and twice as far while there is none."""
     index = np.full(len(points), -1)
     distance = np.full(len(points), np.inf)
     left, reach = np.arange(len(points)), start
     while len(left):
         pairs = find(points[left], np.full(len(left), reach))
-        length = np.linalg.norm(position[pairs[:, 1]] - points[left][pairs[:, 0]], axis=1)
+        length = np.linalg.norm(between(position[pairs[:, 1]], points[left][pairs[:, 0]], box), axis=1)
         order = np.lexsort((pairs[:, 1], length, pairs[:, 0]))
         rows, at = np.unique(pairs[order, 0], return_index=True)
         index[left[rows]], distance[left[rows]] = pairs[order][at, 1], length[order][at]

@@ -11,8 +11,10 @@ from ..constraints import Path
 from ..constraints.distance import Link
 from ..features.feature import Batch, Feature
 from ..forces import Gravity
+from ..neighbours import Periodic
 from ..tools import golden_colors
 from .fill import Fill, outlines, within
+from .images import InBox, box_of, torn
 from .journal import PARTICLES
 from .layout import LEGEND, SCENE, WIDE
 from .lines import Lines
@@ -28,6 +30,7 @@ POINT = -2.5  # a particle without radius is drawn as a dot of so many pixels (n
 MANY = 5000  # links that are drawn as lines; of more, an even selection
 WALL = np.array([[92, 97, 112]], dtype=np.uint8)  # of surfaces of walls
 OPEN = (60, 63, 70)  # of a wall that is switched off
+EDGES = (150, 120, 70)  # of a periodic box
 HELD, PINS = (225, 228, 235), 200  # the marks of particles that are held, and up to how many are marked
 MARK, SPOT = (24, 26, 32), 0.5  # of particles that have turned; the radius of a spot that is a cap of the sphere
 LABEL = (118, 122, 132)  # can be read on black and on white
@@ -56,6 +59,7 @@ class Drawing:
         self.extent, self._overlays = extent, overlays
         self.hues: np.ndarray | None = None  # of particles in the coming frame, where they are not always the same
         self.scenes = 0  # that were begun
+        self._places = InBox()
         self._touched = self._torn = False
 
     def static(self, entity: str, *what: Any) -> None:
@@ -86,9 +90,12 @@ class Drawing:
         self.static(f"{self._root}/{PARTICLES}", *what)
         held = np.flatnonzero(p.inv_mass == 0)
         if 0 < len(held) <= PINS:
-            at = world.position[held].astype(np.float32)
+            at = self.shown(world.position)[held].astype(np.float32)
             marks = self._points.from_fields(positions=at, radii=[-3.5], colors=[HELD], **self._above)
             self._log(f"{self._root}/held", marks)  # not static: nothing clears that when a scene ends
+        if box := box_of(world):
+            edges = box.outline(*self.extent).astype(np.float32)
+            self.static(f"{self._root}/box", self._strips(edges, colors=[EDGES], radii=[-0.8]))
         scale = self._overlays.scale(bool(len(self._pairs)))
         if scale:
             hues, labels = scale
@@ -133,6 +140,10 @@ class Drawing:
             self.static(f"{self._root}/fill", self._strips.from_fields(radii=self._fill.radii, draw_order=BELOW))
         self._some, self._under = some, under
         self._tears = [(k, np.flatnonzero(number == k), row[number == k]) for k, _ in found if k in self._broken]
+
+    def shown(self, x: np.ndarray) -> np.ndarray:
+        """Where particles at x, (n, dim) [m], are drawn: in the box, if there is one."""
+        return self._places.places(self.world, x)
 
     def frame(self, x: np.ndarray, x32: np.ndarray, turned: Iterable[int], torn: bool) -> None:
         """Draw a frame. x: (n, dim), and rounded to f32. turned: features that are not as they were in the last one. torn: if
@@ -190,6 +201,7 @@ class Drawing:
             level = levels(np.sqrt(np.einsum("ij,ij->i", r, r)) / self._rest - 1)
         if not self._overlays.strain:
             level[:] = LEVELS
+        level[torn(box_of(self.world), r)] = -1
         for k, mine, rows in self._tears:
             level[mine[self._broken[k][rows]]] = -1
         row = []
@@ -249,6 +261,8 @@ class Drawing:
             found = world.contacts
             most = np.argsort(-found.impulse, kind="stable")[: -(-len(world.particles) // TOUCH)]
             middle = found.point[np.sort(most)]
+            box = box_of(world)
+            middle = middle if box is None else box.wrap(middle)
         if not len(middle) and not self._touched:
             return
         self._touched = bool(len(middle))
@@ -344,6 +358,9 @@ def walled(features: Iterable[Feature], low: np.ndarray, high: np.ndarray) -> tu
             if strips.size:
                 low = np.minimum(low, strips.min(axis=(0, 1)) - thickness)
                 high = np.maximum(high, strips.max(axis=(0, 1)) + thickness)
+        if isinstance(f, Periodic):
+            ends = f.outline(low, high)
+            low, high = np.minimum(low, ends.min(axis=(0, 1))), np.maximum(high, ends.max(axis=(0, 1)))
         if isinstance(f, Box):
             low = np.where(np.isfinite(f.lower), np.minimum(low, f.lower), low)
             high = np.where(np.isfinite(f.upper), np.maximum(high, f.upper), high)
@@ -354,7 +371,7 @@ def bounds(world: "World") -> tuple[np.ndarray, np.ndarray]:
     """A box around what will be seen: the particles and where they can get to, as far as that is known beforehand: finite walls,
     the ground below, and around a place where a body hangs.
     """
-    x, r = world.position, world.particles.radius[:, None]
+    x, r = InBox().places(world, world.position), world.particles.radius[:, None]
     low = (x - r).min(axis=0, initial=np.inf) if len(x) else np.zeros(world.particles.dim)
     high = (x + r).max(axis=0, initial=-np.inf) if len(x) else np.ones(world.particles.dim)
     low, high = walled(world.features, low, high)

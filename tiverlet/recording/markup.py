@@ -12,6 +12,7 @@ import numpy as np
 from ..colliders.collider import Collider
 from ..constraints import Path
 from .drawing import bounds, colors, links, upwards
+from .images import InBox
 from .layout import eye_axes
 
 if TYPE_CHECKING:
@@ -64,7 +65,7 @@ def of_world(world: "World") -> str:
     """A world: its picture, and what explain() says, folded."""
     try:
         more = f"<details><summary>explain()</summary><pre>{escape(world.explain())}</pre></details>"
-        image = picture(world, world.position)
+        image = picture(world, InBox().places(world, world.position))
     except RuntimeError:  # it was closed
         return f"<code>{escape(repr(world))}</code>"
     return f"<div><code>{escape(repr(world))}, {world.time:.4g} s</code><br>{image}{more}</div>"

@@ -109,5 +109,8 @@ def loads(world: "World", x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     load = found.impulse[some]
     if not len(load):
         return np.zeros((0, 3, dim)), np.zeros(0)
-    size = np.linalg.norm(a - found.point[some], axis=1).mean()
-    return np.stack([a, found.point[some], b], axis=1), WIDEST * size * load / max(np.quantile(load, COMMON), 1e-300)
+    point, box = found.point[some], world._runner.scene.periodic
+    if box is not None:  # as seen from the first of each pair
+        b, point = a - box.difference(a, b), a - box.difference(a, point)
+    size = np.linalg.norm(a - point, axis=1).mean()
+    return np.stack([a, point, b], axis=1), WIDEST * size * load / max(np.quantile(load, COMMON), 1e-300)

@@ -276,7 +276,7 @@ class Recorder:
             picture.log(number, self._own)
             self._own = {}
         now = checkpoint.keep(world, pairs=False)
-        x = now.position(len(world.particles))
+        x = picture.drawing.shown(now.position(len(world.particles)))
         x32 = x.astype(np.float32)
         picture.frame(number, now, x, x32, journal.rounded(), journal.scenes, journal.stirred)
         journal.frame_drawn({"time": world.time, "hash": brief(now.digest()), "crc": zlib.crc32(x32.tobytes())})

@@ -149,6 +149,11 @@ class Redraw:
         """The rows that have to be in the file."""
         return self.rows if self.stride == 1 else self._thinned(found)
 
+    def shown(self, x: np.ndarray) -> np.ndarray:
+        """Where particles at x, (n, dim) [m], are drawn."""
+        assert self._picture
+        return self._picture.drawing.shown(x)
+
     def frame(self, entry: Entry, now: "Checkpoint", x: np.ndarray, x32: np.ndarray) -> str | None:
         """Draw a frame; what is wrong with what the journal says of it, if anything."""
         assert self._picture

@@ -177,7 +177,7 @@ class Replay:
                 if entry.kind == "frame":
                     now = checkpoint.keep(world, pairs=False)
                     same = journal.brief(now.digest()) == entry.data["hash"] and world.time == entry.data["time"]
-                    x = now.position(len(world.particles))
+                    x = redraw.shown(now.position(len(world.particles)))
                     x32 = x.astype(np.float32)
                     off = _differing(x32, self._shown(entry.frame, x32.shape))
                     if same and off is not None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .. import colliders, constraints, contact, forces, solvers
+from .. import colliders, constraints, contact, forces, neighbours, solvers
 from ..colliders.collider import Collider
 from ..device import runtime
 from ..device.language import is_kernel_function, undecorated
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 PARTICLES = ("position", "velocity", "mass", "radius", "pinned", "group", *TURNING)
 PUBLIC = {
-    name: kind for module in (colliders, constraints, contact, forces, solvers) for name, kind in vars(module).items()
+    name: kind for module in (colliders, constraints, contact, forces, neighbours, solvers) for name, kind in vars(module).items()
     if isinstance(kind, type) and issubclass(kind, RecordsArguments)
 }  # fmt: skip
 Turned = tuple[int, dict[str, Any]]  # the number of a feature, and its knobs

@@ -182,7 +182,7 @@ class _View:
         turned = [i for i, (new, old) in enumerate(zip(now, self._known, strict=True)) if not old or not _equal(new, old)]
         self._known = now
         broken = sum(int(f.broken.sum()) for f in world.features if getattr(f, "breaks", False))  # type: ignore[attr-defined]
-        x, radius = world.position, world.particles.radius[:, None]
+        x, radius = self.drawing.shown(world.position), world.particles.radius[:, None]
         some = np.isfinite(x).all(axis=1)
         if some.any():
             self.low = np.minimum(self.low, (x - radius)[some].min(axis=0))

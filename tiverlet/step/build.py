@@ -17,6 +17,7 @@ from ..device.patches.compiler import FEW
 from ..device.thread_team import PIECES, Team, size_of
 from ..features.feature import Acceleration, Batch, Feature, Scene
 from ..neighbours.neighbour_search import NeighbourSearch
+from ..neighbours.periodic import Periodic
 from ..particles import Particles, Radii, State
 from ..solvers.conjugate import ConjugateGradient
 from ..solvers.direct import Direct
@@ -29,6 +30,7 @@ from . import high_order
 from .diagnostics import Diagnostics
 from .frames import Frames
 from .integrator import Forces, Verlet
+from .periodic_fit import refuse_misfits
 from .step import Step
 
 T = TypeVar("T", bound=Feature)
@@ -96,10 +98,14 @@ def assemble(
     copies: where there are to be many of it.
     """
     inv_mass = particles.inv_mass.copy()
+    box = next((f for f in features if isinstance(f, Periodic)), None)
     for feature, start in zip(features, starts, strict=True):
+        feature.periodic = box
         feature.start = particles if start is None else start
         feature.prepare(feature.start, inv_mass)
     refuse_held_twice(particles, features)
+    if box:
+        refuse_misfits(box, particles, features)
     for feature, start in zip(features, starts, strict=True):
         if start is None:
             feature.review(particles, inv_mass)
@@ -135,6 +141,8 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     def of(kind: type[T]) -> list[T]:
         return [f for f in features if isinstance(f, kind)]
 
+    for box in of(Periodic):
+        box.bind(scene)
     accelerations, walls = of(Acceleration), of(Collider)
     drivers = [f for f in of(Batch) if f.drives and f.count]
     batches = [f for f in of(Batch) if not f.drives and (scene.inv_mass[f.indices] > 0).any()]
@@ -193,6 +201,8 @@ def checked_features(features: Iterable[Feature]) -> tuple[Feature, ...]:
         raise ValueError("World: the same feature is listed twice.")
     if sum(isinstance(f, PairContact) for f in features) > 1:
         raise ValueError("World: more than one Contact; one covers all particles.")
+    if sum(isinstance(f, Periodic) for f in features) > 1:
+        raise ValueError("World: more than one Periodic; give one box, with all of its axes.")
     return features
 
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..neighbours.periodic import Periodic
 from . import clock
 
 if TYPE_CHECKING:
@@ -147,5 +148,8 @@ def transfer(old: "World", new: "World") -> None:
         new.spin = old.spin
     if new._particles.orientation is not None:
         new._runner.memory.write(new._runner.scene.state.spin.orientation, np.reshape(old.orientation, (len(old.particles), -1)))
+    for mine, other in zip(new.features, old.features, strict=True):
+        if isinstance(mine, Periodic):
+            mine.continued(other)
     for broke, breaks in zip(old._runner.step.breakers, new._runner.step.breakers, strict=True):
         new._runner.memory.write(breaks.dev.strength.stamp, broke.stamps())

@@ -10,6 +10,7 @@ from ..colliders.collider import Collider
 from ..contact.pair_contact import PairContact
 from ..device.memory import Memory
 from ..features.feature import Acceleration, Batch, Feature
+from ..neighbours.periodic import Periodic
 from ..particles import Particles
 from . import checkpoint
 from .build import assemble, check_settings, checked_features, listed
@@ -61,6 +62,8 @@ def add(world: Any, particles: Particles | None, features: Iterable[Feature]) ->
     checked_features(late)
     if sum(isinstance(f, PairContact) for f in (*world.features, *late)) > 1:
         raise ValueError("World.add: more than one Contact; one covers all particles.")
+    if sum(isinstance(f, Periodic) for f in (*world.features, *late)) > 1:
+        raise ValueError("World.add: more than one Periodic; remove the old box first.")
     check_settings(world._precision, world._requested[1], world._order, (*world.features, *late))
     n, count = len(world.particles), 0 if particles is None else len(particles)
     if late or count:

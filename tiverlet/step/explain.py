@@ -10,6 +10,7 @@ from ..device import runtime
 from ..device.patches import patched
 from ..features.feature import Acceleration, Batch
 from ..neighbours.neighbour_search import NeighbourSearch
+from ..neighbours.periodic import Periodic
 from ..shapes.shape import morton
 from .build import reason
 from .step import REBOUNDS
@@ -100,6 +101,9 @@ def _present(world: "World") -> list[str]:
             out.append(f"{f!r}: in the loop over particles")
         elif isinstance(f, Collider):
             out.append(f"{f!r}: in the loop over particles, last")
+        elif isinstance(f, Periodic):
+            lengths = " x ".join(f"{length:g}" if np.isfinite(length) else "open" for length in f.lengths)
+            out.append(f"{f!r}: differences of nearest images, {lengths} m{', sheared' * f.sheared}")
         elif world._runner.grid:
             grid = world._runner.grid
             out.append(f"{f!r}: {_listed(grid)}")
@@ -131,6 +135,7 @@ def _absent(world: "World") -> list[str]:
         (not step.batches, "slots and gathers: no constraint on particles that can move"),
         (not step.walls, "wall pass: no wall"),
         (not world.particles.spins and bool(step.walls or step.grid), "spin: particles have none"),
+        (not step.state.images, "nearest images: no Periodic"),
         (not step.integrator.forces.all, "accelerations: no force"),
         (not step.integrator.decays, "exponential drag: no Drag or Wind"),
         (not step.integrator.uses_velocity, "second displacement: no force reads velocities"),

@@ -61,7 +61,7 @@ def project(runner: "Runner", h: float, longest: float) -> bool:
     batches += rigid_rows(runner.batches, w)
     if not batches:
         return True
-    start = Rows(batches, w, x)
+    start = Rows(batches, w, x, runner.scene.periodic)
     undone = start.undone(runner)
     if not _matters(float(np.abs(undone * start.close).max(initial=0.0)), ratio):
         return ratio < FAR
@@ -135,8 +135,9 @@ class Rows:
     theta: Any = 1.0  # how rigid they are
     weight: Any = 1.0  # the same as passes see it, which split masses
 
-    def __init__(self, batches: list[Scalar | RigidRows], w: np.ndarray, x: np.ndarray):
+    def __init__(self, batches: list[Scalar | RigidRows], w: np.ndarray, x: np.ndarray, box: Any = None):
         self.batches, self.w, self.n, self.dim = batches, w, *x.shape
+        self.box = box  # the Periodic of the world
         self.some = [~b.idle(w) & ~b.broken if b.breaks else ~b.idle(w) for b in batches]
         self.side, arity = (self._each([of(b) for b in batches]) for of in (lambda b: np.full(b.count, b.side), _sizes))
         self.m = len(self.side)
@@ -229,7 +230,8 @@ class Rows:
         """
         stiff = _over(self.weight, self.diagonal)
         row, i, j = self.pairs
-        across, length = self.x[i] - self.x[j], np.linalg.norm(self.x[i] - self.x[j], axis=1)
+        across = self.x[i] - self.x[j] if self.box is None else self.box.difference(self.x[i], self.x[j])
+        length = np.linalg.norm(across, axis=1)
         across = across * _over(np.ones_like(length), length)[:, None]
         taut = _over(np.maximum(self.C[row], 0.0) * stiff[row], length)
         one, (a, b) = np.eye(self.dim), self.corners

@@ -100,7 +100,7 @@ class Runner:
             self.moved = 0.0
             if clock.first_moved is not None and self.scene.slots:
                 for b in self.driven:
-                    b.placed(self.scene.state.get(self.memory), clock.first_moved)
+                    b.start_at(self.scene.state.get(self.memory), clock.first_moved)
                 moved = initial_violation.remove(self.scene, self.batches, clock.first_moved, self.stop_at_walls)
                 if moved is not None:
                     self.moved, self.jumped = float(moved.max()), bool((moved > self.scene.particles.radius).any())

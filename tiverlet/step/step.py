@@ -150,6 +150,7 @@ class Step:
         self.integrator, self.grid, self.walls, self.drivers, self.batches = integrator, grid, walls, drivers, batches
         self.posed = [w for w in walls if w.poses]
         self.wall_logs: list[Any] = [w.dev.log for w in walls if w.dev.log]
+        self.sheared = bool(scene.state.images and scene.state.images.sheared)
         self.breakers: list[Any] = [b for b in batches if b.breaks]
         self.launched = team.launched
         # Iterations of a loop for each of few pieces of work: to each CPU thread Taichi gives LEAST of them, at least.
@@ -340,6 +341,11 @@ class Step:
             n = self.n * ti.cast(now.s == 0, ti.i32)
             for i in range(self.team.chunk_begin(n, now.thread), self.team.chunk_end(n, now.thread)):
                 log.open(i)
+        if ti.static(self.sheared):
+            ti.loop_config(serialize=True)
+            for _ in range(self.team.one(1, now.thread)):
+                self.state.images.slide(now.h)
+            self.team.wait()
         self.particles.integrate(now)
         self.team.wait()
         self.team.watch(now.thread)

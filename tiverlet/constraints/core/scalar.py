@@ -111,6 +111,11 @@ class Scalar(Batch):
         """f at the given positions, (m,): the rest value when none is given."""
         raise NotImplementedError
 
+    def placed(self, position: np.ndarray) -> np.ndarray:
+        """Where the corners of each constraint are, (m, arity, dim); in a periodic box the images nearest to the first."""
+        x = position[self.indices]
+        return x if self.periodic is None else x[:, :1] + self.periodic.difference(x, x[:, :1])
+
     @property
     def goal(self) -> np.ndarray:
         """What f is to be, (m,)."""
@@ -124,7 +129,7 @@ class Scalar(Batch):
         """grad_k f of every constraint, (m, arity, dim), by central differences: each constraint on particles of its own."""
         twin: Any = self.copy()
         vars(twin)["members"] = FixedSize(type(self).__name__, np.arange(self.indices.size).reshape(self.indices.shape))
-        x = position[self.indices]
+        x = self.placed(position)
         step = 1e-6 * (float(np.ptp(x, axis=1).max(initial=0.0)) or 1.0)
         out = np.zeros_like(x)
         for k in range(self.arity):
@@ -137,7 +142,7 @@ class Scalar(Batch):
 
     def inverse_size(self, position: np.ndarray) -> np.ndarray:
         """What makes C a share of the size of its constraint, (m,): 1 / length for links, 0 for what has no extent."""
-        x = position[self.indices]
+        x = self.placed(position)
         size = np.linalg.norm(x - x[:, :1], axis=2).max(axis=1, initial=0.0)
         size *= np.sqrt((self.gradients(position) ** 2).sum(axis=(1, 2)) / 2)
         return np.divide(1, size, out=np.zeros(self.count), where=size > 0)
@@ -206,7 +211,7 @@ class Scalar(Batch):
         """What moves the rest values, where the batch is driven."""
         raise NotImplementedError
 
-    def placed(self, position: np.ndarray, first: int) -> None:
+    def start_at(self, position: np.ndarray, first: int) -> None:
         """Where the batch is driven: particles from number `first` on were placed where they are, (n, dim)."""
 
     @property
@@ -241,7 +246,7 @@ class Scalar(Batch):
         if self.dev.limited:
             self.dev.postponed = add(f"{name}.postponed", m)
             if self.arity:
-                corner = self.start.position[self.indices]
+                corner = self.placed(self.start.position)
                 span = np.linalg.norm(corner - corner[:, :1], axis=2).max(axis=1, initial=0.0)
                 self.dev.span = add(f"{name}.span", m, values=np.where(span > 0, span, self.start.size))
         self.dev.in_system, self.dev.outside = bool((rows >= 0).any()), bool((rows < 0).any())
@@ -312,7 +317,7 @@ class Scalar(Batch):
         q = ti.Matrix.zero(self.dev.real, self.arity, self.dev.state.dim)
         for k in ti.static(range(1, self.arity)):
             j = self.member(c, k)
-            r = self.dev.state.apart(j, i) - back * (self.dev.state.d[j] - self.dev.state.d[i])
+            r = self.dev.state.apart(j, i) - back * self.dev.state.slid(self.dev.state.d[j] - self.dev.state.d[i], j, i)
             for a in ti.static(range(self.dev.state.dim)):
                 q[k, a] = r[a]
         return q
@@ -325,7 +330,7 @@ class Scalar(Batch):
         start = now
         for k in ti.static(range(1, self.arity)):
             j = self.member(c, k)
-            r, moved = self.dev.state.apart(j, i), self.dev.state.d[j] - self.dev.state.d[i]
+            r, moved = self.dev.state.apart(j, i), self.dev.state.slid(self.dev.state.d[j] - self.dev.state.d[i], j, i)
             for a in ti.static(range(self.dev.state.dim)):
                 now[k, a], start[k, a] = r[a] - 0 * moved[a], r[a] - moved[a]
         return now, start
@@ -511,7 +516,8 @@ class Scalar(Batch):
         )
         for k in ti.static(range(self.arity)):
             i = self.member(c, k)
-            move, split = self.dev.state.d[i] - self.dev.state.d[self.member(c, 0)], self.dev.slots.split[i]
+            j, split = self.member(c, 0), self.dev.slots.split[i]
+            move = self.dev.state.slid(self.dev.state.d[i] - self.dev.state.d[j], i, j)
             if together != 0:
                 split = self.dev.w.of(i) * (self.dev.slots.begin[i + 1] - self.dev.slots.begin[i])
             u += n[k, :].dot(move)

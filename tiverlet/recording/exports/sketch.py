@@ -11,7 +11,9 @@ import numpy as np
 
 from ...colliders.collider import Collider
 from ...constraints import Path
+from ...neighbours import Periodic
 from ..drawing import OPEN, WALL, upwards, walled
+from ..images import box_of, torn
 from ..scene import Parts
 from ..surfaces import Surface
 from .geometry import Geometry
@@ -116,8 +118,9 @@ class Sketch:
 
     def _links(self, x: np.ndarray) -> list[tuple]:
         at, near = self._view.place(x)
-        out, width = [], round(2 * FINE * LINE)
-        for i, j in self._geometry.links.tolist():
+        out, width, links = [], round(2 * FINE * LINE), self._geometry.links
+        across = torn(box_of(self._parts), x[links[:, 0]] - x[links[:, 1]]) if len(links) else np.zeros(0, dtype=bool)
+        for i, j in links[~across].tolist():
             places = [*at[i].tolist(), *at[j].tolist()]
             out.append(((near[i] + near[j]) / 2, "line", places, tuple(map(int, self._geometry.hues[i])), width))
         return out
@@ -132,6 +135,10 @@ class Sketch:
     def _walls(self) -> list[tuple]:
         out = []
         for wall in self._parts.features:
+            if isinstance(wall, Periodic):
+                for edge in wall.outline(*self._extent):
+                    at, near = self._view.place(edge)
+                    out.append((float(near.min()), "line", at.ravel().tolist(), EDGE, round(FINE * LINE)))
             if not isinstance(wall, (Collider, Path)):
                 continue
             closed = not isinstance(wall, Collider) or wall.active

@@ -10,6 +10,7 @@ from ....constraints import Distance, Rope
 from ....contact import Contact
 from ....features.feature import Feature
 from ....forces import Gravity
+from ....neighbours import Periodic
 from ....particles import Particles
 from ....world import World
 from .row import INF, NAN, Finding, finite, refused, row, warned, world
@@ -161,6 +162,19 @@ def _warm() -> Finding:
     return refused(
         *((lambda kind=kind: kind(**no_such), "warm_start") for kind in (solvers.Jacobi, solvers.Direct, solvers.Chebyshev)),
         (scene(**no_such), "warm_start"),
+    )
+
+
+@row(87, "a periodic box that is none, or too small for contacts, links and forces in it; walls across it", "build error")
+def _periodic() -> Finding:
+    small = Periodic((0, 0), (9, 0.3))
+    return refused(
+        (lambda: Periodic((0, 0), (1, 0)), "from 0 to 0 m, which is no length"),
+        (lambda: Periodic((0, 0), (1, NAN)), "high"),
+        (scene(Periodic((0, 0), (9, 0.39)), Contact()), "touch up to 0.2 m apart"),
+        (scene(small, Distance([[0, 1]], 0.2)), "link 0 holds particles up to 0.2 m"),
+        (scene(small.copy(), Box((0, 0), (9, 9))), "stops what goes along x"),
+        (scene(small.copy(), HalfSpace((0, 1))), "stops what goes along y"),
     )
 
 

@@ -8,6 +8,7 @@ from ....contact import Contact
 from ....device import ti
 from ....forces import Drag, Gravity
 from ....measure import kinetic_energy, overlapping
+from ....neighbours import Periodic
 from ....particles import Particles
 from ....solvers import Jacobi
 from .row import Finding, contacts_of, finite, rerun, row, same_pairs, warned, world
@@ -238,6 +239,21 @@ def _outside() -> Finding:
         w.run(1.0)
         gap = abs(w.position[0, 0] - w.position[1, 0])
     return Finding(f"{gap:.3f} m apart", {"collided": gap >= 0.4 - 1e-9})
+
+
+@row(88, "a periodic box hardly longer than two contacts, and one 1e5 times as long", "each pair meets once; no energy is made")
+def _small_periodic() -> Finding:
+    holds, gained = {}, 0.0
+    for size in (2.01, 2e5):
+        x = np.array([[0.1, 0.2], [1.1, 1.2]]) + size * np.array([[0, 0], [3, -2]])
+        v = np.array([[1.0, 0.5], [-1, -0.8]])
+        start = Particles(x, velocity=v, radius=0.5)
+        with world(start, [Periodic((0, 0), (size, size)), Contact(restitution=1.0)], substeps=20) as w:
+            w.run(2.0)
+            gained = max(gained, abs((w.velocity**2).sum() / (v**2).sum() - 1))
+            holds[f"collided in {size:g} m"] = not np.allclose(w.velocity, v)
+            holds[f"momentum in {size:g} m"] = np.allclose(w.velocity.sum(axis=0), v.sum(axis=0), atol=1e-9)
+    return Finding(f"energy to {gained:.0e}", {**holds, "energy": gained < 1e-9})
 
 
 @row(70, "resting contact on a moving belt", "friction drags the right way: up to its speed after v / (mu g), then along")

@@ -1,0 +1,76 @@
+"""What does not fit into a periodic box: what is too large to have one nearest image, and walls across it."""
+
+import numpy as np
+
+from ..colliders import Box, HalfSpace
+from ..colliders.collider import Collider
+from ..constraints import Area, Constraint, ShapeMatch, Volume
+from ..constraints.distance import Link
+from ..contact import Contact, Polygons
+from ..features.feature import Batch, Feature
+from ..forces import PairForce
+from ..neighbours.periodic import Periodic
+from ..particles import Particles
+
+AXES = "xyz"
+SPARE = 2.2  # contact distances, that a sheared box is long at least
+
+
+def refuse_misfits(box: Periodic, particles: Particles, features: tuple[Feature, ...]) -> None:
+    """Raise ValueError for what would meet two images of a particle, or none."""
+    for feature in features:
+        if isinstance(feature, Polygons):
+            raise ValueError("Periodic: Polygons do not know of images. Use Contact, for bodies made of discs.")
+        if isinstance(feature, Contact):
+            _refuse(box, "Contact", "two particles touch", 2 * float(particles.radius.max(initial=0.0)), "radii")
+        if isinstance(feature, PairForce):
+            if feature.radius is None:
+                raise ValueError(
+                    "Periodic: a PairForce without a radius has no end, and every particle has images without end. "
+                    f"Give PairForce(..., radius={box.shortest / 2:g}) or less."
+                )
+            _refuse(box, repr(feature), "pairs act", feature.radius, "a radius")
+        if isinstance(feature, Collider):
+            _refuse_wall(box, feature)
+        if isinstance(feature, Link) and feature.count:
+            _refuse(box, repr(feature), f"link {int(feature.goal.argmax())} holds particles", feature.goal.max(), "links", True)
+        if isinstance(feature, Batch) and isinstance(feature, (Area, Constraint, ShapeMatch, Volume)) and feature.arity != 1:
+            _refuse_torn(box, feature)
+
+
+def _refuse(box: Periodic, who: str, what: str, far: float, smaller: str, half: bool = False) -> None:
+    """What reaches further than half a box; or just so far, where `half`. Where images slide, lists need room for their skin."""
+    k, least = int(np.argmin(box.lengths)), (SPARE if box.sheared else 2) * far
+    if least > box.shortest or (half and least == box.shortest):
+        raise ValueError(
+            f"Periodic: along {AXES[k]} the box is {box.shortest:g} m long, but {who}: {what} up to {far:g} m apart, and would "
+            f"meet two images of the same particle. Make the box longer than {least:g} m there, or {smaller} smaller."
+        )
+
+
+def _refuse_wall(box: Periodic, wall: Collider) -> None:
+    """Walls across a periodic axis, and obstacles in a shear."""
+    along: list[int] = []
+    if isinstance(wall, Box):
+        along = [k for k in box.axes if np.isfinite([wall.lower[k], wall.upper[k]]).any()]
+        remedy = "-inf and inf leave a side of a Box open"
+    elif isinstance(wall, HalfSpace):
+        along = [k for k in box.axes if wall.normal[k] != 0]
+        remedy = "let gravity have the slope instead"
+    elif box.sheared:
+        raise ValueError(f"Periodic: {wall!r} stands still, but a sheared box has images that slide. Leave one of them out.")
+    if along:
+        raise ValueError(f"Periodic: {wall!r} stops what goes along {AXES[along[0]]}, which is periodic; {remedy}.")
+
+
+def _refuse_torn(box: Periodic, batch: Batch) -> None:
+    """Bodies whose particles were put on different sides of the box: these are followed as they are, unwrapped."""
+    x, owner = batch.start.position[batch.indices.ravel()], batch.owner
+    first = x[np.searchsorted(owner, np.arange(batch.count))] if batch.count else x
+    far = np.abs(x - first[owner]) > box.lengths / 2
+    if far.any():
+        e, k = (int(v) for v in np.argwhere(far)[0])
+        raise ValueError(
+            f"Periodic: {batch!r}: particle {batch.indices.ravel()[e]} of number {owner[e]} is more than half a box from its "
+            f"first one along {AXES[k]}. Give unwrapped positions, which keep a body together; it may reach out of the box."
+        )
