@@ -384,7 +384,8 @@ class World:
         with the smaller of the radii of its ends, so that a rope is as thick as it looks; between points it is a line, which in
         3D no ray meets without a radius. Links are all that pictures draw as lines and that are not broken, and the edges of
         Polygons, numbered from body to body. Walls are where they are at world.time: a place that was assigned since is where
-        they go in the next frame. Those that are not active are not there.
+        they go in the next frame. Those that are not active are not there. In a periodic box, particles are met where they are in
+        it; rays do not go on in the next one.
 
         A ray meets what it comes into from outside. It does not meet what it starts in, so one from the center of a particle
         needs no skip; walls let out what is in them, and are met where they would hold a particle. A ray that starts on a

@@ -24,7 +24,8 @@ def inside(world: "World", shape: Collider, part: str) -> np.ndarray:
     if part not in PARTS:
         raise ValueError(f"{who}: part = {part!r}, but it must be one of {', '.join(map(repr, PARTS))}.")
     _check_dimension(who, shape, world.particles.dim)
-    x = np.asarray(world.position)
+    box = world._runner.scene.periodic
+    x = np.asarray(world.position) if box is None else box.wrap(world.position)
     index = np.flatnonzero(np.isfinite(x).all(axis=1))
     depth = shape.clearance(x[index]) * (1 if shape.inside else -1)
     return index[depth >= PARTS[part] * world.particles.radius[index]]

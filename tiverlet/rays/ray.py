@@ -8,6 +8,7 @@ import numpy as np
 from .. import checks
 from ..colliders.collider import Collider
 from ..features.feature import Feature
+from ..neighbours.queries import between
 from ..particles import in_range
 from .hits import Hits
 from .targets import Rods
@@ -26,7 +27,8 @@ def ray(
     single, origin, direction = _rays(origin, direction, world.particles.dim)
     most = checks.per_item(WHO, "reach", reach, len(origin), least=0.0, infinite=True)
     radius = checks.number(WHO, "radius", radius, least=0.0)
-    some, x = _taken(world, features), np.asarray(world.position)
+    some, box = _taken(world, features), world._runner.scene.periodic
+    x = np.asarray(world.position) if box is None else box.wrap(world.position)
     seen = _seen(world, x, groups, skip)
     k, dim = origin.shape
     best, normal = most.copy(), np.full((k, dim), np.nan)
@@ -46,7 +48,8 @@ def ray(
     nearer, which = meet(Rods(world.particles.radius[index] + radius, x[index]))
     particle[nearer] = index[which]
     pairs, number = _rods(world, some, seen)
-    nearer, which = meet(Rods(world.particles.radius[pairs].min(axis=1) + radius, x[pairs[:, 0]], x[pairs[:, 1]]))
+    ends = x[pairs[:, 0]] + between(x[pairs[:, 1]], x[pairs[:, 0]], box)
+    nearer, which = meet(Rods(world.particles.radius[pairs].min(axis=1) + radius, x[pairs[:, 0]], ends))
     particle[nearer], link[nearer] = -1, number[which]
     for f, feature in enumerate(world.features):
         if f in some and isinstance(feature, Collider) and feature.stands and k:

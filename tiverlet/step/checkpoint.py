@@ -149,7 +149,7 @@ def transfer(old: "World", new: "World") -> None:
     if new._particles.orientation is not None:
         new._runner.memory.write(new._runner.scene.state.spin.orientation, np.reshape(old.orientation, (len(old.particles), -1)))
     for mine, other in zip(new.features, old.features, strict=True):
-        if isinstance(mine, Periodic):
+        if isinstance(mine, Periodic) and isinstance(other, Periodic):
             mine.continued(other)
     for broke, breaks in zip(old._runner.step.breakers, new._runner.step.breakers, strict=True):
         new._runner.memory.write(breaks.dev.strength.stamp, broke.stamps())

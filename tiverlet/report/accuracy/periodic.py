@@ -1,6 +1,7 @@
 """Gases and shear flows in periodic boxes against what is known of them. `python -m tiverlet.report.accuracy.periodic`."""
 
 import argparse
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -17,7 +18,7 @@ SHELL = 0.05  # [diameters] width of the first shell of the radial distribution
 BLOCKS = 12  # of a run, for error bars
 
 
-def gas(n: int, dim: int, fraction: float, seed: int = 0, shear: float = 0.0, **contact: float) -> tuple[World, Periodic]:
+def gas(n: int, dim: int, fraction: float, seed: int = 0, shear: float = 0.0, **contact: Any) -> tuple[World, Periodic]:
     """n discs or spheres of diameter and mass 1 on a lattice in a periodic box, with a mean square of velocities of 1 per axis.
     Their sum is 0, so that only n - 1 of them are free, and kT = n / (n - 1)."""
     size = (volume(np.full(n, 0.5), dim) / fraction) ** (1 / dim)
@@ -96,7 +97,7 @@ def mean_and_error(blocks: np.ndarray) -> tuple[float, float]:
     return float(blocks.mean()), float(blocks.std(ddof=1) / np.sqrt(len(blocks)))
 
 
-def couette(n: int, shear: float, seconds: float, layers: int = 10, **contact: float) -> dict[str, float]:
+def couette(n: int, shear: float, seconds: float, layers: int = 10, **contact: Any) -> dict[str, float]:
     """Discs that lose energy in contacts, in a sheared box: the profile of the velocity in the box, and the momentum.
 
     In layers along y, <v_x> = shear (y - middle), around which it fluctuates for height^2 / (4 pi^2 viscosity) at a time. That is
