@@ -39,4 +39,4 @@ def box_of(world: "World | Parts") -> Periodic | None:
 
 def torn(box: Periodic | None, r: np.ndarray) -> np.ndarray:
     """Which differences of places (m, dim), as they are drawn, lead to an image further off than the nearest, (m,)."""
-    return np.zeros(len(r), dtype=bool) if box is None else (np.abs(r) > box.lengths / 2).any(axis=1)
+    return np.zeros(len(r), dtype=bool) if box is None else np.any(np.abs(r) > box.lengths / 2, axis=1)
