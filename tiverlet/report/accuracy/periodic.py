@@ -7,6 +7,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ...contact import Contact
+from ...features.feature import Feature
 from ...neighbours import Periodic
 from ...particles import Particles
 from ...world import World
@@ -17,7 +18,7 @@ SHELL = 0.05  # [diameters] width of the first shell of the radial distribution
 BLOCKS = 12  # of a run, for error bars
 
 
-def gas(n: int, dim: int, fraction: float, contact: Contact, seed: int = 0, shear: float = 0.0) -> tuple[World, Periodic]:
+def gas(n: int, dim: int, fraction: float, contact: Feature, seed: int = 0, shear: float = 0.0) -> tuple[World, Periodic]:
     """n discs or spheres of diameter and mass 1 on a lattice in a periodic box, with a mean square of velocities of 1 per axis.
     Their sum is 0, so that only n - 1 of them are free, and kT = n / (n - 1)."""
     size = (volume(np.full(n, 0.5), dim) / fraction) ** (1 / dim)
