@@ -1,13 +1,13 @@
 """Gases and shear flows in periodic boxes against what is known of them. `python -m tiverlet.report.accuracy.periodic`."""
 
 import argparse
-from typing import Any
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 from ...contact import Contact
+from ...features.feature import Feature
 from ...neighbours import Periodic
 from ...particles import Particles
 from ...world import World
@@ -18,7 +18,7 @@ SHELL = 0.05  # [diameters] width of the first shell of the radial distribution
 BLOCKS = 12  # of a run, for error bars
 
 
-def gas(n: int, dim: int, fraction: float, seed: int = 0, shear: float = 0.0, **contact: Any) -> tuple[World, Periodic]:
+def gas(n: int, dim: int, fraction: float, contact: Feature, seed: int = 0, shear: float = 0.0) -> tuple[World, Periodic]:
     """n discs or spheres of diameter and mass 1 on a lattice in a periodic box, with a mean square of velocities of 1 per axis.
     Their sum is 0, so that only n - 1 of them are free, and kT = n / (n - 1)."""
     size = (volume(np.full(n, 0.5), dim) / fraction) ** (1 / dim)
@@ -27,7 +27,7 @@ def gas(n: int, dim: int, fraction: float, seed: int = 0, shear: float = 0.0, **
     v /= np.sqrt((v**2).mean())
     x, box = lattice(n, dim, size), Periodic([0] * dim, [size] * dim, shear=shear)
     v[:, 0] += shear * (x[:, 1] - size / 2)
-    return World(Particles(x, velocity=v, radius=0.5), [Contact(**contact), box], substeps=1, precision="f64"), box
+    return World(Particles(x, velocity=v, radius=0.5), [contact, box], substeps=1, precision="f64"), box
 
 
 def contact_value(fraction: float, dim: int) -> float:
@@ -51,7 +51,7 @@ def virial(n: int, dim: int, fraction: float, h: float, seconds: float) -> dict[
     D: d <x^2> / dt / (2 dim), of unwrapped positions, between 3 and 6 times D m / kT, in which velocities are forgotten. It
     exceeds Enskog's by the tails that these times cut off, more so in dense gases (Alder, Gass and Wainwright 1970).
     """
-    world, box = gas(n, dim, fraction, restitution=1.0)
+    world, box = gas(n, dim, fraction, Contact(restitution=1.0))
     known_d = diffusion(fraction, dim)
     steps = round(seconds * max(1.0, known_d) / h)
     warm = steps // 5
@@ -97,7 +97,7 @@ def mean_and_error(blocks: np.ndarray) -> tuple[float, float]:
     return float(blocks.mean()), float(blocks.std(ddof=1) / np.sqrt(len(blocks)))
 
 
-def couette(n: int, shear: float, seconds: float, layers: int = 10, **contact: Any) -> dict[str, float]:
+def couette(n: int, shear: float, seconds: float, contact: Contact, layers: int = 10) -> dict[str, float]:
     """Discs that lose energy in contacts, in a sheared box: the profile of the velocity in the box, and the momentum.
 
     In layers along y, <v_x> = shear (y - middle), around which it fluctuates for height^2 / (4 pi^2 viscosity) at a time. That is
@@ -106,7 +106,7 @@ def couette(n: int, shear: float, seconds: float, layers: int = 10, **contact: A
     """
     y, profiles, drift = (np.arange(layers) + 0.5) / layers - 0.5, [], 0.0
     for seed in range(BLOCKS):
-        world, box = gas(n, 2, 0.6, seed, shear, **contact)
+        world, box = gas(n, 2, 0.6, contact.copy(), seed, shear)
         height, momenta, counts = box.lengths[1], np.zeros(layers), np.zeros(layers)
         with world:
             world.substeps = 4
@@ -139,8 +139,8 @@ def main() -> None:
         table.add_row(f"{dim}D, {fraction}", *told, f"{figures['energy']:.1e}", f"{figures['momentum']:.1e}")
     console.print(table)
     table = Table("contacts", "slope / shear", "worst layer / speed of the boundary", "momentum gained", title="Sheared discs")
-    for name, contact in (("restitution 0.7", {"restitution": 0.7}), ("friction 0.5", {"friction": 0.5, "restitution": 0.5})):
-        figures = couette(given.particles // 4, 0.5, given.seconds, **contact)
+    for name, contact in (("restitution 0.7", Contact(0.0, 0.7)), ("friction 0.5", Contact(0.5, 0.5))):
+        figures = couette(given.particles // 4, 0.5, given.seconds, contact)
         row = (f"{figures['slope']:.4f} +- {figures['error']:.4f}", f"{figures['off']:.4f}", f"{figures['momentum']:.1e}")
         table.add_row(name, *row)
     console.print(table)
