@@ -240,6 +240,9 @@ def test_a_winch_stops_at_its_ends(world):
     winch.speed = 2.0
     w.run(2.0)
     assert w.position[1, 1] == pytest.approx(-2.25, abs=1e-9) and winch.rest[0] == 2.25
+    short, winch = hoist(world, -1.0, length=1.0, force=9.0)  # it can run out, and nothing is moved
+    report = short.step(1 / 60)
+    assert "moved" not in report.flags and short.position[1, 1] == pytest.approx(-2.0 - (G - 4.5) / 2 / 60**2, abs=1e-9)
     slack, winch = hoist(world, -1.0, length=3.0)  # which pulls once the slack is in
     slack.run(0.1)
     assert slack.position[1, 1] == pytest.approx(-2.0 - G * 0.1**2 / 2, abs=1e-9) and winch.load[0] == 0
