@@ -81,12 +81,12 @@ ROWS3 = {
         {"speed": -2.0, "torque": 0.3} | SPRINGS,
     ),
     "Motor, angle": (
-        lambda i, x, **k: tv.Motor([i], **k), WINGS, {"speed": 3.0, "angle": 1.0, "torque": 5.0} | SPRING,
-        {"speed": 1.0, "angle": 2.0, "torque": 0.3} | SPRINGS,
+        lambda i, x, **k: tv.Motor([i], **k), WINGS, {"speed": 3.0, "angle": 2.5, "torque": 90.0} | SPRING,
+        {"speed": 1.0, "angle": -1.5, "torque": 0.3} | SPRINGS,
     ),
     "Winch": (
-        lambda i, x, **k: tv.Winch([i], **k), LINK, {"speed": -0.5, "shortest": 0.3, "longest": 1.0, "force": 9.0} | SPRING,
-        {"speed": -2.0, "shortest": 0.1, "longest": 2.0, "force": 3.0} | SPRINGS,
+        lambda i, x, **k: tv.Winch([i], **k), LINK, {"speed": -2.0, "shortest": 0.3, "longest": 1.0, "force": 90.0} | SPRING,
+        {"speed": -4.0, "shortest": 0.1, "longest": 2.0, "force": 3.0} | SPRINGS,
     ),
     "Area": (lambda i, x, **k: tv.Area([i], **k), PATH, AREA | SPRING, {"rest": 0.4, "pressure": 1.3} | SPRINGS),
     "Volume": (lambda i, x, **k: tv.Volume([i], **k), WINGS, AREA | SPRING, {"rest": 0.4, "pressure": 1.3} | SPRINGS),
@@ -174,6 +174,8 @@ ELSEWHERE = {
     ("ShapeMatch", "yield_strain"),
     ("AngleLimit", "lower"),
     ("Box", "lower"),
+    ("Winch", "longest"),
+    ("Winch", "shortest"),
 }  # nothing is there
 
 GOES_ON = ("Path, speed", "Motor", "Motor, angle", "Winch")  # from where they have got to, wherever particles are put
