@@ -371,3 +371,17 @@ BAD = {
 def test_what_cannot_spin_is_refused(what):
     with pytest.raises(ValueError, match=r"(Particles|World|Contact|HalfSpace|Polygons).*:"):
         BAD[what]()
+
+
+def test_none_and_some_that_spin(world):
+    # A world of none has spins, too; and one that had none gets them with the particles that come.
+    none = world(tv.Particles(np.zeros((0, 2)), spin=0, orientation=0), [tv.Gravity(), tv.Contact(friction=0.5)])
+    none.step(1 / 60)
+    assert none.spin.shape == (0,) and none.orientation.shape == (0,) and tv.measure.kinetic_energy(none) == 0
+    w = world(tv.Particles([(0, 0.5)], radius=0.1), [tv.Gravity(), tv.HalfSpace((0, 1), friction=0.3)])
+    w.step(1 / 60)
+    w.add(tv.Particles([(1, 0.5)], radius=0.1, spin=3.0))
+    w.step(1 / 60)
+    np.testing.assert_allclose(w.spin, [0, 3], atol=1e-6)
+    w.remove([0])
+    np.testing.assert_allclose(w.spin, [3], atol=1e-6)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 def kinetic_energy(world: "World") -> float:
     """Sum of m v^2 / 2 and of I omega^2 / 2 [J]; static particles have none."""
-    m, moment, spin = _mass(world), moments(world.particles), world.spin.reshape(len(world.particles), -1)
+    m, moment, spin = _mass(world), moments(world.particles), _spin(world)
     return float(0.5 * np.sum(m * np.sum(world.velocity**2, axis=1)) + 0.5 * np.sum(moment * np.sum(spin**2, axis=1)))
 
 
@@ -27,7 +27,7 @@ def angular_momentum(world: "World", about=None) -> np.ndarray:
     """Sum of m (x - about) x v + I omega [kg m^2/s]: (1,) in 2D, (3,) in 3D; about the origin where no point is given."""
     r = world.position - (0.0 if about is None else np.asarray(about))
     p = _mass(world)[:, None] * world.velocity
-    own = moments(world.particles) @ world.spin.reshape(len(r), -1)
+    own = moments(world.particles) @ _spin(world)
     if r.shape[1] == 2:
         return own + np.sum(r[:, 0] * p[:, 1] - r[:, 1] * p[:, 0])
     return own + np.cross(r, p).sum(axis=0)
@@ -80,6 +80,11 @@ def overlapping(
     both, deep = np.sort(np.concatenate(pairs), axis=1), np.concatenate(depths)
     order = np.lexsort((both[:, 1], both[:, 0]))
     return both[order], deep[order]
+
+
+def _spin(world: "World") -> np.ndarray:
+    """Angular velocities, (n, 1) in 2D and (n, 3) in 3D [rad/s]."""
+    return world.spin.reshape(len(world.particles), 2 * world.particles.dim - 3)
 
 
 def _mass(world: "World") -> np.ndarray:

@@ -170,7 +170,7 @@ def spin_of(who: str, spin, particles: "Particles") -> np.ndarray:
         if array.ndim == 1 and array.shape != (0,):
             array = np.broadcast_to(checks.vector(who, "spin", spin, 3), zero.shape)
         rates = zero if array.ndim == 0 else checks.points(who, "spin", array, dim=3, count=n)
-    turned = (rates != 0).reshape(n, -1).any(axis=1) & (particles.radius == 0)
+    turned = (rates != 0).reshape(n, 2 * particles.dim - 3).any(axis=1) & (particles.radius == 0)
     if turned.any():
         i = int(np.argmax(turned))
         raise ValueError(f"{who}: spin[{i}] = {rates[i]}, but particle {i} is a point (radius 0), which does not spin.")

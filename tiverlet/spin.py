@@ -33,8 +33,9 @@ class Spin:
         self.share = Shared(memory, "spin_share", shares(particles, inv_mass))
         self.orients = particles.orientation is not None
         if self.orients:
-            turned = np.asarray(particles.orientation).reshape(n, -1)
-            self.orientation = memory.field("orientation", n, width=turned.shape[1], kind=ti.f64, values=turned, state=True)
+            width = 1 if self.dim == 2 else 4
+            turned = np.asarray(particles.orientation).reshape(n, width)
+            self.orientation = memory.field("orientation", n, width=width, kind=ti.f64, values=turned, state=True)
             inverse = np.divide(1, particles.radius, out=np.zeros(n), where=particles.radius > 0)
             self.inverse_radius = Shared(memory, "inverse_radius", inverse)
 

@@ -27,8 +27,7 @@ if TYPE_CHECKING:
 class EventLog:
     """The table of one world on the device, and who writes what to it.
 
-    touched: data of each pair, on the
-    side that writes its row: during a frame the number of the row, from 1 on, and 0 without one; between frames 1 where it
+    touched: data of each pair, on the side that writes its row: during a frame the number of the row, from 1 on, and 0 without one; between frames 1 where it
     touched in the last substep. Columns: pair, the particle that writes and the other; when, the substeps in which it began to
     touch and touched last; impulse [kg m]; speed [m], what it came together in a substep; normal, from the other; point [m].
     """
@@ -115,7 +114,8 @@ class EventLog:
     def place(self, row, i, j, n):
         """Where the pair touches: in the middle between the two surfaces along n."""
         self.normal.field[row] = n
-        self.point.field[row] = (self.state.place(i) + self.state.place(j) + (self.radius.of(j) - self.radius.of(i)) * n) / 2
+        way = (self.radius.of(j) - self.radius.of(i)) * n - self.state.apart(i, j)
+        self.point.field[row] = self.state.place(i) + way / 2
 
     @ti.func
     def note_impact(self, e, impulse, speed):

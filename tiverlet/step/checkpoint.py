@@ -147,7 +147,8 @@ def transfer(old: "World", new: "World") -> None:
     if new._particles.spins:
         new.spin = old.spin
     if new._particles.orientation is not None:
-        new._runner.memory.write(new._runner.scene.state.spin.orientation, np.reshape(old.orientation, (len(old.particles), -1)))
+        turned = np.reshape(old.orientation, (len(old.particles), 1 if old.particles.dim == 2 else 4))
+        new._runner.memory.write(new._runner.scene.state.spin.orientation, turned)
     for mine, other in zip(new.features, old.features, strict=True):
         if isinstance(mine, Periodic) and isinstance(other, Periodic):
             mine.continued(other)
