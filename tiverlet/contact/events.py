@@ -27,9 +27,10 @@ if TYPE_CHECKING:
 class EventLog:
     """The table of one world on the device, and who writes what to it.
 
-    touched: data of each pair, on the side that writes its row: during a frame the number of the row, from 1 on, and 0 without one; between frames 1 where it
-    touched in the last substep. Columns: pair, the particle that writes and the other; when, the substeps in which it began to
-    touch and touched last; impulse [kg m]; speed [m], what it came together in a substep; normal, from the other; point [m].
+    touched: data of each pair, on the side that writes its row: during a frame the number of the row, from 1 on, and 0 without
+    one; between frames 1 where it touched in the last substep. Columns: pair, the particle that writes and the other; when, the
+    substeps in which it began to touch and touched last; impulse [kg m]; speed [m], what it came together in a substep; normal,
+    from the other; point [m].
     """
 
     grid: "NeighbourSearch"
