@@ -491,3 +491,15 @@ def test_what_is_removed_from_a_pile_that_moves_is_recorded(world, tmp_path):
             w.step(1 / 60)
             recorder.log()
     assert tv.replay(tmp_path / "removed.rrd").verify()
+
+
+def test_a_recording_begins_while_a_knob_asks_for_other_kernels(world, tmp_path):
+    start = tv.Particles([(0, 0.1), (0.3, 0.1)], radius=0.1, velocity=(1.0, 0.0))
+    contact = tv.Contact()
+    w = world(start, [tv.Gravity(), tv.Box((-1, 0), (1, 2)), contact])
+    w.step(1 / 60)
+    contact.friction = 0.3
+    with tv.Recorder(tmp_path / "knob.rrd", w) as recorder:
+        w.step(1 / 60)
+        recorder.log()
+    assert tv.replay(tmp_path / "knob.rrd").verify()

@@ -131,8 +131,9 @@ class Recorder:
 
     def _begin(self, title: str) -> None:
         """Write what holds for all frames, and the first one."""
-        world, explained = self.world, explain(self.world)
-        world._settle_forces()
+        world = self.world
+        world._adapt()  # the state is to be one of the kernels that the knobs ask for
+        explained = explain(world)
         self._picture = Picture(world, self._stream, explained, environment(), self._overlays)
         self._sent, self._flushed = perf_counter(), 0
         self._picture.stamp(0)
