@@ -122,12 +122,12 @@ class Surface:
             move = ti.max(depth - ti.max(start_depth - self.push_out * h, 0), 0)
             # Normal displacement after the substep; what has bounced may be moved further than that is to tell.
             after = ti.min(leaving + move, ti.max(ti.abs(leaving), self.push_out * h))
-            rise = 0 * depth
+            rise, left = 0 * depth, 1 + 0 * depth
             if ti.static(self.has_restitution):
                 # Where the last bounce has put it back on a straight way, that way began at a height of `gap`.
                 gap = -depth - leaving
                 if gap >= 0 and leaving < 0 and turn != GENTLY:
-                    rise, after = self.bounce(gap, leaving, (self.state.before[i] - moved).dot(n), after)
+                    rise, after, left = self.bounce(gap, leaving, (self.state.before[i] - moved).dot(n), after)
             if ti.static(self.has_log):
                 self.log.note(i, depth, n, after - leaving, -leaving)
             change = (after - leaving) * n
@@ -141,7 +141,7 @@ class Surface:
                     held, rests = self.grip(i, n, d - leaving * n, after - leaving, rise > 0)
                     stuck = rests and rise == 0 and not high
                     change -= held
-                    shift -= held
+                    shift -= left * held  # from the impact on
             elif ti.static(self.has_friction):
                 if turn != GENTLY:
                     slip = d - leaving * n
@@ -212,7 +212,8 @@ class Surface:
 
     @ti.func
     def bounce(self, gap, leaving, before, after):
-        """What is above the wall at the end of the substep, and the normal displacement that carries the velocity then.
+        """What is above the wall at the end of the substep, the normal displacement that carries the velocity then, and which part
+        of the substep is left after the impact: all of it where there is no bounce.
 
         In units of the substep, the height is gap + v s + k s^2 / 2, with k the acceleration and v = leaving - k / 2; the impact
         is at its root s. A bounce that would end below the wall has come to rest.
@@ -220,15 +221,15 @@ class Surface:
         k = leaving - before
         v = leaving - k / 2
         root = ti.sqrt(ti.max(v * v - 2 * k * gap, 0)) - v
-        rise = 0 * gap
+        rise, left = 0 * gap, 1 + 0 * gap
         if root > 0:
             s = ti.min(2 * gap / root, 1)
             out = -self.restitution[None] * (v + k * s)
             height = (1 - s) * (out + k / 2 * (1 - s))
             if height > 0 and out > 0:
-                rise = height
+                rise, left = height, 1 - s
                 after = out + k * (1 - s) - k / 2
-        return rise, after
+        return rise, after, left
 
 
 @ti.func
