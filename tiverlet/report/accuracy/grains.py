@@ -1,0 +1,267 @@
+"""Grains that spin against known laws: rolling, heaps, drums, silos. `python -m tiverlet.report.accuracy.grains`."""
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from ...colliders import Box, HalfSpace, Polygon
+from ...contact import Contact
+from ...forces import Gravity
+from ...particles import Particles
+from ...world import World
+from . import rolling
+
+G, SIZE, SUBSTEPS, FRAME = 9.81, 0.06, 16, 1 / 60  # SIZE: d, the mean diameter of grains [m]
+FRICTIONS, ROLLINGS = (0.1, 0.3, 0.5, 1.0), (0.0, 0.05, 0.1, 0.2)
+DENSITY = 1000.0  # [kg/m^2], [kg/m^3]
+
+
+def grains(n: int, widths: Sequence[float], seed: int, low: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """n grains, of 0.8 to 1.2 of SIZE, loosely in rows above `low`, between walls at 0 and widths [m], one or two; their radii."""
+    rng = np.random.default_rng(seed)
+    radius = SIZE / 2 * rng.permutation(0.8 + 0.4 * (np.arange(n) + 0.5) / n)
+    pitch = 1.22 * SIZE
+    rows = [int(w / pitch) for w in widths]
+    k, x = np.arange(n), np.empty((n, len(widths) + 1))
+    for axis, (row, width) in enumerate(zip(rows, widths, strict=True)):
+        x[:, -1 if axis else 0] = (k % row + 0.5) * (width / row)
+        k = k // row
+    x[:, 1] = low + pitch * (k + 0.6)
+    return x + rng.uniform(-0.01, 0.01, x.shape) * SIZE, radius
+
+
+def particles(x: np.ndarray, radius: np.ndarray, fixed: np.ndarray, size: float, spins: bool = True) -> Particles:
+    """These grains and others in group 1, of radius `size`, that cannot move."""
+    n, m, dim = len(x), len(fixed), x.shape[1]
+    mass = DENSITY * (np.pi * radius**2 if dim == 2 else 4 / 3 * np.pi * radius**3)
+    return Particles(
+        np.concatenate([x, fixed]), radius=np.r_[radius, np.full(m, size)], mass=np.r_[mass, np.ones(m)],
+        pinned=np.arange(n, n + m), group=np.r_[np.zeros(n, int), np.ones(m, int)], spin=0 if spins else None,
+    )  # fmt: skip
+
+
+class Heap:
+    """A heap on a rough base, of `half` diameters to all sides, as is left when walls at its edges move out: what flows falls off.
+
+    Discs, or spheres on a square, whose heap is a pyramid. The surface is s tan(angle) high at a distance s from the nearest edge.
+    """
+
+    def __init__(self, n: int, half: float, dim: int, seed: int, spins: bool = True):
+        self.n, self.dim, self.half, self.spins = n, dim, half * SIZE, spins
+        x, radius = grains(n, [2 * self.half] * (dim - 1), seed)
+        flat = [0] if dim == 2 else [0, 2]
+        x[:, flat] -= self.half
+        line = np.linspace(-self.half, self.half, round(4 * half if dim == 2 else 8 / 3 * half) + 1)
+        corners = np.stack(np.meshgrid(*[line] * (dim - 1), indexing="ij"), -1).reshape(-1, dim - 1)
+        fixed = np.zeros((len(corners), dim))
+        fixed[:, flat] = corners
+        fixed[:, 1] = -SIZE / 2
+        self.flat, self.start = flat, particles(x, radius, fixed, SIZE / 2, spins)
+        self.box, self.contact = Box(*self.walls(self.half)), Contact(friction=self.grip(0.5, 0.0))
+        self.floor = HalfSpace(np.eye(dim)[1], -1.2, friction=self.grip(0.5, 0.1))
+        self.world = World(self.start, [Gravity(G), self.contact, self.box, self.floor], substeps=SUBSTEPS)
+
+    def grip(self, friction: float, resistance: float):
+        """Coefficients, as far as these have them."""
+        return (friction, friction, resistance) if self.spins else friction
+
+    def walls(self, half: float) -> tuple[list[float], list[float]]:
+        """Corners of a box that is so wide and open above and below."""
+        upper = [half] * self.dim
+        upper[1] = np.inf
+        return [-u for u in upper], upper
+
+    def pile(self, friction: float, resistance: float, speed: float = 0.15, rest: float = 1.0) -> float:
+        """Its angle [degrees], for walls that move out at a speed [m/s], after so many seconds of rest."""
+        w, p = self.world, self.start
+        w.position, w.velocity = p.position, p.velocity
+        if self.spins:
+            w.spin = p.spin
+        self.contact.friction = self.grip(friction, resistance)
+        self.box.lower, self.box.upper = self.walls(self.half)
+        w.run(1.0)
+        gap = 0.0
+        while gap < 6 * SIZE:
+            gap += speed * FRAME
+            self.box.lower, self.box.upper = self.walls(self.half + gap)
+            w.step(FRAME)
+        self.box.lower, self.box.upper = self.walls(np.inf)
+        w.run(rest)
+        return self.angle(w.position[: self.n], p.radius[: self.n])
+
+    def angle(self, x: np.ndarray, radius: np.ndarray) -> float:
+        """Of a line through the flanks [degrees]: the highest grain in each cell, the mean of these at each distance from the
+        edge, from 1.5 diameters on to where it comes to 0.8 of the greatest height."""
+        x, top = x[x[:, 1] > 0], (x[:, 1] + radius)[x[:, 1] > 0]
+        cells = int(self.half / SIZE)
+        at = np.floor((x[:, self.flat] + self.half) / SIZE).astype(int)
+        inside = ((at >= 0) & (at < 2 * cells)).all(axis=1)
+        height = np.zeros((2 * cells,) * (self.dim - 1))
+        np.maximum.at(height, tuple(at[inside].T), top[inside])
+        line = cells - np.abs(np.arange(2 * cells) + 0.5 - cells)  # from the edge, in diameters
+        away = np.minimum.reduce(np.meshgrid(*[line] * (self.dim - 1), indexing="ij"))
+        s = np.unique(away)
+        mean = np.array([height[away == value].mean() for value in s])
+        end = int(np.argmax(mean >= 0.8 * mean.max())) + 1
+        used = slice(1, max(end, 4))
+        return float(np.degrees(np.arctan(np.polyfit(SIZE * s[used], mean[used], 1)[0])))
+
+
+def repose(
+    n: int, half: float, dim: int, seeds: Sequence[int], settings: Sequence[tuple[float, float]], spins: bool = True
+) -> np.ndarray:
+    """Angles of heaps [degrees], (settings, seeds), for pairs of friction and resistance to rolling."""
+    out = np.empty((len(settings), len(seeds)))
+    for k, seed in enumerate(seeds):
+        heap = Heap(n, half, dim, seed, spins)
+        with heap.world:
+            for i, setting in enumerate(settings):
+                out[i, k] = heap.pile(*setting)
+    return out
+
+
+def drum(n: int, friction: float, resistance: float, turn: float = 0.8, seconds: float = 10.0) -> tuple[float, float]:
+    """The dynamic angle of a drum of radius 1 m that turns [rad/s], over the second half of the time, and its standard error."""
+    rim = np.linspace(0, 2 * np.pi, 96, endpoint=False)
+    grip = (friction, friction, resistance)
+    wall = Polygon(np.stack([np.cos(rim), np.sin(rim)], axis=1), inside=True, friction=grip)
+    x, radius = grains(n, [1.3], 0, low=-0.7)
+    x[:, 0] -= 0.65
+    angles = []
+    with World(particles(x, radius, np.zeros((0, 2)), 0.0), [Gravity(G), Contact(friction=grip), wall], substeps=SUBSTEPS) as world:
+        world.run(1.0)
+        for frame in range(round(seconds / FRAME)):
+            wall.rotation = turn * (frame + 1) * FRAME
+            world.step(FRAME)
+            middle = world.position.mean(axis=0)
+            angles.append(np.degrees(np.arctan2(middle[0], -middle[1])))
+    # Avalanches follow each other: means over a second are nearly independent.
+    later = np.array(angles[len(angles) // 2 :])
+    blocks = later[: len(later) // 60 * 60].reshape(-1, 60).mean(axis=1)
+    return float(blocks.mean()), float(blocks.std(ddof=1) / np.sqrt(len(blocks)))
+
+
+@dataclass(frozen=True)
+class Silo:
+    """Grains in a silo of `width` [m] on a floor of fixed discs of a fourth of SIZE, without friction there unless said."""
+
+    n: int
+    width: float
+    friction: float = 0.5
+    wall_friction: float = 0.5
+    rolling: float = 0.05
+    floor_friction: float = 0.0
+    seed: int = 0
+
+    def build(self) -> tuple[World, list[Polygon]]:
+        """It and its two walls."""
+        floor = np.arange(-self.width / 2, self.width / 2 + 1e-9, SIZE / 2)
+        x, radius = grains(self.n, [self.width], self.seed, low=SIZE)
+        x[:, 0] -= self.width / 2
+        start = particles(x, radius, np.stack([floor, 0 * floor], axis=1), SIZE / 4)
+        top = float(x[:, 1].max()) + 1.0
+        sides = [-self.width / 2 - 0.1, self.width / 2]
+        walls = [
+            Polygon(
+                np.array([(0, 0), (0.1, 0), (0.1, top), (0, top)]) + (left, -SIZE / 4),
+                friction=(self.wall_friction, self.wall_friction, self.rolling),
+            )
+            for left in sides
+        ]  # fmt: skip
+        grip = {
+            (0, 0): (self.friction, self.friction, self.rolling),
+            (0, 1): (self.floor_friction, self.floor_friction, self.rolling),
+        }
+        ground = HalfSpace((0, 1), -2.5, friction=(0.5, 0.5, 0.0))
+        return World(start, [Gravity(G), Contact(friction=grip), *walls, ground], substeps=SUBSTEPS), walls
+
+
+def bore(world: World) -> float:
+    """The force of grains on what is fixed, along normals [N], downwards."""
+    found, pinned = world.contacts, world.particles.pinned
+    i, j = found.pairs.T
+    push = found.impulse * found.normal[:, 1]  # on the first of each pair, upwards
+    return float((push[~pinned[i] & pinned[j]].sum() - push[pinned[i] & ~pinned[j]].sum()) / (FRAME / world.substeps))
+
+
+def janssen(silo: Silo, settle: float = 3.0, rise: float = 0.02, seconds: float = 2.0) -> tuple[float, float, float]:
+    """Height of the fill H [m], its weight [N] and the load on the floor [N], over the second half of the time in which walls rise
+    [m/s], so that friction there is used up and holds grains back."""
+    world, walls = silo.build()
+    with world:
+        world.run(settle)
+        loads = []
+        for frame in range(round(seconds / FRAME)):
+            for wall in walls:
+                wall.position = (0.0, rise * (frame + 1) * FRAME)
+            world.step(FRAME)
+            loads.append(bore(world))
+        p = world.particles
+        free = ~p.pinned
+        # As high as the column would be at the packing fraction of its lower nine tenths.
+        x, area = world.position[free, 1], np.pi * p.radius[free] ** 2
+        below = float(np.quantile(x, 0.9))
+        height = area.sum() / area[x < below].sum() * below
+        return height, float(G * p.mass[free].sum()), float(np.mean(loads[len(loads) // 2 :]))
+
+
+def saturation(heights: Sequence[float], shares: Sequence[float]) -> tuple[float, float]:
+    """lambda [m] of share = lambda / H (1 - exp(-H / lambda)) by least squares, and the largest difference of a share."""
+    h, known = np.asarray(heights), np.asarray(shares)
+    tries = np.geomspace(0.02 * h.max(), 50 * h.max(), 4000)[:, None]
+    off = tries / h * -np.expm1(-h / tries) - known
+    best = int(np.argmin((off**2).sum(axis=1)))
+    return float(tries[best, 0]), float(np.abs(off[best]).max())
+
+
+def flow(silo: Silo, opening: float, seconds: float, settle: float = 2.0, least: float = 10.0) -> dict[str, float]:
+    """What runs out of an opening of that many diameters.
+
+    Returns the opening D in diameters between the surfaces of what is left of the floor; W in units of rho sqrt(g) d^1.5, where
+    rho is the density of the bulk; the ratio of W in the second half of the time that counts to that in the first; the heights of
+    the fill in the middle of these, in diameters; and the packing fraction. What counts ends with a fill of `least` diameters.
+    """
+    world, _walls = silo.build()
+    with world:
+        world.run(settle)
+        p, x = world.particles, world.position
+        area = np.where(p.pinned, 0, np.pi * p.radius**2)
+        in_bulk = (x[:, 1] > 3 * SIZE) & (x[:, 1] < np.quantile(x[~p.pinned, 1], 0.85)) & (np.abs(x[:, 0]) < 0.4 * silo.width)
+        tall = float(np.quantile(x[~p.pinned, 1], 0.85)) - 3 * SIZE
+        fraction = float(area[in_bulk].sum() / (tall * 0.8 * silo.width))
+        at = np.abs(x[:, 0])
+        gone = np.flatnonzero(p.pinned & (at < opening * SIZE / 2))
+        wide = 2 * at[p.pinned & (at >= opening * SIZE / 2)].min() - SIZE / 2
+        world.remove(gone)
+        area, free = area[~np.isin(np.arange(len(area)), gone)], ~world.particles.pinned
+        out, fills = [], []
+        for _ in range(round(seconds / FRAME)):
+            world.step(FRAME)
+            y = world.position[:, 1]
+            below = y < -SIZE
+            out.append(area[below].sum())
+            fills.append(area[free & ~below].sum() / (fraction * silo.width) / SIZE)
+            if fills[-1] < least:
+                break
+        begin, end = round(0.4 / FRAME), len(out)
+        halves = np.array_split(np.arange(begin, end), 2)
+        time = FRAME * np.arange(end)
+        rates = [float(np.polyfit(time[part], np.array(out)[part], 1)[0]) for part in (np.arange(begin, end), *halves)]
+        unit = fraction * np.sqrt(G) * SIZE**1.5
+        return {
+            "opening": wide / SIZE, "rate": rates[0] / unit, "ratio": rates[2] / rates[1], "fraction": fraction,
+            "first": float(np.mean(np.array(fills)[halves[0]])), "second": float(np.mean(np.array(fills)[halves[1]])),
+        }  # fmt: skip
+
+
+def beverloo(openings: Sequence[float], rates: Sequence[float]) -> tuple[float, float, float]:
+    """C and k of W = C (D - k)^1.5, by a line through W^(2/3), and R^2 of that."""
+    d, root = np.asarray(openings), np.asarray(rates) ** (2 / 3)
+    slope, begin = np.polyfit(d, root, 1)
+    rest = root - (slope * d + begin)
+    return float(slope**1.5), float(-begin / slope), float(1 - rest @ rest / ((root - root.mean()) ** 2).sum())
