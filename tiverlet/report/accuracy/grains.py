@@ -2,10 +2,11 @@
 
 import argparse
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from rich.console import Console
 from rich.table import Table
 
@@ -22,16 +23,20 @@ DENSITY = 1000.0  # [kg/m^2], [kg/m^3]
 
 
 def grains(n: int, widths: Sequence[float], seed: int, low: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """n grains, of 0.8 to 1.2 of SIZE, loosely in rows above `low`, between walls at 0 and widths [m], one or two; their radii."""
+    """n grains, of 0.8 to 1.2 of SIZE, loosely above `low` between walls at 0 and widths [m], one or two; and their radii.
+
+    Each layer is shifted against the one below, as columns of grains that do not spin would stand for ever.
+    """
     rng = np.random.default_rng(seed)
     radius = SIZE / 2 * rng.permutation(0.8 + 0.4 * (np.arange(n) + 0.5) / n)
     pitch = 1.22 * SIZE
-    rows = [int(w / pitch) for w in widths]
+    rows = [int(w / pitch - 0.5) for w in widths]
+    layer = np.arange(n) // np.prod(rows)
     k, x = np.arange(n), np.empty((n, len(widths) + 1))
-    for axis, (row, width) in enumerate(zip(rows, widths, strict=True)):
-        x[:, -1 if axis else 0] = (k % row + 0.5) * (width / row)
+    for axis, row, width in zip((0, -1), rows, widths, strict=False):
+        x[:, axis] = (k % row + 0.5 + 0.5 * (layer % 2)) * (width / (row + 0.5))
         k = k // row
-    x[:, 1] = low + pitch * (k + 0.6)
+    x[:, 1] = low + pitch * (layer + 0.6)
     return x + rng.uniform(-0.01, 0.01, x.shape) * SIZE, radius
 
 
@@ -46,9 +51,9 @@ def particles(x: np.ndarray, radius: np.ndarray, fixed: np.ndarray, size: float,
 
 
 class Heap:
-    """A heap on a rough base, of `half` diameters to all sides, as is left when walls at its edges move out: what flows falls off.
+    """A heap on a rough base, of `half` diameters to all sides, as is left when walls at its edges move out and grains flow off.
 
-    Discs, or spheres on a square, whose heap is a pyramid. The surface is s tan(angle) high at a distance s from the nearest edge.
+    Discs, or spheres on a square, whose heap is a pyramid. The surface is s tan(angle) high at s from the nearest edge.
     """
 
     def __init__(self, n: int, half: float, dim: int, seed: int, spins: bool = True):
@@ -96,7 +101,8 @@ class Heap:
 
     def angle(self, x: np.ndarray, radius: np.ndarray) -> float:
         """Of a line through the flanks [degrees]: the highest grain in each cell, the mean of these at each distance from the
-        edge, from 1.5 diameters on to where it comes to 0.8 of the greatest height."""
+        edge, from 1.5 diameters on to where it comes to 0.8 of the greatest height; where that is too near for a line, of the way
+        there from the edge."""
         x, top = x[x[:, 1] > 0], (x[:, 1] + radius)[x[:, 1] > 0]
         cells = int(self.half / SIZE)
         at = np.floor((x[:, self.flat] + self.half) / SIZE).astype(int)
@@ -108,8 +114,8 @@ class Heap:
         s = np.unique(away)
         mean = np.array([height[away == value].mean() for value in s])
         end = int(np.argmax(mean >= 0.8 * mean.max())) + 1
-        used = slice(1, max(end, 4))
-        return float(np.degrees(np.arctan(np.polyfit(SIZE * s[used], mean[used], 1)[0])))
+        slope = np.polyfit(s[1:end], mean[1:end], 1)[0] if end >= 4 else mean[end - 1] / s[end - 1]
+        return float(np.degrees(np.arctan(slope / SIZE)))
 
 
 def repose(
@@ -133,7 +139,9 @@ def drum(n: int, friction: float, resistance: float, turn: float = 0.8, seconds:
     x, radius = grains(n, [1.3], 0, low=-0.7)
     x[:, 0] -= 0.65
     angles = []
-    with World(particles(x, radius, np.zeros((0, 2)), 0.0), [Gravity(G), Contact(friction=grip), wall], substeps=SUBSTEPS) as world:
+    with World(
+        particles(x, radius, np.zeros((0, 2)), 0.0), [Gravity(G), Contact(friction=grip), wall], substeps=SUBSTEPS
+    ) as world:
         world.run(1.0)
         for frame in range(round(seconds / FRAME)):
             wall.rotation = turn * (frame + 1) * FRAME
@@ -181,7 +189,7 @@ class Silo:
         return World(start, [Gravity(G), Contact(friction=grip), *walls, ground], substeps=SUBSTEPS), walls
 
 
-def bore(world: World) -> float:
+def borne(world: World) -> float:
     """The force of grains on what is fixed, along normals [N], downwards."""
     found, pinned = world.contacts, world.particles.pinned
     i, j = found.pairs.T
@@ -189,10 +197,17 @@ def bore(world: World) -> float:
     return float((push[~pinned[i] & pinned[j]].sum() - push[pinned[i] & ~pinned[j]].sum()) / (FRAME / world.substeps))
 
 
-def janssen(silo: Silo, settle: float = 3.0, rise: float = 0.02, seconds: float = 2.0) -> tuple[float, float, float]:
-    """Height of the fill H [m], its weight [N] and the load on the floor [N], over the second half of the time in which walls rise
-    [m/s], so that friction there is used up and holds grains back."""
+def janssen(
+    silo: Silo, substeps: int = 48, settle: float = 2.0, rise: float = 0.02, seconds: float = 1.5
+) -> tuple[float, float, float]:
+    """Height of the fill H [m], its weight [N] and the load on the floor [N], in the second half of the time in which walls rise
+    [m/s], so that friction there is used up and holds grains back.
+
+    The k-th contact below the top overlaps by 2 k g h^2, so before grains slide a column of k layers grows with its walls, by
+    about k^2 g h^2: 7 diameters in 200 layers with 16 substeps, 0.8 with 48.
+    """
     world, walls = silo.build()
+    world.substeps = substeps
     with world:
         world.run(settle)
         loads = []
@@ -200,7 +215,7 @@ def janssen(silo: Silo, settle: float = 3.0, rise: float = 0.02, seconds: float 
             for wall in walls:
                 wall.position = (0.0, rise * (frame + 1) * FRAME)
             world.step(FRAME)
-            loads.append(bore(world))
+            loads.append(borne(world))
         p = world.particles
         free = ~p.pinned
         # As high as the column would be at the packing fraction of its lower nine tenths.
@@ -210,7 +225,7 @@ def janssen(silo: Silo, settle: float = 3.0, rise: float = 0.02, seconds: float 
         return height, float(G * p.mass[free].sum()), float(np.mean(loads[len(loads) // 2 :]))
 
 
-def saturation(heights: Sequence[float], shares: Sequence[float]) -> tuple[float, float]:
+def saturation(heights: ArrayLike, shares: ArrayLike) -> tuple[float, float]:
     """lambda [m] of share = lambda / H (1 - exp(-H / lambda)) by least squares, and the largest difference of a share."""
     h, known = np.asarray(heights), np.asarray(shares)
     tries = np.geomspace(0.02 * h.max(), 50 * h.max(), 4000)[:, None]
@@ -220,7 +235,7 @@ def saturation(heights: Sequence[float], shares: Sequence[float]) -> tuple[float
 
 
 def flow(silo: Silo, opening: float, seconds: float, settle: float = 2.0, least: float = 10.0) -> dict[str, float]:
-    """What runs out of an opening of that many diameters.
+    """What runs out of an opening of that many diameters, or a little more.
 
     Returns the opening D in diameters between the surfaces of what is left of the floor; W in units of rho sqrt(g) d^1.5, where
     rho is the density of the bulk; the ratio of W in the second half of the time that counts to that in the first; the heights of
@@ -234,9 +249,10 @@ def flow(silo: Silo, opening: float, seconds: float, settle: float = 2.0, least:
         in_bulk = (x[:, 1] > 3 * SIZE) & (x[:, 1] < np.quantile(x[~p.pinned, 1], 0.85)) & (np.abs(x[:, 0]) < 0.4 * silo.width)
         tall = float(np.quantile(x[~p.pinned, 1], 0.85)) - 3 * SIZE
         fraction = float(area[in_bulk].sum() / (tall * 0.8 * silo.width))
-        at = np.abs(x[:, 0])
-        gone = np.flatnonzero(p.pinned & (at < opening * SIZE / 2))
-        wide = 2 * at[p.pinned & (at >= opening * SIZE / 2)].min() - SIZE / 2
+        edge = np.abs(x[:, 0]) - SIZE / 4
+        inside = edge < (opening / 2 - 0.01) * SIZE
+        gone = np.flatnonzero(p.pinned & inside)
+        wide = float(2 * edge[p.pinned & ~inside].min())
         world.remove(gone)
         area, free = area[~np.isin(np.arange(len(area)), gone)], ~world.particles.pinned
         out, fills = [], []
@@ -259,9 +275,93 @@ def flow(silo: Silo, opening: float, seconds: float, settle: float = 2.0, least:
         }  # fmt: skip
 
 
-def beverloo(openings: Sequence[float], rates: Sequence[float]) -> tuple[float, float, float]:
+def beverloo(openings: ArrayLike, rates: ArrayLike) -> tuple[float, float, float]:
     """C and k of W = C (D - k)^1.5, by a line through W^(2/3), and R^2 of that."""
     d, root = np.asarray(openings), np.asarray(rates) ** (2 / 3)
     slope, begin = np.polyfit(d, root, 1)
     rest = root - (slope * d + begin)
     return float(slope**1.5), float(-begin / slope), float(1 - rest @ rest / ((root - root.mean()) ** 2).sum())
+
+
+def shown(values: np.ndarray) -> str:
+    """Their mean and its standard error."""
+    return f"{values.mean():.1f} +- {values.std(ddof=1) / np.sqrt(len(values)):.1f}"
+
+
+def heaps(n: int, half: float, dim: int, seeds: Sequence[int], rollings: Sequence[float], skaters: bool) -> Table:
+    """Angles of repose."""
+    what = "discs" if dim == 2 else "spheres"
+    table = Table("rolling", title=f"Angle of repose [degrees] of {n} {what}, by friction")
+    for friction in FRICTIONS:
+        table.add_column(str(friction), justify="right")
+    pairs = [(friction, resistance) for resistance in rollings for friction in FRICTIONS]
+    rows = repose(n, half, dim, seeds, pairs).reshape(len(rollings), len(FRICTIONS), -1)
+    for resistance, row in zip(rollings, rows, strict=True):
+        table.add_row(str(resistance), *(shown(cell) for cell in row))
+    if skaters:
+        pairs = [(friction, 0.0) for friction in FRICTIONS]
+        table.add_row("do not spin", *(shown(cell) for cell in repose(n, half, dim, seeds, pairs, spins=False)))
+    return table
+
+
+def drums(seconds: float) -> Table:
+    """Dynamic angles."""
+    table = Table("rolling", "angle [degrees]", title="Drum of 420 discs, friction 0.6, 0.8 rad/s")
+    for resistance in ROLLINGS:
+        angle, error = drum(420, 0.6, resistance, seconds=seconds)
+        table.add_row(str(resistance), f"{angle:.1f} +- {error:.1f}")
+    return table
+
+
+def silos(counts: Sequence[int]) -> Table:
+    """Loads on the floor."""
+    table = Table("H / width", title="Load on the floor over the weight, silo of 10 diameters, friction 0.5 between grains")
+    columns, heights = [], []
+    for friction in (0.0, 0.25, 0.5):
+        table.add_column(f"wall {friction}", justify="right")
+        found = np.array([janssen(Silo(n, 10 * SIZE, wall_friction=friction)) for n in counts])
+        heights, shares = found[:, 0] / (10 * SIZE), found[:, 2] / found[:, 1]
+        columns.append([f"{share:.3f}" for share in shares])
+        if friction:
+            length, off = saturation(heights, shares)
+            fit = f"lambda {length:.2f} w, K = w / (2 mu lambda) = {1 / (2 * friction * length):.2f}, within {off:.2f}"
+            table.caption = (f"{table.caption}\n" if table.caption else "") + f"wall {friction}: {fit}"
+    for height, *cells in zip(heights, *columns, strict=True):
+        table.add_row(f"{height:.2f}", *cells)
+    return table
+
+
+def flows(n: int, openings: Sequence[float], resistance: float) -> Table:
+    """Rates of flow."""
+    heads = "D / d", "W / (rho sqrt(g) d^1.5)", "fill of the first half / d", "of the second", "W then / W first"
+    table = Table(*heads, title=f"Flow out of a silo of 30 diameters, {n} discs, friction 0.5, rolling {resistance}")
+    found = [flow(Silo(n, 30 * SIZE, rolling=resistance, floor_friction=0.5), opening, 8.0) for opening in openings]
+    for row in found:
+        cells = (f"{row['first']:.0f}", f"{row['second']:.0f}", f"{row['ratio']:.2f}")
+        table.add_row(f"{row['opening']:.1f}", f"{row['rate']:.2f}", *cells)
+    c, k, square = beverloo([row["opening"] for row in found], [row["rate"] for row in found])
+    table.caption = f"W = C rho sqrt(g) (D - k d)^1.5: C = {c:.2f}, k = {k:.2f}, R^2 of W^(2/3) = {square:.4f}"
+    return table
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(prog="python -m tiverlet.report.accuracy.grains", description=__doc__)
+    parser.add_argument("--peers", metavar="PYTHON", nargs="*", default=[], help="where else to look for Box2D, LAMMPS, ...")
+    parser.add_argument("--quick", action="store_true", help="single spheres only")
+    given = parser.parse_args()
+    console = Console()
+    for table in rolling.tables((sys.executable, *given.peers), log=console.print):
+        console.print(table)
+    if given.quick:
+        return
+    console.print(heaps(470, 20.0, 2, range(5), ROLLINGS, skaters=True))
+    console.print(heaps(1600, 9.0, 3, range(2), (0.0, 0.1), skaters=False))
+    console.print(drums(10.0))
+    console.print(silos((50, 100, 150, 200, 300, 400, 600)))
+    for resistance in (0.0, 0.1):
+        console.print(flows(1500, (5.0, 6.5, 8.0, 10.0, 12.0), resistance))
+
+
+if __name__ == "__main__":
+    main()

