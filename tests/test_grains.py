@@ -1,21 +1,18 @@
 """Grains that spin, against the laws of heaps and silos: what the report prints, small."""
 
+import sys
+
 import numpy as np
 import pytest
 
 from tiverlet.report.accuracy import grains, rolling
 from tiverlet.report.accuracy.grains import SIZE, Silo
 
-from .conftest import order
 
-
-def test_impacts_and_rolling_obey_their_laws():
-    # Velocities after impacts to rounding; the way of a sphere that rolls off another to second order.
-    for case in (rolling.collision(1.0, beta=0.5), rolling.super_ball()):
-        for velocity, _place in rolling.here(case, "f64", (5, 20)):
-            assert velocity <= 1e-12
-    places = [place for _velocity, place in rolling.here(rolling.from_another(), "f64", (5, 10, 20))]
-    assert 1.9 <= order(places) <= 2.1
+def test_a_super_ball_under_gravity_obeys_its_law():
+    # Velocity and spin after three bounces to rounding (test_spin.py has the other cases).
+    for velocity, _place in rolling.here(rolling.super_ball(), "f64", (5, 20)):
+        assert velocity <= 1e-12
 
 
 def test_other_engines_are_asked():
@@ -24,8 +21,6 @@ def test_other_engines_are_asked():
     assert rolling.there("pymunk", ["no-such-python"], given, (5,))[0][0].startswith("FileNotFoundError")
     assert rolling.there("pymunk", [], given, (5, 10)) == [["not installed"] * 2] * 2
     pytest.importorskip("pymunk")
-    import sys  # noqa: PLC0415
-
     rolls, bounces = rolling.there("pymunk", [sys.executable], given, (5, 10))
     assert bounces == ["no tangential restitution"] * 2
     assert max(velocity for velocity, _place in rolls) <= 1e-12
@@ -33,23 +28,20 @@ def test_other_engines_are_asked():
 
 
 def test_heaps_of_what_resists_rolling_are_steeper():
-    # Discs that roll freely lie at 10 to 20 degrees whatever their friction; resistance to rolling, or no spin, holds them up.
+    # Discs that roll freely lie at 10 to 20 degrees, +- 5 for a heap as small as this; resistance to rolling holds them up.
     free, held = grains.repose(200, 12.0, 2, [0], [(0.5, 0.0), (0.5, 0.3)])[:, 0]
-    skaters = grains.repose(200, 12.0, 2, [0], [(0.5, 0.0)], spins=False)[0, 0]
-    assert 5 < free < 22 and held > free + 6 and skaters > free + 6
+    assert 5 < free < 25 and held > free + 10
 
 
 def test_a_silo_bears_its_grains():
-    # Janssen 1895: without friction at the walls the floor bears the weight, to the vibration of the load; with it the load comes
-    # to a limit, so twice as many grains do not press twice as much: for lambda = w / (2 mu K) with K between 1/2 and 3/2 it grows
-    # by less than (1 - exp(-2 H / lambda)) / (1 - exp(-H / lambda)) = 1 + exp(-H / lambda) <= 1.3 at H = 2.5 w.
-    width = 6 * SIZE
-    _height, weight, load = grains.janssen(Silo(60, width, wall_friction=0.0), substeps=16)
-    assert load == pytest.approx(weight, rel=2e-3)
-    found = [grains.janssen(Silo(n, width), settle=1.0) for n in (90, 180)]
-    loads, heights = [load for _h, _w, load in found], [h / width for h, _w, _l in found]
-    assert heights[0] >= 2.4 and loads[1] <= 1.3 * loads[0]
-    assert loads[1] / found[1][1] < 0.4
+    # Janssen 1895: without friction at the walls the floor bears the weight (1e-9 is none; the kernels are those of 0.5); in half a
+    # second that is off by dv / (g 0.5 s) for velocities of dv, 2 cm/s as the walls rise. With friction it bears
+    # lambda / H (1 - exp(-H / lambda)) of it, lambda = w / (2 mu K), with K between 1/2 and 3/2.
+    _height, weight, load = grains.janssen(Silo(500, 20 * SIZE, wall_friction=1e-9), substeps=32, settle=1.0, seconds=1.0)
+    assert load == pytest.approx(weight, rel=0.02 / (9.81 * 0.5))
+    height, weight, load = grains.janssen(Silo(500, 20 * SIZE), substeps=32, settle=1.0, seconds=1.0)
+    least, most = (-np.expm1(-k * height / (20 * SIZE)) / (k * height / (20 * SIZE)) for k in (1.5, 0.5))
+    assert height > 20 * SIZE and least <= load / weight <= most
 
 
 def test_flow_out_of_a_silo_obeys_beverloo():

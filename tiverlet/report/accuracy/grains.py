@@ -22,7 +22,7 @@ FRICTIONS, ROLLINGS = (0.1, 0.3, 0.5, 1.0), (0.0, 0.05, 0.1, 0.2)
 DENSITY = 1000.0  # [kg/m^2], [kg/m^3]
 
 
-def grains(n: int, widths: Sequence[float], seed: int, low: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def loose(n: int, widths: Sequence[float], seed: int, low: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """n grains, of 0.8 to 1.2 of SIZE, loosely above `low` between walls at 0 and widths [m], one or two; and their radii.
 
     Each layer is shifted against the one below, as columns of grains that do not spin would stand for ever.
@@ -58,7 +58,7 @@ class Heap:
 
     def __init__(self, n: int, half: float, dim: int, seed: int, spins: bool = True):
         self.n, self.dim, self.half, self.spins = n, dim, half * SIZE, spins
-        x, radius = grains(n, [2 * self.half] * (dim - 1), seed)
+        x, radius = loose(n, [2 * self.half] * (dim - 1), seed)
         flat = [0] if dim == 2 else [0, 2]
         x[:, flat] -= self.half
         line = np.linspace(-self.half, self.half, round(4 * half if dim == 2 else 8 / 3 * half) + 1)
@@ -136,7 +136,7 @@ def drum(n: int, friction: float, resistance: float, turn: float = 0.8, seconds:
     rim = np.linspace(0, 2 * np.pi, 96, endpoint=False)
     grip = (friction, friction, resistance)
     wall = Polygon(np.stack([np.cos(rim), np.sin(rim)], axis=1), inside=True, friction=grip)
-    x, radius = grains(n, [1.3], 0, low=-0.7)
+    x, radius = loose(n, [1.3], 0, low=-0.7)
     x[:, 0] -= 0.65
     angles = []
     with World(
@@ -169,7 +169,7 @@ class Silo:
     def build(self) -> tuple[World, list[Polygon]]:
         """It and its two walls."""
         floor = np.arange(-self.width / 2, self.width / 2 + 1e-9, SIZE / 2)
-        x, radius = grains(self.n, [self.width], self.seed, low=SIZE)
+        x, radius = loose(self.n, [self.width], self.seed, low=SIZE)
         x[:, 0] -= self.width / 2
         start = particles(x, radius, np.stack([floor, 0 * floor], axis=1), SIZE / 4)
         top = float(x[:, 1].max()) + 1.0

@@ -1,6 +1,6 @@
 """One or two spheres that spin, with known answers, beside other engines with the same substeps.
 
-Spheres, so k = m r^2 / I = 5/2, that move in a plane, so that engines of the plane take part. Where engines are looked for: there().
+Spheres, so k = m r^2 / I = 5/2, that move in a plane, so that engines of the plane take part.
 """
 
 import json
@@ -166,8 +166,9 @@ def from_another(seconds: float = 0.5, theta: float = 0.3) -> Case:
         y = y + h / 6 * (a + 2 * b + 2 * c + rate(y + h * c))
     velocity = (R + r) * y[1] * np.array([np.cos(y[0]), -np.sin(y[0])])
     answer = place(y[0]), velocity, float(-y[1] * (R + r) / r)
+    x = np.array([(0.0, 0.0), tuple(place(theta))])
     return Case(
-        "rolls off another", seconds, answer, [(0, 0), place(theta)], np.zeros((2, 2)), [0, 0], 5.0, mass=[0.0, 1.0],
+        "rolls off another", seconds, answer, x, np.zeros((2, 2)), [0, 0], 5.0, mass=[0.0, 1.0],
         radius=[R, r], floor=False,
     )  # fmt: skip
 
