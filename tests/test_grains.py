@@ -34,8 +34,8 @@ def test_heaps_of_what_resists_rolling_are_steeper():
 
 
 def test_a_silo_bears_its_grains():
-    # Janssen 1895: without friction at the walls the floor bears the weight (1e-9 is none; the kernels are those of 0.5); in half a
-    # second that is off by dv / (g 0.5 s) for velocities of dv, 2 cm/s as the walls rise. With friction it bears
+    # Janssen 1895: without friction at the walls the floor bears the weight (1e-9 is none; the kernels are those of 0.5); in half
+    # a second that is off by dv / (g 0.5 s) for velocities of dv, 2 cm/s as the walls rise. With friction it bears
     # lambda / H (1 - exp(-H / lambda)) of it, lambda = w / (2 mu K), with K between 1/2 and 3/2.
     _height, weight, load = grains.janssen(Silo(500, 20 * SIZE, wall_friction=1e-9), substeps=32, settle=1.0, seconds=1.0)
     assert load == pytest.approx(weight, rel=0.02 / (9.81 * 0.5))
@@ -48,7 +48,7 @@ def test_flow_out_of_a_silo_obeys_beverloo():
     # W = C rho sqrt(g) (D - k d)^1.5 with k between 1 and 2 in 2D, so W(8.5) / W(5.5) is between 2.15 and 2.53; 20 % for so few.
     rates = []
     for opening in (5.0, 8.0):
-        found = grains.flow(Silo(500, 20 * SIZE, rolling=0.0, floor_friction=0.5), opening, 4.0, settle=1.0)
+        found = grains.flow(Silo(500, 20 * SIZE), opening, 4.0, settle=1.0)
         assert found["opening"] == pytest.approx(opening + 0.5)
         rates.append(found["rate"])
     assert 2.15 / 1.2 <= rates[1] / rates[0] <= 2.53 * 1.2
