@@ -268,15 +268,16 @@ def steady(silo: Silo, gate: Gate, out: Sequence[float], fraction: float, least:
     rate, first, second = (float(np.polyfit(FRAME * part, area[part], 1)[0]) for part in (counts, *halves))
     unit = fraction * np.sqrt(G) * SIZE**1.5
     fills = [float(fill[half].mean()) for half in halves]
-    return {"opening": gate.width / SIZE, "rate": float(rate / unit), "ratio": second / first, "first": fills[0], "second": fills[1]}
+    found = {"opening": gate.width / SIZE, "rate": float(rate / unit), "ratio": second / first}
+    return found | {"first": fills[0], "second": fills[1]}
 
 
 def flow(silo: Silo, opening: float, seconds: float, settle: float = 2.0, least: float = 10.0) -> dict[str, float]:
     """What runs out of an opening of that many diameters, or a little more, until the fill is `least` diameters high.
 
     Returns the opening D in diameters between the surfaces of what is left of the floor; W in units of rho sqrt(g) d^1.5, where
-    rho is the density of the bulk; the ratio of W in the second half of the time to that in the first; and the mean heights of the
-    fill in these, in diameters.
+    rho is the density of the bulk; the ratio of W in the second half of the time to that in the first; and the mean heights of
+    the fill in these, in diameters.
     """
     world, _walls = silo.build()
     with world:
