@@ -222,8 +222,8 @@ def there(engine: str, pythons: Sequence[str], given: Sequence[Case], substeps: 
 
 
 def order(errors: Sequence[float], substeps: Sequence[int] = SUBSTEPS) -> str:
-    """By least squares, where errors are more than rounding."""
-    if len(errors) < len(substeps) or not np.isfinite(errors).all() or min(errors) < SMALL:
+    """By least squares, where errors are more than rounding, and fall."""
+    if len(errors) < len(substeps) or not (np.diff(errors) < 0).all() or min(errors) < SMALL:
         return ""
     return f"{-np.polyfit(np.log(substeps), np.log(errors), 1)[0]:.1f}"
 
