@@ -330,7 +330,7 @@ def shown(values: np.ndarray) -> str:
 def heaps(n: int, half: float, dim: int, seeds: Sequence[int], rollings: Sequence[float], skaters: bool) -> Table:
     """Angles of repose."""
     what = "discs" if dim == 2 else "spheres"
-    table = Table("rolling", title=f"Angle of repose [degrees] of {n} {what}, by friction")
+    table = Table("rolling", title=f"Angle of repose (degrees) of {n} {what}, by friction")
     for friction in FRICTIONS:
         table.add_column(str(friction), justify="right")
     pairs = [(friction, resistance) for resistance in rollings for friction in FRICTIONS]
@@ -345,7 +345,7 @@ def heaps(n: int, half: float, dim: int, seeds: Sequence[int], rollings: Sequenc
 
 def drums(seconds: float) -> Table:
     """Dynamic angles."""
-    table = Table("rolling", "angle [degrees]", title="Drum of 420 discs, friction 0.6, 0.8 rad/s")
+    table = Table("rolling", "angle (degrees)", title="Drum of 420 discs, friction 0.6, 0.8 rad/s")
     for resistance in ROLLINGS:
         angle, error = drum(420, 0.6, resistance, seconds=seconds)
         table.add_row(str(resistance), f"{angle:.1f} +- {error:.1f}")
