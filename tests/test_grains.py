@@ -1,0 +1,63 @@
+"""Grains that spin, against the laws of heaps and silos: what the report prints, small."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from tiverlet.report.accuracy import grains, rolling
+from tiverlet.report.accuracy.grains import SIZE, Silo
+
+
+def test_a_super_ball_under_gravity_obeys_its_law():
+    # Velocity and spin after three bounces to rounding (test_spin.py has the other cases).
+    for velocity, _place in rolling.here(rolling.super_ball(), "f64", (5, 20)):
+        assert velocity <= 1e-12
+
+
+def test_other_engines_are_asked():
+    # pymunk solves for the friction that keeps a sphere rolling to rounding; its places are of first order.
+    given = [rolling.downhill(0.3, 0.3), rolling.super_ball()]
+    assert rolling.there("pymunk", ["no-such-python"], given, (5,))[0][0].startswith("FileNotFoundError")
+    assert rolling.there("pymunk", [], given, (5, 10)) == [["not installed"] * 2] * 2
+    pytest.importorskip("pymunk")
+    rolls, bounces = rolling.there("pymunk", [sys.executable], given, (5, 10))
+    assert bounces == ["no tangential restitution"] * 2
+    assert max(velocity for velocity, _place in rolls) <= 1e-12
+    assert rolls[0][1] / rolls[1][1] == pytest.approx(2, rel=0.05)
+
+
+def test_heaps_of_what_resists_rolling_are_steeper():
+    # Discs that roll freely lie at 10 to 20 degrees, +- 5 for a heap as small as this; resistance to rolling holds them up.
+    free, held = grains.repose(200, 12.0, 2, [0], [(0.5, 0.0), (0.5, 0.3)])[:, 0]
+    assert 5 < free < 25 and held > free + 10
+
+
+def test_a_silo_bears_its_grains():
+    # Janssen 1895: without friction at the walls the floor bears the weight (1e-9 is none; the kernels are those of 0.5); in half
+    # a second that is off by dv / (g 0.5 s) for velocities of dv, 2 cm/s as the walls rise. With friction it bears
+    # lambda / H (1 - exp(-H / lambda)) of it, lambda = w / (2 mu K), with K between 1/2 and 3/2.
+    _height, weight, load = grains.janssen(Silo(500, 20 * SIZE, wall_friction=1e-9), substeps=32, settle=1.0, seconds=1.0)
+    assert load == pytest.approx(weight, rel=0.02 / (9.81 * 0.5))
+    height, weight, load = grains.janssen(Silo(500, 20 * SIZE), substeps=32, settle=1.0, seconds=1.0)
+    least, most = (-np.expm1(-k * height / (20 * SIZE)) / (k * height / (20 * SIZE)) for k in (1.5, 0.5))
+    assert height > 20 * SIZE and least <= load / weight <= most
+
+
+def test_flow_out_of_a_silo_obeys_beverloo():
+    # W = C rho sqrt(g) (D - k d)^1.5 with k between 1 and 2 in 2D, so W(8.5) / W(5.5) is between 2.15 and 2.53; 20 % for so few.
+    rates = []
+    for opening in (5.0, 8.0):
+        found = grains.flow(Silo(500, 20 * SIZE), opening, 4.0, settle=1.0)
+        assert found["opening"] == pytest.approx(opening + 0.5)
+        rates.append(found["rate"])
+    assert 2.15 / 1.2 <= rates[1] / rates[0] <= 2.53 * 1.2
+
+
+def test_fits_find_what_they_are_given():
+    # The laws themselves, with lambda, C and k of our own.
+    heights = np.array([0.5, 1.0, 3.0, 6.0])
+    length, off = grains.saturation(heights, 0.8 / heights * (1 - np.exp(-heights / 0.8)))
+    assert length == pytest.approx(0.8, rel=2e-3) and off <= 1e-3
+    openings = np.array([5.0, 8.0, 12.0])
+    assert grains.beverloo(openings, 0.9 * (openings - 1.4) ** 1.5) == pytest.approx((0.9, 1.4, 1.0))

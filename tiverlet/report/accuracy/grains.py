@@ -1,0 +1,415 @@
+"""Grains that spin against known laws: rolling, heaps, drums, silos. `python -m tiverlet.report.accuracy.grains`."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from rich.console import Console
+from rich.table import Table
+
+from ...colliders import Box, HalfSpace, Polygon
+from ...contact import Contact
+from ...forces import Gravity
+from ...particles import Particles
+from ...world import World
+from . import grain_peers, rolling
+
+G, SIZE, SUBSTEPS, FRAME = 9.81, 0.06, 16, 1 / 60  # SIZE: d, the mean diameter of grains [m]
+FRICTIONS, ROLLINGS = (0.1, 0.3, 0.5, 1.0), (0.0, 0.05, 0.1, 0.2)
+DENSITY = 1000.0  # [kg/m^2], [kg/m^3]
+
+
+def loose(n: int, widths: Sequence[float], seed: int, low: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """n grains, of 0.8 to 1.2 of SIZE, loosely above `low` between walls at 0 and widths [m], one or two; and their radii.
+
+    Each layer is shifted against the one below, as columns of grains that do not spin would stand for ever.
+    """
+    rng = np.random.default_rng(seed)
+    radius = SIZE / 2 * rng.permutation(0.8 + 0.4 * (np.arange(n) + 0.5) / n)
+    pitch = 1.22 * SIZE
+    rows = [int(w / pitch - 0.5) for w in widths]
+    layer = np.arange(n) // np.prod(rows)
+    k, x = np.arange(n), np.empty((n, len(widths) + 1))
+    for axis, row, width in zip((0, -1), rows, widths, strict=False):
+        x[:, axis] = (k % row + 0.5 + 0.5 * (layer % 2)) * (width / (row + 0.5))
+        k = k // row
+    x[:, 1] = low + pitch * (layer + 0.6)
+    return x + rng.uniform(-0.01, 0.01, x.shape) * SIZE, radius
+
+
+def particles(x: np.ndarray, radius: np.ndarray, fixed: np.ndarray, size: float, spins: bool = True) -> Particles:
+    """These grains and others in group 1, of radius `size`, that cannot move."""
+    n, m, dim = len(x), len(fixed), x.shape[1]
+    mass = DENSITY * (np.pi * radius**2 if dim == 2 else 4 / 3 * np.pi * radius**3)
+    return Particles(
+        np.concatenate([x, fixed]), radius=np.r_[radius, np.full(m, size)], mass=np.r_[mass, np.ones(m)],
+        pinned=np.arange(n, n + m), group=np.r_[np.zeros(n, int), np.ones(m, int)], spin=0 if spins else None,
+    )  # fmt: skip
+
+
+class Heap:
+    """A heap on a rough base, of `half` diameters to all sides, as is left when walls at its edges move out and grains flow off.
+
+    Discs, or spheres on a square, whose heap is a pyramid. The surface is s tan(angle) high at s from the nearest edge.
+    """
+
+    def __init__(self, n: int, half: float, dim: int, seed: int, spins: bool = True):
+        self.n, self.dim, self.half, self.spins = n, dim, half * SIZE, spins
+        x, radius = loose(n, [2 * self.half] * (dim - 1), seed)
+        flat = [0] if dim == 2 else [0, 2]
+        x[:, flat] -= self.half
+        line = np.linspace(-self.half, self.half, round(4 * half if dim == 2 else 8 / 3 * half) + 1)
+        corners = np.stack(np.meshgrid(*[line] * (dim - 1), indexing="ij"), -1).reshape(-1, dim - 1)
+        fixed = np.zeros((len(corners), dim))
+        fixed[:, flat] = corners
+        fixed[:, 1] = -SIZE / 2
+        self.flat, self.start = flat, particles(x, radius, fixed, SIZE / 2, spins)
+        self.box, self.contact = Box(*self.walls(self.half)), Contact(friction=self.grip(0.5, 0.0))
+        self.floor = HalfSpace(np.eye(dim)[1], -1.2, friction=self.grip(0.5, 0.1))
+        self.world = World(self.start, [Gravity(G), self.contact, self.box, self.floor], substeps=SUBSTEPS)
+
+    def grip(self, friction: float, resistance: float):
+        """Coefficients, as far as these have them."""
+        return (friction, friction, resistance) if self.spins else friction
+
+    def walls(self, half: float) -> tuple[list[float], list[float]]:
+        """Corners of a box that is so wide and open above and below."""
+        upper = [half] * self.dim
+        upper[1] = np.inf
+        return [-u for u in upper], upper
+
+    def pile(self, friction: float, resistance: float, speed: float = 0.15, rest: float = 1.0) -> float:
+        """Its angle [degrees], for walls that move out at a speed [m/s], after so many seconds of rest."""
+        w, p = self.world, self.start
+        w.position, w.velocity = p.position, p.velocity
+        if self.spins:
+            w.spin = p.spin
+        self.contact.friction = self.grip(friction, resistance)
+        self.box.lower, self.box.upper = self.walls(self.half)
+        w.run(1.0)
+        gap = 0.0
+        while gap < 6 * SIZE:
+            gap += speed * FRAME
+            self.box.lower, self.box.upper = self.walls(self.half + gap)
+            w.step(FRAME)
+        self.box.lower, self.box.upper = self.walls(np.inf)
+        w.run(rest)
+        return self.angle(w.position[: self.n], p.radius[: self.n])
+
+    def angle(self, x: np.ndarray, radius: np.ndarray) -> float:
+        """Of a line through the flanks [degrees]: the highest grain in each cell, the mean of these at each distance from the
+        edge, from 1.5 diameters on to where it comes to 0.8 of the greatest height; where that is too near for a line, of the way
+        there from the edge."""
+        x, top = x[x[:, 1] > 0], (x[:, 1] + radius)[x[:, 1] > 0]
+        cells = int(self.half / SIZE)
+        at = np.floor((x[:, self.flat] + self.half) / SIZE).astype(int)
+        inside = ((at >= 0) & (at < 2 * cells)).all(axis=1)
+        height = np.zeros((2 * cells,) * (self.dim - 1))
+        np.maximum.at(height, tuple(at[inside].T), top[inside])
+        line = cells - np.abs(np.arange(2 * cells) + 0.5 - cells)  # from the edge, in diameters
+        away = np.minimum.reduce(np.meshgrid(*[line] * (self.dim - 1), indexing="ij"))
+        s = np.unique(away)
+        mean = np.array([height[away == value].mean() for value in s])
+        end = int(np.argmax(mean >= 0.8 * mean.max())) + 1
+        slope = np.polyfit(s[1:end], mean[1:end], 1)[0] if end >= 4 else mean[end - 1] / s[end - 1]
+        return float(np.degrees(np.arctan(slope / SIZE)))
+
+
+def repose(
+    n: int, half: float, dim: int, seeds: Sequence[int], settings: Sequence[tuple[float, float]], spins: bool = True
+) -> np.ndarray:
+    """Angles of heaps [degrees], (settings, seeds), for pairs of friction and resistance to rolling."""
+    out = np.empty((len(settings), len(seeds)))
+    for k, seed in enumerate(seeds):
+        heap = Heap(n, half, dim, seed, spins)
+        with heap.world:
+            for i, setting in enumerate(settings):
+                out[i, k] = heap.pile(*setting)
+    return out
+
+
+def drum(n: int, friction: float, resistance: float, turn: float = 0.8, seconds: float = 10.0) -> tuple[float, float]:
+    """The dynamic angle of a drum of radius 1 m that turns [rad/s], over the second half of the time, and its standard error."""
+    rim = np.linspace(0, 2 * np.pi, 96, endpoint=False)
+    grip = (friction, friction, resistance)
+    wall = Polygon(np.stack([np.cos(rim), np.sin(rim)], axis=1), inside=True, friction=grip)
+    x, radius = loose(n, [1.3], 0, low=-0.7)
+    x[:, 0] -= 0.65
+    angles = []
+    with World(
+        particles(x, radius, np.zeros((0, 2)), 0.0), [Gravity(G), Contact(friction=grip), wall], substeps=SUBSTEPS
+    ) as world:
+        world.run(1.0)
+        for frame in range(round(seconds / FRAME)):
+            wall.rotation = turn * (frame + 1) * FRAME
+            world.step(FRAME)
+            middle = world.position.mean(axis=0)
+            angles.append(np.degrees(np.arctan2(middle[0], -middle[1])))
+    # Avalanches follow each other: means over a second are nearly independent.
+    later = np.array(angles[len(angles) // 2 :])
+    blocks = later[: len(later) // 60 * 60].reshape(-1, 60).mean(axis=1)
+    return float(blocks.mean()), float(blocks.std(ddof=1) / np.sqrt(len(blocks)))
+
+
+@dataclass(frozen=True)
+class Silo:
+    """Grains in a silo of `width` [m] on a floor of fixed discs of a fourth of SIZE, without friction there unless said."""
+
+    n: int
+    width: float
+    friction: float = 0.5
+    wall_friction: float = 0.5
+    rolling: float = 0.05
+    floor_friction: float = 0.0
+    seed: int = 0
+
+    def build(self) -> tuple[World, list[Polygon]]:
+        """It and its two walls."""
+        floor = np.arange(-self.width / 2, self.width / 2 + 1e-9, SIZE / 2)
+        x, radius = loose(self.n, [self.width], self.seed, low=SIZE)
+        x[:, 0] -= self.width / 2
+        start = particles(x, radius, np.stack([floor, 0 * floor], axis=1), SIZE / 4)
+        top = float(x[:, 1].max()) + 1.0
+        sides = [-self.width / 2 - 0.1, self.width / 2]
+        walls = [
+            Polygon(
+                np.array([(0, 0), (0.1, 0), (0.1, top), (0, top)]) + (left, -SIZE / 4),
+                friction=(self.wall_friction, self.wall_friction, self.rolling),
+            )
+            for left in sides
+        ]  # fmt: skip
+        grip = {
+            (0, 0): (self.friction, self.friction, self.rolling),
+            (0, 1): (self.floor_friction, self.floor_friction, self.rolling),
+        }
+        ground = HalfSpace((0, 1), -2.5, friction=(0.5, 0.5, 0.0))
+        return World(start, [Gravity(G), Contact(friction=grip), *walls, ground], substeps=SUBSTEPS), walls
+
+
+def borne(world: World) -> float:
+    """The force of grains on what is fixed, along normals [N], downwards."""
+    found, pinned = world.contacts, world.particles.pinned
+    i, j = found.pairs.T
+    push = found.impulse * found.normal[:, 1]  # on the first of each pair, upwards
+    return float((push[~pinned[i] & pinned[j]].sum() - push[pinned[i] & ~pinned[j]].sum()) / (FRAME / world.substeps))
+
+
+def janssen(
+    silo: Silo, substeps: int = 48, settle: float = 2.0, rise: float = 0.02, seconds: float = 1.5
+) -> tuple[float, float, float]:
+    """Height of the fill H [m], its weight [N] and the load on the floor [N], in the second half of the time in which walls rise
+    [m/s], so that friction there is used up and holds grains back.
+
+    The k-th contact below the top overlaps by 2 k g h^2, so before grains slide a column of k layers grows with its walls, by
+    about k^2 g h^2: 7 diameters in 200 layers with 16 substeps, 0.8 with 48.
+    """
+    world, walls = silo.build()
+    world.substeps = substeps
+    with world:
+        world.run(settle)
+        loads = []
+        for frame in range(round(seconds / FRAME)):
+            for wall in walls:
+                wall.position = (0.0, rise * (frame + 1) * FRAME)
+            world.step(FRAME)
+            loads.append(borne(world))
+        p = world.particles
+        free = ~p.pinned
+        # As high as the column would be at the packing fraction of its lower nine tenths.
+        x, area = world.position[free, 1], np.pi * p.radius[free] ** 2
+        below = float(np.quantile(x, 0.9))
+        height = area.sum() / area[x < below].sum() * below
+        return height, float(G * p.mass[free].sum()), float(np.mean(loads[len(loads) // 2 :]))
+
+
+def saturation(heights: ArrayLike, shares: ArrayLike) -> tuple[float, float]:
+    """lambda [m] of share = lambda / H (1 - exp(-H / lambda)) by least squares, and the largest difference of a share."""
+    h, known = np.asarray(heights), np.asarray(shares)
+    tries = np.geomspace(0.02 * h.max(), 50 * h.max(), 4000)[:, None]
+    off = tries / h * -np.expm1(-h / tries) - known
+    best = int(np.argmin((off**2).sum(axis=1)))
+    return float(tries[best, 0]), float(np.abs(off[best]).max())
+
+
+@dataclass(frozen=True)
+class Gate:
+    """An opening in the floor of a silo: particles `gone` from it, and its width D [m] between the surfaces of what is left."""
+
+    gone: np.ndarray
+    width: float
+
+    @classmethod
+    def of(cls, p: Particles, opening: float) -> "Gate":
+        """As wide as that many diameters, or a little more."""
+        edge = np.abs(p.position[:, 0]) - p.radius
+        inside = edge < (opening / 2 - 0.01) * SIZE
+        return cls(np.flatnonzero(p.pinned & inside), float(2 * edge[p.pinned & ~inside].min()))
+
+
+def packed(silo: Silo, p: Particles, x: np.ndarray) -> float:
+    """The packing fraction of what has settled at x, away from walls and surface."""
+    free = ~p.pinned
+    low, top = 3 * SIZE, float(np.quantile(x[free, 1], 0.85))
+    bulk = free & (x[:, 1] > low) & (x[:, 1] < top) & (np.abs(x[:, 0]) < 0.4 * silo.width)
+    return float((np.pi * p.radius[bulk] ** 2).sum() / ((top - low) * 0.8 * silo.width))
+
+
+def steady(silo: Silo, gate: Gate, out: Sequence[float], fraction: float, least: float) -> dict[str, float]:
+    """What flow() returns, of the area that has run out after each frame [m^2]."""
+    area = np.asarray(out)
+    total = silo.n * np.pi / 4 * SIZE**2 * (1 + 0.04 / 3)  # of diameters from 0.8 to 1.2
+    fill = (total - area) / (fraction * silo.width * SIZE)
+    end = int(np.argmax(fill < least)) if (fill < least).any() else len(fill)
+    counts = np.arange(round(0.4 / FRAME), end)
+    halves = np.array_split(counts, 2)
+    rate, first, second = (float(np.polyfit(FRAME * part, area[part], 1)[0]) for part in (counts, *halves))
+    unit = fraction * np.sqrt(G) * SIZE**1.5
+    fills = [float(fill[half].mean()) for half in halves]
+    found = {"opening": gate.width / SIZE, "rate": float(rate / unit), "ratio": second / first}
+    return found | {"first": fills[0], "second": fills[1]}
+
+
+def flow(silo: Silo, opening: float, seconds: float, settle: float = 2.0, least: float = 10.0) -> dict[str, float]:
+    """What runs out of an opening of that many diameters, or a little more, until the fill is `least` diameters high.
+
+    Returns the opening D in diameters between the surfaces of what is left of the floor; W in units of rho sqrt(g) d^1.5, where
+    rho is the density of the bulk; the ratio of W in the second half of the time to that in the first; and the mean heights of
+    the fill in these, in diameters.
+    """
+    world, _walls = silo.build()
+    with world:
+        world.run(settle)
+        p = world.particles
+        fraction, gate = packed(silo, p, world.position), Gate.of(p, opening)
+        area = np.delete(np.where(p.pinned, 0, np.pi * p.radius**2), gate.gone)
+        world.remove(gate.gone)
+        out = []
+        for _ in range(round(seconds / FRAME)):
+            world.step(FRAME)
+            out.append(float(area[world.position[:, 1] < -SIZE].sum()))
+            if area.sum() - out[-1] < least * SIZE * fraction * silo.width:
+                break
+        return steady(silo, gate, out, fraction, least)
+
+
+def flow_in_lammps(
+    silo: Silo, opening: float, seconds: float, pythons: Sequence[str], settle: float = 2.0, least: float = 10.0
+) -> dict[str, float] | str:
+    """The same of LAMMPS from the same start, without resistance to rolling; or why not."""
+    world, _walls = silo.build()
+    world.close()
+    p = world.particles
+    gate = Gate.of(p, opening)
+    job = {
+        "x": p.position.tolist(), "radius": p.radius.tolist(), "mass": p.mass.tolist(), "grains": silo.n, "width": silo.width,
+        "size": SIZE, "friction": silo.friction, "gravity": G, "frame": FRAME, "frames": round(seconds / FRAME), "settle": settle,
+        "gone": gate.gone.tolist(),
+    }  # fmt: skip
+    answer = rolling.ask(grain_peers.SILO, pythons, [job])
+    if isinstance(answer, str):
+        return answer
+    return steady(silo, gate, answer[0]["out"], packed(silo, p, np.array(answer[0]["settled"])), least)
+
+
+def beverloo(openings: ArrayLike, rates: ArrayLike) -> tuple[float, float, float]:
+    """C and k of W = C (D - k)^1.5, by a line through W^(2/3), and R^2 of that."""
+    d, root = np.asarray(openings), np.asarray(rates) ** (2 / 3)
+    slope, begin = np.polyfit(d, root, 1)
+    rest = root - (slope * d + begin)
+    return float(slope**1.5), float(-begin / slope), float(1 - rest @ rest / ((root - root.mean()) ** 2).sum())
+
+
+def shown(values: np.ndarray) -> str:
+    """Their mean and its standard error."""
+    return f"{values.mean():.1f} +- {values.std(ddof=1) / np.sqrt(len(values)):.1f}"
+
+
+def heaps(n: int, half: float, dim: int, seeds: Sequence[int], rollings: Sequence[float], skaters: bool) -> Table:
+    """Angles of repose."""
+    what = "discs" if dim == 2 else "spheres"
+    table = Table("rolling", title=f"Angle of repose (degrees) of {n} {what}, by friction")
+    for friction in FRICTIONS:
+        table.add_column(str(friction), justify="right")
+    pairs = [(friction, resistance) for resistance in rollings for friction in FRICTIONS]
+    rows = repose(n, half, dim, seeds, pairs).reshape(len(rollings), len(FRICTIONS), -1)
+    for resistance, row in zip(rollings, rows, strict=True):
+        table.add_row(str(resistance), *(shown(cell) for cell in row))
+    if skaters:
+        pairs = [(friction, 0.0) for friction in FRICTIONS]
+        table.add_row("do not spin", *(shown(cell) for cell in repose(n, half, dim, seeds, pairs, spins=False)))
+    return table
+
+
+def drums(seconds: float) -> Table:
+    """Dynamic angles."""
+    table = Table("rolling", "angle (degrees)", title="Drum of 420 discs, friction 0.6, 0.8 rad/s")
+    for resistance in ROLLINGS:
+        angle, error = drum(420, 0.6, resistance, seconds=seconds)
+        table.add_row(str(resistance), f"{angle:.1f} +- {error:.1f}")
+    return table
+
+
+def silos(counts: Sequence[int]) -> Table:
+    """Loads on the floor."""
+    table = Table("H / width", title="Load on the floor over the weight, silo of 10 diameters, friction 0.5 between grains")
+    columns, heights = [], []
+    for friction in (0.0, 0.25, 0.5):
+        table.add_column(f"wall {friction}", justify="right")
+        found = np.array([janssen(Silo(n, 10 * SIZE, wall_friction=friction)) for n in counts])
+        heights, shares = found[:, 0] / (10 * SIZE), found[:, 2] / found[:, 1]
+        columns.append([f"{share:.3f}" for share in shares])
+        if friction:
+            length, off = saturation(heights, shares)
+            fit = f"lambda {length:.2f} w, K = w / (2 mu lambda) = {1 / (2 * friction * length):.2f}, within {off:.2f}"
+            table.caption = (f"{table.caption}\n" if table.caption else "") + f"wall {friction}: {fit}"
+    for height, *cells in zip(heights, *columns, strict=True):
+        table.add_row(f"{height:.2f}", *cells)
+    return table
+
+
+def flows(n: int, openings: Sequence[float], resistance: float, pythons: Sequence[str]) -> Table:
+    """Rates of flow; those of LAMMPS where nothing resists rolling."""
+    heads = "D / d", "W / (rho sqrt(g) d^1.5)", "fill of the first half / d", "of the second", "W then / W first", "W of LAMMPS"
+    table = Table(*heads, title=f"Flow out of a silo of 30 diameters, {n} discs, friction 0.5, rolling {resistance}")
+    silo = Silo(n, 30 * SIZE, rolling=resistance, floor_friction=0.5)
+    rows = {"tiverlet": [flow(silo, opening, 8.0) for opening in openings]}
+    peers = ["-" if resistance else flow_in_lammps(silo, opening, 8.0, pythons) for opening in openings]
+    for row, peer in zip(rows["tiverlet"], peers, strict=True):
+        cells = (f"{row['first']:.0f}", f"{row['second']:.0f}", f"{row['ratio']:.2f}")
+        other = peer if isinstance(peer, str) else f"{peer['rate']:.2f}"
+        table.add_row(f"{row['opening']:.1f}", f"{row['rate']:.2f}", *cells, other)
+    rows["LAMMPS"] = [peer for peer in peers if not isinstance(peer, str)]
+    lines = ["W = C rho sqrt(g) (D - k d)^1.5"]
+    for name, found in rows.items():
+        if len(found) > 2:
+            c, k, square = beverloo([row["opening"] for row in found], [row["rate"] for row in found])
+            lines.append(f"{name}: C = {c:.2f}, k = {k:.2f}, R^2 of W^(2/3) = {square:.4f}")
+    table.caption = "\n".join(lines)
+    return table
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(prog="python -m tiverlet.report.accuracy.grains", description=__doc__)
+    parser.add_argument("--peers", metavar="PYTHON", nargs="*", default=[], help="where else to look for Box2D, LAMMPS, ...")
+    parser.add_argument("--quick", action="store_true", help="single spheres only")
+    given = parser.parse_args()
+    console = Console()
+    pythons = (sys.executable, *given.peers)
+    for table in rolling.tables(pythons, log=console.print):
+        console.print(table)
+    if given.quick:
+        return
+    console.print(heaps(470, 20.0, 2, range(5), ROLLINGS, skaters=True))
+    console.print(heaps(1600, 9.0, 3, range(2), (0.0, 0.1), skaters=False))
+    console.print(drums(10.0))
+    console.print(silos((50, 100, 150, 200, 300, 400, 600)))
+    for resistance in (0.0, 0.1):
+        console.print(flows(1500, (5.0, 6.5, 8.0, 10.0, 12.0), resistance, pythons))
+
+
+if __name__ == "__main__":
+    main()

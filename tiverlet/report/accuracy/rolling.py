@@ -1,0 +1,262 @@
+"""One or two spheres that spin, with known answers, beside other engines with the same substeps.
+
+Spheres, so k = m r^2 / I = 5/2, that move in a plane, so that engines of the plane take part.
+"""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+from rich.table import Table
+
+from ...colliders import HalfSpace
+from ...contact import Contact
+from ...forces import Gravity
+from ...particles import Particles
+from ...world import World
+from ..output import said
+from . import grain_peers
+
+G, K, RADIUS, FRAME = 9.81, 2.5, 0.1, 1 / 60
+SUBSTEPS = (5, 20, 80)
+PATIENCE = 300.0  # [s] for another engine
+SMALL = 1e-9  # relative errors below which an order says nothing
+
+
+@dataclass(frozen=True)
+class Case:
+    """Bodies above the floor y = 0, or without one, and what the law says of the one that is watched, the last.
+
+    x, v: (n, 2) [m, m/s]; omega: (n,) [rad/s]; mass 0: it cannot move. answer: place (2,), velocity (2,) and angular velocity
+    after so many seconds. bounces: whether what happens is an impact.
+    """
+
+    title: str
+    seconds: float
+    answer: tuple[np.ndarray, np.ndarray, float]
+    x: ArrayLike
+    v: ArrayLike
+    omega: Sequence[float]
+    friction: float
+    gravity: tuple[float, float] = (0.0, -G)
+    restitution: float = 0.0
+    tangential: float = 0.0
+    mass: Sequence[float] = (1.0,)
+    radius: Sequence[float] = (RADIUS,)
+    floor: bool = True
+    bounces: bool = False
+
+    def job(self, substeps: int) -> dict:
+        """For grain_peers."""
+        names = ("friction", "restitution", "tangential", "floor", "bounces")
+        lists = {name: np.asarray(getattr(self, name), dtype=float).tolist() for name in ("x", "v", "omega", "mass", "radius")}
+        steps = round(self.seconds / FRAME) * substeps
+        h = {"h": FRAME / substeps, "steps": steps, "share": K, "gravity": list(self.gravity)}
+        return {name: getattr(self, name) for name in names} | lists | h
+
+    def world(self, precision: str) -> World:
+        """It, here."""
+        mass = np.asarray(self.mass)
+        start = Particles(
+            self.x, velocity=self.v, mass=np.where(mass > 0, mass, 1.0), radius=self.radius, pinned=mass == 0, spin=self.omega,
+            inertia="sphere",
+        )  # fmt: skip
+        law = {"friction": self.friction, "restitution": (self.restitution, self.tangential) if self.bounces else 0.0}
+        wall = [HalfSpace((0, 1), **law)] if self.floor else []
+        return World(start, [Gravity(self.gravity), *wall, *([Contact(**law)] if len(mass) > 1 else [])], precision=precision)
+
+    def errors(self, found: Sequence[float]) -> tuple[float, float]:
+        """Of (x, y, v_x, v_y, omega): that of v and r omega, and that of the place, relative to how fast and how far it is."""
+        place, velocity, omega = self.answer
+        r = self.radius[-1]
+        speed, way = np.hypot(*velocity) + r * abs(omega), np.hypot(*(place - np.asarray(self.x)[-1]))
+        off = max(np.hypot(*(np.asarray(found[2:4]) - velocity)), r * abs(found[4] - omega))
+        return float(off / speed), float(np.hypot(*(np.asarray(found[:2]) - place)) / way)
+
+
+def downhill(angle: float, mu: float, seconds: float = 0.5) -> Case:
+    """A sphere on an incline [rad]: a = k / (1 + k) g sin a, omega = -a t / r while tan a <= (1 + k) mu; beyond that it slips,
+    a = g (sin a - mu cos a), omega = -k mu g cos a t / r."""
+    pull, weight = G * np.sin(angle), G * np.cos(angle)
+    rolls = np.tan(angle) <= (1 + K) * mu
+    a = K / (1 + K) * pull if rolls else pull - mu * weight
+    alpha = a if rolls else K * mu * weight
+    t = seconds
+    answer = np.array([a * t**2 / 2, RADIUS]), np.array([a * t, 0.0]), float(-alpha * t / RADIUS)
+    title = f"{'rolls' if rolls else 'slips'} down {np.degrees(angle):.0f} degrees, friction {mu}"
+    return Case(title, t, answer, [(0, RADIUS)], [(0, 0)], [0], mu, gravity=(float(pull), float(-weight)))
+
+
+def bowled(v0: float = 3.0, mu: float = 0.2, seconds: float = 1.0) -> Case:
+    """Thrown without spin on a floor it slides until v0 / ((1 + k) mu g) and rolls on at k / (1 + k) v0."""
+    t1, v = v0 / ((1 + K) * mu * G), K / (1 + K) * v0
+    x = v0 * t1 - mu * G * t1**2 / 2 + v * (seconds - t1)
+    answer = np.array([x, RADIUS]), np.array([v, 0.0]), -v / RADIUS
+    return Case("slides, then rolls", seconds, answer, [(0, RADIUS)], [(v0, 0)], [0], mu)
+
+
+def collision(mu: float, e: float = 0.8, beta: float = 0.0, seconds: float = 0.5) -> Case:
+    """Two spheres that spin (Walton 1993; Foerster et al. 1994): the normal velocity is reversed, times e; the tangential one of
+    the points that touch, times beta, by an impulse of at most mu times the normal one."""
+    m, r = np.array([1.0, 2.5]), np.array([0.1, 0.15])
+    x, v = np.array([(0.0, 0.0), (0.5, 0.12)]), np.array([(2.0, 0.3), (-1.0, 0.5)])
+    omega = np.array([10.0, -20.0])
+    d, u = x[0] - x[1], v[0] - v[1]
+    a, b, c = u @ u, d @ u, d @ d - r.sum() ** 2
+    hit = (-b - np.sqrt(b * b - a * c)) / a
+    n = (d + hit * u) / r.sum()
+    t = np.array([-n[1], n[0]])
+    push = -(1 + e) * (u @ n) / (1 / m).sum()
+    slip = u @ t - omega @ r
+    grip = -(1 + beta) * slip / ((1 + K) / m).sum()
+    sticks = abs(grip) <= mu * push
+    grip = np.clip(grip, -mu * push, mu * push)
+    after = v[1] - (push * n + grip * t) / m[1]
+    spin = float(omega[1] - grip * K / (m[1] * r[1]))
+    answer = x[1] + hit * v[1] + (seconds - hit) * after, after, spin
+    how = "grip" if sticks else "slip"
+    title = f"two that collide and {how}, friction {mu}, restitution ({e}, {beta})"
+    return Case(
+        title, seconds, answer, x, v, omega.tolist(), mu, gravity=(0.0, 0.0), restitution=e, tangential=beta, mass=m.tolist(),
+        radius=r.tolist(), floor=False, bounces=True,
+    )  # fmt: skip
+
+
+def super_ball(bounces: int = 3, height: float = 0.5, v: float = 2.0) -> Case:
+    """e = 1 across and along: each bounce turns v + r omega around by an impulse of 2 / (1 + k) of it, so the second undoes the
+    first (Garwin 1969)."""
+    fall = np.sqrt(2 * height / G)
+    spin, x, left = 0.0, fall * v, 0.0
+    seconds = round((2 * bounces * fall) / FRAME) * FRAME
+    for k in range(bounces):
+        change = -2 * (v + RADIUS * spin) / (1 + K)
+        v, spin = v + change, spin + K * change / RADIUS
+        left = seconds - (2 * k + 1) * fall
+        x += v * min(2 * fall, left)
+    up = np.sqrt(2 * G * height)
+    answer = np.array([x, RADIUS + up * left - G * left**2 / 2]), np.array([v, up - G * left]), spin
+    return Case(
+        f"a super ball bounces {bounces} times", seconds, answer, [(0, RADIUS + height)], [(2.0, 0)], [0], 1e3, restitution=1.0,
+        tangential=1.0, bounces=True,
+    )  # fmt: skip
+
+
+def from_another(seconds: float = 0.5, theta: float = 0.3) -> Case:
+    """A sphere rolls off a larger one, (1 + 1 / k) (R + r) theta'' = g sin theta; by Runge and Kutta in 2000 steps."""
+    R, r, steps = 1.0, 0.2, 2000
+    h, y = seconds / steps, np.array([theta, 0.0])
+
+    def rate(y):
+        """theta', theta''."""
+        return np.array([y[1], G * np.sin(y[0]) / ((R + r) * (1 + 1 / K))])
+
+    def place(angle):
+        """On the larger one."""
+        return (R + r) * np.array([np.sin(angle), np.cos(angle)])
+
+    for _ in range(steps):
+        a = rate(y)
+        b = rate(y + h / 2 * a)
+        c = rate(y + h / 2 * b)
+        y = y + h / 6 * (a + 2 * b + 2 * c + rate(y + h * c))
+    velocity = (R + r) * y[1] * np.array([np.cos(y[0]), -np.sin(y[0])])
+    answer = place(y[0]), velocity, float(-y[1] * (R + r) / r)
+    x = np.array([(0.0, 0.0), tuple(place(theta))])
+    return Case(
+        "rolls off another", seconds, answer, x, np.zeros((2, 2)), [0, 0], 5.0, mass=[0.0, 1.0],
+        radius=[R, r], floor=False,
+    )  # fmt: skip
+
+
+def cases() -> list[Case]:
+    """All of them."""
+    return [
+        downhill(np.radians(30), 0.3), downhill(np.radians(55), 0.3), bowled(), from_another(), collision(0.1), collision(1.0),
+        collision(1.0, beta=0.5), super_ball(),
+    ]  # fmt: skip
+
+
+def here(case: Case, precision: str, substeps: Iterable[int] = SUBSTEPS) -> list[tuple[float, float]]:
+    """The errors of tiverlet."""
+    out = []
+    with case.world(precision) as world:
+        p = world.particles
+        for n in substeps:
+            world.position, world.velocity, world.spin, world.substeps = p.position, p.velocity, case.omega, n
+            world.run(case.seconds)
+            out.append(case.errors([*world.position[-1], *world.velocity[-1], world.spin[-1]]))
+    return out
+
+
+def ask(engine: str, pythons: Sequence[str], jobs: list[dict]) -> list | str:
+    """What grain_peers answers, with the first Python that has the engine; or why there is none."""
+    why = "not installed"
+    for python in pythons:
+        command = [python, "-P", str(Path(grain_peers.__file__)), engine]
+        try:
+            done = subprocess.run(command, input=json.dumps(jobs), capture_output=True, text=True, timeout=PATIENCE)
+            done.check_returncode()
+        except (OSError, subprocess.SubprocessError) as error:
+            why = said(error)
+            continue
+        answers = json.loads(done.stdout)
+        if not isinstance(answers[0], str) or not answers[0].startswith("not installed"):
+            return answers
+    return why
+
+
+def there(engine: str, pythons: Sequence[str], given: Sequence[Case], substeps: Sequence[int] = SUBSTEPS) -> list[list]:
+    """The errors of another engine, a list for each case, or why there are none."""
+    answers = ask(engine, pythons, [case.job(n) for n in substeps for case in given])
+    if isinstance(answers, str):
+        return [[answers] * len(substeps) for _ in given]
+    return [
+        [found if isinstance(found, str) else case.errors(found[-1]) for found in answers[k :: len(given)]]
+        for k, case in enumerate(given)
+    ]
+
+
+def order(errors: Sequence[float], substeps: Sequence[int] = SUBSTEPS) -> str:
+    """By least squares, where errors are more than rounding, and fall."""
+    if len(errors) < len(substeps) or not (np.diff(errors) < 0).all() or min(errors) < SMALL:
+        return ""
+    return f"{-np.polyfit(np.log(substeps), np.log(errors), 1)[0]:.1f}"
+
+
+def measured(pythons: Sequence[str], log: Callable[[str], None]) -> dict[str, list[list]]:
+    """The errors, or why there are none, of each engine: a list for each case, with an entry for each of SUBSTEPS."""
+    given, rows = cases(), {}
+    for precision in ("f32", "f64"):
+        log(f"tiverlet, {precision}")
+        rows[f"tiverlet, {precision}"] = [here(case, precision) for case in given]
+    for engine in grain_peers.ENGINES:
+        log(engine)
+        rows[engine] = there(engine, pythons, given)
+    return rows
+
+
+def tables(pythons: Sequence[str] = (sys.executable,), log: Callable[[str], None] = lambda line: None) -> list[Table]:
+    """One for each case. pythons: where other engines are looked for."""
+    rows, out = measured(pythons, log), []
+    for k, case in enumerate(cases()):
+        table = Table("substeps", title=case.title, caption="relative errors of velocity, spin included, and of place")
+        for name in [f"{what}, {n}" for what in ("velocity", "place") for n in SUBSTEPS]:
+            table.add_column(name, justify="right")
+        table.add_column("orders")
+        for name, found in rows.items():
+            numbers = [f for f in found[k] if not isinstance(f, str)]
+            if not numbers:
+                table.add_row(name, found[k][0])
+                continue
+            cells, orders = [], []
+            for column in zip(*numbers, strict=True):
+                cells += [f"{error:.0e}" for error in column] + ["-"] * (len(SUBSTEPS) - len(numbers))
+                orders.append(order(column) or "-")
+            table.add_row(name, *cells, ", ".join(orders))
+        out.append(table)
+    return out
