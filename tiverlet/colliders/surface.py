@@ -212,8 +212,8 @@ class Surface:
 
     @ti.func
     def bounce(self, gap, leaving, before, after):
-        """What is above the wall at the end of the substep, the normal displacement that carries the velocity then, and which part
-        of the substep is left after the impact: all of it where there is no bounce.
+        """What is above the wall at the end of the substep, the normal displacement that carries the velocity then, and which
+        part of the substep is left after the impact: all of it where there is no bounce.
 
         In units of the substep, the height is gap + v s + k s^2 / 2, with k the acceleration and v = leaving - k / 2; the impact
         is at its root s. A bounce that would end below the wall has come to rest.
