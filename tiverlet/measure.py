@@ -84,7 +84,8 @@ def overlapping(
 
 def _spin(world: "World") -> np.ndarray:
     """Angular velocities, (n, 1) in 2D and (n, 3) in 3D [rad/s]."""
-    return world.spin.reshape(len(world.particles), 2 * world.particles.dim - 3)
+    n, axes = len(world.particles), 2 * world.particles.dim - 3
+    return world.spin.reshape(n, axes) if world.particles.spins else np.zeros((n, axes))
 
 
 def _mass(world: "World") -> np.ndarray:

@@ -119,7 +119,7 @@ def rigid(features: list[Any], free: np.ndarray, x: np.ndarray) -> tuple[float, 
             continue
         if not isinstance(f, Scalar) or not f.arity or f.collapses or (f.compliance > 0).any():
             whole = False
-        if isinstance(f, Scalar) and f.driven:
+        if isinstance(f, Scalar) and (f.driven or (f.side and (f.load > 0).any())):  # what still pulls where it is slack counts
             whole = False
         if not isinstance(f, Scalar) or f.driven:
             continue

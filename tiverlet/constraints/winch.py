@@ -101,7 +101,7 @@ class Winch(Link):
         if self.acts:
             self.dev.drive.upload(*self._course(), self.force)
 
-    def placed(self, position: np.ndarray, first: int) -> None:
+    def start_at(self, position: np.ndarray, first: int) -> None:
         """Ropes that can run out have done so, where their ends were placed further apart."""
         far = np.isfinite(self.force) & (self.violation(position) > 0) & (self.indices >= first).any(axis=1)
         if far.any():

@@ -80,9 +80,9 @@ class Table:
             pairs = checks.rows(who, "groups", touching, "a list of pairs of groups, such as [(0, 1)],")
             self.touching = [self._pair("groups", p) for p in pairs]
         pairs = checks.rows(who, "sensors", sensing, "a list of pairs of groups, such as [(0, 1)],")
-        self.sensing = [self._pair("sensors", p) for p in pairs]
-        self.senses = bool(self.sensing)
-        for a, b in self.sensing:
+        self.sensing = noting = [self._pair("sensors", p) for p in pairs]
+        self.senses = bool(noting)
+        for a, b in noting:
             if {(a, b), (b, a)} & {*(self.touching or ())}:
                 raise ValueError(f"{who}: groups has {(a, b)}, which touch, and so has sensors; leave one of them out.")
         single = not isinstance(friction, Mapping) and not isinstance(restitution, Mapping)

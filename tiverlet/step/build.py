@@ -30,7 +30,6 @@ from . import high_order
 from .diagnostics import Diagnostics
 from .frames import Frames
 from .integrator import Forces, Verlet
-from .periodic_fit import refuse_misfits
 from .step import Step
 
 T = TypeVar("T", bound=Feature)
@@ -105,6 +104,8 @@ def assemble(
         feature.prepare(feature.start, inv_mass)
     refuse_held_twice(particles, features)
     if box:
+        from .periodic_fit import refuse_misfits  # noqa: PLC0415  (it knows of features that there may not be)
+
         refuse_misfits(box, particles, features)
     for feature, start in zip(features, starts, strict=True):
         if start is None:
