@@ -181,7 +181,7 @@ class Contact(PairContact):
                     j = self.dev.grid.neighbour[e]
                     last = self.dev.push.field[e]
                     shared = self.dev.splitting.weight[i] + self.dev.splitting.weight[j]
-                    overlap, each, n = self.dev.geometry.impact(i, j, self.dev.geometry.contact_distance(i, j), shared)
+                    overlap, each, n, reach = self.dev.geometry.impact(i, j, self.dev.geometry.contact_distance(i, j), shared)
                     each *= ti.static(RELAXATION)
                     paid, given, rests, alone = overlap, ti.zero(overlap), True, w + self.dev.w.of(j)
                     if ti.static(self.dev.has_restitution):
@@ -210,7 +210,7 @@ class Contact(PairContact):
                     push += part
                     want = part * n
                     if ti.static(self.dev.spins):
-                        tangential, turned = self.grip(i, j, e, n, part + given / shared, given > 0)
+                        tangential, turned = self.grip(i, j, e, n, reach, part + given / shared, given > 0)
                         want += tangential
                         if ti.static(self.dev.has_restitution):
                             if given > 0:  # it acts from the time of impact on
@@ -248,10 +248,10 @@ class Contact(PairContact):
         return self.dev.friction.held(i, j, n, normal, moved)
 
     @ti.func
-    def grip(self, i, j, e, n, pressed, bounces):
+    def grip(self, i, j, e, n, reach, pressed, bounces):
         """What friction between particles that spin pushes i by, and turns its surface by, both per inverse mass, for a push
-        `pressed` along the normal."""
-        m, split_mass = self.dev.spinning.arm(i, j, n), self.dev.spinning.split_mass(i, j)
+        `pressed` along the normal of a pair that is `reach` apart."""
+        m, split_mass = self.dev.spinning.arm_of(i, j, n, reach), self.dev.spinning.split_mass(i, j)
         slip = self.dev.slip.field[e] + self.dev.spinning.slip(i, j, m)
         if ti.static(self.dev.turns and self.dev.has_restitution):
             if bounces:

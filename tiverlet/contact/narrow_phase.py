@@ -72,7 +72,8 @@ class DiscGeometry:
 
     @ti.func
     def impact(self, i, j, contact_distance, shared):
-        """Overlap, 1 / shared, and normal, as in overlap(), of a pair that touches.
+        """Overlap, 1 / shared, and normal, as in overlap(), of a pair that touches; and how far from each other it was where its
+        push acts, for particles that spin.
 
         A pair that came together in this substep has the normal that it had at the time of impact: |r0 + s d| = contact_distance,
         with r0 at the start and d the relative displacement; what is left of d along n is the overlap. This is exact for free
@@ -99,10 +100,12 @@ class DiscGeometry:
                 s = ti.min(c / root, 1)
                 n = (r + s * d) / contact_distance
                 overlap = ti.max((s - 1) * d.dot(n), 0)
-        elif ti.static(self.state.spins):
-            if r.dot(r) > contact_distance * contact_distance * ti.static(SAME_PLACE):
-                n = r.normalized()
-        return overlap, each, n
+        reach = contact_distance
+        if ti.static(self.state.spins):
+            before = ti.sqrt(c + contact_distance * contact_distance)
+            if c <= 0 and before > contact_distance * ti.static(SAME_PLACE**0.5):
+                n, reach = r / before, before
+        return overlap, each, n, reach
 
     @ti.func
     def fallback_normal(self, i, j, r):

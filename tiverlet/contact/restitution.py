@@ -81,7 +81,7 @@ class Restitution:
             for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
                 if self.struck.field[e] > 0:
                     j = self.grid.neighbour[e]
-                    overlap, _each, n = self.geometry.impact(i, j, self.geometry.contact_distance(i, j), self.weight[i])
+                    overlap, _each, n, _reach = self.geometry.impact(i, j, self.geometry.contact_distance(i, j), self.weight[i])
                     given, here, a = self.target(i, j, n)
                     if overlap > 0 and a > 0 and given > 0:
                         left = ti.select(overlap < here, overlap / here, 1)

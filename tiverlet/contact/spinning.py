@@ -35,8 +35,13 @@ class Spinning:
         self.change = add("Contact.spin_change", n, width=self.spin.axes)
 
     @ti.func
+    def arm_of(self, i, j, n, reach):
+        """The arm m of a pair that is so far apart along the normal n where its push acts."""
+        return reach / (self.radius.of(i) + self.radius.of(j)) * n
+
+    @ti.func
     def arm(self, i, j, n):
-        """The arm m of a pair that touches along the normal n."""
+        """The same after the pass."""
         distance = self.radius.of(i) + self.radius.of(j)
         r = self.state.apart(i, j) - self.state.slid(self.state.d[i] - self.state.d[j], i, j)
         return ti.select(r.dot(r) > distance * distance, n, r / distance)
