@@ -390,3 +390,21 @@ def test_none_and_some_that_spin(world):
     np.testing.assert_allclose(w.spin, [0, 3], atol=1e-6)
     w.remove([0])
     np.testing.assert_allclose(w.spin, [3], atol=1e-6)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_recordings_show_angular_momentum(world, dim, tmp_path, read_here):
+    # Two that collide and spin: the curve is that of measure, but for half a substep, and constant to rounding in f64.
+    x = np.zeros((2, dim))
+    x[1, :2] = 0.5, 0.07
+    start = tv.Particles(x, velocity=[np.eye(dim)[0], -np.eye(dim)[0]], radius=0.1, spin=turning(3.0, dim))
+    w = world(start, [tv.Contact(friction=0.5, restitution=0.7)], precision="f64")
+    about = tv.measure.angular_momentum(w)
+    with tv.Recorder(tmp_path / "spin.rrd", w) as recorder:
+        for _ in range(30):
+            w.step(1 / 60)
+            recorder.log()
+    recording = tv.replay(tmp_path / "spin.rrd")
+    assert recording.verify()
+    for axis, want in zip("z" if dim == 2 else "xyz", about, strict=True):
+        np.testing.assert_allclose(recording.curves[f"angular momentum/{axis}"][1], want, atol=1e-14)

@@ -7,6 +7,7 @@ import numpy as np
 from ..colliders.collider import Collider
 from ..constraints.core.anchored import Anchored
 from ..features.feature import Batch
+from ..spin import moments
 from ..step.checkpoint import Checkpoint
 from ..step_report import StepReport
 
@@ -26,7 +27,22 @@ CURVES = {
     "Substeps": ("substeps", {"substeps": ("substeps", [150, 160, 175])}),
     "Time per frame [ms]": ("milliseconds", {"milliseconds": ("ms", [190, 140, 220])}),
 }  # fmt: skip
+# Where particles spin: of the axes the first one in 2D.
+SPIN = {
+    "Angular momentum [kg m^2/s]": ("angular_momentum", {
+        "angular momentum/z": ("z", [110, 150, 240]), "angular momentum/x": ("x", [235, 110, 100]),
+        "angular momentum/y": ("y", [130, 200, 110]),
+    }),
+}  # fmt: skip
 OWN = "own"  # the begin of the paths of quantities of the user's
+
+
+def curves_of(world: "World") -> dict[str, tuple[str, dict[str, Any]]]:
+    """CURVES, and where particles spin their angular momentum about the origin."""
+    if not world.particles.spins:
+        return CURVES
+    ((title, (end, curves)),) = SPIN.items()
+    return CURVES | {title: (end, {name: curves[name] for name in list(curves)[: 1 if world.particles.dim == 2 else 3]})}
 
 
 def shown(world: "World") -> dict[str, tuple[str, list[bool]]]:
@@ -37,9 +53,11 @@ def shown(world: "World") -> dict[str, tuple[str, list[bool]]]:
     hidden = {
         "residual": not any(isinstance(f, Batch) for f in world.features), "overlap": not world._runner.step.contacts,
         "substeps": world.settings["substeps"] != "auto", **{f"momentum/{axis}": held for axis in "xyz"},
+        **{f"angular momentum/{axis}": held for axis in "xyz"},
     }  # fmt: skip
     out = {
-        title: (end, [not hidden.get(name, False) for name in _names(curves, world)]) for title, (end, curves) in CURVES.items()
+        title: (end, [not hidden.get(name, False) for name in _names(curves, world)])
+        for title, (end, curves) in curves_of(world).items()
     }
     return {title: (end, those) for title, (end, those) in out.items() if any(those)}
 
@@ -56,11 +74,12 @@ class Curves:
         import rerun as rr
 
         self._rr, self._stream = rr, stream
+        self._curves = curves_of(world)
         self.weigh(world)
         self._rows: dict[str, list[tuple[int, float, list[float]]]] = {}
         self._begun = False
         self.own: list[str] = []  # quantities of the user's
-        for title, (end, curves) in CURVES.items():
+        for title, (end, curves) in self._curves.items():
             titles, colors = zip(*(curves[name] for name in _names(curves, world)), strict=True)
             _, those = shown(world).get(title, (end, [False] * len(titles)))
             lines = rr.SeriesLines(names=titles, colors=colors, visible_series=those)
@@ -70,6 +89,8 @@ class Curves:
         """Look at the masses; there may be others when particles were added or removed."""
         p = world.particles
         self._mass = np.where(p.inv_mass > 0, p.mass, 0.0)
+        # What is multiplied by r omega to make I omega.
+        self._lever = np.divide(moments(p), p.radius, out=np.zeros(len(p)), where=p.radius > 0)
 
     def add(self, frame: int, report: StepReport, now: Checkpoint) -> None:
         """The figures of a frame. The momentum is that of the displacements, half a substep ago, as the energy is."""
@@ -77,12 +98,24 @@ class Curves:
         momentum = scale * (self._mass @ now.values["displacement"][: len(self._mass)])
         figures = {name: getattr(report, name) for name in ("residual", "overlap", "energy", "substeps")}
         figures |= {f"momentum/{axis}": p for axis, p in zip("xyz", momentum.tolist(), strict=False)}
+        if "spin" in now.values:
+            figures |= self._angular(now, scale)
         if self._begun:  # the first frame compiles the kernels, and would dwarf all others
             figures["milliseconds"] = report.seconds * 1e3
         self._begun = True
-        for end, curves in CURVES.values():
+        for end, curves in self._curves.values():
             if values := [figures[name] for name in curves if name in figures]:
                 self._rows.setdefault(end, []).append((frame, now.clock["_time"], values))
+
+    def _angular(self, now: Checkpoint, scale: float) -> dict[str, float]:
+        """The angular momentum about the origin, of displacements likewise: m x (x_n - d) x d / h + I omega."""
+        n = len(self._mass)
+        d, spin = scale * now.values["displacement"][:n].astype(np.float64), scale * now.values["spin"][:n]
+        x, p, own = now.position(n), self._mass[:, None] * d, self._lever @ spin
+        if x.shape[1] == 2:
+            return {"angular momentum/z": float(own[0] + np.sum(x[:, 0] * p[:, 1] - x[:, 1] * p[:, 0]))}
+        total = own + np.cross(x, p).sum(axis=0)
+        return {f"angular momentum/{axis}": float(v) for axis, v in zip("xyz", total, strict=True)}
 
     def log(self, frame: int, time: float, numbers: dict[str, float]) -> None:
         """Quantities of the user's."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from .. import checks
 from ..contact import Polygons
-from .curves import CURVES
+from .curves import CURVES, SPIN
 from .strain import legend
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def checked_color(value: Any) -> tuple[str, float, float] | None:
 
 def checked_quantities(given: dict[str, Any], count: int) -> dict[str, Any]:
     """Quantities of the user's as floats, and arrays (count,) in f64."""
-    taken = {name for _, curves in CURVES.values() for name in curves}
+    taken = {name for _, curves in (CURVES | SPIN).values() for name in curves}
     out: dict[str, Any] = {}
     for name, value in given.items():
         array = np.asarray(value)

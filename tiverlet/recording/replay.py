@@ -15,7 +15,7 @@ from ..device.language import NAMES
 from ..shapes import Shape
 from ..step import checkpoint
 from . import journal, rrd, scene
-from .curves import CURVES, OWN
+from .curves import CURVES, OWN, SPIN
 from .journal import Entry
 from .redraw import Redraw, compare
 from .scene import plain
@@ -421,7 +421,7 @@ def _curves(contents: rrd.Contents) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         name = contents.entities[entity]
         if name.startswith("figures/"):
             found.setdefault(name[len("figures/") :], {})[frame] = k
-    out, known = {}, {end: list(curves) for end, curves in CURVES.values()}
+    out, known = {}, {end: list(curves) for end, curves in (CURVES | SPIN).values()}
     found = {end.removeprefix(f"{OWN}/"): rows for end, rows in found.items()}
     for end, rows in found.items():
         frames = sorted(rows)
