@@ -37,7 +37,7 @@ def check(world: tv.World, angle: float) -> None:
     """Grains stay inside, and the heap leans as heaps of such grains do."""
     if (np.linalg.norm(world.position, axis=1) > 1.0).any():
         raise SystemExit("a grain is outside of the drum")
-    if not 18 < angle < 40:
+    if not 18 < angle < 45:
         raise SystemExit(f"the heap leans by {angle:.0f} degrees")
 
 

@@ -55,7 +55,7 @@ def test_pay_finds_that_features_only_add(printed):
         ("pendulums", {"settings": [("SECONDS", 4.0)], "side": 12}, "so a million take"),
         ("stairs", {"built": {"rows": 2}, "seconds": 2.0}, "are down"),
         ("silo", {"settings": [("GRAINS", 250), ("SETTLED", 2.5)], "seconds": 4.5}, "of the weight"),
-        ("drum", {"settings": [("GRAINS", 150), ("RADIUS", 0.05)], "seconds": 4.0}, "the heap leans"),
+        ("drum", {"settings": [("GRAINS", 250), ("RADIUS", 0.04)], "seconds": 4.0}, "the heap leans"),
         ("billiards", {}, "all at rest"),
         *((name, {}, f"{name}.rrd") for name in ("soft", "bead", "tidy", "ragdoll", "machine", "buggy")),
     ],
