@@ -27,10 +27,14 @@ def angular_momentum(world: "World", about=None) -> np.ndarray:
     """Sum of m (x - about) x v + I omega [kg m^2/s]: (1,) in 2D, (3,) in 3D; about the origin where no point is given."""
     r = world.position - (0.0 if about is None else np.asarray(about))
     p = _mass(world)[:, None] * world.velocity
-    own = moments(world.particles) @ _spin(world)
+    return moments(world.particles) @ _spin(world) + moment_sum(r, p)
+
+
+def moment_sum(r: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """Sum of r x p of vectors (n, dim): (1,) in 2D, (3,) in 3D."""
     if r.shape[1] == 2:
-        return own + np.sum(r[:, 0] * p[:, 1] - r[:, 1] * p[:, 0])
-    return own + np.cross(r, p).sum(axis=0)
+        return np.array([np.sum(r[:, 0] * p[:, 1] - r[:, 1] * p[:, 0])])
+    return np.cross(r, p).sum(axis=0)
 
 
 def torque(world: "World") -> np.ndarray:
@@ -84,8 +88,8 @@ def overlapping(
 
 def _spin(world: "World") -> np.ndarray:
     """Angular velocities, (n, 1) in 2D and (n, 3) in 3D [rad/s]."""
-    n, axes = len(world.particles), 2 * world.particles.dim - 3
-    return world.spin.reshape(n, axes) if world.particles.spins else np.zeros((n, axes))
+    shape = len(world.particles), world.particles.axes
+    return world.spin.reshape(shape) if world.particles.spins else np.zeros(shape)
 
 
 def _mass(world: "World") -> np.ndarray:

@@ -72,6 +72,11 @@ class Particles:
         return extent or float(self.radius.max(initial=0.0)) or 1.0
 
     @property
+    def axes(self) -> int:
+        """Of rotation: 1 in 2D, 3 in 3D."""
+        return 2 * self.dim - 3
+
+    @property
     def spins(self) -> bool:
         """Whether they spin."""
         return self.spin is not None
@@ -170,7 +175,7 @@ def spin_of(who: str, spin, particles: "Particles") -> np.ndarray:
         if array.ndim == 1 and array.shape != (0,):
             array = np.broadcast_to(checks.vector(who, "spin", spin, 3), zero.shape)
         rates = zero if array.ndim == 0 else checks.points(who, "spin", array, dim=3, count=n)
-    turned = (rates != 0).reshape(n, 2 * particles.dim - 3).any(axis=1) & (particles.radius == 0)
+    turned = (rates != 0).reshape(n, particles.axes).any(axis=1) & (particles.radius == 0)
     if turned.any():
         i = int(np.argmax(turned))
         raise ValueError(f"{who}: spin[{i}] = {rates[i]}, but particle {i} is a point (radius 0), which does not spin.")

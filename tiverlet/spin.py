@@ -6,7 +6,6 @@ import numpy as np
 
 from .device import ti
 from .device.memory import Memory
-from .device.number import OnDevice
 from .particles import Particles, Shared, at_rest
 
 
@@ -23,12 +22,9 @@ class Spin:
     axes: 1 in 2D, 3 in 3D. orients: whether it is known how far particles have turned since the start.
     """
 
-    count: Any = OnDevice()
-
     def __init__(self, memory: Memory, particles: Particles, inv_mass: np.ndarray):
         n, self.dim, self.real = particles.count, particles.dim, memory.real
-        self.axes = 1 if self.dim == 2 else 3
-        self.memory, self.count, self.radius = memory, memory.number(n), particles.radius
+        self.axes, self.radius = particles.axes, particles.radius
         self.s = memory.field("spin", n, width=self.axes, values=self.from_rates(particles.spin), state=True)
         self.share = Shared(memory, "spin_share", shares(particles, inv_mass))
         self.orients = particles.orientation is not None

@@ -10,7 +10,7 @@ from ..features.feature import Knob, Scene
 from ..particles import Particles
 from .collider import Collider
 from .pose import Pose, rotation_matrix
-from .shape import Shape
+from .shape import HostShape, Shape
 
 TOUCHES = 8  # of one particle in one substep; then it stays where it is known to be free
 
@@ -94,6 +94,22 @@ class Moving(Collider):
         if self.scene is not None:
             position, rotation = self.dev.pose.position.now, self.dev.pose.rotation.now
         return position, rotation_matrix(rotation) if np.any(rotation) else np.eye(dim)
+
+    def host_shape(self, dim: int) -> HostShape:
+        """Its shape for questions of the host, in its own frame; for as many dimensions where it is not in a world."""
+        raise NotImplementedError
+
+    def clearance(self, points: np.ndarray) -> np.ndarray:
+        """That of the shape, less what it is thickened by."""
+        position, turn = self.frame(points.shape[1])
+        return self.host_shape(points.shape[1]).clearance((points - position) @ turn) - self.radius
+
+    def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+        """In the frame of the shape."""
+        position, turn = self.frame(origin.shape[1])
+        shape = self.host_shape(origin.shape[1])
+        distance, normal = shape.cast((origin - position) @ turn, direction @ turn, self.radius + radius)
+        return distance, normal @ turn.T
 
     @ti.func
     def pose(self, frame_fraction):

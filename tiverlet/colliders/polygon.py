@@ -8,7 +8,7 @@ from ..features.feature import Scene
 from ..particles import Particles
 from .facets import Facets, FacetShape, facet_normals
 from .moving import Moving
-from .shape import Shape
+from .shape import HostShape, Shape
 
 BLOCK = 1 << 20  # pairs of edges that are compared together
 
@@ -83,16 +83,9 @@ class Polygon(Moving):
         """Its facets."""
         return FacetShape(self.facets, scene, repr(self), self.radius)
 
-    def clearance(self, points: np.ndarray) -> np.ndarray:
-        """The distance to the facets, less what they are thickened by."""
-        position, turn = self.frame(self.dim)
-        return self.facets.clearance((points - position) @ turn) - self.radius
-
-    def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-        """In the frame of the facets."""
-        position, turn = self.frame(self.dim)
-        distance, normal = self.facets.cast((origin - position) @ turn, direction @ turn, self.radius + radius)
-        return distance, normal @ turn.T
+    def host_shape(self, dim: int) -> HostShape:
+        """Likewise."""
+        return self.facets
 
     @property
     def normals(self) -> np.ndarray:

@@ -14,7 +14,7 @@ from ..particles import Particles
 from ..tools import golden
 from .moving import Moving
 from .pose import rotation_matrix
-from .shape import Shape
+from .shape import HostShape, Shape
 
 MARCH = 64  # steps along a way; what has not come to its end by then stays where it is
 FINE = 1 / 64  # of a way: closer than that, the surface is taken for its tangent plane
@@ -72,7 +72,7 @@ class Sdf(Moving):
         reach = float((high - low).max()) or float(particles.radius.max()) or 1.0
         around = low - reach / 2 + golden(np.arange(SAMPLES), dim=self.dim) * (high - low + reach)
         points = (np.concatenate([x[:SAMPLES], around]) - self.position) @ rotation_matrix(self.rotation)
-        value, slope = self.dev.probe.value(points), self.dev.probe.slope(points, 1e-6 * reach)
+        value, slope = self.dev.probe.clearance(points), self.dev.probe.slope(points, 1e-6 * reach)
         size = np.linalg.norm(slope, axis=1)
         bad = ~np.isfinite(value) | ~np.isfinite(size)
         if bad.any():
@@ -114,29 +114,10 @@ class Sdf(Moving):
                 grid[..., a] += line[:, None]
                 grid[..., b] += line[None, :]
                 local = (grid.reshape(-1, self.dim) - self.position) @ rotation_matrix(self.rotation)
-                out.append(contour(grid, self.dev.probe.value(local).reshape(129, 129) - self.radius))
+                out.append(contour(grid, self.dev.probe.clearance(local).reshape(129, 129) - self.radius))
         return np.concatenate(out), 0.0
 
-    def clearance(self, points: np.ndarray) -> np.ndarray:
-        """What the function says, less the radius."""
-        position, turn = self.frame(points.shape[1])
-        return self._probe(points.shape[1]).value((points - position) @ turn) - self.radius
-
-    def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-        """By sphere tracing; the normal is the gradient."""
-        position, turn = self.frame(origin.shape[1])
-        probe = self._probe(origin.shape[1])
-        o, d, radius = (origin - position) @ turn, direction @ turn, self.radius + radius
-        distance, normal = probe.cast(o, d, radius), np.full(o.shape, np.nan)
-        met = distance < np.inf
-        x = o[met] + distance[met, None] * d[met]
-        step = SLOPE * (float(np.abs(x).max(initial=0.0)) or 1.0)
-        slope = probe.gradient(x) if self.gradient else probe.slope(x, step)
-        size = np.linalg.norm(slope, axis=1)[:, None]
-        normal[met] = np.where(size > 0, slope / np.where(size > 0, size, 1.0), -d[met]) @ turn.T
-        return distance, normal
-
-    def _probe(self, dim: int) -> "_Probe":
+    def host_shape(self, dim: int) -> HostShape:
         """The function on the host; outside of any world, too, for as many dimensions as it is asked about."""
         if "probe" not in vars(self.dev) or self.dev.probe.dim != dim:
             runtime.ensure_started()
@@ -253,24 +234,31 @@ class _Probe:
         self.wall: Any = wall
         self.dim = dim
 
-    def value(self, points: np.ndarray) -> np.ndarray:
+    def clearance(self, points: np.ndarray) -> np.ndarray:
         """The function at points (n, dim) of the wall's frame, (n,)."""
         out = np.zeros(len(points))
         with self.compiler():
             self._value(np.ascontiguousarray(points, dtype=np.float64), out)
         return out
 
-    def cast(self, points: np.ndarray, direction: np.ndarray, radius: float) -> np.ndarray:
-        """How far rays go until the function falls to `radius` from above, (n,) [m], inf where it does not in CAST steps."""
-        out = np.zeros(len(points))
+    def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+        """How far rays go until the function falls to `radius` from above, (n,) [m], inf where it does not in CAST steps of
+        sphere tracing, and its gradients there as normals, (n, dim)."""
+        distance, normal = np.zeros(len(origin)), np.full(origin.shape, np.nan)
         with self.compiler():
-            self._cast(np.ascontiguousarray(points), np.ascontiguousarray(direction), radius, out)
-        return out
+            self._cast(np.ascontiguousarray(origin), np.ascontiguousarray(direction), radius, distance)
+        met = distance < np.inf
+        x = origin[met] + distance[met, None] * direction[met]
+        step = SLOPE * (float(np.abs(x).max(initial=0.0)) or 1.0)
+        slope = self.gradient(x) if self.wall.gradient else self.slope(x, step)
+        size = np.linalg.norm(slope, axis=1)[:, None]
+        normal[met] = np.where(size > 0, slope / np.where(size > 0, size, 1.0), -direction[met])
+        return distance, normal
 
     def slope(self, points: np.ndarray, step: float) -> np.ndarray:
         """Its central differences, (n, dim)."""
         moves = np.concatenate([np.eye(self.dim), -np.eye(self.dim)]) * step
-        ahead, behind = np.split(self.value((points + moves[:, None]).reshape(-1, self.dim)).reshape(2 * self.dim, -1), 2)
+        ahead, behind = np.split(self.clearance((points + moves[:, None]).reshape(-1, self.dim)).reshape(2 * self.dim, -1), 2)
         return (ahead - behind).T / (2 * step)
 
     def gradient(self, points: np.ndarray) -> np.ndarray:

@@ -1,6 +1,22 @@
-"""The contract of the shapes that moving colliders hold."""
+"""The contracts of the shapes that moving colliders hold."""
+
+from typing import Protocol
+
+import numpy as np
 
 from ..device import ti
+
+
+class HostShape(Protocol):
+    """A shape in a frame of its own, for questions of the host."""
+
+    def clearance(self, points: np.ndarray) -> np.ndarray:
+        """How far points (k, dim) are from it [m], negative inside of it, (k,)."""
+        ...
+
+    def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+        """As Collider.cast(); radius: with what the shape is thickened by."""
+        ...
 
 
 class Shape:

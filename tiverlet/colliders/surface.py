@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 from ..device import at, inline, ti
+from ..features.material import limited, refuse_turning
 from .wall_log import WallLog
 
 if TYPE_CHECKING:
@@ -35,10 +36,7 @@ class Surface:
         self.spins, self.turns, self.radius = scene.state.spins and self.has_friction, turns, scene.radius
         self.spin: Any = scene.state.spin if scene.state.spins else None
         if turns and not scene.state.spins:
-            raise ValueError(
-                f"{name}: resistance to rolling and tangential restitution are for particles that spin. Leave them out, or give "
-                "tv.Particles a spin."
-            )
+            refuse_turning(name)
         if friction:
             self.friction = scene.memory.field(f"{name}.friction", None, width=2, values=friction[:2])
         if restitution:
@@ -230,12 +228,3 @@ class Surface:
                 rise, left = height, 1 - s
                 after = out + k * (1 - s) - k / 2
         return rise, after, left
-
-
-@ti.func
-def limited(v, most, least):
-    """A vector, if it is no longer than `most`; else it in the length `least`."""
-    size = v.norm()
-    if size > most:
-        v *= least / size
-    return v

@@ -10,6 +10,7 @@ from .. import checks
 from ..device import ti
 from ..device.thread_team import Team
 from ..features.feature import Batch, Knob, Scene
+from ..features.material import refuse_turning
 from ..neighbours.neighbour_list import WORD, PairData, lowest_bit
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
@@ -95,10 +96,7 @@ class Contact(PairContact):
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Choose the skin, and refuse positions too far out for cells to be told apart."""
         if self.wanted.turns and not particles.spins:
-            raise ValueError(
-                "Contact: resistance to rolling and tangential restitution are for particles that spin. Leave them out, or give "
-                "tv.Particles a spin."
-            )
+            refuse_turning("Contact")
         radius = particles.radius
         some = radius[radius > 0]
         auto = 0.75 * median(some) if len(some) else 1.0
@@ -119,8 +117,8 @@ class Contact(PairContact):
         # What parted the pair in the last substep, per inverse mass [kg m].
         dev.push = PairData("push", 0, lasting=True, marked=True)
         dev.slip = PairData("slip", dim, lasting=True)
-        dev.spins = scene.state.spins and dev.has_friction
-        dev.turn = PairData("turn", 2 * dim - 3, lasting=True) if dev.turns else None  # 1 in 2D, 3 in 3D
+        dev.spins, dev.axes = scene.state.spins and dev.has_friction, scene.particles.axes
+        dev.turn = PairData("turn", dev.axes, lasting=True) if dev.turns else None
         dev.slack = PairData("slack", 0, lasting=True)  # of the overlap, what no push is for
         dev.impulse = PairData("given", 0, lasting=True)  # pushes and impacts in the last substep [kg m]
         struck, bouncing = PairData("struck", 0, lasting=False), [dev.slack] if dev.has_restitution else []
@@ -148,7 +146,7 @@ class Contact(PairContact):
             dev.restitution = Restitution(scene, dev.geometry, self.table, struck, dev.slack, dev.impulse, noted)
             dev.hit = dev.restitution.hit
         if dev.spins:
-            dev.spinning = Spinning(scene, self.table, dev.geometry, dev.splitting.weight, dev.turn)
+            dev.spinning = Spinning(scene, self.table, dev.splitting.weight, dev.turn)
         dev.projection = VelocityProjection(scene, dev.grid, dev.push, dev.splitting.weight, dev.restitution, dev.move, team)
         return dev.grid
 
@@ -167,7 +165,7 @@ class Contact(PairContact):
         """What the pairs of particle i want of it."""
         total, w = ti.Vector.zero(self.scene.real, self.dev.state.dim), self.dev.w.of(i)
         lift, forced = total, total
-        spin_change = ti.Vector.zero(self.scene.real, ti.static(2 * self.dev.state.dim - 3))
+        spin_change = ti.Vector.zero(self.scene.real, self.dev.axes)
         spin_forced = spin_change
         if ti.static(self.dev.has_restitution):
             if first != 0:
@@ -311,7 +309,7 @@ class Contact(PairContact):
             for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
                 j = self.dev.grid.neighbour[e]
                 overlap, n = self.dev.geometry.overlap(i, j, self.dev.geometry.contact_distance(i, j))
-                slip, turn = 0 * self.dev.state.x[i], ti.Vector.zero(self.scene.real, ti.static(2 * self.dev.state.dim - 3))
+                slip, turn = 0 * self.dev.state.x[i], ti.Vector.zero(self.scene.real, self.dev.axes)
                 if overlap > 0 and self.dev.push.field[e] > 0:
                     shared = self.dev.splitting.weight[i] + self.dev.splitting.weight[j]
                     pressed = self.dev.push.field[e] * shared

@@ -40,15 +40,18 @@ class ForceShare:
     @ti.func
     def add_turn(self, i, turned, first):
         """Add what forces of a pass turned the surface of particle i by; the first pass begins the sum."""
-        if first != 0:
-            self.turned[i] = turned
-        else:
-            self.turned[i] = self.turned[i] + turned
+        accumulate(self.turned, i, turned, first)
 
     @ti.func
     def add(self, i, moved, first):
         """Add what forces of a pass moved particle i by; the first pass begins the sum."""
-        if first != 0:
-            self.sum[i] = moved
-        else:
-            self.sum[i] = self.sum[i] + moved
+        accumulate(self.sum, i, moved, first)
+
+
+@ti.func
+def accumulate(field: ti.template(), i, value, first):  # type: ignore[valid-type]
+    """Add to what a field has of particle i; the first pass begins the sum."""
+    if first != 0:
+        field[i] = value
+    else:
+        field[i] = field[i] + value

@@ -1,7 +1,7 @@
 """Coulomb friction of contacts, whatever their geometry."""
 
 from ..device import ti
-from ..features.material import Table
+from ..features.material import Table, limited
 
 
 class Friction:
@@ -14,7 +14,4 @@ class Friction:
     def held(self, i, j, n, normal, slip):
         """The part of a slip [m] of particles i and j that friction takes back, for a normal displacement along n [m]."""
         s, row = slip - slip.dot(n) * n, self.table.of(i, j)
-        size = s.norm()
-        if size > row[0] * normal:
-            s *= row[1] * normal / size
-        return s
+        return limited(s, row[0] * normal, row[1] * normal)

@@ -3,11 +3,10 @@
 from typing import TYPE_CHECKING, Any
 
 from ..device import ti
-from ..features.material import Table
+from ..features.material import Table, limited
 
 if TYPE_CHECKING:
     from ..features.feature import Scene
-    from .narrow_phase import DiscGeometry
 
 
 class Spinning:
@@ -27,9 +26,8 @@ class Spinning:
     spins, (n,).
     """
 
-    def __init__(self, scene: "Scene", table: Table, geometry: "DiscGeometry", weight: Any, turn: Any):
-        self.state, self.real, self.radius = scene.state, scene.real, scene.radius
-        self.table, self.geometry, self.weight, self.turn = table, geometry, weight, turn
+    def __init__(self, scene: "Scene", table: Table, weight: Any, turn: Any):
+        self.state, self.radius, self.table, self.weight, self.turn = scene.state, scene.radius, table, weight, turn
         self.spin = scene.state.spin
         n, add = scene.particles.count, scene.memory.field
         self.change = add("Contact.spin_change", n, width=self.spin.axes)
@@ -68,47 +66,38 @@ class Spinning:
         return -self.spin.share.of(i) * self.spin.moment(m, push)
 
     @ti.func
-    def rolled(self, i, j, s_i, s_j):
-        """rho of such spins."""
-        a = self.radius.of(i) / (self.radius.of(i) + self.radius.of(j))
-        return (1 - a) * s_i - a * s_j
+    def part(self, i, j):
+        """a_i, that of particle i in the sum of the radii."""
+        return self.radius.of(i) / (self.radius.of(i) + self.radius.of(j))
 
     @ti.func
-    def held(self, i, j, n, rolled, most, least):
-        """The part of a rotation rho that is taken back: at most so much about the normal, and about other axes."""
+    def rolling_mass(self, i, j):
+        """What f changes rho by, with split masses."""
+        a = self.part(i, j)
+        return (1 - a) * (1 - a) * self.spin.share.of(i) * self.weight[i] + a * a * self.spin.share.of(j) * self.weight[j]
+
+    @ti.func
+    def held(self, i, j, e, n, s_i, s_j, most):
+        """Of rho, for such spins and with what was left of it, what is taken back: up to so much times each coefficient."""
+        a, row = self.part(i, j), self.table.of(i, j)
+        rolled = self.turn.field[e] + ((1 - a) * s_i - a * s_j)
         twist = self.spin.along(rolled, n)
-        return limited(rolled - twist, most) + limited(twist, least)
+        return limited(rolled - twist, row[4] * most, row[4] * most) + limited(twist, row[5] * most, row[5] * most)
 
     @ti.func
     def resist(self, i, j, e, n, m, push, pressed):
         """What resistance to rolling and twisting changes s_i by, per inverse mass, for a push `pressed` along the normal; after
         what friction, `push`, has done to the pair by itself, as its masses are split."""
-        k_i, k_j = self.spin.share.of(i), self.spin.share.of(j)
-        a = self.radius.of(i) / (self.radius.of(i) + self.radius.of(j))
-        compliance = (1 - a) * (1 - a) * k_i * self.weight[i] + a * a * k_j * self.weight[j]
+        k_i, k_j, rolling_mass = self.spin.share.of(i), self.spin.share.of(j), self.rolling_mass(i, j)
         out = 0 * self.spin.s[i]
-        if compliance > 0:
+        if rolling_mass > 0:
             moment = self.spin.moment(m, push)
             s_i, s_j = self.spin.s[i] - k_i * self.weight[i] * moment, self.spin.s[j] - k_j * self.weight[j] * moment
-            rolled, row = self.turn.field[e] + self.rolled(i, j, s_i, s_j), self.table.of(i, j)
-            most = pressed * compliance
-            out = -(1 - a) * k_i / compliance * self.held(i, j, n, rolled, row[4] * most, row[5] * most)
+            held = self.held(i, j, e, n, s_i, s_j, pressed * rolling_mass)
+            out = -(1 - self.part(i, j)) * k_i / rolling_mass * held
         return out
 
     @ti.func
     def left(self, i, j, e, n, pressed):
         """At the end of a substep: what the pair has turned against each other, as far as it can be held."""
-        a = self.radius.of(i) / (self.radius.of(i) + self.radius.of(j))
-        compliance = (1 - a) * (1 - a) * self.spin.share.of(i) * self.weight[i] + a * a * self.spin.share.of(j) * self.weight[j]
-        rolled, row = self.turn.field[e] + self.rolled(i, j, self.spin.s[i], self.spin.s[j]), self.table.of(i, j)
-        most = pressed * compliance
-        return self.held(i, j, n, rolled, row[4] * most, row[5] * most)
-
-
-@ti.func
-def limited(v, most):
-    """A vector, no longer than `most`."""
-    size = v.norm()
-    if size > most:
-        v *= most / size
-    return v
+        return self.held(i, j, e, n, self.spin.s[i], self.spin.s[j], pressed * self.rolling_mass(i, j))

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from .. import checks
+from ..features.material import group_pair
 
 BEFORE, NEVER = 0, -1  # numbers of substeps, which count from 1: it touched when the frame began; not yet
 
@@ -81,9 +82,8 @@ class ContactEvents:
         wanted = checks.rows("World.events", "groups", groups, "a list of pairs of groups, such as [(0, 1)],")
         some, (a, b) = np.zeros(len(self), dtype=bool), group[self.touches.pairs.T]
         for pair in wanted:
-            if not (isinstance(pair, (tuple, list)) and len(pair) == 2 and all(isinstance(k, (int, np.integer)) for k in pair)):
-                raise TypeError(f"World.events: groups has {pair!r}, but a pair of groups such as (0, 1) is needed.")
-            some |= ((a == pair[0]) & (b == pair[1])) | ((a == pair[1]) & (b == pair[0]))
+            one, other = group_pair("World.events", "groups", pair)
+            some |= ((a == one) & (b == other)) | ((a == other) & (b == one))
         return ContactEvents(self.touches[some])
 
     def renumbered(self, first: np.ndarray, second: np.ndarray) -> "ContactEvents":

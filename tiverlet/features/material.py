@@ -58,6 +58,30 @@ def as_given(value: Any) -> Any:
     return tuple(float(v) for v in value) if isinstance(value, (tuple, list)) else float(value)
 
 
+def refuse_turning(who: str) -> None:
+    """Raise: particles that do not spin have no use for what resists or reverses it."""
+    raise ValueError(
+        f"{who}: resistance to rolling and tangential restitution are for particles that spin. Leave them out, or give "
+        "tv.Particles a spin."
+    )
+
+
+@ti.func
+def limited(v, most, length):
+    """A vector that is no longer than `most`; else it in this length: what friction can take back of a slip v."""
+    size = v.norm()
+    if size > most:
+        v *= length / size
+    return v
+
+
+def group_pair(who: str, name: str, pair: Any, what: str = "") -> tuple[int, int]:
+    """A pair of groups, checked. what: it is in `name`, for the error."""
+    if not (isinstance(pair, (tuple, list)) and len(pair) == 2 and all(isinstance(k, (int, np.integer)) for k in pair)):
+        raise TypeError(f"{who}: {name} has {what}{pair!r}, but a pair of groups such as (0, 1) is needed.")
+    return int(pair[0]), int(pair[1])
+
+
 MOST = 1000  # groups of particles that are told apart
 TOUCHES, SENSES, SENSED = 1, 2, 3  # what a particle of a group does with one of another: push it, note it, be noted by it
 
@@ -159,6 +183,4 @@ class Table:
         return radius.of(i) + radius.of(j)
 
     def _pair(self, name: str, pair: Any) -> tuple[int, int]:
-        if not (isinstance(pair, (tuple, list)) and len(pair) == 2 and all(isinstance(k, (int, np.integer)) for k in pair)):
-            raise TypeError(f"{self.who}: {name} has the key {pair!r}, but a pair of groups such as (0, 1) is needed.")
-        return int(pair[0]), int(pair[1])
+        return group_pair(self.who, name, pair, "the key ")

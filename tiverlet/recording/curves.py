@@ -7,6 +7,7 @@ import numpy as np
 from ..colliders.collider import Collider
 from ..constraints.core.anchored import Anchored
 from ..features.feature import Batch
+from ..measure import moment_sum
 from ..spin import moments
 from ..step.checkpoint import Checkpoint
 from ..step_report import StepReport
@@ -42,7 +43,7 @@ def curves_of(world: "World") -> dict[str, tuple[str, dict[str, Any]]]:
     if not world.particles.spins:
         return CURVES
     ((title, (end, curves)),) = SPIN.items()
-    return CURVES | {title: (end, {name: curves[name] for name in list(curves)[: 1 if world.particles.dim == 2 else 3]})}
+    return CURVES | {title: (end, {name: curves[name] for name in list(curves)[: world.particles.axes]})}
 
 
 def shown(world: "World") -> dict[str, tuple[str, list[bool]]]:
@@ -111,11 +112,8 @@ class Curves:
         """The angular momentum about the origin, of displacements likewise: m x (x_n - d) x d / h + I omega."""
         n = len(self._mass)
         d, spin = scale * now.values["displacement"][:n].astype(np.float64), scale * now.values["spin"][:n]
-        x, p, own = now.position(n), self._mass[:, None] * d, self._lever @ spin
-        if x.shape[1] == 2:
-            return {"angular momentum/z": float(own[0] + np.sum(x[:, 0] * p[:, 1] - x[:, 1] * p[:, 0]))}
-        total = own + np.cross(x, p).sum(axis=0)
-        return {f"angular momentum/{axis}": float(v) for axis, v in zip("xyz", total, strict=True)}
+        total = self._lever @ spin + moment_sum(now.position(n), self._mass[:, None] * d)
+        return {f"angular momentum/{axis}": float(v) for axis, v in zip("z" if len(total) == 1 else "xyz", total, strict=True)}
 
     def log(self, frame: int, time: float, numbers: dict[str, float]) -> None:
         """Quantities of the user's."""

@@ -170,7 +170,7 @@ class Drawing:
             self._load(x)
         elif self._contacts:
             self._contact()
-        if turns_shown(self.world):
+        if self.world.particles.orientation is not None:
             self._mark(x)
         if self._overlays.velocities:
             way = (AHEAD * self.world.velocity).astype(np.float32)
@@ -306,11 +306,6 @@ class Drawing:
         """A line in the list of events."""
         self._log("events", self._rr.TextLog(text, level=level))
         self.bytes += len(text)
-
-
-def turns_shown(world: "World") -> bool:
-    """Whether it is known how far particles have turned."""
-    return world.particles.orientation is not None
 
 
 def marked(x: np.ndarray, radius: np.ndarray, orientation: np.ndarray) -> np.ndarray:

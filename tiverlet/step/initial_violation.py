@@ -20,6 +20,7 @@ import numpy as np
 
 from ..constraints.core.scalar import Scalar
 from ..features.feature import Batch, Scene
+from ..neighbours.queries import between
 from .jacobian import Jacobian, bodies_of
 
 ENOUGH = 0.2  # of its size: a violation from where on it is taken out before the first substep
@@ -141,8 +142,7 @@ def _within(move: np.ndarray, rows: "Rows", body: np.ndarray, bodies: int) -> np
     legs = rows.legs
     i, j = rows.who[legs], rows.who[legs + 1]
     change = np.linalg.norm(move[j] - move[i], axis=1)
-    box = rows.batches[0].periodic
-    leg = np.linalg.norm(rows.x[j] - rows.x[i] if box is None else box.difference(rows.x[j], rows.x[i]), axis=1)
+    leg = np.linalg.norm(between(rows.x[j], rows.x[i], rows.batches[0].periodic), axis=1)
     np.minimum.at(out, of[legs], np.divide(leg / 2, change, out=np.ones(len(leg)), where=(change > 0) & (leg > 0)))
     return out[body]
 

@@ -5,6 +5,7 @@ from typing import Any
 
 from ..colliders.collider import ROUNDS, SWEEPS, Collider
 from ..colliders.surface import AGAIN, FIRST, GENTLY
+from ..contact.force_share import accumulate
 from ..device import ti
 from ..device.number import OnDevice
 from ..device.thread_team import Team, block, blocks
@@ -131,16 +132,10 @@ class ParticlePass:
         if ti.static(len(self.walls) > 0):
             if now.final != 0:
                 for i in range(begin, end):
-                    if now.first != 0:
-                        self.wall_displacement[i] = -self.state.d[i]
-                    else:
-                        self.wall_displacement[i] = self.wall_displacement[i] - self.state.d[i]
+                    accumulate(self.wall_displacement, i, -self.state.d[i], now.first)
                 if ti.static(self.turned_by_walls):
                     for i in range(begin, end):
-                        if now.first != 0:
-                            self.wall_turn[i] = -self.state.spin.s[i]
-                        else:
-                            self.wall_turn[i] = self.wall_turn[i] - self.state.spin.s[i]
+                        accumulate(self.wall_turn, i, -self.state.spin.s[i], now.first)
         if ti.static(len(self.walls) > 0 and self.few):
             for i in range(begin, end):
                 self.confine(i, now.h, now.frame_fraction)

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..constraints.core.scalar import Scalar
+from ..neighbours.queries import between
 from .block_matrix import BlockMatrix
 from .integrator import FREE
 from .jacobian import Jacobian, bodies_of
@@ -230,7 +231,7 @@ class Rows:
         """
         stiff = _over(self.weight, self.diagonal)
         row, i, j = self.pairs
-        across = self.x[i] - self.x[j] if self.box is None else self.box.difference(self.x[i], self.x[j])
+        across = between(self.x[i], self.x[j], self.box)
         length = np.linalg.norm(across, axis=1)
         across = across * _over(np.ones_like(length), length)[:, None]
         taut = _over(np.maximum(self.C[row], 0.0) * stiff[row], length)

@@ -169,8 +169,8 @@ class Runner:
         elif self.probe:
             out = high_order.velocity(self.probe, clock, self.memory, iterations)
         else:
-            if self.grid and touching and self.memory.read(self.grid.old_saved)[0]:  # of a state that was put back
-                self.list_neighbours()
+            if touching:
+                self._list_again()
             out = self._velocities()
         return out[: self.n]
 
@@ -180,13 +180,17 @@ class Runner:
         self.step.velocities(self.clock.h, self.clock.time, *self.shares(), out)
         return out
 
+    def _list_again(self) -> None:
+        """Of a state that was put back, build the list that reactions of contacts are asked for with."""
+        if self.grid and self.memory.read(self.grid.old_saved)[0]:
+            self.list_neighbours()
+
     def spin(self) -> np.ndarray:
         """Velocities r omega of the surfaces of particles, (n, axes) [m/s], likewise."""
         clock, spin = self.clock, self.scene.state.spin
         if clock.d_is_velocity:
             return self.memory.read(spin.s).astype(np.float64)[: self.n]
-        if self.grid and self.memory.read(self.grid.old_saved)[0]:
-            self.list_neighbours()
+        self._list_again()
         out = np.zeros((max(1, self.n), spin.axes))
         self.step.spins(clock.h, clock.time, *self.shares(), out)
         return out[: self.n]
@@ -195,7 +199,7 @@ class Runner:
         """Moments of contacts and walls in the last substep, (n, axes) [N m]: I alpha, by r omega = s / h + r alpha h / 2."""
         clock, particles = self.clock, self.scene.particles
         if not self.scene.state.spins or clock.d_is_velocity:
-            return np.zeros((self.n, 2 * particles.dim - 3))
+            return np.zeros((self.n, particles.axes))
         half = self.spin() - self.memory.read(self.scene.state.spin.s)[: self.n] / clock.h
         r = particles.radius
         return np.divide(moments(particles), r, out=np.zeros(len(r)), where=r > 0)[:, None] * half * (2 / clock.h)
