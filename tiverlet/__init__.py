@@ -29,6 +29,7 @@ from .neighbours import Periodic
 from .particles import Particles
 from .recording import Recorder, WorldsRecorder, replay
 from .solvers import Chebyshev, ConjugateGradient, Direct, Jacobi
+from .step.sleep import Sleep
 from .step_report import StepReport
 from .tools import approach, clamp, golden, golden_colors, golden_index, mix, smoothstep
 from .world import World
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
 __all__ = [
     "AngleLimit", "Area", "Attractor", "Ball", "Bend", "Box", "Capsule", "Chebyshev", "ConjugateGradient", "Constraint",
     "Contact", "Dihedral", "Direct", "Distance", "Drag", "Force", "Gravity", "HalfSpace", "Hand", "Jacobi", "Mesh", "Motor",
-    "PairForce", "Particles", "Path", "Periodic", "Pin", "Polygon", "Polygons", "Recorder", "Rope", "Sdf", "ShapeMatch", "Snap",
+    "PairForce", "Particles", "Path", "Periodic", "Pin", "Polygon", "Polygons", "Recorder", "Rope", "Sdf", "ShapeMatch", "Sleep", "Snap",
     "Spacer", "StepReport", "SweepResult", "Volume", "Winch", "Wind", "World", "Worlds", "WorldsRecorder", "approach", "clamp",
     "golden",
     "golden_colors", "golden_index", "gradient", "init", "measure", "mix", "play", "replay", "runtime", "shapes", "smoothstep",

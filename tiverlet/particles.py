@@ -255,6 +255,7 @@ class State:
         self.count, self.dim = n, dim
         self.starts = self.befores = self.keeps_wall_push = self.carries = self.spins = False
         self.images: Any = None  # where the world has a periodic box, see neighbours/periodic.py
+        self.sleepers: Any = None  # where particles may fall asleep, see step/sleep.py
         self.x = memory.field("position", n, width=dim, values=particles.position, state=True)
         self.d = memory.field("displacement", n, width=dim, values=particles.velocity, state=True)
         self.w = Shared(memory, "inv_mass", inv_mass)
@@ -289,6 +290,23 @@ class State:
         memory.write(self.d, velocity)
         if self.carries:
             memory.write(self.d_low, np.zeros_like(velocity))
+
+    @inline
+    def awake(self, i):
+        """Whether particle i is awake; where none can sleep, no branch is left."""
+        return self.sleepers.awake(i) if self.sleepers else ti.cast(1, ti.i32) > 0
+
+    @inline
+    def moves(self, i):
+        """Whether particle i can move, and is awake."""
+        if not self.sleepers:
+            return self.w.positive(i)
+        return ti.select(self.sleepers.awake(i), self.w.of(i), ti.cast(0, self.real)) > 0
+
+    @inline
+    def stirs(self, begin, end):
+        """1 unless all blocks of particles from `begin` up to `end` sleep."""
+        return self.sleepers.stirs(begin, end) if self.sleepers else 1
 
     @inline
     def apart(self, i, j):

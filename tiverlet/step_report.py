@@ -14,7 +14,7 @@ class StepReport:
     smaller particle. contacts: number of overlapping pairs. energy: kinetic and potential energy [J], of what has a
     potential, half a substep ago, of springs by the force that they exert; energy_change: since the frame before [J]. bad:
     index of the first particle whose state is not finite, or None. broken: number of constraints that broke; world.broken has
-    them. turn: 26 or 41 where a constraint turned by more than so many degrees in a substep, else 0. tension: (omega h)^2 of
+    them. asleep: number of particles that sleep, see Sleep. turn: 26 or 41 where a constraint turned by more than so many degrees in a substep, else 0. tension: (omega h)^2 of
     the fastest vibration across a tension that a solver converged to; 4 is the limit of stability. tries: how often the frame
     was made, see StepController. seconds: what the frame took.
 
@@ -44,6 +44,7 @@ class StepReport:
     notes: tuple[str, ...] = field(default=(), repr=False)
     bad: int | None = None
     broken: int = 0
+    asleep: int = 0
     turn: int = 0
     tension: float = 0.0
     tries: int = 1
@@ -76,6 +77,6 @@ class StepReport:
             last.energy, first.energy_change + last.energy_change, first.flags | last.flags,
             tuple({n.partition(":")[0]: n for n in first.notes + last.notes}.values()),
             last.bad if first.bad is None else first.bad,
-            first.broken + last.broken, max(first.turn, last.turn), max(first.tension, last.tension),
+            first.broken + last.broken, last.asleep, max(first.turn, last.turn), max(first.tension, last.tension),
             max(first.tries, last.tries), max(first.seconds, last.seconds),
         )  # fmt: skip

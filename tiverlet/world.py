@@ -17,7 +17,7 @@ from .contact.touches import ContactEvents, joined, no_events
 from .device.copies import Copies
 from .device.interrupts import whole
 from .features.arguments import meant
-from .features.feature import Acceleration, Feature
+from .features.feature import Acceleration, Batch, Feature
 from .features.read_only import assign_whole, read_only, structure
 from .neighbours.queries import Contacts, PointSearch, near_by_all, nearest
 from .particles import Particles, at_rest, in_range, spin_of
@@ -165,7 +165,10 @@ class World:
 
     def _upload_parameters(self) -> None:
         """Bring the knobs to the device; where a force has changed, start anew while the device still has what it was."""
-        for feature in self._features:
+        waiting = [f for f in self._features if f.changed or f.moving]
+        if any(not (isinstance(f, Batch) and f.drives) for f in waiting):
+            self._runner.wake()
+        for feature in waiting:
             if feature.changed or feature.moving:
                 self._adapt()
                 with self._runner.memory.compiler():

@@ -55,7 +55,8 @@ class WallLog:
     @ti.func
     def close(self, i):
         """As a frame ends: keep whether particle i touches."""
-        self.touching[i] = ti.cast(self.when[i][1] == self.substep[None], ti.i32)
+        if self.state.awake(i):  # else it touches what it touched
+            self.touching[i] = ti.cast(self.when[i][1] == self.substep[None], ti.i32)
 
     @property
     def made(self) -> Any:

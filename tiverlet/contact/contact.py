@@ -294,7 +294,7 @@ class Contact(PairContact):
     @ti.func
     def apply_corrections(self, i, first):
         """Move particle i as its pairs want."""
-        if self.dev.w.of(i) > 0:  # what touches nothing moves by 0, without a branch
+        if self.dev.state.moves(i):  # what touches nothing moves by 0, without a branch
             self.dev.state.shift(i, self.dev.move[i])
             if ti.static(self.dev.spins):
                 self.dev.state.spin.s[i] = self.dev.state.spin.s[i] + self.dev.spinning.change[i]

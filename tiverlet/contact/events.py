@@ -154,6 +154,8 @@ class EventLog:
                     else:
                         self.place(row, i, j, self.geometry.fallback_normal(i, j, r))
                 self.touched.field[e] = ti.cast(last == self.substep[None], ti.i32)
+                if not self.state.awake(i):  # which touches what it touched
+                    self.touched.field[e] = 1
 
     @property
     def made(self) -> Any:

@@ -59,19 +59,21 @@ class MassSplitting:
 
         Fast path: a block without contact in the last pass is tested only for any contact. Small worlds compile faster without.
         """
-        some = 1
+        some = self.state.stirs(begin, end)
         if ti.static(not self.few):
-            some = 0
-            for i in range(begin, end):
-                some |= ti.cast(self.weight[i] > 0, ti.i32)
-            if some == 0:
+            if some != 0:
+                some = 0
                 for i in range(begin, end):
-                    some |= self.any_contact(i)
+                    some |= ti.cast(self.weight[i] > 0, ti.i32)
+                if some == 0:
+                    for i in range(begin, end):
+                        some |= self.any_contact(i)
         if ti.static(self.skips):
             self.some[begin // self.block] = some
         if some != 0:
             for i in range(begin, end):
-                self.split(i)
+                if self.state.awake(i):
+                    self.split(i)
 
     @ti.func
     def busy(self, begin):

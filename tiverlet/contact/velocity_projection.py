@@ -59,7 +59,7 @@ class VelocityProjection:
         """List the loaded pairs of particle i, each with what all passes multiply by; returns how many there are."""
         first, w = self.grid.first[i], self.state.w.of(i)
         at = first
-        if self.weight[i] > 0:
+        if self.weight[i] > 0 and self.state.awake(i):
             for word in range(self.grid.words(i)):
                 # Not touches(): the pair may have parted in this pass, and both of it have to agree.
                 bits = ti.select(word == 0, self.grid.touching[i], self.grid.all_bits(i, word))

@@ -320,6 +320,17 @@ class Batch(Feature):
         """The particle at corner k of constraint c."""
         return at(at(self.dev.members, c), k)
 
+    @inline
+    def awake(self, c):
+        """Whether constraint c has a particle that is awake, or one that cannot move alone."""
+        state = self.dev.state
+        if not state.sleepers or not self.arity or self.drives:
+            return ti.cast(1, ti.i32) > 0
+        asleep = at(state.sleepers.asleep, self.member(c, 0))
+        for k in range(1, self.arity):
+            asleep = ti.max(asleep, at(state.sleepers.asleep, self.member(c, k)))
+        return asleep == 0
+
     @ti.func
     def push(self, c, k: ti.template(), move):  # type: ignore[valid-type]
         """Write the move of corner k into its slot; a particle that cannot move has none."""

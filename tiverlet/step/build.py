@@ -30,6 +30,8 @@ from . import high_order
 from .diagnostics import Diagnostics
 from .frames import Frames
 from .integrator import Forces, Verlet
+from .sleep import Sleep, SleepPass
+from .sleep import refuse_misfits as refuse_restless
 from .step import Step
 
 T = TypeVar("T", bound=Feature)
@@ -107,6 +109,8 @@ def assemble(
         from .periodic_fit import refuse_misfits  # noqa: PLC0415  (it knows of features that there may not be)
 
         refuse_misfits(box, particles, features)
+    if any(isinstance(f, Sleep) for f in features):
+        refuse_restless(features, order)
     for feature, start in zip(features, starts, strict=True):
         if start is None:
             feature.review(particles, inv_mass)
@@ -142,8 +146,8 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     def of(kind: type[T]) -> list[T]:
         return [f for f in features if isinstance(f, kind)]
 
-    for box in of(Periodic):
-        box.bind(scene)
+    for first in [*of(Periodic), *of(Sleep)]:
+        first.bind(scene)
     accelerations, walls = of(Acceleration), of(Collider)
     drivers = [f for f in of(Batch) if f.drives and f.count]
     batches = [f for f in of(Batch) if not f.drives and (scene.inv_mass[f.indices] > 0).any()]
@@ -176,6 +180,8 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     forces = Forces(scene, accelerations)
     integrator = Verlet(scene, forces) if scene.order == 2 else high_order.Composition(scene, forces, batches)
     step = Step(scene, integrator, batches, drivers, contact, grid, walls, team)
+    if state.sleepers:
+        step.sleep = SleepPass(step, state.sleepers, drivers, batches)
     diagnostics = Diagnostics(step, solver)
     if grid and contact:
         grid.allocate(int(len(particles) * max(ROOM[scene.radius.uniform][particles.dim - 2], contact.room)) + 64)
@@ -204,6 +210,8 @@ def checked_features(features: Iterable[Feature]) -> tuple[Feature, ...]:
         raise ValueError("World: more than one Contact; one covers all particles.")
     if sum(isinstance(f, Periodic) for f in features) > 1:
         raise ValueError("World: more than one Periodic; give one box, with all of its axes.")
+    if sum(isinstance(f, Sleep) for f in features) > 1:
+        raise ValueError("World: more than one Sleep; one is for all particles.")
     return features
 
 

@@ -91,6 +91,9 @@ def put_back(world: "World", kept: Checkpoint) -> None:
     for log in world._runner.logs:
         log.forget()
     world._runner.invalidate()
+    if world._runner.sleep:
+        world._runner.sleep.rests = False
+        world._runner.sleepers.review()
     if list(map(id, world._runner.memories)) != stores:
         world._runner.renew()  # there are new fields
     world._clock.put_back(kept.clock)

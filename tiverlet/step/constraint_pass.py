@@ -61,7 +61,8 @@ class ConstraintPass:
             self.team.wait()
         for f in ti.static(self.batches):
             for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
-                f.relax(c, now.h, h2_effective, now.frame_fraction, now.first, fresh)
+                if f.awake(c):
+                    f.relax(c, now.h, h2_effective, now.frame_fraction, now.first, fresh)
         if ti.static(len(self.batches) > 0):
             self.team.wait()
         self.scatter_blocks(now.thread, now.h, h2_effective, now.first, fresh)
@@ -99,7 +100,8 @@ class ConstraintPass:
                 system.end(now.thread)
         for f in ti.static(self.in_systems):
             for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
-                f.update_multiplier(c, now.first)
+                if f.awake(c):
+                    f.update_multiplier(c, now.first)
         if ti.static(len(self.in_systems) > 0):
             self.team.wait()
 

@@ -48,13 +48,15 @@ class ContactPass:
                     low, high = block(b, begin, end)
                     if c.busy(low) != 0:
                         for i in range(low, high):
-                            c.relax(i, now.first, now.fresh, now.final)
+                            if c.dev.state.awake(i):
+                                c.relax(i, now.first, now.fresh, now.final)
                     elif now.final != 0:
                         if ti.static(c.has_friction):
                             for i in range(low, high):
-                                c.dev.forces.add(i, ti.Vector.zero(self.real, self.dim), now.first)
-                                if ti.static(c.dev.forces.spins):
-                                    c.dev.forces.add_turn(i, 0 * c.dev.forces.turned[i], now.first)
+                                if c.dev.state.awake(i):
+                                    c.dev.forces.add(i, ti.Vector.zero(self.real, self.dim), now.first)
+                                    if ti.static(c.dev.forces.spins):
+                                        c.dev.forces.add_turn(i, 0 * c.dev.forces.turned[i], now.first)
             self.team.wait()
 
     @ti.func
@@ -82,10 +84,12 @@ class ContactPass:
                 if ti.static(self.team.launched):
                     n *= self.bounces[None]
                 for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
-                    c.choose_impact(i)
+                    if c.dev.state.awake(i):
+                        c.choose_impact(i)
                 self.team.wait()
                 for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
-                    c.apply_impact(i)
+                    if c.dev.state.awake(i):
+                        c.apply_impact(i)
                 self.team.wait()
 
     @ti.func
@@ -120,7 +124,8 @@ class ContactPass:
         for c in ti.static(self.contacts):
             if ti.static(c.has_friction or c.has_restitution):
                 for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
-                    c.finish_substep(i)
+                    if c.dev.state.awake(i):
+                        c.finish_substep(i)
             if ti.static(c.dev.has_events):
                 self.finish_events(now)
             self.team.wait()

@@ -298,7 +298,8 @@ class Reporter:
         self.figures = sheet[: 11 + step.dim]
 
     def __call__(
-        self, time: float, h: float, substeps: int, iterations: int, before: float | None, moved: float, released: float
+        self, time: float, h: float, substeps: int, iterations: int, before: float | None, moved: float, released: float,
+        asleep: int = 0,
     ) -> tuple[StepReport, list[float]]:
         """The report of a frame, and the size of the bounding box [m]. before: the energy one frame ago [J]. moved: how far
         particles were moved before the first substep [m]. released: see Runner."""
@@ -325,6 +326,7 @@ class Reporter:
                 "notes": tuple(notes.values()),
                 "bad": first,
                 "broken": int(broken),
+                "asleep": asleep,
                 "turn": TURNS[int(turned)],
                 "tension": tension,
                 "tries": 1,

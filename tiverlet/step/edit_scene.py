@@ -15,6 +15,7 @@ from ..particles import Particles
 from . import checkpoint
 from .build import assemble, check_settings, checked_features, listed
 from .integrator import decay
+from .sleep import Sleep
 
 NOTHING = 2.0**-20  # of a velocity: less than this of it is in the next displacement
 
@@ -64,6 +65,8 @@ def add(world: Any, particles: Particles | None, features: Iterable[Feature]) ->
         raise ValueError("World.add: more than one Contact; one covers all particles.")
     if sum(isinstance(f, Periodic) for f in (*world.features, *late)) > 1:
         raise ValueError("World.add: more than one Periodic; remove the old box first.")
+    if sum(isinstance(f, Sleep) for f in (*world.features, *late)) > 1:
+        raise ValueError("World.add: more than one Sleep; one is for all particles.")
     check_settings(world._precision, world._requested[1], world._order, (*world.features, *late))
     n, count = len(world.particles), 0 if particles is None else len(particles)
     if late or count:
@@ -149,6 +152,7 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
     world._install(particles, features, parts)
     world._runner.scene.h2_effective = h2_effective
     world._runner.memory.restore(state)
+    world._runner.wake()
     walls = np.array([features.index(f) if f in features else -1 for f in before], dtype=np.int64)
     world._events = told[0].renumbered(number, number), told[1].renumbered(number, walls)
     if contact and contact in world._runner.step.contacts:

@@ -118,7 +118,7 @@ class Verlet:
 
         Only the writes depend on whether it moves, so that several particles are integrated at once.
         """
-        live, x, d, h = self.state.w.positive(i), self.state.x[i], self.state.d[i], now.h
+        live, x, d, h = self.state.moves(i), self.state.x[i], self.state.d[i], now.h
         v = self.velocity_before(i, h, now.fresh)
         a = self.forces.accelerate(i, self.state.place(i), v, now.time, pull)
         before, low = ti.select(now.fresh != 0, h * v - h * h / 2 * a, d), ti.zero(d)

@@ -64,17 +64,19 @@ class ParticlePass:
     def integrate(self, now):
         """All particles."""
         for k in range(self.team.dealt_count(self.pieces * self.each, self.each, now.thread)):
-            self.advance(k, now)
+            first, end = self.tile_of(k, now.thread)
+            if self.state.stirs(first, end) != 0:
+                self.advance(first, end, now)
 
     @ti.func
-    def advance(self, k, now):
+    def advance(self, first, end, now):
         """Integrate a tile of particles. Short loops, so that each is done for several particles at once."""
-        first, end = self.tile_of(k, now.thread)
         for c in ti.static(self.contacts):
             if now.final != 0:
                 scale = ti.select(now.fresh != 0, now.h, ti.cast(1, self.real))
                 for i in range(first, end):
-                    c.start_last_substep(i, scale)
+                    if self.state.awake(i):
+                        c.start_last_substep(i, scale)
         if ti.static(self.state.starts):
             for i in range(first, end):
                 self.state.x0[i] = self.state.x[i]
@@ -104,25 +106,32 @@ class ParticlePass:
         """Move particles as constraints want, before their contacts are solved; the list has to hear of it."""
         for c in ti.static(self.contacts):
             for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
-                self.slots.gather(i)
+                self.gather(i)
                 c.note_motion(self.grid.moved_too_far(i), c.overshoots(i))
             self.team.wait()
+
+    @ti.func
+    def gather(self, i):
+        """Move particle i as constraints want."""
+        if self.state.awake(i):
+            self.slots.gather(i)
 
     @ti.func
     def apply_corrections(self, now):
         """Move particles as constraints or contacts want, and walls after that."""
         if ti.static(self.acts):
             for k in range(self.team.dealt_count(self.pieces * self.each, self.each, now.thread)):
-                self.move(k, now)
+                begin, end = self.tile_of(k, now.thread)
+                if self.state.stirs(begin, end) != 0:
+                    self.move(begin, end, now)
         self.team.wait()
 
     @ti.func
-    def move(self, k, now):
+    def move(self, begin, end, now):
         """What a tile of particles gathers."""
-        begin, end = self.tile_of(k, now.thread)
         if ti.static(self.gathers):
             for i in range(begin, end):
-                self.slots.gather(i)
+                self.gather(i)
         for c in ti.static(self.contacts):
             for b in range(blocks(begin, end)):
                 low, high = block(b, begin, end)
@@ -132,10 +141,12 @@ class ParticlePass:
         if ti.static(len(self.walls) > 0):
             if now.final != 0:
                 for i in range(begin, end):
-                    accumulate(self.wall_displacement, i, -self.state.d[i], now.first)
+                    if self.state.awake(i):
+                        accumulate(self.wall_displacement, i, -self.state.d[i], now.first)
                 if ti.static(self.turned_by_walls):
                     for i in range(begin, end):
-                        accumulate(self.wall_turn, i, -self.state.spin.s[i], now.first)
+                        if self.state.awake(i):
+                            accumulate(self.wall_turn, i, -self.state.spin.s[i], now.first)
         if ti.static(len(self.walls) > 0 and self.few):
             for i in range(begin, end):
                 self.confine(i, now.h, now.frame_fraction)
@@ -158,15 +169,17 @@ class ParticlePass:
         if ti.static(len(self.walls) > 0):
             if now.final != 0:
                 for i in range(begin, end):
-                    self.wall_displacement[i] = self.wall_displacement[i] + self.state.d[i]
+                    if self.state.awake(i):
+                        self.wall_displacement[i] = self.wall_displacement[i] + self.state.d[i]
                 if ti.static(self.turned_by_walls):
                     for i in range(begin, end):
-                        self.wall_turn[i] = self.wall_turn[i] + self.state.spin.s[i]
+                        if self.state.awake(i):
+                            self.wall_turn[i] = self.wall_turn[i] + self.state.spin.s[i]
 
     @ti.func
     def confine(self, i, h, frame_fraction):
         """The walls, which have the last word; they take turns until they agree, see Collider."""
-        if self.state.w.positive(i):
+        if self.state.moves(i):
             if ti.static(len(self.walls) == 1 and not self.walls[0].repeats):
                 for f in ti.static(self.walls):
                     self.touch(f, i, h, frame_fraction, FIRST)

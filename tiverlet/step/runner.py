@@ -37,6 +37,7 @@ class Runner:
         self.clock = clock
         self.moved = 0.0  # how far the coming frame has had to move a particle to where its constraints are met [m]
         self.jumped = False  # whether that was further than a particle is large
+        self.sleepers, self.sleep = parts.scene.state.sleepers, parts.step.sleep
         self.released = 0.0  # the violation that its shorter substep turns into energy, as a share of its size
         self.interruptible = False  # what handlers of signals raise in the middle of a frame is followed by an undo
         # Asked in every frame, and Taichi looks at each attribute of what has kernels.
@@ -53,6 +54,9 @@ class Runner:
     def _prepare(self) -> None:
         """The kernels that are launched in every frame."""
         self.sheet = self.diagnostics.sheet
+        if self.sleep:
+            self.sleep = self.step.sleep = self.sleep.of(self.step)
+            self._settle = CachedLaunch(self.sleep, "settle", self.memory.compiler, self.sleep.sheet)
         self._fused = CachedLaunch(self.step, "fused", self.memory.compiler, self.sheet)
         if self.frames:
             self.frames = self.frames.of(self.step)
@@ -75,6 +79,8 @@ class Runner:
             with self.memory.compiler():
                 if self.clock.energy is None:
                     self.look()
+                    if self.sleep:
+                        self.sleep.compile(self.clock)
                     if self.asks_velocities:  # so that nobody waits later for its kernel to compile
                         self._velocities()
                         self.asks_velocities = False
@@ -89,6 +95,7 @@ class Runner:
         known = clock.energy is not None and clock.first_moved is None
         if h == clock.h and drag == clock.drag and not clock.d_is_velocity and known:
             return False
+        self.wake()
         with self.memory.compiler():
             if h != clock.h or drag != clock.drag:
                 clock.longest = max(clock.longest, clock.h if clock.first_moved is None else 0.0)
@@ -131,12 +138,31 @@ class Runner:
                 semi_iteration.prepare(iterations)
         clock = self.clock
         span, started = clock.counted(dt), clock.d_is_velocity and substeps == 1
-        self.run(substeps if self.n else 0, iterations, span[0] + span[1] * span[2], STARTED if started else STEPPED)
+        if not (self.sleep and self.sleep.rests):
+            self.run(substeps if self.n else 0, iterations, span[0] + span[1] * span[2], STARTED if started else STEPPED)
         clock.advance(substeps, span, started)
+        if self.sleep:
+            self.settle(dt)
         self.scene.h2_effective = clock.h**2 * self.integrator.h2_factor * (clock.drag or FREE)[2 if started else 1]
         report, self.moved, self.released = self.report(substeps, iterations), 0.0, 0.0
         clock.softened = "softened" in report.flags
         return report
+
+    def settle(self, dt: float) -> None:
+        """After a frame of dt [s]: see who is slow, and who falls asleep."""
+        sleep, clock = self.sleep, self.clock
+        if sleep.rests and not sleep.watches:
+            return
+        sleep.begin(dt, clock)
+        self._settle()
+        with self.memory.compiler():
+            sleep.rests = sleep.finish(dt, clock) and not self.step.drivers
+
+    def wake(self, particles: np.ndarray | None = None) -> None:
+        """Have all that sleeps wake, or the islands of some particles."""
+        if self.sleep:
+            self.sleep.rests = False
+            self.sleepers.wake(particles)
 
     def set_substep(self, h: float, drag: list[float] | None) -> None:
         """Take h, and what drag makes of it."""
@@ -241,6 +267,7 @@ class Runner:
             if self._data[HALT]:
                 resumed, begin, half = self.stopped()
                 self.grow()
+                self.wake_called(stages, passes, begin, half)
                 continue
             if begin == stages or (until > stages and part == passes):
                 return
@@ -250,6 +277,15 @@ class Runner:
                 resumed, begin, half, part = 0, until, 0, min(passes, some) if splits else passes
                 until = min(stages + 1, until + max(1, some // passes))
             self.raise_signals()
+
+    def wake_called(self, substeps: int, passes: int, s: int, half: int) -> None:
+        """Where the frame stopped in substep s for islands that were touched: wake them."""
+        if self.sleep and self.memory.read(self.sleepers.calls)[0]:
+            clock = self.clock
+            with self.memory.compiler():
+                self.sleep.wake_called(
+                    clock.h, clock.time, clock.tick, clock.since, clock.d_is_velocity, s, substeps, passes, max(0, half)
+                )
 
     def stopped(self) -> tuple[int, int, int]:
         """Where the frame stopped, for Span, when what it waits for is about to be done."""
@@ -264,6 +300,7 @@ class Runner:
             while self.step.grids and self._data[HALT]:
                 span.resumed, span.begin, span.half = self.stopped()
                 self.list_neighbours()
+                self.wake_called(span.substeps, span.iterations, span.begin, span.half)
                 frame(self.launcher, span)
         except BaseException:  # as signals raise
             self.launcher.waiting.clear()
@@ -324,7 +361,10 @@ class Runner:
     def report(self, substeps: int = 1, iterations: int = 1) -> StepReport:
         """What the diagnostics found."""
         clock = self.clock
-        report, extent = self._reporter(clock.time, clock.h, substeps, iterations, clock.energy, self.moved, self.released)
+        asleep = int(self.memory.read(self.sleepers.count)[0]) if self.sleepers else 0
+        report, extent = self._reporter(
+            clock.time, clock.h, substeps, iterations, clock.energy, self.moved, self.released, asleep
+        )
         for grid in self.step.grids:
             grid.fit(extent)
         return report
@@ -369,6 +409,7 @@ class Launcher:
         )
         self.has_pair_forces, self.lists_pairs = step.has_pair_forces, bool(step.listed_forces)
         self.systems, self.steps = bool(step.constraints.systems), step.constraints.steps
+        self.looks = step.looks
         self.waiting: list[str] = []
         self.now: Any = None  # the half of a pass that they are in
 
@@ -450,6 +491,9 @@ class Launcher:
         if half and not half % self.halves:
             self.runner.raise_signals()
         self.put(self.turn(now, half), "ask_for_list", bool(self.runner.grid))
+        if self.looks and self.solves(now):
+            self.put(self.turn(now, half), "look_for_sleepers")
+            self.put(self.turn(now, half), "ask_to_wake")
 
     def solve_constraints(self, now: Moment) -> None:
         """Behind it, and so on."""

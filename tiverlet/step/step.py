@@ -139,6 +139,7 @@ class Step:
     """
 
     diagnostics: Any  # what sums up a frame; given once it is there
+    sleep: Any = None  # the SleepPass, where there is one
     n: Any = OnDevice()  # particles
 
     def __init__(
@@ -165,6 +166,8 @@ class Step:
         keeps = self.contact_pass.remembers or bool(self.breakers)
         self.finishes = keeps or self.orients or bool(self.wall_logs)
         self.hashes = bool(grid)
+        self.sleepers = scene.state.sleepers
+        self.looks = bool(grid) and bool(self.sleepers)  # for what touches those that sleep
         self.pair_forces: list[Any] = integrator.forces.pairwise
         self.has_pair_forces = bool(self.pair_forces)
         self.listed_forces = [f for f in self.pair_forces if f.dev.grid]
@@ -370,6 +373,26 @@ class Step:
                 self.grid.build(now.thread)
                 if self.grid.need[None] > self.grid.capacity:
                     self.halt[None] = [1, now.s, half]  # all write the same
+        if ti.static(self.looks):
+            if self.solves(now) and self.sleepers.count[None] > 0:
+                self.look_for_sleepers(now)
+                if self.sleepers.calls[None] != 0:
+                    self.halt[None] = [1, now.s, half]
+
+    @ti.func
+    def look_for_sleepers(self, now):
+        """Call those that are touched; the frame stops for them to wake, before contacts are solved."""
+        for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
+            self.sleep.look(i)
+        self.team.wait()
+
+    @ti.func
+    def ask_to_wake(self, now):
+        """Where phases are launched: have the frame stop for those that were called."""
+        ti.loop_config(serialize=True)
+        for _ in range(self.team.one(1, now.thread)):
+            if self.sleepers.calls[None] != 0:
+                self.halt[None] = [1, now.s, now.half]
 
     @ti.func
     def ask_for_list(self, now):
@@ -443,7 +466,8 @@ class Step:
         self.contact_pass.finish(now)
         if ti.static(self.orients):
             for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
-                self.state.spin.turn(i)
+                if self.state.awake(i):
+                    self.state.spin.turn(i)
         for log in ti.static(self.wall_logs):
             n = self.n * now.final
             for i in range(self.team.chunk_begin(n, now.thread), self.team.chunk_end(n, now.thread)):
