@@ -14,9 +14,9 @@ class StepReport:
     smaller particle. contacts: number of overlapping pairs. energy: kinetic and potential energy [J], of what has a
     potential, half a substep ago, of springs by the force that they exert; energy_change: since the frame before [J]. bad:
     index of the first particle whose state is not finite, or None. broken: number of constraints that broke; world.broken has
-    them. asleep: number of particles that sleep, see Sleep. turn: 26 or 41 where a constraint turned by more than so many degrees in a substep, else 0. tension: (omega h)^2 of
-    the fastest vibration across a tension that a solver converged to; 4 is the limit of stability. tries: how often the frame
-    was made, see StepController. seconds: what the frame took.
+    them. asleep: number of particles that sleep, see Sleep. turn: 26 or 41 where a constraint turned by more than so many degrees
+    in a substep, else 0. tension: (omega h)^2 of the fastest vibration across a tension that a solver converged to; 4 is the
+    limit of stability. tries: how often the frame was made, see StepController. seconds: what the frame took.
 
     flags: words for what the user should know; notes: one sentence for each, with the cause and a remedy.
         "non-finite"        a position or displacement is NaN or infinite

@@ -19,13 +19,15 @@ from ..features.arguments import RecordsArguments, knobs_of
 from ..features.feature import Batch, Feature
 from ..particles import TURNING, Particles
 from ..solvers.solver import Solver
+from ..step import sleep
 
 if TYPE_CHECKING:
     from ..world import World
 
 PARTICLES = ("position", "velocity", "mass", "radius", "pinned", "group", *TURNING)
 PUBLIC = {
-    name: kind for module in (colliders, constraints, contact, forces, neighbours, solvers) for name, kind in vars(module).items()
+    name: kind for module in (colliders, constraints, contact, forces, neighbours, sleep, solvers)
+    for name, kind in vars(module).items()
     if isinstance(kind, type) and issubclass(kind, RecordsArguments)
 }  # fmt: skip
 Turned = tuple[int, dict[str, Any]]  # the number of a feature, and its knobs

@@ -298,7 +298,14 @@ class Reporter:
         self.figures = sheet[: 11 + step.dim]
 
     def __call__(
-        self, time: float, h: float, substeps: int, iterations: int, before: float | None, moved: float, released: float,
+        self,
+        time: float,
+        h: float,
+        substeps: int,
+        iterations: int,
+        before: float | None,
+        moved: float,
+        released: float,
         asleep: int = 0,
     ) -> tuple[StepReport, list[float]]:
         """The report of a frame, and the size of the bounding box [m]. before: the energy one frame ago [J]. moved: how far

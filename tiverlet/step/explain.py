@@ -13,6 +13,7 @@ from ..neighbours.neighbour_search import NeighbourSearch
 from ..neighbours.periodic import Periodic
 from ..shapes.shape import morton
 from .build import reason
+from .sleep import Sleep
 from .step import REBOUNDS
 
 if TYPE_CHECKING:
@@ -104,6 +105,9 @@ def _present(world: "World") -> list[str]:
         elif isinstance(f, Periodic):
             lengths = " x ".join(f"{length:g}" if np.isfinite(length) else "open" for length in f.lengths)
             out.append(f"{f!r}: differences of nearest images, {lengths} m{', sheared' * f.sheared}")
+        elif isinstance(f, Sleep):
+            slow = f"slower than {f.speed:g} m/s for {f.time:g} s"
+            out.append(f"{f!r}: leaves out islands that were {slow}; {world.last.asleep if world.last else 0} asleep")
         elif world._runner.grid:
             grid = world._runner.grid
             out.append(f"{f!r}: {_listed(grid)}")
@@ -136,6 +140,7 @@ def _absent(world: "World") -> list[str]:
         (not step.walls, "wall pass: no wall"),
         (not world.particles.spins and bool(step.walls or step.grid), "spin: particles have none"),
         (not step.state.images, "nearest images: no Periodic"),
+        (not step.sleepers, "islands and who sleeps: no Sleep"),
         (not step.integrator.forces.all, "accelerations: no force"),
         (not step.integrator.decays, "exponential drag: no Drag or Wind"),
         (not step.integrator.uses_velocity, "second displacement: no force reads velocities"),

@@ -6,13 +6,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import checks
-from ..colliders.collider import Collider
 from ..contact.polygons import Polygons
 from ..device import at, inline, ti
 from ..device.number import OnDevice
 from ..device.thread_team import BLOCK
 from ..features.feature import Acceleration, Batch, Feature, Knob, Scene
-from ..particles import Particles
 from .step import Span
 
 if TYPE_CHECKING:
@@ -44,8 +42,8 @@ class Sleep(Feature):
 
     StepReport.asleep says how many sleep. Where all do, a frame is not computed at all. (Box2D and others: sleeping islands.)
 
-    Raises ValueError beside Polygons, PairForce and a sheared Periodic box, which islands do not know of, in order above 2, and in
-    Worlds. A world has at most one.
+    Raises ValueError beside Polygons, PairForce and a sheared Periodic box, which islands do not know of, in order above 2, and
+    in Worlds. A world has at most one.
     """
 
     speed = Knob(lambda f, v: checks.number("Sleep", "speed", v, above=0.0), "Below which a particle is slow [m/s].")
@@ -313,7 +311,7 @@ class SleepPass:
 
     @ti.func
     def look(self, i):
-        """Call the islands that particle i touches; where it is driven, also those that it touched at the start of the substep."""
+        """Call the islands that particle i touches; if it is driven, also those that it touched as the substep began."""
         drifts, d = self.drifts(i), self.state.d[i]
         for c in ti.static(self.contacts):
             if drifts or (self.sleepers.awake(i) and d.dot(d) > 0):

@@ -1,0 +1,278 @@
+"""Sleep: what rests is left out, is as it was to the bit, and goes on when something reaches it."""
+
+import contextlib
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+from tiverlet.device import ti
+
+R = 0.5
+
+
+def heap(columns, rows, apart=2.05, x0=0.0):
+    """Discs on top of each other, a little aside, so that columns lean on each other or stand."""
+    rng = np.random.default_rng(3)
+    x = np.stack(np.meshgrid(np.arange(columns) * apart * R, np.arange(rows) * 2.02 * R), -1).reshape(-1, 2) + R
+    return x + rng.uniform(0, 0.02 * R, x.shape) + [x0, 0.0]
+
+
+def pile(world, height=60.0, sleep=True, contact=None, spin=None, **settings):
+    """A heap between walls, and far above a disc that falls on it, where it has a height."""
+    x = heap(8, 4)
+    x = np.vstack([x, [4.0, height]]) if height else x
+    contact = {"friction": 0.3} if contact is None else contact
+    features = [
+        tv.Gravity(),
+        tv.Box((0, 0), (8 * 2.05 * R + 0.02, 99), friction=contact.get("friction", 0.0)),
+        tv.Contact(**contact),
+        *([tv.Sleep()] if sleep else []),
+    ]
+    return world(tv.Particles(x, radius=R, spin=spin), features, substeps=10, **settings)
+
+
+def until(w, asleep, seconds=12.0):
+    """Step until so many are asleep."""
+    for _ in range(round(60 * seconds)):
+        if w.step(1 / 60).asleep == asleep:
+            return
+    raise AssertionError(f"{w.last.asleep} of {asleep} asleep after {seconds} s")
+
+
+def falls(w, i=0, frames=20):
+    """Whether particle i moves by more than rounding and creep: at rest it is less than speed times the time."""
+    before = w.position[i]
+    for _ in range(frames):
+        w.step(1 / 60)
+    return np.linalg.norm(w.position[i] - before) > 0.02
+
+
+def test_what_sleeps_is_as_it_was_and_frames_cost_nothing(world):
+    """Nothing of the state changes but the clock, loads neither."""
+    w = pile(world, height=0)
+    until(w, 32)
+    w.step(1 / 60)
+    x, v, loads, state = w.position, w.velocity, w.contacts.impulse, w.last
+    launched, w._runner._fused = w._runner._fused, None  # what would compute a frame
+    for _ in range(120):
+        w.step(1 / 60)
+    w._runner._fused = launched
+    assert (w.position == x).all() and (w.velocity == v).all() and np.array_equal(w.contacts.impulse, loads)
+    assert w.last.asleep == 32 and w.last.energy_change == 0 and w.last.clean and w.last.contacts == state.contacts
+    assert w.last.energy == state.energy and w.last.time == w.time == pytest.approx(state.time + 2.0)
+
+
+def test_a_row_that_was_never_disturbed_is_hit_to_the_bit(world):
+    """Without gravity discs at rest have no displacement, so sleep leaves nothing out: the bits are those of a world without.
+    Cradle with e = 1: the speed of the first goes to the last one."""
+    x = np.array([(k * 1.05, 0.0) for k in range(1, 6)] + [(-9.0, 0.0)])
+    v = np.zeros((6, 2))
+    v[-1] = 4.0, 0.0
+    worlds = [
+        world(tv.Particles(x, velocity=v, radius=R), [tv.Contact(restitution=1.0), *more], substeps=8, path=path)
+        for more, path in (([], "auto"), ([tv.Sleep()], "fused"), ([tv.Sleep(time=0.1)], "parallel"), ([tv.Sleep()], "launched"))
+    ]
+    most = 0
+    for _ in range(240):
+        reports = [w.step(1 / 60) for w in worlds]
+        most = max(most, reports[1].asleep)
+        for w in worlds[1:]:
+            assert (w.position == worlds[0].position).all() and (w.velocity == worlds[0].velocity).all()
+    assert most == 5 and worlds[1].last.asleep == 5  # the last one flies on, the others rest again
+    assert worlds[1].velocity[4] == pytest.approx([4.0, 0.0], abs=1e-5)
+
+
+def test_against_a_world_that_never_rested(world):
+    """Until the disc arrives, a pile that sleeps is off by less than speed * time from one that does not, and as the disc arrives
+    momentum goes into all of it in the same substep: heights of what bounced agree to the bound."""
+    a, b = (pile(world, sleep=sleep) for sleep in (True, False))
+    until(a, 32, seconds=3.0)
+    while b.time < a.time - 1e-9:
+        b.step(1 / 60)
+    while a.last.asleep == 32 and a.time < 9.0:
+        before = a.position
+        a.step(1 / 60)
+        reached = b.position
+        b.step(1 / 60)
+    assert np.linalg.norm(before - reached, axis=1).max() < 0.005 and a.last.asleep < 32
+    # What the disc struck stood there, and its island moves: in the frame of the impact they are as near.
+    assert np.linalg.norm(a.position - b.position, axis=1).max() < 0.01
+    assert np.abs(a.velocity[:32]).max() > 0.1
+
+
+@pytest.mark.parametrize("what", ["plain", "rough"])
+def test_bits_of_all_paths(world, what):
+    """Who sleeps, and when who wakes, is the same on one thread, on a team, and phase by phase."""
+    more: dict = dict(contact={}, height=200.0)
+    if what == "rough":
+        more = dict(contact=dict(friction=(0.5, 0.4, 0.05), restitution=0.2, events=True), spin=0.0)
+    worlds = [pile(world, path=path, **more) for path in ("fused", "parallel", "launched")]
+    seen = []
+    for k in range(250 if what == "rough" else 430):
+        seen.append({w.step(1 / 60).asleep for w in worlds})
+        if k % 10 == 0 or seen[-1] != seen[k - 1]:
+            assert len({w.hash() for w in worlds}) == 1
+    assert all(len(s) == 1 for s in seen) and {32} in seen and seen[-1] != {32}  # fell asleep, and was hit
+
+
+def test_clones_and_replays_sleep_alike(world, tmp_path, read_here):
+    """A clone that is made while some sleep goes on to the bit, and a recording verifies through sleep and waking."""
+    w = pile(world)
+    with tv.Recorder(tmp_path / "sleep.rrd", w) as recorder:
+        until(w, 32)
+        for _ in range(5):
+            w.step(1 / 60)
+            recorder.log()
+        other = w.clone()
+        for _ in range(100):
+            w.step(1 / 60), other.step(1 / 60)
+            recorder.log()
+            assert w.last.asleep == other.last.asleep
+        assert w.hash() == other.hash() and w.last.asleep != 32
+        other.close()
+    assert tv.replay(tmp_path / "sleep.rrd").verify()
+
+
+def test_islands(world):
+    """Heaps that do not touch are islands of their own: one is hit, the other one sleeps on."""
+    x = np.vstack([heap(3, 3), heap(3, 3, x0=20.0), [(21.0, 50.0)]])
+    w = world(tv.Particles(x, radius=R), [tv.Gravity(), tv.HalfSpace((0, 1), friction=1.0), tv.Contact(friction=1.0), tv.Sleep()])
+    until(w, 18, 3.0)
+    first = w.position[:9]
+    while w.last.asleep == 18 and w.time < 9.0:
+        w.step(1 / 60)
+    assert 9 <= w.last.asleep < 18 and w.position[18, 1] < 5.0  # columns that lean on nothing are islands, too
+    w.run(0.5)
+    assert (w.position[:9] == first).all()
+
+
+def test_what_wakes(world):
+    """Whatever the user changes, and what he drives."""
+    gate = tv.Box((-9, -9), (99, 99), active=True)
+    floor, gravity = tv.HalfSpace((0, 1)), tv.Gravity()
+    x = np.vstack([heap(2, 2), [(0.5, -0.5), (1.5, -0.5)]])  # on two discs that are driven, and on a floor
+    carrier = tv.Pin([4, 5], x[4:])
+    w = world(
+        tv.Particles(x, radius=R), [gravity, floor, gate, tv.Contact(friction=0.5), carrier, tv.Sleep(time=0.2)], substeps=8
+    )
+    floor.offset = -1.0
+    until(w, 4)
+
+    def again(change):
+        new = w.clone()
+        new.step(1 / 60)
+        assert new.last.asleep == 4
+        change(new)
+        moved = falls(new)
+        new.close()
+        return moved
+
+    def assigned(name, value):
+        return lambda new: setattr(new, name, value)
+
+    def turned(k, name, value):
+        return lambda new: setattr(new.features[k], name, value)
+
+    assert not again(lambda new: None)
+    assert again(assigned("position", w.position + 1.0))
+    assert again(assigned("velocity", np.full((6, 2), 1.0)))
+    assert again(turned(0, "g", (5.0, 9.0)))
+    assert again(turned(4, "target", x[4:] - [0.0, 0.4]))  # what carried them moves away from under them
+    assert again(turned(4, "target", x[4:] + [0.0, 0.4]))
+    assert again(lambda new: new.remove([4, 5]))
+    assert not again(turned(2, "active", False))  # a gate far away
+
+
+def test_forces_that_change_by_themselves(world):
+    """A force that depends on time wakes what it begins to pull at, and only that."""
+
+    @ti.func
+    def later(x, v, t):
+        return ti.Vector([ti.select(t > 1.5 and x[0] > 5, 30.0, 0.0), 0.0])
+
+    x = [(0.0, R), (10.0, R)]
+    w = world(
+        tv.Particles(x, radius=R),
+        [tv.Gravity(), tv.HalfSpace((0, 1), friction=0.2), tv.Contact(friction=0.2), tv.Force(later), tv.Sleep()],
+    )
+    until(w, 2, 1.2)
+    w.run(1.5)
+    assert w.last.asleep == 1 and w.position[0] == pytest.approx(x[0]) and w.position[1, 0] > 10.5
+
+
+@pytest.mark.parametrize("solver", [None, tv.Jacobi(), tv.ConjugateGradient(4)], ids=["direct", "jacobi", "conjugate"])
+def test_linked_particles(world, solver):
+    """A rope at rest sleeps whole, with its loads, and wakes whole; Sleep changes nothing of what does not rest."""
+    rope = tv.shapes.rope((0, 0), (3.0, 0), 16)
+    x = np.vstack([rope.position, [(rope.position[8, 0] + 0.01, 12.0)]])
+    w = world(
+        tv.Particles(x, radius=0.05, mass=0.1),
+        [tv.Gravity(), tv.HalfSpace((0, 1), -0.05, friction=0.5), tv.Contact(friction=0.5), tv.Distance(rope.links), tv.Sleep()],
+        substeps=12,
+        solver=solver,
+    )
+    until(w, len(rope.position), 2.0)
+    strain, position = w.features[3].residual, w.position[:-1]
+    while w.last.asleep and w.time < 3.0:
+        assert (w.position[:-1] == position).all() and np.array_equal(w.features[3].residual, strain)
+        w.step(1 / 60)
+    assert w.time > 1.4 and falls(w, 8, 5)  # when the ball came down: sqrt(2 * 12 / g) = 1.56 s
+
+
+def test_what_never_sleeps(world):
+    """Bodies that islands do not know of stay awake, and so does what is linked to what is driven."""
+    body = tv.shapes.grid((4, 4), spacing=1.0)
+    x = np.vstack([body.position + R, [(8.0, R), (20.0, R), (21.2, R)]])
+    w = world(
+        tv.Particles(x, radius=R),
+        [
+            tv.Gravity(),
+            tv.HalfSpace((0, 1)),
+            tv.Contact(),
+            tv.ShapeMatch([np.arange(16)]),
+            tv.Pin([17], x[17:18]),
+            tv.Distance([(17, 18)], compliance=1e-4),
+            tv.Sleep(),
+        ],
+    )
+    w.run(2.0)
+    assert w.last.asleep == 1  # the one that is alone
+
+
+def test_energy_never_grows(world):
+    """Of a pile that falls asleep, and is woken by touching its knobs over and over again: J of creep at most."""
+    w = pile(world, height=0)
+    until(w, 32)
+    energy = w.last.energy
+    for _ in range(5):
+        w.features[2].friction = 0.3
+        w.run(0.9)
+        assert w.last.energy <= energy * (1 + 1e-5)
+
+
+def test_refusals(world):
+    """What islands do not know of, with what to do."""
+
+    @ti.func
+    def apart(r):
+        return 0.1 * r
+
+    p = tv.Particles([(0, 0), (1, 1), (0, 1)], radius=0.1)
+    loop = tv.Polygons([[0, 1, 2]])
+    for features, word in (
+        ([loop, tv.Sleep()], "Polygons"),
+        ([tv.Sleep(), tv.Sleep()], "more than one Sleep"),
+        ([tv.Periodic((0, 0), (9, 9), shear=0.1), tv.Sleep()], "sheared"),
+        ([tv.PairForce(apart, 0.5), tv.Sleep()], "PairForce"),
+    ):
+        with pytest.raises(ValueError, match=word):
+            tv.World(p, features)
+    with pytest.raises(ValueError, match="order"):
+        tv.World(p, [tv.Sleep()], order=4, precision="f64")
+    for bad in (dict(speed=0.0), dict(time=-1.0)):
+        with pytest.raises(ValueError, match="Sleep"):
+            tv.Sleep(**bad)
+    w = tv.World(p, [tv.Contact(), tv.Sleep()])
+    with contextlib.closing(w), pytest.raises(ValueError, match="Worlds"):
+        tv.Worlds(w, 3)
