@@ -43,9 +43,8 @@ __all__ = [
     "Contact", "Dihedral", "Direct", "Distance", "Drag", "Force", "Gravity", "HalfSpace", "Hand", "Jacobi", "Mesh", "Motor",
     "PairForce", "Particles", "Path", "Periodic", "Pin", "Polygon", "Polygons", "Recorder", "Rope", "Sdf", "ShapeMatch", "Sleep",
     "Snap", "Spacer", "StepReport", "SweepResult", "Volume", "Winch", "Wind", "World", "Worlds", "WorldsRecorder", "approach",
-    "clamp", "golden", "golden_colors", "golden_index", "gradient", "init", "measure", "mix", "play", "replay", "runtime", "shapes",
-    "smoothstep",
-    "sweep",
+    "clamp", "golden", "golden_colors", "golden_index", "gradient", "init", "measure", "mix", "play", "replay", "runtime",
+    "shapes", "smoothstep", "sweep",
 ]  # fmt: skip
 __version__ = "0.1.0"  # the only place that says it
 
