@@ -9,12 +9,13 @@ from .. import checks
 from ..features.feature import Knob, Scene
 from ..particles import Particles
 from .core.drive import Drive, largest_load
-from .distance import Link
+from .core.length import Length
+from .core.scalar import Scalar
 
 SHORTEST = 1e-2  # of its initial length: what remains of a rope, where nothing else is said
 
 
-class Winch(Link):
+class Winch(Scalar):
     """Winches: ropes whose length changes at a given speed, with a largest force.
 
     C(x) = |x_i - x_j| - rest <= 0, gradients as in Distance; the multiplier may only pull. In a substep h the length `rest` grows
@@ -31,10 +32,11 @@ class Winch(Link):
     `load` is the tension [N], `rest` the length now [m].
     """
 
+    measures = Length
     side = 1
     driven = True
     each = ("speed", "length", "shortest", "longest", "force", "compliance", "damping", "break_at")
-    compiled_for = (*Link.compiled_for, "capped")
+    compiled_for = (*Scalar.compiled_for, "capped")
     uploads_all = False  # goals are of one
     speed = Knob(lambda f, v: checks.per_item("Winch", "speed", v, f.count), "Change of length [m/s].")
     shortest = Knob(lambda f, v: checks.per_item("Winch", "shortest", v, f.count, above=0.0), "Least length [m].")
@@ -97,7 +99,7 @@ class Winch(Link):
 
     def upload(self) -> None:
         """Write new speeds, ends and forces."""
-        Link.upload(self)
+        Scalar.upload(self)
         if self.acts:
             self.dev.drive.upload(*self._course(), self.force)
 
