@@ -144,6 +144,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     memory, state, particles = scene.memory, scene.state, scene.particles
 
     def of(kind: type[T]) -> list[T]:
+        """Those of one kind."""
         return [f for f in features if isinstance(f, kind)]
 
     for first in [*of(Periodic), *of(Sleep)]:

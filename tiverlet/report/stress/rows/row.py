@@ -47,6 +47,7 @@ def row(number: int, what: str, criterion: str) -> Callable:
     """Register a function as the row of this number."""
 
     def register(attempt: Callable[[], Finding]) -> Callable[[], Finding]:
+        """Enter it, once."""
         if number in ROWS:
             raise ValueError(f"row {number} is there twice.")
         ROWS[number] = Row(number, what, criterion, attempt)
