@@ -42,7 +42,6 @@ class Motor(Scalar):
     index_name = "hinges"
     driven = True
     each = ("speed", "angle", "torque", "compliance", "damping", "break_at")
-    compiled_for = (*Scalar.compiled_for, "capped")
     uploads_all = False  # goals are of one
     speed = Knob(lambda f, v: checks.per_item("Motor", "speed", v, f.count), "Angular velocity [rad/s].")
     angle = Knob(lambda f, v: f._angle(v), "Where to turn to [rad].")
@@ -68,9 +67,9 @@ class Motor(Scalar):
         return checks.per_item("Motor", "angle", value, self.count, least=-TURN, most=TURN)
 
     @property
-    def capped(self) -> bool:
-        """Whether any torque is limited, or was when kernels were compiled."""
-        return bool(np.isfinite(self.torque).any()) or self._built("drive", "capped")
+    def largest(self) -> Any:
+        """The largest torques."""
+        return self.torque
 
     @property
     def rest(self) -> np.ndarray:
@@ -95,26 +94,16 @@ class Motor(Scalar):
         self.dev.ends = scene.state.dim == 3 and self.arity == 3
         super().bind(scene)
 
-    def relaxed_alone(self, scene: Scene) -> np.ndarray:
-        """A multiplier that is clamped cannot be eliminated."""
-        return self.acts_as_force(scene) | np.isfinite(self.torque)
-
     def drive_of(self, scene: Scene) -> Drive:
         """Towards the angle, or on and on."""
         largest = self.torque if self.capped else None
         endless, period = not (self.serves or self.dev.ends), 0.0 if self.dev.ends else TURN
-        return Drive(scene, "Motor", self._begin, *self._course(), largest, endless, period, SETTLE * self.serves)
+        return Drive(scene, "Motor", self._begin, *self.course(), largest, endless, period, SETTLE * self.serves)
 
-    def _course(self) -> tuple[Any, Any]:
+    def course(self) -> tuple[Any, Any]:
         """Where rest angles go to, and how fast."""
         end = np.where(self.speed > 0, np.pi, 0.0)
         return self.angle if self.serves else end, self.speed
-
-    def upload(self) -> None:
-        """Write new speeds, angles and torques."""
-        super().upload()
-        if self.acts:
-            self.dev.drive.upload(*self._course(), self.torque)
 
     def start_at(self, position: np.ndarray, first: int) -> None:
         """Go on from where hinges were placed."""

@@ -69,7 +69,7 @@ class Scalar(Batch):
     compliance = Knob(lambda f, v: checks.per_item(repr(f), "compliance", v, f.count, least=0.0), "Of springs.", force=True)
     damping = Knob(lambda f, v: checks.per_item(repr(f), "damping", v, f.count, least=0.0), "Of the dashpot.", force=True)
     break_at = Knob(strength_of, "Load beyond which a constraint breaks, (m,); None for never.")
-    compiled_for = ("soft", "damped", "breaks", "limited", "cusp", "_strictly")
+    compiled_for = ("soft", "damped", "breaks", "limited", "cusp", "capped", "_strictly")
 
     each = ("rest", "compliance", "damping", "break_at")
     rest_name = "rest"
@@ -258,7 +258,9 @@ class Scalar(Batch):
         return (self.compliance > 0) & (scene.order > 2)
 
     def relaxed_alone(self, scene: Scene) -> np.ndarray:
-        """Which constraints no system is to have, (m,): forces, and those that end where gradients do."""
+        """Which constraints no system is to have, (m,): forces, those that end where gradients do, and clamped multipliers."""
+        if self.driven:
+            return self.acts_as_force(scene) | np.isfinite(self.largest)
         return self.acts_as_force(scene) | (self.cusp & (self.goal == 0) & (self.compliance == 0))
 
     @property
@@ -270,6 +272,20 @@ class Scalar(Batch):
     def drive_of(self, scene: Scene) -> Drive:
         """What moves the rest values, where the batch is driven."""
         raise NotImplementedError
+
+    def course(self) -> tuple[Any, Any]:
+        """Where the batch is driven: where rest values go to, and how fast, (m,) each."""
+        raise NotImplementedError
+
+    @property
+    def largest(self) -> Any:
+        """Where the batch is driven: the largest loads, (m,)."""
+        raise NotImplementedError
+
+    @property
+    def capped(self) -> bool:
+        """Whether any load of a drive is limited, or was when kernels were compiled."""
+        return self.driven and bool(np.isfinite(self.largest).any()) or self._built("drive", "capped")
 
     def start_at(self, position: np.ndarray, first: int) -> None:
         """Where the batch is driven: particles from number `first` on were placed where they are, (n, dim)."""
@@ -328,7 +344,9 @@ class Scalar(Batch):
     def upload(self) -> None:
         """Write new rest values, stiffnesses and strengths."""
         if self.acts:
-            if not self.driven:
+            if self.driven:
+                self.dev.drive.upload(*self.course(), self.largest)
+            else:
                 self.scene.memory.write(self.dev.rest, self.goal)
             self.dev.spring.upload(self.compliance, self.damping)
             self.dev.strength.upload(self.break_at)
