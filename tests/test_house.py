@@ -1,4 +1,4 @@
-"""The layout: how deep classes inherit, and that modules import each other one way."""
+"""The layout: how much lies at the root of the package, how deep classes inherit, and that imports go one way."""
 
 import ast
 from pathlib import Path
@@ -69,3 +69,8 @@ def test_classes_are_at_most_two_below_a_contract():
     assert all(name in kinds for name in CONTRACTS)
     assert {name: d for name in kinds if (d := depth(name)) > 2} == {}
     assert depth("Distance") == depth("Mesh") == 2 and depth("Gravity") == depth("Direct") == 1
+
+
+def test_the_root_of_the_package_can_be_taken_in_at_a_glance():
+    entries = [p.name for p in ROOT.iterdir() if p.name != "__pycache__"]
+    assert len(entries) <= 25, sorted(entries)

@@ -12,7 +12,7 @@ import numpy as np
 from ....features.feature import Feature
 from ....measure import overlapping
 from ....particles import Particles
-from ....step_report import StepReport
+from ....step.step_report import StepReport
 from ....world import World
 
 NAN, INF = float("nan"), float("inf")
