@@ -182,6 +182,24 @@ class Acceleration(Feature):
     pairwise = False
     room = 0  # listed neighbours of a particle for which there is room at first
 
+    def settings(self) -> dict[str, Any]:
+        """What its knobs come to for kernels: numbers and vectors, which are `dev.name[None]`."""
+        return {}
+
+    def bind(self, scene: Scene) -> None:
+        """Declare a field for each of its settings."""
+        self.scene = scene
+        for name, value in self.settings().items():
+            kind, width = ti.i32 if isinstance(value, int) else None, np.size(value) if np.ndim(value) else 0
+            field = scene.memory.field(f"{type(self).__name__}.{name}", None, width=width, kind=kind, values=value)
+            setattr(self.dev, name, field)
+        self.changed = False
+
+    def upload(self) -> None:
+        """Write them."""
+        for name, value in self.settings().items():
+            self.scene.memory.write(vars(self.dev)[name], value)
+
     def join(self, scene: Scene, team: Any) -> Any:
         """Where it is pairwise: declare its neighbour list and return it, None if it has none."""
 
