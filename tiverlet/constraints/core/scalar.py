@@ -31,7 +31,7 @@ LOST = 0.015  # violation at the start of a substep, relative to the size, from 
 
 
 class Scalar(Batch):
-    """Constraints C(x) = f(x) - rest = 0, >= 0 or <= 0, soft or rigid, from `measure`. numerics: one formula for all.
+    """Constraints C(x) = f(x) - rest = 0, >= 0 or <= 0, soft or rigid; f is its `quantity`. One formula for all:
 
         theta = s^4 / (1 + s^4), s^2 = (omega h)^2 = w h^2 / alpha     0: resolved by the step, 1: rigid
         C*    = (1 - theta) (C_(n+1) + 2 C_n + C_(n-1)) / 4 + theta C_(n+1)
