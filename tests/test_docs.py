@@ -66,27 +66,27 @@ def test_the_first_page_is_short_and_leads_to_all_others():
     assert all(str(page) in text for page in PAGES[1:])
 
 
-def undocumented(body: list[ast.stmt], within: str) -> list[str]:
-    """Public names in a body without a docstring; not what a setter is for, which its property says."""
+def undocumented(tree: ast.Module) -> list[str]:
+    """Names without a docstring, nested ones too; not what a setter is for, which its property says, nor what begins with _."""
     out = []
-    for node in body:
-        if not isinstance(node, ast.FunctionDef | ast.ClassDef) or node.name.startswith("_"):
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) or node.name.startswith("_"):
             continue
         if any(isinstance(d, ast.Attribute) and d.attr == "setter" for d in node.decorator_list):
             continue
-        out += [] if ast.get_docstring(node) else [f"{within}{node.name}"]
-        out += undocumented(node.body, f"{within}{node.name}.") if isinstance(node, ast.ClassDef) else []
+        out += [] if ast.get_docstring(node) else [f"{node.lineno} {node.name}"]
     return out
 
 
 def test_every_public_name_says_what_it_is():
-    # Modules, classes, functions, methods and properties of the package; and live settings, which say it when they are made.
+    # Modules, classes, functions, methods and properties of the package, and what is defined inside of them; and live settings,
+    # which say it when they are made.
     missing = []
     for path in ROOT.glob("tiverlet/**/*.py"):
         tree = ast.parse(path.read_text())
         name = str(path.relative_to(ROOT))
         missing += [] if ast.get_docstring(tree) else [name]
-        missing += undocumented(tree.body, f"{name}: ")
+        missing += [f"{name}:{what}" for what in undocumented(tree)]
     kinds = [kind for kind in vars(tv).values() if inspect.isclass(kind)]
     missing += [f"{kind.__name__}.{knob}" for kind in kinds for knob in knobs_of(kind) if not getattr(kind, knob).__doc__]
     assert not missing

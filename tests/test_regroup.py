@@ -172,8 +172,8 @@ def test_bodies_go_whole_and_numbers_follow():
     for f in (volume, limit, polygons, shape):
         f.remap_indices(number, 11)
     assert volume.count == 1 and volume.pressure.tolist() == [2.0] and volume.indices.tolist() == [6, 7, 8, 9]
-    np.testing.assert_array_equal(np.sort(volume.function.faces, axis=1), np.sort(four + 6, axis=1))
-    assert volume.function.surface.tolist() == [0, 0, 0, 0]
+    np.testing.assert_array_equal(np.sort(volume.quantity.faces, axis=1), np.sort(four + 6, axis=1))
+    assert volume.quantity.surface.tolist() == [0, 0, 0, 0]
     assert limit.indices.tolist() == [[2, 3, 4]] and (limit.lower, limit.upper, limit.compliance) == ([0.2], [0.4], [2.0])
     assert [loop.tolist() for loop in polygons.loops] == [[6, 7, 8]]
     assert shape.indices.tolist() == [3, 4, 5] and shape.compliance.tolist() == [2.0] and shape._rest.shape == (11, 2)

@@ -30,7 +30,7 @@ from .particles import Particles
 from .recording import Recorder, WorldsRecorder, replay
 from .solvers import Chebyshev, ConjugateGradient, Direct, Jacobi
 from .step.sleep import Sleep
-from .step_report import StepReport
+from .step.step_report import StepReport
 from .tools import approach, clamp, golden, golden_colors, golden_index, mix, smoothstep
 from .world import World
 from .worlds import SweepResult, Worlds, gradient, sweep

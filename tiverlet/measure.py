@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .neighbours.queries import between
-from .spin import moments
+from .particles.spin import moments
 
 if TYPE_CHECKING:
     from .neighbours import Periodic

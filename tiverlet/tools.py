@@ -48,8 +48,11 @@ def _both(kernel: Callable) -> Callable[[Callable], Callable]:
     """Use `kernel`, a ti.func, when called while a kernel is compiled, and the decorated function otherwise."""
 
     def decorate(python: Callable) -> Callable:
+        """Of one function."""
+
         @functools.wraps(python)
         def chosen(*args, **kwargs):
+            """Call the one that fits where this is."""
             return kernel(*args, **kwargs) if inside_kernel() else python(*args, **kwargs)
 
         return callable_in_kernels(chosen)

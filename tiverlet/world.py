@@ -13,6 +13,7 @@ from .colliders.collider import Collider
 from .constraints.core.strength import BREAKS
 from .contact.initial_overlap import overlapping
 from .contact.pair_contact import PairContact
+from .contact.rays import Hits, inside, ray
 from .contact.touches import ContactEvents, joined, no_events
 from .device.copies import Copies
 from .device.interrupts import whole
@@ -21,7 +22,6 @@ from .features.feature import Acceleration, Batch, Feature
 from .features.read_only import assign_whole, read_only, structure
 from .neighbours.queries import Contacts, PointSearch, near_by_all, nearest
 from .particles import Particles, at_rest, in_range, spin_of
-from .rays import Hits, inside, ray
 from .solvers.solver import Solver
 from .step import checkpoint, edit_scene
 from .step.adaptive import StepController
@@ -30,7 +30,7 @@ from .step.clock import Clock
 from .step.edit_scene import Handle
 from .step.explain import compiling, explain
 from .step.runner import Runner
-from .step_report import StepReport
+from .step.step_report import StepReport
 
 LIVE = ("position", "velocity", "spin", "substeps", "iterations")
 

@@ -100,7 +100,7 @@ def overlap(contact: Any, features: list[Any], particles: Any, free: np.ndarray,
 
 def shapeless(f: Any, x: np.ndarray) -> np.ndarray:
     """Of constraints on angles, those between corners that have none: nothing acts on them."""
-    if not isinstance(f, Angle):
+    if not isinstance(getattr(f, "quantity", None), Angle):
         return np.zeros(f.count, dtype=bool)
     q = x[f.indices]
     legs = np.diff(q, axis=1) if f.arity == 3 else q[:, 1:] - q[:, :1]

@@ -15,6 +15,7 @@ from .collider import Collider
 
 def _corner(name: str):
     def check(box: "Box", value):
+        """Check one corner against the other, where that is known."""
         value = checks.vector("Box", name, value, box.dim or len(np.atleast_1d(value)), infinite=True)
         other = box.__dict__.get("upper" if name == "lower" else "lower")
         if other is not None and len(other) == len(value):

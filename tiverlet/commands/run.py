@@ -77,11 +77,14 @@ def recording(out: str, live: bool | str = False) -> Iterator[list[Any]]:
     step, recorder = World.step, tiverlet.Recorder
 
     class Redirected(recorder):
+        """A Recorder that writes to the file of the command, and is known to it."""
+
         def __init__(self, path, *args, **kwargs):
             super().__init__(path if made else out, *args, **(kwargs if made else kwargs | given))
             made.append(self)
 
     def stepped(world: World, *args, **kwargs):
+        """World.step(), recorded by one of our own where the script makes no Recorder."""
         if not made:
             made.append(recorder(out, world, **given))
         report = step(world, *args, **kwargs)

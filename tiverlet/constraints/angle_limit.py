@@ -7,11 +7,12 @@ from .. import checks
 from ..device import ti
 from ..features.feature import Knob, Scene
 from ..particles import Particles
-from .core.angle import TURN, Angle, path_angle, path_angles, wrapped
+from .core.angle import TURN, PathAngle, turned, wrapped
+from .core.quantity import differences
 from .core.scalar import Scalar
 
 
-class AngleLimit(Angle):
+class AngleLimit(Scalar):
     """Corners that are free between two angles: elbows, knees, doors.
 
     C(x) = |f(x) - (lower + upper) / 2| - (upper - lower) / 2 <= 0, with the angle f [rad] of Bend, taken within half a turn of
@@ -26,10 +27,9 @@ class AngleLimit(Angle):
     `load` is the moment at either stop [N m].
     """
 
-    arity = 3
+    measures = PathAngle
     bulk = 3.0
     index_name = "triples"
-    exchangeable = ((0, 2),)
     each = ("lower", "upper", "compliance", "damping", "break_at")
     side = 1
     lower = Knob(lambda f, v: f._bound("lower", v), "The smaller limit [rad].")
@@ -66,10 +66,13 @@ class AngleLimit(Angle):
             if particles.dim == 3:
                 checks.per_item("AngleLimit", f"{name} (in 3D)", value, self.count, least=0.0, most=np.pi)
 
-    def rest_of(self, position: np.ndarray) -> np.ndarray:
+    def values(self, x: np.ndarray) -> np.ndarray:
         """How far the angles are from the middle."""
-        f = path_angles(*np.moveaxis(self.placed(position), 1, 0)) - self.middle
-        return np.abs(f - TURN * np.round(f / TURN))
+        return np.abs(turned(super().values(x) - self.middle))
+
+    def gradients(self, position: np.ndarray) -> np.ndarray:
+        """Of that, by each corner."""
+        return differences(self.values, self.placed(position))
 
     def violation(self, position: np.ndarray) -> np.ndarray:
         """C at the given positions."""
@@ -78,21 +81,25 @@ class AngleLimit(Angle):
     def bind(self, scene: Scene) -> None:
         """The middle of each range."""
         self.dev.middle = scene.memory.field("AngleLimit.middle", self.count, values=self.middle)
-        Angle.bind(self, scene)
+        super().bind(scene)
 
     def upload(self) -> None:
         """Write new limits."""
-        Angle.upload(self)
+        super().upload()
         if self.acts:
             self.scene.memory.write(self.dev.middle, self.middle)
 
     uploads_all = False  # middle is of one
-    unwrap = Scalar.unwrap  # a distance from the middle has one value
+
+    @ti.func
+    def unwrap(self, f, other):
+        """A distance from the middle has one value."""
+        return f
 
     @ti.func
     def measure(self, c, q):
         """See the class."""
-        f, g = path_angle(q, 0 * q[0, :], False, self.faint())
+        f, g = self.dev.quantity.measure(q)
         middle = self.dev.middle[c]
         f = wrapped(f, middle) - middle
         side = ti.select(f < 0, ti.cast(-1, self.dev.real), ti.cast(1, self.dev.real))

@@ -1,5 +1,7 @@
 """Areas of triangles and of closed loops."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -8,12 +10,13 @@ from ..device import ti
 from ..features.feature import Knob, Scene
 from ..features.members import FixedSize
 from ..particles import Particles
-from .core.enclosed import Enclosed
+from .core.outline import PRESSURE
+from .core.quantity import Quantity
 from .core.scalar import Scalar
-from .core.variable_size import Corners, VariableSize, rows
+from .core.variable_size import VariableSize, rows
 
 
-class Area(Enclosed):
+class Area(Scalar):
     """Triangles, or closed loops of any length in 2D, that keep their area: cells, soft bodies, cushions.
 
     C(x) = A(x) - pressure rest.
@@ -32,7 +35,9 @@ class Area(Enclosed):
     """
 
     index_name = "loops"
-    collapses, curved = 2, True
+    each = (*Scalar.each, "pressure")
+    pressure = PRESSURE
+    quantity: "Triangles | Loops"
     rest = Knob(lambda f, v: checks.per_item("Area", "rest", v, f.count, least=0.0), "Area at pressure 1 [m^2].")
 
     def __init__(
@@ -42,11 +47,16 @@ class Area(Enclosed):
         self.setup(loops, rest, compliance, damping, break_at)
         self.pressure = pressure
 
-    def function_of(self, indices) -> "Triangles | Loops":
+    @property
+    def goal(self) -> np.ndarray:
+        """pressure rest."""
+        return self.pressure * self.rest
+
+    def quantity_of(self, indices) -> Quantity:
         """Triangles are simpler than loops, and have kernels of their own."""
         loops = checks.rows("Area", "loops", indices, "a sequence of index sequences")
         if all(np.ndim(loop) == 1 and len(loop) == 3 for loop in loops):
-            return Triangles(FixedSize("Area", checks.indices("Area", "loops", indices, checks.ANY, arity=3)))
+            return Triangles(self.fixed(indices, 3))
         return Loops(VariableSize("Area", rows("Area", "loops", indices, 3)))
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
@@ -55,33 +65,33 @@ class Area(Enclosed):
             raise ValueError("Area: loops of more than 3 particles enclose no definite area in 3D; use triangles, or Volume.")
         self.check_indices(particles)
         if particles.dim == 2:
-            self.reverse(self.rest_of(particles.position) < 0)
-        Scalar.prepare(self, particles, inv_mass)
+            self.hold(self.quantity.reversed(self.rest_of(particles.position) < 0))
+        super().prepare(particles, inv_mass)
 
 
-class Triangles:
-    """Areas of triangles. See Enclosed for the methods."""
+class Triangles(Quantity):
+    """Areas of triangles."""
 
-    def __init__(self, members: FixedSize):
-        self.members = members
-        self.listing, self.pairs = members.listing, members.pairs
+    arity, collapses, curved = 3, 2, True
+    exchangeable = ((0, 1, 2),)
 
     def reversed(self, which: np.ndarray) -> "Triangles":
         """Two corners swapped."""
         indices = self.members.indices
         return Triangles(FixedSize("Area", np.where(which[:, None], indices[:, ::-1], indices)))
 
-    def remapped(self, some: np.ndarray, number: np.ndarray) -> "Triangles":
-        """Those in the mask."""
-        return Triangles(self.members.remapped(some, number))
-
-    def values(self, members, position: np.ndarray) -> np.ndarray:
+    def values(self, x: np.ndarray) -> np.ndarray:
         """Areas of the triangles; signed in 2D."""
-        a, b, c = (position[k] for k in members.indices.T)
-        if position.shape[1] == 2:
+        a, b, c = x[:, 0], x[:, 1], x[:, 2]
+        if x.shape[2] == 2:
             (ux, uy), (vx, vy) = (b - a).T, (c - a).T
             return (ux * vy - uy * vx) / 2
         return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+
+    @ti.func
+    def reach(self, q):
+        """The size of a triangle."""
+        return q.norm()
 
     @ti.func
     def measure(self, q):
@@ -103,40 +113,29 @@ class Triangles:
         return f, ti.Matrix.rows([-u - v, u, v])
 
 
-class Loops:
-    """Areas of closed loops in 2D. See Enclosed for the methods."""
+class Loops(Quantity):
+    """Areas of closed loops in 2D."""
 
-    def __init__(self, members: VariableSize):
-        self.members = members
-
-    @property
-    def listing(self) -> list[np.ndarray]:
-        """The particles of each loop."""
-        return self.members.listing
+    collapses, curved = 2, True
+    sides: Any  # on the device: the neighbours of each corner, (total, 2)
 
     def reversed(self, which: np.ndarray) -> "Loops":
         """Some of them the other way round."""
         return Loops(VariableSize("Area", [self.members.row(k)[:: -1 if w else 1] for k, w in enumerate(which)]))
 
-    def remapped(self, some: np.ndarray, number: np.ndarray) -> "Loops":
-        """Those in the mask."""
-        return Loops(self.members.remapped(some, number))
-
-    def values(self, members, position: np.ndarray) -> np.ndarray:
+    def values(self, x: np.ndarray) -> np.ndarray:
         """Areas by the shoelace formula."""
-        indices, starts = members.indices, members.starts
-        if not members.count:
+        indices, starts = self.members.indices, self.members.starts
+        if not self.members.count:
             return np.zeros(0)
-        r = position[indices] - np.repeat(position[indices[starts[:-1]]], np.diff(starts), axis=0)
+        r = x[indices] - np.repeat(x[indices[starts[:-1]]], np.diff(starts), axis=0)
         s = r[self.after]
         return np.add.reduceat(r[:, 0] * s[:, 1] - r[:, 1] * s[:, 0], starts[:-1]) / 2
 
-    def gradients(self, position: np.ndarray) -> np.ndarray:
+    def gradients(self, x: np.ndarray) -> np.ndarray:
         """Their gradients by each corner, (total, 2)."""
-        before = np.empty_like(self.after)
-        before[self.after] = np.arange(len(before))
-        x = position[self.members.indices]
-        across = x[self.after] - x[before]
+        sides = x[self.neighbours]
+        across = sides[:, 1] - sides[:, 0]
         return np.stack([across[:, 1], -across[:, 0]], axis=1) / 2
 
     @property
@@ -147,25 +146,24 @@ class Loops:
         out[starts[1:] - 1] = starts[:-1]
         return out
 
+    @property
+    def neighbours(self) -> np.ndarray:
+        """The particles before and after each corner, (total, 2)."""
+        before = np.empty_like(self.after)
+        before[self.after] = np.arange(len(before))
+        indices = self.members.indices
+        return np.stack([indices[before], indices[self.after]], axis=1)
+
     def pairs(self) -> np.ndarray:
         """Neighbours along a loop."""
         indices = self.members.indices
         return np.stack([indices, indices[self.after]], axis=1)
 
-    def bind(self, scene: Scene, corners: Corners) -> "LoopGradients":
+    def bind(self, scene: Scene, batch: Any) -> "Loops":
         """Its gradients, on the device."""
-        before = np.empty_like(self.after)
-        before[self.after] = np.arange(len(before))
-        indices = self.members.indices
-        return LoopGradients(scene, np.stack([indices[before], indices[self.after]], axis=1))
-
-
-class LoopGradients:
-    """Gradients of areas of loops on the device. sides: the neighbours of each corner, (total, 2)."""
-
-    def __init__(self, scene: Scene, sides: np.ndarray):
-        self.state = scene.state
-        self.sides = scene.memory.field("Area.sides", len(sides), width=2, kind=ti.i32, values=sides)
+        bound, sides = super().bind(scene, batch), self.neighbours
+        bound.sides = scene.memory.field("Area.sides", len(sides), width=2, kind=ti.i32, values=sides)
+        return bound
 
     @ti.func
     def slope(self, e, back):

@@ -1,14 +1,14 @@
 """Angles between links."""
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from ..device import ti
 from ..features.feature import Scene
-from .core.angle import Angle, path_angle, path_angles
+from .core.angle import REST_ANGLE, PathAngle, path_angle
+from .core.scalar import Scalar
 
 
-class Bend(Angle):
+class Bend(Scalar):
     """Bending springs and rigid corners: the path i - j - k turns by a given angle at j.
 
     C(x) = f(x) - rest, the angle f [rad] and its gradients as in path_angle(): f = 0 where the path is straight.
@@ -25,20 +25,16 @@ class Bend(Angle):
     the compliance 30 h^2 / (m l^2), however rigid it was meant to be.
     """
 
-    arity = 3
+    measures = PathAngle
     index_name = "triples"
-    exchangeable = ((0, 2),)
+    rest = REST_ANGLE
 
     def __init__(self, triples, rest=None, *, compliance: ArrayLike = 0.0, damping: ArrayLike = 0.0, break_at=None):
         self.setup(triples, rest, compliance, damping, break_at)
 
-    def rest_of(self, position: np.ndarray) -> np.ndarray:
-        """The angles at the given positions."""
-        return path_angles(*np.moveaxis(self.placed(position), 1, 0))
-
     def bind(self, scene: Scene) -> None:
         """In 3D, the normals as they were last."""
-        Angle.bind(self, scene)
+        super().bind(scene)
         if scene.state.dim == 3:
             self.dev.axis = scene.memory.field(f"{self!r}.axis", self.count, width=3, state=True)
 
@@ -48,7 +44,7 @@ class Bend(Angle):
         axis = 0 * q[0, :]
         if ti.static(self.dev.state.dim == 3):
             axis = self.dev.axis[c]
-        return path_angle(q, axis, self.mirrored(c), self.faint())
+        return path_angle(q, axis, self.mirrored(c), self.dev.quantity.faint())
 
     @ti.func
     def mirrored(self, c):
@@ -70,9 +66,9 @@ class Bend(Angle):
             if fresh != 0:
                 self.dev.axis[c] = 0 * self.dev.axis[c]
             e = crossed(self.corners(c, 1))
-            if e.norm() < 10 * self.faint():
+            if e.norm() < 10 * self.dev.quantity.faint():
                 e = crossed(self.corners(c, 0))
-            if e.norm() > 10 * self.faint():
+            if e.norm() > 10 * self.dev.quantity.faint():
                 side = ti.cast(1, self.dev.real)
                 if self.mirrored(c) and self.dev.axis[c].dot(e) < 0:
                     side = -side

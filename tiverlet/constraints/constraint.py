@@ -13,6 +13,7 @@ from ..features.feature import Knob, Scene
 from ..particles import Particles
 from ..tools import golden
 from .core.finite_differences import NumericGradient
+from .core.quantity import Quantity
 from .core.scalar import Scalar
 
 WRONG = 1e-4  # relative difference between a gradient and differences of the function that is not rounding
@@ -48,7 +49,6 @@ class Constraint(Scalar):
     """
 
     index_name = "indices"
-    exchangeable = ()
     _size = 0.0  # of what it acts on [m]
     _known: tuple[Any, Any, Any] = (None, None, None)  # positions, and values and gradients there
     rest = Knob(lambda f, v: checks.per_item(repr(f), "rest", v, f.count), "What function should be.")
@@ -68,8 +68,14 @@ class Constraint(Scalar):
             raise ValueError(f"{self!r}: side = {side!r}, but it must be 0 (equal), 1 (at most) or -1 (at least).")
         self.side = side
         self.origin: Any = origin
-        self.unit = None if unit is None else checks.number(repr(self), "unit", unit, above=0.0)
+        self._unit = None if unit is None else checks.number(repr(self), "unit", unit, above=0.0)
         self.setup(indices, rest, compliance, damping, break_at)
+
+    def quantity_of(self, indices) -> Quantity:
+        """That of any corners, in the unit that is given."""
+        quantity = Quantity(self.fixed(indices, self.arity))
+        quantity.unit = self._unit
+        return quantity
 
     def __repr__(self) -> str:
         return f"Constraint({self.name})"

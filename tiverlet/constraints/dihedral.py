@@ -3,11 +3,11 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..device import ti
-from .core.angle import Angle, dihedral_angle, dihedral_angles, dihedral_reach
+from .core.angle import REST_ANGLE, DihedralAngle
+from .core.scalar import Scalar
 
 
-class Dihedral(Angle):
+class Dihedral(Scalar):
     """Bending of surfaces: two triangles with a common edge keep the angle between them. 3D only.
 
     C(x) = f(x) - rest, the angle f [rad] and its gradients as in dihedral_angle(): 0 where flat, pi where folded.
@@ -19,9 +19,9 @@ class Dihedral(Angle):
     An edge or a triangle of no size has no angle: nothing acts until it has one. `load` is the moment about the edge [N m].
     """
 
-    arity = 4
+    measures = DihedralAngle
     index_name = "quads"
-    exchangeable = ((0, 1), (2, 3))
+    rest = REST_ANGLE
 
     def __init__(self, quads, rest=None, *, compliance: ArrayLike = 0.0, damping: ArrayLike = 0.0, break_at=None):
         self.setup(quads, rest, compliance, damping, break_at)
@@ -30,19 +30,4 @@ class Dihedral(Angle):
         """Surfaces are in 3D."""
         if particles.dim != 3:
             raise ValueError("Dihedral: there is no angle between triangles in 2D. Use Bend(triples).")
-        Angle.prepare(self, particles, inv_mass)
-
-    def rest_of(self, position: np.ndarray) -> np.ndarray:
-        """The angles at the given positions."""
-        x = self.placed(position)
-        return dihedral_angles(*(x[:, k] for k in range(4)))
-
-    @ti.func
-    def reach(self, c, q):
-        """The shortest way from an end of the edge to another corner."""
-        return dihedral_reach(q)
-
-    @ti.func
-    def measure(self, c, q):
-        """See dihedral_angle()."""
-        return dihedral_angle(q)
+        super().prepare(particles, inv_mass)

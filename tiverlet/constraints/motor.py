@@ -6,17 +6,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import checks
-from ..device import ti
 from ..features.feature import Knob, Scene
 from ..particles import Particles
-from .core.angle import TURN, Angle, dihedral_angle, dihedral_angles, dihedral_reach, path_angle, path_angles, path_reach
+from .core.angle import TURN, DihedralAngle, PathAngle
 from .core.drive import Drive, largest_load
+from .core.scalar import Scalar
 
 SETTLE = 0.1  # [s] how long a servo takes for the last e-th of its way
 PLACED = 0.2  # [rad] from where on hinges that were placed elsewhere go on from there
 
 
-class Motor(Angle):
+class Motor(Scalar):
     """Motors: the angle of a hinge turns at a given speed, or to a given angle, with a largest torque.
 
     C(x) = f(x) - rest with the angle f [rad] and its gradients of Bend (triples) or Dihedral (quads). In a substep h the rest
@@ -42,7 +42,6 @@ class Motor(Angle):
     index_name = "hinges"
     driven = True
     each = ("speed", "angle", "torque", "compliance", "damping", "break_at")
-    compiled_for = (*Angle.compiled_for, "capped")
     uploads_all = False  # goals are of one
     speed = Knob(lambda f, v: checks.per_item("Motor", "speed", v, f.count), "Angular velocity [rad/s].")
     angle = Knob(lambda f, v: f._angle(v), "Where to turn to [rad].")
@@ -53,8 +52,7 @@ class Motor(Angle):
         ArrayLike = 0.0, break_at=None,
     ):  # fmt: skip
         hinges = np.asarray(hinges)
-        self.arity = 4 if hinges.ndim == 2 and hinges.shape[1] == 4 else 3
-        self.exchangeable = ((0, 1), (2, 3)) if self.arity == 4 else ((0, 2),)
+        self.measures = DihedralAngle if hinges.ndim == 2 and hinges.shape[1] == 4 else PathAngle
         self.serves = angle is not None
         self.setup(hinges, None, compliance, damping, break_at)
         self.speed, self.torque = speed, torque
@@ -69,9 +67,9 @@ class Motor(Angle):
         return checks.per_item("Motor", "angle", value, self.count, least=-TURN, most=TURN)
 
     @property
-    def capped(self) -> bool:
-        """Whether any torque is limited, or was when kernels were compiled."""
-        return bool(np.isfinite(self.torque).any()) or self._built("drive", "capped")
+    def largest(self) -> Any:
+        """The largest torques."""
+        return self.torque
 
     @property
     def rest(self) -> np.ndarray:
@@ -91,59 +89,24 @@ class Motor(Angle):
             checks.per_item("Motor", "angle (of triples in 3D)", self.angle, self.count, least=0.0, most=np.pi)
         self._begin = self.rest_of(particles.position)
 
-    def rest_of(self, position: np.ndarray) -> np.ndarray:
-        """The angles at the given positions."""
-        x = self.placed(position)
-        return (dihedral_angles if self.arity == 4 else path_angles)(*(x[:, k] for k in range(self.arity)))
-
     def bind(self, scene: Scene) -> None:
         """Whether angles end at 0 and pi."""
         self.dev.ends = scene.state.dim == 3 and self.arity == 3
-        Angle.bind(self, scene)
-
-    def relaxed_alone(self, scene: Scene) -> np.ndarray:
-        """A multiplier that is clamped cannot be eliminated."""
-        return self.acts_as_force(scene) | np.isfinite(self.torque)
+        super().bind(scene)
 
     def drive_of(self, scene: Scene) -> Drive:
         """Towards the angle, or on and on."""
         largest = self.torque if self.capped else None
         endless, period = not (self.serves or self.dev.ends), 0.0 if self.dev.ends else TURN
-        return Drive(scene, "Motor", self._begin, *self._course(), largest, endless, period, SETTLE * self.serves)
+        return Drive(scene, "Motor", self._begin, *self.course(), largest, endless, period, SETTLE * self.serves)
 
-    def _course(self) -> tuple[Any, Any]:
+    def course(self) -> tuple[Any, Any]:
         """Where rest angles go to, and how fast."""
         end = np.where(self.speed > 0, np.pi, 0.0)
         return self.angle if self.serves else end, self.speed
-
-    def upload(self) -> None:
-        """Write new speeds, angles and torques."""
-        Angle.upload(self)
-        if self.acts:
-            self.dev.drive.upload(*self._course(), self.torque)
 
     def start_at(self, position: np.ndarray, first: int) -> None:
         """Go on from where hinges were placed."""
         far = (np.abs(self.violation(position)) > PLACED) & (self.indices >= first).any(axis=1)
         if far.any():
             self.dev.drive.put(np.where(far, self.rest_of(position), self.rest))
-
-    @ti.func
-    def reach(self, c, q):
-        """As in Bend and Dihedral."""
-        out = ti.cast(0, self.dev.real)
-        if ti.static(self.arity == 4):
-            out = dihedral_reach(q)
-        else:
-            out = path_reach(q)
-        return out
-
-    @ti.func
-    def measure(self, c, q):
-        """See path_angle() and dihedral_angle()."""
-        f, g = ti.cast(0, self.dev.real), 0 * q
-        if ti.static(self.arity == 4):
-            f, g = dihedral_angle(q)
-        else:
-            f, g = path_angle(q, 0 * q[0, :], False, self.faint())
-        return f, g

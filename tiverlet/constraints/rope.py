@@ -2,10 +2,11 @@
 
 from numpy.typing import ArrayLike
 
-from .distance import Link
+from .core.length import REST_LENGTH, Length
+from .core.scalar import Scalar
 
 
-class Rope(Link):
+class Rope(Scalar):
     """Links that are at most as long as given: taut they are a Distance, slack they are not there.
 
     C(x) = |x_i - x_j| - length <= 0, gradients as in Distance; the multiplier may only pull.
@@ -16,6 +17,8 @@ class Rope(Link):
     """
 
     side = 1
+    measures = Length
+    rest = REST_LENGTH
     rest_name = "length"
 
     def __init__(self, pairs, length=None, *, compliance: ArrayLike = 0.0, damping: ArrayLike = 0.0, break_at=None):

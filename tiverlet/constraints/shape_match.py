@@ -155,6 +155,7 @@ class ShapeMatch(Batch):
         self.dev.place = add(f"{name}.place", m, width=dim, kind=ti.f64)
 
         def moment(what, width):
+            """A field with a row for each block, to be summed up."""
             return add(f"{name}.{what}", self.blocks, width=width, kind=ti.f64)
 
         self.dev.total = moment("total", 0)

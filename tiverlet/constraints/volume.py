@@ -1,5 +1,7 @@
 """Volumes of tetrahedra and of closed meshes."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -8,14 +10,15 @@ from ..device import ti
 from ..features.feature import Knob, Scene
 from ..features.members import FixedSize
 from ..particles import Particles
-from .core.enclosed import Enclosed
+from .core.outline import PRESSURE
+from .core.quantity import Quantity
 from .core.scalar import Scalar
-from .core.variable_size import Corners, VariableSize
+from .core.variable_size import VariableSize
 
 LARGEST = 1e9  # [m] the square of a volume's gradient, a length to the fourth, has to stay below 3e38
 
 
-class Volume(Enclosed):
+class Volume(Scalar):
     """Tetrahedra, or closed surfaces of triangles, that keep their volume: flesh, balloons.
 
     C(x) = V(x) - pressure rest,   V = sum over faces of a . (b x c) / 6,   grad_a V = sum over the faces at a of b x c / 6.
@@ -34,7 +37,9 @@ class Volume(Enclosed):
     """
 
     index_name = "cells"
-    collapses, transcends, curved = 3, True, True
+    each = (*Scalar.each, "pressure")
+    pressure = PRESSURE
+    quantity: "Tetrahedra | Surfaces"
     rest = Knob(lambda f, v: checks.per_item("Volume", "rest", v, f.count, least=0.0), "Volume at pressure 1 [m^3].")
 
     def __init__(
@@ -44,11 +49,16 @@ class Volume(Enclosed):
         self.setup(cells, rest, compliance, damping, break_at)
         self.pressure = pressure
 
-    def function_of(self, indices) -> "Tetrahedra | Surfaces":
+    @property
+    def goal(self) -> np.ndarray:
+        """pressure rest."""
+        return self.pressure * self.rest
+
+    def quantity_of(self, indices) -> Quantity:
         """Tetrahedra are simpler than meshes, and have kernels of their own."""
         if np.ndim(indices) == 2 and np.shape(indices)[1] == 3:
             return Surfaces(*_oriented(checks.indices("Volume", "cells", indices, checks.ANY, arity=3)))
-        return Tetrahedra(FixedSize("Volume", checks.indices("Volume", "cells", indices, checks.ANY, arity=4)))
+        return Tetrahedra(self.fixed(indices, 4))
 
     @property
     def faces(self) -> np.ndarray:
@@ -62,8 +72,8 @@ class Volume(Enclosed):
         if particles.dim != 3:
             raise ValueError("Volume: there are no volumes in a 2D world; use Area.")
         self.check_indices(particles)
-        self.reverse(self.rest_of(particles.position) < 0)
-        Scalar.prepare(self, particles, inv_mass)
+        self.hold(self.quantity.reversed(self.rest_of(particles.position) < 0))
+        super().prepare(particles, inv_mass)
 
     def bind(self, scene: Scene) -> None:
         """Refuse what f32 cannot hold."""
@@ -73,26 +83,26 @@ class Volume(Enclosed):
         super().bind(scene)
 
 
-class Tetrahedra:
-    """Volumes of tetrahedra. See Enclosed for the methods."""
+class Tetrahedra(Quantity):
+    """Volumes of tetrahedra."""
 
-    def __init__(self, members: FixedSize):
-        self.members = members
-        self.listing, self.pairs = members.listing, members.pairs
+    arity, collapses, transcends, curved = 4, 3, True, True
+    exchangeable = ((0, 1, 2, 3),)
 
     def reversed(self, which: np.ndarray) -> "Tetrahedra":
         """Two corners of some swapped."""
         indices = self.members.indices
         return Tetrahedra(FixedSize("Volume", np.where(which[:, None], indices[:, [0, 1, 3, 2]], indices)))
 
-    def remapped(self, some: np.ndarray, number: np.ndarray) -> "Tetrahedra":
-        """Those in the mask."""
-        return Tetrahedra(self.members.remapped(some, number))
-
-    def values(self, members, position: np.ndarray) -> np.ndarray:
+    def values(self, x: np.ndarray) -> np.ndarray:
         """Signed volumes."""
-        a, b, c, d = (position[k] for k in members.indices.T)
+        a, b, c, d = (x[:, k] for k in range(4))
         return np.einsum("ij,ij->i", b - a, np.cross(c - a, d - a)) / 6
+
+    @ti.func
+    def reach(self, q):
+        """The size of a tetrahedron."""
+        return q.norm()
 
     @ti.func
     def measure(self, q):
@@ -102,15 +112,22 @@ class Tetrahedra:
         return a.dot(u), ti.Matrix.rows([-u - v - w, u, v, w])
 
 
-class Surfaces:
-    """Volumes inside closed surfaces. See Enclosed for the methods.
+class Surfaces(Quantity):
+    """Volumes inside closed surfaces.
 
     faces: (k, 3), the two at each edge run along it in opposite senses. surface: the surface that each belongs to, (k,).
+    On the device, ring: the other two corners of the faces around each corner e, from starts[e] on.
     """
+
+    collapses, transcends, curved = 3, True, True
+    corners: Any
+    starts: Any
+    ring: Any
 
     def __init__(self, faces: np.ndarray, surface: np.ndarray):
         self.faces, self.surface = faces, surface
-        self.members = VariableSize("Volume", [np.unique(faces[surface == k]) for k in range(int(surface.max(initial=-1)) + 1)])
+        bodies = [np.unique(faces[surface == k]) for k in range(int(surface.max(initial=-1)) + 1)]
+        super().__init__(VariableSize("Volume", bodies))
 
     @property
     def listing(self) -> np.ndarray:
@@ -126,18 +143,21 @@ class Surfaces:
         stays = some[self.surface]
         return Surfaces(number[self.faces[stays]].astype(np.int32), (np.cumsum(some) - 1)[self.surface[stays]])
 
-    def values(self, members, position: np.ndarray) -> np.ndarray:
-        """Signed volumes, each seen from one of its own particles."""
-        eye = position[members.indices[members.starts[:-1]]][self.surface][:, None]
-        a, b, c = np.moveaxis(position[self.faces] - eye, 1, 0)
+    def values(self, x: np.ndarray) -> np.ndarray:
+        """Signed volumes."""
+        a, b, c = self._seen(x)
         parts = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6
-        return np.bincount(self.surface, weights=parts, minlength=members.count)
+        return np.bincount(self.surface, weights=parts, minlength=self.members.count)
 
-    def gradients(self, position: np.ndarray) -> np.ndarray:
+    def _seen(self, x: np.ndarray) -> np.ndarray:
+        """The corners of each face, (3, k, 3), as seen from one of the particles of its surface."""
+        eye = x[self.members.indices[self.members.starts[:-1]]][self.surface][:, None]
+        return np.moveaxis(x[self.faces] - eye, 1, 0)
+
+    def gradients(self, x: np.ndarray) -> np.ndarray:
         """Their gradients by each corner, (total, 3)."""
         members, corner = self.members, self._corner
-        eye = position[members.indices[members.starts[:-1]]][self.surface][:, None]
-        a, b, c = np.moveaxis(position[self.faces] - eye, 1, 0)
+        a, b, c = self._seen(x)
         parts = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1).reshape(-1, 3) / 6
         return np.stack([np.bincount(corner, part, minlength=len(members.indices)) for part in parts.T], axis=1)
 
@@ -153,28 +173,22 @@ class Surfaces:
         """The ends of each edge."""
         return np.unique(np.sort(_edges(self.faces)[:, :2], axis=1), axis=0)
 
-    def bind(self, scene: Scene, corners: Corners) -> "SurfaceGradients":
+    def bind(self, scene: Scene, batch: Any) -> "Surfaces":
         """Its gradients, on the device: the faces around each corner, as the two other corners of each, in order."""
         members, corner = self.members, self._corner
         others = np.stack([self.faces[:, [1, 2, 0]].ravel(), self.faces[:, [2, 0, 1]].ravel()], axis=1)
         order = np.argsort(corner, kind="stable")
         starts = np.concatenate([[0], np.cumsum(np.bincount(corner, minlength=len(members.indices)))])
-        return SurfaceGradients(scene, corners, starts, others[order])
-
-
-class SurfaceGradients:
-    """Gradients of volumes on the device. ring: the other two corners of the faces around each corner e, from starts[e] on."""
-
-    def __init__(self, scene: Scene, corners: Corners, starts: np.ndarray, ring: np.ndarray):
-        add = scene.memory.field
-        self.state, self.members = scene.state, corners.members
-        self.starts = add("Volume.rings", len(starts), kind=ti.i32, values=starts)
-        self.ring = add("Volume.ring", len(ring), width=2, kind=ti.i32, values=ring)
+        bound, add = super().bind(scene, batch), scene.memory.field
+        bound.corners = batch.dev.corners
+        bound.starts = add("Volume.rings", len(starts), kind=ti.i32, values=starts)
+        bound.ring = add("Volume.ring", len(order), width=2, kind=ti.i32, values=others[order])
+        return bound
 
     @ti.func
     def slope(self, e, back):
         """Sum of b x c / 6 over the faces around a corner; b and c relative to it, which changes nothing in a closed ring."""
-        i = self.members[e]
+        i = self.corners.members[e]
         total = 0 * self.state.d[i]
         for k in range(self.starts[e], self.starts[e + 1]):
             j, m = self.ring[k]

@@ -9,12 +9,13 @@ from .. import checks
 from ..features.feature import Knob, Scene
 from ..particles import Particles
 from .core.drive import Drive, largest_load
-from .distance import Link
+from .core.length import Length
+from .core.scalar import Scalar
 
 SHORTEST = 1e-2  # of its initial length: what remains of a rope, where nothing else is said
 
 
-class Winch(Link):
+class Winch(Scalar):
     """Winches: ropes whose length changes at a given speed, with a largest force.
 
     C(x) = |x_i - x_j| - rest <= 0, gradients as in Distance; the multiplier may only pull. In a substep h the length `rest` grows
@@ -31,10 +32,10 @@ class Winch(Link):
     `load` is the tension [N], `rest` the length now [m].
     """
 
+    measures = Length
     side = 1
     driven = True
     each = ("speed", "length", "shortest", "longest", "force", "compliance", "damping", "break_at")
-    compiled_for = (*Link.compiled_for, "capped")
     uploads_all = False  # goals are of one
     speed = Knob(lambda f, v: checks.per_item("Winch", "speed", v, f.count), "Change of length [m/s].")
     shortest = Knob(lambda f, v: checks.per_item("Winch", "shortest", v, f.count, above=0.0), "Least length [m].")
@@ -58,9 +59,9 @@ class Winch(Link):
         return False
 
     @property
-    def capped(self) -> bool:
-        """Whether any pull is limited, or was when kernels were compiled."""
-        return bool(np.isfinite(self.force).any()) or self._built("drive", "capped")
+    def largest(self) -> Any:
+        """The largest pulls."""
+        return self.force
 
     @property
     def rest(self) -> np.ndarray:
@@ -83,23 +84,13 @@ class Winch(Link):
         if "shortest" not in self.__dict__:
             self.shortest = SHORTEST * self.length
 
-    def relaxed_alone(self, scene: Scene) -> np.ndarray:
-        """A multiplier that is clamped cannot be eliminated."""
-        return self.acts_as_force(scene) | np.isfinite(self.force)
-
     def drive_of(self, scene: Scene) -> Drive:
         """From end to end."""
-        return Drive(scene, "Winch", self.length, *self._course(), self.force if self.capped else None, False, 0.0, 0.0)
+        return Drive(scene, "Winch", self.length, *self.course(), self.force if self.capped else None, False, 0.0, 0.0)
 
-    def _course(self) -> tuple[Any, Any]:
+    def course(self) -> tuple[Any, Any]:
         """Where lengths go to, and how fast."""
         return np.where(self.speed > 0, self.longest, self.shortest), np.abs(self.speed)
-
-    def upload(self) -> None:
-        """Write new speeds, ends and forces."""
-        Link.upload(self)
-        if self.acts:
-            self.dev.drive.upload(*self._course(), self.force)
 
     def start_at(self, position: np.ndarray, first: int) -> None:
         """Ropes that can run out have done so, where their ends were placed further apart."""

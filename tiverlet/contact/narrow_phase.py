@@ -225,6 +225,7 @@ def fallback_normals(pairs: np.ndarray, dim: int) -> np.ndarray:
     """What DiscGeometry.fallback_normal() returns for pairs i < j, (m, dim)."""
 
     def fraction(bits: np.ndarray) -> np.ndarray:
+        """Bits as numbers between -1 and 1, never 0."""
         return (2.0 * (bits >> np.uint32(9)) + 1 - 2**23) * 2.0**-23
 
     low, high = pairs.astype(np.uint32).T

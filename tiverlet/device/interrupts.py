@@ -84,6 +84,7 @@ def uncut(function: Callable) -> Callable:
 
     @functools.wraps(function)
     def guarded(*args, **kwargs):
+        """The function, which no interrupt cuts in two."""
         with whole:
             return function(*args, **kwargs)
 

@@ -95,6 +95,7 @@ def before_fields(check: Callable[[], None]) -> None:
 
     @functools.wraps(create)
     def created(*args, **kwargs):
+        """A field's member, where a check allows one."""
         check()
         return create(*args, **kwargs)
 

@@ -110,6 +110,7 @@ def _recording(init):
 
     @functools.wraps(init)
     def recorded(self, *args, **kwargs):
+        """The same __init__, which keeps its arguments."""
         args, kwargs = _frozen(args), _frozen(kwargs)
         init(self, *args, **kwargs)
         if type(self).__init__ is recorded:  # and not that of a base class, whose subclass is not done yet

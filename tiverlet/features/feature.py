@@ -6,7 +6,7 @@ asks of them:
 
     Acceleration   acceleration(i, x, v, t) of one particle, and/or a linear drag rate
     Batch          relax(c, ...) of one constraint: reads its particles, writes the moves it wants into slots
-    Scalar         (constraints/core/scalar.py) a Batch whose constraint is one number: give measure(c, q) = f and its gradients,
+    Scalar         (constraints/core/scalar.py) a Batch whose constraint is one number: name a Quantity with f and its gradients,
                    and C = f - rest gets compliance, damping, mass splitting, residual and load from there
     Anchored         (constraints/core/anchored.py) a Batch of particles, each drawn to a place of its own: give the vector to it
     Collider           (colliders/collider.py) confine(i, ...) of one particle, with the last word
@@ -14,8 +14,8 @@ asks of them:
 Which particles a Batch acts on is an object that it holds, `members`: FixedSize (members.py), or VariableSize
 (constraints/core/variable_size.py) for constraints on any number of particles each.
 
-A new constraint on k particles is one file with one Scalar subclass: `arity = k`, an __init__ that checks its arrays,
-`rest_of(position)` for a default rest value, and `measure`. See constraints/distance.py. Arrays of its own with a row for each
+A new constraint on k particles is one file with one Scalar subclass, which names its Quantity (constraints/core/quantity.py) and
+has an __init__ that checks its arrays. See constraints/distance.py. Arrays of its own with a row for each
 constraint are named in `each`, and what depends on where particles were is taken from `self.start`, so that a world can be built
 anew around it (step/edit_scene.py). What a method other than __init__ finds out is set by self._keep(name=value), or under a name
 that begins with an underscore: from outside only Knobs can be set.
@@ -181,6 +181,24 @@ class Acceleration(Feature):
     rate = 0.0
     pairwise = False
     room = 0  # listed neighbours of a particle for which there is room at first
+
+    def settings(self) -> dict[str, Any]:
+        """What its knobs come to for kernels: numbers and vectors, which are `dev.name[None]`."""
+        return {}
+
+    def bind(self, scene: Scene) -> None:
+        """Declare a field for each of its settings."""
+        self.scene = scene
+        for name, value in self.settings().items():
+            kind, width = ti.i32 if isinstance(value, int) else None, np.size(value) if np.ndim(value) else 0
+            field = scene.memory.field(f"{type(self).__name__}.{name}", None, width=width, kind=kind, values=value)
+            setattr(self.dev, name, field)
+        self.changed = False
+
+    def upload(self) -> None:
+        """Write them."""
+        for name, value in self.settings().items():
+            self.scene.memory.write(vars(self.dev)[name], value)
 
     def join(self, scene: Scene, team: Any) -> Any:
         """Where it is pairwise: declare its neighbour list and return it, None if it has none."""

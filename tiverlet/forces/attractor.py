@@ -1,10 +1,12 @@
 """A point that attracts."""
 
+from typing import Any
+
 import numpy as np
 
 from .. import checks
 from ..device import ti
-from ..features.feature import Acceleration, Knob, Scene
+from ..features.feature import Acceleration, Knob
 from ..particles import Particles
 
 
@@ -29,17 +31,9 @@ class Attractor(Acceleration):
         self._keep(dim=particles.dim)
         self.center = self.center
 
-    def bind(self, scene: Scene) -> None:
-        """Center and strength on the device."""
-        self.scene = scene
-        self.dev.center = scene.memory.field("Attractor.center", None, width=self.dim, values=self.center)
-        self.dev.strength = scene.memory.field("Attractor.strength", None, values=self.strength)
-        self.changed = False
-
-    def upload(self) -> None:
-        """Write both."""
-        self.scene.memory.write(self.dev.center, self.center)
-        self.scene.memory.write(self.dev.strength, self.strength)
+    def settings(self) -> dict[str, Any]:
+        """Both."""
+        return {"center": self.center, "strength": self.strength}
 
     @ti.func
     def acceleration(self, i, x, v, t):

@@ -1,11 +1,13 @@
 """Uniform gravity."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import checks
 from ..device import ti
-from ..features.feature import Acceleration, Knob, Scene
+from ..features.feature import Acceleration, Knob
 from ..particles import Particles
 
 
@@ -34,20 +36,10 @@ class Gravity(Acceleration):
         self._keep(dim=particles.dim)
         self.g = self.g
 
-    def bind(self, scene: Scene) -> None:
-        """One vector on the device."""
-        self.scene = scene
-        self.dev.g = scene.memory.field("Gravity.g", None, width=scene.particles.dim, values=self._vector())
-        self.changed = False
-
-    def _vector(self) -> list[float]:
+    def settings(self) -> dict[str, Any]:
         """g as a vector."""
         g = np.asarray(self.g, dtype=np.float64)
-        return (g if g.ndim else g * [0.0, -1.0, 0.0][: self.dim]).tolist()
-
-    def upload(self) -> None:
-        """Write g."""
-        self.scene.memory.write(self.dev.g, self._vector())
+        return {"g": (g if g.ndim else g * [0.0, -1.0, 0.0][: self.dim]).tolist()}
 
     @ti.func
     def acceleration(self, i, x, v, t):

@@ -1,5 +1,7 @@
 """A hand that draws one particle, whichever it is now."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -55,19 +57,14 @@ class Hand(Acceleration):
         if self.particle >= 0:
             self.particle = int(number[self.particle])
 
-    def bind(self, scene: Scene) -> None:
+    def settings(self) -> dict[str, Any]:
         """Which particle, where to, how fast."""
-        self.scene, self.dev.state = scene, scene.state
-        self.dev.particle = scene.memory.field("Hand.particle", None, kind=ti.i32, values=self.particle)
-        self.dev.target = scene.memory.field("Hand.target", None, width=self.dim, values=self.target)
-        self.dev.rate = scene.memory.field("Hand.rate", None, values=self.rate)
-        self.changed = False
+        return {"particle": self.particle, "target": self.target, "rate": self.rate}
 
-    def upload(self) -> None:
-        """Write all three."""
-        self.scene.memory.write(self.dev.particle, self.particle)
-        self.scene.memory.write(self.dev.target, self.target)
-        self.scene.memory.write(self.dev.rate, self.rate)
+    def bind(self, scene: Scene) -> None:
+        """The state, for images of the target."""
+        super().bind(scene)
+        self.dev.state = scene.state
 
     @ti.func
     def acceleration(self, i, x, v, t):

@@ -1,10 +1,12 @@
 """Wind: drag relative to moving air."""
 
+from typing import Any
+
 import numpy as np
 
 from .. import checks
 from ..device import ti
-from ..features.feature import Acceleration, Knob, Scene
+from ..features.feature import Acceleration, Knob
 from ..particles import Particles
 
 
@@ -29,15 +31,9 @@ class Wind(Acceleration):
         self._keep(dim=particles.dim)
         self.velocity = self.velocity
 
-    def bind(self, scene: Scene) -> None:
-        """One vector on the device: rate * velocity, the acceleration that is left when the drag is taken apart."""
-        self.scene = scene
-        self.dev.push = scene.memory.field("Wind.push", None, width=self.dim, values=self.rate * self.velocity)
-        self.changed = False
-
-    def upload(self) -> None:
-        """Write rate * velocity."""
-        self.scene.memory.write(self.dev.push, self.rate * self.velocity)
+    def settings(self) -> dict[str, Any]:
+        """rate * velocity: the acceleration that is left when the drag is taken apart."""
+        return {"push": self.rate * self.velocity}
 
     @ti.func
     def acceleration(self, i, x, v, t):

@@ -8,7 +8,7 @@ import numpy as np
 from .. import checks
 from ..colliders.collider import Collider
 from ..constraints import Path
-from ..constraints.distance import Link
+from ..constraints.core.length import is_link
 from ..features.feature import Batch
 from ..forces import Hand
 from ..recording.drawing import bounds, colors, links, upwards
@@ -24,7 +24,7 @@ def scene(world: "World", title: str) -> str:
     p = world.particles
     found = links(world)
     none = np.zeros((0, 2), dtype=np.int64)
-    rest = [np.asarray(f.rest, dtype=np.float64) if isinstance(f, Link) else np.zeros(f.count) for _, f in found]
+    rest = [np.asarray(f.rest, dtype=np.float64) if is_link(f) else np.zeros(f.count) for _, f in found]
     low, high = bounds(world)
     corners = triangles(world)
     return json.dumps({

@@ -8,9 +8,9 @@ from ..colliders.collider import Collider
 from ..constraints.core.anchored import Anchored
 from ..features.feature import Batch
 from ..measure import moment_sum
-from ..spin import moments
+from ..particles.spin import moments
 from ..step.checkpoint import Checkpoint
-from ..step_report import StepReport
+from ..step.step_report import StepReport
 
 if TYPE_CHECKING:
     from ..world import World

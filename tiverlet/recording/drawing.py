@@ -8,7 +8,7 @@ import numpy as np
 from ..colliders import Ball, Box, Capsule, HalfSpace, Mesh, Polygon
 from ..colliders.collider import Collider
 from ..constraints import Path
-from ..constraints.distance import Link
+from ..constraints.core.length import is_link
 from ..features.feature import Batch, Feature
 from ..forces import Gravity
 from ..neighbours import Periodic
@@ -112,7 +112,7 @@ class Drawing:
         found = links(world)
         none = np.zeros((0, 2), dtype=np.int64)
         self._pairs = np.concatenate([none, *(f.indices for _, f in found)])
-        lengths = [f.rest if isinstance(f, Link) and not f.driven else np.full(f.count, np.nan) for _, f in found]
+        lengths = [f.rest if is_link(f) and not f.driven else np.full(f.count, np.nan) for _, f in found]
         self._rest = np.concatenate([[], *lengths])
         number, row = (np.concatenate([[], *each]).astype(np.int64) for each in (
             [np.full(f.count, k) for k, f in found], [np.arange(f.count) for _, f in found]

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..step import checkpoint
-from ..step_report import StepReport
+from ..step.step_report import StepReport
 from . import rrd, scene
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from .layout import eye_axes
 
 if TYPE_CHECKING:
     from ..features.feature import Feature
-    from ..step_report import StepReport
+    from ..step.step_report import StepReport
     from ..world import World
     from .replay import Replay
 

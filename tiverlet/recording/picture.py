@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..step.checkpoint import Checkpoint
-from ..step_report import StepReport
+from ..step.step_report import StepReport
 from .overlays import Overlays
 
 if TYPE_CHECKING:

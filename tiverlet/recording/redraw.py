@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import checks
-from ..step_report import StepReport
+from ..step.step_report import StepReport
 from . import reader
 from .journal import GUARD, JOURNAL, PARTICLES, Entry
 from .messages import droppable, thins

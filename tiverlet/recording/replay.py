@@ -52,6 +52,7 @@ def _clear(function):
 
     @functools.wraps(function)
     def guarded(self, *args, **kwargs):
+        """The same method; what it stumbles over in a damaged file is a ValueError that names it."""
         try:
             return function(self, *args, **kwargs)
         except (KeyError, IndexError, TypeError, AttributeError, OverflowError, RecursionError, AssertionError) as e:

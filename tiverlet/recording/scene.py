@@ -141,6 +141,7 @@ def describe(world: "World") -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     needs = Needs()
 
     def made(thing: Any, name: str) -> dict[str, Any]:
+        """How a particle set or a feature is made again: its class and its arguments."""
         kinds = type(thing).__mro__
         if kinds[0].__module__.partition(".")[0] == __name__.partition(".")[0]:
             kind = next(k.__name__ for k in kinds if PUBLIC.get(k.__name__) is k)

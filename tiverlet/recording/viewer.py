@@ -49,6 +49,7 @@ def _told_to_end() -> Iterator[None]:
         return
 
     def leave(number: int, frame: Any) -> None:
+        """End as the signal asks, but by an exception, so that what is open is closed."""
         raise SystemExit(128 + number)
 
     before = [(number, signal.signal(number, leave)) for number in (signal.SIGTERM, signal.SIGHUP)]

@@ -89,6 +89,7 @@ def _obj(name: str, data: bytes):
     points, places, edges, polygons, textures = [], [], [], [], []
 
     def numbers(words: list[str], count: int) -> list[int]:
+        """Numbers of vertices from 0 on; -1 where there is none."""
         found = [int(w) for w in words]
         return [i - 1 if i > 0 else count + i if i < 0 else -1 for i in found]
 
@@ -161,6 +162,7 @@ def _ply(name: str, data: bytes):
     found: dict[str, dict[str, list]] = {}
 
     def take(form: str, count: int) -> list:
+        """The next `count` numbers."""
         nonlocal here, at
         if kind == "ascii":
             here += count

@@ -41,6 +41,7 @@ def ragdoll(feet, height: float = 1.8) -> Shape:
     number = {name: k for k, name in enumerate(NAMES)}
 
     def pairs(*names):
+        """Numbers of two points each, by their names."""
         return [(number[a], number[b]) for a, b in names]
 
     links = pairs(("head", "neck"), ("neck", "chest"), ("chest", "hip"))

@@ -26,6 +26,7 @@ def cloth(corner, along, across, points: tuple[int, int], *, shear: bool = True,
     k = np.arange(rows * columns).reshape(rows, columns)
 
     def tuples(*parts):
+        """Corners of many at once, a row for each."""
         return np.stack([p.ravel() for p in parts], axis=1)
 
     links = np.concatenate([tuples(k[:-1], k[1:]), tuples(k[:, :-1], k[:, 1:])])

@@ -122,6 +122,7 @@ def _addresses(order, later, corners, sharing, owners, items, begin, widths) -> 
     entry = {(r, j): e for r, row in enumerate(columns) for e, j in enumerate(row, int(ends[r]))}
 
     def address(row: int, column: int) -> int:
+        """Where an entry of the matrix lies: diagonals first, then one triangle, then the other."""
         if row == column:
             return row
         return m + entry[row, column] if row < column else m + total + entry[column, row]
@@ -136,6 +137,7 @@ def _addresses(order, later, corners, sharing, owners, items, begin, widths) -> 
         update_begin.append(len(updates))
 
     def ints(values) -> np.ndarray:
+        """As an array."""
         return np.asarray(values, dtype=np.int64)
 
     return Plan(

@@ -8,8 +8,8 @@ import numpy as np
 
 from .. import checks
 from ..constraints.core.scalar import TENSEST
-from ..step_report import StepReport
 from . import checkpoint
+from .step_report import StepReport
 
 if TYPE_CHECKING:
     from ..world import World

@@ -19,13 +19,13 @@ from ..features.feature import Acceleration, Batch, Feature, Scene
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..neighbours.periodic import Periodic
 from ..particles import Particles, Radii, State
+from ..particles.spin import Spin
 from ..solvers.conjugate import ConjugateGradient
 from ..solvers.direct import Direct
 from ..solvers.elimination import plan_of
 from ..solvers.jacobi import Jacobi
 from ..solvers.slots import Slots
 from ..solvers.solver import Solver
-from ..spin import Spin
 from . import high_order
 from .diagnostics import Diagnostics
 from .frames import Frames
@@ -144,6 +144,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     memory, state, particles = scene.memory, scene.state, scene.particles
 
     def of(kind: type[T]) -> list[T]:
+        """Those of one kind."""
         return [f for f in features if isinstance(f, kind)]
 
     for first in [*of(Periodic), *of(Sleep)]:

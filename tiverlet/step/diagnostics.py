@@ -13,8 +13,8 @@ from ..features.feature import FAR
 from ..neighbours.neighbour_search import FARTHEST
 from ..particles import LARGEST
 from ..solvers.solver import Solver
-from ..step_report import UNCONVERGED, StepReport
 from .step import END, FIGURES, ORIGIN, SHEET, H, Step, integer
+from .step_report import UNCONVERGED, StepReport
 
 BLOCKS = 64  # partial sums: their number is fixed, so the total has the same bits on any number of threads; squared on a GPU
 TURNS = (0, 26, 41)  # degrees, for nothing, BENT and FAR

@@ -5,7 +5,7 @@ import numpy as np
 from ..colliders import Box, HalfSpace
 from ..colliders.collider import Collider
 from ..constraints import Area, Constraint, ShapeMatch, Volume
-from ..constraints.distance import Link
+from ..constraints.core.length import is_link
 from ..contact import Contact, Polygons
 from ..features.feature import Batch, Feature
 from ..forces import PairForce
@@ -32,7 +32,7 @@ def refuse_misfits(box: Periodic, particles: Particles, features: tuple[Feature,
             _refuse(box, repr(feature), "pairs act", feature.radius, "a radius")
         if isinstance(feature, Collider):
             _refuse_wall(box, feature)
-        if isinstance(feature, Link) and feature.count:
+        if is_link(feature) and feature.count:
             _refuse(box, repr(feature), f"link {int(feature.goal.argmax())} holds particles", feature.goal.max(), "links", True)
         if isinstance(feature, Batch) and isinstance(feature, (Area, Constraint, ShapeMatch, Volume)) and feature.arity != 1:
             _refuse_torn(box, feature)

@@ -254,6 +254,7 @@ class Rows:
         rows, (label, body) = self.m, bodies_of(self.m, self.row, self.who, self.w)
 
         def summed(values: np.ndarray) -> np.ndarray:
+            """Sums by bodies."""
             return np.bincount(body, m * values, minlength=rows + 1)
 
         work, size, along = summed(np.linalg.norm(moves, axis=1)), summed((moves**2).sum(axis=1)), summed((moves * v).sum(axis=1))

@@ -11,8 +11,7 @@ from ..contact.velocity_projection import EVERY
 from ..device.interrupts import whole
 from ..device.language import template
 from ..device.patches.compiler import CachedLaunch
-from ..spin import moments
-from ..step_report import StepReport
+from ..particles.spin import moments
 from . import high_order, initial_violation
 from .clock import Clock
 from .diagnostics import STARTED, STEPPED, UNSTEPPED
@@ -20,6 +19,7 @@ from .frames import Frames
 from .integrator import FREE, decay
 from .projection import project
 from .step import ACTIVE_THREADS, BEFORE, END, GIVE, HALT, ORIGIN, H, Moment, Span, frame
+from .step_report import StepReport
 
 LONG = 10_000_000  # particles and constraints, times passes, in a launch: it takes about a second
 

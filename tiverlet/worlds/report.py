@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ..step_report import StepReport
+from ..step.step_report import StepReport
 
 SUMS = ("energy_change", "broken")  # over frames
 LAST = ("time", "energy")

@@ -89,6 +89,7 @@ class _Process:
         self.at: int | None = None  # the world that it makes; -1 when all of the part are made
 
     def begin(self, part: Part) -> None:
+        """Send it a part to make."""
         self.part, self.at = part, None
         with contextlib.suppress(OSError):  # where it died meanwhile, the pipe will say so
             self.pipe.send(part)
@@ -107,6 +108,7 @@ class _Process:
         return message
 
     def end(self, kill: bool = False) -> None:
+        """Close the pipe, and wait for the process; `kill`: end it."""
         self.pipe.close()
         if kill:
             self.process.terminate()

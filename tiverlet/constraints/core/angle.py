@@ -1,41 +1,84 @@
-"""What constraints on an angle share, the angle of a path, and that between two triangles."""
+"""Angles: that of a path, and that between two triangles."""
 
 import numpy as np
 
 from ... import checks
 from ...device import ti
 from ...features.feature import Knob
-from .scalar import Scalar
+from .quantity import Quantity
 
 TURN = 2 * np.pi
 SHORT = 1e-24  # [m^2] squared length below which a link has no direction, in f32 and far below any in use
 
 
-class Angle(Scalar):
-    """What all constraints on an angle share: C is the wrapped difference, in (-pi, pi], and residuals are in radians."""
+REST_ANGLE = Knob(lambda f, v: checks.per_item(repr(f), f.rest_name, v, f.count, least=-TURN, most=TURN), "Rest angle [rad].")
+
+
+class Angle(Quantity):
+    """Angles: those that are whole turns apart mean the same, and residuals are in radians."""
 
     unit, transcends, curved = 1.0, True, True
-    rest = Knob(lambda f, v: checks.per_item(repr(f), f.rest_name, v, f.count, least=-TURN, most=TURN), "Rest angle [rad].")
 
-    def violation(self, position: np.ndarray) -> np.ndarray:
-        """C at the given positions."""
-        C = self.rest_of(position) - self.rest
-        return C - TURN * np.round(C / TURN)
+    def difference(self, f: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        """How far angles are from others, in (-pi, pi]."""
+        return turned(f - goal)
 
     @ti.func
     def unwrap(self, f, other):
         """f plus whole turns, within half a turn of `other`."""
         return wrapped(f, other)
 
+
+class PathAngle(Angle):
+    """The angle by which a path i - j - k turns at j, see path_angle()."""
+
+    arity = 3
+    exchangeable = ((0, 2),)
+
+    def values(self, x: np.ndarray) -> np.ndarray:
+        """The angles of paths."""
+        return path_angles(x[:, 0], x[:, 1], x[:, 2])
+
     @ti.func
-    def reach(self, c, q):
-        """The shorter of the two legs of a path."""
-        return path_reach(q)
+    def reach(self, q):
+        """The shorter of the two legs."""
+        return ti.min((q[1, :] - q[0, :]).norm(), (q[2, :] - q[1, :]).norm())
 
     @ti.func
     def faint(self):
         """|u x v| of unit vectors below which their normal is lost in rounding."""
-        return ti.cast(ti.static(1e-13 if self.dev.state.double else 1e-6), self.dev.real)
+        return ti.cast(ti.static(1e-13 if self.state.double else 1e-6), self.real)
+
+    @ti.func
+    def measure(self, q):
+        """See path_angle(); nothing is remembered of the plane."""
+        return path_angle(q, 0 * q[0, :], False, self.faint())
+
+
+class DihedralAngle(Angle):
+    """The angle between two triangles with a common edge, see dihedral_angle()."""
+
+    arity = 4
+    exchangeable = ((0, 1), (2, 3))
+
+    def values(self, x: np.ndarray) -> np.ndarray:
+        """The angles of edges."""
+        return dihedral_angles(x[:, 0], x[:, 1], x[:, 2], x[:, 3])
+
+    @ti.func
+    def reach(self, q):
+        """The shortest way from an end of the edge to another corner."""
+        return ti.min(q[1, :].norm(), ti.min(q[2, :].norm(), q[3, :].norm()))
+
+    @ti.func
+    def measure(self, q):
+        """See dihedral_angle()."""
+        return dihedral_angle(q)
+
+
+def turned(C: np.ndarray) -> np.ndarray:
+    """A difference of angles, in (-pi, pi]."""
+    return C - TURN * np.round(C / TURN)
 
 
 @ti.func
@@ -124,15 +167,3 @@ def dihedral_angle(q):
             k, l = e.cross(p) / pp, -e.cross(r) / rr  # noqa: E741
             g = ti.Matrix.rows([-((1 - s) * k + (1 - t) * l), -(s * k + t * l), k, l])
     return f, g
-
-
-@ti.func
-def path_reach(q):
-    """The shorter of the two legs of a path: how far a corner may move before its angle is no longer what gradients say."""
-    return ti.min((q[1, :] - q[0, :]).norm(), (q[2, :] - q[1, :]).norm())
-
-
-@ti.func
-def dihedral_reach(q):
-    """The same of two triangles: the shortest way from an end of the edge to another corner."""
-    return ti.min(q[1, :].norm(), ti.min(q[2, :].norm(), q[3, :].norm()))

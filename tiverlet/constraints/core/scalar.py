@@ -11,6 +11,8 @@ from ...features.feature import FAR, Batch, Knob, Scene
 from ...features.members import FixedSize
 from ...tools import distinct
 from .drive import Drive
+from .outline import Outline
+from .quantity import Quantity
 from .spring import Spring, stiff
 from .strength import Strength, strength_of
 
@@ -29,7 +31,7 @@ LOST = 0.015  # violation at the start of a substep, relative to the size, from 
 
 
 class Scalar(Batch):
-    """Constraints C(x) = f(x) - rest = 0, >= 0 or <= 0, soft or rigid, from `measure`. numerics: one formula for all.
+    """Constraints C(x) = f(x) - rest = 0, >= 0 or <= 0, soft or rigid; f is its `quantity`. One formula for all:
 
         theta = s^4 / (1 + s^4), s^2 = (omega h)^2 = w h^2 / alpha     0: resolved by the step, 1: rigid
         C*    = (1 - theta) (C_(n+1) + 2 C_n + C_(n-1)) / 4 + theta C_(n+1)
@@ -60,23 +62,19 @@ class Scalar(Batch):
     """
 
     index_name = "pairs"
-    exchangeable: tuple[tuple[int, ...], ...] | None = None  # groups of corners that may swap; None: all of them
+    measures: type[Quantity] = Quantity  # f, of a fixed number of corners
+    quantity: Quantity  # the f of its constraints
     side = 0  # 0: C = 0;  1: C <= 0, pulls when f > rest;  -1: C >= 0, pushes when f < rest
     rest: Any  # a Knob in each constraint: (m,) array
     compliance = Knob(lambda f, v: checks.per_item(repr(f), "compliance", v, f.count, least=0.0), "Of springs.", force=True)
     damping = Knob(lambda f, v: checks.per_item(repr(f), "damping", v, f.count, least=0.0), "Of the dashpot.", force=True)
     break_at = Knob(strength_of, "Load beyond which a constraint breaks, (m,); None for never.")
-    compiled_for = ("soft", "damped", "breaks", "limited", "_strictly")
+    compiled_for = ("soft", "damped", "breaks", "limited", "cusp", "capped", "_strictly")
 
     each = ("rest", "compliance", "damping", "break_at")
     rest_name = "rest"
     uploads_all = True
-    unit: float | None = None  # what residuals are relative to; None: the rest value
-    precise = False  # whether exactly() measures to all the digits that positions have
-    cusp = False  # whether any goal is f = 0, where gradients end: no direction at the start of the step means anything there
-    curved = False  # whether f is so curved that Newton's step from afar means nothing
     driven = False  # whether rest values move by themselves: what drive_of() gives, see Drive
-    collapses = 0  # the power of a length that f is, where gradients vanish with the size of the body; else 0
 
     def setup(self, indices, rest, compliance, damping, break_at=None) -> None:
         """Keep the arguments of __init__; what depends on the particles is checked in prepare()."""
@@ -86,17 +84,30 @@ class Scalar(Batch):
 
     def keep_indices(self, indices) -> None:
         """Keep the particles of each constraint."""
-        indices = checks.indices(repr(self), self.index_name, indices, checks.ANY, arity=self.arity)
-        self.members = FixedSize(type(self).__name__, indices)
+        self.hold(self.quantity_of(indices))
         self._warn_duplicates()
+
+    def quantity_of(self, indices) -> Quantity:
+        """f of these particles, as the user gives them."""
+        return self.measures(self.fixed(indices, self.measures.arity))
+
+    def fixed(self, indices, arity: int) -> FixedSize:
+        """These particles, checked, as many for each constraint."""
+        return FixedSize(type(self).__name__, checks.indices(repr(self), self.index_name, indices, checks.ANY, arity=arity))
+
+    def hold(self, quantity: Quantity) -> None:
+        """Act on the particles of this f."""
+        self._keep(quantity=quantity, members=quantity.members, arity=getattr(quantity.members, "arity", 0))
 
     def check_indices(self, particles: "Particles") -> None:
         """Check the particles of each constraint against those that there are."""
         self.members.check(repr(self), self.index_name, particles.count)
 
     def _warn_duplicates(self) -> None:
+        if not self.arity:
+            return
         ordered = self.indices.copy()
-        for group in [range(self.arity)] if self.exchangeable is None else self.exchangeable:
+        for group in self.quantity.exchangeable:
             ordered[:, group] = np.sort(ordered[:, group], axis=1)
         unique, _, counts = distinct(ordered)
         if len(unique) < len(ordered):
@@ -107,9 +118,61 @@ class Scalar(Batch):
                 stacklevel=5,
             )
 
+    @property
+    def unit(self) -> float | None:
+        """What residuals are relative to; None: the rest value."""
+        return self.quantity.unit
+
+    @property
+    def precise(self) -> bool:
+        """Whether exactly() measures to all the digits that positions have."""
+        return self.quantity.precise
+
+    @property
+    def curved(self) -> bool:
+        """Whether f is so curved that Newton's step from afar means nothing."""
+        return self.quantity.curved
+
+    @property
+    def collapses(self) -> int:
+        """The power of a length that f is, where gradients vanish with the size of the body; else 0."""
+        return self.quantity.collapses
+
+    @property
+    def transcends(self) -> bool:
+        """Whether it takes angles, cube roots or exponentials."""
+        return self.quantity.transcends
+
+    @property
+    def cusp(self) -> bool:
+        """Whether any goal is f = 0, where gradients end and directions mean nothing, or was when kernels were compiled."""
+        return self.quantity.ends and bool((self.goal == 0).any()) or vars(self.dev).get("cusp", False)
+
+    @property
+    def reweighs(self) -> bool:
+        """Outlines do."""
+        return self.arity == 0
+
+    @property
+    def listing(self) -> Any:
+        """As the user gives them."""
+        return self.quantity.listing
+
+    def select(self, some: np.ndarray, number: np.ndarray) -> None:
+        """Keep these constraints, by the new numbers of their particles."""
+        self.hold(self.quantity.remapped(some, number))
+
+    def excluded_pairs(self, particles: "Particles") -> np.ndarray:
+        """All corners of a constraint may overlap, but of outlines only neighbours."""
+        return self.quantity.pairs()
+
+    def values(self, x: np.ndarray) -> np.ndarray:
+        """f of corners x (m, arity, dim), (m,); of outlines, of all positions (n, dim)."""
+        return self.quantity.values(x)
+
     def rest_of(self, position: np.ndarray) -> np.ndarray:
         """f at the given positions, (m,): the rest value when none is given."""
-        raise NotImplementedError
+        return self.values(self.placed(position) if self.arity else position)
 
     def placed(self, position: np.ndarray) -> np.ndarray:
         """Where the corners of each constraint are, (m, arity, dim); in a periodic box the images nearest to the first."""
@@ -123,28 +186,25 @@ class Scalar(Batch):
 
     def violation(self, position: np.ndarray) -> np.ndarray:
         """C at the given positions, (m,)."""
-        return self.rest_of(position) - self.goal
+        return self.quantity.difference(self.rest_of(position), self.goal)
 
     def gradients(self, position: np.ndarray) -> np.ndarray:
-        """grad_k f of every constraint, (m, arity, dim), by central differences: each constraint on particles of its own."""
-        twin: Any = self.copy()
-        vars(twin)["members"] = FixedSize(type(self).__name__, np.arange(self.indices.size).reshape(self.indices.shape))
-        x = self.placed(position)
-        step = 1e-6 * (float(np.ptp(x, axis=1).max(initial=0.0)) or 1.0)
-        out = np.zeros_like(x)
-        for k in range(self.arity):
-            for a in range(x.shape[2]):
-                ends = np.stack([x, x])
-                ends[:, :, k, a] += [[step], [-step]]
-                up, down = (twin.rest_of(end.reshape(-1, x.shape[2])) for end in ends)
-                out[:, k, a] = (up - down) / (2 * step)
-        return out
+        """grad_k f of every constraint at the given positions, (m, arity, dim); of outlines (total, dim)."""
+        return self.quantity.gradients(self.placed(position) if self.arity else position)
 
     def inverse_size(self, position: np.ndarray) -> np.ndarray:
         """What makes C a share of the size of its constraint, (m,): 1 / length for links, 0 for what has no extent."""
-        x = self.placed(position)
-        size = np.linalg.norm(x - x[:, :1], axis=2).max(axis=1, initial=0.0)
-        size *= np.sqrt((self.gradients(position) ** 2).sum(axis=(1, 2)) / 2)
+        squares = self.gradients(position) ** 2
+        if self.arity:
+            x = self.placed(position)
+            size = np.linalg.norm(x - x[:, :1], axis=2).max(axis=1, initial=0.0)
+            size *= np.sqrt(squares.sum(axis=(1, 2)) / 2)
+        elif self.count:
+            x, starts, owner = position[self.indices], self.members.starts, self.owner
+            size = np.maximum.reduceat(np.linalg.norm(x - x[starts[owner]], axis=1), starts[:-1])
+            size *= np.sqrt(np.bincount(owner, squares.sum(axis=1), minlength=self.count) / 2)
+        else:
+            size = np.zeros(0)
         return np.divide(1, size, out=np.zeros(self.count), where=size > 0)
 
     def prepare(self, particles: "Particles", inv_mass: np.ndarray) -> None:
@@ -198,7 +258,9 @@ class Scalar(Batch):
         return (self.compliance > 0) & (scene.order > 2)
 
     def relaxed_alone(self, scene: Scene) -> np.ndarray:
-        """Which constraints no system is to have, (m,): forces, and those that end where gradients do."""
+        """Which constraints no system is to have, (m,): forces, those that end where gradients do, and clamped multipliers."""
+        if self.driven:
+            return self.acts_as_force(scene) | np.isfinite(self.largest)
         return self.acts_as_force(scene) | (self.cusp & (self.goal == 0) & (self.compliance == 0))
 
     @property
@@ -210,6 +272,20 @@ class Scalar(Batch):
     def drive_of(self, scene: Scene) -> Drive:
         """What moves the rest values, where the batch is driven."""
         raise NotImplementedError
+
+    def course(self) -> tuple[Any, Any]:
+        """Where the batch is driven: where rest values go to, and how fast, (m,) each."""
+        raise NotImplementedError
+
+    @property
+    def largest(self) -> Any:
+        """Where the batch is driven: the largest loads, (m,)."""
+        raise NotImplementedError
+
+    @property
+    def capped(self) -> bool:
+        """Whether any load of a drive is limited, or was when kernels were compiled."""
+        return self.driven and bool(np.isfinite(self.largest).any()) or self._built("drive", "capped")
 
     def start_at(self, position: np.ndarray, first: int) -> None:
         """Where the batch is driven: particles from number `first` on were placed where they are, (n, dim)."""
@@ -261,11 +337,16 @@ class Scalar(Batch):
         )
         if self.dev.steps:
             self.dev.step = add(f"{name}.step", m)
+        if not self.arity:
+            self.dev.outline = Outline(scene, self)
+        self.dev.quantity = self.quantity.bind(scene, self)
 
     def upload(self) -> None:
         """Write new rest values, stiffnesses and strengths."""
         if self.acts:
-            if not self.driven:
+            if self.driven:
+                self.dev.drive.upload(*self.course(), self.largest)
+            else:
                 self.scene.memory.write(self.dev.rest, self.goal)
             self.dev.spring.upload(self.compliance, self.damping)
             self.dev.strength.upload(self.break_at)
@@ -289,17 +370,25 @@ class Scalar(Batch):
     @ti.func
     def measure(self, c, q):
         """f and its (arity, dim) gradients at corners q (arity, dim), which are relative to corner 0."""
-        return 0.0, q
+        return self.dev.quantity.measure(q)
 
     @ti.func
     def unwrap(self, f, other):
         """Of the values that mean the same as f, the one nearest to `other`; more than one only for angles."""
-        return f
+        return self.dev.quantity.unwrap(f, other)
 
     @ti.func
-    def excess(self, c, f, rest):
+    def excess(self, c, f):
         """f - rest."""
-        return f - rest
+        C = f - self.dev.rest[c]
+        if ti.static(self.precise):
+            C = self.dev.quantity.excess(self.member(c, 0), self.member(c, 1), f, self.dev.rest[c])
+        return C
+
+    @ti.func
+    def exactly(self, c):
+        """C in f64, to all the digits that positions have."""
+        return self.dev.quantity.exactly(self.member(c, 0), self.member(c, 1), self.dev.rest[c])
 
     @ti.func
     def direction_reliable(self, f, f0):
@@ -338,7 +427,11 @@ class Scalar(Batch):
     @ti.func
     def value(self, c, back):
         """f at x - back d."""
-        f, _ = self.measure(c, self.corners(c, back))
+        f = ti.cast(0, self.dev.real)
+        if ti.static(self.arity > 0):
+            f, _ = self.measure(c, self.corners(c, back))
+        else:
+            f = self.dev.outline.value(c, back)
         return f
 
     @ti.func
@@ -357,7 +450,7 @@ class Scalar(Batch):
         if ti.static(self.dev.forces):
             if not self.dev.spring.is_rigid(c):
                 W = 0
-        C, A = self.excess(c, f, self.dev.rest[c]), ti.cast(1, self.dev.real)
+        C, A = self.excess(c, f), ti.cast(1, self.dev.real)
         B, alpha = ti.cast(0, self.dev.real), ti.cast(0, self.dev.real)
         lam = self.dev.lam[c]
         if first != 0:
@@ -497,11 +590,6 @@ class Scalar(Batch):
         return new
 
     @ti.func
-    def reach(self, c, q):
-        """How far a corner may move before f is no longer what its gradient says, with corners q: about the size of the body."""
-        return ti.cast(1, self.dev.real)
-
-    @ti.func
     def motion(self, c, n, together):
         """The motion u along n in this substep, its weight W, the largest move by a multiplier of 1, the largest move squared.
 
@@ -534,7 +622,7 @@ class Scalar(Batch):
         far = False
         if self.dev.spring.is_rigid(c):
             u, W, longest, fastest = self.motion(c, n, together)
-            reach = self.reach(c, self.corners(c, 0))
+            reach = self.dev.quantity.reach(self.corners(c, 0))
             if W > 0 and (self.dev.postponed[c] != 0 or ti.abs(new - lam) * longest > TRUST * reach):
                 pace = APPROACH * share * ti.min(self.residual_scale(c), W * ti.min(reach, self.dev.span[c]) / longest)
                 if fastest * W * W > (2 * pace * longest) ** 2:
@@ -544,7 +632,25 @@ class Scalar(Batch):
         return new, far
 
     @ti.func
+    def reduce_block(self, b, h, h2_effective, first, fresh):
+        """See Outline."""
+        self.dev.outline.reduce_block(b)
+
+    @ti.func
+    def scatter_corner(self, e, h, h2_effective, first, fresh):
+        """See Outline."""
+        self.dev.outline.scatter_corner(e)
+
+    @ti.func
     def relax(self, c, h, h2_effective, frame_fraction, first, fresh):
+        """One Jacobi correction of constraint c."""
+        if ti.static(self.arity == 0):
+            self.dev.outline.relax(c, h, h2_effective, frame_fraction, first, fresh)
+        else:
+            self.relax_corners(c, h, h2_effective, frame_fraction, first, fresh)
+
+    @ti.func
+    def relax_corners(self, c, h, h2_effective, frame_fraction, first, fresh):
         """Move each corner by w_j dlam grad_j C; a constraint that belongs to a system tells it what it knows."""
         violation, A, alpha, lam, W, n, g, turn, moved = self.linearise(
             c, h, h2_effective, frame_fraction[1] - frame_fraction[0], first, fresh
@@ -567,7 +673,7 @@ class Scalar(Batch):
                     if split > 0 and self.dev.spring.is_rigid(c):
                         spare = 2 * (violation - moved) ** 2 / split
                         if ti.static(self.dev.limited):
-                            most = TRUST * self.reach(c, self.corners(c, 0)) / longest
+                            most = TRUST * self.dev.quantity.reach(self.corners(c, 0)) / longest
                     self.dev.slots.system.limit_row(row, u, spare, most, lam - new)
                 for k in ti.static(range(self.arity)):
                     self.dev.slots.system.set_gradient(self.dev.places[c][k], self.member(c, k), g[k, :])
@@ -633,16 +739,19 @@ class Scalar(Batch):
 
         Rigid links find their force in the next substep.
         """
-        f, g = self.measure(c, self.corners(c, 0))
-        f = self.unwrap(f, self.dev.rest[c])
-        f0, w = f, ti.cast(0, self.dev.real)
-        if ti.static(self.dev.spring.damped):
-            f0, _ = self.measure(c, self.corners(c, 1))
-        for k in ti.static(range(self.arity)):
-            w += self.dev.w.of(self.member(c, k)) * g[k, :].dot(g[k, :])
-        force = self.spring_force(c, f, self.unwrap(f0, f), w, h)
-        for k in ti.static(range(self.arity)):
-            self.push(c, k, h * h * self.dev.w.of(self.member(c, k)) * force * g[k, :])
+        if ti.static(self.arity == 0):
+            self.dev.outline.push_spring_force(c, h)
+        else:
+            f, g = self.measure(c, self.corners(c, 0))
+            f = self.unwrap(f, self.dev.rest[c])
+            f0, w = f, ti.cast(0, self.dev.real)
+            if ti.static(self.dev.spring.damped):
+                f0, _ = self.measure(c, self.corners(c, 1))
+            for k in ti.static(range(self.arity)):
+                w += self.dev.w.of(self.member(c, k)) * g[k, :].dot(g[k, :])
+            force = self.spring_force(c, f, self.unwrap(f0, f), w, h)
+            for k in ti.static(range(self.arity)):
+                self.push(c, k, h * h * self.dev.w.of(self.member(c, k)) * force * g[k, :])
 
     @ti.func
     def spring_force(self, c, f, f0, w, h):
@@ -666,10 +775,13 @@ class Scalar(Batch):
     @ti.func
     def push_reaction(self, c, firm, soft):
         """scale w_j lam grad_j C(x_n)."""
-        _, g = self.measure(c, self.corners(c, 0))
         pull = self.dev.lam[c] * ti.select(self.dev.spring.is_rigid(c), firm, soft)
-        for k in ti.static(range(self.arity)):
-            self.push(c, k, self.dev.w.of(self.member(c, k)) * pull * g[k, :])
+        if ti.static(self.arity == 0):
+            self.dev.outline.push_reaction(c, pull)
+        else:
+            _, g = self.measure(c, self.corners(c, 0))
+            for k in ti.static(range(self.arity)):
+                self.push(c, k, self.dev.w.of(self.member(c, k)) * pull * g[k, :])
 
     @ti.func
     def break_overloaded(self, c, h2_effective, tick):
@@ -679,12 +791,16 @@ class Scalar(Batch):
     @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
         """The violation that is left, relative to the rest value (to the batch's mean f where that is 0)."""
-        violation, A, alpha, lam, W, _, _, _, _ = self.linearise(c, h, h2_effective, 0 * h, 0, fresh)
-        _, left = self.jacobi_update(c, violation, A, alpha, lam, W, 0)
-        if ti.static(self.collapses > 0):
-            f, g = self.measure(c, self.corners(c, 0))
-            if g.norm_sqr() == 0 and self.dev.strength.holds(c):
-                left = ti.abs(self.bounded(f - self.dev.rest[c]))
+        left = ti.cast(0, self.dev.real)
+        if ti.static(self.arity == 0):
+            left = self.dev.outline.violation_left(c, h, h2_effective, fresh)
+        else:
+            violation, A, alpha, lam, W, _, _, _, _ = self.linearise(c, h, h2_effective, 0 * h, 0, fresh)
+            _, left = self.jacobi_update(c, violation, A, alpha, lam, W, 0)
+            if ti.static(self.collapses > 0):
+                f, g = self.measure(c, self.corners(c, 0))
+                if g.norm_sqr() == 0 and self.dev.strength.holds(c):
+                    left = ti.abs(self.bounded(f - self.dev.rest[c]))
         return left / self.residual_scale(c)
 
     @ti.func

@@ -53,6 +53,7 @@ class _Failed:
 
     def __getattr__(self, name: str) -> Any:
         def fail(ctx, node):
+            """Raise what went wrong when the tree was read."""
             raise self._error
 
         return fail

@@ -50,7 +50,10 @@ def launches(timed: bool = False) -> Iterator[Launches]:
     count = Launches()
 
     def counted(launch, name):
+        """A way to launch kernels, which counts them."""
+
         def run(self, *args, **options):
+            """Launch, and write down how often and for how long."""
             clock = perf_counter()
             out = launch(self, *args, **options)
             known = name(self, args)
@@ -106,11 +109,13 @@ class Tracer:
         assign, augment = Operations._assign, Operations._augassign
 
         def begun(ctx, node):
+            """A kernel's tree is read: start anew."""
             if ctx.is_kernel:  # Quadrants does so twice, and the second time it counts
                 self._open, self._known = [], {}
             return define(ctx, node)
 
         def translated(kernel, **given):
+            """A kernel is compiled: keep what its loops touch."""
             self._open, self._known = [], {}
             out = materialize(kernel, **given)
             args = given.get("args") or given.get("py_args") or ()
@@ -119,6 +124,7 @@ class Tracer:
             return out
 
         def looped(ctx, node):
+            """A loop: those on the outside are one sweep each."""
             self._depth += 1
             if self._depth == 1:
                 self._open.append(Sweep())
@@ -132,6 +138,7 @@ class Tracer:
             return out
 
         def subscripted(builder, value, *args, **kwargs):
+            """An entry of a field: read, until something is assigned to it."""
             out = subscript(builder, value, *args, **kwargs)
             if isinstance(value, ti.Field) and self._open and self._depth:
                 site = [value, True, False, self._depth > 1]
@@ -142,17 +149,20 @@ class Tracer:
             return out
 
         def assigned(to, value):
+            """An entry that is written to."""
             if id(to) in self._known:
                 site = self._known[id(to)][1]
                 site[1], site[2] = False, True
             return assign(to, value)
 
         def changed(to, value, op):
+            """An entry that is read and written to."""
             if id(to) in self._known:
                 self._known[id(to)][1][2] = True
             return augment(to, value, op)
 
         def called(ctx, node):
+            """An atomic operation changes its first argument."""
             out = call(ctx, node)
             if any(node.func.ptr is function for function in ATOMIC) and id(node.args[0].ptr) in self._known:
                 self._known[id(node.args[0].ptr)][1][2] = True

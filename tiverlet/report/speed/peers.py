@@ -167,11 +167,13 @@ def main(job: dict[str, Any]) -> None:
     os.dup2(2, 1)
 
     def say(what: Any) -> None:
+        """Write one answer, a line of JSON."""
         print(json.dumps(what), file=answers, flush=True)
 
     particles, features = SCENES[job["scene"]].build(job["n"])
 
     def made():
+        """The scene in the peer's engine."""
         return MODELS[job["peer"]](particles, features, job["threads"], job["setting"])
 
     engine = made()

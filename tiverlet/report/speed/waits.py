@@ -40,6 +40,7 @@ def waits(n: int, cache: str, peers: list[str]) -> list[Wait]:
     from .processes import started
 
     def of(engine: str) -> dict[str, float]:
+        """Seconds of each act in one engine, in a process of its own."""
         with started(START, {"engine": engine, "n": n}, cache) as talker:
             return talker.ask()
 
@@ -63,6 +64,7 @@ def pile(n: int):
     x, radius = particles.position, float(particles.radius[0])
 
     def more(k: int, turn: int) -> Particles:
+        """k more particles on top of the pile, higher with each turn."""
         place = np.stack([np.arange(k) % 30, np.arange(k) // 30], axis=1) * 2.2 * radius
         return Particles(place + [x[:, 0].min(), x[:, 1].max() + 3 * radius + turn * 10 * radius], radius=radius)
 
@@ -102,6 +104,7 @@ def ours(n: int) -> dict[str, float]:
     particles, features, more = pile(n)
 
     def built(count: int):
+        """The pile of so many particles as a World, and what hands and gates act on it."""
         some = tv.Particles(particles.position[:count], radius=particles.radius[:count])
         wall, hand = tv.HalfSpace((0, -1), -1e3, active=True), tv.Hand((0.0, 0.0), rate=0.0)
         pin = tv.Pin([0])
@@ -124,21 +127,27 @@ def ours(n: int) -> dict[str, float]:
         copied = perf_counter() - clock
 
     def frame():
+        """One frame."""
         world.step(DT)
 
     def hold(k: int):
+        """Hold another particle."""
         pin.indices = [n // 2 + k]
 
     def take(k: int):
+        """Draw another particle by the hand."""
         hand.particle = k
 
     def switch(k: int):
+        """Open or close the gate."""
         wall.active = bool(k % 2)
 
     def added(k: int):
+        """Add k particles."""
         return lambda turn: world.add(more(k, turn))
 
     def removed(k: int):
+        """Take the last k away."""
         return lambda turn: world.remove(np.arange(len(world.particles) - k, len(world.particles)))
 
     acts = {
@@ -160,6 +169,7 @@ def pymunks(n: int) -> dict[str, float]:
     particles, features, more = pile(n)
 
     def built():
+        """The pile in Pymunk."""
         return Pymunk(particles, features, 1, (8, 10))
 
     clock = perf_counter()
@@ -176,7 +186,10 @@ def pymunks(n: int) -> dict[str, float]:
     space, come, grip = engine.space, [], []
 
     def added(k: int):
+        """Add k bodies."""
+
         def act(turn: int):
+            """Put them on top of the pile."""
             for x in more(k, turn).position.tolist():
                 body = pymunk.Body(1.0, float("inf"))
                 body.position = tuple(x)
@@ -187,13 +200,17 @@ def pymunks(n: int) -> dict[str, float]:
         return act
 
     def removed(k: int):
+        """Take the last k away."""
+
         def act(turn: int):
+            """One after the other."""
             for _ in range(k):
                 space.remove(*come.pop())
 
         return act
 
     def hold(k: int):
+        """Hold another body by a joint."""
         body = engine.bodies[n // 2 + k]
         space.remove(*grip)
         grip[:] = [PivotJoint(space.static_body, body, tuple(body.position))]
@@ -215,6 +232,7 @@ def newtons(n: int) -> dict[str, float]:
     particles, features, _ = pile(n)
 
     def built():
+        """The pile in Newton, and its first frame."""
         engine = Newton(particles, features, 1, (8, 2))
         engine.frame()
         return engine

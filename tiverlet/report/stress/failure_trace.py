@@ -10,7 +10,7 @@ import numpy as np
 from ... import checks
 from ...features.feature import Batch
 from ...step.checkpoint import keep, put_back
-from ...step_report import StepReport
+from ...step.step_report import StepReport
 from ...world import World
 
 

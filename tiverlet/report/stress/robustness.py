@@ -24,7 +24,7 @@ from .. import output
 from ..output import said
 
 if TYPE_CHECKING:
-    from ...step_report import StepReport
+    from ...step.step_report import StepReport
 
 STANDS, REFUSED, BREAKS, UNTRIED = "stands it", "refused by name", "BREAKS", "not tried"
 LOOSE = 0.1  # relative violation of a constraint beyond which it no longer holds

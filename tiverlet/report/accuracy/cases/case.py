@@ -13,7 +13,7 @@ from ....features.feature import Feature
 from ....measure import angular_momentum
 from ....particles import Particles
 from ....solvers import Chebyshev, ConjugateGradient, Direct, Jacobi
-from ....step_report import StepReport
+from ....step.step_report import StepReport
 
 if TYPE_CHECKING:
     from ....world import World

@@ -66,6 +66,7 @@ def sprung(name: str, seconds: float, limit: float) -> Case:
     want = 1.0 + 0.1 * np.cos(np.sqrt(p["k"] / p["m"]) * seconds)
 
     def build() -> tuple[Particles, list[Feature]]:
+        """A mass on a spring."""
         return Particles([[0.0, 0], [1.1, 0]], mass=p["m"], pinned=[0]), [Distance([[0, 1]], 1.0, compliance=p["alpha"])]
 
     return Case(name, f"Oscillator by a compliant link, {p['k']:g} N/m", build, seconds, ends_at([1], [[want, 0]]), limit, 0.2)
@@ -84,6 +85,7 @@ def orbit(e: str, limit: float, **more) -> Case:
     s, want = states[f"{e}_start"], states[f"{e}_t10"]
 
     def build() -> tuple[Particles, list[Feature]]:
+        """A planet."""
         return Particles([[s["x"], s["y"]]], velocity=(s["vx"], s["vy"])), [Attractor((0, 0), 1.0)]
 
     title = f"Kepler's orbit of eccentricity {e[1:]}"
@@ -101,6 +103,7 @@ def mode(j: int, limit: float) -> Case:
     want = x + np.cos(values[f"mode{j}"]["omega"] * seconds) * u
 
     def build() -> tuple[Particles, list[Feature]]:
+        """A chain, displaced along its mode."""
         link = Distance(links(n + 1), p["rest"], compliance=p["alpha"])
         return Particles(x + u, mass=p["m"], pinned=[0, n + 1]), [link]
 
@@ -120,6 +123,7 @@ def sway(n: int, limit: float) -> Case:
     want = np.cos(omega * seconds)
 
     def build() -> tuple[Particles, list[Feature]]:
+        """A chain that hangs, displaced along its slowest mode."""
         return Particles(x, pinned=[0]), [Gravity(9.81), Distance(links(n), 1 / n)]
 
     return Case(

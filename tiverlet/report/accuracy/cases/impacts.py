@@ -53,6 +53,7 @@ def bounces(e: float, limit: float) -> Case:
     times = known(f"R16_bounce_e{e}")["values"]["impact_times"]
 
     def error(run: Run) -> float:
+        """Of the heights between impacts."""
         y, v, t = np.array([s[0] for s in run.seen]), np.array([s[1] for s in run.seen]), np.array(run.times)
         found = []
         for a, b in zip(times, times[1:], strict=False):
@@ -92,6 +93,7 @@ def slides(degrees: int, mu: float, speed: int, limit: float) -> Case:
     way = np.array([np.cos(a), -np.sin(a)])
 
     def error(run: Run) -> float:
+        """Of the way that it slid."""
         return abs(float((run.world.position[0] - run.world.particles.position[0]) @ way) / want - 1)
 
     return Case(

@@ -91,6 +91,7 @@ def hollows(n: int, alpha: float, limit: float) -> Case:
     want = known("S08_net_sag")["values"][key]["center_y"]
 
     def error(run: Run) -> float:
+        """Of the sag in the middle."""
         return abs(float(run.world.position[(n + 1) ** 2 // 2, 1]) / want - 1)
 
     return Case(

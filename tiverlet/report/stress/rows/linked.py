@@ -69,6 +69,7 @@ def _infinite() -> Finding:
 @row(7, "a link between two static particles", "skipped, and warned of where it is violated")
 def _idle() -> Finding:
     def build():
+        """Two pinned particles, off the length of their link."""
         from ....world import World
 
         return World(Particles([[0.0, 0], [1, 0]], pinned=[0, 1]), [Distance([[0, 1]], 3.0)])

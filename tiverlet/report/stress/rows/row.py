@@ -12,7 +12,7 @@ import numpy as np
 from ....features.feature import Feature
 from ....measure import overlapping
 from ....particles import Particles
-from ....step_report import StepReport
+from ....step.step_report import StepReport
 from ....world import World
 
 NAN, INF = float("nan"), float("inf")
@@ -47,6 +47,7 @@ def row(number: int, what: str, criterion: str) -> Callable:
     """Register a function as the row of this number."""
 
     def register(attempt: Callable[[], Finding]) -> Callable[[], Finding]:
+        """Enter it, once."""
         if number in ROWS:
             raise ValueError(f"row {number} is there twice.")
         ROWS[number] = Row(number, what, criterion, attempt)

@@ -9,7 +9,7 @@ from ....particles import Particles
 from ....shapes import cloth, net
 from ....solvers import Chebyshev, ConjugateGradient, Jacobi
 from ....step.adaptive import StepController
-from ....step_report import UNCONVERGED
+from ....step.step_report import UNCONVERGED
 from .row import Finding, finite, row, world
 
 G = 9.81

@@ -75,6 +75,7 @@ def _crowd() -> Finding:
     made = []
 
     def build() -> None:
+        """A world of them, and how many pairs touch."""
         from ....world import World
 
         with World(Particles(x, radius=0.5), [Contact()], precision="f64") as w:
@@ -273,6 +274,7 @@ def _far() -> Finding:
     x = [(-0.5, 0.2), (0.0, 0.1), (0.5, 0.3), (0.1, 0.4), (2.017036, -0.207938), (2.5, -1.0)]
 
     def places(far: float, *contact: Contact) -> np.ndarray:
+        """Where all others end, with a static particle so far away."""
         wire = Path([4, 5], [[2.0, 0.0], [2.5, -1.0], [3.0, -0.5], [4.0, -1.5]])
         start = Particles([*x, (far, far)], radius=0.05, pinned=[len(x)])
         with world(start, [Gravity(9.81), Sdf(_round_room), wire, *contact], precision="f32") as w:

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from ..geometry.bounding_tree import BoundingTree, ahead
-from ..geometry.intervals import ball, capsule, entry, rounding
-from ..geometry.nearest import away, on_segment
+from ...geometry.bounding_tree import BoundingTree, ahead
+from ...geometry.intervals import ball, capsule, entry, rounding
+from ...geometry.nearest import away, on_segment
 
 
 class Rods:

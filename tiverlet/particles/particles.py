@@ -5,12 +5,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from . import checks
-from .device import at, inline, ti
-from .device.memory import Memory
-from .device.number import OnDevice
-from .features.arguments import meant
-from .features.read_only import read_only, structure
+from .. import checks
+from ..device import at, inline, ti
+from ..device.memory import Memory
+from ..device.number import OnDevice
+from ..features.arguments import meant
+from ..features.read_only import read_only, structure
 
 LARGEST = 1e15  # [m] beyond this, squared lengths near 1e38 leave f32; nothing physical is that far
 

@@ -5,16 +5,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .. import checks
-from ..colliders.collider import Collider
-from ..features.feature import Feature
-from ..neighbours.queries import between
-from ..particles import in_range
+from ... import checks
+from ...colliders.collider import Collider
+from ...features.feature import Feature
+from ...neighbours.queries import between
+from ...particles import in_range
 from .hits import Hits
 from .targets import Rods
 
 if TYPE_CHECKING:
-    from ..world import World
+    from ...world import World
 
 WHO = "World.ray"
 

@@ -4,11 +4,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..colliders.collider import Collider
-from ..features.arguments import knobs_of
+from ...colliders.collider import Collider
+from ...features.arguments import knobs_of
 
 if TYPE_CHECKING:
-    from ..world import World
+    from ...world import World
 
 PARTS = {"center": 0.0, "whole": 1.0, "touching": -1.0}  # how many radii deep in the shape a center has to be
 

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from .device import ti
-from .device.memory import Memory
+from ..device import ti
+from ..device.memory import Memory
 from .particles import Particles, Shared, at_rest
 
 

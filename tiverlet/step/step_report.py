@@ -59,7 +59,7 @@ class StepReport:
         return new
 
     def _repr_html_(self) -> str:
-        from .recording.markup import of_report
+        from ..recording.markup import of_report
 
         return of_report(self)
 

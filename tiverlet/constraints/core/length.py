@@ -1,0 +1,70 @@
+"""The length of a link."""
+
+from typing import TYPE_CHECKING, Any, TypeGuard
+
+import numpy as np
+
+from ... import checks
+from ...device import ti
+from ...features.feature import Knob
+from .quantity import Quantity
+
+if TYPE_CHECKING:
+    from .scalar import Scalar
+
+REST_LENGTH = Knob(lambda f, v: checks.per_item(repr(f), f.rest_name, v, f.count, least=0.0), "Rest length [m].")
+
+
+class Length(Quantity):
+    """The distance of a pair, f(x) = |x_i - x_j|, and its gradients.
+
+    Two particles in the same place have no direction between them; +x stands in for it.
+    """
+
+    arity = 2
+    exchangeable = ((0, 1),)
+    ends = precise = True
+
+    def values(self, x: np.ndarray) -> np.ndarray:
+        """Lengths of the links."""
+        return np.linalg.norm(x[:, 0] - x[:, 1], axis=1)
+
+    def gradients(self, x: np.ndarray) -> np.ndarray:
+        """As in measure()."""
+        r = x[:, 0] - x[:, 1]
+        length = np.linalg.norm(r, axis=1, keepdims=True)
+        n = np.divide(r, length, out=np.eye(1, r.shape[1]).repeat(len(r), axis=0), where=length > 0)
+        return np.stack([n, -n], axis=1)
+
+    @ti.func
+    def excess(self, i, j, f, rest):
+        """|r| - rest = (r^2 - rest^2) / (|r| + rest): to all digits of the low words, where there are any."""
+        C = f - rest
+        if ti.static(self.state.carries):
+            if f + rest > 0:
+                r = self.state.between(i, j)
+                goal = ti.cast(rest, ti.f64)
+                C = ti.cast(r.dot(r) - goal * goal, self.real) / (f + rest)
+        return C
+
+    @ti.func
+    def measure(self, q):
+        """|r| and +- r / |r|, with r = x_0 - x_1."""
+        r = q[0, :] - q[1, :]
+        length = ti.sqrt(r.dot(r))
+        n = 0 * r
+        n[0] = 1
+        if length > 0:
+            n = r / length
+        return length, ti.Matrix.rows([n, -n])
+
+    @ti.func
+    def exactly(self, i, j, rest):
+        """f - rest in f64, which the difference of two lengths in f32 is not."""
+        r = self.state.between(i, j)
+        return ti.sqrt(r.dot(r)) - ti.cast(rest, ti.f64)
+
+
+def is_link(feature: Any) -> "TypeGuard[Scalar]":
+    """Whether what a feature constrains is lengths."""
+    return isinstance(getattr(feature, "quantity", None), Length)

@@ -1,0 +1,111 @@
+"""What a constraint that is one number holds: the number f, of the corners of each of its constraints."""
+
+from collections.abc import Callable
+from copy import copy
+from typing import Any
+
+import numpy as np
+
+from ...device import ti
+from ...features.feature import Scene
+
+
+class Quantity:
+    """The contract of f in C(x) = f(x) - rest: a length, an angle, an area; and what most of them do.
+
+    A new one says values() and measure(), and how it differs from a plain number: unwrap() and difference() where some values
+    mean the same, `curved` and reach() where its gradient is right only near by. Kernels call what bind() returns. Of outlines
+    (arity 0) f is a polynomial of degree dim in the corners, and they give slope() in place of measure(), see Outline.
+
+    members: FixedSize or VariableSize, the particles of each constraint.
+    """
+
+    arity = 0  # corners of each constraint; 0: as many as each needs
+    exchangeable: tuple[tuple[int, ...], ...] = ()  # groups of corners that may swap
+    unit: float | None = None  # what residuals are relative to; None: the rest value
+    precise = False  # whether exactly() measures to all the digits that positions have
+    ends = False  # whether gradients end at f = 0
+    curved = False  # whether f is so curved that Newton's step from afar means nothing
+    collapses = 0  # the power of a length that f is, where gradients vanish with the size of the body; else 0
+    transcends = False  # takes angles, cube roots or exponentials, which SPIR-V has for f32 only
+    state: Any  # on the device
+    real: Any
+
+    def __init__(self, members: Any):
+        self.members = members
+
+    @property
+    def listing(self) -> Any:
+        """The particles of each, as the user gives them."""
+        return self.members.listing
+
+    def pairs(self) -> np.ndarray:
+        """Pairs of particles that may overlap, (k, 2)."""
+        return self.members.pairs()
+
+    def remapped(self, some: np.ndarray, number: np.ndarray) -> "Quantity":
+        """That of the constraints in the mask `some`, by the new numbers of their particles."""
+        new = copy(self)
+        new.members = self.members.remapped(some, number)
+        return new
+
+    def values(self, x: np.ndarray) -> np.ndarray:
+        """f, (m,), of corners x (m, arity, dim) [m]; of outlines, of all positions (n, dim)."""
+        raise NotImplementedError
+
+    def gradients(self, x: np.ndarray) -> np.ndarray:
+        """Its gradients by each corner, (m, arity, dim); of outlines (total, dim)."""
+        return differences(self.values, x)
+
+    def difference(self, f: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        """How far f is from a goal, (m,)."""
+        return f - goal
+
+    def bind(self, scene: Scene, batch: Any) -> Any:
+        """The same for the kernels of a batch, whose members are bound."""
+        bound = copy(self)
+        bound.state, bound.real = scene.state, scene.real
+        return bound
+
+    @ti.func
+    def measure(self, q):
+        """f and its (arity, dim) gradients at corners q (arity, dim), which are relative to corner 0."""
+        return 0.0, q
+
+    @ti.func
+    def slope(self, e, back):
+        """Of outlines: the gradient by corner e, at x - back d."""
+        return ti.Vector.zero(self.real, 1)
+
+    @ti.func
+    def unwrap(self, f, other):
+        """Of the values that mean the same as f, the one nearest to `other`; more than one only for angles."""
+        return f
+
+    @ti.func
+    def excess(self, i, j, f, rest):
+        """Where it is `precise`: f - rest to all digits, with first corners i and j."""
+        return f - rest
+
+    @ti.func
+    def exactly(self, i, j, rest):
+        """The same in f64."""
+        return ti.cast(0, ti.f64)
+
+    @ti.func
+    def reach(self, q):
+        """How far a corner may move before f is no longer what its gradient says, with corners q: about the size of the body."""
+        return ti.cast(1, self.real)
+
+
+def differences(values: Callable, x: np.ndarray) -> np.ndarray:
+    """Gradients of values(x) by each corner of x (m, arity, dim), central differences."""
+    step = 1e-6 * (float(np.ptp(x, axis=1).max(initial=0.0)) or 1.0)
+    out = np.zeros_like(x)
+    for k in range(x.shape[1]):
+        for a in range(x.shape[2]):
+            ends = np.stack([x, x])
+            ends[:, :, k, a] += [[step], [-step]]
+            up, down = (values(end) for end in ends)
+            out[:, k, a] = (up - down) / (2 * step)
+    return out
