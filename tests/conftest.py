@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import gc
 import json
 import os
 import pathlib
@@ -94,18 +95,28 @@ def keep_kernels() -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def taichi():
-    tv.init(arch=ARCH)
+def process():
+    """What a whole run has: no teams beside other workers, and the process that forks."""
     if int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) > 1:
         # The cores are all taken by workers: threads of one team would wait for those of another, for three times as long as one
         # takes for all. The bits are the same; who wants a team asks for path="parallel".
         build.CROSSOVER = sys.maxsize
+    # What has been imported is no garbage: to look through all of it again and again takes 4 % of a run that compiles nothing.
+    gc.collect()
+    gc.freeze()
     with checked_assignments() if patched else contextlib.nullcontext():
         yield
     build.CROSSOVER = CROSSOVER
     if server.cache_info().currsize:
         with server():  # which closes the pipes, so that it ends
             pass
+
+
+@pytest.fixture(scope="module", autouse=True)
+def taichi(process):
+    """A Taichi for the tests of one file, see keep_kernels()."""
+    tv.init(arch=ARCH)
+    yield
     keep_kernels()
 
 
