@@ -23,9 +23,9 @@ from tiverlet.recording import reader, rrd, scene
 from tiverlet.report.accuracy.cases import entries, known
 from tiverlet.step import build
 
-# Taichi keeps kernels that it has compiled, by their content, and finds them when a worker comes by the same tests in the same
-# order: a second run takes half of the time or less, see keep_kernels(). All of them are about as large as what it keeps by
-# default, 100 MB.
+# Taichi keeps kernels that it has compiled, by their content. Part of that are the numbers of the trees of fields that were made
+# before, so every file of tests has a Taichi of its own: a second run finds them all and takes a third of the time, and after an
+# edit it compiles what the edit changes. All of them are larger than what Taichi keeps by default, 100 MB.
 os.environ.setdefault("TI_OFFLINE_CACHE_MAX_SIZE_OF_FILES", str(512 << 20))
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as it is in the background of a shell; tests send it
@@ -78,12 +78,16 @@ def compiled() -> Iterator[list[str]]:
         Kernel.materialize = materialize
 
 
-def keep_kernels() -> None:
-    """End Taichi, which writes what was compiled, one worker after the other.
+@ti.kernel
+def nothing():
+    """Taichi reads what is kept when it compiles the first kernel."""
+    pass
 
-    Who writes has the folder for himself, for seconds. Another one that ends meanwhile gives up after a quarter of a second, and
-    what half of the tests had compiled was lost; so it was where xdist ended a worker that took longer than 10 s to end.
-    """
+
+@contextlib.contextmanager
+def alone_with_what_is_kept() -> Iterator[None]:
+    """One worker after the other: who reads or writes what is kept has the folder for himself, for seconds at most. Taichi gives
+    up after a quarter of a second, and what was compiled is lost, or compiled again."""
     folder = pathlib.Path(ti.cfg.offline_cache_file_path)
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / "tests.lock", "w") as file:
@@ -91,7 +95,7 @@ def keep_kernels() -> None:
             import fcntl  # noqa: PLC0415
 
             fcntl.flock(file, fcntl.LOCK_EX)
-        ti.reset()
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -114,10 +118,13 @@ def process():
 
 @pytest.fixture(scope="module", autouse=True)
 def taichi(process):
-    """A Taichi for the tests of one file, see keep_kernels()."""
+    """A Taichi for the tests of one file, so that its kernels are those of the next run, whatever else runs before."""
     tv.init(arch=ARCH)
+    with alone_with_what_is_kept():
+        nothing()
     yield
-    keep_kernels()
+    with alone_with_what_is_kept():
+        ti.reset()
 
 
 @pytest.fixture
