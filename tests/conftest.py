@@ -1,4 +1,4 @@
-"""One Taichi for the whole run, of the architecture TIVERLET_ARCH (cpu); worlds are closed after each test."""
+"""A Taichi for each file of tests, of the architecture TIVERLET_ARCH (cpu); worlds are closed after each test."""
 
 import contextlib
 import functools
@@ -105,7 +105,7 @@ def process():
         # The cores are all taken by workers: threads of one team would wait for those of another, for three times as long as one
         # takes for all. The bits are the same; who wants a team asks for path="parallel".
         build.CROSSOVER = sys.maxsize
-    # What has been imported is no garbage: to look through all of it again and again takes 4 % of a run that compiles nothing.
+    # What has been imported is no garbage; to look through all of it again and again takes 4 % of a run that compiles nothing.
     gc.collect()
     gc.freeze()
     with checked_assignments() if patched else contextlib.nullcontext():
