@@ -1,7 +1,8 @@
-"""One Taichi for the whole run, of the architecture TIVERLET_ARCH (cpu); worlds are closed after each test."""
+"""A Taichi for each file of tests, of the architecture TIVERLET_ARCH (cpu); worlds are closed after each test."""
 
 import contextlib
 import functools
+import gc
 import json
 import os
 import pathlib
@@ -22,9 +23,9 @@ from tiverlet.recording import reader, rrd, scene
 from tiverlet.report.accuracy.cases import entries, known
 from tiverlet.step import build
 
-# Taichi keeps kernels that it has compiled, by their content, and finds them when a worker comes by the same tests in the same
-# order: a second run takes half of the time or less, see keep_kernels(). All of them are about as large as what it keeps by
-# default, 100 MB.
+# Taichi keeps kernels that it has compiled, by their content. Part of that are the numbers of the trees of fields that were made
+# before, so every file of tests has a Taichi of its own: a second run finds them all and takes a third of the time, and after an
+# edit it compiles what the edit changes. All of them are larger than what Taichi keeps by default, 100 MB.
 os.environ.setdefault("TI_OFFLINE_CACHE_MAX_SIZE_OF_FILES", str(512 << 20))
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as it is in the background of a shell; tests send it
@@ -77,12 +78,16 @@ def compiled() -> Iterator[list[str]]:
         Kernel.materialize = materialize
 
 
-def keep_kernels() -> None:
-    """End Taichi, which writes what was compiled, one worker after the other.
+@ti.kernel
+def nothing():
+    """Taichi reads what is kept when it compiles the first kernel."""
+    pass
 
-    Who writes has the folder for himself, for seconds. Another one that ends meanwhile gives up after a quarter of a second, and
-    what half of the tests had compiled was lost; so it was where xdist ended a worker that took longer than 10 s to end.
-    """
+
+@contextlib.contextmanager
+def alone_with_what_is_kept() -> Iterator[None]:
+    """One worker after the other: who reads or writes what is kept has the folder for himself, for seconds at most. Taichi gives
+    up after a quarter of a second, and what was compiled is lost, or compiled again."""
     folder = pathlib.Path(ti.cfg.offline_cache_file_path)
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / "tests.lock", "w") as file:
@@ -90,23 +95,36 @@ def keep_kernels() -> None:
             import fcntl  # noqa: PLC0415
 
             fcntl.flock(file, fcntl.LOCK_EX)
-        ti.reset()
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)
-def taichi():
-    tv.init(arch=ARCH)
+def process():
+    """What a whole run has: no teams beside other workers, and the process that forks."""
     if int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) > 1:
         # The cores are all taken by workers: threads of one team would wait for those of another, for three times as long as one
         # takes for all. The bits are the same; who wants a team asks for path="parallel".
         build.CROSSOVER = sys.maxsize
+    # What has been imported is no garbage; to look through all of it again and again takes 4 % of a run that compiles nothing.
+    gc.collect()
+    gc.freeze()
     with checked_assignments() if patched else contextlib.nullcontext():
         yield
     build.CROSSOVER = CROSSOVER
     if server.cache_info().currsize:
         with server():  # which closes the pipes, so that it ends
             pass
-    keep_kernels()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def taichi(process):
+    """A Taichi for the tests of one file, so that its kernels are those of the next run, whatever else runs before."""
+    tv.init(arch=ARCH)
+    with alone_with_what_is_kept():
+        nothing()
+    yield
+    with alone_with_what_is_kept():
+        ti.reset()
 
 
 @pytest.fixture

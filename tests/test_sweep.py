@@ -6,14 +6,11 @@ import importlib.util
 import json
 import multiprocessing
 import os
-import pathlib
 import re
 import shutil
-import signal
 import subprocess
 import sys
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
-from typing import Any
 
 import dask.config
 import distributed
@@ -22,26 +19,9 @@ import pytest
 
 import tiverlet as tv
 from tests.conftest import python
+from tests.sweeps import SECONDS, STARTS, G, ball, ends, height, pendulum, wrong, wrong_figures
 from tests.test_docs import ROOT
-from tiverlet.device import runtime
 from tiverlet.worlds import part, workers
-
-G, SECONDS = 9.81, 0.25
-STARTS = {"angle": np.linspace(0.1, 3.0, 7), "length": np.linspace(0.5, 2.0, 7)}
-
-
-def pendulum(angle: float, length: float) -> tv.World:
-    """Two links, so that it is chaotic: any difference in the bits grows."""
-    bend = np.array([np.sin(angle), -np.cos(angle)]) * length
-    x = [[0, 0], bend, [bend[0] + length, bend[1]]]
-    return tv.World(tv.Particles(x, pinned=[0]), [tv.Gravity(G), tv.Distance([(0, 1), (1, 2)])], substeps=4)
-
-
-def ends(worlds) -> dict[str, Any]:
-    """Where and how fast they are in the end; which process has computed it, and on how many threads."""
-    worlds.run(SECONDS)
-    here = {"process": [os.getpid()] * len(worlds), "threads": [runtime.threads()] * len(worlds)}
-    return {"end": worlds.position, "speed": worlds.velocity} | here
 
 
 def same(a: tv.SweepResult, b: tv.SweepResult) -> bool:
@@ -51,22 +31,6 @@ def same(a: tv.SweepResult, b: tv.SweepResult) -> bool:
 @pytest.fixture(scope="module")
 def here() -> tv.SweepResult:
     return tv.sweep(pendulum, STARTS, ends)
-
-
-def ball(speed: float, marker: str = "", always: bool = False) -> tv.World:
-    """Thrown upwards. With a marker, the first process that throws one at 2 m/s is killed; always: every one ends."""
-    if marker and speed == 2.0 and always:
-        os._exit(3)
-    if marker and speed == 2.0 and not os.path.exists(marker):
-        pathlib.Path(marker).touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return tv.World(tv.Particles([[0.0, 0.0]], velocity=(0, speed)), [tv.Gravity(G)])
-
-
-def height(worlds) -> dict[str, Any]:
-    """After a while."""
-    worlds.run(0.5)
-    return {"y": worlds.position[:, 0, 1]}
 
 
 SPEEDS = np.arange(6.0)
@@ -186,26 +150,6 @@ def test_parameters_that_end_every_worker_are_named():
         tv.sweep(make, {"speed": SPEEDS}, height, executor=1, at_once=1)
 
 
-class Unsendable(Exception):
-    """Comes out of no pickle."""
-
-    def __init__(self, a, b):
-        super().__init__(f"{a} and {b}")
-
-
-def wrong(speed: float, how: str = "") -> Any:
-    """What make() may do wrong."""
-    if how == "raise":
-        raise ArithmeticError("no")
-    if how == "unsendable":
-        raise Unsendable("one", "other")
-    return how if how else ball(speed)
-
-
-def wrong_figures(worlds) -> dict[str, Any]:
-    raise LookupError("nothing there")
-
-
 def raised(kind, *args) -> tuple[str, str]:
     """What an exception of a sweep says, and its notes."""
     with pytest.raises(kind) as caught:
@@ -313,7 +257,7 @@ import json, sys
 import numpy as np
 import tiverlet as tv
 sys.path.insert(0, {root!r})
-from tests.test_sweep import STARTS, ends, pendulum
+from tests.sweeps import STARTS, ends, pendulum
 
 if __name__ == "__main__":
     from mpi4py.futures import MPIPoolExecutor

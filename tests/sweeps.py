@@ -1,0 +1,65 @@
+"""What sweeps in other processes make and measure: each of these imports this file, and what this one imports."""
+
+import os
+import pathlib
+import signal
+from typing import Any
+
+import numpy as np
+
+import tiverlet as tv
+from tiverlet.device import runtime
+
+G, SECONDS = 9.81, 0.25
+STARTS = {"angle": np.linspace(0.1, 3.0, 7), "length": np.linspace(0.5, 2.0, 7)}
+
+
+def pendulum(angle: float, length: float) -> tv.World:
+    """Two links, so that it is chaotic: any difference in the bits grows."""
+    bend = np.array([np.sin(angle), -np.cos(angle)]) * length
+    x = [[0, 0], bend, [bend[0] + length, bend[1]]]
+    return tv.World(tv.Particles(x, pinned=[0]), [tv.Gravity(G), tv.Distance([(0, 1), (1, 2)])], substeps=4)
+
+
+def ends(worlds) -> dict[str, Any]:
+    """Where and how fast they are in the end; which process has computed it, and on how many threads."""
+    worlds.run(SECONDS)
+    here = {"process": [os.getpid()] * len(worlds), "threads": [runtime.threads()] * len(worlds)}
+    return {"end": worlds.position, "speed": worlds.velocity} | here
+
+
+def ball(speed: float, marker: str = "", always: bool = False) -> tv.World:
+    """Thrown upwards. With a marker, the first process that throws one at 2 m/s is killed; always: every one ends."""
+    if marker and speed == 2.0 and always:
+        os._exit(3)
+    if marker and speed == 2.0 and not os.path.exists(marker):
+        pathlib.Path(marker).touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return tv.World(tv.Particles([[0.0, 0.0]], velocity=(0, speed)), [tv.Gravity(G)])
+
+
+def height(worlds) -> dict[str, Any]:
+    """After a while."""
+    worlds.run(0.5)
+    return {"y": worlds.position[:, 0, 1]}
+
+
+class Unsendable(Exception):
+    """Comes out of no pickle."""
+
+    def __init__(self, a, b):
+        super().__init__(f"{a} and {b}")
+
+
+def wrong(speed: float, how: str = "") -> Any:
+    """What make() may do wrong."""
+    if how == "raise":
+        raise ArithmeticError("no")
+    if how == "unsendable":
+        raise Unsendable("one", "other")
+    return how if how else ball(speed)
+
+
+def wrong_figures(worlds) -> dict[str, Any]:
+    """What figures() may do wrong."""
+    raise LookupError("nothing there")
