@@ -13,7 +13,7 @@ def test_a_world_makes_what_the_constructor_makes(world):
     report = w.step(0.1)
     made = tv.StepReport(**vars(report))
     assert list(vars(report)) == list(vars(made)) == [field.name for field in dataclasses.fields(made)]
-    kinds = [float, int, int, float, float, int, float, float, frozenset, tuple, type(None), int, int, float, int, float]
+    kinds = [float, int, int, float, float, int, float, float, frozenset, tuple, type(None), int, int, int, float, int, float]
     assert list(map(type, vars(report).values())) == kinds
     assert report == made == pickle.loads(pickle.dumps(report)) and hash(report) == hash(made)
     assert repr(report) == repr(made) and w.last is report
