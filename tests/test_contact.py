@@ -317,3 +317,14 @@ def test_masses_are_split_as_often_however_deep_pairs_are(world):
         w.step(1.0)
         np.testing.assert_allclose(w.position[1:], (1 - deep + 1.25 * deep / 3) * out, atol=off * c)
         np.testing.assert_allclose(w.position[0], 0, atol=1e-6)
+
+
+def test_a_column_that_is_too_heavy_for_the_substep_is_flagged(world):
+    # The k-th contact from the top overlaps by 2 k g h^2: the lowest of 60 discs by 0.8 radii at 2 substeps, by 0.05 at 8.
+    x = np.stack([np.full(60, 0.1), 0.1 + 0.2 * np.arange(60)], axis=1)
+    w = world(tv.Particles(x, radius=0.1), [tv.Gravity(9.81), tv.Contact(), tv.Box((0, 0), (0.2, 20))], substeps=2)
+    for substeps in (2, 8):
+        w.position, w.velocity, w.substeps = x, 0 * x, substeps
+        report = w.run(1.0)
+        assert report.flags == ({"compressed"} if substeps == 2 else set())
+        assert "substeps" in " ".join(report.notes) or report.clean
