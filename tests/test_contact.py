@@ -303,3 +303,28 @@ def test_discs_in_the_same_place_have_the_normal_along_which_they_part(world, di
     w.step(1 / 60)
     apart = w.position[0] - w.position[1]
     np.testing.assert_allclose(apart / np.linalg.norm(apart), found.normal[0], atol=1e-9)
+
+
+def test_masses_are_split_as_often_however_deep_pairs_are(world):
+    # Four discs come to a fifth, and overlap with it by c from left and right and by a little from above and below. The sum of
+    # n n^T is 2 I for the one in the middle, so its mass is split twice, those of the others once, and each goes out by r c / 3,
+    # with r = 5/4. As if all were as deep as the deepest it would be split by up to 1 / (1 - c)^2 more, and four times at most.
+    out = np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1]])
+    for c, off in ((0.05, 0.04), (0.2, 1e-5), (0.45, 1e-5)):
+        deep = np.array([c, c, 0.01, 0.01])[:, None]
+        v = np.vstack([[0, 0], -(deep + 0.01) * out])
+        w = world(tv.Particles(np.vstack([[0, 0], 1.01 * out]), velocity=v, radius=0.5), [tv.Contact()], substeps=1)
+        w.step(1.0)
+        np.testing.assert_allclose(w.position[1:], (1 - deep + 1.25 * deep / 3) * out, atol=off * c)
+        np.testing.assert_allclose(w.position[0], 0, atol=1e-6)
+
+
+def test_a_column_that_is_too_heavy_for_the_substep_is_flagged(world):
+    # The k-th contact from the top overlaps by 2 k g h^2: the lowest of 60 discs by 0.8 radii at 2 substeps, by 0.05 at 8.
+    x = np.stack([np.full(60, 0.1), 0.1 + 0.2 * np.arange(60)], axis=1)
+    w = world(tv.Particles(x, radius=0.1), [tv.Gravity(9.81), tv.Contact(), tv.Box((0, 0), (0.2, 20))], substeps=2)
+    for substeps in (2, 8):
+        w.position, w.velocity, w.substeps = x, 0 * x, substeps
+        report = w.run(1.0)
+        assert report.flags == ({"compressed"} if substeps == 2 else set())
+        assert "substeps" in " ".join(report.notes) or report.clean

@@ -4,8 +4,11 @@ from ..device import ti
 from ..device.thread_team import BLOCK, Team
 from ..features.feature import Scene
 from ..neighbours.neighbour_list import WORD, PairData, lowest_bit
-from .narrow_phase import DiscGeometry
+from .narrow_phase import SAME_PLACE, DiscGeometry
 
+# Of (|r| / contact distance)^2: down to here all pairs count as if they were as deep as the deepest, which spares a division for
+# each. Deeper that would split masses too often, and a heap that is compressed would stay so.
+DEEP = 0.8
 FADE = 31 / 32  # of how much more often than needed a mass was split, what is left a pass later
 
 
@@ -124,11 +127,30 @@ class MassSplitting:
                         scale = 1 / (contact_distance * contact_distance)
                         tensor += scale * r.outer_product(r)
                         deepest = lesser(r.dot(r) * scale, deepest)
-                if deepest > 0.25:
-                    split = lesser(largest(tensor) / deepest, split)
+                if deepest <= ti.static(DEEP):
+                    tensor, deepest = self.normals(i), ti.cast(1, self.real)
+                split = lesser(largest(tensor) / deepest, split)
         split *= self.state.w.of(i)
         rest = ti.static(FADE) * ti.max(self.weight[i] - split, 0)
         self.weight[i] = ti.select(pairs > 0, split + rest, split)
+
+    @ti.func
+    def normals(self, i):
+        """S, the sum of n n^T over the pairs of particle i that touch, and of the identity for those in the same place."""
+        tensor = ti.Matrix.zero(self.real, self.state.dim, self.state.dim)
+        for word in range(self.grid.words(i)):
+            bits = self.touching(i, word)
+            while bits != 0:
+                j = self.grid.neighbour[self.grid.first[i] + word * WORD + lowest_bit(bits)]
+                bits &= bits - ti.u32(1)
+                r, contact_distance = self.state.apart(i, j), self.geometry.contact_distance(i, j)
+                rr = r.dot(r)
+                if rr > contact_distance * contact_distance * ti.static(SAME_PLACE):
+                    tensor += r.outer_product(r) / rr
+                else:
+                    for k in ti.static(range(self.state.dim)):
+                        tensor[k, k] += 1
+        return tensor
 
     @ti.func
     def clear(self, i, word, gone):

@@ -12,6 +12,7 @@ from ..features.feature import Batch, Feature, Knob, Scene
 from ..features.material import Table
 from ..neighbours.neighbour_search import FARTHEST, NeighbourSearch
 from ..neighbours.queries import Contacts
+from ..neighbours.strays import MOVED
 from ..particles import Particles
 
 
@@ -177,7 +178,7 @@ class PairContact(Feature):
         """Write down what was noticed; threads that all write to the same place would wait for each other."""
         if stale != 0:
             if self.dev.grid.stale[None] == 0:
-                self.dev.grid.stale[None] = 1
+                self.dev.grid.stale[None] = MOVED
         if fast != 0:
             if self.dev.fast[None] == 0:
                 self.dev.fast[None] = 1

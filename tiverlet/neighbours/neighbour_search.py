@@ -62,6 +62,8 @@ class NeighbourSearch(NeighbourList):
         self._extent: Sequence[float] = [-1.0] * dim
         self.cells = CellList(scene, radius, reach, skin, team, scratch)
         self.several_levels = self.cells.levels > 1
+        # A particle finds all others in the 3^dim cells around it, as far as they have gone since.
+        self.lone = not self.several_levels and not self.state.images and not reach.any()
         self.counts = self.several_levels or team.launched  # before it lists
         self.serial = not self.counts or (team.size == 1 and not team.launched)  # one thread makes a list, in order
         self.blocks = number(max(1, -(-n // team.piece)) if team.size > 1 and not self.counts else 1)

@@ -14,7 +14,7 @@ from ..neighbours.neighbour_search import FARTHEST
 from ..particles import LARGEST
 from ..solvers.solver import Solver
 from .step import END, FIGURES, ORIGIN, SHEET, H, Step, integer
-from .step_report import UNCONVERGED, StepReport
+from .step_report import COMPRESSED, UNCONVERGED, StepReport
 
 BLOCKS = 64  # partial sums: their number is fixed, so the total has the same bits on any number of threads; squared on a GPU
 TURNS = (0, 26, 41)  # degrees, for nothing, BENT and FAR
@@ -315,10 +315,10 @@ class Reporter:
         first = int(bad) if bad < self.n else None
         notes = {}
         for flag, there in risks(
-            self.n, self.farthest, bad, reach, fast, turned, moved, tension, stiff, released, residual
+            self.n, self.farthest, bad, reach, fast, overlap, turned, moved, tension, stiff, released, residual
         ).items():  # fmt: skip
             if there:
-                notes[flag] = self._note(flag, first, reach, moved, tension, stiff, released, residual, substeps)
+                notes[flag] = self._note(flag, first, reach, overlap, moved, tension, stiff, released, residual, substeps)
         report = StepReport.of(
             {
                 "time": time,
@@ -342,7 +342,7 @@ class Reporter:
         )
         return report, extent
 
-    def _note(self, flag, first, reach, moved, tension, stiff, released, residual, substeps) -> str:
+    def _note(self, flag, first, reach, overlap, moved, tension, stiff, released, residual, substeps) -> str:
         """What a flag means, and what to do, with the figures of this frame."""
         if flag == "non-finite":
             return f"The state of particle {first} is not finite (the first of them); go back and use a smaller step."
@@ -350,6 +350,13 @@ class Reporter:
             return f"A coordinate is out of range: it reached {reach:g} m, and beyond {self.farthest:g} m the precision fails."
         if flag == "tunnelling-risk":
             return "A particle moved by more than its own size in one substep and may have passed another; use more substeps."
+        if flag == "compressed":
+            need = np.ceil(substeps * overlap / UNCONVERGED)  # of order h after impacts, h^2 under loads
+            return (
+                f"Contacts are pressed or thrown together by more than they hold: the worst overlaps by {100 * overlap:.3g} % "
+                f"of the radius of the smaller particle. Use up to {need:.7g} substeps, or more iterations; what was placed so "
+                "parts at push_out."
+            )
         if flag == "turned":
             return "A constraint turned by more than 41 degrees in one substep and is damped there; use more substeps."
         if flag == "moved":
@@ -389,12 +396,13 @@ class Reporter:
         )
 
 
-def risks(n, farthest, bad, reach, fast, turned, moved, tension, stiff, released, residual) -> dict[str, Any]:
+def risks(n, farthest, bad, reach, fast, overlap, turned, moved, tension, stiff, released, residual) -> dict[str, Any]:
     """Which flags a frame has, in the order of their notes; of many frames, whose figures are arrays, arrays."""
     return {
         "non-finite": bad < n,
         "out-of-range": reach >= farthest,
         "tunnelling-risk": fast > 0,
+        "compressed": overlap > COMPRESSED,
         "turned": turned == FAR,
         "moved": moved > 0,
         "softened": tension >= TENSEST,

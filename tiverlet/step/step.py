@@ -14,6 +14,7 @@ from ..device import at, inline, record, runtime, ti
 from ..device.number import OnDevice
 from ..device.thread_team import LEAST, Team
 from ..features.feature import Batch, Scene
+from ..neighbours.strays import Strays
 from .constraint_pass import ConstraintPass
 from .contact_pass import ContactPass
 from .particle_pass import ParticlePass
@@ -168,6 +169,8 @@ class Step:
         self.hashes = bool(grid)
         self.sleepers = scene.state.sleepers
         self.looks = bool(grid) and bool(self.sleepers)  # for what touches those that sleep
+        apart = grid and grid.lone and not self.launched and not scene.memory.compiler.few
+        self.strays: Any = Strays(scene, grid, team) if apart else None
         self.pair_forces: list[Any] = integrator.forces.pairwise
         self.has_pair_forces = bool(self.pair_forces)
         self.listed_forces = [f for f in self.pair_forces if f.dev.grid]
@@ -370,9 +373,12 @@ class Step:
         """Build the list of neighbours anew where it is stale. Where it has no room for all of them, the frame stops."""
         if ti.static(self.hashes):
             if self.halted() == 0 and self.is_stale() != 0:
-                self.grid.build(now.thread)
-                if self.grid.need[None] > self.grid.capacity:
-                    self.halt[None] = [1, now.s, half]  # all write the same
+                if ti.static(bool(self.strays)):
+                    self.strays.keep_list(now.thread)
+                if self.is_stale() != 0:
+                    self.grid.build(now.thread)
+                    if self.grid.need[None] > self.grid.capacity:
+                        self.halt[None] = [1, now.s, half]  # all write the same
         if ti.static(self.looks):
             if self.solves(now) and self.sleepers.count[None] > 0:
                 self.look_for_sleepers(now)

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 UNCONVERGED = 0.1  # residual above which a frame has the flag of that name
+COMPRESSED = 0.5  # overlap above which it has that flag, in radii
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,7 @@ class StepReport:
         "non-finite"        a position or displacement is NaN or infinite
         "out-of-range"      a coordinate is too large for the precision, or for the cells of the contact grid
         "tunnelling-risk"   a particle moved by more than its own size in one substep, so it may have passed another
+        "compressed"        a contact overlaps by more than half of the radius of the smaller particle
         "stiff-force"       a force changes too fast for the substep (omega h > 2) and makes energy grow
         "softened"          a system was made to give way, because its tension is too large for the substep
         "unconverged"       the residual is above 0.1: a link is off by a tenth of its length, an angle by a tenth of a radian

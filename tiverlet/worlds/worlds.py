@@ -383,7 +383,7 @@ class Worlds:
         stiff = np.maximum(stiff, (self._fastest * clocks.h**2)[:, None])
         first = np.arange(figures.shape[1]) == 0
         every = risks(
-            n, reporter.farthest, bad, reach, fast, turned, np.where(first, moved[:, None], 0.0), tension, stiff,
+            n, reporter.farthest, bad, reach, fast, overlap, turned, np.where(first, moved[:, None], 0.0), tension, stiff,
             np.where(first, released[:, None], 0.0), residual,
         )  # fmt: skip
         clocks.softened = every["softened"][:, -1].copy()
