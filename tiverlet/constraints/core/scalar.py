@@ -677,7 +677,10 @@ class Scalar(Batch):
                     self.dev.slots.system.limit_row(row, u, spare, most, lam - new)
                 for k in ti.static(range(self.arity)):
                     self.dev.slots.system.set_gradient(self.dev.places[c][k], self.member(c, k), g[k, :])
-                if violation != 0:
+                acts = violation != 0
+                if ti.static(self.side != 0):  # one that is slack has a direction, but does nothing along it
+                    acts = self.side * violation > 0 or lam != 0
+                if acts:
                     self.dev.slots.note_turn(turn)
         if ti.static(self.dev.outside):
             if self.outside_systems(c):
