@@ -281,10 +281,7 @@ class World:
         with whole:
             for watcher in self._watchers:
                 watcher.assigned("position", value)
-            with self._runner.memory.compiler():
-                self._runner.restart(self._iterations)
-                self._runner.scene.state.put(self._runner.memory, value)
-            self._clock.energy, self._clock.first_moved = None, 0
+            self._runner.place(value, self._iterations)
             self._runner.invalidate()
 
     @property
