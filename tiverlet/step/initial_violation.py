@@ -24,7 +24,7 @@ import numpy as np
 
 from ..constraints.core.scalar import Scalar
 from ..device import ti
-from ..features.feature import Batch, Scene
+from ..features.feature import Batch, Feature, Scene
 from ..neighbours.queries import between
 from .jacobian import Jacobian, bodies_of
 
@@ -49,6 +49,16 @@ def forget(scene: Scene, batches: list[Batch], x: np.ndarray) -> None:
             off = np.abs(b.violation(x) - b.violation(old)) * b.inverse_size(b.start.position) > SEEN
             lam[: b.count][off] = 0.0
             scene.memory.write(b.dev.lam, lam)
+
+
+def first_off(features: list[Feature], x: np.ndarray) -> int | None:
+    """The first particle of rigid constraints that are off by more than SEEN at x, (n, dim); None where none is."""
+    out = []
+    for b in _rigid([f for f in features if isinstance(f, Batch)]):
+        C = b.violation(x) * b.inverse_size(x) * (b.compliance == 0)
+        off = (np.abs(C) if b.side == 0 else C * b.side) > SEEN
+        out += b.indices.ravel()[off[b.owner]].tolist()
+    return min(out, default=None)
 
 
 def _rigid(batches: list[Batch]) -> list[Scalar]:
