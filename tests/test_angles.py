@@ -181,3 +181,34 @@ def test_a_bent_corner_between_pins_stays_near_them(world):
                 w.step(1 / 60)
                 assert np.abs(w.position).max() < 1.0 and np.abs(w.velocity).max() < 20 * 0.3
             assert bend.rest_of(w.position) == pytest.approx(2.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("solver", [tv.Jacobi(), tv.ConjugateGradient(10)], ids=str)
+def test_limits_know_no_less_than_straight(world, solver):
+    # In 3D an angle is at least 0: straight limbs in any position meet limits of 0 to 2 rad, in f32, too, where the sign of
+    # |u x v| next to 0 was rounding. Nothing acts on them in a free fall, and what does not act has not turned.
+    rng = np.random.default_rng(3)
+    u = rng.normal(size=(200, 3))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    x = (rng.uniform(-4, 4, (200, 1, 3)) + np.array([0.0, 0.2, 0.5])[:, None] * u[:, None]).reshape(-1, 3)
+    legs = np.concatenate([np.arange(0, 600, 3)[:, None] + [a, a + 1] for a in (0, 1)])
+    joints = tv.AngleLimit(np.arange(600).reshape(200, 3), 0.0, 2.0, compliance=1e-3, damping=0.2)
+    w = world(tv.Particles(x), [tv.Gravity(9.81), tv.Distance(legs), joints], substeps=20, solver=solver)
+    for _ in range(3):
+        report = w.step(1 / 60)
+        assert report.clean and report.turn == 0 and (joints.load == 0).all()
+
+
+def test_what_is_slack_has_not_turned(world):
+    # Two balls on a slack rope pass each other: its direction turns by 2 atan((10 / 2400) / (0.1 / 60)) = 136 degrees in one.
+    x = [[0.0, 0.0], [-10 / 40 / 60, 0.1 / 60]]
+    w = world(
+        tv.Particles(x, velocity=[[0, 0], [10.0, 0.0]]),
+        [tv.Rope([[0, 1]], 9.0)],
+        substeps=20,
+        solver=tv.Direct(),
+        precision="f64",
+    )
+    for _ in range(2):
+        report = w.step(1 / 60)
+        assert report.clean and report.turn == 0

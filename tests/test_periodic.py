@@ -365,6 +365,19 @@ def test_what_does_not_fit_is_refused(features, words):
         tv.World(tv.Particles(x, radius=0.2), [f.copy() for f in features])
 
 
+def test_lengths_are_refused_while_it_runs(world):
+    # From half a box on there is another image that is nearer, and a link that nothing can meet: 1 m in a box of 1.5 m.
+    links, ropes = tv.Distance([[0, 1]], 0.5), tv.Rope([[0, 1]], 0.7)
+    w = world(tv.Particles([[0.1, 0.1], [0.6, 0.1]]), [tv.Periodic((0, 0), (1.5, 4)), links, ropes])
+    w.step(1 / 60)
+    for feature, name in ((links, "Distance"), (ropes, "Rope")):
+        for length in (0.75, 1.0):
+            with pytest.raises(ValueError, match=f"Periodic: along x .* but {name}: link 0 .*longer than {2 * length:g} m"):
+                feature.rest = length
+    assert links.rest == 0.5 and ropes.rest == 0.7 and w.step(1 / 60).clean
+    links.rest = 0.74
+
+
 @pytest.mark.parametrize("count", [0, 1])
 def test_none_and_one(world, count):
     particles = tv.Particles(np.full((count, 2), 0.9), velocity=(1.0, 0.0), radius=0.1)

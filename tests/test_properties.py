@@ -12,7 +12,7 @@ import tiverlet as tv
 from tiverlet import constraints
 
 from .bad_starts import BadStart
-from .conftest import order, rms
+from .conftest import order, rms, unprojected
 from .rows import OTHERS, ROWS, Row
 
 BLOCKS = ("met", "off", "turned", "held", "stuck", "soft", "free", "swing", "loaded", "weak")
@@ -56,12 +56,13 @@ class Scene:
         self.feature = row.make(self.corners, rest, compliance=alpha, damping=damping, break_at=strength)
         self.gravity = tv.Gravity(np.zeros(self.dim))
         start = tv.Particles(self.x, velocity=self.v, mass=self.mass, pinned=pinned.ravel())
-        self.world = world(start, [self.gravity, self.feature], substeps=1, precision="f64")
+        self.world = unprojected(world(start, [self.gravity, self.feature], substeps=1, precision="f64"))
 
     def again(self, substeps: int = 1, iterations: int = 1) -> None:
         """Put everything back to where it started."""
         self.world.position, self.world.velocity = self.x, self.v
         self.world.substeps, self.world.iterations = substeps, iterations
+        unprojected(self.world)
 
     def block(self, name: str, array=None) -> np.ndarray:
         """The rows of one block."""

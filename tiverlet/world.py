@@ -281,10 +281,7 @@ class World:
         with whole:
             for watcher in self._watchers:
                 watcher.assigned("position", value)
-            with self._runner.memory.compiler():
-                self._runner.restart(self._iterations)
-                self._runner.scene.state.put(self._runner.memory, value)
-            self._clock.energy, self._clock.first_moved = None, 0
+            self._runner.place(value, self._iterations)
             self._runner.invalidate()
 
     @property
@@ -546,6 +543,7 @@ class World:
 
         The new particles come after the last; features name all of them by their numbers, so a rope that is added on top of n
         particles has the links shapes.rope(...).links + n. Rest values that are not given are taken from the present positions.
+        Rigid constraints that are not met there are met before the next frame, without velocity; it has the flag "moved".
         Particles that overlap others part gently, as at the start.
 
         What was there goes on to the bit: time, positions, velocities, multipliers, the history of springs, what pairs in contact

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+import tiverlet as tv
 from tiverlet.constraints.core.angle import Angle
 from tiverlet.constraints.core.scalar import Scalar
 from tiverlet.features.feature import Batch
@@ -16,7 +17,7 @@ WALLS = ("Box", "HalfSpace", "Ball", "Capsule", "Polygon", "Mesh", "Sdf")
 PULLS = ("Gravity", "Drag", "Wind", "Attractor", "Force", "PairForce")
 TETHERS = ("Pin", "Path", "Snap")
 PASSIVE = ("Gravity", "Drag", *WALLS, "Distance", "Rope", "Spacer", "Bend", "AngleLimit", "Dihedral", "Constraint",
-           "Area", "Volume", "ShapeMatch", "Snap", "Contact", "Polygons")  # fmt: skip
+           "Area", "Volume", "ShapeMatch", "Snap", "Contact", "Polygons", "Periodic")  # fmt: skip
 EPS = {"f32": 2.0**-23, "f32-compensated": 2.0**-23, "f64": 2.0**-52}
 
 
@@ -88,10 +89,11 @@ def excluded(features: list[Any], particles: Any) -> set[tuple[int, int]]:
 
 def overlap(contact: Any, features: list[Any], particles: Any, free: np.ndarray, x: np.ndarray) -> tuple[int, float]:
     """Pairs that overlap, and the worst, in radii of the smaller one."""
+    box = next((f for f in features if isinstance(f, tv.Periodic)), None)
     r, group, out = particles.radius, particles.group, excluded(features, particles)
     allowed = None if contact.table.touching is None else {tuple(sorted(p)) for p in contact.table.touching}
     deep = []
-    for (i, j), depth in zip(*(a.tolist() for a in overlapping(x, r)), strict=True):
+    for (i, j), depth in zip(*(a.tolist() for a in overlapping(x, r, periodic=box)), strict=True):
         grouped = allowed is None or tuple(sorted((int(group[i]), int(group[j])))) in allowed
         if grouped and (i, j) not in out and (free[i] or free[j]):
             deep.append(depth / (min(r[i], r[j]) or max(r[i], r[j])))
@@ -102,7 +104,7 @@ def shapeless(f: Any, x: np.ndarray) -> np.ndarray:
     """Of constraints on angles, those between corners that have none: nothing acts on them."""
     if not isinstance(getattr(f, "quantity", None), Angle):
         return np.zeros(f.count, dtype=bool)
-    q = x[f.indices]
+    q = f.placed(x)
     legs = np.diff(q, axis=1) if f.arity == 3 else q[:, 1:] - q[:, :1]
     if f.arity == 4:  # an edge, and the heights of two wings over it
         e = legs[:, :1] / np.maximum(np.linalg.norm(legs[:, :1], axis=2, keepdims=True), 1e-300)
@@ -192,9 +194,10 @@ def feasible(features: list[Any], particles: Any, free: np.ndarray, x: np.ndarra
     if rigid(features, free, x)[0] > 1e-6 + 1e3 * eps:
         return False
     built = bool(np.array_equal(x, particles.position))
+    periodic = any(isinstance(f, tv.Periodic) for f in features)
     for f in features:
         name = type(f).__name__
-        if name in WALLS and (gap(f, x, particles.radius)[free > 0] < -1e-6 * particles.size).any():
+        if name in WALLS and (periodic or (gap(f, x, particles.radius)[free > 0] < -1e-6 * particles.size).any()):  # of images
             return False
         if name == "Contact" and overlap(f, features, particles, free, x)[0]:
             return False

@@ -67,6 +67,11 @@ class Structure:
             return tv.World(self.particles.make(), features, **{**settings, "path": "parallel"}), features
 
     @property
+    def periodic(self) -> bool:
+        """Whether particles have images."""
+        return any(f.name == "Periodic" for f in self.features)
+
+    @property
     def position(self) -> np.ndarray:
         """At the start."""
         return np.asarray(self.particles.args["position"])
@@ -457,6 +462,14 @@ def contacts(draw, s: Stage) -> Call | None:
     return Call("Contact", more | ({"events": True} if "friction" in more else {}))
 
 
+def boxes(draw, s: Stage, radius: float) -> Call:
+    """A periodic box that what is in it fits into, and that it leaves soon."""
+    low, high = s.x.min(axis=0), s.x.max(axis=0)
+    spare = 1.3 * float((high - low).max()) + 0.3 * s.size + 2.5 * radius
+    axes = pick(draw, None, None, [0], [s.dim - 1])
+    return Call("Periodic", {"low": low - 0.1 * spare, "high": high + spare, "axes": axes})
+
+
 @st.composite
 def structures(draw) -> Structure:
     """Any."""
@@ -501,6 +514,8 @@ def structures(draw) -> Structure:
         if call and not (met and call.name in ("Contact", "Polygons")):
             met = met or call.name in ("Contact", "Polygons")
             calls.append(call)
+    if pick(draw, False, False, False, False, False, True):
+        calls.append(boxes(draw, stage, float(np.max(args.get("radius", 0.0)))))
     settings: dict[str, Any] = {"precision": precision}
     if order > 2:
         settings |= {"order": order, "solver": Call("Direct", {"width": 16})}

@@ -14,6 +14,8 @@ from ..features.feature import Feature, Knob, Scene
 from ..particles import Particles
 
 FLOW, GRADIENT = 0, 1  # the axes of a shear: images along y move along x
+AXES = "xyz"
+SPARE = 2.2  # contact distances, that a sheared box is long at least
 
 
 class Images:
@@ -176,6 +178,16 @@ class Periodic(Feature):
     def shortest(self) -> float:
         """The shortest side along a periodic axis [m]."""
         return float(self.lengths.min())
+
+    def refuse(self, who: str, what: str, far: float, smaller: str, half: bool = False) -> None:
+        """Raise ValueError for what reaches further than half a box; or just so far, where `half`. Where images slide, lists need
+        room for their skin."""
+        k, least = int(np.argmin(self.lengths)), (SPARE if self.sheared else 2) * far
+        if least > self.shortest or (half and least == self.shortest):
+            raise ValueError(
+                f"Periodic: along {AXES[k]} the box is {self.shortest:g} m long, but {who}: {what} up to {far:g} m apart, and "
+                f"would meet two images of the same particle. Make the box longer than {least:g} m there, or {smaller} smaller."
+            )
 
     @property
     def strain(self) -> float:

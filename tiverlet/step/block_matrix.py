@@ -82,16 +82,18 @@ class BlockMatrix:
 
 
 def conjugate_gradients(
-    apply: Callable[[np.ndarray], np.ndarray], precondition: Callable[[np.ndarray], np.ndarray], right: np.ndarray, enough: float
-) -> np.ndarray:
-    """x with A x = right, preconditioned (Hestenes and Stiefel 1952). enough: of r . z at the start, what may be left.
+    apply: Callable[[np.ndarray], np.ndarray], precondition: Callable[[np.ndarray], np.ndarray], right: np.ndarray, enough: float,
+    steps: int = STEPS,
+) -> np.ndarray:  # fmt: skip
+    """x with A x = right, preconditioned (Hestenes and Stiefel 1952). enough: of r . z at the start, what may be left. steps: at
+    most.
 
     Sums are NumPy's: bits of BLAS depend on how many threads it has.
     """
     x, r = np.zeros_like(right), right
     p = z = precondition(r)
     now = first = float((r * z).sum())
-    for _ in range(STEPS):
+    for _ in range(steps):
         if now <= enough * first:
             break
         q = apply(p)

@@ -358,10 +358,13 @@ class Reporter:
                 "parts at push_out."
             )
         if flag == "turned":
-            return "A constraint turned by more than 41 degrees in one substep and is damped there; use more substeps."
+            return (
+                "A constraint turned by more than 41 degrees in one substep; it is damped there, or, as a soft spring, pulls and "
+                "pushes as before it turned. Use more substeps."
+            )
         if flag == "moved":
             return (
-                f"Particles were off their rigid constraints by more than a fifth, and were moved by up to {moved:.3g} m "
+                f"Particles were off their rigid constraints by a thousandth or more, and were moved by up to {moved:.3g} m "
                 "to where these are met. Place them there, or give the constraints other rest values, or compliance."
             )
         if flag == "softened" and tension > TENSEST:

@@ -12,7 +12,7 @@ from ..device.memory import Memory
 from ..features.feature import Acceleration, Batch, Feature
 from ..neighbours.periodic import Periodic
 from ..particles import Particles
-from . import checkpoint
+from . import checkpoint, initial_violation
 from .build import assemble, check_settings, checked_features, listed
 from .integrator import decay
 from .sleep import Sleep
@@ -176,6 +176,9 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
         world._clock.first_moved = int(some[: world._clock.first_moved].sum())
     elif m:
         world._clock.first_moved = n
+    tied = initial_violation.first_off([f for f in came if f not in before], world.position)
+    if tied is not None:
+        world._clock.first_moved = min(tied, n if world._clock.first_moved is None else world._clock.first_moved)
     if m and not world._clock.d_is_velocity:
         _launch(world, n)
     if seen is not None and not world._clock.d_is_velocity:  # what went has left its part in the velocities of what stays

@@ -4,14 +4,18 @@ A pass takes out whatever violation it finds, in one substep: as a spring of sti
 C^2 / (2 W h^2), which no shorter substep bounds. Nobody supplied it. So what is placed anew first goes to where its rigid
 constraints are met, by Newton's method with the least moves in the metric of the masses, and its velocities stay:
 
-    x += s w J^T lam,  (J w J^T + mu) lam = -C
+    x += s w J^T lam,  (J w J^T + mu W) lam = -C,  W = sum_j n_j w_j |grad_j C|^2
 
 for each body by itself, that is, for constraints that hang together by particles that can move. s is halved until the violation
 falls; no particle moves further in a step than its body is large, and no leg of an angle changes by more than half. From afar
 an angle is flat: Newton's step, pi r^2 / L for one that has to be straight between two pins L apart, would throw its corner away,
-or into one of the pins. Where constraints contradict each other, the violation gets as small as it can, and the report says so;
-links that do stay where they are, for their passes find the compromise between them. Walls have the last word: what they stop
-goes on from there, in turns.
+or into one of the pins. Where constraints contradict each other, bodies go to where sum C^2 / W is least, that is, where passes,
+which split masses, find nothing to do, and the report says what is left. Systems soften all rows alike, so theirs have the same
+weight. A straight rope that is too long for its two pins has no direction to give way in, so a body whose links are pushed bulges
+first: across all in which it extends, and down where it can. Walls have the last word: what they stop goes on, in turns.
+
+In a world that runs, part of a violation bears the load of the last substep, -W lam, or less of it in a shorter one. That part
+stays, of constraints whose particles were put nowhere else.
 """
 
 from collections.abc import Callable
@@ -19,54 +23,93 @@ from collections.abc import Callable
 import numpy as np
 
 from ..constraints.core.scalar import Scalar
-from ..features.feature import Batch, Scene
+from ..device import ti
+from ..features.feature import Batch, Feature, Scene
 from ..neighbours.queries import between
 from .jacobian import Jacobian, bodies_of
 
-ENOUGH = 0.2  # of its size: a violation from where on it is taken out before the first substep
-DONE = 1e-6  # of its size: a violation that is none
+SEEN = 1e-3  # of its size: a violation from where on the report says that it was taken out
+ENOUGH = 0.2  # of its size: a violation after which loads are others
+DONE = 1e-6  # of its size: a violation that is none, but for rounding
+ROUNDING = {ti.f32: 8 * 2.0**-24, ti.f64: 8 * 2.0**-53}  # of coordinates: what lengths lose, and the Newton steps with them
 NEWTON = 60  # steps at most
+STEPS, LEFT = 1000, 1e-8  # of conjugate gradients in each, at most; what of r . z they may leave
 TURNS = 16  # with walls, at most: a link that stands on one halves its violation in each
 LEAST = 1e-2  # part of a step: where even less does not help, nothing does
-BETTER = 0.99  # of its square: a violation that falls by less in a step contradicts others
+BETTER = 0.999  # of its square: a violation that falls by less in a step contradicts others
+THIN = 1e-3  # of the longest: an axis along which a body does not extend
 
 
-def remove(scene: Scene, batches: list[Batch], placed: int, stop: Callable[[np.ndarray], None]) -> np.ndarray | None:
+def forget(scene: Scene, batches: list[Batch], x: np.ndarray) -> None:
+    """Before particles are put to x, (n, dim): of constraints that this changes no load is known."""
+    for b in _rigid(batches):
+        lam = scene.memory.read(b.dev.lam)
+        if lam.any():
+            old = scene.state.get(scene.memory)
+            off = np.abs(b.violation(x) - b.violation(old)) * b.inverse_size(b.start.position) > SEEN
+            lam[: b.count][off] = 0.0
+            scene.memory.write(b.dev.lam, lam)
+
+
+def first_off(features: list[Feature], x: np.ndarray) -> int | None:
+    """The first particle of rigid constraints that are off by more than SEEN at x, (n, dim); None where none is."""
+    out = []
+    for b in _rigid([f for f in features if isinstance(f, Batch)]):
+        C = b.violation(x) * b.inverse_size(x) * (b.compliance == 0)
+        off = (np.abs(C) if b.side == 0 else C * b.side) > SEEN
+        out += b.indices.ravel()[off[b.owner]].tolist()
+    return min(out, default=None)
+
+
+def _rigid(batches: list[Batch]) -> list[Scalar]:
+    """Those with rigid constraints."""
+    return [b for b in batches if isinstance(b, Scalar) and b.count and (b.compliance == 0).any()]
+
+
+def remove(
+    scene: Scene, batches: list[Batch], placed: int, ratio: float, stop: Callable[[np.ndarray], None]
+) -> tuple[np.ndarray, float] | None:
     """Move bodies to where their rigid constraints are met, or as near to it as they get; those that are there stay.
 
-    placed: the first of the particles that were placed anew; bodies without any stay as they are. stop: lets walls stop what has
-    moved from some places, (n, dim). Returns how far each particle went [m], (n,); None where nothing moved.
+    placed: the first of the particles that were placed anew; bodies without any stay as they are. ratio: of the coming substep to
+    the last. stop: lets walls stop what has moved from some places, (n, dim). Returns how far each particle went [m], (n,), and
+    the violation of the worst constraint that was taken out, as a share of its size; None where nothing moved.
     """
     w, state, memory = scene.inv_mass, scene.state, scene.memory
-    rigid = [b for b in batches if isinstance(b, Scalar) and b.count and (b.compliance == 0).any() and not b.broken.any()]
+    rigid = [b for b in _rigid(batches) if not b.broken.any()]
     if not rigid:
         return None
     x = state.get(memory)
     if not np.isfinite(x).all() or not any(_off(b, x) for b in rigid):
         return None
+    rows = Rows(rigid, x, w, ROUNDING[ti.f64 if state.sums else scene.real])
     body, bodies = _bodies(rigid, w)
-    going = np.bincount(body[placed:], minlength=bodies) > 0
-    rows = Rows(rigid, x, w)
-    going &= _violation(rows, body, bodies)[0] > ENOUGH
-    if going.any():
-        new, moving = x, going.copy()
-        for _ in range(TURNS):
-            old = new
-            state.put(memory, met(rows, body, moving))
-            sent = state.get(memory)
-            stop(old)
-            new = state.get(memory)
-            rows = rows.at(new)
-            stopped = np.bincount(body, (sent != new).any(axis=1), minlength=bodies) > 0
-            moving &= stopped & (_violation(rows, body, bodies)[0] > DONE)
-            if not moving.any():
-                break
-        for b in rigid:
-            lam = memory.read(b.dev.lam)[: b.count]
-            here = np.logical_or.reduceat(going[body[b.indices.ravel()]], np.searchsorted(b.owner, np.arange(b.count)))
-            memory.write(b.dev.lam, np.where(here, 0.0, lam))  # they bear nothing there yet
-        return np.linalg.norm(new - x, axis=1)
-    return None
+    far, _ = _violation(rows, body, bodies)
+    going = far > ENOUGH
+    if any(memory.read(b.dev.lam).any() for b in rigid):
+        rows = rows.towards(_borne(scene, rigid, x, going[body], min(1.0, ratio**2)))
+    going = (np.bincount(body[placed:], minlength=bodies) > 0) & _open(rows, body, bodies)
+    if not going.any():
+        return None
+    far, _ = _violation(rows, body, bodies)
+    new, moving = x, going.copy()
+    for _ in range(TURNS):
+        old = new
+        state.put(memory, met(rows, body, moving))
+        sent = state.get(memory)
+        stop(old)
+        new = state.get(memory)
+        rows = rows.at(new)
+        stopped = np.bincount(body, (sent != new).any(axis=1), minlength=bodies) > 0
+        moving &= stopped & _open(rows, body, bodies)
+        if not moving.any():
+            break
+    for b in rigid:
+        lam = memory.read(b.dev.lam)[: b.count]
+        others = (going & (far > ENOUGH))[body[b.indices.ravel()]]
+        here = np.logical_or.reduceat(others, np.searchsorted(b.owner, np.arange(b.count)))
+        memory.write(b.dev.lam, np.where(here, 0.0, lam))  # they bear nothing there yet
+    return np.linalg.norm(new - x, axis=1), float(far[going].max())
 
 
 def _off(batch: Scalar, x: np.ndarray) -> bool:
@@ -75,17 +118,43 @@ def _off(batch: Scalar, x: np.ndarray) -> bool:
     return bool(((np.abs(C) if batch.side == 0 else C * batch.side) > DONE * np.maximum(np.abs(batch.goal), DONE)).any())
 
 
+def _borne(scene: Scene, batches: list[Scalar], x: np.ndarray, others: np.ndarray, part: float) -> list[np.ndarray]:
+    """The violations by which passes bear the load of the last substep, -W lam, a part of them in a shorter one; none in systems,
+    which bear it without, nor where the particle is one of the `others`, (n,)."""
+    split, out = scene.memory.read(scene.slots.split)[: len(x)].astype(np.float64), []
+    for b in batches:
+        g = b.gradients(x).reshape(-1, x.shape[1])
+        who = b.indices.ravel()
+        W = np.bincount(b.owner, split[who] * (g**2).sum(axis=1), minlength=b.count)
+        gone = np.bincount(b.owner, others[who], minlength=b.count) > 0
+        lam = scene.memory.read(b.dev.lam)[: b.count].astype(np.float64)
+        out.append(np.where((scene.slots.rows(b) >= 0) | gone, 0.0, -part * W * lam))
+    return out
+
+
 def met(rows: "Rows", body: np.ndarray, going: np.ndarray) -> np.ndarray:
-    """Places near those of the rows, (n, dim), at which their constraints are met. Links that contradict each other stay.
+    """Places near those of the rows, (n, dim), at which their constraints are met, or as nearly as they can be.
 
     body: that of each particle (n,). going: which bodies move.
     """
-    going, bodies, start = going.copy(), len(going), rows.x
-    x = start
+    rows = _newton(rows, body, going)
+    worst, left = _violation(rows, body, len(going))
+    pushed = going & (worst > SEEN) & _pushed(rows, body, len(going))
+    if pushed.any():
+        bulged = _newton(rows.at(_bulged(rows, body, pushed, worst)), body, pushed)
+        better = pushed & (_violation(bulged, body, len(going))[1] < BETTER * left)
+        return np.where(better[body][:, None], bulged.x, rows.x)
+    return rows.x
+
+
+def _newton(rows: "Rows", body: np.ndarray, going: np.ndarray) -> "Rows":
+    """The rows where Newton's method ends."""
+    going, bodies = going.copy(), len(going)
+    x = rows.x
     far = np.ones(bodies)
     for _ in range(NEWTON):
-        worst, size = _violation(rows, body, bodies)
-        going &= worst > DONE
+        _, size = _violation(rows, body, bodies)
+        going &= _open(rows, body, bodies)
         if not going.any():
             break
         move = rows.newton()
@@ -101,8 +170,7 @@ def met(rows: "Rows", body: np.ndarray, going: np.ndarray) -> np.ndarray:
             tried &= ~stuck
         far = np.minimum(1.0, 2 * far)
         rows = rows.at(x)
-    stays = (_violation(rows, body, bodies)[0] > ENOUGH) & ~_curved(rows, body, bodies)
-    return np.where(stays[body][:, None], start, x)
+    return rows
 
 
 def _bodies(batches: list[Scalar], w: np.ndarray) -> tuple[np.ndarray, int]:
@@ -114,20 +182,44 @@ def _bodies(batches: list[Scalar], w: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def _violation(rows: "Rows", body: np.ndarray, bodies: int) -> tuple[np.ndarray, np.ndarray]:
-    """The largest violation of each body, and the sum of the squares of all, relative to the sizes of the constraints."""
+    """The largest violation of each body, relative to the sizes of the constraints, and what it stores, sum C^2 / W."""
     of = _of(rows, body, bodies)
-    C, worst = np.abs(rows.C * rows.close), np.zeros(bodies)
-    np.maximum.at(worst, of, C)
-    return worst, np.bincount(of, C**2, minlength=bodies)
+    worst = np.zeros(bodies)
+    np.maximum.at(worst, of, np.abs(rows.C * rows.close))
+    return worst, np.bincount(of, (rows.C * rows.scale) ** 2, minlength=bodies)
 
 
-def _curved(rows: "Rows", body: np.ndarray, bodies: int) -> np.ndarray:
-    """Which bodies have constraints that passes cannot take to a compromise."""
-    out = np.zeros(bodies, dtype=bool)
-    for b in rows.batches:
-        if b.curved:
-            out[body[b.indices]] = True
-    return out
+def _open(rows: "Rows", body: np.ndarray, bodies: int) -> np.ndarray:
+    """Which bodies have a violation beyond rounding."""
+    return np.bincount(_of(rows, body, bodies), rows.open, minlength=bodies) > 0
+
+
+def _pushed(rows: "Rows", body: np.ndarray, bodies: int) -> np.ndarray:
+    """Which bodies have links that would be longer."""
+    short = (rows.C < 0) & np.concatenate([np.full(some.sum(), b.arity == 2) for b, some in rows.active])
+    return np.bincount(_of(rows, body, bodies), short, minlength=bodies) > 0
+
+
+def _bulged(rows: "Rows", body: np.ndarray, pushed: np.ndarray, strain: np.ndarray) -> np.ndarray:
+    """Places of bodies that bulge as an arc does that is longer than its chord by the strain: by sqrt(3 / 8 strain) of it."""
+    x = rows.x.copy()
+    for b in np.flatnonzero(pushed):
+        who = np.unique(rows.who[_of(rows, body, len(pushed))[rows.row] == b])
+        r = between(x[who], x[who[0]], rows.batches[0].periodic)
+        r = r - (r.max(axis=0) + r.min(axis=0)) / 2
+        _, axes = np.linalg.eigh(r.T @ r)
+        along = r @ axes
+        half = np.abs(along).max(axis=0)
+        wide = half > THIN * half.max()
+        across = np.eye(rows.dim)[[1, 0, *range(2, rows.dim)]] * np.where(np.arange(rows.dim) == 0, -1.0, 1.0)[:, None]
+        across = across - across @ axes[:, wide] @ axes[:, wide].T
+        size = np.linalg.norm(across, axis=1)
+        if size.max() > THIN:
+            first = int(np.argmax(size > THIN))
+            shape = np.prod(1 - (along[:, wide] / half[wide]) ** 2, axis=1) * half.max()
+            shape *= 2 * np.sqrt(3 / 8 * min(strain[b], 1.0)) * (rows.w[who] > 0)
+            x[who] += shape[:, None] * across[first] / size[first]
+    return x
 
 
 def _within(move: np.ndarray, rows: "Rows", body: np.ndarray, bodies: int) -> np.ndarray:
@@ -158,27 +250,60 @@ def _of(rows: "Rows", body: np.ndarray, bodies: int) -> np.ndarray:
 class Rows:
     """The rigid constraints that act at positions x, and their violations C.
 
-    Corner k belongs to row[k] and is particle who[k]. sizes: of each batch, what makes violations shares of its constraints.
+    Corner k belongs to row[k] and is particle who[k]. rounding: of coordinates. borne: of each batch, what violations bear.
+    sizes, weights: of each batch, what makes violations shares of its constraints, and W at the start.
     """
 
-    def __init__(self, batches: list[Scalar], x: np.ndarray, w: np.ndarray, sizes: list[np.ndarray] | None = None):
-        self.x, self.w, self.dim, self.batches = x, w, x.shape[1], batches
+    def __init__(
+        self, batches: list[Scalar], x: np.ndarray, w: np.ndarray, rounding: float, borne=None, sizes=None, weights=None
+    ):  # fmt: skip
+        self.x, self.w, self.dim, self.batches, self.rounding, self.borne = x, w, x.shape[1], batches, rounding, borne
         self.sizes = [b.inverse_size(b.start.position) for b in batches] if sizes is None else sizes
+        gradients = [b.gradients(x).reshape(-1, self.dim) for b in batches]
+        self.weights = self._weights(gradients) if weights is None else weights
         found = [b.violation(x) for b in batches]
         active = [
             (b.compliance == 0) & ((C * b.side > 0) if b.side else True) & ~b.idle(w) for b, C in zip(batches, found, strict=True)
         ]
-        self.corners = [some[b.owner] for b, some in zip(batches, active, strict=True)]
+        self.active = list(zip(batches, active, strict=True))
+        self.corners = [some[b.owner] for b, some in self.active]
+        if borne is not None:
+            found = [C - np.clip(C, np.minimum(some, 0), np.maximum(some, 0)) for C, some in zip(found, borne, strict=True)]
         self.C, self.close = (
             np.concatenate([v[some] for v, some in zip(values, active, strict=True)]) for values in (found, self.sizes)
         )
         self.who = np.concatenate([b.indices.ravel()[some] for b, some in zip(batches, self.corners, strict=True)])
-        counts = [np.bincount(b.owner, minlength=b.count)[some] for b, some in zip(batches, active, strict=True)]
-        self.row = np.repeat(np.arange(len(self.C)), np.concatenate(counts))
+        counts = np.concatenate([np.bincount(b.owner, minlength=b.count)[some] for b, some in self.active])
+        self.row = np.repeat(np.arange(len(self.C)), counts)
+        self.first = np.cumsum(counts) - counts  # corner of each row
+        self.J = np.concatenate([g[some] for g, some in zip(gradients, self.corners, strict=True)])
+        W = np.concatenate([v[some] for v, some in zip(self.weights, active, strict=True)])
+        self.scale = np.divide(1, np.sqrt(W), out=np.zeros(len(W)), where=W > 0)
+
+    def _weights(self, gradients: list[np.ndarray]) -> list[np.ndarray]:
+        """W of each batch; rows of systems, which are softened alike, have the same."""
+        split = self.w * sum(np.bincount(b.indices.ravel(), minlength=len(self.w)) for b in self.batches)
+        out = []
+        for b, g in zip(self.batches, gradients, strict=True):
+            W = np.bincount(b.owner, split[b.indices.ravel()] * (g**2).sum(axis=1), minlength=b.count)
+            together = b.scene.slots.rows(b) >= 0
+            out.append(np.where(together, W[together].mean() if together.any() else 0.0, W))
+        return out
 
     def at(self, x: np.ndarray) -> "Rows":
         """Those that act at other positions."""
-        return Rows(self.batches, x, self.w, self.sizes)
+        return Rows(self.batches, x, self.w, self.rounding, self.borne, self.sizes, self.weights)
+
+    def towards(self, borne: list[np.ndarray]) -> "Rows":
+        """The same, which keep what bears loads."""
+        return Rows(self.batches, self.x, self.w, self.rounding, borne, self.sizes, self.weights)
+
+    @property
+    def open(self) -> np.ndarray:
+        """Which are violated by more than rounding: of coordinates X it changes C by about X |grad C|, (rows,)."""
+        slope = np.sqrt(np.bincount(self.row, (self.J**2).sum(axis=1), minlength=len(self.C)))
+        X = np.abs(self.x[self.who[self.first]]).max(axis=1, initial=0.0)
+        return np.abs(self.C) * self.close > DONE + self.rounding * X * slope * self.close
 
     @property
     def legs(self) -> np.ndarray:
@@ -190,6 +315,5 @@ class Rows:
 
     def newton(self) -> np.ndarray:
         """The least moves that take C to 0, as far as it is linear."""
-        gradients = [b.gradients(self.x).reshape(-1, self.dim) for b in self.batches]
-        J = np.concatenate([g[some] for g, some in zip(gradients, self.corners, strict=True)])
-        return Jacobian(len(self.C), self.row, self.who, self.w, J).solve(-self.C)
+        scaled = Jacobian(len(self.C), self.row, self.who, self.w, self.J * self.scale[self.row, None])
+        return scaled.solve(-self.C * self.scale, enough=LEFT, steps=STEPS)

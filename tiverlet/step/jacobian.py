@@ -3,7 +3,7 @@
 import numpy as np
 
 from ..solvers.elimination import components
-from .block_matrix import conjugate_gradients
+from .block_matrix import STEPS, conjugate_gradients
 
 SOFT = 1e-6  # of the diagonal: what has hardly a direction to move in stays
 DONE = 1e-12  # of r . z at the start of conjugate gradients: what is left
@@ -31,11 +31,13 @@ class Jacobian:
         """w J^T lam."""
         return self.w[:, None] * self.gathered(self.J * lam[self.row][:, None])
 
-    def solve(self, right: np.ndarray, some: np.ndarray | float = 1.0) -> np.ndarray:
+    def solve(
+        self, right: np.ndarray, some: np.ndarray | float = 1.0, enough: float = DONE, steps: int = STEPS
+    ) -> np.ndarray:  # fmt: skip
         """w J^T lam with (J w J^T + mu) lam = right, for some rows; conjugate gradients, preconditioned by the diagonal."""
         mu = SOFT * self.diagonal
         scale = np.divide(1, self.diagonal + mu, out=np.zeros_like(mu), where=self.diagonal > 0)
-        lam = conjugate_gradients(lambda p: some * self.rates(self.moves(p)) + mu * p, lambda r: scale * r, right, DONE)
+        lam = conjugate_gradients(lambda p: some * self.rates(self.moves(p)) + mu * p, lambda r: scale * r, right, enough, steps)
         return self.moves(lam)
 
 

@@ -9,11 +9,8 @@ from ..constraints.core.length import is_link
 from ..contact import Contact, Polygons
 from ..features.feature import Batch, Feature
 from ..forces import PairForce
-from ..neighbours.periodic import Periodic
+from ..neighbours.periodic import AXES, Periodic
 from ..particles import Particles
-
-AXES = "xyz"
-SPARE = 2.2  # contact distances, that a sheared box is long at least
 
 
 def refuse_misfits(box: Periodic, particles: Particles, features: tuple[Feature, ...]) -> None:
@@ -22,30 +19,20 @@ def refuse_misfits(box: Periodic, particles: Particles, features: tuple[Feature,
         if isinstance(feature, Polygons):
             raise ValueError("Periodic: Polygons do not know of images. Use Contact, for bodies made of discs.")
         if isinstance(feature, Contact):
-            _refuse(box, "Contact", "two particles touch", 2 * float(particles.radius.max(initial=0.0)), "radii")
+            box.refuse("Contact", "two particles touch", 2 * float(particles.radius.max(initial=0.0)), "radii")
         if isinstance(feature, PairForce):
             if feature.radius is None:
                 raise ValueError(
                     "Periodic: a PairForce without a radius has no end, and every particle has images without end. "
                     f"Give PairForce(..., radius={box.shortest / 2:g}) or less."
                 )
-            _refuse(box, repr(feature), "pairs act", feature.radius, "a radius")
+            box.refuse(repr(feature), "pairs act", feature.radius, "a radius")
         if isinstance(feature, Collider):
             _refuse_wall(box, feature)
         if is_link(feature) and feature.count:
-            _refuse(box, repr(feature), f"link {int(feature.goal.argmax())} holds particles", feature.goal.max(), "links", True)
+            box.refuse(repr(feature), f"link {int(feature.goal.argmax())} holds particles", feature.goal.max(), "links", True)
         if isinstance(feature, Batch) and isinstance(feature, (Area, Constraint, ShapeMatch, Volume)) and feature.arity != 1:
             _refuse_torn(box, feature)
-
-
-def _refuse(box: Periodic, who: str, what: str, far: float, smaller: str, half: bool = False) -> None:
-    """What reaches further than half a box; or just so far, where `half`. Where images slide, lists need room for their skin."""
-    k, least = int(np.argmin(box.lengths)), (SPARE if box.sheared else 2) * far
-    if least > box.shortest or (half and least == box.shortest):
-        raise ValueError(
-            f"Periodic: along {AXES[k]} the box is {box.shortest:g} m long, but {who}: {what} up to {far:g} m apart, and would "
-            f"meet two images of the same particle. Make the box longer than {least:g} m there, or {smaller} smaller."
-        )
 
 
 def _refuse_wall(box: Periodic, wall: Collider) -> None:

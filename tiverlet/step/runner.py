@@ -108,9 +108,12 @@ class Runner:
             if clock.first_moved is not None and self.scene.slots:
                 for b in self.driven:
                     b.start_at(self.scene.state.get(self.memory), clock.first_moved)
-                moved = initial_violation.remove(self.scene, self.batches, clock.first_moved, self.stop_at_walls)
-                if moved is not None:
-                    self.moved, self.jumped = float(moved.max()), bool((moved > self.scene.particles.radius).any())
+                ratio = h / (clock.h or h)
+                removed = initial_violation.remove(self.scene, self.batches, clock.first_moved, ratio, self.stop_at_walls)
+                if removed is not None:
+                    way, share = removed
+                    self.moved = float(way.max()) if share > initial_violation.SEEN else 0.0
+                    self.jumped = bool((way > self.scene.particles.radius).any()) and self.moved > 0
                     self.invalidate()
                 bare = clock.first_moved < self.n and not any((b.indices >= clock.first_moved).any() for b in self.batches)
                 if self.scene.slots.system and not bare:  # particles that came without constraints are nothing to it
@@ -169,6 +172,18 @@ class Runner:
         if drag and drag != self.clock.drag:
             self.memory.write(self.integrator.decay, drag)
         self.clock.h, self.clock.drag = h, drag
+
+    def place(self, position: np.ndarray, iterations: int) -> None:
+        """Put particles elsewhere, (n, dim) [m], with the velocities that they have."""
+        with self.memory.compiler():
+            self.restart(iterations)
+            self.forget_loads(position)
+            self.scene.state.put(self.memory, position)
+        self.clock.energy, self.clock.first_moved = None, 0
+
+    def forget_loads(self, position: np.ndarray) -> None:
+        """Before particles are put elsewhere: of constraints that this changes no load is known."""
+        initial_violation.forget(self.scene, self.batches, position)
 
     def restart(self, iterations: int) -> None:
         """Turn displacements into velocities, so that the next substep starts from the state at this time. iterations: of the

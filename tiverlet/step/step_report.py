@@ -28,8 +28,10 @@ class StepReport:
         "softened"          a system was made to give way, because its tension is too large for the substep
         "unconverged"       the residual is above 0.1: a link is off by a tenth of its length, an angle by a tenth of a radian
                             (or large clusters that share particles gained energy, because a substep became shorter)
-        "turned"            a constraint turned by more than 41 degrees in a substep and lost its second order there
-        "moved"             what was placed off its rigid constraints by a fifth went to where they are met before the frame
+        "turned"            a constraint turned by more than 41 degrees in a substep and lost its second order there; it
+                            takes energy out, or, as a spring that the substep resolves, keeps it on average
+        "moved"             what was placed off its rigid constraints by a thousandth of their size or more went to where they are
+                            met before the frame, without velocity
         "substeps-capped"   the controller would have taken more substeps, but they are at most 4096, or the budget was spent
         "stuck"             neither more substeps nor more iterations bring the residual or the overlap to the tolerance
     """

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .. import checks
+from ..constraints.core.scalar import Scalar
 from ..device import runtime
 from ..device.copies import Copies
 from ..device.interrupts import whole
@@ -550,9 +551,11 @@ class Worlds:
         in_range("Worlds", "position", rows)
         for contact in self._runner.step.contacts:
             contact.check_range(rows)
-        for k in chosen[~self._clocks.d_is_velocity[chosen]]:
+        bound = any(isinstance(b, Scalar) for b in self._runner.batches)
+        for k in chosen if bound else chosen[~self._clocks.d_is_velocity[chosen]]:
             with self._at(k) as world, self._runner.memory.compiler():
                 self._runner.restart(world.iterations)
+                self._runner.forget_loads(position[k])
         self._runner.scene.state.put(self._runner.memory, position)
         self._clocks.known[chosen], self._clocks.first_moved[chosen] = False, 0
         self._runner.invalidate(chosen)

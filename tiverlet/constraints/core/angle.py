@@ -129,7 +129,10 @@ def path_angle(q, axis, mirrored, faint):
                     axis[1] = 1
             n = side * e + faint * (axis - axis.dot(u) * u)
             n /= ti.max(n.norm(), 1e-30)
-            f = ti.atan2(e.dot(n), u.dot(v))
+            s = e.dot(n)
+            if not mirrored:  # next to straight, where `axis` is the normal, the sign of s is rounding
+                s = ti.max(s, 0)
+            f = ti.atan2(s, u.dot(v))
             g, k = n.cross(u), n.cross(v)
         g, k = g / ti.sqrt(aa), k / ti.sqrt(bb)
     return f, ti.Matrix.rows([g, -(g + k), k])

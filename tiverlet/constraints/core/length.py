@@ -12,7 +12,16 @@ from .quantity import Quantity
 if TYPE_CHECKING:
     from .scalar import Scalar
 
-REST_LENGTH = Knob(lambda f, v: checks.per_item(repr(f), f.rest_name, v, f.count, least=0.0), "Rest length [m].")
+
+def lengths_of(batch: Any, value: Any) -> np.ndarray:
+    """Rest lengths as the user gives them, checked, (m,); in a periodic box they are below half of it."""
+    out = checks.per_item(repr(batch), batch.rest_name, value, batch.count, least=0.0)
+    if batch.periodic is not None and batch.count:
+        batch.periodic.refuse(repr(batch), f"link {int(out.argmax())} holds particles", float(out.max()), "links", True)
+    return out
+
+
+REST_LENGTH = Knob(lengths_of, "Rest length [m].")
 
 
 class Length(Quantity):

@@ -27,6 +27,7 @@ APPROACH = 1 / 3  # of its size (1 rad for angles), in a frame: how fast a const
 BORNE = 0.25  # of its size: an angle that is off by more than this is off by more than a load explains
 TRUST = 0.5  # of its reach, by which a pass moves a corner: beyond, f is not what its gradient says
 
+RESOLVED = 4.0  # alpha' / W: from where on the substep resolves a spring
 LOST = 0.015  # violation at the start of a substep, relative to the size, from where on its direction would bring in energy
 
 
@@ -41,7 +42,9 @@ class Scalar(Batch):
     W = sum_j n_j w_j grad_j C(x_(n+1)) . grad_j C(x_n) is the mass-split weight: particle j belongs to n_j constraints, and
     gives each an n_j-th of its mass (Tonge 2012), which keeps the sum of all corrections stable and conserves momentum.
     The direction is that at the start of the step, x_n (SHAKE, Ryckaert 1977): second order and no loss of energy. When a
-    constraint turns by more than 41 degrees in a step, or has no direction at x_n, the current direction takes its place.
+    constraint turns by more than 41 degrees in a step, or has no direction at x_n, the current direction takes its place. Not so
+    of springs that the step resolves, alpha' >= RESOLVED W: those that are pushed through their own middle would get the push of
+    the other side before they are there, in every such step, which is a pump. In the direction of x_n it is Verlet's kick.
 
     In the first substep after a start (`fresh`) the force acts for half a kick, alpha' = alpha / (h^2 / 2), and C* is made of
     C_(n+1) and C_n.
@@ -534,7 +537,13 @@ class Scalar(Batch):
             if self.dev.spring.is_rigid(c):
                 lost = lost or ti.abs(self.bounded(f0 - self.dev.rest[c])) * self.dev.inverse_size[c] > LOST
         if lost:
-            n, both = g, here
+            resolved = False
+            if ti.static(self.dev.spring.soft):
+                resolved = self.dev.spring.alpha[c] >= RESOLVED * here * h2_effective
+            if resolved:
+                both = ti.max(both, here / RESOLVED)  # positive, and small beside alpha'
+            else:
+                n, both = g, here
         if ti.static(self.driven):
             if first != 0:
                 alpha = ti.cast(0, self.dev.real)
@@ -677,7 +686,10 @@ class Scalar(Batch):
                     self.dev.slots.system.limit_row(row, u, spare, most, lam - new)
                 for k in ti.static(range(self.arity)):
                     self.dev.slots.system.set_gradient(self.dev.places[c][k], self.member(c, k), g[k, :])
-                if violation != 0:
+                acts = violation != 0
+                if ti.static(self.side != 0):  # one that is slack has a direction, but does nothing along it
+                    acts = self.side * violation > 0 or lam != 0
+                if acts:
                     self.dev.slots.note_turn(turn)
         if ti.static(self.dev.outside):
             if self.outside_systems(c):
