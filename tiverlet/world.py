@@ -206,7 +206,7 @@ class World:
         self._settle_forces()
         if any(f.changed and f.outgrown for f in self._features):
             check_settings(self._precision, self._requested[1], self._order, self._features)
-            edit_scene.rebuild(self, np.ones(len(self._particles), dtype=bool), None, self._features)
+            edit_scene.renew(self)
 
     def _upload(self) -> None:
         """Write what was changed in Python since the last frame."""
@@ -452,14 +452,15 @@ class World:
         if self._events is not None:
             return self._events
         h, time, step = self._clock.h or 1.0, self._clock.time, self._runner.step
-        pairs, walls = no_events(self._particles.dim), [no_events(self._particles.dim).touches]
+        pairs = none = no_events(self._particles.dim)
+        walls = []
         for contact in step.contacts:
             if contact.dev.events:
                 pairs = contact.dev.events.read(h, time)
         for number, f in enumerate(self._features):
             if isinstance(f, Collider) and f.dev.log:
                 walls.append(f.dev.log.read(number, h, time))
-        return pairs, ContactEvents(joined(walls))
+        return pairs, ContactEvents(joined([none.touches, *walls])) if walls else none
 
     @property
     def broken(self) -> list[tuple[Feature, np.ndarray]]:
@@ -548,9 +549,10 @@ class World:
 
         What was there goes on to the bit: time, positions, velocities, multipliers, the history of springs, what pairs in contact
         remember. Where a force or a spring is added, displacements are first turned into velocities, as when a force changes.
-        On a CPU it takes milliseconds, and nothing is compiled: the world keeps its kernels until there are four times as many of
-        what they work on. Features, masses or radii of a kind that it did not have, and the first particles that overlap others,
-        cost the compiling that a new world costs, once; all worlds share what was compiled.
+        On a CPU it takes a millisecond or two where particles come alone, which happens in place, and some more else. Nothing is
+        compiled: the world keeps its kernels until there are four times as many of what they work on. Features, masses or radii
+        of a kind that it did not have, and the first particles that overlap others, cost the compiling that a new world costs,
+        once; all worlds share what was compiled.
 
         Raises as World() does; the world is then as before.
         """

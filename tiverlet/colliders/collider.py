@@ -8,6 +8,7 @@ from .. import checks
 from ..device import ti
 from ..features.feature import Feature, Knob, Scene
 from ..features.material import Bounce, as_given, friction_of, restitution_of
+from ..features.regrouping import Regrouping
 from .surface import Surface
 
 SWEEPS = 8  # rounds over the walls, for particles that several of them push
@@ -136,6 +137,10 @@ class Collider(Feature):
         """Write friction and restitution, and whether it is there."""
         self.dev.surface.upload(friction_of(repr(self), "friction", self.friction), self._bounce, self.active)
         self._stands = self.active
+
+    def can_regroup(self, change: Regrouping) -> bool:
+        """Whether the widest particle, for which it was checked and made, is as wide as before."""
+        return change.now.radius.max(initial=0.0) == change.before.radius.max(initial=0.0)
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
         """For pictures of a scene between two corners: line strips (m, k, dim), and half their width [m], 0 for a thin line."""

@@ -10,6 +10,7 @@ from ..device import runtime, ti
 from ..device.language import is_kernel_function, undecorated
 from ..device.patches.compiler import Compiler
 from ..features.feature import Scene
+from ..features.regrouping import Regrouping
 from ..particles import Particles
 from ..tools import golden
 from .moving import Moving
@@ -98,6 +99,10 @@ class Sdf(Moving):
                 raise ValueError(
                     f"Sdf: gradient is off by {off[k]:.3g} at {_at(points[k])}, compared with differences of function."
                 )
+
+    def can_regroup(self, change: Regrouping) -> bool:
+        """No: the function is tried around all particles."""
+        return False
 
     def shape_on(self, scene: Scene) -> Shape:
         """Its function."""

@@ -20,7 +20,7 @@ class WallLog:
     per_particle = True
 
     def __init__(self, scene: Scene, name: str):
-        n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
+        n, dim, add = scene.count, scene.particles.dim, scene.memory.field
         self._scene, self.state, self.radius = scene, scene.state, scene.radius
         self.touching = add(f"events.{name}.touching", n, kind=ti.i32, state=True)
         self.when = add(f"events.{name}.when", n, width=2, kind=ti.i32)

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 from .. import checks
 from ..device import ti
 from ..features.feature import Knob, Scene
+from ..features.regrouping import Regrouping
 from ..particles import Particles, in_range
 from .core.anchored import Anchored, one_each
 
@@ -87,6 +88,22 @@ class Pin(Anchored):
     def afresh(self) -> bool:
         """Whether it holds others."""
         return self._grabs
+
+    def can_grab(self, change: Regrouping) -> bool:
+        """Whether the others that are to be held now can be, while it stays bound, and while no other thing but their masses
+        changes."""
+        return self._grabs and self.drives and self.acts and vars(self.dev)["built"] == self.compiled()
+
+    def grab(self, change: Regrouping) -> None:
+        """Hold them from where they are, as a new Pin would."""
+        memory = self.scene.memory
+        self.note_arguments()
+        self.start, self._grabs, self.changed, self.moving, self.new_force = change.now, False, True, False, False
+        here = self.start.position[self.indices[:, 0]]
+        memory.write(self.dev.members, self.indices)
+        memory.write(self.dev.source, here)
+        memory.write(self.dev.target, here)
+        self.dev.size.set(self.start.size)
 
     def select(self, some: np.ndarray, number: np.ndarray) -> None:
         """Keep some, by their new numbers."""

@@ -11,6 +11,7 @@ from ..device import ti
 from ..device.thread_team import Team
 from ..features.feature import Batch, Knob, Scene
 from ..features.material import refuse_turning
+from ..features.regrouping import Regrouping
 from ..neighbours.neighbour_list import WORD, PairData, lowest_bit
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
@@ -97,22 +98,45 @@ class Contact(PairContact):
         """Choose the skin, and refuse positions too far out for cells to be told apart."""
         if self.wanted.turns and not particles.spins:
             refuse_turning("Contact")
-        radius = particles.radius
+        self._measure(particles.radius)
+        self._keep(matters=bool((particles.radius > 0).any()), table=self.wanted)
+        if self.matters:
+            self.check_range(particles.position)
+
+    def _measure(self, radius: np.ndarray) -> None:
+        """How far beyond touching pairs are listed [m], and the smallest radius [m]."""
         some = radius[radius > 0]
         auto = 0.75 * median(some) if len(some) else 1.0
         self._listed = auto if self.skin == "auto" else float(self.skin)
         self._finest = float(radius.min(initial=np.inf))
-        self._keep(matters=len(some) > 0, table=self.wanted)
-        if self.matters:
-            self.check_range(particles.position)
+
+    def can_regroup(self, change: Regrouping) -> bool:
+        """Whether particles can come and go: not where there are others to tell apart, or lists of another make."""
+        dev, now = self.dev, change.now
+        if not self.matters:
+            return not bool((now.radius > 0).any())
+        alike = self.table.can_be(change.before.group, now.group)
+        splits = dev.splitting.can_regroup(dev.grid.team.piece_of(now.count))
+        return alike and splits and bool((now.radius > 0).any()) and dev.grid.can_regroup(change)
+
+    def regroup(self, change: Regrouping) -> None:
+        """They came and went, and the team knows."""
+        if not self.matters:
+            return
+        dev, n = self.dev, change.now.count
+        self._measure(change.now.radius)
+        self.table.regroup(self.scene, change.now.group)
+        dev.grid.regroup(change, self._listed)
+        dev.splitting.regroup(n)
+        dev.projection.regroup(n, dev.grid.team)
 
     def join(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
         """Declare the fields, among them the neighbour list's, which is returned."""
-        n, dim, dev = scene.particles.count, scene.particles.dim, self.dev
+        dim, dev = scene.particles.dim, self.dev
         pairs = [b.excluded_pairs(b.start) for b in batches]
         linked = np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=np.int32)
         self.enter(scene)
-        dev.move = scene.memory.field("Contact.move", n, width=dim)
+        dev.move = scene.memory.field("Contact.move", scene.count, width=dim)
         self.table.bind(scene)
         # What parted the pair in the last substep, per inverse mass [kg m].
         dev.push = PairData("push", 0, lasting=True, marked=True)

@@ -11,7 +11,7 @@ class ForceShare:
     """
 
     def __init__(self, scene: Scene, sums: bool, lasting: bool):
-        n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
+        n, dim, add = scene.count, scene.particles.dim, scene.memory.field
         self.state = scene.state
         self.before = add("Contact.before", n, width=dim, state=lasting)  # displacements in the substep before
         self.in_state = {"before": self.before}

@@ -37,9 +37,13 @@ def overlapping(scene: Scene, batches: list[Batch], first: int = 0) -> bool | No
 
 def _by_all(x: np.ndarray, radius: np.ndarray, first: int) -> np.ndarray:
     """Pairs of which one is from number `first` on, near along the first axis."""
-    near = np.abs(x[first:, None, 0] - x[None, :, 0]) < radius[first:, None] + radius
+    y, r = x[first:], radius[first:]
+    reach = r.max(initial=0.0) + radius.max(initial=0.0)
+    low, high = y.min(axis=0, initial=np.inf) - reach, y.max(axis=0, initial=-np.inf) + reach
+    others = np.flatnonzero(((x >= low) & (x <= high)).all(axis=1))
+    near = np.abs(y[:, None, 0] - x[others, 0]) < r[:, None] + radius[others]
     i, j = np.nonzero(near)
-    i += first
+    i, j = i + first, others[j]
     return np.stack([i, j], axis=1)[(j < i) | (j < first)]
 
 

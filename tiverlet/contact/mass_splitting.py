@@ -20,14 +20,25 @@ class MassSplitting:
     """
 
     def __init__(self, scene: Scene, geometry: DiscGeometry, has_friction: bool, skips: bool, ended: list[PairData], team: Team):
-        n = scene.particles.count
         self.geometry, self.grid, self.ended, self.has_friction, self.skips = geometry, geometry.grid, ended, has_friction, skips
         self.state, self.real, self.few = scene.state, scene.real, scene.memory.compiler.few
-        self.weight = scene.memory.field("Contact.split_mass", n, state=True)
+        self.weight = scene.memory.field("Contact.split_mass", scene.count, state=True)
         self.in_state = {"weight": self.weight}
         self.block = min(BLOCK, team.piece) if skips else BLOCK
         if skips:
-            self.some = scene.memory.field("Contact.some_touch", -(-n // self.block), kind=ti.i32)
+            self.some = scene.memory.field("Contact.some_touch", self._blocks(scene.particles.count), kind=ti.i32)
+
+    def _blocks(self, n: int) -> int:
+        return -(-n // self.block)
+
+    def can_regroup(self, piece: int) -> bool:
+        """Whether blocks are what they were when so many particles make up a piece of the team."""
+        return not self.skips or self.block == min(BLOCK, piece)
+
+    def regroup(self, n: int) -> None:
+        """There are n particles now."""
+        if self.skips:
+            self.grid.memory.resize(self.some, self._blocks(n))
 
     @ti.func
     def touches(self, i, word):

@@ -145,7 +145,7 @@ class DiscGeometry:
         """From now on particles may be smaller than they are; the field for it exists only once it is needed."""
         if not self.shrinks:
             self.store = self.scene.memory.more()
-            self.shrunk = self.store.field("Contact.shrunk", self.scene.particles.count, state=True)
+            self.shrunk = self.store.field("Contact.shrunk", self.scene.count, state=True)
             self.store.place()
             self.shrinks = True
 

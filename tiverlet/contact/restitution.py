@@ -20,7 +20,7 @@ class Restitution:
         self, scene: Scene, geometry: DiscGeometry, table: Table, struck: PairData, slack: PairData, impulse: PairData,
         events: Any,
     ):  # fmt: skip
-        n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
+        n, dim, add = scene.count, scene.particles.dim, scene.memory.field
         self.geometry, self.grid, self.table, self.state = geometry, geometry.grid, table, scene.state
         self.struck, self.slack, self.impulse, self.events = struck, slack, impulse, events
         self.has_events = events is not None

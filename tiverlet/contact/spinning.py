@@ -29,7 +29,7 @@ class Spinning:
     def __init__(self, scene: "Scene", table: Table, weight: Any, turn: Any):
         self.state, self.radius, self.table, self.weight, self.turn = scene.state, scene.radius, table, weight, turn
         self.spin = scene.state.spin
-        n, add = scene.particles.count, scene.memory.field
+        n, add = scene.count, scene.memory.field
         self.change = add("Contact.spin_change", n, width=self.spin.axes)
 
     @ti.func

@@ -88,6 +88,8 @@ class ContactEvents:
 
     def renumbered(self, first: np.ndarray, second: np.ndarray) -> "ContactEvents":
         """With new numbers of those that come first and second in pairs, in the same order; without what goes, -1."""
+        if not len(self):
+            return self
         pairs = np.stack([first[self.touches.pairs[:, 0]], second[self.touches.pairs[:, 1]]], axis=1)
         return ContactEvents(replace(self.touches, pairs=pairs)[(pairs >= 0).all(axis=1)])
 

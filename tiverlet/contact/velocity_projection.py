@@ -41,9 +41,16 @@ class VelocityProjection:
         # The fields of the old list, which is needed only while lists are built, are free: here they hold the loaded pairs of
         # each particle, how many they are, and the particles that have any, piece by piece.
         self.number, self.loaded = self.grid.old_number, self.grid.old_first
-        pieces = -(-scene.particles.count // team.piece)
-        self.count = scene.memory.field("Contact.loaded", pieces, kind=ti.i32)
+        self.count = scene.memory.field("Contact.loaded", self._pieces(scene.particles.count, team), kind=ti.i32)
         self.factors = scene.memory.field("Contact.chebyshev", PASSES, values=chebyshev(PASSES, CONDITION))
+
+    @staticmethod
+    def _pieces(n: int, team: "Team") -> int:
+        return -(-n // team.piece)
+
+    def regroup(self, n: int, team: "Team") -> None:
+        """There are n particles now."""
+        self.grid.memory.resize(self.count, self._pieces(n, team))
 
     @ti.func
     def bears(self, i, e):

@@ -22,6 +22,7 @@ class Entry:
     kind: np.dtype
     state: bool  # part of the exact state, hence of hash() and clone()
     copies: int = 0  # of which each has so many elements; 0 where it is one for all
+    rows: Any = None  # the Number of what it has an element for each of; None where that is not told
 
     @property
     def shape(self) -> tuple[int, ...]:

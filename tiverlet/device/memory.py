@@ -44,6 +44,7 @@ class Memory:
         self.real, self.copies = real, copies
         self.compiler = compiler or Compiler(real, few, long, often)
         self.entries: list[Entry] = []
+        self._at: dict[int, int] = {}  # by the ids of fields: which entry they are
         self._named: Counter[str] = Counter()
         self._later: list[tuple[Entry, np.ndarray]] = []
         self._declared: list[Declared] = []
@@ -65,19 +66,24 @@ class Memory:
         return Memory(self.real, compiler=self.compiler, copies=self.copies)
 
     def field(
-        self, name: str, length: int | None, *, width: int = 0, kind=None, values=None, state: bool = False, shared: bool = False
-    ) -> Any:
-        """Declare a field of `length` elements (None: a single one, of 0 dimensions) and give it its first values. shared: it
-        is one for all copies."""
-        kind = self.real if kind is None else kind
+        self, name: str, length: int | Number | None, *, width: int = 0, kind=None, values=None, state: bool = False,
+        shared: bool = False,
+    ) -> Any:  # fmt: skip
+        """Declare a field of `length` elements (None: a single one, of 0 dimensions) and give it its first values. A Number: one
+        for each of what it counts, see regroup(). shared: it is one for all copies."""
+        kind, rows = self.real if kind is None else kind, None
+        if isinstance(length, Number):
+            rows, length = length, int(length.now)
         length = 0 if length is None else max(1, length)  # a field of 0 elements poisons the runtime
         made = layout.field(kind, width)
-        self._declare(name, made, length, width, kind, state, shared)
+        self._declare(name, made, length, width, kind, state, shared, rows)
         if values is not None and np.size(values):
             self._later.append((self.entries[-1], np.asarray(values, dtype=np.float64)))
         return made
 
-    def _declare(self, name: str, made: Any, length: int, width: int, kind: Any, state: bool, shared: bool = False) -> None:
+    def _declare(
+        self, name: str, made: Any, length: int, width: int, kind: Any, state: bool, shared: bool = False, rows: Any = None
+    ) -> None:
         copies = 0 if shared or not self.copies else self.copies.count
         in_all = max(1, length) * copies if copies else length
         if in_all >= 2**31:
@@ -86,7 +92,8 @@ class Memory:
         self._named[name] += 1
         same = self._named[name]
         name = f"{name} #{same}" if same > 1 else name  # two batches of a kind
-        self.entries.append(Entry(name, made, width, length, np.dtype(_NUMPY[kind]), state, copies))
+        self._at[id(made)] = len(self.entries)
+        self.entries.append(Entry(name, made, width, length, np.dtype(_NUMPY[kind]), state, copies, rows))
 
     def number(self, value: float, kind=None) -> Number:
         """A number that kernels find in a field, so that others share them: an integer, unless `kind` says so."""
@@ -99,7 +106,9 @@ class Memory:
 
     def set_number(self, number: Number) -> None:
         """Write it, where it is on the device already; in all copies, for kernels are made for all."""
-        if self._layout:
+        if view := self._seen():
+            view[id(self._find(number.field))][..., number.place] = number._value
+        elif self._layout:
             with self.copies.all() if self.copies else contextlib.nullcontext():
                 values = self.read(number.field)
                 values[..., number.place] = number._value
@@ -135,10 +144,47 @@ class Memory:
         """Give all fields so many elements, where they are. False where kernels would have to know: nothing was done then."""
         if self.copies or not (self._layout and self._layout.shared and length <= self._layout.room):
             return False  # copies begin elsewhere when those before are longer
-        longer = [replace(d, length=length) for d in self._declared]
-        self._declared, self._views = longer, {}
+        self._views = {}
         self.entries = [replace(e, length=length) for e in self.entries]
         return True
+
+    @property
+    def elastic(self) -> bool:
+        """Whether fields can have other lengths where they are: on a CPU, of one world."""
+        return not self.copies and bool(self._layout and self._layout.shared and self._seen())
+
+    def holds(self, length: int) -> bool:
+        """Whether there is room for so many elements of each field."""
+        return bool(self._layout) and length <= self._layout.room  # type: ignore[union-attr]
+
+    def regroup(self, rows: Number, some: np.ndarray, count: int) -> None:
+        """Of each field that has an element for each of what a number counts, keep those in the mask `some`, in order, and give
+        it `count` in all; new ones are 0. What comes before the first that goes is not touched. For an elastic memory."""
+        first, kept = len(some) if some.all() else int(np.argmin(some)), int(some.sum())
+        stay = some[first:]
+        for k, e in enumerate(self.entries):
+            if e.rows is rows:
+                moved = self._seen()[id(e)][first : len(some)][stay]
+                view = self._resized(k, count)
+                view[first:kept], view[kept:] = moved, 0
+
+    def resize(self, field, length: int) -> None:
+        """Give a field so many elements; those that it had stay, and new ones are 0. For an elastic memory."""
+        k = self._at[id(field)]
+        before = self.entries[k].length
+        if length != before:
+            self._resized(k, length)[before:] = 0
+
+    def _resized(self, k: int, length: int) -> np.ndarray:
+        """A field by its number: what it is as an array when it has another length."""
+        old, views, length = self.entries[k], self._seen(), max(1, length)
+        if old.length == length:
+            return views[id(old)]
+        assert self._layout
+        self.entries[k] = new = replace(old, length=length)
+        del views[id(old)]
+        (views[id(new)],) = self._layout.views(self._address, [(self._which[k], new.whole, new.kind)])
+        return views[id(new)]
 
     def _seen(self) -> dict[int, np.ndarray]:
         """Arrays that are the fields, by the id of the entry; none where the host cannot see them.
@@ -192,6 +238,17 @@ class Memory:
         self.check()
         if np.size(values):
             self._load([self._find(field)], [np.asarray(values, dtype=np.float64)])
+
+    def write_from(self, field, first: int, values) -> None:
+        """Overwrite some elements of a field, from one on; of a world alone."""
+        self.check()
+        view = self._seen().get(id(self._find(field)))
+        if view is None:
+            rows = self.read(field)
+            rows[first : first + len(values)] = values
+            self.write(field, rows)
+        else:
+            view[first : first + len(values)] = values
 
     def write_some(self, field, values, some: np.ndarray) -> None:
         """Overwrite a field of some copies; values: the same for all, or one row for each of them."""
@@ -259,7 +316,7 @@ class Memory:
             self._load(some, values)
 
     def _find(self, field) -> Entry:
-        return next(e for e in self.entries if e.field is field)
+        return self.entries[self._at[id(field)]]
 
     def _load(self, entries: list[Entry], arrays: list[np.ndarray]) -> None:
         views = self._seen()

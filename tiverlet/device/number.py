@@ -24,7 +24,8 @@ class Number:
 
 
 class OnDevice:
-    """An attribute that holds a Number: read as a number by the host, and by kernels as what stands in the field."""
+    """An attribute that holds a Number: read as a number by the host, and by kernels as what stands in the field. Assign the
+    Number first, and later what it is to be."""
 
     def __set_name__(self, owner: type, name: str) -> None:
         self.kept = f"{name}_number"
@@ -32,5 +33,8 @@ class OnDevice:
     def __get__(self, owner: Any, kind: type | None = None) -> Any:
         return self if owner is None else vars(owner)[self.kept].now
 
-    def __set__(self, owner: Any, number: Number) -> None:
-        vars(owner)[self.kept] = number
+    def __set__(self, owner: Any, value: Any) -> None:
+        if isinstance(value, Number):
+            vars(owner)[self.kept] = value
+        elif vars(owner)[self.kept].now != value:
+            vars(owner)[self.kept].set(value)

@@ -78,8 +78,8 @@ class Team:
 
     def __init__(self, memory: "Memory", size: int, particles: int, launched: bool, pieces: int):
         self.size, self.launched, self.patience = size, launched, memory.number(PATIENCE + particles)
-        even = -(-particles // (max(min(pieces, particles // SMALL), size) * EVEN)) * EVEN
-        self.piece = memory.number(max(1, 1 if launched else particles if size == 1 else even))
+        self._pieces = pieces
+        self.piece = memory.number(self.piece_of(particles))
         self.spread = LEAST * size if size > 1 else 1
         self._alone, self._frames = 0, 0
         self.memory = memory
@@ -88,6 +88,15 @@ class Team:
             self.active_threads = memory.field("team.active_threads", None, kind=ti.i32, values=size)  # at work
             self.late = memory.field("team.long_waits", None, kind=ti.i32)
             self.ends = memory.field("team.ends", None, kind=ti.i32)  # 1: in the next substep all but the first leave
+
+    def piece_of(self, particles: int) -> int:
+        """How many particles make up a piece."""
+        even = -(-particles // (max(min(self._pieces, particles // SMALL), self.size) * EVEN)) * EVEN
+        return max(1, 1 if self.launched else particles if self.size == 1 else even)
+
+    def regroup(self, particles: int) -> None:
+        """There are so many particles now."""
+        self.piece, self.patience = self.piece_of(particles), PATIENCE + particles
 
     def rejoin(self, active: int) -> None:
         """Before a frame: those who left some frames ago come back. active: how many were at work in the last one."""

@@ -38,6 +38,7 @@ from .read_only import handed_out
 
 if TYPE_CHECKING:
     from ..particles import Particles, State
+    from .regrouping import Regrouping
 
 BENT, FAR = 1, 2  # how far a constraint turned in a substep: by more than 26 degrees, by more than 41
 
@@ -59,10 +60,10 @@ class Scene:
     periodic: Any = None  # the Periodic of the world
     h2_effective: float = 0.0  # [s^2] what an acceleration added to the displacement in the last substep, see Batch.relax
 
-    @functools.cached_property
+    @property
     def count(self) -> Number:
-        """Of particles, for kernels."""
-        return self.memory.number(self.particles.count)
+        """Of particles, for kernels, and for fields that have a row for each."""
+        return self.state.number
 
     @property
     def real(self):
@@ -81,6 +82,7 @@ class Feature(RecordsArguments):
     uploads_all = False  # upload() and end_motion() do as well for many worlds, where knobs have one more axis, the first
     compiled_for: tuple[str, ...] = ()  # properties that decide what its kernels consist of
     told_apart = True  # its share of the time that kernels take to compile is known by its name
+    for_all = False  # nothing of it, on the device or beside, depends on which particles there are; see can_regroup()
     bulk = 0.3  # of its code in the kernels, next to that of a Distance; see build.LONG
     changed = True
     moving = new_force = lets_go = afresh = False
@@ -147,6 +149,13 @@ class Feature(RecordsArguments):
 
     def remap_indices(self, number: np.ndarray, count: int) -> None:
         """Take the new numbers of its particles, of which there are `count` now, and leave out what had one that goes."""
+
+    def can_regroup(self, change: "Regrouping") -> bool:
+        """Whether particles can come and go while it stays bound. Where not, the world is built anew around it."""
+        return self.for_all
+
+    def regroup(self, change: "Regrouping") -> None:
+        """They came and went: fields with a row for each particle have those of `change.now`, with 0 for new ones."""
 
     def rods(self) -> tuple[np.ndarray, np.ndarray]:
         """What rays meet of it between two particles: these, (k, 2), and which of its links that is, (k,)."""
@@ -300,6 +309,10 @@ class Batch(Feature):
         for name in self.each:
             if isinstance(rows := self.__dict__.get(name), np.ndarray):
                 self.__dict__[name] = handed_out(rows[some], getattr(rows, "advice", ""))
+        self.note_arguments()
+
+    def note_arguments(self) -> None:
+        """Keep what it would be made with now: other particles, and rows."""
         now = {self.index_name: self.listing} | {name: self.__dict__[name] for name in self.each if name in self.__dict__}
         self.arguments = {k: v if v is None or np.isscalar(v) else now.get(k, v) for k, v in self.arguments.items()}
 

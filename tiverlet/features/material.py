@@ -157,10 +157,19 @@ class Table:
         if self.uniform:
             rows = rows[:1]
         else:
-            self.rank = scene.memory.field("Contact.group", len(rank), kind=ti.i32, values=rank)
+            self.rank = scene.memory.field("Contact.group", scene.count, kind=ti.i32, values=rank)
         if self.has_friction or self.has_restitution or not self.uniform or asked:
             self.width = 7 if self.turns else 4  # of a row on the device
             self.entries = scene.memory.field("Contact.table", len(rows), width=self.width, values=rows[:, : self.width])
+
+    def can_be(self, before: np.ndarray, now: np.ndarray) -> bool:
+        """Whether the rows for particles of the groups before are those for the groups now."""
+        return self.uniform or np.array_equal(self.rows(before)[1], self.rows(now)[1])
+
+    def regroup(self, scene: "Scene", group: np.ndarray) -> None:
+        """Particles have these groups now, as can_be() says."""
+        if not self.uniform:
+            scene.memory.write(self.rank, self.rows(group)[0])
 
     def upload(self, scene: "Scene", other: "Table") -> None:
         """Write the values of another table, for the same kernels."""

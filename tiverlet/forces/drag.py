@@ -12,6 +12,7 @@ class Drag(Acceleration):
     With a constant acceleration a beside it, the displacements obey d' = exp(-z) d + h^2 a (1 - exp(-z)) / z, z = rate h.
     """
 
+    for_all = True
     accelerates = False
     decays = True
     rate = Knob(lambda f, v: checks.number("Drag", "rate", v, least=0.0), "Drag rate [1/s].")

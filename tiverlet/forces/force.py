@@ -30,6 +30,8 @@ class Force(Acceleration):
     known to second order, at the cost of one more field.
     """
 
+    for_all = True
+
     def __init__(self, function):
         self.arity = check_function("Force", "function", function, ("x", "v", "t", "i"), (1, 2, 3, 4))
         self.function = function

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 from .. import checks
 from ..device import ti
 from ..features.feature import Acceleration, Knob, Scene
+from ..features.regrouping import Regrouping
 from ..particles import Particles, in_range
 
 
@@ -56,6 +57,15 @@ class Hand(Acceleration):
         self._keep(_count=count)
         if self.particle >= 0:
             self.particle = int(number[self.particle])
+
+    def can_regroup(self, change: Regrouping) -> bool:
+        """Always: it holds one particle, by its number."""
+        return True
+
+    def regroup(self, change: Regrouping) -> None:
+        """Write its new number."""
+        self.remap_indices(change.number, change.now.count)
+        self.upload()
 
     def settings(self) -> dict[str, Any]:
         """Which particle, where to, how fast."""

@@ -75,10 +75,10 @@ class PairForce(Acceleration):
     def bind(self, scene: Scene) -> None:
         """Two fields of accelerations; the list comes with join()."""
         self.scene, dev = scene, self.dev
-        n, dim = scene.particles.count, scene.particles.dim
+        dim = scene.particles.dim
         dev.state, dev.w, dev.dim, dev.n = scene.state, scene.state.w, dim, scene.count
-        dev.now = scene.memory.field("PairForce.acceleration", n, width=dim, state=True)
-        dev.last = scene.memory.field("PairForce.acceleration_before", n, width=dim)
+        dev.now = scene.memory.field("PairForce.acceleration", scene.count, width=dim, state=True)
+        dev.last = scene.memory.field("PairForce.acceleration_before", scene.count, width=dim)
 
     def join(self, scene: Scene, team: Any) -> NeighbourSearch | None:
         """Declare the neighbour list; None without a radius."""

@@ -41,22 +41,13 @@ class CellList:
         self.team = team
         self.place = scratch  # of the particles as they are sorted, while a list is built: read one after the other
         self.memory = scene.memory
-        n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
+        dim, add = scene.particles.dim, scene.memory.field
         self.n, self.dim, self.state, self.real = scene.count, dim, scene.state, scene.real
         self.serial = not team.launched  # counting in order, on one thread, beats atomic counters in parallel on a CPU
-        with np.errstate(divide="ignore"):
-            size = radius + reach / 2
-            level = np.minimum(np.floor(np.log2(size.max() / size)), most_levels() - 1).astype(int)
-        used, level, _ = distinct(level)
-        self.levels = len(used)
-        own = np.array([radius[level == m].max() for m in range(self.levels)])
-        finer, longest = (np.array([v[level >= m].max() for m in range(self.levels)]) for v in (radius, reach))
-        # Rounding of floor(x * scale) must not hide a neighbour.
-        self.sizes = (own + finer + longest + skin) * (1 + 2.0**-12)
+        level = levels_of(radius, reach)
+        self.levels = int(level.max(initial=0)) + 1
+        self.sizes, self.bits, offsets = self._tables(radius, reach, skin, level)
         self.coarsest = scene.memory.number(float(1 / self.sizes[0]), scene.real)
-        counts = np.bincount(level, minlength=self.levels)
-        self.bits = np.maximum(2 * dim, np.ceil(np.log2(np.maximum(2 * counts, 1)))).astype(int)
-        offsets = np.concatenate([[0], np.cumsum(1 << self.bits)])
         self.buckets = scene.memory.number(int(offsets[-1]))
         self.images, self._lengths = scene.state.images, np.full(dim, np.inf)
         self.axes, self.sheared = (self.images.axes, self.images.sheared) if self.images else ((), False)
@@ -65,16 +56,50 @@ class CellList:
         self._shapes = self.shapes(np.ptp(scene.particles.position, axis=0))
         self.sums = Sums(self.buckets + 2, team)
         self.edge = add("grid.edge", self.sums.room, kind=ti.i32)
-        self.sorted = add("grid.sorted", n, kind=ti.i32)
+        self.sorted = add("grid.sorted", scene.count, kind=ti.i32)
         if self.state.compensated:
-            self.low = add("grid.place_low", n, width=dim)
+            self.low = add("grid.place_low", scene.count, width=dim)
         self.shape = add("grid.shape", self.levels, width=dim, kind=ti.i32, values=self._shapes)
         if self.images:
             self.count = add("grid.cells", self.levels, width=dim, kind=ti.i32, values=self.counts(self._shapes))
         if self.levels > 1:
-            self.level = add("grid.level", n, kind=ti.i32, values=level)
+            self.level = add("grid.level", scene.count, kind=ti.i32, values=level)
             self.per_meter = add("grid.cells_per_meter", self.levels, values=1 / self.sizes)
             self.offset = add("grid.offset", self.levels, kind=ti.i32, values=offsets[:-1])
+
+    def _tables(
+        self, radius: np.ndarray, reach: np.ndarray, skin: float, level: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+        """Of each table the size of its cells [m], the bits of its number of buckets, and where it begins; and where all end."""
+        own = np.array([radius[level == m].max() for m in range(self.levels)])
+        finer, longest = (np.array([v[level >= m].max() for m in range(self.levels)]) for v in (radius, reach))
+        # Rounding of floor(x * scale) must not hide a neighbour.
+        sizes = (own + finer + longest + skin) * (1 + 2.0**-12)
+        counts = np.bincount(level, minlength=self.levels)
+        bits = np.maximum(2 * self.dim, np.ceil(np.log2(np.maximum(2 * counts, 1)))).astype(int)
+        return sizes, bits, np.concatenate([[0], np.cumsum(1 << bits)])
+
+    def can_regroup(self, radius: np.ndarray, reach: np.ndarray) -> bool:
+        """Whether particles of these sizes have as many tables, which have room."""
+        level = levels_of(radius, reach)
+        return int(level.max(initial=0)) + 1 == self.levels and self.memory.holds(4 * (len(radius) + 4**self.dim) + 2)
+
+    def regroup(self, radius: np.ndarray, reach: np.ndarray, skin: float, extent: np.ndarray) -> None:
+        """There are other particles now, see NeighbourSearch.regroup(). extent: of all of them [m]."""
+        level, memory = levels_of(radius, reach), self.memory
+        sizes, bits, offsets = self._tables(radius, reach, skin, level)
+        if self.levels > 1:
+            memory.write(self.level, level)
+        if np.array_equal(sizes, self.sizes) and np.array_equal(bits, self.bits):
+            return
+        self.sizes, self.bits, self.coarsest, self.buckets = sizes, bits, float(1 / sizes[0]), int(offsets[-1])
+        self.sums.room = self.buckets + 2
+        memory.resize(self.edge, self.sums.room)
+        if self.levels > 1:
+            memory.write(self.per_meter, 1 / sizes)
+            memory.write(self.offset, offsets[:-1])
+        self._shapes = np.zeros((0, self.dim))
+        self.fit(extent)
 
     def shapes(self, extent: np.ndarray) -> np.ndarray:
         """Bits of each axis of each table, (levels, dim): at least 2, the rest where there are most cells per bucket."""
@@ -234,6 +259,16 @@ class CellList:
         if ti.static(0 in self.axes):
             cell = ti.select(cell < self.count[m][0], cell, cell - self.count[m][0])
         return cell & ((1 << self.shape[m][0]) - 1)
+
+
+def levels_of(radius: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """The level of each particle, of those that there are, (n,)."""
+    size = radius + reach / 2
+    if len(size) and (size == size[0]).all():
+        return np.zeros(len(size), dtype=int)
+    with np.errstate(divide="ignore"):
+        level = np.minimum(np.floor(np.log2(size.max() / size)), most_levels() - 1).astype(int)
+    return distinct(level)[1]
 
 
 def most_levels() -> int:

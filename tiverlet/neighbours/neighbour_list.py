@@ -55,21 +55,20 @@ class NeighbourList:
     host_only = ("room",)
     told_apart = True  # as a Feature
 
-    def __init__(self, memory: Memory, count: Number, rooms: int, pair_data: list[PairData], team: Team, short: int):
+    def __init__(self, memory: Memory, count: Number, rooms: Number, pair_data: list[PairData], team: Team, short: int):
         self.team, self.n, self.memory, self.real, self.short = team, count, memory, memory.real, short
-        n = self.n
         self.capacity, self.pitch = memory.number(0), memory.number(0)
         self.pair_data = pair_data
         self.lasting, self.transferred = [p for p in pair_data if p.lasting], [p for p in pair_data if p.kept]
         self.marked = all(p.marked for p in self.transferred)
         add = memory.field
         self.first = add("grid.first", rooms, kind=ti.i32)
-        self.number = add("grid.number", n, kind=ti.i32)
+        self.number = add("grid.number", count, kind=ti.i32)
         self.stale = add("grid.stale", None, kind=ti.i32, values=1)
         self.need = add("grid.need", None, kind=ti.i32)
-        self.touching = add("grid.touching", n, kind=ti.u32)  # bits: which of the first entries touch, when last looked at
-        self.old_first = add("grid.old_first", n, kind=ti.i32)
-        self.old_number = add("grid.old_number", n, kind=ti.i32)
+        self.touching = add("grid.touching", count, kind=ti.u32)  # bits: which of the first entries touch, when last looked at
+        self.old_first = add("grid.old_first", count, kind=ti.i32)
+        self.old_number = add("grid.old_number", count, kind=ti.i32)
         self.old_saved = add("grid.kept", None, kind=ti.i32)  # 1: the old list is saved for the one that is being built
         self.neighbour: Any = None
         self.old_neighbour: Any = None  # of the old list, pairs with data other than 0, while a new one is built
@@ -143,6 +142,13 @@ class NeighbourList:
         np.moveaxis(room, axis, 0)[:some] = np.moveaxis(values, axis, 0)[:some]
         self.store.write(field, room)  # type: ignore[union-attr]
 
+    def _write_begin(self, field, values: np.ndarray) -> None:
+        """Write a field of the list as far as there are values; what is behind them is not read."""
+        if self.store.elastic:  # type: ignore[union-attr]
+            self.store.write_from(field, 0, values)  # type: ignore[union-attr]
+        else:
+            self._write_padded(field, values)
+
     def invalidate(self) -> None:
         """Have a new list built in the next frame."""
         self.memory.write(self.stale, 1)  # Taichi would compile a kernel for stale[None] = 1
@@ -167,11 +173,12 @@ class NeighbourList:
     def lasting_data(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Every listed pair (i, j) with lasting data other than 0, in order, and its data, whatever the list's layout."""
         assert self.store
+        seen = self.store.seen if self.store.elastic else self.store.read
         saved = bool(self.memory.read(self.old_saved)[0])  # given by restore(), and not built into a list yet
         first, number = (self.old_first, self.old_number) if saved else (self.first, self.number)
         i, at = self._entries(first, number)
-        near = self.store.read(self.old_neighbour if saved else self.neighbour)[at]
-        values = {piece.name: self.store.read(piece.old if saved else piece.field)[at] for piece in self.lasting}
+        near = seen(self.old_neighbour if saved else self.neighbour)[at]
+        values = {piece.name: seen(piece.old if saved else piece.field)[at] for piece in self.lasting}
         some = np.zeros(len(i), dtype=bool)
         for value in values.values():
             some |= (value != 0) if value.ndim == 1 else (value != 0).any(axis=1)
@@ -181,11 +188,10 @@ class NeighbourList:
         """Give what lasting_data() returned to the next list that is built."""
         if len(pairs) > self.room:
             self.allocate(len(pairs))
-        self._write_padded(self.old_neighbour, pairs[:, 1].astype(np.int32))
+        self._write_begin(self.old_neighbour, pairs[:, 1].astype(np.int32))
         for piece in self.transferred:
-            self._write_padded(
-                piece.old, values[piece.name] if piece.lasting else np.zeros((1, *[piece.width] * (piece.width > 0)))
-            )
+            nothing = np.zeros((len(pairs), *[piece.width] * (piece.width > 0)))
+            self._write_begin(piece.old, values[piece.name] if piece.lasting else nothing)
         counts = np.bincount(pairs[:, 0], minlength=max(1, self.n))
         self.memory.write(self.old_first, np.cumsum(counts) - counts)
         self.memory.write(self.old_number, counts)

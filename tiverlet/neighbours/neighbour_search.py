@@ -17,6 +17,7 @@ from ..device.prefix_sum import MOST, Sums
 from ..device.sorting import exchange, sort, sorting_network
 from ..device.thread_team import Team
 from ..features.feature import Scene
+from ..features.regrouping import Regrouping
 from ..tools import distinct
 from .cell_list import CellList, add_to
 from .neighbour_list import NeighbourList, PairData
@@ -45,10 +46,11 @@ class NeighbourSearch(NeighbourList):
         reach: np.ndarray | None = None, radius: np.ndarray | None = None,
     ):  # fmt: skip
         n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
-        self.sums = Sums(n, team, capped=True)
+        self.sums = Sums(n, team, capped=True)  # with a room of its own where the team is launched
         # Entries of a list that is sorted without branches; to compile that takes an eighth of all.
         short = 1 if scene.memory.compiler.few else 8 if dim == 2 else 16
-        super().__init__(scene.memory, scene.count, self.sums.room, pair_data, team, short)
+        rooms = self.sums.room if team.launched else scene.count
+        super().__init__(scene.memory, scene.count, rooms, pair_data, team, short)
         self.network = sorting_network(self.short)
         self.dim, self.state, self.radius = dim, scene.state, scene.radius
         self.table = table
@@ -56,8 +58,8 @@ class NeighbourSearch(NeighbourList):
         radius = scene.particles.radius if radius is None else radius
         reach = 0 * radius if reach is None else reach
         self.sheared = bool(self.state.images and self.state.images.sheared)
-        if self.sheared:  # within half of its height the nearest image along y is the nearest one
-            skin = min(skin, float(scene.periodic.lengths[GRADIENT]) / 2 - 2 * radius.max() - reach.max())
+        self._scene = scene
+        skin = self._skin(skin, radius, reach)
         self.skin, self.too_far = number(skin, real), number((STALE * skin) ** 2, real)
         self._extent: Sequence[float] = [-1.0] * dim
         self.cells = CellList(scene, radius, reach, skin, team, scratch)
@@ -66,8 +68,8 @@ class NeighbourSearch(NeighbourList):
         self.lone = not self.several_levels and not self.state.images and not reach.any()
         self.counts = self.several_levels or team.launched  # before it lists
         self.serial = not self.counts or (team.size == 1 and not team.launched)  # one thread makes a list, in order
-        self.blocks = number(max(1, -(-n // team.piece)) if team.size > 1 and not self.counts else 1)
-        self.origin = add("grid.built_at", n, width=dim)
+        self.blocks = number(self._blocks(n))
+        self.origin = add("grid.built_at", scene.count, width=dim)
         if self.sheared:
             self.strain = add("grid.built_strain", None, kind=ti.f64)
             self.farthest = number(float(self.cells.sizes.max()), real)
@@ -79,6 +81,43 @@ class NeighbourSearch(NeighbourList):
             begin = np.searchsorted(both[:, 0], np.arange(n + 1))
             self.excluded = add("grid.linked", len(both), kind=ti.i32, values=both[:, 1])
             self.excluded_begin = add("grid.linked_begin", n + 1, kind=ti.i32, values=begin)
+
+    def _skin(self, skin: float, radius: np.ndarray, reach: np.ndarray) -> float:
+        """What can be listed beyond touching [m]. In a shear, within half of the height the nearest image along y is the nearest
+        one."""
+        if not self.sheared:
+            return skin
+        return min(skin, float(self._scene.periodic.lengths[GRADIENT]) / 2 - 2 * radius.max() - reach.max())
+
+    def _blocks(self, n: int) -> int:
+        """Parts of the list of n particles."""
+        return max(1, -(-n // self.team.piece)) if self.team.size > 1 and not self.counts else 1
+
+    def can_regroup(self, change: Regrouping) -> bool:
+        """Whether particles can come and go where it is; its reach is 0, and its radii are theirs."""
+        radius, n = change.now.radius, change.now.count
+        room = bool(self.store) and self.store.holds(self.room + (self.short + 1) * (n + 1))  # type: ignore[union-attr]
+        static = bool((change.inv_mass == 0).any()) == self.has_static
+        return room and static and not self.team.launched and self.cells.can_regroup(radius, 0 * radius)
+
+    def regroup(self, change: Regrouping, skin: float) -> None:
+        """They came and went, and the team knows. What pairs remember is given to the next list by restore(), where any went."""
+        radius, n = change.now.radius, change.now.count
+        skin = self._skin(skin, radius, 0 * radius)
+        self.skin, self.too_far = skin, (STALE * skin) ** 2
+        self.cells.regroup(radius, 0 * radius, skin, np.ptp(change.now.position, axis=0))
+        if self.sheared:
+            self.farthest = float(self.cells.sizes.max())
+        self.sums.room = n
+        if self.blocks != self._blocks(n):
+            room = self.room  # where the old list stands
+            self.blocks = self._blocks(n)
+            self.allocate(room)
+        if self.linked:
+            begin = self.memory.seen(self.excluded_begin)[change.first]
+            self.memory.resize(self.excluded_begin, n + 1)
+            self.memory.write_from(self.excluded_begin, change.first, np.full(n + 1 - change.first, begin))
+        self.invalidate()
 
     @property
     def finest(self) -> float:

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from .. import checks
 from ..device import ti
 from ..features.feature import Feature, Knob, Scene
+from ..features.regrouping import Regrouping
 from ..particles import Particles
 
 FLOW, GRADIENT = 0, 1  # the axes of a shear: images along y move along x
@@ -221,6 +222,10 @@ class Periodic(Feature):
         """What is found out while the world is built anew is found out where images are now."""
         self._last = self._come
         super().release()
+
+    def can_regroup(self, change: Regrouping) -> bool:
+        """Whether the widest particle, which has to fit in, is as wide as before."""
+        return change.now.radius.max(initial=0.0) == change.before.radius.max(initial=0.0)
 
     def bind(self, scene: Scene) -> None:
         """Lengths, and where images are."""

@@ -8,9 +8,10 @@ from numpy.typing import ArrayLike
 from .. import checks
 from ..device import at, inline, ti
 from ..device.memory import Memory
-from ..device.number import OnDevice
+from ..device.number import Number, OnDevice
 from ..features.arguments import meant
 from ..features.read_only import read_only, structure
+from ..features.regrouping import Regrouping
 
 LARGEST = 1e15  # [m] beyond this, squared lengths near 1e38 leave f32; nothing physical is that far
 
@@ -83,14 +84,23 @@ class Particles:
 
     def regrouped(self, some: np.ndarray, added: "Particles | None" = None, position: np.ndarray | None = None) -> "Particles":
         """Those in the mask `some` and then `added` ones; position: where those are, if not where they were."""
-        here = self.position[some] if position is None else position
-        names = ("velocity", "mass", "radius", "pinned", "group", "inv_mass")
-        both: dict[str, np.ndarray] = {"position": here} | {name: getattr(self, name)[some] for name in names}
+        names, own = ("velocity", "mass", "radius", "pinned", "group", "inv_mass"), vars(self)
+        both: dict[str, np.ndarray] = {"position": self.position if position is None else position}
+        both |= {name: own[name] for name in names}
+        if not some.all():
+            both |= {name: values[some] for name, values in both.items() if position is None or name != "position"}
         if added is not None:
-            both = {name: np.concatenate([values, getattr(added, name)]) for name, values in both.items()}
+            both = {name: np.concatenate([values, vars(added)[name]]) for name, values in both.items()}
         new = object.__new__(Particles)  # of what was checked when it came
         vars(new).update(both, count=len(both["position"]), dim=self.dim)
         vars(new).update(self._turning_of(some, added))
+        new._fix()
+        return new
+
+    def placed(self, position: np.ndarray) -> "Particles":
+        """The same particles, at other places, (n, dim) [m]."""
+        new = object.__new__(Particles)
+        vars(new).update(vars(self), position=position, _fixed=False)
         new._fix()
         return new
 
@@ -245,7 +255,7 @@ class State:
     So `low` is there with either of them, but what only reads x does without where it is not `compensated`.
     """
 
-    host_only = ("count",)
+    host_only = ("count", "number")
     spin: Any  # where particles spin: the same for their rotation, see spin.py
 
     def __init__(self, memory: Memory, particles: Particles, inv_mass: np.ndarray, compensated: bool):
@@ -256,23 +266,41 @@ class State:
         self.starts = self.befores = self.keeps_wall_push = self.carries = self.spins = False
         self.images: Any = None  # where the world has a periodic box, see neighbours/periodic.py
         self.sleepers: Any = None  # where particles may fall asleep, see step/sleep.py
-        self.x = memory.field("position", n, width=dim, values=particles.position, state=True)
-        self.d = memory.field("displacement", n, width=dim, values=particles.velocity, state=True)
-        self.w = Shared(memory, "inv_mass", inv_mass)
+        self.number = memory.number(n)  # of particles
+        self.x = memory.field("position", self.number, width=dim, values=particles.position, state=True)
+        self.d = memory.field("displacement", self.number, width=dim, values=particles.velocity, state=True)
+        self.w = Shared(memory, "inv_mass", inv_mass, self.number)
         self.sums = compensated  # x in two words
         if compensated:
             self._add_low(memory, particles)
 
     def _add_low(self, memory: Memory, particles: Particles) -> None:
         low = particles.position - particles.position.astype(np.float32)
-        self.low = memory.field("position_low", self.count, width=self.dim, values=low, state=True)
+        self.low = memory.field("position_low", self.number, width=self.dim, values=low, state=True)
 
     def carry(self, memory: Memory, particles: Particles) -> None:
         """Declare the low words of displacements, and of positions where there are none."""
-        self.d_low = memory.field("displacement_low", self.count, width=self.dim, state=True)
+        self.d_low = memory.field("displacement_low", self.number, width=self.dim, state=True)
         if not self.sums:
             self._add_low(memory, particles)
         self.carries = self.sums = True
+
+    def can_regroup(self, change: Regrouping) -> bool:
+        """Whether particles can come and go where it is."""
+        spins = change.now.spins == self.spins and (not self.spins or self.spin.can_regroup(change))
+        return spins and self.w.can_be(change.inv_mass)
+
+    def regroup(self, memory: Memory, change: Regrouping) -> None:
+        """They came and went: give new ones their places and velocities. The memory has the rows of those that stay."""
+        self.count, first = change.now.count, change.kept
+        self.w.become(memory, change.inv_mass)
+        x = change.now.position[first:]
+        memory.write_from(self.x, first, x)
+        memory.write_from(self.d, first, change.now.velocity[first:])
+        if self.sums:
+            memory.write_from(self.low, first, x - x.astype(np.float32))
+        if self.spins:
+            self.spin.regroup(memory, change)
 
     def get(self, memory: Memory) -> np.ndarray:
         """A copy of the positions, low words added in f64."""
@@ -362,13 +390,13 @@ class State:
         walls have pushed since then."""
         self.starts, self.befores, self.keeps_wall_push = start, before, wall_push
         if wall_push:
-            self.wall_push = memory.field("wall_push", self.count, width=self.dim)
+            self.wall_push = memory.field("wall_push", self.number, width=self.dim)
         if start:
-            self.x0 = memory.field("position_at_start", self.count, width=self.dim)
+            self.x0 = memory.field("position_at_start", self.number, width=self.dim)
             if self.sums:
-                self.low0 = memory.field("position_low_at_start", self.count, width=self.dim)
+                self.low0 = memory.field("position_low_at_start", self.number, width=self.dim)
         if before:
-            self.before = memory.field("displacement_at_start", self.count, width=self.dim)
+            self.before = memory.field("displacement_at_start", self.number, width=self.dim)
 
     @ti.func
     def digits(self, i):
@@ -419,17 +447,29 @@ class State:
 
 
 class Shared:
-    """A number for each particle: a single one where all are equal, a field otherwise."""
+    """A number for each particle: a single one where all are equal, a field otherwise. number: of particles."""
 
     constant: Any = OnDevice()
 
-    def __init__(self, memory: Memory, name: str, values: np.ndarray):
+    def __init__(self, memory: Memory, name: str, values: np.ndarray, number: Number):
         self.real = memory.real
         self.uniform = bool(len(values) == 0 or (values == values[0]).all())
         self.all_positive = self.uniform and bool(len(values) and values[0] > 0)
         self.constant = memory.number(float(values[0]) if len(values) else 0.0, memory.real)
         if not self.uniform:
-            self.field = memory.field(name, len(values), values=values)
+            self.field = memory.field(name, number, values=values)
+
+    def can_be(self, values: np.ndarray) -> bool:
+        """Whether its kernels are those for other values, too."""
+        uniform = bool(len(values) == 0 or (values == values[0]).all())
+        return uniform == self.uniform and (uniform and bool(len(values) and values[0] > 0)) == self.all_positive
+
+    def become(self, memory: Memory, values: np.ndarray) -> None:
+        """Take other values, as can_be() says."""
+        if self.uniform:
+            self.constant = float(values[0]) if len(values) else 0.0
+        else:
+            memory.write(self.field, values)
 
     @inline
     def of(self, i):
@@ -447,11 +487,25 @@ class Radii(Shared):
 
     least: Any = OnDevice()
 
-    def __init__(self, memory: Memory, radius: np.ndarray):
-        super().__init__(memory, "radius", radius)
+    def __init__(self, memory: Memory, radius: np.ndarray, number: Number):
+        super().__init__(memory, "radius", radius, number)
+        least, self.points, self.discs = self._kinds(radius)
+        self.least = memory.number(least, memory.real)
+
+    @staticmethod
+    def _kinds(radius: np.ndarray) -> tuple[float, bool, bool]:
+        """The least radius that is not 0, and whether there are points and discs."""
         positive = radius[radius > 0]
-        self.least = memory.number(float(positive.min()) if len(positive) else 0.0, memory.real)
-        self.points, self.discs = bool((radius == 0).any()), bool(len(positive))
+        return float(positive.min()) if len(positive) else 0.0, bool((radius == 0).any()), bool(len(positive))
+
+    def can_be(self, values: np.ndarray) -> bool:
+        """Whether its kernels are those for other radii, too."""
+        return super().can_be(values) and self._kinds(values)[1:] == (self.points, self.discs)
+
+    def become(self, memory: Memory, values: np.ndarray) -> None:
+        """Take other radii, as can_be() says."""
+        super().become(memory, values)
+        self.least = self._kinds(values)[0]
 
     @ti.func
     def stride(self, i):

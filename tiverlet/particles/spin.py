@@ -6,6 +6,8 @@ import numpy as np
 
 from ..device import ti
 from ..device.memory import Memory
+from ..device.number import Number
+from ..features.regrouping import Regrouping
 from .particles import Particles, Shared, at_rest
 
 
@@ -22,18 +24,34 @@ class Spin:
     axes: 1 in 2D, 3 in 3D. orients: whether it is known how far particles have turned since the start.
     """
 
-    def __init__(self, memory: Memory, particles: Particles, inv_mass: np.ndarray):
+    def __init__(self, memory: Memory, particles: Particles, inv_mass: np.ndarray, number: Number):
         n, self.dim, self.real = particles.count, particles.dim, memory.real
         self.axes, self.radius = particles.axes, particles.radius
-        self.s = memory.field("spin", n, width=self.axes, values=self.from_rates(particles.spin), state=True)
-        self.share = Shared(memory, "spin_share", shares(particles, inv_mass))
+        self.s = memory.field("spin", number, width=self.axes, values=self.from_rates(particles.spin), state=True)
+        self.share = Shared(memory, "spin_share", shares(particles, inv_mass), number)
         self.orients = particles.orientation is not None
         if self.orients:
             width = 1 if self.dim == 2 else 4
             turned = np.asarray(particles.orientation).reshape(n, width)
-            self.orientation = memory.field("orientation", n, width=width, kind=ti.f64, values=turned, state=True)
-            inverse = np.divide(1, particles.radius, out=np.zeros(n), where=particles.radius > 0)
-            self.inverse_radius = Shared(memory, "inverse_radius", inverse)
+            self.orientation = memory.field("orientation", number, width=width, kind=ti.f64, values=turned, state=True)
+            self.inverse_radius = Shared(memory, "inverse_radius", inverse(particles.radius), number)
+
+    def can_regroup(self, change: Regrouping) -> bool:
+        """Whether particles can come and go where it is."""
+        now = change.now
+        if (now.orientation is not None) != self.orients or not self.share.can_be(shares(now, change.inv_mass)):
+            return False
+        return not self.orients or self.inverse_radius.can_be(inverse(now.radius))
+
+    def regroup(self, memory: Memory, change: Regrouping) -> None:
+        """They came and went, see State."""
+        now, first = change.now, change.kept
+        self.radius = now.radius
+        self.share.become(memory, shares(now, change.inv_mass))
+        memory.write_from(self.s, first, self.from_rates(now.spin)[first:])
+        if self.orients:
+            self.inverse_radius.become(memory, inverse(now.radius))
+            memory.write_from(self.orientation, first, np.asarray(now.orientation).reshape(now.count, -1)[first:])
 
     def from_rates(self, rates: Any) -> np.ndarray:
         """r omega [m/s] of angular velocities [rad/s], (n, axes)."""
@@ -105,6 +123,11 @@ class Spin:
                 turned = v0 * q0 + q[3] * v + v.cross(q0)  # type: ignore[operator]
                 out = ti.Vector([turned[0], turned[1], turned[2], v0 * q[3] - v.dot(q0)])  # type: ignore[operator]
                 self.orientation[i] = out / out.norm()
+
+
+def inverse(radius: np.ndarray) -> np.ndarray:
+    """1 / r of each particle [1/m], 0 for points."""
+    return np.divide(1, radius, out=np.zeros(len(radius)), where=radius > 0)
 
 
 def shares(particles: Particles, inv_mass: np.ndarray) -> np.ndarray:

@@ -91,7 +91,7 @@ class CGSystem(System):
         self.direction, self.residual, self.applied = self.vector("direction"), self.vector("residual"), self.vector("applied")
         self.inverse_diagonal, self.shift = self.vector("preconditioner"), self.vector("shift")
         self.gradient = scene.memory.field("system.gradient", slots.total, width=self.dim)
-        self.pulled = scene.memory.field("system.pulled", self.n, width=self.dim)
+        self.pulled = scene.memory.field("system.pulled", scene.count, width=self.dim)
         self.partial, self.worst = self.reals("partial_sums", BLOCKS), self.reals("worst", BLOCKS)
         if self.limits_steps:
             self.gain, self.over = self.reals("gain", BLOCKS), self.reals("over", BLOCKS)

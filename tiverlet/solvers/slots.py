@@ -6,7 +6,9 @@ import numpy as np
 
 from ..constraints.core.scalar import TENSEST, Scalar
 from ..device import ti
+from ..device.memory import Memory
 from ..features.feature import BENT, FAR, Batch, Scene
+from ..features.regrouping import Regrouping
 
 
 class Slots:
@@ -51,8 +53,14 @@ class Slots:
         scalars = [b for b in batches if isinstance(b, Scalar) and b.solvable_together]
         self.exact = bool(scalars) and (not self.system.steps if self.system else bool(degree.max(initial=0) <= 1))
         blocks = self.system.blocks if self.system else degree
-        self.split = memory.field("slots.split_mass", n, values=blocks * inv_mass)
+        self.split = memory.field("slots.split_mass", scene.count, values=blocks * inv_mass)
         self.relaxation = solver.relaxed_by(scene, batches, blocks * inv_mass)
+
+    def regroup(self, memory: Memory, change: Regrouping) -> None:
+        """Particles that no constraint holds came and went."""
+        n, first = change.now.count, change.first
+        memory.resize(self.begin, n + 1)
+        memory.write_from(self.begin, first, np.full(n + 1 - first, self.total))
 
     def places(self, batch: Batch) -> np.ndarray:
         """The slot of each corner of a batch, -1 where it cannot move."""

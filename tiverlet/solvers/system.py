@@ -51,7 +51,7 @@ class System:
             self.motion, self.spare_energy, self.own_step = self.reals("toward"), self.reals("spare"), self.reals("instead")
             self.trusted_step = self.reals("most")
         if self.shares:
-            self.share = self.ints("share", self.blocks)
+            self.share = scene.memory.field("system.share", scene.count, kind=ti.i32, values=self.blocks)
 
     def ints(self, name: str, values: np.ndarray, width: int = 0):
         """A field of integers."""

@@ -131,7 +131,7 @@ def assemble(
     try:
         state = State(memory, particles, inv_mass, precision == "f32-compensated")
         if particles.spins:
-            state.spin, state.spins = Spin(memory, particles, inv_mass), True
+            state.spin, state.spins = Spin(memory, particles, inv_mass, state.number), True
         return _bind(Scene(memory, state, particles, inv_mass, order=order), features, solver, path, scale)
     except BaseException:
         memory.destroy()
@@ -154,7 +154,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     batches = [f for f in of(Batch) if not f.drives and (scene.inv_mass[f.indices] > 0).any()]
     contact = next((c for c in of(PairContact) if c.matters), None)
     if contact or walls:
-        scene.radius = Radii(memory, particles.radius)
+        scene.radius = Radii(memory, particles.radius, scene.count)
     surfaces = [*walls, *([contact] if contact else [])]
     has_friction, bounces = any(f.has_friction for f in surfaces), any(f.has_restitution for f in surfaces)
     solver = solver or (by_structure(batches, scene.inv_mass) if scene.order == 2 else Direct())

@@ -291,11 +291,16 @@ class Reporter:
     """Makes a StepReport of the figures on the sheet."""
 
     def __init__(self, step: Step, solver: Solver, sheet: np.ndarray):
-        self.solver, self.scene, self.batches, self.n = solver, step.scene, step.batches, step.n
+        self.solver, self.scene, self.batches, self._step = solver, step.scene, step.batches, step
         self.remedy: str | None = None  # the setting that meets constraints better, known once it is asked for
         self.fastest = step.integrator.fastest
-        self.farthest = min(LARGEST, step.grid.finest * FARTHEST) if step.grid else LARGEST
+        self.regroup()
         self.figures = sheet[: 11 + step.dim]
+
+    def regroup(self) -> None:
+        """Particles came or went."""
+        grid, self.n = self._step.grid, self._step.n
+        self.farthest = min(LARGEST, grid.finest * FARTHEST) if grid else LARGEST
 
     def __call__(
         self,

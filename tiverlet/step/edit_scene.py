@@ -1,4 +1,5 @@
-"""Adding to a world and removing from it: it is built anew around the same features, and what stays is carried over."""
+"""Adding to a world and removing from it. Particles that come and go by themselves do so in place, see edit_in_place.py; for what
+else there is the world is built anew around the same features, and what stays is carried over."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -8,11 +9,12 @@ import numpy as np
 from .. import checks
 from ..colliders.collider import Collider
 from ..contact.pair_contact import PairContact
+from ..contact.touches import ContactEvents
 from ..device.memory import Memory
 from ..features.feature import Acceleration, Batch, Feature
 from ..neighbours.periodic import Periodic
 from ..particles import Particles
-from . import checkpoint, initial_violation
+from . import checkpoint, edit_in_place, initial_violation
 from .build import assemble, check_settings, checked_features, listed
 from .integrator import decay
 from .sleep import Sleep
@@ -70,7 +72,7 @@ def add(world: Any, particles: Particles | None, features: Iterable[Feature]) ->
     check_settings(world._precision, world._requested[1], world._order, (*world.features, *late))
     n, count = len(world.particles), 0 if particles is None else len(particles)
     if late or count:
-        rebuild(world, np.ones(n, dtype=bool), particles, (*world.features, *late))
+        change(world, np.ones(n, dtype=bool), particles, (*world.features, *late))
     return handle(world, np.arange(n, n + count))
 
 
@@ -84,7 +86,7 @@ def remove(world: Any, particles: Any, features: Iterable[Feature]) -> None:
     some = np.ones(len(world.particles), dtype=bool)
     some[chosen(world, "World.remove", particles)] = False
     if gone or not some.all():
-        rebuild(world, some, None, tuple(f for f in world.features if not any(f is g for g in gone)))
+        change(world, some, None, tuple(f for f in world.features if not any(f is g for g in gone)))
 
 
 def handle(world: Any, indices: np.ndarray) -> Handle:
@@ -104,6 +106,38 @@ def chosen(world: Any, who: str, particles: Any) -> np.ndarray:
     return checks.indices(who, "particles", array, n)
 
 
+def change(world: Any, some: np.ndarray, added: Particles | None, features: tuple[Feature, ...]) -> None:
+    """Keep particles in the mask `some`, add others, and let these features act; in place where that can be."""
+    number = np.where(some, np.cumsum(some) - 1, -1)
+    planned = edit_in_place.planned(world, some, number, added) if features == world.features else None
+    if planned is None:
+        rebuild(world, some, added, features)
+        return
+    told, seen = world._all_events(), _seen(world, number, features)
+    if world._force_waits:
+        with world._runner.memory.compiler():
+            world._runner.restart(world.iterations)
+    world._clock.parted = None
+    edit_in_place.regroup(world, planned, added)
+    _edited(world, some, added, told, seen, np.arange(len(features)), False)
+
+
+def renew(world: Any) -> None:
+    """Give a world what its knobs ask for: to pins other particles to hold, in place where that can be; or other kernels."""
+    some = np.ones(len(world.particles), dtype=bool)
+    grabbing = edit_in_place.grabbing(world, some)
+    if grabbing is None:
+        rebuild(world, some, None, world.features)
+        return
+    told = world._all_events()
+    if world._force_waits:
+        with world._runner.memory.compiler():
+            world._runner.restart(world.iterations)
+    world._clock.parted = None
+    edit_in_place.grab(world, grabbing)
+    _edited(world, some, None, told, None, np.arange(len(world.features)), True)
+
+
 def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tuple[Feature, ...]) -> None:
     """Build the world anew, of its particles in the mask `some` and the added ones, under these features."""
     world._runner.memory.check()
@@ -115,9 +149,7 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
     went = [f for f in before if f not in features or f.afresh]
     starts = {known: start.regrouped(some, added) for known, start in {id(f.start): f.start for f in before}.items()}
     starts = [None if f in came else starts[id(f.start)] for f in features]
-    parts, seen, told = None, None, world._all_events()
-    if not world._clock.d_is_velocity and (world._clock.parted is not None or any(_loses(f, number, features) for f in before)):
-        seen = world.velocity
+    parts, told, seen = None, world._all_events(), _seen(world, number, features)
     try:
         borne = any(isinstance(f, Collider) for f in went)
         pulled = (added is not None or not some.all()) and world._runner.step.has_pair_forces  # by others than before
@@ -153,8 +185,6 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
     world._runner.scene.h2_effective = h2_effective
     world._runner.memory.restore(state)
     world._runner.wake()
-    walls = np.array([features.index(f) if f in features else -1 for f in before], dtype=np.int64)
-    world._events = told[0].renumbered(number, number), told[1].renumbered(number, walls)
     if contact and contact in world._runner.step.contacts:
         _give_contacts(world, contact, old, number, some)
     drag, world._clock.drag = world._clock.drag, None
@@ -166,23 +196,43 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
             f.new_force = attributes[f].get("new_force", False)
     for memory in memories:
         memory.destroy()
-    for one in list(world._handles):
-        one.follow(number)
-    if m or came or went or not some.all():  # else knobs only asked for other kernels
-        world._clock.energy = None
     if any(isinstance(f, PairContact) for f in came):
         world._clock.first_moved = 0
-    elif world._clock.first_moved is not None:
-        world._clock.first_moved = int(some[: world._clock.first_moved].sum())
-    elif m:
-        world._clock.first_moved = n
+    walls = np.array([features.index(f) if f in features else -1 for f in before], dtype=np.int64)
     tied = initial_violation.first_off([f for f in came if f not in before], world.position)
+    _edited(world, some, added, told, seen, walls, bool(came or went), tied)
+
+
+def _seen(world: Any, number: np.ndarray, features: tuple[Feature, ...]) -> np.ndarray | None:
+    """Velocities before an edit, where what goes has a part in them; None where they are what displacements say."""
+    loses = any(_loses(f, number, features) for f in world.features)
+    return world.velocity if not world._clock.d_is_velocity and (world._clock.parted is not None or loses) else None
+
+
+def _edited(
+    world: Any, some: np.ndarray, added: Particles | None, told: tuple[ContactEvents, ContactEvents], seen: np.ndarray | None,
+    walls: np.ndarray, features_too: bool, tied: int | None = None,
+) -> None:  # fmt: skip
+    """What else there is to an edit once particles and features are there. told: events, of walls that have these numbers now.
+    seen: velocities, see _seen(). features_too: whether features came or went, too.
+    tied: the first particle of constraints that came and are not met."""
+    number, clock = np.where(some, np.cumsum(some) - 1, -1), world._clock
+    n, m = int(some.sum()), 0 if added is None else len(added)
+    world._events = told[0].renumbered(number, number), told[1].renumbered(number, walls)
+    for one in list(world._handles):
+        one.follow(number)
+    if m or features_too or n < len(some):  # else knobs only asked for other kernels
+        clock.energy = None
+    if clock.first_moved is not None:
+        clock.first_moved = int(some[: clock.first_moved].sum())
+    elif m:
+        clock.first_moved = n
     if tied is not None:
-        world._clock.first_moved = min(tied, n if world._clock.first_moved is None else world._clock.first_moved)
-    if m and not world._clock.d_is_velocity:
+        clock.first_moved = min(tied, n if clock.first_moved is None else clock.first_moved)
+    if m and not clock.d_is_velocity:
         _launch(world, n)
-    if seen is not None and not world._clock.d_is_velocity:  # what went has left its part in the velocities of what stays
-        world._clock.parted = seen[some] if added is None else np.concatenate([seen[some], added.velocity])
+    if seen is not None and not clock.d_is_velocity:  # what went has left its part in the velocities of what stays
+        clock.parted = seen[some] if added is None else np.concatenate([seen[some], added.velocity])
     for watcher in world._watchers:
         watcher.regrouped()
 

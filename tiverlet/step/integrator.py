@@ -55,7 +55,7 @@ class Verlet:
         self.decays = bool(forces.drags)
         self.dithers = scene.real == ti.f32 and not scene.state.carries
         if self.uses_velocity:
-            self.earlier = scene.memory.field("displacement_before", scene.particles.count, width=self.dim, state=True)
+            self.earlier = scene.memory.field("displacement_before", scene.count, width=self.dim, state=True)
         if self.decays:
             self.decay = scene.memory.field("decay", None, width=5)
 

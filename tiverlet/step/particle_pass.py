@@ -28,9 +28,8 @@ class ParticlePass:
     def __init__(self, scene: Scene, integrator: Any, batches: list[Batch], contact, grid, walls: list[Collider], team: Team):
         self.integrator, self.forces, self.team = integrator, integrator.forces, team
         self.state, self.n, self.real = scene.state, scene.count, scene.real
-        n, number = scene.particles.count, scene.memory.number
-        tile = min(TILE, team.piece)
-        self.pieces, self.tile, self.each = number(-(-n // team.piece)), number(tile), number(-(-team.piece // tile))
+        number = scene.memory.number
+        self.pieces, self.tile, self.each = map(number, self._parts(scene.particles.count, team))
         self.few = scene.memory.compiler.few
         self.slots, self.grid, self.walls, self.radius = scene.slots, grid, walls, scene.radius
         self.gathers = bool(batches) and not contact  # else the moves of constraints are applied before contacts are solved
@@ -40,9 +39,19 @@ class ParticlePass:
         self.rough = any(w.has_friction or w.has_restitution for w in walls)
         self.turned_by_walls = scene.state.spins and any(w.has_friction for w in walls)
         if walls:
-            self.wall_displacement = scene.memory.field("thrust", n, width=scene.particles.dim, state=True)
+            self.wall_displacement = scene.memory.field("thrust", scene.count, width=scene.particles.dim, state=True)
         if self.turned_by_walls:
-            self.wall_turn = scene.memory.field("wall_turn", n, width=scene.state.spin.axes, state=True)
+            self.wall_turn = scene.memory.field("wall_turn", scene.count, width=scene.state.spin.axes, state=True)
+
+    @staticmethod
+    def _parts(n: int, team: Team) -> tuple[int, int, int]:
+        """How many pieces n particles are, how many of them a tile is, and tiles a piece."""
+        tile = min(TILE, team.piece)
+        return -(-n // team.piece), tile, -(-team.piece // tile)
+
+    def regroup(self, n: int) -> None:
+        """There are n particles now, and the team knows."""
+        self.pieces, self.tile, self.each = self._parts(n, self.team)
 
     @ti.func
     def piece(self, k, thread):

@@ -46,7 +46,7 @@ class Runner:
         self.driven = [b for b in self.batches if isinstance(b, Scalar) and b.driven]
         self.semi_iterations, self.drags = step.constraints.semi_iterations, step.integrator.forces.drags
         self.probe = high_order.Probe(step) if self.scene.order > 2 else None
-        self.passes_at_once = max(1, LONG // (1 + self.n + sum(b.count for b in self.batches)))  # in a launch
+        self.passes_at_once = self._passes_at_once()
         self.asks_velocities = any(wall.has_switch for wall in step.walls)
         self.launcher = Launcher(self)
         self._prepare()
@@ -69,6 +69,16 @@ class Runner:
         self.step = copy.copy(self.step)
         self.diagnostics = self.diagnostics.of(self.step)
         self._prepare()
+
+    def _passes_at_once(self) -> int:
+        """Over the constraints, in a launch."""
+        return max(1, LONG // (1 + self.n + sum(b.count for b in self.batches)))
+
+    def regroup(self) -> None:
+        """Particles came and went, and the parts know."""
+        self.n = self.step.n
+        self.passes_at_once = self._passes_at_once()
+        self.diagnostics.report.regroup()
 
     # Frames.
 

@@ -6,6 +6,7 @@ from ... import checks
 from ...device import ti
 from ...features.feature import Batch, Knob, Scene
 from ...features.members import FixedSize
+from ...features.regrouping import Regrouping
 from ...particles import Particles
 from .spring import Spring, stiff
 
@@ -61,6 +62,15 @@ class Anchored(Batch):
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check that the particles exist."""
         checks.indices(repr(self), "indices", self.indices[:, 0], particles.count)
+
+    def can_regroup(self, change: Regrouping) -> bool:
+        """Whether none of its particles goes or gets another number."""
+        return not (self.indices >= change.first).any()
+
+    def regroup(self, change: Regrouping) -> None:
+        """Its violations are relative to the size of the scene."""
+        if self.acts:
+            self.dev.size.set(self.start.size)
 
     def start_offset(self, position: np.ndarray) -> np.ndarray:
         """C at the start, (m, dim)."""

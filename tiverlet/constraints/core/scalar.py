@@ -9,6 +9,7 @@ from ... import checks
 from ...device import ti
 from ...features.feature import FAR, Batch, Knob, Scene
 from ...features.members import FixedSize
+from ...features.regrouping import Regrouping
 from ...tools import distinct
 from .drive import Drive
 from .outline import Outline
@@ -77,6 +78,7 @@ class Scalar(Batch):
     each = ("rest", "compliance", "damping", "break_at")
     rest_name = "rest"
     uploads_all = True
+    _scene_sized = False  # whether any of its lengths is that of the whole scene, in want of one of its own
     driven = False  # whether rest values move by themselves: what drive_of() gives, see Drive
 
     def setup(self, indices, rest, compliance, damping, break_at=None) -> None:
@@ -172,6 +174,10 @@ class Scalar(Batch):
     def values(self, x: np.ndarray) -> np.ndarray:
         """f of corners x (m, arity, dim), (m,); of outlines, of all positions (n, dim)."""
         return self.quantity.values(x)
+
+    def can_regroup(self, change: Regrouping) -> bool:
+        """Whether none of its particles goes or gets another number, and no length of it is that of the whole scene."""
+        return not (self.indices >= change.first).any() and not self._scene_sized
 
     def rest_of(self, position: np.ndarray) -> np.ndarray:
         """f at the given positions, (m,): the rest value when none is given."""
@@ -310,6 +316,7 @@ class Scalar(Batch):
         self.dev.forces = bool(self.acts_as_force(scene).any())
         start = self.rest_of(self.start.position) if self.count else np.zeros(0)
         scale = self.unit or (float(np.abs(start).mean()) if np.any(start) else self.start.size)
+        self._scene_sized = not self.unit and not np.any(start)
         self.dev.scale = scene.memory.number(scale, scene.real)
         name, m, add = repr(self), self.count, scene.memory.field
         self.dev.rest = add(f"{name}.rest", m, values=self.goal, state=self.driven)
@@ -328,6 +335,7 @@ class Scalar(Batch):
                 corner = self.placed(self.start.position)
                 span = np.linalg.norm(corner - corner[:, :1], axis=2).max(axis=1, initial=0.0)
                 self.dev.span = add(f"{name}.span", m, values=np.where(span > 0, span, self.start.size))
+                self._scene_sized |= not span.all()
         self.dev.in_system, self.dev.outside = bool((rows >= 0).any()), bool((rows < 0).any())
         if self.dev.in_system:
             self.dev.row = add(f"{name}.row", m, kind=ti.i32, values=rows)

@@ -1,0 +1,197 @@
+"""Particles that come and go in place: to the bit as in a world that is built anew for them, and nothing is made."""
+
+import resource
+from typing import Any
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+from tiverlet.device import runtime
+from tiverlet.device.patches import patched
+from tiverlet.step import edit_in_place
+
+from .conftest import ARCH, compiled
+
+pytestmark = [
+    pytest.mark.usefixtures("read_here"),
+    pytest.mark.skipif(not patched or ARCH != "cpu", reason="every edit builds the world anew there"),
+]
+RADIUS = 0.1
+
+
+def places(n: int, dim: int = 2) -> np.ndarray:
+    """A loose heap."""
+    i, side = np.arange(n), int(np.ceil(n ** (1 / dim)))
+    lattice = np.stack([i // side**k % side for k in range(dim)], axis=1)
+    return 0.205 * lattice + 0.15 + 0.003 * np.sin(np.arange(n * dim)).reshape(n, dim)
+
+
+def drops(k: int, turn: int, dim: int = 2, radius: Any = RADIUS, **more) -> tv.Particles:
+    """Particles that come from above, each turn further up: none overlaps another."""
+    x = np.concatenate([0.3 + 0.25 * np.arange(k)[:, None], np.full((k, dim - 1), 1.9 + 0.3 * turn)], axis=1)
+    return tv.Particles(x, velocity=(0.3, -0.5, 0.1)[:dim], radius=radius, **more)
+
+
+def discs():
+    """Groups, sensors, events, spins, a wall, a hand, a spring that holds one."""
+    n = 40
+    particles = tv.Particles(places(n), radius=RADIUS, group=np.arange(n) % 3, spin=0.5, orientation=0.0)
+    contact = tv.Contact(friction={(0, 1): 0.5}, groups=[(0, 1), (1, 1), (0, 0)], sensors=[(0, 2)], events=True)
+    features = [
+        tv.Gravity(), tv.Drag(0.1), tv.Hand((1.0, 0.2), particle=30), contact, tv.HalfSpace((0, 1), 0.0, events=True),
+        tv.Pin([2], compliance=1e-3),
+    ]  # fmt: skip
+    w = tv.World(particles, features, substeps=5)
+    return w, lambda k, turn: drops(k, turn, group=np.arange(k) % 3, spin=2.0)
+
+
+def grains():
+    """Discs of many sizes in a box without end, in f64."""
+    sizes = RADIUS * (0.3 + 0.7 * np.abs(np.sin(np.arange(60))))
+    sizes[0] = RADIUS  # which stays, and is the widest
+    features = [tv.Gravity((0.5, -1.0)), tv.Periodic((0, 0), (2, 4)), tv.Contact(restitution=0.5)]
+    w = tv.World(tv.Particles(places(60), radius=sizes, mass=sizes**2), features, substeps=5, precision="f64")
+    return w, lambda k, turn: drops(k, turn, radius=sizes[1 : k + 1], mass=sizes[1 : k + 1] ** 2)
+
+
+def beside_a_rope():
+    """Spheres beside a rope between a pinned particle and a driven one, in two words of f32."""
+    rope = tv.shapes.rope((0.1, 2.5, 0.2), (1.9, 2.5, 0.2), points=10)
+    particles = tv.Particles(np.concatenate([rope.position, places(30, 3)]), radius=0.09, pinned=[0])
+    features = [tv.Gravity(), tv.Distance(rope.links), tv.Pin([9]), tv.HalfSpace((0, 1, 0), 0.0), tv.Contact()]
+    w = tv.World(particles, features, substeps=5, precision="f32-compensated")
+    return w, lambda k, turn: drops(k, turn, 3, 0.09)
+
+
+def steps_of(w) -> list:
+    """A few frames, by all that is seen of them."""
+    out = []
+    for _ in range(3):
+        report = w.step(1 / 60)
+        figures = report.energy, report.residual, report.overlap, report.contacts, sorted(report.flags)
+        out.append((w.hash(), figures, w.velocity.tobytes(), w.spin.tobytes(), w.contacts.impulse.tobytes()))
+    return out
+
+
+def edited(scene, anew: bool) -> tuple[list, int]:
+    """A world that is edited, and how many of the edits were in place. anew: none."""
+    planned, taken = edit_in_place.planned, []
+
+    def watched(*args):
+        change = None if anew else planned(*args)
+        taken.append(change is not None)
+        return change
+
+    edit_in_place.planned = watched
+    try:
+        w, more = scene()
+        w.run(0.1)
+        seen, n = steps_of(w), len(w.particles)
+        edits = [
+            lambda: w.add(more(1, 0)), lambda: w.add(more(5, 1)), lambda: w.remove([len(w.particles) - 3]),
+            lambda: w.remove(np.arange(14, n, 7)), lambda: (w.remove([12]), w.add(more(2, 2)), w.remove([13])),
+        ]  # fmt: skip
+        for edit in edits:
+            edit()
+            seen += [w.hash(), w.position.tobytes(), w.velocity.tobytes(), w.contacts.pairs.tobytes()]
+            seen += steps_of(w)
+            seen += [sorted(w.fields), {name: size for name, size in w.fields.items() if not name.startswith("grid")}]
+            if any(getattr(f, "events", False) is True for f in w.features):
+                seen += [repr(w.events()), repr(w.wall_events())]
+        with w.clone() as twin:
+            seen.append(twin.hash())
+        w.close()
+    finally:
+        edit_in_place.planned = planned
+    return seen, sum(taken)
+
+
+@pytest.mark.parametrize("scene", [discs, grains, beside_a_rope])
+def test_in_place_is_to_the_bit_as_built_anew(scene):
+    seen, count = edited(scene, anew=False)
+    known, none = edited(scene, anew=True)
+    assert count == 7 and none == 0
+    for k, (a, b) in enumerate(zip(seen, known, strict=True)):
+        assert a == b, k
+
+
+def test_what_holds_a_particle_that_goes_is_built_anew():
+    w, _ = beside_a_rope()
+    link: Any = w.features[1]
+    runner = w._runner
+    w.run(0.05)
+    w.remove([20])
+    assert w._runner is runner and link.count == 9
+    w.remove([5])
+    assert w._runner is not runner and link.count == 7
+    w.close()
+
+
+def test_an_edit_makes_and_compiles_nothing():
+    w, more = discs()
+    w.run(0.1)
+    first = w.add(more(1, 0))
+    w.step(1 / 60)
+    runner, fields = w._runner, len(w.fields)
+    with compiled() as names:
+        for k in range(1, 4):
+            w.add(more(k, k))
+            w.step(1 / 60)
+            w.remove(np.arange(40, len(w.particles) - 1))
+            w.step(1 / 60)
+    assert names == [] and w._runner is runner and len(w.fields) == fields and len(first) == 0
+    w.close()
+
+
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+def test_a_pin_takes_a_disc_in_place(precision):
+    # As the Pin that would be made for it, to the bit; among others that are held, whose pairs the list leaves out.
+    def scene():
+        pin = tv.Pin([10], (0.5, 0.9))
+        particles = tv.Particles(places(30), radius=RADIUS, pinned=[0, 1])
+        w = tv.World(particles, [tv.Gravity(), tv.Box((0, 0), (2, 4)), tv.Contact(friction=0.3), pin], precision=precision)
+        w.run(0.1)
+        return w, pin
+
+    w, pin = scene()
+    other, old = scene()
+    runner = w._runner
+    for k in (11, 7, 20):
+        pin.indices, pin.target = [k], [(0.6, 0.01 * k)]
+        other.remove(features=[old])
+        old = tv.Pin([k], [(0.6, 0.01 * k)])
+        other.add(features=[old])
+        for _ in range(4):
+            assert w.step(1 / 60).energy == other.step(1 / 60).energy
+        np.testing.assert_array_equal(w.position, other.position)
+        np.testing.assert_array_equal(w.velocity, other.velocity)
+    assert w._runner is runner and w._runner.scene.inv_mass[[0, 10, 20]].tolist() == [0, 1, 0]
+    pin.indices = [0]
+    with pytest.raises(ValueError, match="holds particle 0, which is pinned"):
+        w.step(1 / 60)
+    pin.indices = [12]
+    w.step(1 / 60)
+    w.close()
+    other.close()
+
+
+def test_worlds_one_after_the_other_take_no_more_memory():
+    # Taichi has 512 trees of fields at most, and fields that do not grow: worlds share trees, and give their bytes back.
+    def peak() -> int:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+    def live(k: int) -> None:
+        with tv.World(tv.Particles(places(20 + k % 7), radius=RADIUS), [tv.Gravity(), tv.Contact()], substeps=2) as w:
+            w.step(1 / 60)
+            w.add(drops(1 + k % 3, 0))
+            w.step(1 / 60)
+            w.remove([0])
+            w.step(1 / 60)
+
+    for k in range(50):
+        live(k)
+    trees, before = runtime.trees, peak()
+    for k in range(200):
+        live(k)
+    assert runtime.trees == trees and peak() - before < 4 << 10  # KiB; a world of its own would take 100
