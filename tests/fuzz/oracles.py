@@ -17,7 +17,7 @@ WALLS = ("Box", "HalfSpace", "Ball", "Capsule", "Polygon", "Mesh", "Sdf")
 PULLS = ("Gravity", "Drag", "Wind", "Attractor", "Force", "PairForce")
 TETHERS = ("Pin", "Path", "Snap")
 PASSIVE = ("Gravity", "Drag", *WALLS, "Distance", "Rope", "Spacer", "Bend", "AngleLimit", "Dihedral", "Constraint",
-           "Area", "Volume", "ShapeMatch", "Snap", "Contact", "Polygons", "Periodic")  # fmt: skip
+           "Area", "Volume", "ShapeMatch", "Snap", "Contact", "Polygons", "Periodic", "Sleep")  # fmt: skip
 EPS = {"f32": 2.0**-23, "f32-compensated": 2.0**-23, "f64": 2.0**-52}
 
 

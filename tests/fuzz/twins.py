@@ -136,7 +136,7 @@ def by_recording(trial: Trial, events: list[Event]) -> None:
 def by_company(trial: Trial, events: list[Event]) -> None:
     """A particle that comes and goes far away changes nothing."""
     structure = trial.structure
-    if structure.periodic:  # nothing is far away
+    if structure.periodic or any(f.name == "Sleep" for f in structure.features):  # nothing is far away; edits wake
         return
     other, n, radius = Trial(structure), len(structure.position), float(trial.world.particles.radius.max())
     try:
