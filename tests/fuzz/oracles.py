@@ -215,6 +215,6 @@ def height(features: list[Any], particles: Any, free: np.ndarray, low: np.ndarra
     out, m = 0.0, np.where(free > 0, particles.mass, 0.0)
     for f in features:
         if type(f).__name__ == "Gravity":
-            g = np.abs(f._vector())
+            g = np.abs(np.asarray(f.settings()["g"]))
             out += float(m.sum() * (g @ (high - low)))
     return out

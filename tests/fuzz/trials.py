@@ -265,7 +265,8 @@ class Judge:
         if np.abs(m @ v - m @ self.v).max() > near:
             raise Find("momentum", f"of velocities {m @ self.v} -> {m @ v}, allowed {near:.3g}, {self.w.last}")
         blur = 64 * self.t.eps * n * m.sum() * reach / event.dt
-        moved = "moved" in self.w.last.flags  # by the host, which solves for it to 1e-9 of its size
+        # By the host, which solves for it to 1e-9 of its size; or not at all, asleep.
+        moved = "moved" in self.w.last.flags or self.w.last.asleep
         if not moved and np.abs(m @ way - m @ self.v).max() > near + blur:
             raise Find(
                 "momentum", f"of velocities {m @ self.v}, of positions {m @ way}, allowed {near + blur:.3g}, {self.w.last}"

@@ -169,7 +169,7 @@ class Runner:
         sleep.begin(dt, clock)
         self._settle()
         with self.memory.compiler():
-            sleep.rests = sleep.finish(dt, clock) and not self.step.drivers
+            sleep.rests = sleep.finish(dt, clock)
 
     def wake(self, particles: np.ndarray | None = None) -> None:
         """Have all that sleeps wake, or the islands of some particles."""

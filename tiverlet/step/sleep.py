@@ -157,7 +157,7 @@ DT, H, TIME, AWAKE, READY, CALLED = range(6)  # of the sheet of a frame: what is
 class SleepPass:
     """The kernels of one world: who is slow, who falls asleep, who wakes."""
 
-    host_only = ("sheet", "clock", "rests")
+    host_only = ("sheet", "rests", "goes_on")
     told_apart = True  # as a Feature
     n: Any = OnDevice()  # particles
     links: Any = OnDevice()  # pairs of them that constraints hold together
@@ -175,7 +175,9 @@ class SleepPass:
         self.pairs = memory.field("Sleep.links", len(pairs), width=2, kind=ti.i32, values=pairs)
         if self.watches:
             sleepers.pull = memory.field("Sleep.pull", n, width=step.dim, state=True)
-        self.sheet, self.rests = np.zeros(CALLED + 1), False
+        # What is driven goes on, and what cannot move keeps turning, where orientations are asked for.
+        turns = step.orients and bool((step.scene.inv_mass == 0).any())
+        self.sheet, self.rests, self.goes_on = np.zeros(CALLED + 1), False, turns or bool(drivers)
 
     def __repr__(self) -> str:
         return "sleep"
@@ -190,14 +192,15 @@ class SleepPass:
         self.sheet[:] = dt, clock.h, clock.time, 0, 0, 0
 
     def finish(self, dt: float, clock: "Clock") -> bool:
-        """After it: have islands fall asleep, or wake. Returns whether all slept in the frame that has gone by."""
+        """After it: have islands fall asleep, or wake. Returns whether all slept in the frame that has gone by, and nothing else
+        goes on."""
         awake, ready, called = self.sheet[AWAKE:].tolist()
         if called:
             self.wake_called(clock.h, clock.time, 0, 0, 0, 1, 1, 1, 0)
         part = self.sleepers.time / TRIES
         if ready and clock.time // part > (clock.time - dt) // part:
             self.fall_asleep(clock.time)
-        return awake == 0 and not called
+        return awake == 0 and not called and not self.goes_on
 
     def of(self, step: "Step") -> "SleepPass":
         """The same fields, for another Step."""
