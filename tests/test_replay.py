@@ -73,7 +73,7 @@ def solid(precision="f64", **settings):
         tv.Volume([(0, 1, 2, 3)], compliance=1e-4), tv.Dihedral([(0, 1, 2, 3)], compliance=0.1),
         tv.Motor([(0, 1, 2, 3)], 1.0, torque=0.5, compliance=0.1),
         tv.Mesh(vertices, [(0, 2, 1), (0, 3, 2)], closed=False, restitution=0.3), tv.Contact(),
-        tv.Periodic((-9, -9, -9), (9, 9, 9), (0, 2)),
+        tv.Periodic((-9, -9, -9), (9, 9, 9), (0, 2)), tv.Sleep(0.02, time=0.3),
     ]  # fmt: skip
     settings = {"solver": tv.ConjugateGradient(7), "substeps": 5, **settings}
     return tv.World(tv.Particles(tetrahedron, radius=0.05, pinned=[4]), features, precision=precision, **settings)

@@ -205,7 +205,7 @@ PLANTS = {
     "averaging by the count of constraints": (
         "error_vs_time('M01', precisions=('f64',), efforts=(20,), baselines=False, runs=1)",
         [
-            ("solvers/slots.py", "n, values=blocks * inv_mass)", "n, values=inv_mass)"),
+            ("solvers/slots.py", "scene.count, values=blocks * inv_mass)", "scene.count, values=inv_mass)"),
             (
                 "solvers/slots.py",
                 "        return total\n",

@@ -19,17 +19,17 @@ from ..features.arguments import RecordsArguments, knobs_of
 from ..features.feature import Batch, Feature
 from ..particles import TURNING, Particles
 from ..solvers.solver import Solver
-from ..step import sleep
+from ..step.sleep import Sleep
 
 if TYPE_CHECKING:
     from ..world import World
 
 PARTICLES = ("position", "velocity", "mass", "radius", "pinned", "group", *TURNING)
 PUBLIC = {
-    name: kind for module in (colliders, constraints, contact, forces, neighbours, sleep, solvers)
+    name: kind for module in (colliders, constraints, contact, forces, neighbours, solvers)
     for name, kind in vars(module).items()
     if isinstance(kind, type) and issubclass(kind, RecordsArguments)
-}  # fmt: skip
+} | {"Sleep": Sleep}  # fmt: skip
 Turned = tuple[int, dict[str, Any]]  # the number of a feature, and its knobs
 TAKES = {
     "Force": ("function",),
