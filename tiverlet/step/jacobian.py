@@ -32,10 +32,10 @@ class Jacobian:
         return self.w[:, None] * self.gathered(self.J * lam[self.row][:, None])
 
     def solve(
-        self, right: np.ndarray, some: np.ndarray | float = 1.0, enough: float = DONE, steps: int = STEPS
+        self, right: np.ndarray, some: np.ndarray | float = 1.0, enough: float = DONE, steps: int = STEPS, soft: float = SOFT
     ) -> np.ndarray:  # fmt: skip
         """w J^T lam with (J w J^T + mu) lam = right, for some rows; conjugate gradients, preconditioned by the diagonal."""
-        mu = SOFT * self.diagonal
+        mu = soft * self.diagonal
         scale = np.divide(1, self.diagonal + mu, out=np.zeros_like(mu), where=self.diagonal > 0)
         lam = conjugate_gradients(lambda p: some * self.rates(self.moves(p)) + mu * p, lambda r: scale * r, right, enough, steps)
         return self.moves(lam)

@@ -52,10 +52,10 @@ def project(runner: "Runner", h: float, longest: float) -> bool:
     if not np.isfinite(x).all():
         return True
     scalars: list[Any] = [b for b in runner.batches if isinstance(b, Scalar) and b.count]
-    batches = [b for b in scalars if _sizes(b).max() <= LARGEST]
+    batches = [b for b in scalars if sizes(b).max() <= LARGEST]
     large = [b.violation(x) * b.inverse_size(b.start.position) * (b.compliance == 0) for b in scalars if b not in batches]
     stays = max([left_out(runner.batches, w, x), *(float(np.abs(C).max()) for C in large)])
-    if _matters(stays, ratio):
+    if matters(stays, ratio):
         runner.released = stays
     if slots and slots.system and not slots.system.steps and not runner.clock.softened:  # it holds loads without a violation
         batches = [b for b in batches if ((slots.rows(b) < 0) & ~b.idle(w)).any()]
@@ -64,7 +64,7 @@ def project(runner: "Runner", h: float, longest: float) -> bool:
         return True
     start = Rows(batches, w, x, runner.scene.periodic)
     undone = start.undone(runner)
-    if not _matters(float(np.abs(undone * start.close).max(initial=0.0)), ratio):
+    if not matters(float(np.abs(undone * start.close).max(initial=0.0)), ratio):
         return ratio < FAR
     rows = start = start.towards(start.C - (1 - ratio**2) * undone)
     mu, enough, far, first = BEGIN, LEFT * ratio**2, None, rows.stored
@@ -86,7 +86,7 @@ def project(runner: "Runner", h: float, longest: float) -> bool:
     n = len(x)
     still = (undone != 0) & (start.theta > FIRM)
     v[:n] += rows.jacobian.solve(-rows.jacobian.rates(v[:n]) * still, still)
-    energy, overlap = _seen(runner)
+    energy, overlap = seen(runner)
     known = runner.clock.energy
     if known is not None:  # by the loads of the last substep: what springs of its violations would hold is not there
         energy = known
@@ -94,29 +94,29 @@ def project(runner: "Runner", h: float, longest: float) -> bool:
     runner.stop_at_walls(before)
     x = state.get(memory)
     memory.write(state.d, v)
-    more, deeper = _seen(runner)
+    more, deeper = seen(runner)
     if deeper > overlap:
         state.put(memory, before)
         memory.write(state.d, kept)
     elif more > energy:
-        v[:n] = start.paid(v[:n], x - before, more - energy)
+        v[:n] = paid(start.jacobian, v[:n], x - before, more - energy)
         memory.write(state.d, v)
     return True
 
 
-def _matters(violation: float, ratio: float) -> bool:
+def matters(violation: float, ratio: float) -> bool:
     """Whether what a violation, as a share of its size, leaves to vibrate is worth a look."""
     return violation * (1 - ratio**2) ** 2 > ENOUGH * ratio**2
 
 
-def _seen(runner: Any) -> tuple[float, float]:
+def seen(runner: Any) -> tuple[float, float]:
     """Energy [J], and the overlap of the worst contact, in radii."""
     runner.look()
     report = runner.report()
     return report.energy, report.overlap
 
 
-def _sizes(batch: Scalar | RigidRows) -> np.ndarray:
+def sizes(batch: Scalar | RigidRows) -> np.ndarray:
     """The number of corners of each constraint, (m,)."""
     return np.bincount(batch.owner, minlength=batch.count)
 
@@ -140,7 +140,7 @@ class Rows:
         self.batches, self.w, self.n, self.dim = batches, w, *x.shape
         self.box = box  # the Periodic of the world
         self.some = [~b.idle(w) & ~b.broken if b.breaks else ~b.idle(w) for b in batches]
-        self.side, arity = (self._each([of(b) for b in batches]) for of in (lambda b: np.full(b.count, b.side), _sizes))
+        self.side, arity = (self._each([of(b) for b in batches]) for of in (lambda b: np.full(b.count, b.side), sizes))
         self.m = len(self.side)
         self.corner = [some[b.owner] for b, some in zip(batches, self.some, strict=True)]
         self.who = np.concatenate([b.indices.ravel()[some] for b, some in zip(batches, self.corner, strict=True)])
@@ -245,26 +245,28 @@ class Rows:
         out[self.inside] = self.matrix.solve(blocks, -right[self.inside])
         return out
 
-    def paid(self, v: np.ndarray, moves: np.ndarray, energy: float) -> np.ndarray:
-        """Velocities without the energy [J] that moves added: of their part along them first, then of what is anchored.
 
-        Each body pays by the mass that it has lifted, up to all it has.
-        """
-        m = np.divide(1, self.w, out=np.zeros_like(self.w), where=self.w > 0)
-        rows, (label, body) = self.m, bodies_of(self.m, self.row, self.who, self.w)
+def paid(jacobian: Jacobian, v: np.ndarray, moves: np.ndarray, energy: float) -> np.ndarray:
+    """Velocities without the energy [J] that moves added: of their part along them first, then of what is anchored.
 
-        def summed(values: np.ndarray) -> np.ndarray:
-            """Sums by bodies."""
-            return np.bincount(body, m * values, minlength=rows + 1)
+    Each body, of what constraints tie together, pays by the mass that it has lifted, up to all it has.
+    """
+    rows, row, who, w = jacobian.m, jacobian.row, jacobian.who, jacobian.w
+    m = np.divide(1, w, out=np.zeros_like(w), where=w > 0)
+    label, body = bodies_of(rows, row, who, w)
 
-        work, size, along = summed(np.linalg.norm(moves, axis=1)), summed((moves**2).sum(axis=1)), summed((moves * v).sum(axis=1))
-        due = energy * _over(work, np.full(len(work), work.sum()))  # none where rounding gained it, and nothing moved
-        part = _over(along, size)
-        due, left = _settled(due, part * along / 2)
-        v = v - ((1 - left) * part)[body][:, None] * moves
-        held = np.bincount(label[self.row[self.w[self.who] == 0]], minlength=rows + 1) > 0
-        _, left = _settled(np.where(held, due, 0.0), summed((v**2).sum(axis=1)) / 2)
-        return v * left[body][:, None]
+    def summed(values: np.ndarray) -> np.ndarray:
+        """Sums by bodies."""
+        return np.bincount(body, m * values, minlength=rows + 1)
+
+    work, size, along = summed(np.linalg.norm(moves, axis=1)), summed((moves**2).sum(axis=1)), summed((moves * v).sum(axis=1))
+    due = energy * _over(work, np.full(len(work), work.sum()))  # none where rounding gained it, and nothing moved
+    part = _over(along, size)
+    due, left = _settled(due, part * along / 2)
+    v = v - ((1 - left) * part)[body][:, None] * moves
+    held = np.bincount(label[row[w[who] == 0]], minlength=rows + 1) > 0
+    _, left = _settled(np.where(held, due, 0.0), summed((v**2).sum(axis=1)) / 2)
+    return v * left[body][:, None]
 
 
 def _settled(due: np.ndarray, kinetic: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

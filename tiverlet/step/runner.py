@@ -17,6 +17,7 @@ from .clock import Clock
 from .diagnostics import STARTED, STEPPED, UNSTEPPED
 from .frames import Frames
 from .integrator import FREE, decay
+from .overlap_release import release
 from .projection import project
 from .step import ACTIVE_THREADS, BEFORE, END, GIVE, HALT, ORIGIN, H, Moment, Span, frame
 from .step_report import StepReport
@@ -110,8 +111,10 @@ class Runner:
             if h != clock.h or drag != clock.drag:
                 clock.longest = max(clock.longest, clock.h if clock.first_moved is None else 0.0)
                 self.restart(iterations)
-                if h < clock.longest and not self.probe and project(self, h, clock.longest):
-                    clock.longest = h
+                if h < clock.longest and not self.probe:
+                    released = release(self, h, clock.longest)
+                    if project(self, h, clock.longest) or released:
+                        clock.longest = h
             if clock.d_is_velocity:
                 clock.since = 0
             self.moved = 0.0

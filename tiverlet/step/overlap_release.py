@@ -1,0 +1,143 @@
+"""What contacts overlap by becomes less where the substep gets shorter: else it would become energy.
+
+A pass holds a load F by an overlap C = D h^2 F, as a spring of stiffness 1 / (D h^2) would. A shorter substep h' makes that
+spring stiffer while it is pressed, and its energy (h / h')^2 times as large. So positions first go to where the same loads need
+the overlap (h' / h)^2 C, by the least moves in the metric of the masses, and velocities stay:
+
+    x += w J^T lam,  (J w J^T + mu D) lam = C - (h' / h)^2 C_0,  D the diagonal of J w J^T
+
+for discs or spheres that overlap; those that the moves push into each other part again, C_0 = 0. What a wall has stopped does
+not move into it again, and rigid constraints keep what they measure. mu falls while that helps and rises where it does not
+(Levenberg and Marquardt). Motion pays for what is lifted, as in projection.py.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from ..constraints.core.scalar import Scalar
+from ..contact.contact import Contact
+from ..features.material import TOUCHES
+from ..neighbours.queries import between
+from .jacobian import Jacobian
+from .projection import LARGEST, Rows, matters, paid, seen, sizes
+from .rigid_rows import rigid_rows
+
+SOFT, SOFTEST = 1e-2, 1e-5  # mu of the first round, and the least
+STEPS, ENOUGH = 32, 1e-6  # of conjugate gradients, at most; what of r . z they leave
+ROUNDS = 16  # of them, each with what particles were pushed into in the one before
+LEFT = 0.01  # of what overlaps store: what may be left of it in the shorter substep
+
+
+def release(runner: Any, h: float, longest: float) -> bool:
+    """Take out what overlaps would store; d holds velocities. Nothing happens where they are small.
+
+    h: the coming substep [s]; longest: since this was done last. Returns whether overlaps have been looked after.
+    """
+    state, memory, ratio = runner.scene.state, runner.memory, h / longest
+    x = state.get(memory)
+    contact = next((c for c in runner.step.contacts if isinstance(c, Contact)), None)
+    if contact is None or not np.isfinite(x).all():
+        return False
+    energy, overlap = seen(runner)
+    if not matters(overlap, ratio):
+        return False
+    jacobian = part(runner, Pairs(runner, contact, x), x, ratio)
+    if runner.clock.energy is not None:  # of the whole frame, to second order
+        energy = runner.clock.energy
+    more = seen(runner)[0]
+    if jacobian and more > energy:
+        d = memory.read(state.d)
+        v = d.astype(np.float64)
+        v[: len(x)] = paid(jacobian, v[: len(x)], state.get(memory) - x, more - energy)
+        memory.write(state.d, v)
+    return True
+
+
+def part(runner: Any, pairs: "Pairs", x: np.ndarray, ratio: float) -> Jacobian | None:
+    """Move particles from x, (n, dim), until their overlaps are ratio^2 of what they are, or as near to that as they get; returns
+    the rows of the last round."""
+    state, memory, w, jacobian = runner.scene.state, runner.memory, runner.scene.inv_mass, None
+    overlap = np.maximum(pairs.overlaps(x)[0], 0.0)
+    goal, active = ratio**2 * overlap, overlap > 0
+    best, soft, tied, walls = x, SOFT, rigid(runner, x), Walls(x)
+    least = first = stored_by(overlap - goal)
+    for _ in range(ROUNDS):
+        if least <= LEFT * ratio**2 * first:
+            break
+        overlap, normal = pairs.overlaps(best)
+        some = np.flatnonzero(active)
+        m, k = len(some), len(walls.who)
+        row, who = [np.arange(m), np.arange(m), m + np.arange(k)], [*pairs.who[some].T, walls.who]
+        J, right = [normal[some], -normal[some], walls.normal], [(overlap - goal)[some], np.zeros(k)]
+        if tied:
+            now = tied.at(best)
+            row, who, J, right = [*row, m + k + now.row], [*who, now.who], [*J, now.J], [*right, tied.C - now.C]
+        wanted = np.concatenate(right)
+        jacobian = Jacobian(len(wanted), np.concatenate(row), np.concatenate(who), w, np.concatenate(J))
+        state.put(memory, best + jacobian.solve(wanted, enough=ENOUGH, steps=STEPS, soft=soft))
+        sent = state.get(memory)
+        runner.stop_at_walls(best)
+        new = state.get(memory)
+        walls.push(new - sent)
+        more = pairs.overlaps(new)[0] - goal
+        active = active | (more > 0)
+        stored = stored_by(more)
+        if stored < least:
+            best, least, soft = new, stored, max(soft / 4, SOFTEST)
+        else:
+            soft *= 10
+    state.put(memory, best)
+    return jacobian
+
+
+class Pairs:
+    """Those of the neighbour list that push each other, who (m, 2), at positions x (n, dim) [m]."""
+
+    def __init__(self, runner: Any, contact: Contact, x: np.ndarray):
+        grid, particles, self.box = runner.grid, runner.scene.particles, runner.scene.periodic
+        pairs, _ = grid.entries()
+        some = (pairs[:, 0] < pairs[:, 1]) | (runner.scene.inv_mass[pairs[:, 1]] == 0)
+        if grid.table.senses:
+            rank, table = grid.table.rows(particles.group)
+            table = table.reshape(rank.max() + 1, rank.max() + 1, -1)
+            some &= table[rank[pairs[:, 0]], rank[pairs[:, 1]], 3] == TOUCHES
+        self.who = pairs[some]
+        radius = particles.radius.copy()
+        if contact.shrinks:
+            radius -= contact.store.read(contact.dev.geometry.shrunk)[: len(x)]
+        self.reach = radius[self.who].sum(axis=1)
+
+    def overlaps(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How deep they overlap [m], negative where apart, and their normals, at positions x."""
+        r = between(x[self.who[:, 0]], x[self.who[:, 1]], self.box)
+        length = np.linalg.norm(r, axis=1)
+        return self.reach - length, np.divide(r, length[:, None], out=np.zeros_like(r), where=length[:, None] > 0)
+
+
+class Walls:
+    """Which particles were stopped by walls, (k,), and along which normals, (k, dim)."""
+
+    def __init__(self, x: np.ndarray):
+        self.who, self.normal = np.zeros(0, dtype=np.int64), np.zeros((0, x.shape[1]))
+
+    def push(self, way: np.ndarray) -> None:
+        """Note how far walls took particles back, (n, dim)."""
+        length = np.linalg.norm(way, axis=1)
+        new = np.setdiff1d(np.flatnonzero(length > 0), self.who)
+        self.who = np.concatenate([self.who, new])
+        self.normal = np.concatenate([self.normal, way[new] / length[new, None]])
+
+
+def rigid(runner: Any, x: np.ndarray) -> Rows | None:
+    """The rigid constraints of the world, and its rigid clusters, where there are any that are not too large."""
+    w = runner.scene.inv_mass
+    scalars = [b for b in runner.batches if isinstance(b, Scalar) and b.count and not b.compliance.any()]
+    some = [b for b in scalars if sizes(b).max() <= LARGEST and (~b.idle(w) & ~b.broken).any()]
+    some += rigid_rows(runner.batches, w)
+    return Rows(some, w, x, runner.scene.periodic) if some else None
+
+
+def stored_by(overlap: np.ndarray) -> float:
+    """What overlaps store, but for a factor."""
+    return float((np.maximum(overlap, 0.0) ** 2).sum())
