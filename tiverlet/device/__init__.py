@@ -1,6 +1,6 @@
 """The door to Taichi: starting it, memory, threads. All other modules import Taichi from here."""
 
-from .language import at, ti
+from .language import at, inline, record, ti
 from .patches import assignments, lean, patched
 
 if lean:
@@ -10,10 +10,9 @@ if patched:
 
     source_cache.apply()  # before what comes next, which is imported in half the time
     syntax_cache.apply()
-    sharing.apply()
+    sharing.apply(timing.compiled)
     timing.apply()
 from . import copies
-from .patches.compiler import inline, record
 
 copies.apply()  # last, and whatever is patched: it is what subscripts mean
 

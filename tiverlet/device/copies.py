@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from .language import current, impl, plain_field
-from .patches.compiler import inline
+from .language import current, impl, inline, plain_field
 
 
 class Copies:

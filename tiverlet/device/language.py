@@ -8,6 +8,7 @@ import contextlib
 import functools
 import io
 import os
+import pathlib
 import sys
 import tempfile
 from collections.abc import Callable
@@ -61,6 +62,11 @@ _VECTORS, _NUMBERS = module("matrix").MatrixField, module("field").ScalarField
 Operations: Any = getattr(module("common_ops"), f"{NAME}Operations")  # what it inherits
 
 
+active: list[Any] = []  # Compilers whose kernels are being compiled or launched, the innermost last
+# Where functions come from that are known to be safe.
+HOME = OURS, TAICHI = tuple(str(p) + os.sep for p in (pathlib.Path(__file__).parents[1], pathlib.Path(ti.__file__).parent))
+
+
 def current() -> Any:
     """What runs: another object after each ti.init and ti.reset."""
     return impl.get_runtime()
@@ -103,7 +109,7 @@ def before_fields(check: Callable[[], None]) -> None:
 
 
 def at(field: Any, index: Any) -> Any:
-    """field[index], in a Python function that a kernel calls as it is; see inline() in patches/compiler.py."""
+    """field[index], in a Python function that a kernel calls as it is; see inline()."""
     return impl.subscript(current().compiling_callable.ast_builder(), field, index)
 
 
@@ -122,6 +128,21 @@ def callable_in_kernels(function: Any) -> Any:
     setattr(function, _MARK, True)
     setattr(function, _INNER, SimpleNamespace(has_print=False))
     return function
+
+
+def inline(function: Any) -> Any:
+    """A function of one expression, for kernels to call as Python does: they get the expression itself.
+
+    Taichi compiles a call of a ti.func by reading its source, copying each argument to a variable, and each result: as much as
+    for ten more operations.
+    """
+    return callable_in_kernels(function)
+
+
+def record(kind: Any) -> Any:
+    """A class of several values under names, for kernels: what they call makes one, passes it on whole and reads it."""
+    kind._data_oriented = True  # by this Taichi knows objects of ours, which it leaves as they are
+    return inline(kind)
 
 
 def is_kernel_function(thing: Any) -> bool:

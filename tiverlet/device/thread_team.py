@@ -11,9 +11,8 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from . import runtime
-from .language import at, ti
+from .language import at, inline, ti
 from .number import OnDevice
-from .patches.compiler import inline
 
 if TYPE_CHECKING:
     from .memory import Memory

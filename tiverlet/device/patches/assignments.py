@@ -2,8 +2,7 @@
 
 from typing import Any
 
-from ..language import Expression, Operations, ti
-from . import active
+from ..language import Expression, Operations, active, ti
 
 
 def _assigned(self: Any, value: Any) -> Any:

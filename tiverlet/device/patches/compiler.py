@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from ..language import callable_in_kernels, impl, sources
-from . import active, lean, patched
+from ..language import active, impl, sources
+from . import lean, patched
 
 HOSTS = ("Arch.x64", "Arch.arm64")  # whose kernels LLVM makes as fast without it; measured on x64
 # No variables for what loops read and write at one address: Taichi does not see that another address may be the same place, such
@@ -132,21 +132,6 @@ def readable(function: Any) -> bool:
     except (OSError, TypeError):
         return False
     return True
-
-
-def inline(function: Any) -> Any:
-    """A function of one expression, for kernels to call as Python does: they get the expression itself.
-
-    Taichi compiles a call of a ti.func by reading its source, copying each argument to a variable, and each result: as much as
-    for ten more operations.
-    """
-    return callable_in_kernels(function)
-
-
-def record(kind: Any) -> Any:
-    """A class of several values under names, for kernels: what they call makes one, passes it on whole and reads it."""
-    kind._data_oriented = True  # by this Taichi knows objects of ours, which it leaves as they are
-    return inline(kind)
 
 
 class CachedLaunch:

@@ -10,8 +10,6 @@ Everything here knows the inside of Taichi 1.7.4; with another one, functions ar
 import ast
 import contextlib
 import linecache
-import os
-import pathlib
 import sys
 import textwrap
 import weakref
@@ -21,11 +19,8 @@ from typing import Any
 from taichi.lang import impl, kernel_impl, matrix, snode
 from taichi.lang.ast import ASTTransformerContext
 
-from ..language import ti
-from . import active
+from ..language import HOME, OURS, TAICHI, active
 
-# Where functions come from that are known to be safe.
-HOME = OURS, TAICHI = tuple(str(p) + os.sep for p in (pathlib.Path(__file__).parents[2], pathlib.Path(ti.__file__).parent))
 CLOSING = (")", "]", "}")  # what the last lines of a function may begin with that are not in its code
 NOTHING = 8  # bytes of code of a function that has nothing but a docstring
 _lines: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()  # of functions, as inspect finds them

@@ -23,8 +23,7 @@ from taichi.lang.expr import Expr
 from taichi.lang.field import ScalarField
 from taichi.lang.matrix import MatrixField
 
-from ..language import at, ti
-from . import active
+from ..language import active, at, ti
 
 PLACES = 1000  # lines of code that are kept as what Taichi tells its compiler about where things are
 INT = range(-(2**31), 2**31)  # what a literal may be without a type of its own

@@ -12,7 +12,7 @@ from typing import Any
 from taichi.lang import impl
 from taichi.lang.kernel_impl import Func
 
-from . import active
+from ..language import active
 
 LONG = 0.3  # [s] of translating a kernel, after which LLVM is expected to take the better part of a second
 
