@@ -10,6 +10,7 @@ from ..features.feature import Feature, Knob, Scene
 from ..features.material import Bounce, as_given, friction_of, restitution_of
 from ..features.regrouping import Regrouping
 from .surface import Surface
+from .wall_log import WallLog
 
 SWEEPS = 8  # rounds over the walls, for particles that several of them push
 ROUNDS = 32  # more of them, without friction and bounces
@@ -127,10 +128,10 @@ class Collider(Feature):
         self.dev.real = scene.real
         both = friction_of(repr(self), "friction", self.friction) if self.has_friction else None
         restitution, active = self._bounce if self.has_restitution else None, self.active if self.has_switch else None
+        self.dev.log = WallLog(scene, repr(self)) if self.events else None
         self.dev.surface = Surface(
-            scene, repr(self), both, restitution, self.push_out, active, self.turns, self.events, self.one_way
+            scene, repr(self), both, restitution, self.push_out, active, self.turns, self.dev.log, self.one_way
         )
-        self.dev.log = self.dev.surface.log
         self._stands = self.active
 
     def upload(self) -> None:

@@ -4,11 +4,11 @@ from typing import TYPE_CHECKING, Any
 
 from ..device import at, inline, ti
 from ..features.material import limited, refuse_turning
-from .wall_log import WallLog
 
 if TYPE_CHECKING:
     from ..features.feature import Scene
     from ..features.material import Bounce, Coefficients
+    from .wall_log import WallLog
 
 # How a collider confines: as it comes; only what is further out than rounding; of that, without friction and bounces.
 FIRST, AGAIN, GENTLY = range(3)
@@ -20,16 +20,16 @@ class Surface:
 
     friction: coefficients, or None for a surface without. restitution: 0 to 1, or None. push_out: [m/s]. active: whether
     it is there, or None for one without a switch. turns: whether it resists rolling, or bounces across the normal. poses: of a
-    wall that may turn, its Pose; else none. events: whether there is a `log` of what touches. one_way: unit vector along which it
-    lets particles pass, or None.
+    wall that may turn, its Pose; else none. log: of what touches, or None. one_way: unit vector along which it lets particles
+    pass, or None.
     """
 
     def __init__(
         self, scene: "Scene", name: str, friction: "Coefficients | None", restitution: "Bounce | None", push_out: float, active:
-        bool | None, turns: bool, events: bool, one_way: Any,
+        bool | None, turns: bool, log: "WallLog | None", one_way: Any,
     ):  # fmt: skip
-        self.has_log = events
-        self.log: Any = WallLog(scene, name) if events else None
+        self.log: Any = log
+        self.has_log = log is not None
         self._memory, self.state, self.push_out, self.real = scene.memory, scene.state, push_out, scene.real
         self.has_friction, self.has_restitution = friction is not None, restitution is not None
         self.poses: list[Any] = []

@@ -1,12 +1,14 @@
 """Events of one wall: which particles began to touch it, went on touching it, or left it in a frame."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..contact.touches import BEFORE, NEVER, Touches, span
 from ..device import ti
-from ..features.feature import Scene
+
+if TYPE_CHECKING:
+    from ..features.feature import Scene
 
 
 class WallLog:
@@ -19,7 +21,7 @@ class WallLog:
 
     per_particle = True
 
-    def __init__(self, scene: Scene, name: str):
+    def __init__(self, scene: "Scene", name: str):
         n, dim, add = scene.count, scene.particles.dim, scene.memory.field
         self._scene, self.state, self.radius = scene, scene.state, scene.radius
         self.touching = add(f"events.{name}.touching", n, kind=ti.i32, state=True)

@@ -236,6 +236,8 @@ class Batch(Feature):
     breaks = False  # has constraints that a load can break
     clusters = False  # keeps shapes, which members_of() and shape_of() give
     drives = False  # puts its particles in place instead of relaxing them
+    solvable_together = False  # its constraints may be solved together with others, by the System of a solver; see Scalar
+    driven = False  # rest values move by themselves: what drive_of() gives, see Drive
     transcends = False  # takes angles, cube roots or exponentials, which SPIR-V has for f32 only
     members: Any  # FixedSize or VariableSize: the particles of each constraint
     bulk = 1.0
@@ -289,6 +291,10 @@ class Batch(Feature):
     def owner(self) -> np.ndarray:
         """The constraint of each corner, (total,)."""
         return self.members.owner
+
+    def acts_as_force(self, scene: Scene) -> np.ndarray:
+        """Which constraints act as forces, (m,): those of Scalar may, in substeps of an order above 2."""
+        return np.zeros(self.count, dtype=bool)
 
     def members_of(self, c: int) -> np.ndarray:
         """The particles of constraint c."""

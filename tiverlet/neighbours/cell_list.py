@@ -20,7 +20,7 @@ from ..device import runtime, ti
 from ..device.number import OnDevice
 from ..device.prefix_sum import Sums
 from ..tools import distinct
-from .periodic import FLOW, GRADIENT
+from .images import FLOW, GRADIENT
 
 if TYPE_CHECKING:
     from ..device.thread_team import Team

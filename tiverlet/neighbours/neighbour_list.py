@@ -2,16 +2,19 @@
 
 import contextlib
 import warnings
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..device import ti
-from ..device.memory import Memory
 from ..device.number import Number, OnDevice
 from ..device.thread_team import Team
 
+if TYPE_CHECKING:
+    from ..device.memory import Memory
+
 CROWDED = 300  # near pairs per particle beyond which the user is told
+STALE = 0.49  # of the skin: a list is good until something has moved so far
 WORD, FULL = 32, 2**32 - 1  # entries that one word of bits is for
 
 
@@ -55,7 +58,7 @@ class NeighbourList:
     host_only = ("room",)
     told_apart = True  # as a Feature
 
-    def __init__(self, memory: Memory, count: Number, rooms: Number, pair_data: list[PairData], team: Team, short: int):
+    def __init__(self, memory: "Memory", count: Number, rooms: Number, pair_data: list[PairData], team: Team, short: int):
         self.team, self.n, self.memory, self.real, self.short = team, count, memory, memory.real, short
         self.capacity, self.pitch = memory.number(0), memory.number(0)
         self.pair_data = pair_data

@@ -7,7 +7,7 @@ hash, or on the skin.
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,15 +16,16 @@ from ..device.number import OnDevice
 from ..device.prefix_sum import MOST, Sums
 from ..device.sorting import exchange, sort, sorting_network
 from ..device.thread_team import Team
-from ..features.feature import Scene
 from ..features.regrouping import Regrouping
 from ..tools import distinct
 from .cell_list import CellList, add_to
-from .neighbour_list import NeighbourList, PairData
-from .periodic import FLOW, GRADIENT
+from .images import FLOW, GRADIENT
+from .neighbour_list import STALE, NeighbourList, PairData
+
+if TYPE_CHECKING:
+    from ..features.feature import Scene
 
 FARTHEST = 1 << 22  # cells from the origin: beyond it, f32 cannot tell a cell from the next
-STALE = 0.49  # of the skin: a list is good until something has moved so far
 APPEND, COUNT, FILL = range(3)  # what a scan of the cells around a particle does with the neighbours that it finds
 
 
@@ -42,7 +43,7 @@ class NeighbourSearch(NeighbourList):
     farthest: Any = OnDevice()  # how far apart pairs are listed [m], at most
 
     def __init__(
-        self, scene: Scene, skin: float, linked: np.ndarray, table: Any, pair_data: list[PairData], team: Team, scratch: Any,
+        self, scene: "Scene", skin: float, linked: np.ndarray, table: Any, pair_data: list[PairData], team: Team, scratch: Any,
         reach: np.ndarray | None = None, radius: np.ndarray | None = None,
     ):  # fmt: skip
         n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field

@@ -3,104 +3,21 @@
 import contextlib
 from collections.abc import Sequence
 from itertools import product
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import checks
-from ..device import ti
 from ..features.feature import Feature, Knob, Scene
 from ..features.regrouping import Regrouping
-from ..particles import Particles
+from .images import FLOW, GRADIENT, Images
 
-FLOW, GRADIENT = 0, 1  # the axes of a shear: images along y move along x
+if TYPE_CHECKING:
+    from ..particles import Particles
+
 AXES = "xyz"
 SPARE = 2.2  # contact distances, that a sheared box is long at least
-
-
-class Images:
-    """The nearest images of particles, on the device of one world.
-
-    axes: those that are periodic. sheared: whether images along GRADIENT slide along FLOW. in_state: fields of the state.
-    """
-
-    def __init__(self, scene: Scene, box: "Periodic"):
-        add, dim = scene.memory.field, scene.particles.dim
-        self.axes, self.sheared, self.real = box.axes, box.sheared, scene.real
-        kind = ti.f64 if scene.state.compensated else scene.real  # whose differences are
-        self.length = add("Periodic.length", None, width=dim, kind=kind, values=box.away(np.eye(dim, dtype=int)).diagonal())
-        self.per_length = add("Periodic.per_length", None, width=dim, kind=kind, values=1 / box.lengths)
-        self.near = add("Periodic.near", None, kind=kind, values=(1 - 2.0**-20) * box.shortest**2 / 4)
-        self.middle = add("Periodic.middle", None, width=dim, values=box.middle)
-        self.kind = kind
-        self.in_state: dict[str, Any] = {}
-        if self.sheared:
-            self.rate = add("Periodic.rate", None, kind=ti.f64, values=box.shear)
-            self.strain = add("Periodic.strain", None, kind=ti.f64, state=True)
-            # How far the next image along GRADIENT is along FLOW, and how far it slid in the last substep [m].
-            self.shift = add("Periodic.shift", None, width=2, kind=kind, state=True)
-            self.in_state = {"strain": self.strain, "shift": self.shift}
-
-    @ti.func
-    def turns(self, r, axis: ti.template()):  # type: ignore[valid-type]
-        """How many boxes along an axis are nearest to r."""
-        return ti.floor(r[axis] * self.per_length[None][axis] + ti.cast(0.5, self.real))
-
-    @ti.func
-    def nearest(self, r):
-        """The least of the differences x_i - x_j + whole boxes; of most pairs it is r itself, which is told at once."""
-        if r.dot(r) > self.near[None]:
-            r = self.reduced(r)
-        return r
-
-    @ti.func
-    def reduced(self, r):
-        """The same, in steps."""
-        if ti.static(self.sheared):
-            k = self.turns(r, GRADIENT)
-            r[GRADIENT] -= k * self.length[None][GRADIENT]
-            r[FLOW] -= k * self.shift[None][0]
-        for axis in ti.static(self.axes):
-            if ti.static(not (self.sheared and axis == GRADIENT)):
-                r[axis] -= self.turns(r, axis) * self.length[None][axis]
-        return r
-
-    @ti.func
-    def inside(self, x):
-        """The image of a place that is in the box."""
-        middle = self.middle[None]
-        return middle + self.nearest(x - middle)
-
-    @ti.func
-    def slid(self, moved, r):
-        """How particles r apart, of which one moved by so much more than the other in a substep, moved as images."""
-        moved[FLOW] -= self.turns(r, GRADIENT) * self.shift[None][1]
-        return moved
-
-    @ti.func
-    def cell(self, x, axis: ti.template(), turn, count):  # type: ignore[valid-type]
-        """Of `count` cells along an axis, that of a place: where it is in the box, seen from `turn` boxes further along GRADIENT.
-
-        In f64: where a particle that is many boxes away is in the box is told as well as its position.
-        """
-        at = ti.cast(x[axis], ti.f64)
-        if ti.static(self.sheared and axis == FLOW):
-            boxes = ti.floor(ti.cast(x[GRADIENT], ti.f64) / self.length[None][GRADIENT])
-            at -= (boxes + turn) * self.shift[None][0]
-        part = at / self.length[None][axis]
-        part -= ti.floor(part)
-        return ti.min(ti.cast(part * count, ti.i32), count - 1)
-
-    @ti.func
-    def slide(self, h):
-        """The images go on, for a substep."""
-        step = self.rate[None] * ti.cast(h, ti.f64)
-        self.strain[None] = self.strain[None] + step
-        height, length = ti.cast(self.length[None][GRADIENT], ti.f64), ti.cast(self.length[None][FLOW], ti.f64)
-        offset = self.strain[None] * height
-        offset -= ti.floor(offset / length + 0.5) * length
-        self.shift[None] = ti.cast(ti.Vector([offset, step * height]), self.kind)
 
 
 class Periodic(Feature):
@@ -151,7 +68,7 @@ class Periodic(Feature):
                 )
         self.shear = shear
 
-    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+    def prepare(self, particles: "Particles", inv_mass: np.ndarray) -> None:
         """Check the dimension, and that a shear has both of its axes."""
         if len(self.low) != particles.dim:
             raise ValueError(f"Periodic: low has {len(self.low)} coordinates, but the particles are in {particles.dim}D.")

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 from ..device import ti
 from ..device.number import OnDevice
 from ..device.thread_team import block, blocks
-from .neighbour_search import STALE
+from .neighbour_list import STALE
 
 if TYPE_CHECKING:
     from ..device.thread_team import Team

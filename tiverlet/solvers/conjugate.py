@@ -1,18 +1,20 @@
 """Preconditioned conjugate gradients on the constraints of a scene: cloth and nets that converge."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from .. import checks
-from ..constraints.core.scalar import TENSEST, Scalar
 from ..device import ti
 from ..device.number import OnDevice
 from ..features.feature import Batch, Scene
-from .slots import Slots
+from .slots import TENSEST, Slots
 from .solver import Solver
 from .spectrum import largest
-from .system import SLACK, System
+from .system import SLACK, System, solvable
+
+if TYPE_CHECKING:
+    from ..constraints.core.scalar import Scalar
 
 POWER = 30  # rounds of power iteration for lambda_max
 GROWTH, HIGHEST = 1.1, 1.0  # of the floor, by which it grows, and up to where, a link gives way as much as by itself
@@ -49,7 +51,7 @@ class ConjugateGradient(Solver):
 
     def system(self, scene: Scene, batches: list[Batch], slots: Slots) -> "CGSystem | None":
         """The system of a scene on the device; None where there is none."""
-        scalars = [b for b in batches if isinstance(b, Scalar) and b.solvable_together and b.side == 0]
+        scalars = [b for b in solvable(batches) if b.side == 0]
         joined = any((~b.relaxed_alone(scene) & ~b.idle(scene.inv_mass)).any() for b in scalars)
         return CGSystem(scene, batches, slots, scalars, self.steps) if joined else None
 
@@ -73,7 +75,7 @@ class CGSystem(System):
     n: Any = OnDevice()
     least: Any = OnDevice()
 
-    def __init__(self, scene: Scene, batches: list[Batch], slots: Slots, scalars: list[Scalar], steps: int):
+    def __init__(self, scene: Scene, batches: list[Batch], slots: Slots, scalars: "list[Scalar]", steps: int):
         places = [slots.places(b) for b in scalars]
         rows = np.flatnonzero(
             np.concatenate([(p >= 0).any(axis=1) & ~b.relaxed_alone(scene) for b, p in zip(scalars, places, strict=True)])

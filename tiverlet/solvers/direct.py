@@ -1,18 +1,20 @@
 """Chains, trees and loops by elimination: exact for any length, any mass ratio and any compliance."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from .. import checks
-from ..constraints.core.scalar import TENSEST, Scalar
 from ..device import ti
 from ..device.number import OnDevice
 from ..features.feature import Batch, Scene
 from .elimination import Plan, plan
-from .slots import Slots
+from .slots import TENSEST, Slots
 from .solver import WIDTH, Solver
-from .system import SLACK, System
+from .system import SLACK, System, solvable
+
+if TYPE_CHECKING:
+    from ..constraints.core.scalar import Scalar
 
 REDUNDANT = 1e-12  # of its diagonal: a pivot this small belongs to a constraint that others imply
 CONTRADICTION = 1e-6  # of its violation: what others leave of such a constraint without contradicting it
@@ -63,7 +65,7 @@ class Direct(Solver):
 
     def system(self, scene: Scene, batches: list[Batch], slots: Slots) -> "Elimination | None":
         """The systems of a scene on the device; None where there are none."""
-        scalars = [b for b in batches if isinstance(b, Scalar) and b.solvable_together]
+        scalars = solvable(batches)
         if not scalars:
             return None
         slot = np.concatenate([slots.places(b).ravel() for b in scalars])
@@ -96,7 +98,7 @@ class Elimination(System):
     entries: Any = OnDevice()
 
     def __init__(
-        self, scene: Scene, batches: list[Batch], slots: Slots, scalars: list[Scalar], found: Plan, slot: np.ndarray,
+        self, scene: Scene, batches: list[Batch], slots: Slots, scalars: "list[Scalar]", found: Plan, slot: np.ndarray,
         item: np.ndarray,
     ):  # fmt: skip
         super().__init__(scene, batches, slots, scalars, found.rows)

@@ -3,10 +3,10 @@
 import numpy as np
 
 from .. import checks
-from ..constraints.core.scalar import Scalar
 from ..features.feature import Batch, Scene
 from .solver import Solver
 from .spectrum import largest
+from .system import solvable
 
 
 class Jacobi(Solver):
@@ -31,7 +31,7 @@ class Jacobi(Solver):
         """The factor in this scene; ValueError where stepping would be unstable."""
         if self.relaxation != "auto" and self.relaxation < 4 / 3:
             return float(self.relaxation)
-        scalars = [b for b in batches if isinstance(b, Scalar) and b.solvable_together and not b.soft]
+        scalars = [b for b in solvable(batches) if not b.soft]
         if len(scalars) < len(batches):
             if self.relaxation == "auto":
                 return 1.0

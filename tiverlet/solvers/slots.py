@@ -4,11 +4,14 @@ from typing import Any
 
 import numpy as np
 
-from ..constraints.core.scalar import TENSEST, Scalar
 from ..device import ti
 from ..device.memory import Memory
 from ..features.feature import BENT, FAR, Batch, Scene
 from ..features.regrouping import Regrouping
+from .system import solvable
+
+# Where constraints converge within a substep, SHAKE is an explicit method for what is across them, with a limit:
+TENSEST = 4.0  # (omega h)^2 of a vibration across a tension, beyond which Verlet diverges
 
 
 class Slots:
@@ -50,7 +53,7 @@ class Slots:
         self.system: Any = solver.system(scene, batches, self)
         self.has_system = bool(self.system)
         # Whether a substep fulfils constraints to rounding, which is then the error that is left.
-        scalars = [b for b in batches if isinstance(b, Scalar) and b.solvable_together]
+        scalars = solvable(batches)
         self.exact = bool(scalars) and (not self.system.steps if self.system else bool(degree.max(initial=0) <= 1))
         blocks = self.system.blocks if self.system else degree
         self.split = memory.field("slots.split_mass", scene.count, values=blocks * inv_mass)

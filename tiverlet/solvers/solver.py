@@ -4,11 +4,11 @@ from typing import Any
 
 import numpy as np
 
-from ..constraints.core.scalar import Scalar
 from ..device import ti
 from ..features.arguments import RecordsArguments
 from ..features.feature import Batch, Scene
 from .elimination import plan_of
+from .system import solvable
 
 WIDTH = 16  # of the systems that Direct takes
 
@@ -58,7 +58,7 @@ class Solver(RecordsArguments):
 
     def remedy(self, batches: list[Batch], slots, inv_mass: np.ndarray) -> str:
         """The setting that meets constraints better, as the user writes it; "" where only more substeps do."""
-        some = [b for b in batches if isinstance(b, Scalar) and b.solvable_together and not (b.side or b.driven)]
+        some = [b for b in solvable(batches) if not (b.side or b.driven)]
         alone = [b for b in some if (slots.rows(b) < 0).any()]
         if not alone:
             return ""

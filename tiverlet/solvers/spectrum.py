@@ -1,15 +1,19 @@
 """The largest eigenvalue of one pass over the constraints of a scene, which bounds the relaxation."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
-from ..constraints.core.scalar import Scalar
-from ..features.feature import Scene
 from ..tools import golden
+
+if TYPE_CHECKING:
+    from ..constraints.core.scalar import Scalar
+    from ..features.feature import Scene
 
 ROUNDS = 300  # of power iteration; it converges from below, and the margin of 1.2 to 4/3 covers what is missing
 
 
-def largest(scene: Scene, scalars: list[Scalar], split: np.ndarray, rounds: int = ROUNDS) -> float:
+def largest(scene: "Scene", scalars: "list[Scalar]", split: np.ndarray, rounds: int = ROUNDS) -> float:
     """lambda_max of D^-1 A for the scene as it starts, A = G w G^T and D its diagonal in mass-split weights."""
     w, n, dim = scene.inv_mass, len(scene.inv_mass), scene.particles.dim
     slopes = [b.gradients(b.start.position) for b in scalars]

@@ -4,15 +4,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..constraints.core.scalar import Scalar
 from ..device import ti
 from ..device.number import OnDevice
 
 if TYPE_CHECKING:
+    from ..constraints.core.scalar import Scalar
     from ..features.feature import Batch, Scene
     from .slots import Slots
 
 SLACK = 0.1  # of |step violation|: how much energy steps may bring in by their own curvature
+
+
+def solvable(batches: "list[Batch]") -> list[Any]:
+    """Those of which a System may solve the constraints: each is a Scalar."""
+    return [b for b in batches if b.solvable_together]
 
 
 class System:
@@ -30,7 +35,7 @@ class System:
     team: Any  # the threads that share the loops of start(), iterate() and end(), given when the kernels are made
     stride: int  # iterations of such a loop for each block of rows
 
-    def __init__(self, scene: "Scene", batches: "list[Batch]", slots: "Slots", scalars: list[Scalar], rows: np.ndarray):
+    def __init__(self, scene: "Scene", batches: "list[Batch]", slots: "Slots", scalars: "list[Scalar]", rows: np.ndarray):
         self.real, self.dim, self.move, self.tension = scene.real, scene.state.dim, slots.move, slots.tension
         self.memory, self.inv_mass, self.rows = scene.memory, scene.inv_mass, scene.memory.number(len(rows))
         counts = [b.count for b in scalars]
@@ -67,7 +72,7 @@ class System:
         inside, alone = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64)
         for b in batches:
             row = self.row(b)
-            if isinstance(b, Scalar) and b.acts_as_force(scene).any():
+            if b.acts_as_force(scene).any():
                 row = np.where(b.acts_as_force(scene), 0, row)  # forces take no share of the mass
             if (row >= 0).any():
                 inside[b.indices[row >= 0]] = True

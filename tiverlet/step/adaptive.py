@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .. import checks
-from ..constraints.core.scalar import TENSEST
+from ..solvers.slots import TENSEST
 from . import checkpoint
 from .step_report import StepReport
 

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-from ..constraints.core.scalar import Scalar
 from ..device import ti
 from ..device.thread_team import Team
 from ..features.feature import Batch, Scene
@@ -18,7 +17,7 @@ class ConstraintPass:
         for system in self.systems:
             system.team, system.stride = team, stride
         self.semi_iterations = [scene.slots.semi_iteration] if scene.slots and scene.slots.semi_iteration else []
-        self.in_systems = [b for b in batches if isinstance(b, Scalar) and b.dev.in_system]
+        self.in_systems = [b for b in batches if b.solvable_together and b.dev.in_system]
         self.ragged = [b for b in batches if b.blocks]
         self.springs = any(b.soft for b in batches)
 

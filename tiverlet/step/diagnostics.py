@@ -5,13 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from ..constraints.core.scalar import TENSEST
 from ..device import runtime, ti
 from ..device.number import OnDevice
 from ..device.thread_team import LEAST
 from ..features.feature import FAR
 from ..neighbours.neighbour_search import FARTHEST
 from ..particles import LARGEST
+from ..solvers.slots import TENSEST
 from ..solvers.solver import Solver
 from .step import END, FIGURES, ORIGIN, SHEET, H, Step, integer
 from .step_report import COMPRESSED, UNCONVERGED, StepReport

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from ..constraints.core.scalar import Scalar
 from ..contact.initial_overlap import overlapping
 from ..contact.velocity_projection import EVERY
 from ..device.interrupts import whole
@@ -44,7 +43,7 @@ class Runner:
         # Asked in every frame, and Taichi looks at each attribute of what has kernels.
         step = self.step
         self.n, self.launched, self.team, self.integrator = step.n, step.launched, step.team, step.integrator
-        self.driven = [b for b in self.batches if isinstance(b, Scalar) and b.driven]
+        self.driven = [b for b in self.batches if b.driven]
         self.semi_iterations, self.drags = step.constraints.semi_iterations, step.integrator.forces.drags
         self.probe = high_order.Probe(step) if self.scene.order > 2 else None
         self.passes_at_once = self._passes_at_once()

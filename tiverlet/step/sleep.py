@@ -357,7 +357,7 @@ def linked(n: int, drivers: list[Batch], batches: list[Batch]) -> tuple[np.ndarr
     for b in drivers:
         driven[b.indices] = True
     for b in batches:
-        if b.arity == 0 or b.clusters or b.blocks or getattr(b, "driven", False):
+        if b.arity == 0 or b.clusters or b.blocks or b.driven:
             kept[b.indices] = True
         else:
             kept[b.indices[driven[b.indices].any(axis=1)]] = True

@@ -20,10 +20,7 @@ from .strength import Strength, strength_of
 if TYPE_CHECKING:
     from ...particles import Particles
 
-# Where constraints converge within a substep, SHAKE is an explicit method for what is across them, with its limits:
-TENSEST = 4.0  # (omega h)^2 of a vibration across a tension, beyond which Verlet diverges
-
-# Where f is curved, Newton's step is an explicit method for large violations, with limits too:
+# Where f is curved, Newton's step is an explicit method for large violations, with limits:
 APPROACH = 1 / 3  # of its size (1 rad for angles), in a frame: how fast a constraint gives up a violation that no load explains
 BORNE = 0.25  # of its size: an angle that is off by more than this is off by more than a load explains
 TRUST = 0.5  # of its reach, by which a pass moves a corner: beyond, f is not what its gradient says
@@ -79,7 +76,6 @@ class Scalar(Batch):
     rest_name = "rest"
     uploads_all = True
     _scene_sized = False  # whether any of its lengths is that of the whole scene, in want of one of its own
-    driven = False  # whether rest values move by themselves: what drive_of() gives, see Drive
 
     def setup(self, indices, rest, compliance, damping, break_at=None) -> None:
         """Keep the arguments of __init__; what depends on the particles is checked in prepare()."""
