@@ -1,7 +1,7 @@
 """What a frame came to: one pass over the state when it ends."""
 
 import copy
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,8 +13,11 @@ from ..neighbours.neighbour_search import FARTHEST
 from ..particles import LARGEST
 from ..solvers.slots import TENSEST
 from ..solvers.solver import Solver
-from .step import END, FIGURES, ORIGIN, SHEET, H, Step, integer
+from .span import END, FIGURES, ORIGIN, SHEET, H, integer
 from .step_report import COMPRESSED, UNCONVERGED, StepReport
+
+if TYPE_CHECKING:
+    from .step import Step
 
 BLOCKS = 64  # partial sums: their number is fixed, so the total has the same bits on any number of threads; squared on a GPU
 TURNS = (0, 26, 41)  # degrees, for nothing, BENT and FAR
@@ -35,7 +38,7 @@ class Diagnostics:
     told_apart = True  # as a Feature
     n: Any = OnDevice()  # particles
 
-    def __init__(self, step: Step, solver: Solver):
+    def __init__(self, step: "Step", solver: Solver):
         self.step: Any = step
         self.team = step.team
         self.n, self.dim, self.state = step.scene.count, step.dim, step.state
@@ -64,7 +67,7 @@ class Diagnostics:
     def __repr__(self) -> str:
         return "report"
 
-    def of(self, step: Step) -> "Diagnostics":
+    def of(self, step: "Step") -> "Diagnostics":
         """The same fields, for another Step."""
         new = copy.copy(self)
         new.step, new.details = step, {}
@@ -290,7 +293,7 @@ class Residuals:
 class Reporter:
     """Makes a StepReport of the figures on the sheet."""
 
-    def __init__(self, step: Step, solver: Solver, sheet: np.ndarray):
+    def __init__(self, step: "Step", solver: Solver, sheet: np.ndarray):
         self.solver, self.scene, self.batches, self._step = solver, step.scene, step.batches, step
         self.remedy: str | None = None  # the setting that meets constraints better, known once it is asked for
         self.fastest = step.integrator.fastest

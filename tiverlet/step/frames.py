@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from ..device.memory import Memory
 from ..device.patches.compiler import CachedLaunch
 from ..device.thread_team import LEAST
 from .diagnostics import STEPPED
-from .step import (
+from .span import (
     BEGIN,
     END,
     FIGURES,
@@ -28,10 +29,12 @@ from .step import (
     TICK,
     UNTIL,
     H,
-    Step,
     integer,
 )  # fmt: skip
-from .step import SUBSTEPS as STAGES
+from .span import SUBSTEPS as STAGES
+
+if TYPE_CHECKING:
+    from .step import Step
 
 # What a launch is given: how many copies, how many frames each, the substeps of one; of how many frames one is kept on the track,
 # how many were made before, how many the track has room for; whether figures are kept; how many copies, one beside the other, a
@@ -66,12 +69,12 @@ def resume(row: np.ndarray, resumed: int, begin: int, half: int) -> None:
 class Frames:
     """The kernel that takes copies from frame to frame, each on one thread, and what it is told and tells.
 
-    sheet: of each copy, see step.py. dates: see DATES.
+    sheet: of each copy, see span.py. dates: see DATES.
     """
 
     kernels_read = ("step", "memory", "copies", "sheet", "dates", "next", "lanes", "spread")
 
-    def __init__(self, step: Step, memory: Memory):
+    def __init__(self, step: "Step", memory: Memory):
         assert memory.copies
         self.step, self.memory, self.copies = step, memory, memory.copies
         self.sheet = memory.field("frames.sheet", SHEET, kind=ti.f64)
@@ -81,7 +84,7 @@ class Frames:
         on_cpu = runtime.architecture() == "cpu"
         self.lanes, self.spread = (runtime.cores(), LEAST) if on_cpu else (self.copies.count, 1)
 
-    def of(self, step: Step) -> "Frames":
+    def of(self, step: "Step") -> "Frames":
         """The same fields, for another Step."""
         new = copy.copy(self)
         new.step = step

@@ -10,7 +10,7 @@ where rigid constraints are fulfilled at its end along their directions at its b
 is symmetric and symplectic, so their composition is both. A spring counts as a force, -C grad C / alpha, in a.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,7 +23,11 @@ from ..features.feature import Acceleration, Batch, Feature, Scene
 from ..solvers.solver import Solver
 from .clock import Clock
 from .integrator import Forces
-from .step import Moment, Span, Step, substep
+from .span import Moment, Span
+from .step import substep
+
+if TYPE_CHECKING:
+    from .step import Step
 
 # The first half of the stages; the one in the middle is what is missing to 1.
 _HALVES = {
@@ -165,7 +169,7 @@ class Composition:
 class Probe:
     """The kernel that looks where a stage would lead."""
 
-    def __init__(self, step: Step):
+    def __init__(self, step: "Step"):
         self.step = step
 
     @ti.kernel

@@ -18,7 +18,8 @@ from .frames import Frames
 from .integrator import FREE, decay
 from .overlap_release import release
 from .projection import project
-from .step import ACTIVE_THREADS, BEFORE, END, GIVE, HALT, ORIGIN, H, Moment, Span, frame
+from .span import ACTIVE_THREADS, BEFORE, END, GIVE, HALT, ORIGIN, H, Moment, Span
+from .step import frame
 from .step_report import StepReport
 
 LONG = 10_000_000  # particles and constraints, times passes, in a launch: it takes about a second

@@ -11,7 +11,7 @@ from ..device import at, inline, ti
 from ..device.number import OnDevice
 from ..device.thread_team import BLOCK
 from ..features.feature import Acceleration, Batch, Feature, Knob, Scene
-from .step import Span
+from .span import Span
 
 if TYPE_CHECKING:
     from .clock import Clock

@@ -17,7 +17,7 @@ from ...device.patches.compiler import CachedLaunch
 from ...features.feature import Feature
 from ...forces import Drag, Gravity
 from ...particles import Particles
-from ...step.step import integer
+from ...step.span import integer
 
 KINDS = (Gravity, Drag, Distance)  # what they know
 STIFFNESS = 0.5  # of the article, per pass
