@@ -1,7 +1,6 @@
 """Writing a simulation to a file that is picture, checkpoint and proof."""
 
 import contextlib
-import errno
 import os
 import warnings
 import weakref
@@ -17,19 +16,17 @@ from ..device import interrupts
 from ..step import checkpoint
 from ..step.explain import explain
 from ..world import World
-from ..worlds import Worlds
-from .journal import JOURNAL, Journal, brief, said
+from ..worlds.worlds import Worlds
+from .journal import JOURNAL, brief, said
+from .journal_writer import Journal
 from .overlays import Overlays, checked_color, checked_quantities
 from .picture import Picture, layout
 from .scene import environment
-from .sink import Sink
+from .sink import BACKLOG, LOOK, SMALL, Sink, file_error
 
 SEND = 1.0  # [s] after which the points of curves are sent on
-LOOK = 0.2  # [s] after which the file is looked for
-BACKLOG = 32 << 20  # bytes that may wait to be written
 SHARE = 20  # an exact state is written when the pictures since the last one weigh so many times as much, uncompressed
 SPARSE = 300  # frames after which one is written in any case
-SMALL = 2 << 20  # bytes of a file that is written anew when it is closed: rows take less when they stand together
 RESERVE = 40_000  # bytes of a budget for the layout and the summary
 
 
@@ -319,10 +316,3 @@ class Recorder:
         self._closing()
         if self._sink.error:
             self._fail()
-
-
-def file_error(error: Exception, what: str, rest: str = "") -> OSError:
-    """The error of a file, with what it means."""
-    if isinstance(error, OSError):
-        return type(error)(error.errno, f"{what} ({error.strerror}){rest}")
-    return OSError(errno.EIO, f"{what} ({error!r}){rest}")

@@ -11,11 +11,10 @@ import numpy as np
 from .. import checks
 from ..device import interrupts
 from ..world import World
-from ..worlds import Worlds
+from ..worlds.worlds import Worlds
 from . import scene
 from .overlays import Overlays
-from .recorder import BACKLOG, LOOK, SMALL, file_error
-from .sink import Sink
+from .sink import BACKLOG, LOOK, SMALL, Sink, file_error
 
 MOST = 64  # views in a recording
 FEW = 9  # by default

@@ -15,6 +15,9 @@ from .reader import SEAL
 
 WAIT = 10.0  # [s] that a flush may take
 PIECE = 1 << 20  # bytes that are read at a time
+LOOK = 0.2  # [s] after which the file is looked for
+BACKLOG = 32 << 20  # bytes that may wait to be written
+SMALL = 2 << 20  # bytes of a file that is written anew when it is closed: rows take less when they stand together
 TICK = 0.1  # [s] at which rerun sends what is older than that: it waits for two at most
 
 
@@ -247,3 +250,10 @@ def is_recording(path: str) -> bool:
     """Whether a file begins as recordings do; so does an empty one."""
     with open(path, "rb") as file:
         return file.read(4) in (b"RRF2", b"")
+
+
+def file_error(error: Exception, what: str, rest: str = "") -> OSError:
+    """The error of a file, with what it means."""
+    if isinstance(error, OSError):
+        return type(error)(error.errno, f"{what} ({error.strerror}){rest}")
+    return OSError(errno.EIO, f"{what} ({error!r}){rest}")

@@ -1,0 +1,121 @@
+"""Who watches a world and writes the journal of its recording."""
+
+import contextlib
+import copy
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..step import checkpoint
+from ..step.step_report import StepReport
+from . import scene
+from .journal import FORMAT, PARTED, Entry, checksum, said
+
+if TYPE_CHECKING:
+    from ..world import World
+
+Write = Callable[[str, np.ndarray, str], None]
+
+
+class Journal:
+    """Watches a world and writes entries."""
+
+    def __init__(self, world: "World", write: Write, told: dict[str, Any]):
+        self._told = told  # what is in the picture and follows from nothing else
+        self.world, self.frame, self.bytes = world, 0, 0
+        self.worst: StepReport | None = None  # of the whole recording
+        self.recent: StepReport | None = None  # since the last frame
+        self.stirred: set[int]  # features that were turned since then
+        self._write, self._serial, self._sum = write, 0, ""
+        self._steps: list[list] = []
+        self.scenes = self.size = 0  # how many there were, and the size of the last state [bytes]
+        self._last: list | None = None
+        self.regrouped()
+        world._watchers.append(self)
+
+    def regrouped(self) -> None:
+        """Write the scene and its state: at the begin, and when the user has added or removed something."""
+        data, arrays = scene.describe(self.world)
+        self._known = [copy.deepcopy(scene.knobs(f)) for f in self.world.features]
+        self.put("scene", {"format": FORMAT, **data, **self._told}, arrays)
+        self.size = self.state()
+        self.scenes += 1
+        self.stirred = set(range(len(self.world.features)))  # all are to be drawn
+
+    def put(self, kind: str, data: dict[str, Any], arrays: dict[str, np.ndarray] | None = None) -> int:
+        """Write an entry; returns its size [bytes]."""
+        now = self._now()
+        if now != self._last:
+            data["now"], self._last = now, now
+        text, blob = Entry(kind, self.frame, data, arrays or {}, self._steps).pack(self._serial)
+        self._sum = checksum(self._sum, text, blob)
+        self._write(text, np.frombuffer(blob, dtype=np.uint8), self._sum)
+        self._serial, self._steps = self._serial + 1, []
+        self.bytes += len(text) + len(blob)
+        return len(text) + len(blob)
+
+    def rounded(self) -> StepReport | None:
+        """The worst report since the last frame, with as many digits of its seconds as mean something."""
+        if self.recent:
+            self.recent = replace(self.recent, seconds=float(f"{self.recent.seconds:.3g}"))
+        return self.recent
+
+    def frame_drawn(self, data: dict[str, Any]) -> None:
+        """A frame was drawn."""
+        took = {"seconds": self.recent.seconds} if self.recent else {}
+        self.put("frame", {**data, **took, **said(self.recent)})
+        self.recent = None
+        self.stirred.clear()
+
+    def _now(self) -> list:
+        """What the user has set for the next step, and what the controller remembers."""
+        settings = self.world.settings
+        return [settings["substeps"], settings["iterations"], list(self.world._controller.memory)]
+
+    def state(self, kind: str = "state") -> int:
+        """Write the exact state; returns the size of the entry [bytes]."""
+        kept, world = checkpoint.keep(self.world), self.world
+        more = {"flags": checkpoint.flags(world), "reach": world._runner.scene.h2_effective}
+        parted = kept.clock["_parted"]
+        arrays = kept.values if parted is None else kept.values | {PARTED: np.asarray(parted)}
+        return self.put(kind, {"clock": kept.clock | {"_parted": None}, **more}, arrays)
+
+    def before(self) -> None:
+        """A step begins: write down what was turned since the last one."""
+        arrays: dict[str, np.ndarray] = {}
+        turned = {}
+        for k, feature in enumerate(self.world.features):
+            if feature.changed:
+                now, known = scene.knobs(feature), self._known[k]
+                new = {name: v for name, v in now.items() if name not in known or not np.array_equal(v, known[name])}
+                turned[k] = {name: scene.encode(v, f"{k}.{name}", arrays, scene.Needs()) for name, v in new.items()}
+                known.update(copy.deepcopy(new))
+        if turned:
+            self.stirred.update(turned)
+            self.put("turned", {"features": turned}, arrays)
+
+    def after(self, dt: float, report: StepReport) -> None:
+        """A step was made."""
+        step = [dt, report.substeps, report.iterations]
+        if self._steps and self._steps[-1][:3] == step:
+            self._steps[-1][3] += 1
+        else:
+            self._steps.append([*step, 1])
+        self.worst = report if self.worst is None else self.worst.worse(report)
+        self.recent = report if self.recent is None else self.recent.worse(report)
+
+    def broken_off(self) -> None:
+        """A step ended with an exception."""
+        with contextlib.suppress(RuntimeError):  # a world whose fields are gone has no state
+            self.state("taken")
+
+    def assigned(self, name: str, value: np.ndarray) -> None:
+        """The user assigned positions or velocities."""
+        self.put("assigned", {"name": name}, {"value": value})
+
+    def close(self) -> None:
+        """Look away."""
+        if self in self.world._watchers:
+            self.world._watchers.remove(self)
