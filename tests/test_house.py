@@ -1,9 +1,10 @@
-"""The layout: how much lies at the root of the package, how deep classes inherit, and that imports go one way."""
+"""The layout: how much lies at the root of the package, how deep classes inherit, and that imports go one way, not deep."""
 
 import ast
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1] / "tiverlet"
+DEPTH = 16  # modules, one importing the next
 CONTRACTS = ("Acceleration", "Batch", "Collider", "PairContact", "Solver")  # what a step asks of each kind of object
 
 
@@ -51,6 +52,21 @@ def test_imports_go_in_no_circle():
 
     for name in MODULES:
         visit(name, ())
+
+
+def test_imports_are_shallow():
+    # The longest chain of modules, each of which the one before imports, so that what is read to the ground stays little.
+    chains: dict[str, tuple[str, ...]] = {}
+
+    def chain(name: str) -> tuple[str, ...]:
+        """The longest one that begins there."""
+        if name not in chains:
+            chains[name] = (name, *max(map(chain, imported(name)), key=len, default=()))
+        return chains[name]
+
+    longest = max(map(chain, MODULES), key=len)
+    assert len(longest) <= DEPTH, " -> ".join(longest)
+    assert longest[-1] == "tiverlet.device.language" and len(chain("tiverlet.world")) > 5  # and imports are seen
 
 
 def test_classes_are_at_most_two_below_a_contract():

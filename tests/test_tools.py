@@ -6,7 +6,7 @@ import pytest
 import tiverlet as tv
 from tiverlet.colliders.angle import cos_sin
 from tiverlet.device import ti
-from tiverlet.tools import distinct, median
+from tiverlet.geometry.ordered import distinct, median
 
 
 def test_mix_is_exact_at_both_ends():

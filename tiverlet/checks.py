@@ -167,3 +167,10 @@ def _bounds(who, name, array, **bounds) -> None:
     if any(_missed(array[i], **bounds) for i in ends):
         i, words = next((i, words) for i, value in enumerate(array) if (words := _missed(value, **bounds)))
         raise ValueError(f"{who}: {name}[{i}] = {array[i]:g}, but it must be {words}.")
+
+
+def group_pair(who: str, name: str, pair: Any, what: str = "") -> tuple[int, int]:
+    """A pair of groups, checked. what: it is in `name`, for the error."""
+    if not (isinstance(pair, (tuple, list)) and len(pair) == 2 and all(isinstance(k, (int, np.integer)) for k in pair)):
+        raise TypeError(f"{who}: {name} has {what}{pair!r}, but a pair of groups such as (0, 1) is needed.")
+    return int(pair[0]), int(pair[1])

@@ -9,8 +9,9 @@ from ..features.feature import Knob, Scene
 from ..geometry.intervals import ball, entry, exit_of, rounding
 from ..geometry.nearest import away
 from ..particles import Particles
-from .collider import TOUCH, Collider
+from .collider import Collider
 from .round import rounded
+from .surface import TOUCH
 from .track import Track
 
 

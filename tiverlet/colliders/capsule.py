@@ -9,8 +9,9 @@ from ..features.feature import Knob, Scene
 from ..geometry.intervals import capsule, entry, rounding
 from ..geometry.nearest import away, on_segment
 from ..particles import Particles
-from .collider import TOUCH, Collider
+from .collider import Collider
 from .round import rounded
+from .surface import TOUCH
 from .track import Track
 
 MARCH = 32  # steps along a path; what only grazes is then within 1e-6 of its way

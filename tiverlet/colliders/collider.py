@@ -12,10 +12,6 @@ from ..features.regrouping import Regrouping
 from .surface import Surface
 from .wall_log import WallLog
 
-SWEEPS = 8  # rounds over the walls, for particles that several of them push
-ROUNDS = 32  # more of them, without friction and bounces
-TOUCH = 2.0**-20  # of the size of a wall: a start that is no deeper inside than this counts as on the surface
-
 
 class Collider(Feature):
     """Keeps each particle by itself on one side of a wall, with the last word in every iteration.
@@ -26,9 +22,9 @@ class Collider(Feature):
     (a bad start) is left at `push_out` [m/s], and gives no more velocity than that.
 
     Where one correction may lead into a wall again (several walls, a box in whose corners particles bounce), corrections take
-    turns until none changes anything: SWEEPS rounds as they come, then ROUNDS without friction and bounces, which are projections
-    of the displacement and give no energy. What is still not free then, in a wedge, stays where it was at the start of the
-    substep. Walls that move towards each other may leave no room at all: then the last of them in the list has its way.
+    turns until none changes anything: some rounds as they come, then more without friction and bounces, which are projections of
+    the displacement and give no energy. What is still not free then, in a wedge, stays where it was at the start of the substep.
+    Walls that move towards each other may leave no room at all: then the last of them in the list has its way.
 
     friction: Coulomb, a number or (static, dynamic). The tangential displacement relative to the wall is taken back, up to
     friction times the normal displacement that the wall gave, so neither coefficient depends on h. What sticks goes back to

@@ -8,10 +8,10 @@ import numpy as np
 from ..device import ti
 from ..features.feature import Scene
 from ..particles import Particles
-from .collider import TOUCH
 from .facet_grid import FacetGrid
 from .facet_solid import FacetSolid
 from .shape import Shape
+from .surface import TOUCH
 
 NEWTON = 16  # steps to the moment of a touch; only what grazes needs more than 3
 

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
 # How a collider confines: as it comes; only what is further out than rounding; of that, without friction and bounces.
 FIRST, AGAIN, GENTLY = range(3)
+TOUCH = 2.0**-20  # of the size of a wall: a start that is no deeper inside than this counts as on the surface
 ON = 1e-3  # of its distance from the middle of a wall: what is no deeper inside than this lies on it
 
 

@@ -12,10 +12,10 @@ from ..device.thread_team import Team
 from ..features.feature import Batch, Knob, Scene
 from ..features.material import refuse_turning
 from ..features.regrouping import Regrouping
+from ..geometry.ordered import median
 from ..neighbours.neighbour_list import WORD, PairData, lowest_bit
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
-from ..tools import median
 from .events import EventLog
 from .force_share import ForceShare
 from .friction import Friction

@@ -1,7 +1,11 @@
 """What of the pushes of contacts are forces: the part that counts for velocities at the end of a frame."""
 
+from typing import TYPE_CHECKING
+
 from ..device import ti
-from ..features.feature import Scene
+
+if TYPE_CHECKING:
+    from ..features.feature import Scene
 
 
 class ForceShare:
@@ -10,7 +14,7 @@ class ForceShare:
     in_state: its fields that are part of the state. lasting: whether they are.
     """
 
-    def __init__(self, scene: Scene, sums: bool, lasting: bool):
+    def __init__(self, scene: "Scene", sums: bool, lasting: bool):
         n, dim, add = scene.count, scene.particles.dim, scene.memory.field
         self.state = scene.state
         self.before = add("Contact.before", n, width=dim, state=lasting)  # displacements in the substep before

@@ -10,7 +10,8 @@ from ..device import ti
 from ..device.thread_team import Team
 from ..features.feature import Batch, Feature, Knob, Scene
 from ..features.material import Table
-from ..neighbours.neighbour_search import FARTHEST, NeighbourSearch
+from ..neighbours.cell_list import FARTHEST
+from ..neighbours.neighbour_search import NeighbourSearch
 from ..neighbours.queries import Contacts
 from ..neighbours.strays import MOVED
 from ..particles import Particles

@@ -10,10 +10,10 @@ from ..device import ti
 from ..device.thread_team import Team
 from ..features.feature import Batch, Scene
 from ..features.material import Table
+from ..geometry.ordered import median
 from ..neighbours.neighbour_list import PairData
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
-from ..tools import median
 from .force_share import ForceShare
 from .friction import Friction
 from .loops import checked, laid, refuse_deep

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from .. import checks
-from ..features.material import group_pair
 
 BEFORE, NEVER = 0, -1  # numbers of substeps, which count from 1: it touched when the frame began; not yet
 
@@ -82,7 +81,7 @@ class ContactEvents:
         wanted = checks.rows("World.events", "groups", groups, "a list of pairs of groups, such as [(0, 1)],")
         some, (a, b) = np.zeros(len(self), dtype=bool), group[self.touches.pairs.T]
         for pair in wanted:
-            one, other = group_pair("World.events", "groups", pair)
+            one, other = checks.group_pair("World.events", "groups", pair)
             some |= ((a == one) & (b == other)) | ((a == other) & (b == one))
         return ContactEvents(self.touches[some])
 

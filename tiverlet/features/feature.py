@@ -30,13 +30,13 @@ import numpy as np
 
 from ..device import at, inline, ti
 from ..device.language import inside_kernel
-from ..device.memory import Memory
 from ..device.number import Number
 from .arguments import Knob as Knob
 from .arguments import RecordsArguments, knobs_of
 from .read_only import handed_out
 
 if TYPE_CHECKING:
+    from ..device.memory import Memory
     from ..particles import Particles, State
     from .regrouping import Regrouping
 
@@ -49,7 +49,7 @@ class Scene:
 
     host_only = ("inv_mass", "residuals", "h2_effective", "periodic")
 
-    memory: Memory
+    memory: "Memory"
     state: "State"
     particles: "Particles"
     inv_mass: np.ndarray  # (n,) after pins: 0 means that constraints cannot move it

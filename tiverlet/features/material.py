@@ -7,7 +7,7 @@ import numpy as np
 
 from .. import checks
 from ..device import inline, ti
-from ..tools import distinct
+from ..geometry.ordered import distinct
 
 if TYPE_CHECKING:
     from .feature import Scene
@@ -73,13 +73,6 @@ def limited(v, most, length):
     if size > most:
         v *= length / size
     return v
-
-
-def group_pair(who: str, name: str, pair: Any, what: str = "") -> tuple[int, int]:
-    """A pair of groups, checked. what: it is in `name`, for the error."""
-    if not (isinstance(pair, (tuple, list)) and len(pair) == 2 and all(isinstance(k, (int, np.integer)) for k in pair)):
-        raise TypeError(f"{who}: {name} has {what}{pair!r}, but a pair of groups such as (0, 1) is needed.")
-    return int(pair[0]), int(pair[1])
 
 
 MOST = 1000  # groups of particles that are told apart
@@ -192,4 +185,4 @@ class Table:
         return radius.of(i) + radius.of(j)
 
     def _pair(self, name: str, pair: Any) -> tuple[int, int]:
-        return group_pair(self.who, name, pair, "the key ")
+        return checks.group_pair(self.who, name, pair, "the key ")

@@ -1,1 +1,2 @@
-"""Plain geometry in NumPy and f64: rays, segments, triangles, and trees of boxes around many of them. It knows of no world."""
+"""Plain geometry in NumPy and f64: rays, segments, triangles, trees of boxes around many of them, rows in order. It knows of no
+world."""

@@ -19,13 +19,14 @@ import numpy as np
 from ..device import runtime, ti
 from ..device.number import OnDevice
 from ..device.prefix_sum import Sums
-from ..tools import distinct
+from ..geometry.ordered import distinct
 from .images import FLOW, GRADIENT
 
 if TYPE_CHECKING:
     from ..device.thread_team import Team
     from ..features.feature import Scene
 
+FARTHEST = 1 << 22  # cells from the origin: beyond it, f32 cannot tell a cell from the next
 LEVELS = 14  # the last one holds all that are smaller, down to points
 
 

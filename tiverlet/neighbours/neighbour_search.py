@@ -17,7 +17,7 @@ from ..device.prefix_sum import MOST, Sums
 from ..device.sorting import exchange, sort, sorting_network
 from ..device.thread_team import Team
 from ..features.regrouping import Regrouping
-from ..tools import distinct
+from ..geometry.ordered import distinct
 from .cell_list import CellList, add_to
 from .images import FLOW, GRADIENT
 from .neighbour_list import STALE, NeighbourList, PairData
@@ -25,7 +25,6 @@ from .neighbour_list import STALE, NeighbourList, PairData
 if TYPE_CHECKING:
     from ..features.feature import Scene
 
-FARTHEST = 1 << 22  # cells from the origin: beyond it, f32 cannot tell a cell from the next
 APPEND, COUNT, FILL = range(3)  # what a scan of the cells around a particle does with the neighbours that it finds
 
 

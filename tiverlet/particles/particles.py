@@ -1,17 +1,19 @@
 """Particles: what the user gives (plain arrays), and the state that a world keeps of them on the device."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import checks
 from ..device import at, inline, ti
-from ..device.memory import Memory
 from ..device.number import Number, OnDevice
 from ..features.arguments import meant
 from ..features.read_only import read_only, structure
 from ..features.regrouping import Regrouping
+
+if TYPE_CHECKING:
+    from ..device.memory import Memory
 
 LARGEST = 1e15  # [m] beyond this, squared lengths near 1e38 leave f32; nothing physical is that far
 
@@ -258,7 +260,7 @@ class State:
     host_only = ("count", "number")
     spin: Any  # where particles spin: the same for their rotation, see spin.py
 
-    def __init__(self, memory: Memory, particles: Particles, inv_mass: np.ndarray, compensated: bool):
+    def __init__(self, memory: "Memory", particles: Particles, inv_mass: np.ndarray, compensated: bool):
         n, dim = particles.count, particles.dim
         self.compensated = compensated
         self.real, self.double = memory.real, memory.real == ti.f64
@@ -274,11 +276,11 @@ class State:
         if compensated:
             self._add_low(memory, particles)
 
-    def _add_low(self, memory: Memory, particles: Particles) -> None:
+    def _add_low(self, memory: "Memory", particles: Particles) -> None:
         low = particles.position - particles.position.astype(np.float32)
         self.low = memory.field("position_low", self.number, width=self.dim, values=low, state=True)
 
-    def carry(self, memory: Memory, particles: Particles) -> None:
+    def carry(self, memory: "Memory", particles: Particles) -> None:
         """Declare the low words of displacements, and of positions where there are none."""
         self.d_low = memory.field("displacement_low", self.number, width=self.dim, state=True)
         if not self.sums:
@@ -290,7 +292,7 @@ class State:
         spins = change.now.spins == self.spins and (not self.spins or self.spin.can_regroup(change))
         return spins and self.w.can_be(change.inv_mass)
 
-    def regroup(self, memory: Memory, change: Regrouping) -> None:
+    def regroup(self, memory: "Memory", change: Regrouping) -> None:
         """They came and went: give new ones their places and velocities. The memory has the rows of those that stay."""
         self.count, first = change.now.count, change.kept
         self.w.become(memory, change.inv_mass)
@@ -302,18 +304,18 @@ class State:
         if self.spins:
             self.spin.regroup(memory, change)
 
-    def get(self, memory: Memory) -> np.ndarray:
+    def get(self, memory: "Memory") -> np.ndarray:
         """A copy of the positions, low words added in f64."""
         out = memory.read(self.x).astype(np.float64, copy=False)
         return (out + memory.read(self.low) if self.sums else out)[..., : self.count, :]
 
-    def put(self, memory: Memory, position: np.ndarray) -> None:
+    def put(self, memory: "Memory", position: np.ndarray) -> None:
         """Overwrite the positions."""
         memory.write(self.x, position)
         if self.sums:
             memory.write(self.low, position - position.astype(np.float32))
 
-    def start(self, memory: Memory, velocity: np.ndarray) -> None:
+    def start(self, memory: "Memory", velocity: np.ndarray) -> None:
         """Overwrite the displacements with velocities, which they are at a start."""
         memory.write(self.d, velocity)
         if self.carries:
@@ -385,7 +387,7 @@ class State:
             x += self.low0[i]
         return x
 
-    def remember(self, memory: Memory, start: bool, before: bool, wall_push: bool) -> None:
+    def remember(self, memory: "Memory", start: bool, before: bool, wall_push: bool) -> None:
         """Declare what friction, swept walls and bounces need, position and displacement at the start of the substep, and how far
         walls have pushed since then."""
         self.starts, self.befores, self.keeps_wall_push = start, before, wall_push
@@ -451,7 +453,7 @@ class Shared:
 
     constant: Any = OnDevice()
 
-    def __init__(self, memory: Memory, name: str, values: np.ndarray, number: Number):
+    def __init__(self, memory: "Memory", name: str, values: np.ndarray, number: Number):
         self.real = memory.real
         self.uniform = bool(len(values) == 0 or (values == values[0]).all())
         self.all_positive = self.uniform and bool(len(values) and values[0] > 0)
@@ -464,7 +466,7 @@ class Shared:
         uniform = bool(len(values) == 0 or (values == values[0]).all())
         return uniform == self.uniform and (uniform and bool(len(values) and values[0] > 0)) == self.all_positive
 
-    def become(self, memory: Memory, values: np.ndarray) -> None:
+    def become(self, memory: "Memory", values: np.ndarray) -> None:
         """Take other values, as can_be() says."""
         if self.uniform:
             self.constant = float(values[0]) if len(values) else 0.0
@@ -487,7 +489,7 @@ class Radii(Shared):
 
     least: Any = OnDevice()
 
-    def __init__(self, memory: Memory, radius: np.ndarray, number: Number):
+    def __init__(self, memory: "Memory", radius: np.ndarray, number: Number):
         super().__init__(memory, "radius", radius, number)
         least, self.points, self.discs = self._kinds(radius)
         self.least = memory.number(least, memory.real)
@@ -502,7 +504,7 @@ class Radii(Shared):
         """Whether its kernels are those for other radii, too."""
         return super().can_be(values) and self._kinds(values)[1:] == (self.points, self.discs)
 
-    def become(self, memory: Memory, values: np.ndarray) -> None:
+    def become(self, memory: "Memory", values: np.ndarray) -> None:
         """Take other radii, as can_be() says."""
         super().become(memory, values)
         self.least = self._kinds(values)[0]

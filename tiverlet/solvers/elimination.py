@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..tools import distinct
+from ..geometry.ordered import distinct
 
 
 @dataclass

@@ -4,11 +4,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-import numpy as np
-
 from ..colliders.collider import Collider
-from ..constraints.core.anchored import Anchored
-from ..constraints.core.scalar import LOST, Scalar
+from ..constraints.core.anchored import refuse_held_twice
 from ..contact.pair_contact import PairContact
 from ..device import runtime, ti
 from ..device.copies import Copies
@@ -20,18 +17,16 @@ from ..neighbours.neighbour_search import NeighbourSearch
 from ..neighbours.periodic import Periodic
 from ..particles import Particles, Radii, State
 from ..particles.spin import Spin
-from ..solvers.conjugate import ConjugateGradient
+from ..solvers.choice import by_structure
 from ..solvers.direct import Direct
-from ..solvers.elimination import plan_of
-from ..solvers.jacobi import Jacobi
 from ..solvers.slots import Slots
 from ..solvers.solver import Solver
 from . import high_order
 from .diagnostics import Diagnostics
 from .frames import Frames
 from .integrator import Forces, Verlet
+from .scale import Scale
 from .sleep import Sleep, SleepPass
-from .sleep import refuse_misfits as refuse_restless
 from .step import Step
 
 T = TypeVar("T", bound=Feature)
@@ -44,7 +39,6 @@ ROOM = {True: (6.5, 14), False: (12, 32)}
 # pile, 0.122 and 0.136 ms with 500 discs, 0.169 and 0.170 with 1000, 0.50 and 0.37 with 4000; of 20 substeps of cloth with 225
 # particles (1200 with constraints) 0.55 and 0.35; of ropes with 205 (405) 0.18 and 0.18, with 820 (1620) 0.64 and 0.40.
 CROSSOVER = 1000
-STRETCH = 4  # times more or fewer of them, for which a world keeps its kernels
 # Kernels of so many times the code of a Distance in 2D are long. A hundred figures on stairs (13) took 13 to 17 s to compile when
 # Taichi simplified them and 5 s without, and frames took as long; discs, ropes and soft balls (6) 9.5 and 3.8 s, but frames a
 # fifth more.
@@ -53,23 +47,6 @@ LONG = 10.0
 # frames of a double pendulum (1.3) take 8 to 13 % less, of 100 discs (3.6) 5 to 17 %, of discs, ropes and soft balls (6) 5 %, and
 # compile in 0.6 s, 0.7 to 1.4 s, and 7 to 14 s more.
 COPIES, MIDDLING = 100, 5.0
-USUAL = 1 / 1200  # [s] substep: 20 of a frame of 1/60 s
-MANY = 200  # stiff links from which systems are worth their sums
-STEPS = 5  # of conjugate gradients: at equal time 5 to 20 leave about the same, and these take the least of a frame
-WIDTH = 2  # of the systems that are solved directly where the user names no solver: chains, loops, joints of up to 3 rods
-
-
-@dataclass(frozen=True)
-class Scale:
-    """How many there are of what kernels work on, which decides how they are made. work: particles and constraints."""
-
-    particles: int
-    work: int
-
-    def holds(self, now: "Scale") -> bool:
-        """Whether what was made for this is still good, so that what comes and goes compiles nothing."""
-        pairs = (self.particles, now.particles), (self.work, now.work)
-        return all(max(some) <= STRETCH * max(1, min(some)) for some in pairs)
 
 
 @dataclass
@@ -106,10 +83,12 @@ def assemble(
         feature.prepare(feature.start, inv_mass)
     refuse_held_twice(particles, features)
     if box:
-        from .periodic_fit import refuse_misfits  # noqa: PLC0415  (it knows of features that there may not be)
+        from .misfits import refuse_misfits  # noqa: PLC0415  (it knows of features that there may not be)
 
         refuse_misfits(box, particles, features)
     if any(isinstance(f, Sleep) for f in features):
+        from .misfits import refuse_restless  # noqa: PLC0415
+
         refuse_restless(features, order)
     for feature, start in zip(features, starts, strict=True):
         if start is None:
@@ -221,64 +200,6 @@ def listed(who: str, features: Any) -> tuple[Feature, ...]:
     if isinstance(features, Feature) or not isinstance(features, Iterable):
         raise TypeError(f"{who}: features = {features!r} is a {type(features).__name__}; write a list, [...].")
     return tuple(features)
-
-
-def refuse_held_twice(particles: Particles, features: tuple[Feature, ...]) -> None:
-    """A particle has one place: refuse pins and driven paths on one that is pinned, or that another one holds."""
-    holder = np.full(len(particles), -1)
-    tethers = [(k, f) for k, f in enumerate(features) if isinstance(f, Anchored) and f.exclusive]
-    for k, f in sorted(tethers, key=lambda item: not item[1].drives):  # springs are lost on what is driven
-        rows = f.indices[:, 0]
-        wrong = particles.pinned[rows] | (holder[rows] >= 0)
-        if wrong.any():
-            i = int(rows[np.argmax(wrong)])
-            other = "is pinned" if particles.pinned[i] else f"is held by features[{holder[i]}] = {features[holder[i]]!r}"
-            raise ValueError(
-                f"World: features[{k}] = {f!r} holds particle {i}, which {other}. It has one place; leave one of them out."
-            )
-        if f.drives:
-            holder[rows] = k
-
-
-def by_structure(batches: list[Batch], inv_mass: np.ndarray) -> Solver:
-    """The solver of a world whose user names none.
-
-    Direct where links hang together like chains, trees or loops: for the cost of one relaxation it leaves some 1e-4 of the length
-    of a link where Jacobi leaves a tenth. ConjugateGradient for what is denser, such as cloth, where many links are stiff: at
-    equal time it leaves a third of what Jacobi and Chebyshev do. Jacobi for few or soft links; where there are rigid constraints
-    on more than two particles, which contacts can lock in a shape that Newton's method does not leave; and for scenes that start
-    with violated constraints, which may contradict each other: relaxed, they settle on a compromise.
-    """
-    links = [b for b in batches if isinstance(b, Scalar) and b.solvable_together]
-    angles = [b for b in links if b.arity > 2]
-    if not links or any((b.compliance == 0).any() for b in angles):
-        return Jacobi()
-    for b in links:
-        C = b.violation(b.start.position)
-        if (np.where(b.side, np.maximum(b.side * C, 0), np.abs(C)) * b.inverse_size(b.start.position) > LOST).any():
-            return Jacobi()
-    if not angles and len(plan_of(links, inv_mass, WIDTH).column):
-        return Direct(WIDTH)
-    return ConjugateGradient(STEPS) if stiff_links(links, inv_mass) >= MANY else Jacobi()
-
-
-def stiff_links(links: list[Scalar], inv_mass: np.ndarray) -> int:
-    """How many act both ways and are stiffer than what one pass of a usual substep makes of them, alpha < W h^2."""
-    degree = np.bincount(np.concatenate([b.indices.ravel() for b in links]), minlength=len(inv_mass))
-    return sum(
-        int((b.compliance < (degree * inv_mass)[b.indices].sum(axis=1) * USUAL**2).sum())
-        for b in links
-        if b.arity == 2 and not b.side
-    )
-
-
-def reason(solver: Solver) -> str:
-    """Why by_structure() has chosen this one."""
-    if isinstance(solver, Direct):
-        return "links hang together like chains, trees or loops"
-    if isinstance(solver, ConjugateGradient):
-        return f"links are stiff, at least {MANY}, and hang together more closely than elimination takes"
-    return "links are few, soft or violated at the start, or there are rigid constraints on more than two particles, or none"
 
 
 def checked_solver(solver: Solver | None) -> Solver | None:

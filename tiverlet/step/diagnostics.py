@@ -9,7 +9,7 @@ from ..device import runtime, ti
 from ..device.number import OnDevice
 from ..device.thread_team import LEAST
 from ..features.feature import FAR
-from ..neighbours.neighbour_search import FARTHEST
+from ..neighbours.cell_list import FARTHEST
 from ..particles import LARGEST
 from ..solvers.slots import TENSEST
 from ..solvers.solver import Solver

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from ..constraints.core.anchored import refuse_held_twice
 from ..features.feature import Batch
 from ..features.regrouping import Regrouping
 from ..particles import Particles
-from .build import Scale, refuse_held_twice
+from .scale import Scale
 
 
 def planned(world: Any, some: np.ndarray, number: np.ndarray, added: Particles | None) -> Regrouping | None:

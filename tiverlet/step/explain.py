@@ -12,7 +12,7 @@ from ..features.feature import Acceleration, Batch
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..neighbours.periodic import Periodic
 from ..shapes.shape import morton
-from .build import reason
+from ..solvers.choice import reason
 from .sleep import Sleep
 from .step import REBOUNDS
 

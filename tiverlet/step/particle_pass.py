@@ -1,9 +1,8 @@
 """What happens to a tile of particles: loops so short that their state stays in a cache, and so simple that several are done at
 once."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ..colliders.collider import ROUNDS, SWEEPS, Collider
 from ..colliders.surface import AGAIN, FIRST, GENTLY
 from ..contact.force_share import accumulate
 from ..device import ti
@@ -11,7 +10,12 @@ from ..device.number import OnDevice
 from ..device.thread_team import Team, block, blocks
 from ..features.feature import Batch, Scene
 
+if TYPE_CHECKING:
+    from ..colliders.collider import Collider
+
 TILE = 256  # particles that a thread takes at a time, through several loops: their state stays in its cache
+SWEEPS = 8  # rounds over the walls, for particles that several of them push
+ROUNDS = 32  # more of them, without friction and bounces
 
 
 class ParticlePass:
@@ -25,7 +29,7 @@ class ParticlePass:
     tile: Any = OnDevice()
     each: Any = OnDevice()
 
-    def __init__(self, scene: Scene, integrator: Any, batches: list[Batch], contact, grid, walls: list[Collider], team: Team):
+    def __init__(self, scene: Scene, integrator: Any, batches: list[Batch], contact, grid, walls: "list[Collider]", team: Team):
         self.integrator, self.forces, self.team = integrator, integrator.forces, team
         self.state, self.n, self.real = scene.state, scene.count, scene.real
         number = scene.memory.number

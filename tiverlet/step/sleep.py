@@ -6,11 +6,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import checks
-from ..contact.polygons import Polygons
 from ..device import at, inline, ti
 from ..device.number import OnDevice
 from ..device.thread_team import BLOCK
-from ..features.feature import Acceleration, Batch, Feature, Knob, Scene
+from ..features.feature import Batch, Feature, Knob, Scene
 from .span import Span
 
 if TYPE_CHECKING:
@@ -363,16 +362,3 @@ def linked(n: int, drivers: list[Batch], batches: list[Batch]) -> tuple[np.ndarr
             kept[b.indices[driven[b.indices].any(axis=1)]] = True
             pairs += [b.indices[:, k : k + 2] for k in range(b.arity - 1)]
     return kept, np.concatenate(pairs)
-
-
-def refuse_misfits(features: tuple[Feature, ...], order: int) -> None:
-    """Raise ValueError for what Sleep does not know of."""
-    for f in features:
-        if isinstance(f, Polygons):
-            raise ValueError("Sleep: it does not know when Polygons touch. Use Contact, for bodies made of discs.")
-        if isinstance(f, Acceleration) and f.pairwise:
-            raise ValueError(f"Sleep: {f!r} reaches through space, from one island to the next. Leave one of both out.")
-        if getattr(f, "shear", 0.0):
-            raise ValueError("Sleep: in a sheared Periodic box nothing comes to rest. Leave it out.")
-    if order > 2:
-        raise ValueError(f"Sleep: order = {order} is for motion without contacts; Sleep is for order 2.")

@@ -5,9 +5,8 @@ a whole frame in one launch, by one CPU thread or a team of them ("fused" and "p
 as on a GPU, Python runs the same lines, and `do` is a Launcher (runner.py). Higher orders differ in the integrator alone.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ..colliders.collider import Collider
 from ..contact.velocity_projection import EVERY, PASSES
 from ..device import runtime, ti
 from ..device.number import OnDevice
@@ -18,6 +17,9 @@ from .constraint_pass import ConstraintPass
 from .contact_pass import ContactPass
 from .particle_pass import ParticlePass
 from .span import ACTIVE_THREADS, BEFORE, FIRST, HALT, Moment, Span, integer, span_on
+
+if TYPE_CHECKING:
+    from ..colliders.collider import Collider
 
 REBOUNDS = 8  # rounds of restitution in a substep, at most
 
@@ -81,7 +83,7 @@ class Step:
 
     def __init__(
         self, scene: Scene, integrator: Any, batches: list[Batch], drivers: list[Batch], contact: Any, grid: Any,
-        walls: list[Collider], team: Team,
+        walls: "list[Collider]", team: Team,
     ):  # fmt: skip
         self.scene, self.state, self.slots, self.team = scene, scene.state, scene.slots, team
         self.n, self.dim, self.real = scene.count, scene.particles.dim, scene.real

@@ -1,5 +1,7 @@
 """Particles drawn to a place, each by itself: what pins, paths and grids share."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ... import checks
@@ -7,8 +9,11 @@ from ...device import ti
 from ...features.feature import Batch, Knob, Scene
 from ...features.members import FixedSize
 from ...features.regrouping import Regrouping
-from ...particles import Particles
 from .spring import Spring, stiff
+
+if TYPE_CHECKING:
+    from ...features.feature import Feature
+    from ...particles import Particles
 
 
 def one_each(who: str, indices, count: int = checks.ANY) -> FixedSize:
@@ -59,7 +64,7 @@ class Anchored(Batch):
         if self.acts and not self.drives:
             self.dev.spring.upload(self.compliance, self.damping)
 
-    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
+    def prepare(self, particles: "Particles", inv_mass: np.ndarray) -> None:
         """Check that the particles exist."""
         checks.indices(repr(self), "indices", self.indices[:, 0], particles.count)
 
@@ -182,3 +187,20 @@ class Anchored(Batch):
                 out = ti.cast(C.dot(C) / (2 * alpha), ti.f64)
                 out *= self.dev.spring.solved(self.dev.lam[c].norm() * alpha, h2_effective, residual * self.dev.size.now)
         return out
+
+
+def refuse_held_twice(particles: "Particles", features: "tuple[Feature, ...]") -> None:
+    """A particle has one place: refuse pins and driven paths on one that is pinned, or that another one holds."""
+    holder = np.full(len(particles), -1)
+    tethers = [(k, f) for k, f in enumerate(features) if isinstance(f, Anchored) and f.exclusive]
+    for k, f in sorted(tethers, key=lambda item: not item[1].drives):  # springs are lost on what is driven
+        rows = f.indices[:, 0]
+        wrong = particles.pinned[rows] | (holder[rows] >= 0)
+        if wrong.any():
+            i = int(rows[np.argmax(wrong)])
+            other = "is pinned" if particles.pinned[i] else f"is held by features[{holder[i]}] = {features[holder[i]]!r}"
+            raise ValueError(
+                f"World: features[{k}] = {f!r} holds particle {i}, which {other}. It has one place; leave one of them out."
+            )
+        if f.drives:
+            holder[rows] = k

@@ -10,7 +10,7 @@ from ...device import ti
 from ...features.feature import FAR, Batch, Knob, Scene
 from ...features.members import FixedSize
 from ...features.regrouping import Regrouping
-from ...tools import distinct
+from ...geometry.ordered import distinct
 from .drive import Drive
 from .outline import Outline
 from .quantity import Quantity

@@ -1,4 +1,5 @@
-"""What does not fit into a periodic box: what is too large to have one nearest image, and walls across it."""
+"""What does not fit into a periodic box: what is too large to have one nearest image, and walls across it. And what
+Sleep does not know of."""
 
 import numpy as np
 
@@ -7,7 +8,7 @@ from ..colliders.collider import Collider
 from ..constraints import Area, Constraint, ShapeMatch, Volume
 from ..constraints.core.length import is_link
 from ..contact import Contact, Polygons
-from ..features.feature import Batch, Feature
+from ..features.feature import Acceleration, Batch, Feature
 from ..forces import PairForce
 from ..neighbours.periodic import AXES, Periodic
 from ..particles import Particles
@@ -61,3 +62,16 @@ def _refuse_torn(box: Periodic, batch: Batch) -> None:
             f"Periodic: {batch!r}: particle {batch.indices.ravel()[e]} of number {owner[e]} is more than half a box from its "
             f"first one along {AXES[k]}. Give unwrapped positions, which keep a body together; it may reach out of the box."
         )
+
+
+def refuse_restless(features: tuple[Feature, ...], order: int) -> None:
+    """Raise ValueError for what Sleep does not know of."""
+    for f in features:
+        if isinstance(f, Polygons):
+            raise ValueError("Sleep: it does not know when Polygons touch. Use Contact, for bodies made of discs.")
+        if isinstance(f, Acceleration) and f.pairwise:
+            raise ValueError(f"Sleep: {f!r} reaches through space, from one island to the next. Leave one of both out.")
+        if getattr(f, "shear", 0.0):
+            raise ValueError("Sleep: in a sheared Periodic box nothing comes to rest. Leave it out.")
+    if order > 2:
+        raise ValueError(f"Sleep: order = {order} is for motion without contacts; Sleep is for order 2.")
