@@ -95,7 +95,7 @@ class Curves:
 
     def add(self, frame: int, report: StepReport, now: Checkpoint) -> None:
         """The figures of a frame. The momentum is that of the displacements, half a substep ago, as the energy is."""
-        scale = 1.0 if now.clock["_fresh"] else 1 / now.clock["_h"]
+        scale = 1.0 if now.clock.d_is_velocity else 1 / now.clock.h
         momentum = scale * (self._mass @ now.values["displacement"][: len(self._mass)])
         figures = {name: getattr(report, name) for name in ("residual", "overlap", "energy", "substeps")}
         figures |= {f"momentum/{axis}": p for axis, p in zip("xyz", momentum.tolist(), strict=False)}
@@ -106,7 +106,7 @@ class Curves:
         self._begun = True
         for end, curves in self._curves.values():
             if values := [figures[name] for name in curves if name in figures]:
-                self._rows.setdefault(end, []).append((frame, now.clock["_time"], values))
+                self._rows.setdefault(end, []).append((frame, now.clock.time, values))
 
     def _angular(self, now: Checkpoint, scale: float) -> dict[str, float]:
         """The angular momentum about the origin, of displacements likewise: m x (x_n - d) x d / h + I omega."""

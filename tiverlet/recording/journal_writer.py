@@ -78,9 +78,9 @@ class Journal:
         """Write the exact state; returns the size of the entry [bytes]."""
         kept, world = checkpoint.keep(self.world), self.world
         more = {"flags": checkpoint.flags(world), "reach": world._runner.scene.h2_effective}
-        parted = kept.clock["_parted"]
+        parted = kept.clock.parted
         arrays = kept.values if parted is None else kept.values | {PARTED: np.asarray(parted)}
-        return self.put(kind, {"clock": kept.clock | {"_parted": None}, **more}, arrays)
+        return self.put(kind, {"clock": kept.clock.named() | {"_parted": None}, **more}, arrays)
 
     def before(self) -> None:
         """A step begins: write down what was turned since the last one."""

@@ -14,6 +14,7 @@ from ..device import runtime
 from ..device.language import NAMES
 from ..shapes import Shape
 from ..step import checkpoint
+from ..step.clock import Clock
 from . import journal, rrd, scene
 from .curves import CURVES, OWN, SPIN
 from .journal import Entry
@@ -390,7 +391,7 @@ def _settle(world: "World", settings: list) -> None:
 
 def _kept(entry: Entry, world: "World") -> checkpoint.Checkpoint:
     values = {name: value for name, value in entry.arrays.items() if name != journal.PARTED}
-    clock = entry.data["clock"] | {"_parted": entry.arrays.get(journal.PARTED)}
+    clock = Clock.of(entry.data["clock"] | {"_parted": entry.arrays.get(journal.PARTED)})
     kept = checkpoint.Checkpoint(values, clock, world._controller.memory)
     checkpoint.check(world, kept, entry.data["flags"])
     return kept

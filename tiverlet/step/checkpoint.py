@@ -2,12 +2,12 @@
 
 import hashlib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..neighbours.periodic import Periodic
-from . import clock
+from .clock import Clock
 
 if TYPE_CHECKING:
     from ..world import World
@@ -23,12 +23,12 @@ class Checkpoint:
     """The state at one time: of every field that the future depends on, and of the clock."""
 
     values: dict[str, np.ndarray]
-    clock: dict[str, Any]
+    clock: Clock
     controller: tuple
 
     def digest(self) -> str:
         """SHA-256 of the exact state, the clock, and what the controller remembers."""
-        out = hashlib.sha256(repr((*clock.hashed(self.clock), *self.controller)).encode())
+        out = hashlib.sha256(repr((*self.clock.hashed, *self.controller)).encode())
         for name, values in self._lasting().items():
             out.update(name.encode())
             out.update(values.tobytes())
@@ -69,7 +69,7 @@ def state(world: "World", pairs: bool = True) -> dict[str, np.ndarray]:
 
 def keep(world: "World", pairs: bool = True) -> Checkpoint:
     """A copy of the exact state."""
-    return Checkpoint(state(world, pairs), world._clock.keep(), world._controller.memory)
+    return Checkpoint(state(world, pairs), world._clock.copy(), world._controller.memory)
 
 
 def flags(world: "World") -> list[list[bool]]:
@@ -79,7 +79,7 @@ def flags(world: "World") -> list[list[bool]]:
 
 def put_back(world: "World", kept: Checkpoint) -> None:
     """Return to an earlier state, bit for bit."""
-    world._runner.set_substep(kept.clock["_h"], kept.clock["_drag"])
+    world._runner.set_substep(kept.clock.h, kept.clock.drag)
     grid, stores = world._runner.grid, list(map(id, world._runner.memories))
     if "Contact.shrunk" in kept.values:
         world._runner.step.contacts[0].enable_shrink()
@@ -109,7 +109,7 @@ def install(world: "World", kept: Checkpoint, flagged: list[list[bool]]) -> None
 def check(world: "World", kept: Checkpoint, flagged: list[list[bool]]) -> None:
     """Raise ValueError unless a state that came from elsewhere fits the world; above all what kernels take for indices."""
     present = keep(world)
-    if set(present.values) - LATE != set(kept.values) - LATE or set(present.clock) != set(kept.clock):
+    if set(present.values) - LATE != set(kept.values) - LATE:
         raise ValueError("The state is not one of this scene: it has other fields.")
     pieces = {f"Contact.{piece.name}" for piece in world._runner.grid.lasting} if world._runner.grid else set()
     most = {"Contact.pairs": len(world.particles)}
@@ -126,7 +126,7 @@ def check(world: "World", kept: Checkpoint, flagged: list[list[bool]]) -> None:
     if len({len(value) for name, value in kept.values.items() if name in pieces or name == "Contact.pairs"}) > 1:
         raise ValueError("The state is not one of this scene: pairs in contact carry other numbers of values.")
     right = len(flagged) == len(world.features) and all(type(b) is bool for pair in flagged for b in pair)
-    if not right or not clock.sound(kept.clock, len(world.particles), world.particles.dim):
+    if not right or not kept.clock.sound(len(world.particles), world.particles.dim):
         raise ValueError("The state is not one of this scene: its clock is none.")
 
 

@@ -1,17 +1,16 @@
 """Where a world is in time, and what its displacements stand for."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
-# What the future depends on, by its name in recordings. The hash of a state has the first five; the rest follows from the past.
+# Names in recordings.
 NAMES = {
     "_time": "time", "_tick": "tick", "_since": "since", "_h": "h", "_fresh": "d_is_velocity", "_longest": "longest",
     "_frame": "frame", "_drag": "drag", "_started": "started", "_owed": "owed", "_parted": "parted", "_placed": "first_moved",
     "_energy": "energy", "_softened": "softened",
 }  # fmt: skip
-HASHED = tuple(NAMES)[:5]
 
 
 @dataclass
@@ -43,14 +42,25 @@ class Clock:
     energy: float | None = None
     softened: bool = False
 
-    def keep(self) -> dict[str, Any]:
-        """A copy, by the names in recordings."""
+    def copy(self) -> "Clock":
+        """The same."""
+        return replace(self)
+
+    def put_back(self, kept: "Clock") -> None:
+        """Return to an earlier one."""
+        for field in fields(self):
+            setattr(self, field.name, getattr(kept, field.name))
+
+    def named(self) -> dict[str, Any]:
+        """What it consists of, by the names in recordings."""
         return {name: getattr(self, own) for name, own in NAMES.items()}
 
-    def put_back(self, kept: dict[str, Any]) -> None:
-        """Return to an earlier one."""
-        for name, own in NAMES.items():
-            setattr(self, own, kept[name])
+    @staticmethod
+    def of(named: dict[str, Any]) -> "Clock":
+        """The one of which named() tells."""
+        if set(named) != set(NAMES):
+            raise ValueError("The state is not one of this scene: it has other fields.")
+        return Clock(**{own: named[name] for name, own in NAMES.items()})
 
     def counted(self, dt: float) -> tuple[float, float, int]:
         """When frames of this length began, their length, and their number, with one more: frames of the same length are counted,
@@ -64,22 +74,19 @@ class Clock:
         self.started, self.d_is_velocity, self.parted = started, False, None
         self.frame, self.time = frame, frame[0] + frame[1] * frame[2]
 
+    @property
+    def hashed(self) -> list[Any]:
+        """What the future depends on, and the past does not tell."""
+        later: list[Any] = [self.longest] if self.longest > self.h else []  # seen when h changes
+        later += ["softened"] if self.softened else []
+        return [self.time, self.tick, self.since, self.h, self.d_is_velocity, *later]
 
-def hashed(kept: dict[str, Any]) -> list[Any]:
-    """Of what keep() returned, what the future depends on and the past does not tell."""
-    later = [kept["_longest"]] if kept["_longest"] > kept["_h"] else []  # seen when h changes
-    later += ["softened"] if kept["_softened"] else []
-    return [*(kept[name] for name in HASHED), *later]
-
-
-def sound(kept: dict[str, Any], particles: int, dim: int) -> bool:
-    """Whether it can be that of a world of so many particles."""
-    parted = kept["_parted"]
-    if parted is not None and (np.shape(parted) != (particles, dim) or not np.isfinite(parted).all()):
-        return False
-    right = [type(kept[name]) is int and 0 <= kept[name] < 2**31 for name in ("_tick", "_since")]
-    right += [type(kept[name]) is bool for name in ("_fresh", "_started", "_softened")]
-    numbers = [kept["_time"], kept["_h"], kept["_longest"], *kept["_frame"], kept["_energy"] or 0]
-    right += [type(v) in (int, float) for v in numbers]
-    right += [kept["_placed"] is None or 0 <= kept["_placed"] <= particles, len(kept["_frame"]) == 3]
-    return all(right) and (kept["_drag"] is None or [type(v) for v in kept["_drag"]] == [float] * 5)
+    def sound(self, particles: int, dim: int) -> bool:
+        """Whether it can be that of a world of so many particles."""
+        if self.parted is not None and (np.shape(self.parted) != (particles, dim) or not np.isfinite(self.parted).all()):
+            return False
+        right = [type(k) is int and 0 <= k < 2**31 for k in (self.tick, self.since)]
+        right += [type(some) is bool for some in (self.d_is_velocity, self.started, self.softened)]
+        right += [type(v) in (int, float) for v in (self.time, self.h, self.longest, *self.frame, self.energy or 0)]
+        right += [self.first_moved is None or 0 <= self.first_moved <= particles, len(self.frame) == 3]
+        return all(right) and (self.drag is None or [type(v) for v in self.drag] == [float] * 5)

@@ -172,7 +172,7 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
         for f, values in attributes.items():
             f.__dict__.clear()
             f.__dict__.update(values)
-        if world._clock.d_is_velocity != kept.clock["_fresh"]:
+        if world._clock.d_is_velocity != kept.clock.d_is_velocity:
             checkpoint.put_back(world, kept)
         raise
     memories, particles = world._runner.memories, world._particles.regrouped(some, added)
