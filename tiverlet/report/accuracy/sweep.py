@@ -1,17 +1,16 @@
 """Error against run time: sweep substeps, solvers and precisions of the cases, with the baselines on the same axes."""
 
 from collections.abc import Iterable, Sequence
-from concurrent.futures import Executor, as_completed
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any
 
-from rich.progress import Progress
-
-from ..output import machine, said
+from ..jobs import done
+from ..output import machine
 from .baselines import BASELINES
 from .cases import CASES, LEFT_OUT, METHODS, Case, chosen
 from .errors import ErrorReport, Missing
-from .points import Point, Task, curve
+from .points import Task, curve
 
 FARTHER = (4, 16)  # baselines get the substeps of the case, and its most times these: they need more for as much time
 QUICK = 3  # efforts of a quick sweep
@@ -78,40 +77,10 @@ def error_vs_time(
     some = chosen(cases)
     todo = plan(some, methods, precisions, efforts, baselines, 1 if quick else runs, quick)
     points, missing = [], []
-    with Progress(disable=not progress) as bar:
-        row = bar.add_task("error against run time", total=len(todo.tasks))
-        for task, made, why in run(todo.tasks, executor):
-            points += made
-            missing += [Missing(str(task), why)] if why else []
-            bar.update(row, advance=1, description=str(task))
+    for task, made, why in done("error against run time", curve, todo.tasks, executor, progress):
+        points += made or []
+        missing += [Missing(str(task), why)] if why else []
     order = {name: k for k, name in enumerate(CASES)}
     points.sort(key=lambda p: (order[p.case], p.method in BASELINES))
     left = [f"{name}: {why}" for name, why in LEFT_OUT.items()] if cases is None else []
     return ErrorReport([c.name for c in some], points, missing, todo.omissions + left, machine())
-
-
-def run(tasks: Sequence[Task], executor: Any = None) -> Iterable[tuple[Task, list[Point], str]]:
-    """Each task with its points, or with why it has none, as they are done."""
-    if executor is None:
-        for task in tasks:
-            yield attempt(task)
-        return
-    waiting = {}
-    for task in tasks:
-        try:
-            waiting[executor.submit(curve, task)] = task
-        except Exception as error:  # a pool that has lost a worker takes no more
-            yield task, [], said(error)
-    for future in as_completed(waiting):
-        try:
-            yield waiting[future], future.result(), ""
-        except Exception as error:
-            yield waiting[future], [], said(error)
-
-
-def attempt(task: Task) -> tuple[Task, list[Point], str]:
-    """A task here and now."""
-    try:
-        return task, curve(task), ""
-    except Exception as error:
-        return task, [], said(error)

@@ -3,17 +3,16 @@
 import json
 import warnings
 from collections.abc import Iterable, Sequence
-from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.jupyter import JupyterMixin
-from rich.progress import Progress
 from rich.table import Table
 
 from .. import output
+from ..jobs import done
 from ..output import said
 from .rows import ROWS, NotAvailable
 
@@ -116,23 +115,7 @@ def stress(
         if number not in ROWS:
             raise ValueError(f"stress: rows has {number!r}, but they are {min(ROWS)} to {max(ROWS)}.")
     results = []
-    with Progress(disable=not progress) as bar:
-        shown = bar.add_task("stiff and extreme cases", total=len(chosen))
-        for result in attempts(chosen, executor):
-            results.append(result)
-            bar.update(shown, advance=1, description=result.what)
+    for number, result, why in done("stiff and extreme cases", certify, chosen, executor, progress, lambda k: ROWS[k].what):
+        row = ROWS[number]
+        results.append(result or Result(number, row.what, row.criterion, "", FAILED, (why,), 0.0))
     return Certificate(results)
-
-
-def attempts(numbers: Sequence[int], executor: Any) -> Iterable[Result]:
-    """Rows as they are done."""
-    if executor is None:
-        yield from map(certify, numbers)
-        return
-    waiting = {executor.submit(certify, number): number for number in numbers}
-    for future in as_completed(waiting):
-        try:
-            yield future.result()
-        except Exception as error:
-            row = ROWS[waiting[future]]
-            yield Result(row.number, row.what, row.criterion, "", FAILED, (said(error),), 0.0)

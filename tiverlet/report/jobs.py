@@ -1,0 +1,50 @@
+"""The parts of a report, one after the other here or in the workers of an executor, and a bar meanwhile."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import as_completed
+from typing import Any, TypeVar
+
+from rich.progress import Progress
+
+from .output import said
+
+T = TypeVar("T")
+Done = tuple[T, Any, str]  # a part, what it came to, and why it came to nothing
+
+
+def done(
+    title: str, function: Callable[[T], Any], parts: Sequence[T], executor: Any, progress: bool, name: Callable[[T], str] = str
+) -> Iterator[Done[T]]:
+    """Each part with function(part), as they are done; with None, and the error in a line, where that or its worker failed.
+
+    executor: with submit(), or None. progress: whether there is a bar, on which a part goes by name(part).
+    """
+    with Progress(disable=not progress) as bar:
+        shown = bar.add_task(title, total=len(parts))
+        for part, made, why in _submitted(function, parts, executor) if executor is not None else _here(function, parts):
+            yield part, made, why
+            bar.update(shown, advance=1, description=name(part))
+
+
+def _here(function: Callable[[T], Any], parts: Iterable[T]) -> Iterator[Done[T]]:
+    for part in parts:
+        try:
+            made, why = function(part), ""
+        except Exception as error:
+            made, why = None, said(error)
+        yield part, made, why
+
+
+def _submitted(function: Callable[[T], Any], parts: Iterable[T], executor: Any) -> Iterator[Done[T]]:
+    waiting = {}
+    for part in parts:
+        try:
+            waiting[executor.submit(function, part)] = part
+        except Exception as error:  # a pool that has lost a worker takes no more
+            yield part, None, said(error)
+    for future in as_completed(waiting):
+        try:
+            made, why = future.result(), ""
+        except Exception as error:
+            made, why = None, said(error)
+        yield waiting[future], made, why
