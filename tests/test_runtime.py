@@ -57,7 +57,7 @@ def test_the_host_sees_the_fields_as_kernels_do():
 def test_f64_fields_can_stand_apart(monkeypatch):
     # As on Vulkan: in a tree of their own, which shows in nothing else. Lengths that would put an f64 between two multiples of 8.
     monkeypatch.setattr(fields, "aligned", lambda: False)
-    monkeypatch.setattr(layout, "_alone", True)
+    monkeypatch.setattr(layout, "_unshared", True)
     rng = np.random.default_rng(0)
     plans = {
         "two": [(ti.i32, 3, 0), (ti.f64, 4, 0), (ti.f32, 5, 3), (ti.f64, None, 2), (ti.u32, 1, 0), (ti.i32, None, 0)],

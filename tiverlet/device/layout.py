@@ -155,12 +155,12 @@ def check_trees() -> None:
 @contextlib.contextmanager
 def unshared() -> Iterator[None]:
     """Worlds that are built within it have trees and kernels of their own."""
-    global _alone
-    before, _alone = _alone, True
+    global _unshared
+    before, _unshared = _unshared, True
     try:
         yield
     finally:
-        _alone = before
+        _unshared = before
 
 
 def made(kind: Any, width: int) -> Any:
@@ -183,7 +183,7 @@ def sharing() -> bool:
     """Whether worlds can share trees."""
     if patched and _table[0] is not language.current():
         Layout((Declared(ti.i32, 0, 1, False),)).destroy()  # which finds out
-    return bool(LAZY) and _table[1] is not None and not _alone
+    return bool(LAZY) and _table[1] is not None and not _unshared
 
 
 def take(declared: list[Declared], fields: list[Any], held: list[Layout], shared: bool) -> tuple[Layout, list[int]]:
@@ -247,5 +247,5 @@ def _roomy(kind: Any, width: int, many: bool, room: int) -> Declared:
 
 _leaving: list[Layout] = []  # that are to be freed
 _known: dict[Layout, Counter[Kind]] = {}  # the shared ones, and how many fields of each kind they have
-_alone = False
+_unshared = False
 _table: tuple[Any, Any] = (None, None)  # a runtime, and where its kernels look up where trees are

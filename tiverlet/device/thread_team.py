@@ -30,23 +30,23 @@ LINE = 32  # integers that are not in the same line of a cache
 SHIFT = 4096  # frames after which arrivals are counted from 0 again, while nobody waits
 
 
-_apart = False
+_launching = False
 
 
 @contextlib.contextmanager
 def launching() -> Iterator[None]:
     """Worlds that are built within it, on the parallel path, are launched phase by phase, as they are on a GPU."""
-    global _apart
-    before, _apart = _apart, True
+    global _launching
+    before, _launching = _launching, True
     try:
         yield
     finally:
-        _apart = before
+        _launching = before
 
 
 def size_of(path: str, work: int) -> int:
     """How many threads make up the team of a world. work: particles and constraints."""
-    return min(runtime.cores(), max(2, work // SHARE)) if path == "parallel" and not _apart else 1
+    return min(runtime.cores(), max(2, work // SHARE)) if path == "parallel" and not _launching else 1
 
 
 @inline
