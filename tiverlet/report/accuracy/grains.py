@@ -15,6 +15,7 @@ from ...contact import Contact
 from ...forces import Gravity
 from ...particles import Particles
 from ...world import World
+from ..output import mean_and_error
 from . import grain_peers, rolling
 
 G, SIZE, SUBSTEPS, FRAME = 9.81, 0.06, 16, 1 / 60  # SIZE: d, the mean diameter of grains [m]
@@ -151,7 +152,7 @@ def drum(n: int, friction: float, resistance: float, turn: float = 0.8, seconds:
     # Avalanches follow each other: means over a second are nearly independent.
     later = np.array(angles[len(angles) // 2 :])
     blocks = later[: len(later) // 60 * 60].reshape(-1, 60).mean(axis=1)
-    return float(blocks.mean()), float(blocks.std(ddof=1) / np.sqrt(len(blocks)))
+    return mean_and_error(blocks)
 
 
 @dataclass(frozen=True)
@@ -324,7 +325,8 @@ def beverloo(openings: ArrayLike, rates: ArrayLike) -> tuple[float, float, float
 
 def shown(values: np.ndarray) -> str:
     """Their mean and its standard error."""
-    return f"{values.mean():.1f} +- {values.std(ddof=1) / np.sqrt(len(values)):.1f}"
+    mean, error = mean_and_error(values)
+    return f"{mean:.1f} +- {error:.1f}"
 
 
 def heaps(n: int, half: float, dim: int, seeds: Sequence[int], rollings: Sequence[float], skaters: bool) -> Table:

@@ -15,6 +15,7 @@ from ...device import runtime
 from ...forces import Drag
 from ...particles import Particles
 from ...world import World
+from ..output import mean_and_error
 from ..speed import c_baseline, scenes
 
 GASES = (
@@ -74,13 +75,17 @@ def collision_rate(fraction: float, dim: int) -> float:
     return 2 * dim * (compressibility(fraction, dim) - 1) / np.sqrt(np.pi)
 
 
+def thermal(n: int, dim: int, seed: int = 0) -> np.ndarray:
+    """Velocities (n, dim) with a mean square of 1 per axis, and a sum of 0."""
+    v = np.random.default_rng(seed).normal(size=(n, dim))
+    v -= v.mean(axis=0)
+    return v / np.sqrt((v**2).mean())
+
+
 def box_of_gas(n: int, dim: int, fraction: float, substeps: int) -> tuple[World, float]:
     """n elastic discs or spheres of radius 0.5 m and thermal speed 1 m/s on a lattice in an elastic box, and its size [m]."""
     size = (volume(np.full(n, 0.5), dim) / fraction) ** (1 / dim)
-    v = np.random.default_rng(0).normal(size=(n, dim))
-    v -= v.mean(axis=0)
-    v /= np.sqrt((v**2).mean())
-    start = Particles(lattice(n, dim, size - 1) + 0.5, velocity=v, radius=0.5)
+    start = Particles(lattice(n, dim, size - 1) + 0.5, velocity=thermal(n, dim), radius=0.5)
     return World(start, [Contact(restitution=1.0), Box([0] * dim, [size] * dim, restitution=1.0)], substeps=substeps), size
 
 
@@ -122,12 +127,9 @@ def gas(n: int, dim: int, fraction: float, h: float, seconds: float, away: float
                 blocks.append((blows / (each * h) / (2 * dim * middle ** (dim - 1)) / known, float(np.mean(moments))))
                 blows, bulk, moments = 0.0, [], []
             world.step(h)
-    pressure, moment = np.array(blocks[-12:]).T
-    return {
-        "pressure": float(pressure.mean()),
-        "error": float(pressure.std(ddof=1) / np.sqrt(len(pressure))),
-        "moment": float(moment.mean()) / (2.0 if dim == 2 else 5 / 3),
-    }
+    pressures, moment = np.array(blocks[-12:]).T
+    pressure, error = mean_and_error(pressures)
+    return {"pressure": pressure, "error": error, "moment": float(moment.mean()) / (2.0 if dim == 2 else 5 / 3)}
 
 
 def energies_gained(n: int, dim: int, fraction: float, beats: dict[float, float]) -> list[float]:

@@ -11,7 +11,8 @@ from ...features.feature import Feature
 from ...neighbours import Periodic
 from ...particles import Particles
 from ...world import World
-from .granular import compressibility, lattice, volume
+from ..output import mean_and_error
+from .granular import compressibility, lattice, thermal, volume
 
 GASES = ((2, 0.1), (2, 0.3), (2, 0.5), (3, 0.1), (3, 0.2), (3, 0.3))  # dim, fraction
 SHELL = 0.05  # [diameters] width of the first shell of the radial distribution
@@ -22,10 +23,7 @@ def gas(n: int, dim: int, fraction: float, contact: Feature, seed: int = 0, shea
     """n discs or spheres of diameter and mass 1 on a lattice in a periodic box, with a mean square of velocities of 1 per axis.
     Their sum is 0, so that only n - 1 of them are free, and kT = n / (n - 1)."""
     size = (volume(np.full(n, 0.5), dim) / fraction) ** (1 / dim)
-    v = np.random.default_rng(seed).normal(size=(n, dim))
-    v -= v.mean(axis=0)
-    v /= np.sqrt((v**2).mean())
-    x, box = lattice(n, dim, size), Periodic([0] * dim, [size] * dim, shear=shear)
+    x, v, box = lattice(n, dim, size), thermal(n, dim, seed), Periodic([0] * dim, [size] * dim, shear=shear)
     v[:, 0] += shear * (x[:, 1] - size / 2)
     return World(Particles(x, velocity=v, radius=0.5), [contact, box], substeps=1, precision="f64"), box
 
@@ -90,11 +88,6 @@ def virial(n: int, dim: int, fraction: float, h: float, seconds: float) -> dict[
         for name, values in (("pressure", pressures), ("g", contacts), ("D", spreads)):
             out[f"{name} mean"], out[f"{name} error"] = mean_and_error(np.array(values))
         return out
-
-
-def mean_and_error(blocks: np.ndarray) -> tuple[float, float]:
-    """The mean of independent values, and its standard error."""
-    return float(blocks.mean()), float(blocks.std(ddof=1) / np.sqrt(len(blocks)))
 
 
 def couette(n: int, shear: float, seconds: float, contact: Contact, layers: int = 10) -> dict[str, float]:

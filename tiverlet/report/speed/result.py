@@ -6,11 +6,8 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
-from rich.box import SIMPLE
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.jupyter import JupyterMixin
-from rich.table import Table
-from rich.text import Text
 
 from .. import output
 
@@ -209,24 +206,14 @@ class SpeedReport(JupyterMixin):
         )  # fmt: skip
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        for title, heads, rows in self.tables():
-            table = Table(title=title, box=SIMPLE, padding=(0, 1, 0, 0), pad_edge=False)
-            for k, head in enumerate(heads):
-                table.add_column(head, justify="left" if k == 0 or head in TEXT else "right")
-            for row in rows:
-                table.add_row(*map(Text, row))
-            yield table
-        yield from map(Text, self.lines())
+        yield from output.printed(self.tables(), self.lines(), left=TEXT)
 
     def __str__(self) -> str:
         return output.text(self, 150)
 
     def markdown(self) -> str:
         """Everything as Markdown."""
-        out: list[str] = []
-        for title, heads, rows in self.tables():
-            out += [f"**{title}**", "", *output.table(heads, rows), ""]
-        return "\n".join([*out, *(f"- {line}" for line in self.lines())]) + "\n"
+        return output.markdown(self.tables(), self.lines())
 
     def json(self) -> str:
         """Everything, for machines; see of_json()."""

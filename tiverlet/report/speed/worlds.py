@@ -18,11 +18,8 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from rich.box import SIMPLE
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.jupyter import JupyterMixin
-from rich.table import Table
-from rich.text import Text
 
 from .. import output
 
@@ -73,14 +70,7 @@ class WorldsSpeed(JupyterMixin):
     notes: tuple[str, ...]
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        for title, (heads, rows) in self.tables.items():
-            table = Table(title=title, box=SIMPLE, padding=(0, 1, 0, 0), pad_edge=False)
-            for k, head in enumerate(heads):
-                table.add_column(head, justify="left" if k == 0 else "right")
-            for row in rows:
-                table.add_row(*map(Text, row))
-            yield table
-        yield from map(Text, (f"Machine: {self.machine}.", *self.notes))
+        yield from output.printed(self._titled, self._lines)
 
     def __str__(self) -> str:
         return output.text(self, 150)
@@ -92,10 +82,15 @@ class WorldsSpeed(JupyterMixin):
 
     def markdown(self) -> str:
         """Everything as Markdown."""
-        out: list[str] = []
-        for title, (heads, rows) in self.tables.items():
-            out += [f"**{title}**", "", *output.table(heads, rows), ""]
-        return "\n".join([*out, f"- Machine: {self.machine}.", *(f"- {note}" for note in self.notes)]) + "\n"
+        return output.markdown(self._titled, self._lines)
+
+    @property
+    def _titled(self) -> list[output.Titled]:
+        return [(title, *table) for title, table in self.tables.items()]
+
+    @property
+    def _lines(self) -> list[str]:
+        return [f"Machine: {self.machine}.", *self.notes]
 
     def json(self) -> str:
         """Everything, for machines."""
