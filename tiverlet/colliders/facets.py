@@ -50,7 +50,11 @@ class Facets:
         """As Collider.cast(), in this frame; radius: with what the facets are thickened by."""
         return self._solid.cast(origin, direction, radius)
 
-    def check_thickness(self, who: str, particles: Particles, radius: float) -> None:
+    def on_device(self, scene: Scene, who: str, radius: float) -> "FacetShape":
+        """As fields."""
+        return FacetShape(self, scene, who, radius)
+
+    def check(self, who: str, particles: Particles, radius: float) -> None:
         """Refuse points that meet a wall without thickness: a point on it would have no side."""
         points = particles.radius + radius == 0
         if not self.closed and points.any():

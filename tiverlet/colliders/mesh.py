@@ -4,12 +4,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import checks
-from ..features.feature import Scene
-from ..particles import Particles
 from .collider import Collider
-from .facets import Facets, FacetShape, facet_normals
+from .facets import Facets, facet_normals
 from .moving import Moving
-from .shape import HostShape, Shape
+from .shape import HostShape
 
 FLAT = 0.999  # cosine between faces whose common edge is not drawn
 
@@ -116,17 +114,8 @@ class Mesh(Moving):
         facing /= np.maximum(np.linalg.norm(facing, axis=1), 1e-9)[:, None]
         return Facets(c, features, wings, facing, self.closed, self.inside)
 
-    def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Check the dimension, and that particles and sheet are not both without thickness."""
-        Moving.prepare(self, particles, inv_mass)
-        self.facets.check_thickness(repr(self), particles, self.radius)
-
-    def shape_on(self, scene: Scene) -> Shape:
-        """Its facets."""
-        return FacetShape(self.facets, scene, repr(self), self.radius)
-
     def host_shape(self, dim: int) -> HostShape:
-        """Likewise."""
+        """Its facets."""
         return self.facets
 
     @property

@@ -10,7 +10,7 @@ from ..features.feature import Knob, Scene
 from ..particles import Particles
 from .collider import Collider
 from .pose import Pose, rotation_matrix
-from .shape import HostShape, Shape
+from .shape import HostShape
 
 TOUCHES = 8  # of one particle in one substep; then it stays where it is known to be free
 
@@ -56,22 +56,19 @@ class Moving(Collider):
         self.position, self.rotation = position, rotation
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Check the dimension."""
+        """Check the dimension, and the particles."""
         if self.dim and self.dim != particles.dim:
             raise ValueError(f"{self!r}: it is a wall for {self.dim}D, but the particles are in {particles.dim}D.")
         self._keep(dim=particles.dim)
         self.position, self.rotation = self.position, self.rotation
-
-    def shape_on(self, scene: Scene) -> Shape:
-        """Its shape, on the device of a world."""
-        raise NotImplementedError
+        self.host_shape(self.dim).check(repr(self), particles, self.radius)
 
     def bind(self, scene: Scene) -> None:
         """The pose at the ends of a frame and of the substep that is under way, and the shape."""
         Collider.bind(self, scene)
         self.dev.pose = Pose(scene, repr(self), self.position, self.rotation, self.dev.surface.turns)
         self.dev.surface.poses = [self.dev.pose]
-        self.dev.shape = self.shape_on(scene)
+        self.dev.shape = self.host_shape(self.dim).on_device(scene, repr(self), self.radius)
         self.changed = False
 
     def upload(self) -> None:
@@ -96,7 +93,7 @@ class Moving(Collider):
         return position, rotation_matrix(rotation) if np.any(rotation) else np.eye(dim)
 
     def host_shape(self, dim: int) -> HostShape:
-        """Its shape for questions of the host, in its own frame; for as many dimensions where it is not in a world."""
+        """Its shape in its own frame; for as many dimensions where it is not in a world."""
         raise NotImplementedError
 
     def clearance(self, points: np.ndarray) -> np.ndarray:

@@ -63,9 +63,8 @@ class Sdf(Moving):
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the dimension, and refuse a function that is not finite, or not a distance, around the particles."""
+        vars(self.dev).pop("probe", None)  # it may be of an earlier start of Taichi
         Moving.prepare(self, particles, inv_mass)
-        runtime.ensure_started()
-        self.dev.probe = _Probe(self, self.dim)
         x = particles.position
         if not len(x):
             return
@@ -104,10 +103,6 @@ class Sdf(Moving):
         """No: the function is tried around all particles."""
         return False
 
-    def shape_on(self, scene: Scene) -> Shape:
-        """Its function."""
-        return FunctionShape(self.function, self.gradient, scene, self.dim)
-
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
         """Where the surface meets the plane of a 2D scene, or the three planes through the middle of a 3D one."""
         middle, half = (low + high) / 2, float((high - low).max()) * 0.6 or 1.0
@@ -123,7 +118,7 @@ class Sdf(Moving):
         return np.concatenate(out), 0.0
 
     def host_shape(self, dim: int) -> HostShape:
-        """The function on the host; outside of any world, too, for as many dimensions as it is asked about."""
+        """The function; outside of any world, too, for as many dimensions as it is asked about."""
         if "probe" not in vars(self.dev) or self.dev.probe.dim != dim:
             runtime.ensure_started()
             self.dev.probe = _Probe(self, dim)
@@ -238,6 +233,13 @@ class _Probe:
         self.compiler = Compiler(ti.f64)
         self.wall: Any = wall
         self.dim = dim
+
+    def check(self, who: str, particles: Particles, radius: float) -> None:
+        """All can meet it; Sdf.prepare() looks at the function around them."""
+
+    def on_device(self, scene: Scene, who: str, radius: float) -> FunctionShape:
+        """The function in kernels."""
+        return FunctionShape(self.wall.function, self.wall.gradient, scene, self.dim)
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
         """The function at points (n, dim) of the wall's frame, (n,)."""

@@ -1,21 +1,34 @@
 """The contracts of the shapes that moving colliders hold."""
 
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from ..device import ti
 
+if TYPE_CHECKING:
+    from ..features.feature import Scene
+    from ..particles import Particles
+
 
 class HostShape(Protocol):
-    """A shape in a frame of its own, for questions of the host."""
+    """A shape in a frame of its own, for questions of the host. who: the collider that holds it. radius: with what the shape is
+    thickened by [m]."""
+
+    def check(self, who: str, particles: "Particles", radius: float) -> None:
+        """Raise ValueError for particles that it is no wall for."""
+        ...
+
+    def on_device(self, scene: "Scene", who: str, radius: float) -> "Shape":
+        """The same in a world."""
+        ...
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
         """How far points (k, dim) are from it [m], negative inside of it, (k,)."""
         ...
 
     def cast(self, origin: np.ndarray, direction: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-        """As Collider.cast(); radius: with what the shape is thickened by."""
+        """As Collider.cast()."""
         ...
 
 
