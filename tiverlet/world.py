@@ -25,11 +25,12 @@ from .particles import Particles, at_rest, in_range, spin_of
 from .solvers.solver import Solver
 from .step import checkpoint, edit_scene
 from .step.adaptive import StepController
-from .step.build import Assembly, Scale, assemble, check_settings, checked_features, checked_solver
+from .step.build import Assembly, assemble, check_settings, checked_features, checked_solver
 from .step.clock import Clock
 from .step.edit_scene import Handle
 from .step.explain import compiling, explain
 from .step.runner import Runner
+from .step.scale import Scale
 from .step.step_report import StepReport
 
 LIVE = ("position", "velocity", "spin", "substeps", "iterations")

@@ -6,13 +6,12 @@ import numpy as np
 
 from ... import checks
 from ...device import ti
-from ...features.feature import Batch, Knob, Scene
+from ...features.feature import Batch, Feature, Knob, Scene
 from ...features.members import FixedSize
 from ...features.regrouping import Regrouping
 from .spring import Spring, stiff
 
 if TYPE_CHECKING:
-    from ...features.feature import Feature
     from ...particles import Particles
 
 
@@ -189,7 +188,7 @@ class Anchored(Batch):
         return out
 
 
-def refuse_held_twice(particles: "Particles", features: "tuple[Feature, ...]") -> None:
+def refuse_held_twice(particles: "Particles", features: tuple[Feature, ...]) -> None:
     """A particle has one place: refuse pins and driven paths on one that is pinned, or that another one holds."""
     holder = np.full(len(particles), -1)
     tethers = [(k, f) for k, f in enumerate(features) if isinstance(f, Anchored) and f.exclusive]
