@@ -53,7 +53,7 @@ class CellList:
         self.axes, self.sheared = (self.images.axes, self.images.sheared) if self.images else ((), False)
         if self.images:
             self._lengths = scene.periodic.lengths
-        self._shapes = self.shapes(np.ptp(scene.particles.position, axis=0))
+        self._shapes = self.shapes(np.array(scene.particles.extent))
         self.sums = Sums(self.buckets + 2, team)
         self.edge = add("grid.edge", self.sums.room, kind=ti.i32)
         self.sorted = add("grid.sorted", scene.count, kind=ti.i32)

@@ -177,12 +177,14 @@ class NeighbourList:
         saved = bool(self.memory.read(self.old_saved)[0])  # given by restore(), and not built into a list yet
         first, number = (self.old_first, self.old_number) if saved else (self.first, self.number)
         i, at = self._entries(first, number)
-        near = seen(self.old_neighbour if saved else self.neighbour)[at]
-        values = {piece.name: seen(piece.old if saved else piece.field)[at] for piece in self.lasting}
+        near = seen(self.old_neighbour if saved else self.neighbour).take(at)
+        values = {piece.name: seen(piece.old if saved else piece.field).take(at, axis=0) for piece in self.lasting}
         some = np.zeros(len(i), dtype=bool)
         for value in values.values():
-            some |= (value != 0) if value.ndim == 1 else (value != 0).any(axis=1)
-        return np.stack([i[some], near[some]], axis=1), {name: value[some] for name, value in values.items()}
+            for column in value.T if value.ndim > 1 else [value]:  # any(axis=1) takes ten times as long
+                some |= column != 0
+        kept = np.flatnonzero(some)
+        return np.stack([i[kept], near[kept]], axis=1), {name: value.take(kept, axis=0) for name, value in values.items()}
 
     def restore(self, pairs: np.ndarray, values: dict[str, np.ndarray]) -> None:
         """Give what lasting_data() returned to the next list that is built."""

@@ -105,7 +105,7 @@ class NeighbourSearch(NeighbourList):
         radius, n = change.now.radius, change.now.count
         skin = self._skin(skin, radius, 0 * radius)
         self.skin, self.too_far = skin, (STALE * skin) ** 2
-        self.cells.regroup(radius, 0 * radius, skin, np.ptp(change.now.position, axis=0))
+        self.cells.regroup(radius, 0 * radius, skin, np.array(change.now.extent))
         if self.sheared:
             self.farthest = float(self.cells.sizes.max())
         self.sums.room = n

@@ -20,7 +20,7 @@ def planned(world: Any, some: np.ndarray, number: np.ndarray, added: Particles |
     """What is to happen to the particles of a world if those in the mask `some` stay and others are added; None where the world
     has to be built anew for it. Raises ValueError as building it does, and changes nothing."""
     runner = world._runner
-    scene, count = runner.scene, int(some.sum()) + (0 if added is None else len(added))
+    scene, count = runner.scene, int(np.count_nonzero(some)) + (0 if added is None else len(added))
     work = count + sum(f.count for f in world.features if isinstance(f, Batch))
     if not (count and len(some) and scene.order == 2 and world._scale.holds(Scale(count, work))):
         return None
@@ -28,8 +28,9 @@ def planned(world: Any, some: np.ndarray, number: np.ndarray, added: Particles |
         return None
     if any(f.changed and f.outgrown for f in world.features):
         return None
-    now = world._particles.regrouped(some, added, scene.state.get(runner.memory)[some])
-    inv_mass = scene.inv_mass[some] if added is None else np.concatenate([scene.inv_mass[some], added.inv_mass])
+    stay = np.flatnonzero(some)
+    now = world._particles.regrouped(some, added, scene.state.get(runner.memory).take(stay, axis=0))
+    inv_mass = scene.inv_mass[stay] if added is None else np.concatenate([scene.inv_mass[stay], added.inv_mass])
     change = Regrouping(some, number, scene.particles, now, inv_mass)
     if not (scene.state.can_regroup(change) and (scene.radius is None or scene.radius.can_be(now.radius))):
         return None
@@ -42,12 +43,12 @@ def planned(world: Any, some: np.ndarray, number: np.ndarray, added: Particles |
 
 def regroup(world: Any, change: Regrouping, added: Particles | None) -> None:
     """Do what was planned."""
-    runner, some, count = world._runner, change.some, change.now.count
+    runner, count = world._runner, change.now.count
     scene, step, memory = runner.scene, runner.step, runner.memory
     pairs = _pairs(runner.grid, change) if runner.grid and change.goes else None
     rows = scene.count
     for one in runner.memories:
-        one.regroup(rows, some, count)
+        one.regroup(rows, change.first, change.stay[change.first :], count)
     rows.set(count)
     scene.particles, scene.inv_mass = change.now, change.inv_mass
     scene.state.regroup(memory, change)
@@ -58,7 +59,7 @@ def regroup(world: Any, change: Regrouping, added: Particles | None) -> None:
     runner.team.regroup(count)
     step.particles.regroup(count)
     known = {id(start): start for start in (world._particles, *(f.start for f in world.features))}
-    starts = {one: start.regrouped(some, added) for one, start in known.items()}
+    starts = {one: change.now.placed(change.joined(start.position, None if added is None else added.position)) for one, start in known.items()}
     world._particles = starts[id(world._particles)]
     for f in world.features:
         waits = f.changed, f.moving, f.new_force
@@ -115,5 +116,5 @@ def _pairs(grid: Any, change: Regrouping) -> tuple[np.ndarray, dict[str, np.ndar
     """What pairs of particles that stay remember, by their new numbers."""
     pairs, values = grid.lasting_data()
     pairs = change.number[pairs]
-    both = (pairs >= 0).all(axis=1)
-    return pairs[both], {name: value[both] for name, value in values.items()}
+    both = np.flatnonzero((pairs[:, 0] >= 0) & (pairs[:, 1] >= 0))
+    return pairs.take(both, axis=0), {name: value.take(both, axis=0) for name, value in values.items()}

@@ -217,7 +217,7 @@ def _edited(
     seen: velocities, see _seen(). features_too: whether features came or went, too.
     tied: the first particle of constraints that came and are not met."""
     number, clock = np.where(some, np.cumsum(some) - 1, -1), world._clock
-    n, m = int(some.sum()), 0 if added is None else len(added)
+    n, m = int(np.count_nonzero(some)), 0 if added is None else len(added)
     world._events = told[0].renumbered(number, number), told[1].renumbered(number, walls)
     for one in list(world._handles):
         one.follow(number)
@@ -306,21 +306,14 @@ def _launch(world: Any, first: int) -> None:
     integrator = world._runner.integrator
     want = np.where(world._runner.scene.inv_mass[first:, None] > 0, world._particles.velocity[first:], 0.0)
     fields = [state.d, *([integrator.earlier] if integrator.uses_velocity else [])]
-    values = [memory.read(field).astype(np.float64) for field in fields]
-    for field, rows in zip(fields, values, strict=True):
-        rows[first:] = h * want
-        memory.write(field, rows)
+    for field in fields:
+        memory.write_from(field, first, h * want)
     if state.spins:
-        rows = memory.read(state.spin.s).astype(np.float64)
-        rows[first:] = h * state.spin.from_rates(world._particles.spin)[first:]
-        memory.write(state.spin.s, rows)
+        memory.write_from(state.spin.s, first, h * state.spin.from_rates(world._particles.spin)[first:])
     share = max(decay(sum(f.rate for f in integrator.forces.drags), h)[0], NOTHING)
     with world._runner.memory.compiler():
         seen = world._runner.velocity(world.iterations, touching=False)
     d = h * want + h / share * (want - seen[first:])
     d[world._runner.scene.inv_mass[first:] == 0] = 0.0
-    values[0][first:] = d
-    for rows in values[1:]:
-        rows[first:] = 3 * d - 2 * h * want  # so that 3 d - earlier = 2 h v
-    for field, rows in zip(fields, values, strict=True):
-        memory.write(field, rows)
+    for field, rows in zip(fields, (d, 3 * d - 2 * h * want), strict=False):  # so that 3 d - earlier = 2 h v
+        memory.write_from(field, first, rows)
