@@ -58,8 +58,9 @@ def regroup(world: Any, change: Regrouping, added: Particles | None) -> None:
         scene.slots.regroup(memory, change)
     runner.team.regroup(count)
     step.particles.regroup(count)
+    came = None if added is None else added.position
     known = {id(start): start for start in (world._particles, *(f.start for f in world.features))}
-    starts = {one: change.now.placed(change.joined(start.position, None if added is None else added.position)) for one, start in known.items()}
+    starts = {one: change.now.placed(change.joined(start.position, came)) for one, start in known.items()}
     world._particles = starts[id(world._particles)]
     for f in world.features:
         waits = f.changed, f.moving, f.new_force
