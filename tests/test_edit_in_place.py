@@ -64,6 +64,14 @@ def beside_a_rope():
     return w, lambda k, turn: drops(k, turn, 3, 0.09)
 
 
+def crowd():
+    """So many that few which are far off have no list built, by two threads; each has more than 32 others on its list."""
+    particles = tv.Particles(places(1100), radius=RADIUS)
+    features = [tv.Gravity(60.0), tv.Box((0, 0), (8, 12)), tv.Contact(0.3, skin=0.5)]
+    w = tv.World(particles, features, substeps=3, path="parallel")
+    return w, lambda k, turn: tv.Particles(drops(k, 19 + turn).position, velocity=(0.2, -20.0), radius=RADIUS)
+
+
 def steps_of(w) -> list:
     """A few frames, by all that is seen of them."""
     out = []
@@ -99,19 +107,21 @@ def edited(scene, anew: bool) -> tuple[list, int]:
             seen += [sorted(w.fields), {name: size for name, size in w.fields.items() if not name.startswith("grid")}]
             if any(getattr(f, "events", False) is True for f in w.features):
                 seen += [repr(w.events()), repr(w.wall_events())]
-        with w.clone() as twin:
+        with w.clone() as twin:  # which has pairs for a list, and none yet
             seen.append(twin.hash())
+            twin.remove([len(w.particles) - 2])
+            seen += steps_of(twin)
         w.close()
     finally:
         edit_in_place.planned = planned
     return seen, sum(taken)
 
 
-@pytest.mark.parametrize("scene", [discs, grains, beside_a_rope])
+@pytest.mark.parametrize("scene", [discs, grains, beside_a_rope, crowd])
 def test_in_place_is_to_the_bit_as_built_anew(scene):
     seen, count = edited(scene, anew=False)
     known, none = edited(scene, anew=True)
-    assert count == 7 and none == 0
+    assert count == 8 and none == 0
     for k, (a, b) in enumerate(zip(seen, known, strict=True)):
         assert a == b, k
 

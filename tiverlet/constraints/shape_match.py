@@ -124,7 +124,7 @@ class ShapeMatch(Batch):
         """Shapes that are given are given for all particles."""
         return self._rest is None
 
-    def hold_all(self, listing: list) -> None:
+    def hold_all(self, listing: Any) -> None:
         """Act on these."""
         self._keep(members=VariableSize("ShapeMatch", listing))
 

@@ -348,10 +348,11 @@ class Batch(Feature):
             if any(rows is not None for rows in both):
                 rows = [np.full(m, np.inf) if one is None else one for one, m in zip(both, counts, strict=True)]
                 self.__dict__[name] = handed_out(np.concatenate(rows), assign_whole(type(self).__name__, name))
-        self.hold_all([*self.listing, *more.listing])
+        listing = self.listing, more.listing
+        self.hold_all(np.concatenate(listing) if self.arity else [*listing[0], *listing[1]])
         self.note_arguments()
 
-    def hold_all(self, listing: list) -> None:
+    def hold_all(self, listing: Any) -> None:
         """Have these particles for each constraint, as the user would give them."""
 
     def rods(self) -> tuple[np.ndarray, np.ndarray]:

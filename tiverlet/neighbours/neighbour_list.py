@@ -200,6 +200,37 @@ class NeighbourList:
         self.memory.write(self.old_saved, 1)
         self.invalidate()
 
+    @property
+    def saved(self) -> bool:
+        """Whether the old list is saved for one that is not built yet."""
+        return bool(self.memory.seen(self.old_saved)[0])
+
+    def drop(self, number: np.ndarray) -> None:
+        """Of an elastic list that is not saved, whose particles have new numbers, -1 for those that went, and rows by these: take
+        out the pairs of what went. Other pairs stay where they are, or move up in the list of their particle."""
+        assert self.store
+        first, count, touching = (self.memory.seen(field) for field in (self.first, self.number, self.touching))
+        i, at = self._entries(self.first, self.number)
+        near = self.store.seen(self.neighbour)
+        new = number.take(near.take(at))
+        near[at] = new
+        fewer = np.flatnonzero(np.bincount(i, new < 0, self.n))
+        if not len(fewer):
+            return
+        loses = np.zeros(self.n, dtype=bool)
+        loses[fewer] = True
+        stay = np.flatnonzero(loses[i] & (new >= 0))
+        i, at = i[stay], at[stay]
+        place, before = np.arange(len(i)) - np.searchsorted(i, i), at - first[i]
+        for field in (self.neighbour, *(piece.field for piece in self.pair_data)):
+            rows = self.store.seen(field)
+            rows[first[i] + place] = rows[at]
+        bits = np.zeros(self.n, dtype=np.uint32)
+        bit = np.where(before < WORD, touching[i] >> np.minimum(before, WORD - 1) & 1, 1)  # of those behind it is not known
+        some = place < WORD
+        np.bitwise_or.at(bits, i[some], (bit[some] << place[some]).astype(np.uint32))
+        touching[fewer], count[fewer] = bits[fewer], np.bincount(i, minlength=self.n)[fewer]
+
     @ti.func
     def save_old_list(self, thread):
         """Save the list as the old one, unless one is there already, from a build that did not fit."""

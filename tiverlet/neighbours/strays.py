@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 from ..device import ti
 from ..device.number import OnDevice
 from ..device.thread_team import block, blocks
+from .neighbour_search import MOVED as MOVED  # of the list, which it keeps
 from .neighbour_search import STALE
 
 if TYPE_CHECKING:
@@ -14,7 +15,6 @@ if TYPE_CHECKING:
 
 MOST = 256  # strays at a time, since all are compared with each other
 SHARE = 64  # particles for each of them: to look around all strays is to cost less than a list
-MOVED = 2  # what NeighbourList.stale is while it is only because particles moved
 
 
 class Strays:

@@ -45,7 +45,7 @@ def regroup(world: Any, change: Regrouping, added: Particles | None) -> None:
     """Do what was planned."""
     runner, count = world._runner, change.now.count
     scene, step, memory = runner.scene, runner.step, runner.memory
-    pairs = _pairs(runner.grid, change) if runner.grid and change.goes else None
+    pairs = _pairs(runner.grid, change) if runner.grid and runner.grid.saved and change.goes else None
     rows = scene.count
     for one in runner.memories:
         one.regroup(rows, change.first, change.stay[change.first :], count)
