@@ -186,6 +186,42 @@ def test_a_pin_takes_a_disc_in_place(precision):
     other.close()
 
 
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+def test_springs_of_a_pin_take_others_in_place(precision, monkeypatch, tmp_path):
+    # As in a world that is built anew for it, to the bit; beside links, whose slots stand among theirs, and with knobs of both.
+    def scene():
+        pin = tv.Pin([10, 3], (0.5, 0.9), compliance=1e-3, damping=0.5)
+        link = tv.Distance([[20, 21], [21, 22], [5, 6]], compliance=1e-5)
+        particles = tv.Particles(places(30), radius=RADIUS, pinned=[0, 1])
+        features = [tv.Gravity(), tv.HalfSpace((0, 1), 0.0), tv.Contact(friction=0.3), pin, link]
+        w = tv.World(particles, features, precision=precision, substeps=5, solver=tv.Jacobi())
+        w.run(0.1)
+        return w, pin
+
+    (w, pin), (other, twin) = scene(), scene()
+    runner, grabbing = w._runner, edit_in_place.grabbing
+    with tv.Recorder(tmp_path / "held.rrd", w) as recorder:
+        for k in ([11, 3], [21, 12], [7, 6], [28, 13]):
+            seen = []
+            for one, hand, planned in ((w, pin, grabbing), (other, twin, lambda *_: None)):
+                monkeypatch.setattr(edit_in_place, "grabbing", planned)
+                hand.indices, hand.target, hand.damping = k, [(0.6, 0.01 * k[0]), (1.0, 1.0)], 0.1 * k[1]
+                for _ in range(3):
+                    report = one.step(1 / 60)
+                seen.append((one.hash(), report.energy, report.residual, one.velocity.tobytes(), hand.load.tobytes()))
+            assert seen[0] == seen[1]
+            recorder.log()
+    assert w._runner is runner and other._runner is not runner
+    with w.clone() as copy:
+        assert copy.hash() == w.hash()
+    assert tv.replay(tmp_path / "held.rrd").verify()
+    pin.indices = [0, 12]  # which is pinned
+    with pytest.raises(ValueError, match="holds particle 0, which is pinned"):
+        w.step(1 / 60)
+    w.close()
+    other.close()
+
+
 def test_worlds_one_after_the_other_take_no_more_memory():
     # Taichi has 512 trees of fields at most, and fields that do not grow: worlds share trees, and give their bytes back.
     def peak() -> int:

@@ -77,8 +77,8 @@ def regroup(world: Any, change: Regrouping, added: Particles | None) -> None:
 
 def grabbing(world: Any, some: np.ndarray) -> Regrouping | None:
     """What is to happen where knobs ask for nothing but that pins hold other particles: none of all, `some`, comes or goes, but
-    masses change, as contacts see them. None where the world has to be built anew for it, as where constraints act on what is
-    taken or let go."""
+    masses change, as contacts see them, and slots. None where the world has to be built anew for it, as where constraints act on
+    what is driven now or was before."""
     runner, pins = world._runner, [f for f in world.features if f.afresh]
     scene, memory = runner.scene, runner.memory
     if not pins or pins != [f for f in world.features if f.changed and f.outgrown]:
@@ -90,6 +90,7 @@ def grabbing(world: Any, some: np.ndarray) -> Regrouping | None:
         inv_mass[f.indices] = 0.0
     change, touched = Regrouping(some, np.arange(len(some)), scene.particles, now, inv_mass), inv_mass != scene.inv_mass
     free = not any(touched[b.indices].any() for b in runner.batches)
+    free = free and (all(f.drives for f in pins) or scene.slots.can_grab(change, runner.batches))
     static = not runner.grid or runner.grid.has_static == bool((inv_mass == 0).any())
     if not (free and static and scene.state.can_regroup(change) and all(f.can_grab(change) for f in pins)):
         return None
@@ -104,9 +105,11 @@ def grab(world: Any, change: Regrouping) -> None:
     alone = max(int((inv_mass == 0).sum()) for inv_mass in (scene.inv_mass, change.inv_mass)) <= 1
     scene.particles, scene.inv_mass = change.now, change.inv_mass
     scene.state.regroup(runner.memory, change)
-    for f in world.features:
-        if f.afresh:
-            f.grab(change)
+    pins = [f for f in world.features if f.afresh]
+    if any(f.soft for f in pins):
+        scene.slots.grab(runner.memory, change, runner.batches)
+    for f in pins:
+        f.grab(change)
     for log in runner.logs:
         log.forget()
     if not alone:  # lists leave out pairs of which none can move

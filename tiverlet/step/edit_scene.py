@@ -151,7 +151,7 @@ def renew(world: Any) -> None:
         rebuild(world, some, None, world.features)
         return
     told = world._all_events()
-    if world._force_waits:
+    if world._force_waits or any(f.afresh and f.soft for f in world.features):
         with world._runner.memory.compiler():
             world._runner.restart(world.iterations)
     world._clock.parted = None
