@@ -68,7 +68,7 @@ class Slots:
         memory.write_from(self.begin, first, np.full(n + 1 - first, self.total))
 
     def can_grab(self, change: Regrouping, batches: list[Batch]) -> bool:
-        """Whether constraints can act on others than before: each by itself, on a fixed number, in as many slots, and as exactly."""
+        """Whether constraints can act on others than before: each by itself, in as many slots, and as exactly."""
         if self.system or self.semi_iteration or not all(b.arity for b in batches):
             return False
         degree = arranged(batches, change.inv_mass)[1]
