@@ -320,10 +320,7 @@ class Memory:
         views = self._seen()
         if views:
             for e, a in zip(entries, arrays, strict=True):
-                view = views[id(e)]
-                if not e.copies or self.copies.chosen is not None:  # type: ignore[union-attr]
-                    view, a = self._one(e, view), np.broadcast_to(a, e.shape)
-                view[...] = a
+                self._one(e, views[id(e)])[...] = a
             return
         if self._all_of(entries):
             self._each(entries, lambda k: self._load(entries, [_part(e, a, k) for e, a in zip(entries, arrays, strict=True)]))

@@ -147,8 +147,8 @@ def ours(n: int) -> dict[str, float]:
         wall.active = bool(k % 2)
 
     def added(k: int):
-        """Add k particles."""
-        return lambda turn: world.add(more(k, turn))
+        """Add k particles, where others were that are gone."""
+        return lambda turn: world.add(more(k, 0))
 
     def removed(k: int):
         """Take the last k away."""
