@@ -560,7 +560,7 @@ class World:
 
         What was there goes on to the bit: time, positions, velocities, multipliers, the history of springs, what pairs in contact
         remember. Where a force or a spring is added, displacements are first turned into velocities, as when a force changes.
-        On a CPU it takes a millisecond or two where particles come alone, which happens in place, and some more else. Nothing is
+        On a CPU it takes two to four milliseconds where particles come alone, which happens in place, and ten else. Nothing is
         compiled: the world keeps its kernels until there are four times as many of what they work on. Features, masses or radii
         of a kind that it did not have, and the first particles that overlap others, cost the compiling that a new world costs,
         once; all worlds share what was compiled.
