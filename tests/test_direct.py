@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
+from tiverlet.solvers.elimination import plan
 from tiverlet.step import checkpoint
 
 from .chains import links
@@ -297,3 +298,35 @@ def test_straight_ropes_between_pins_stay_where_they_are(world, link, precision)
         if substeps != 2:
             assert "straight rope" in " ".join(report.notes)
             assert np.abs(w.position - x).max() < 40**2 * 9.81 * h**2 + 1e-6
+
+
+def test_a_plan_of_many_parts_solves_each():
+    # Gram matrices of unit gradients, coupled where corners share a particle: followed address by address, and by LAPACK.
+    rng = np.random.default_rng(0)
+    graphs = [loop(5), some_tree(rng, 8), loop(5), net(), loop(5), some_tree(rng, 30)[:, ::-1]]
+    begin = np.cumsum([0] + [g.max() + 1 for g in graphs])
+    pairs = rng.permutation(np.vstack([g + b for g, b in zip(graphs, begin, strict=False)]))
+    owner, item = np.repeat(np.arange(len(pairs)), 2), pairs.ravel()
+    found = plan(len(pairs), owner, item, 9)
+    m, entries = len(found.rows), len(found.column)
+    assert found.parts == len(found.widths) == len(graphs) and np.array_equal(np.sort(found.rows), np.arange(len(pairs)))
+    gradient = rng.normal(size=(len(owner), 2))
+    each = [np.bincount(owner, g * (item == i), m) for g in gradient.T for i in range(begin[-1])]
+    A = np.eye(m) + sum(np.outer(row, row) for row in each)
+    value = np.concatenate([np.ones(m), np.zeros(2 * entries)])
+    for at, a, b in found.product:
+        value[at] += gradient[a] @ gradient[b]
+    right = rng.normal(size=m)
+    step = right.copy()
+    for r in range(m):
+        mine = range(found.entry_begin[r], found.entry_begin[r + 1])
+        changed = iter(found.update[found.update_begin[r] : found.update_begin[r + 1]])
+        for j in mine:
+            step[found.column[j]] -= value[m + entries + j] / value[r] * step[r]
+            for k in mine:
+                value[next(changed)] -= value[m + entries + j] / value[r] * value[m + k]
+    for r in reversed(range(m)):
+        mine = np.arange(found.entry_begin[r], found.entry_begin[r + 1])
+        step[r] = (step[r] - value[m + mine] @ step[found.column[mine]]) / value[r]
+    known = np.linalg.solve(A[np.ix_(found.rows, found.rows)], right)
+    np.testing.assert_allclose(step, known, rtol=0, atol=1e-12)

@@ -64,6 +64,14 @@ def beside_a_rope():
     return w, lambda k, turn: drops(k, turn, 3, 0.09)
 
 
+def crowd():
+    """So many that few which are far off have no list built, by two threads; each has more than 32 others on its list."""
+    particles = tv.Particles(places(1100), radius=RADIUS)
+    features = [tv.Gravity(60.0), tv.Box((0, 0), (8, 12)), tv.Contact(0.3, skin=0.5)]
+    w = tv.World(particles, features, substeps=3, path="parallel")
+    return w, lambda k, turn: tv.Particles(drops(k, 19 + turn).position, velocity=(0.2, -20.0), radius=RADIUS)
+
+
 def steps_of(w) -> list:
     """A few frames, by all that is seen of them."""
     out = []
@@ -99,19 +107,21 @@ def edited(scene, anew: bool) -> tuple[list, int]:
             seen += [sorted(w.fields), {name: size for name, size in w.fields.items() if not name.startswith("grid")}]
             if any(getattr(f, "events", False) is True for f in w.features):
                 seen += [repr(w.events()), repr(w.wall_events())]
-        with w.clone() as twin:
+        with w.clone() as twin:  # which has pairs for a list, and none yet
             seen.append(twin.hash())
+            twin.remove([len(w.particles) - 2])
+            seen += steps_of(twin)
         w.close()
     finally:
         edit_in_place.planned = planned
     return seen, sum(taken)
 
 
-@pytest.mark.parametrize("scene", [discs, grains, beside_a_rope])
+@pytest.mark.parametrize("scene", [discs, grains, beside_a_rope, crowd])
 def test_in_place_is_to_the_bit_as_built_anew(scene):
     seen, count = edited(scene, anew=False)
     known, none = edited(scene, anew=True)
-    assert count == 7 and none == 0
+    assert count == 8 and none == 0
     for k, (a, b) in enumerate(zip(seen, known, strict=True)):
         assert a == b, k
 
@@ -172,6 +182,42 @@ def test_a_pin_takes_a_disc_in_place(precision):
         w.step(1 / 60)
     pin.indices = [12]
     w.step(1 / 60)
+    w.close()
+    other.close()
+
+
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+def test_springs_of_a_pin_take_others_in_place(precision, monkeypatch, tmp_path):
+    # As in a world that is built anew for it, to the bit; beside links, whose slots stand among theirs, and with knobs of both.
+    def scene():
+        pin = tv.Pin([10, 3], (0.5, 0.9), compliance=1e-3, damping=0.5)
+        link = tv.Distance([[20, 21], [21, 22], [5, 6]], compliance=1e-5)
+        particles = tv.Particles(places(30), radius=RADIUS, pinned=[0, 1])
+        features = [tv.Gravity(), tv.HalfSpace((0, 1), 0.0), tv.Contact(friction=0.3), pin, link]
+        w = tv.World(particles, features, precision=precision, substeps=5, solver=tv.Jacobi())
+        w.run(0.1)
+        return w, pin
+
+    (w, pin), (other, twin) = scene(), scene()
+    runner, grabbing = w._runner, edit_in_place.grabbing
+    with tv.Recorder(tmp_path / "held.rrd", w) as recorder:
+        for k in ([11, 3], [21, 12], [7, 6], [28, 13]):
+            seen = []
+            for one, hand, planned in ((w, pin, grabbing), (other, twin, lambda *_: None)):
+                monkeypatch.setattr(edit_in_place, "grabbing", planned)
+                hand.indices, hand.target, hand.damping = k, [(0.6, 0.01 * k[0]), (1.0, 1.0)], 0.1 * k[1]
+                for _ in range(3):
+                    report = one.step(1 / 60)
+                seen.append((one.hash(), report.energy, report.residual, one.velocity.tobytes(), hand.load.tobytes()))
+            assert seen[0] == seen[1]
+            recorder.log()
+    assert w._runner is runner and other._runner is not runner
+    with w.clone() as copy:
+        assert copy.hash() == w.hash()
+    assert tv.replay(tmp_path / "held.rrd").verify()
+    pin.indices = [0, 12]  # which is pinned
+    with pytest.raises(ValueError, match="holds particle 0, which is pinned"):
+        w.step(1 / 60)
     w.close()
     other.close()
 

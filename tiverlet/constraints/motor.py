@@ -40,7 +40,7 @@ class Motor(Scalar):
     """
 
     index_name = "hinges"
-    driven = True
+    driven, grows = True, False
     each = ("speed", "angle", "torque", "compliance", "damping", "break_at")
     uploads_all = False  # goals are of one
     speed = Knob(lambda f, v: checks.per_item("Motor", "speed", v, f.count), "Angular velocity [rad/s].")

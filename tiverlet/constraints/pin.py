@@ -92,14 +92,17 @@ class Pin(Anchored):
     def can_grab(self, change: Regrouping) -> bool:
         """Whether the others that are to be held now can be, while it stays bound, and while no other thing but their masses
         changes."""
-        return self._grabs and self.drives and self.acts and vars(self.dev)["built"] == self.compiled()
+        return self._grabs and self.acts and vars(self.dev)["built"] == self.compiled()
 
     def grab(self, change: Regrouping) -> None:
-        """Hold them from where they are, as a new Pin would."""
+        """Hold them as a new Pin would."""
         memory = self.scene.memory
         self.note_arguments()
-        self.start, self._grabs, self.changed, self.moving, self.new_force = change.now, False, True, False, False
-        here = self.start.position[self.indices[:, 0]]
+        self.start, self._grabs, self.changed, self.moving, self.new_force = change.now, False, self.drives, False, False
+        here = self._anchors
+        if self.soft:
+            memory.write(self.dev.lam, np.zeros_like(here))
+            self.dev.spring.begin(self.compliance, self.damping)
         memory.write(self.dev.members, self.indices)
         memory.write(self.dev.source, here)
         memory.write(self.dev.target, here)
@@ -127,11 +130,15 @@ class Pin(Anchored):
     def bind(self, scene: Scene) -> None:
         """Targets at the start and the end of a frame."""
         super().bind(scene)
-        # A driven particle sets out from where it is; a spring is anchored at the target from the start.
-        here = self.start.position[self.indices[:, 0]] if self.drives else self.target
+        here = self._anchors
         self.changed = self.drives
         self.dev.source = scene.memory.field("Pin.from", self.count, width=self.dim, values=here, state=True)
         self.dev.target = scene.memory.field("Pin.to", self.count, width=self.dim, values=here, state=True)
+
+    @property
+    def _anchors(self) -> np.ndarray:
+        """Where a driven particle sets out from: where it is. A spring is anchored at the target from the start."""
+        return self.start.position[self.indices[:, 0]] if self.drives else self.target
 
     def upload(self) -> None:
         """Aim at the new target."""

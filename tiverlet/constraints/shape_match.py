@@ -119,6 +119,15 @@ class ShapeMatch(Batch):
         square = np.bincount(self.members.owner, weights=m * (self._shape**2).sum(axis=1), minlength=self.count)
         self._radius = np.sqrt(square / total)
 
+    @property
+    def grows(self) -> bool:
+        """Shapes that are given are given for all particles."""
+        return self._rest is None
+
+    def hold_all(self, listing: Any) -> None:
+        """Act on these."""
+        self._keep(members=VariableSize("ShapeMatch", listing))
+
     def shape_of(self, c: int) -> np.ndarray:
         """The shape at rest of cluster c, about its center, (k, dim)."""
         return self._shape[self.members.starts[c] : self.members.starts[c + 1]]

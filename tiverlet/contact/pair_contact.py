@@ -13,7 +13,7 @@ from ..features.material import Table
 from ..neighbours.cell_list import FARTHEST
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..neighbours.queries import Contacts
-from ..neighbours.strays import MOVED
+from ..neighbours.neighbour_list import MOVED
 from ..particles import Particles
 
 

@@ -24,6 +24,10 @@ class Entry:
     copies: int = 0  # of which each has so many elements; 0 where it is one for all
     rows: Any = None  # the Number of what it has an element for each of; None where that is not told
 
+    def of_length(self, length: int) -> "Entry":
+        """The same field with so many elements; replace() takes three times as long."""
+        return Entry(self.name, self.field, self.width, length, self.kind, self.state, self.copies, self.rows)
+
     @property
     def shape(self) -> tuple[int, ...]:
         """Of the array that it is."""

@@ -8,7 +8,6 @@ these into an error that says what to do, so that no other module has to know.
 import contextlib
 import weakref
 from collections import Counter
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -145,7 +144,7 @@ class Memory:
         if self.copies or not (self._layout and self._layout.shared and length <= self._layout.room):
             return False  # copies begin elsewhere when those before are longer
         self._views = {}
-        self.entries = [replace(e, length=length) for e in self.entries]
+        self.entries = [e.of_length(length) for e in self.entries]
         return True
 
     @property
@@ -157,14 +156,13 @@ class Memory:
         """Whether there is room for so many elements of each field."""
         return bool(self._layout) and length <= self._layout.room  # type: ignore[union-attr]
 
-    def regroup(self, rows: Number, some: np.ndarray, count: int) -> None:
-        """Of each field that has an element for each of what a number counts, keep those in the mask `some`, in order, and give
-        it `count` in all; new ones are 0. What comes before the first that goes is not touched. For an elastic memory."""
-        first, kept = len(some) if some.all() else int(np.argmin(some)), int(some.sum())
-        stay = some[first:]
+    def regroup(self, rows: Number, first: int, behind: np.ndarray, count: int) -> None:
+        """Of each field that has an element for each of what a number counts, keep the first ones and those `behind` them, by
+        their numbers, in order, and give it `count` in all; new ones are 0. For an elastic memory."""
+        kept = first + len(behind)
         for k, e in enumerate(self.entries):
             if e.rows is rows:
-                moved = self._seen()[id(e)][first : len(some)][stay]
+                moved = self._seen()[id(e)].take(behind, axis=0)
                 view = self._resized(k, count)
                 view[first:kept], view[kept:] = moved, 0
 
@@ -181,7 +179,7 @@ class Memory:
         if old.length == length:
             return views[id(old)]
         assert self._layout
-        self.entries[k] = new = replace(old, length=length)
+        self.entries[k] = new = old.of_length(length)
         del views[id(old)]
         (views[id(new)],) = self._layout.views(self._address, [(self._which[k], new.whole, new.kind)])
         return views[id(new)]
@@ -322,10 +320,7 @@ class Memory:
         views = self._seen()
         if views:
             for e, a in zip(entries, arrays, strict=True):
-                view = views[id(e)]
-                if not e.copies or self.copies.chosen is not None:  # type: ignore[union-attr]
-                    view, a = self._one(e, view), np.broadcast_to(a, e.shape)
-                view[...] = a
+                self._one(e, views[id(e)])[...] = a
             return
         if self._all_of(entries):
             self._each(entries, lambda k: self._load(entries, [_part(e, a, k) for e, a in zip(entries, arrays, strict=True)]))

@@ -33,7 +33,7 @@ from ..device.language import inside_kernel
 from ..device.number import Number
 from .arguments import Knob as Knob
 from .arguments import RecordsArguments, knobs_of
-from .read_only import handed_out
+from .read_only import assign_whole, handed_out
 
 if TYPE_CHECKING:
     from ..device.memory import Memory
@@ -157,6 +157,13 @@ class Feature(RecordsArguments):
     def regroup(self, change: "Regrouping") -> None:
         """They came and went: fields with a row for each particle have those of `change.now`, with 0 for new ones."""
 
+    def check_more(self, more: "Feature") -> None:
+        """Raise TypeError where extend() cannot take it."""
+        raise TypeError(f"World.add: extend: {self!r} cannot take more constraints. Add {more!r} to features.")
+
+    def extend(self, more: Any) -> None:
+        """While it is not bound: take the constraints of another one of its kind behind its own."""
+
     def rods(self) -> tuple[np.ndarray, np.ndarray]:
         """What rays meet of it between two particles: these, (k, 2), and which of its links that is, (k,)."""
         return np.zeros((0, 2), dtype=np.int64), np.zeros(0, dtype=np.int64)
@@ -235,6 +242,7 @@ class Batch(Feature):
     soft = False  # has springs, which act at a start
     breaks = False  # has constraints that a load can break
     clusters = False  # keeps shapes, which members_of() and shape_of() give
+    grows = False  # can have more constraints behind its own, see extend()
     drives = False  # puts its particles in place instead of relaxing them
     solvable_together = False  # its constraints may be solved together with others, by the System of a solver; see Scalar
     driven = False  # rest values move by themselves: what drive_of() gives, see Drive
@@ -330,6 +338,28 @@ class Batch(Feature):
     def select(self, some: np.ndarray, number: np.ndarray) -> None:
         """Keep the particles of these constraints, by their new numbers."""
         self._keep(members=self.members.remapped(some, number))
+
+    def check_more(self, more: Feature) -> None:
+        """It takes others of its own kind, on as many particles each."""
+        if not self.grows:
+            super().check_more(more)
+        if type(more) is not type(self) or more.arity != self.arity or not more.grows:  # type: ignore[attr-defined]
+            raise TypeError(f"World.add: extend: {self!r} cannot take {more!r}, which is of another kind. Add it to features.")
+
+    def extend(self, more: "Batch") -> None:
+        """Rows behind rows. Where only one of the two can break, the other never does."""
+        counts = self.count, more.count
+        for name in self.each:
+            both = [vars(one).get(name) for one in (self, more)]
+            if any(rows is not None for rows in both):
+                rows = [np.full(m, np.inf) if one is None else one for one, m in zip(both, counts, strict=True)]
+                self.__dict__[name] = handed_out(np.concatenate(rows), assign_whole(type(self).__name__, name))
+        listing = self.listing, more.listing
+        self.hold_all(np.concatenate(listing) if self.arity else [*listing[0], *listing[1]])
+        self.note_arguments()
+
+    def hold_all(self, listing: Any) -> None:
+        """Have these particles for each constraint, as the user would give them."""
 
     def rods(self) -> tuple[np.ndarray, np.ndarray]:
         """What has two corners, which pictures draw as lines, and is not broken."""

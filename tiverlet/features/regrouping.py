@@ -25,12 +25,22 @@ class Regrouping:
     @cached_property
     def first(self) -> int:
         """The first particle that goes; those before it keep their numbers."""
-        return len(self.some) if self.some.all() else int(np.argmin(self.some))
+        return int(np.argmin(self.some)) if self.goes else len(self.some)
 
     @cached_property
     def kept(self) -> int:
         """How many stay; from this number on particles are new."""
-        return int(self.some.sum())
+        return int(np.count_nonzero(self.some))
+
+    @cached_property
+    def stay(self) -> np.ndarray:
+        """Those that stay, by their old numbers. NumPy takes rows by numbers ten times as fast as by a mask."""
+        return np.flatnonzero(self.some)
+
+    def joined(self, rows: np.ndarray, added: np.ndarray | None) -> np.ndarray:
+        """Of rows for all that there were, those of what stays, and behind them the added ones."""
+        left = np.asarray(rows).take(self.stay, axis=0) if self.goes else np.asarray(rows)
+        return left if added is None else np.concatenate([left, added])
 
     @property
     def goes(self) -> bool:

@@ -54,10 +54,10 @@ class CellList:
         self.axes, self.sheared = (self.images.axes, self.images.sheared) if self.images else ((), False)
         if self.images:
             self._lengths = scene.periodic.lengths
-        self._shapes = self.shapes(np.ptp(scene.particles.position, axis=0))
+        self._shapes = self.shapes(np.array(scene.particles.extent))
         self.sums = Sums(self.buckets + 2, team)
         self.edge = add("grid.edge", self.sums.room, kind=ti.i32)
-        self.sorted = add("grid.sorted", scene.count, kind=ti.i32)
+        self.sorted = add("grid.sorted", scene.particles.count, kind=ti.i32)
         if self.state.compensated:
             self.low = add("grid.place_low", scene.count, width=dim)
         self.shape = add("grid.shape", self.levels, width=dim, kind=ti.i32, values=self._shapes)
@@ -85,14 +85,24 @@ class CellList:
         level = levels_of(radius, reach)
         return int(level.max(initial=0)) + 1 == self.levels and self.memory.holds(4 * (len(radius) + 4**self.dim) + 2)
 
-    def regroup(self, radius: np.ndarray, reach: np.ndarray, skin: float, extent: np.ndarray) -> None:
-        """There are other particles now, see NeighbourSearch.regroup(). extent: of all of them [m]."""
+    def drop(self, number: np.ndarray) -> None:
+        """Take out particles that went, where others have new numbers, -1 for these, until cells are filled anew."""
+        order, edge = self.memory.seen(self.sorted), self.memory.seen(self.edge)
+        new = number[order[: len(number)]]
+        gone = np.flatnonzero(new < 0)
+        order[: len(new) - len(gone)] = new[new >= 0]
+        edge -= np.searchsorted(gone, edge).astype(edge.dtype)
+
+    def regroup(self, radius: np.ndarray, reach: np.ndarray, skin: float, extent: np.ndarray) -> bool:
+        """There are other particles now, see NeighbourSearch.regroup(). extent: of all of them [m]. Returns whether the cells are
+        those that were filled last."""
         level, memory = levels_of(radius, reach), self.memory
+        memory.resize(self.sorted, len(radius))
         sizes, bits, offsets = self._tables(radius, reach, skin, level)
         if self.levels > 1:
             memory.write(self.level, level)
         if np.array_equal(sizes, self.sizes) and np.array_equal(bits, self.bits):
-            return
+            return True
         self.sizes, self.bits, self.coarsest, self.buckets = sizes, bits, float(1 / sizes[0]), int(offsets[-1])
         self.sums.room = self.buckets + 2
         memory.resize(self.edge, self.sums.room)
@@ -101,6 +111,7 @@ class CellList:
             memory.write(self.offset, offsets[:-1])
         self._shapes = np.zeros((0, self.dim))
         self.fit(extent)
+        return False
 
     def shapes(self, extent: np.ndarray) -> np.ndarray:
         """Bits of each axis of each table, (levels, dim): at least 2, the rest where there are most cells per bucket."""

@@ -20,7 +20,7 @@ from ..features.regrouping import Regrouping
 from ..geometry.ordered import distinct
 from .cell_list import CellList, add_to
 from .images import FLOW, GRADIENT
-from .neighbour_list import STALE, NeighbourList, PairData
+from .neighbour_list import MOVED, STALE, NeighbourList, PairData
 
 if TYPE_CHECKING:
     from ..features.feature import Scene
@@ -101,11 +101,17 @@ class NeighbourSearch(NeighbourList):
         return room and static and not self.team.launched and self.cells.can_regroup(radius, 0 * radius)
 
     def regroup(self, change: Regrouping, skin: float) -> None:
-        """They came and went, and the team knows. What pairs remember is given to the next list by restore(), where any went."""
-        radius, n = change.now.radius, change.now.count
+        """They came and went, and the team knows. The list stays, but for pairs of what went, unless it is another one that
+        would be built now; what came is on no list, as a stray is that has gone far. Where the old list is saved, what pairs
+        remember is to be given to the next list by restore()."""
+        radius, n, stale = change.now.radius, change.now.count, int(self.memory.seen(self.stale)[0])
+        if change.goes and not self.saved:
+            self.drop(change.number)
+            self.cells.drop(change.number)
         skin = self._skin(skin, radius, 0 * radius)
+        stays = self.lone and not self.saved and stale != 1 and skin == self.skin
         self.skin, self.too_far = skin, (STALE * skin) ** 2
-        self.cells.regroup(radius, 0 * radius, skin, np.ptp(change.now.position, axis=0))
+        stays &= self.cells.regroup(radius, 0 * radius, skin, np.array(change.now.extent))
         if self.sheared:
             self.farthest = float(self.cells.sizes.max())
         self.sums.room = n
@@ -117,7 +123,10 @@ class NeighbourSearch(NeighbourList):
             begin = self.memory.seen(self.excluded_begin)[change.first]
             self.memory.resize(self.excluded_begin, n + 1)
             self.memory.write_from(self.excluded_begin, change.first, np.full(n + 1 - change.first, begin))
-        self.invalidate()
+        came = n - change.kept
+        if came:
+            self.memory.write_from(self.origin, change.kept, np.full((came, self.dim), np.nan))
+        self.memory.write(self.stale, (MOVED if came else stale) if stays else 1)
 
     @property
     def finest(self) -> float:

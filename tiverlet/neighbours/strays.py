@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 from ..device import ti
 from ..device.number import OnDevice
 from ..device.thread_team import block, blocks
-from .neighbour_list import STALE
+from .neighbour_list import MOVED, STALE
 
 if TYPE_CHECKING:
     from ..device.thread_team import Team
@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 
 MOST = 256  # strays at a time, since all are compared with each other
 SHARE = 64  # particles for each of them: to look around all strays is to cost less than a list
-MOVED = 2  # what NeighbourList.stale is while it is only because particles moved
 
 
 class Strays:

@@ -64,15 +64,19 @@ class Particles:
         """All that was set is structure from now on."""
         for name, array in vars(self).items():
             if isinstance(array, np.ndarray):
-                live = f" To move particles, assign to world.{name}." if name in ("position", "velocity") else ""
-                vars(self)[name] = read_only(array, structure("Particles", name) + live)
+                vars(self)[name] = _fixed(name, array)
         self._fixed = True
 
     @property
     def size(self) -> float:
         """A length that is typical of them [m], for relative residuals of things that have none of their own."""
-        extent = float(np.ptp(self.position, axis=0).max()) if self.count else 0.0
-        return extent or float(self.radius.max(initial=0.0)) or 1.0
+        return max(self.extent) or float(self.radius.max(initial=0.0)) or 1.0
+
+    @property
+    def extent(self) -> list[float]:
+        """Of the box around them [m]. Axis by axis, which takes NumPy a tenth of what all at once do."""
+        columns = np.ascontiguousarray(np.asarray(self.position).T)
+        return [float(x.max() - x.min()) if self.count else 0.0 for x in columns]
 
     @property
     def axes(self) -> int:
@@ -90,7 +94,8 @@ class Particles:
         both: dict[str, np.ndarray] = {"position": self.position if position is None else position}
         both |= {name: own[name] for name in names}
         if not some.all():
-            both |= {name: values[some] for name, values in both.items() if position is None or name != "position"}
+            stay = np.flatnonzero(some)
+            both |= {name: values.take(stay, axis=0) for name, values in both.items() if position is None or name != "position"}
         if added is not None:
             both = {name: np.concatenate([values, vars(added)[name]]) for name, values in both.items()}
         new = object.__new__(Particles)  # of what was checked when it came
@@ -102,14 +107,15 @@ class Particles:
     def placed(self, position: np.ndarray) -> "Particles":
         """The same particles, at other places, (n, dim) [m]."""
         new = object.__new__(Particles)
-        vars(new).update(vars(self), position=position, _fixed=False)
-        new._fix()
+        vars(new).update(vars(self), position=_fixed("position", position))
         return new
 
     def _turning_of(self, some: np.ndarray, added: "Particles | None") -> dict[str, np.ndarray | None]:
         """How those in the mask and the added ones spin; where only some do, the others do from now on, starting without."""
         groups = [(self, some), *([(added, np.ones(len(added), dtype=bool))] if added is not None else [])]
-        out = {}
+        if not any(p.spins for p, _ in groups):
+            return dict.fromkeys(TURNING)
+        out: dict[str, np.ndarray | None] = {}
         for name in TURNING:
             given = [getattr(p, name) for p, _ in groups]
             rows = [at_rest(name, p) if v is None else v for (p, _), v in zip(groups, given, strict=True)]
@@ -132,6 +138,12 @@ class Particles:
 
     def __repr__(self) -> str:
         return f"Particles({self.count} in {self.dim}D)"
+
+
+def _fixed(name: str, array: np.ndarray) -> np.ndarray:
+    """An array of Particles that is structure."""
+    live = f" To move particles, assign to world.{name}." if name in ("position", "velocity") else ""
+    return read_only(array, structure("Particles", name) + live)
 
 
 def in_range(who: str, name: str, position: np.ndarray) -> None:

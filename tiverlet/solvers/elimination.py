@@ -3,10 +3,14 @@
 import heapq
 from collections import defaultdict
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 
 from ..geometry.ordered import distinct
+
+SHORT = 4096  # corners of a part up to which its plan is kept
+COUNTED = (("entry", "column"), ("product", "product"), ("update", "update"))  # what rows have some of, and the array of it
 
 
 @dataclass
@@ -67,29 +71,77 @@ def plan(count: int, owner: np.ndarray, item: np.ndarray, width: int) -> Plan:
     label = components(count, owner, item)
     crowd = np.bincount(item, minlength=1)
     refused = distinct(label[owner[crowd[item] > width + 1]])[0]
-    touched = distinct(owner)[0]
-    touched = touched[~np.isin(label[touched], refused)]
+    corners = np.flatnonzero(~np.isin(label[owner], refused))
+    corners = corners[np.argsort(label[owner[corners]], kind="stable")]  # part by part
+    _, part, sizes = distinct(label[owner[corners]])
+    owners, own = _numbered(part, owner[corners], len(sizes))
+    _, its = _numbered(part, item[corners], len(sizes))
+    firsts, ends = np.searchsorted(owners[:, 0], np.arange(len(sizes))).tolist(), np.cumsum(sizes).tolist()
+    found = []
+    for first, size, end in zip(firsts, sizes.tolist(), ends, strict=True):
+        mine = slice(end - size, end)
+        plan = (_known if size <= SHORT else _planned)(width, own[mine].tobytes(), its[mine].tobytes())
+        if plan:
+            found.append((plan, first, end - size))
+    return _joined(found, owners[:, 1], corners)
+
+
+def _numbered(part: np.ndarray, what: np.ndarray, parts: int) -> tuple[np.ndarray, np.ndarray]:
+    """All of `what`, each once, by part, (k, 2); and for every one its number among those of its part, in order."""
+    each, which, _ = distinct(np.stack([part, what], axis=1))
+    return each, (which - np.searchsorted(each[:, 0], np.arange(parts))[part]).astype(np.int32)
+
+
+def _planned(width: int, owner: bytes, item: bytes) -> Plan | None:
+    """One part, whose owners and items are numbered from 0 on, as bytes of i32; None where it is wider than `width`."""
+    owners, items = (np.frombuffer(one, dtype=np.int32).tolist() for one in (owner, item))
     corners: dict[int, list[int]] = defaultdict(list)
     sharing: dict[int, list[int]] = defaultdict(list)
-    for k in np.flatnonzero(np.isin(owner, touched)).tolist():
-        corners[int(owner[k])].append(k)
-        sharing[int(item[k])].append(k)
-    groups: dict[int, list[int]] = defaultdict(list)
-    for c in touched.tolist():
-        groups[int(label[c])].append(c)
-    owners = owner.tolist()
-    order: list[int] = []
-    later: dict[int, list[int]] = {}
-    begin, widths = [0], []
-    for group in groups.values():
-        near = {c: {owners[k] for b in corners[c] for k in sharing[int(item[b])]} - {c} for c in group}
-        found = _eliminate(near, width)
-        if found:
-            order += [c for c, _ in found]
-            later.update(found)
-            begin.append(len(order))
-            widths.append(max(len(n) for _, n in found))
-    return _addresses(order, later, corners, sharing, owners, item.tolist(), begin, widths)
+    for k, (c, i) in enumerate(zip(owners, items, strict=True)):
+        corners[c].append(k)
+        sharing[i].append(k)
+    near = {c: {owners[k] for b in corners[c] for k in sharing[items[b]]} - {c} for c in range(len(corners))}
+    found = _eliminate(near, width)
+    return _addresses(found, corners, sharing, owners, items) if found else None
+
+
+# Many parts are alike, as ropes of one length are, and those of an edited world are known from before.
+_known = lru_cache(maxsize=64)(_planned)
+
+
+def _joined(found: list[tuple[Plan, int, int]], owners: np.ndarray, corners: np.ndarray) -> Plan:
+    """The plan of all parts: of each its own, and from which number on the owners and the corners are its."""
+    plans = [one for one, _, _ in found]
+
+    def sizes(name: str) -> np.ndarray:
+        """How many each part has of something."""
+        return np.array([len(getattr(one, name)) for one in plans], dtype=np.int64)
+
+    def ends(name: str) -> np.ndarray:
+        """Where those of each part begin, and where all end."""
+        return np.concatenate([[0], np.cumsum(sizes(name))])
+
+    def joined(name: str, shift: np.ndarray | list[int], skip: int = 0) -> np.ndarray:
+        """What each part has of something, shifted."""
+        each = [getattr(one, name)[skip:] + by for one, by in zip(plans, shift, strict=False)]
+        return np.concatenate([*each, np.zeros(0, dtype=np.int64)])
+
+    def shifted(address: np.ndarray, name: str) -> np.ndarray:
+        """Addresses in the arrays of the parts, in that of all."""
+        part = np.repeat(np.arange(len(plans)), sizes(name))
+        m, entries = sizes("rows")[part], sizes("column")[part]
+        row, entry = address + rows[part], address - m + rows[-1] + columns[part]
+        return np.where(address < m, row, np.where(address < m + entries, entry, entry - entries + columns[-1]))
+
+    rows, columns = ends("rows"), ends("column")
+    product = np.concatenate([*(one.product for one in plans), np.zeros((0, 3), dtype=np.int64)])
+    begin = np.repeat(np.array([k for _, _, k in found], dtype=np.int64), sizes("product"))[:, None]
+    product = np.column_stack([shifted(product[:, 0], "product"), corners[product[:, 1:] + begin]])
+    starts = [np.concatenate([[0], joined(f"{name}_begin", ends(of), 1)]) for name, of in COUNTED]
+    return Plan(
+        owners[joined("rows", [k for _, k, _ in found])], rows, starts[0], joined("column", rows), starts[1], product,
+        starts[2], shifted(joined("update", [0] * len(plans)), "update"), [w for one in plans for w in one.widths],
+    )  # fmt: skip
 
 
 def _eliminate(near: dict[int, set[int]], width: int) -> list[tuple[int, list[int]]] | None:
@@ -113,7 +165,9 @@ def _eliminate(near: dict[int, set[int]], width: int) -> list[tuple[int, list[in
     return out
 
 
-def _addresses(order, later, corners, sharing, owners, items, begin, widths) -> Plan:
+def _addresses(found: list[tuple[int, list[int]]], corners, sharing, owners, items) -> Plan:
+    """The plan of one part, from what _eliminate() found."""
+    order, later = [c for c, _ in found], dict(found)
     at = {c: r for r, c in enumerate(order)}
     m = len(order)
     columns = [sorted(at[o] for o in later[c]) for c in order]
@@ -141,6 +195,6 @@ def _addresses(order, later, corners, sharing, owners, items, begin, widths) -> 
         return np.asarray(values, dtype=np.int64)
 
     return Plan(
-        ints(order), ints(begin), ints(ends), ints([j for row in columns for j in row]), ints(product_begin),
-        ints(products).reshape(-1, 3), ints(update_begin), ints(updates), widths,
+        ints(order), ints([0, m]), ints(ends), ints([j for row in columns for j in row]), ints(product_begin),
+        ints(products).reshape(-1, 3), ints(update_begin), ints(updates), [max(len(row) for row in columns)],
     )  # fmt: skip

@@ -14,6 +14,20 @@ from .system import solvable
 TENSEST = 4.0  # (omega h)^2 of a vibration across a tension, beyond which Verlet diverges
 
 
+def arranged(batches: list[Batch], inv_mass: np.ndarray) -> tuple[dict[int, np.ndarray], np.ndarray]:
+    """The slots of the corners of each batch, by its id, -1 for what cannot move; and how many each particle has, (n,)."""
+    n, members = len(inv_mass), np.concatenate([b.indices.ravel() for b in batches])
+    movable = inv_mass[members] > 0
+    order = np.argsort(np.where(movable, members, n), kind="stable")
+    place = np.empty(len(members), dtype=np.int64)
+    place[order] = np.arange(len(members))
+    place[~movable] = -1
+    ends = np.cumsum([b.indices.size for b in batches])
+    parts = np.split(place, ends[:-1])
+    places = {id(b): p.reshape(b.indices.shape) for b, p in zip(batches, parts, strict=True)}
+    return places, np.bincount(members[movable], minlength=n)
+
+
 class Slots:
     """One slot for each corner of a constraint, in the order of the batches and of the constraints in them.
 
@@ -28,21 +42,11 @@ class Slots:
 
     def __init__(self, scene: Scene, batches: list[Batch], solver):
         memory, state, inv_mass = scene.memory, scene.state, scene.inv_mass
-        n = len(inv_mass)
-        members = np.concatenate([b.indices.ravel() for b in batches])
-        movable = inv_mass[members] > 0
-        self.total = int(movable.sum())
-        degree = np.bincount(members[movable], minlength=n)
-        order = np.argsort(np.where(movable, members, n), kind="stable")
-        place = np.empty(len(members), dtype=np.int64)
-        place[order] = np.arange(len(members))
-        place[~movable] = -1
-        ends = np.cumsum([b.indices.size for b in batches])
-        parts = np.split(place, ends[:-1])
-        self._places = {id(b): p.reshape(b.indices.shape) for b, p in zip(batches, parts, strict=True)}
+        self._places, degree = arranged(batches, inv_mass)
+        self.total, begin = int(degree.sum()), np.concatenate([[0], np.cumsum(degree)])
         self.state = state
         self.move = memory.field("slots.move", self.total, width=state.dim)
-        self.begin = memory.field("slots.begin", n + 1, kind=ti.i32, values=np.concatenate([[0], np.cumsum(degree)]))
+        self.begin = memory.field("slots.begin", len(begin), kind=ti.i32, values=begin)
         self.semi_iteration = solver.semi_iteration(scene)
         self.converges = solver.converges
         if self.converges:
@@ -55,6 +59,7 @@ class Slots:
         # Whether a substep fulfils constraints to rounding, which is then the error that is left.
         scalars = solvable(batches)
         self.exact = bool(scalars) and (not self.system.steps if self.system else bool(degree.max(initial=0) <= 1))
+        self._scalars = bool(scalars)
         blocks = self.system.blocks if self.system else degree
         self.split = memory.field("slots.split_mass", scene.count, values=blocks * inv_mass)
         self.relaxation = solver.relaxed_by(scene, batches, blocks * inv_mass)
@@ -64,6 +69,21 @@ class Slots:
         n, first = change.now.count, change.first
         memory.resize(self.begin, n + 1)
         memory.write_from(self.begin, first, np.full(n + 1 - first, self.total))
+
+    def can_grab(self, change: Regrouping, batches: list[Batch]) -> bool:
+        """Whether constraints can act on others than before: each by itself, in as many slots, and as exactly."""
+        if self.system or self.semi_iteration or not all(b.arity for b in batches):
+            return False
+        degree = arranged(batches, change.inv_mass)[1]
+        return int(degree.sum()) == self.total and self.exact == (self._scalars and bool(degree.max(initial=0) <= 1))
+
+    def grab(self, memory: Memory, change: Regrouping, batches: list[Batch]) -> None:
+        """They do."""
+        self._places, degree = arranged(batches, change.inv_mass)
+        memory.write(self.begin, np.concatenate([[0], np.cumsum(degree)]))
+        memory.write(self.split, degree * change.inv_mass)
+        for b in batches:
+            memory.write(b.dev.places, self.places(b))
 
     def places(self, batch: Batch) -> np.ndarray:
         """The slot of each corner of a batch, -1 where it cannot move."""

@@ -21,7 +21,7 @@ def planned(world: Any, some: np.ndarray, number: np.ndarray, added: Particles |
     """What is to happen to the particles of a world if those in the mask `some` stay and others are added; None where the world
     has to be built anew for it. Raises ValueError as building it does, and changes nothing."""
     runner = world._runner
-    scene, count = runner.scene, int(some.sum()) + (0 if added is None else len(added))
+    scene, count = runner.scene, int(np.count_nonzero(some)) + (0 if added is None else len(added))
     work = count + sum(f.count for f in world.features if isinstance(f, Batch))
     if not (count and len(some) and scene.order == 2 and world._scale.holds(Scale(count, work))):
         return None
@@ -29,8 +29,9 @@ def planned(world: Any, some: np.ndarray, number: np.ndarray, added: Particles |
         return None
     if any(f.changed and f.outgrown for f in world.features):
         return None
-    now = world._particles.regrouped(some, added, scene.state.get(runner.memory)[some])
-    inv_mass = scene.inv_mass[some] if added is None else np.concatenate([scene.inv_mass[some], added.inv_mass])
+    stay = np.flatnonzero(some)
+    now = world._particles.regrouped(some, added, scene.state.get(runner.memory).take(stay, axis=0))
+    inv_mass = scene.inv_mass[stay] if added is None else np.concatenate([scene.inv_mass[stay], added.inv_mass])
     change = Regrouping(some, number, scene.particles, now, inv_mass)
     if not (scene.state.can_regroup(change) and (scene.radius is None or scene.radius.can_be(now.radius))):
         return None
@@ -43,12 +44,12 @@ def planned(world: Any, some: np.ndarray, number: np.ndarray, added: Particles |
 
 def regroup(world: Any, change: Regrouping, added: Particles | None) -> None:
     """Do what was planned."""
-    runner, some, count = world._runner, change.some, change.now.count
+    runner, count = world._runner, change.now.count
     scene, step, memory = runner.scene, runner.step, runner.memory
-    pairs = _pairs(runner.grid, change) if runner.grid and change.goes else None
+    pairs = _pairs(runner.grid, change) if runner.grid and runner.grid.saved and change.goes else None
     rows = scene.count
     for one in runner.memories:
-        one.regroup(rows, some, count)
+        one.regroup(rows, change.first, change.stay[change.first :], count)
     rows.set(count)
     scene.particles, scene.inv_mass = change.now, change.inv_mass
     scene.state.regroup(memory, change)
@@ -58,8 +59,9 @@ def regroup(world: Any, change: Regrouping, added: Particles | None) -> None:
         scene.slots.regroup(memory, change)
     runner.team.regroup(count)
     step.particles.regroup(count)
+    came = None if added is None else added.position
     known = {id(start): start for start in (world._particles, *(f.start for f in world.features))}
-    starts = {one: start.regrouped(some, added) for one, start in known.items()}
+    starts = {one: change.now.placed(change.joined(start.position, came)) for one, start in known.items()}
     world._particles = starts[id(world._particles)]
     for f in world.features:
         waits = f.changed, f.moving, f.new_force
@@ -76,8 +78,8 @@ def regroup(world: Any, change: Regrouping, added: Particles | None) -> None:
 
 def grabbing(world: Any, some: np.ndarray) -> Regrouping | None:
     """What is to happen where knobs ask for nothing but that pins hold other particles: none of all, `some`, comes or goes, but
-    masses change, as contacts see them. None where the world has to be built anew for it, as where constraints act on what is
-    taken or let go."""
+    masses change, as contacts see them, and slots. None where the world has to be built anew for it, as where constraints act on
+    what is driven now or was before."""
     runner, pins = world._runner, [f for f in world.features if f.afresh]
     scene, memory = runner.scene, runner.memory
     if not pins or pins != [f for f in world.features if f.changed and f.outgrown]:
@@ -89,6 +91,7 @@ def grabbing(world: Any, some: np.ndarray) -> Regrouping | None:
         inv_mass[f.indices] = 0.0
     change, touched = Regrouping(some, np.arange(len(some)), scene.particles, now, inv_mass), inv_mass != scene.inv_mass
     free = not any(touched[b.indices].any() for b in runner.batches)
+    free = free and (all(f.drives for f in pins) or scene.slots.can_grab(change, runner.batches))
     static = not runner.grid or runner.grid.has_static == bool((inv_mass == 0).any())
     if not (free and static and scene.state.can_regroup(change) and all(f.can_grab(change) for f in pins)):
         return None
@@ -103,9 +106,11 @@ def grab(world: Any, change: Regrouping) -> None:
     alone = max(int((inv_mass == 0).sum()) for inv_mass in (scene.inv_mass, change.inv_mass)) <= 1
     scene.particles, scene.inv_mass = change.now, change.inv_mass
     scene.state.regroup(runner.memory, change)
-    for f in world.features:
-        if f.afresh:
-            f.grab(change)
+    pins = [f for f in world.features if f.afresh]
+    if any(f.soft for f in pins):
+        scene.slots.grab(runner.memory, change, runner.batches)
+    for f in pins:
+        f.grab(change)
     for log in runner.logs:
         log.forget()
     if not alone:  # lists leave out pairs of which none can move
@@ -116,5 +121,5 @@ def _pairs(grid: Any, change: Regrouping) -> tuple[np.ndarray, dict[str, np.ndar
     """What pairs of particles that stay remember, by their new numbers."""
     pairs, values = grid.lasting_data()
     pairs = change.number[pairs]
-    both = (pairs >= 0).all(axis=1)
-    return pairs[both], {name: value[both] for name, value in values.items()}
+    both = np.flatnonzero((pairs[:, 0] >= 0) & (pairs[:, 1] >= 0))
+    return pairs.take(both, axis=0), {name: value.take(both, axis=0) for name, value in values.items()}

@@ -1,7 +1,8 @@
 """Adding to a world and removing from it. Particles that come and go by themselves do so in place, see edit_in_place.py; for what
 else there is the world is built anew around the same features, and what stays is carried over."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from .build import assemble, check_settings, checked_features, listed
 from .integrator import decay
 from .sleep import Sleep
 
+NONE: Mapping[Feature, Feature] = MappingProxyType({})
 NOTHING = 2.0**-20  # of a velocity: less than this of it is in the next displacement
 
 
@@ -53,16 +55,17 @@ class Handle:
         return f"Handle({len(self)} particles)"
 
 
-def add(world: Any, particles: Particles | None, features: Iterable[Feature]) -> Handle:
+def add(world: Any, particles: Particles | None, features: Iterable[Feature], extend: Mapping[Feature, Feature] | None) -> Handle:
     """See World.add."""
     world._runner.memory.check()
-    late = listed("World.add", features)
+    late, extend = listed("World.add", features), extend or {}
+    check_extended(world, extend)
     if particles is not None:
         if not isinstance(particles, Particles):
             raise TypeError(f"World.add: particles = {particles!r} is a {type(particles).__name__}; use tv.Particles(position).")
         if particles.dim != world.particles.dim:
             raise ValueError(f"World.add: particles are in {particles.dim}D, but the world is in {world.particles.dim}D.")
-    checked_features(late)
+    checked_features((*late, *extend.values()))
     if sum(isinstance(f, PairContact) for f in (*world.features, *late)) > 1:
         raise ValueError("World.add: more than one Contact; one covers all particles.")
     if sum(isinstance(f, Periodic) for f in (*world.features, *late)) > 1:
@@ -71,9 +74,21 @@ def add(world: Any, particles: Particles | None, features: Iterable[Feature]) ->
         raise ValueError("World.add: more than one Sleep; one is for all particles.")
     check_settings(world._precision, world._requested[1], world._order, (*world.features, *late))
     n, count = len(world.particles), 0 if particles is None else len(particles)
-    if late or count:
-        change(world, np.ones(n, dtype=bool), particles, (*world.features, *late))
+    if late or count or extend:
+        change(world, np.ones(n, dtype=bool), particles, (*world.features, *late), extend)
     return handle(world, np.arange(n, n + count))
+
+
+def check_extended(world: Any, extend: Mapping[Feature, Feature]) -> None:
+    """Refuse constraints for features that do not act here, or cannot take them."""
+    if not isinstance(extend, Mapping):
+        raise TypeError(f"World.add: extend = {extend!r} is a {type(extend).__name__}; write {{rope: tv.Distance(pairs)}}.")
+    for feature, more in extend.items():
+        if not any(feature is f for f in world.features):
+            raise ValueError(f"World.add: extend: {feature!r} does not act in this world. Add it to features.")
+        if not isinstance(more, Feature):
+            raise TypeError(f"World.add: extend[{feature!r}] = {more!r} is a {type(more).__name__}; write {feature!r} of others.")
+        feature.check_more(more)
 
 
 def remove(world: Any, particles: Any, features: Iterable[Feature]) -> None:
@@ -106,12 +121,18 @@ def chosen(world: Any, who: str, particles: Any) -> np.ndarray:
     return checks.indices(who, "particles", array, n)
 
 
-def change(world: Any, some: np.ndarray, added: Particles | None, features: tuple[Feature, ...]) -> None:
-    """Keep particles in the mask `some`, add others, and let these features act; in place where that can be."""
+def change(
+    world: Any, some: np.ndarray, added: Particles | None, features: tuple[Feature, ...],
+    extend: Mapping[Feature, Feature] = NONE,
+) -> None:  # fmt: skip
+    """Keep particles in the mask `some`, add others, and let these features act; in place where that can be. extend: features,
+    and others whose constraints they take."""
     number = np.where(some, np.cumsum(some) - 1, -1)
-    planned = edit_in_place.planned(world, some, number, added) if features == world.features else None
+    planned = None
+    if features == world.features and not extend:
+        planned = edit_in_place.planned(world, some, number, added)
     if planned is None:
-        rebuild(world, some, added, features)
+        rebuild(world, some, added, features, extend)
         return
     told, seen = world._all_events(), _seen(world, number, features)
     if world._force_waits:
@@ -130,7 +151,7 @@ def renew(world: Any) -> None:
         rebuild(world, some, None, world.features)
         return
     told = world._all_events()
-    if world._force_waits:
+    if world._force_waits or any(f.afresh and f.soft for f in world.features):
         with world._runner.memory.compiler():
             world._runner.restart(world.iterations)
     world._clock.parted = None
@@ -138,8 +159,11 @@ def renew(world: Any) -> None:
     _edited(world, some, None, told, None, np.arange(len(world.features)), True)
 
 
-def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tuple[Feature, ...]) -> None:
-    """Build the world anew, of its particles in the mask `some` and the added ones, under these features."""
+def rebuild(
+    world: Any, some: np.ndarray, added: Particles | None, features: tuple[Feature, ...],
+    extend: Mapping[Feature, Feature] = NONE,
+) -> None:  # fmt: skip
+    """Build the world anew, of its particles in the mask `some` and the added ones, under these features, see change()."""
     world._runner.memory.check()
     n, m, before = int(some.sum()), 0 if added is None else len(added), world.features
     number = np.where(some, np.cumsum(some) - 1, -1)
@@ -147,13 +171,14 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
     kept, attributes = checkpoint.keep(world), {f: dict(vars(f)) for f in {*before, *features}}
     came = [f for f in features if f not in before or f.afresh]
     went = [f for f in before if f not in features or f.afresh]
-    starts = {known: start.regrouped(some, added) for known, start in {id(f.start): f.start for f in before}.items()}
-    starts = [None if f in came else starts[id(f.start)] for f in features]
+    more = {f: other.copy() for f, other in extend.items()}
+    known = {one: start.regrouped(some, added) for one, start in {id(f.start): f.start for f in before}.items()}
+    starts: list[Any] = [None if f in came else known[id(f.start)] for f in features]
     parts, told, seen = None, world._all_events(), _seen(world, number, features)
     try:
         borne = any(isinstance(f, Collider) for f in went)
         pulled = (added is not None or not some.all()) and world._runner.step.has_pair_forces  # by others than before
-        turned = borne or pulled or world._force_waits or any(_drives(f, number) for f in came + went)
+        turned = borne or pulled or world._force_waits or any(_drives(f, number) for f in (*came, *went, *more.values()))
         if borne:
             world._let_go()
         elif turned:
@@ -164,6 +189,10 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
         for f in before:
             f.release()
             f.remap_indices(number, n + m)
+        box = next((f for f in features if isinstance(f, Periodic)), None)
+        for k, f in enumerate(features):
+            if f in more:
+                starts[k] = _extended(f, more[f], starts[k], now, box)
         parts = assemble(now, features, starts, n, *world._build_options)
         state = _carried(world, parts.memory, old, attributes, masks, some)
     except BaseException:
@@ -199,8 +228,8 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
     if any(isinstance(f, PairContact) for f in came):
         world._clock.first_moved = 0
     walls = np.array([features.index(f) if f in features else -1 for f in before], dtype=np.int64)
-    tied = initial_violation.first_off([f for f in came if f not in before], world.position)
-    _edited(world, some, added, told, seen, walls, bool(came or went), tied)
+    tied = initial_violation.first_off([*(f for f in came if f not in before), *more.values()], world.position)
+    _edited(world, some, added, told, seen, walls, bool(came or went or more), tied)
 
 
 def _seen(world: Any, number: np.ndarray, features: tuple[Feature, ...]) -> np.ndarray | None:
@@ -217,7 +246,7 @@ def _edited(
     seen: velocities, see _seen(). features_too: whether features came or went, too.
     tied: the first particle of constraints that came and are not met."""
     number, clock = np.where(some, np.cumsum(some) - 1, -1), world._clock
-    n, m = int(some.sum()), 0 if added is None else len(added)
+    n, m = int(np.count_nonzero(some)), 0 if added is None else len(added)
     world._events = told[0].renumbered(number, number), told[1].renumbered(number, walls)
     for one in list(world._handles):
         one.follow(number)
@@ -235,6 +264,20 @@ def _edited(
         clock.parted = seen[some] if added is None else np.concatenate([seen[some], added.velocity])
     for watcher in world._watchers:
         watcher.regrouped()
+
+
+def _extended(feature: Any, more: Feature, start: Particles, now: Particles, box: Periodic | None) -> Particles:
+    """Give a feature that is not bound more constraints, which start now. Returns where it started: for what it had, when that
+    came; for other particles, now."""
+    more.periodic, more.start = box, now
+    inv_mass = now.inv_mass.copy()
+    more.prepare(now, inv_mass)
+    more.review(now, inv_mass)
+    position = np.array(now.position)
+    mine = feature.indices.ravel()
+    position[mine] = start.position[mine]
+    feature.extend(more)
+    return start.placed(position)
 
 
 def _drives(feature: Feature, number: np.ndarray) -> bool:
@@ -306,21 +349,14 @@ def _launch(world: Any, first: int) -> None:
     integrator = world._runner.integrator
     want = np.where(world._runner.scene.inv_mass[first:, None] > 0, world._particles.velocity[first:], 0.0)
     fields = [state.d, *([integrator.earlier] if integrator.uses_velocity else [])]
-    values = [memory.read(field).astype(np.float64) for field in fields]
-    for field, rows in zip(fields, values, strict=True):
-        rows[first:] = h * want
-        memory.write(field, rows)
+    for field in fields:
+        memory.write_from(field, first, h * want)
     if state.spins:
-        rows = memory.read(state.spin.s).astype(np.float64)
-        rows[first:] = h * state.spin.from_rates(world._particles.spin)[first:]
-        memory.write(state.spin.s, rows)
+        memory.write_from(state.spin.s, first, h * state.spin.from_rates(world._particles.spin)[first:])
     share = max(decay(sum(f.rate for f in integrator.forces.drags), h)[0], NOTHING)
     with world._runner.memory.compiler():
         seen = world._runner.velocity(world.iterations, touching=False)
     d = h * want + h / share * (want - seen[first:])
     d[world._runner.scene.inv_mass[first:] == 0] = 0.0
-    values[0][first:] = d
-    for rows in values[1:]:
-        rows[first:] = 3 * d - 2 * h * want  # so that 3 d - earlier = 2 h v
-    for field, rows in zip(fields, values, strict=True):
-        memory.write(field, rows)
+    for field, rows in zip(fields, (d, 3 * d - 2 * h * want), strict=False):  # so that 3 d - earlier = 2 h v
+        memory.write_from(field, first, rows)

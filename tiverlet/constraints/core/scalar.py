@@ -76,6 +76,7 @@ class Scalar(Batch):
     rest_name = "rest"
     uploads_all = True
     _scene_sized = False  # whether any of its lengths is that of the whole scene, in want of one of its own
+    grows = True
 
     def setup(self, indices, rest, compliance, damping, break_at=None) -> None:
         """Keep the arguments of __init__; what depends on the particles is checked in prepare()."""
@@ -170,6 +171,10 @@ class Scalar(Batch):
     def values(self, x: np.ndarray) -> np.ndarray:
         """f of corners x (m, arity, dim), (m,); of outlines, of all positions (n, dim)."""
         return self.quantity.values(x)
+
+    def hold_all(self, listing: Any) -> None:
+        """Act on these."""
+        self.hold(self.quantity_of(listing))
 
     def can_regroup(self, change: Regrouping) -> bool:
         """Whether none of its particles goes or gets another number, and no length of it is that of the whole scene."""

@@ -57,6 +57,11 @@ class Spring:
         if self.damped:
             self._memory.write(self.damping, damping)
 
+    def begin(self, compliance: np.ndarray, damping: np.ndarray) -> None:
+        """Springs of these values start where they are fulfilled."""
+        self.upload(compliance, damping)
+        self._memory.write(self.last, np.zeros(1))
+
     @ti.func
     def is_rigid(self, c):
         """Whether constraint c has no compliance."""

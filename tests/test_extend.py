@@ -1,0 +1,148 @@
+"""Constraints that features of a world take behind their own: as if all had been there, and nothing is compiled."""
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+from tiverlet.device.patches import patched
+from tiverlet.step import checkpoint
+
+from .conftest import ARCH, compiled
+
+pytestmark = pytest.mark.usefixtures("read_here")
+ROPE = np.stack([0.3 * np.arange(6), np.full(6, 2.0)], axis=1)
+RING = 0.4 * np.stack([np.cos(np.arange(7) * 0.9), np.sin(np.arange(7) * 0.9)], axis=1) + [0.5, 0.9]
+BLOCK = np.array([[2.0, 1], [2.4, 1], [2.4, 1.4], [2.0, 1.4]])
+LINKS = np.stack([np.arange(5), np.arange(1, 6)], axis=1)
+
+
+RIM = 6 + np.stack([np.arange(7), np.roll(np.arange(7), -1)], axis=1)
+
+
+def ropes(some: list[int]) -> list:
+    """Ropes, of which all but the first can be torn; slack ones beside them, and corners that turn only so far."""
+    k, all_of = np.array(some), several(some, len(ROPE))
+    torn = np.repeat(np.where(k > 0, 1e3 * k, np.inf), 5) if k.any() else None
+    lengths = np.tile([0.4, 0.5, 0.31], len(k))
+    return [
+        tv.Distance(all_of(LINKS), break_at=torn), tv.Rope(all_of(LINKS[:3]), lengths),
+        tv.AngleLimit(all_of([[1, 2, 3]]), -0.4, 0.1 * (k + 1)),
+    ]  # fmt: skip
+
+
+def bodies(some: list[int]) -> list:
+    """Of soft links, outlines and shapes, each softer than the one before."""
+    k, all_of = np.array(some), several(some, len(ROPE) + len(RING) + len(BLOCK))
+    soft = np.repeat(1e-4 * (k + 1), 5)
+    return [
+        tv.Distance(all_of(LINKS), compliance=soft, damping=0.1), tv.Distance(all_of(RIM)),
+        tv.Area(all_of([6 + np.arange(7)]), pressure=1.05 + 0.1 * k),
+        tv.ShapeMatch(all_of([13 + np.arange(4)]), compliance=1e-3, creep=2.0 + k), tv.Spacer(all_of([[0, 14]]), 0.2),
+    ]  # fmt: skip
+
+
+PLACES = {ropes: ROPE, bodies: np.concatenate([ROPE, RING, BLOCK])}
+
+
+def several(some: list[int], n: int):
+    """Rows of constraints, for copies of n particles each."""
+    return lambda rows: np.concatenate([np.asarray(rows) + n * k for k in some])
+
+
+def placed(kind, some: list[int]) -> tv.Particles:
+    """The particles of these copies, 20 m apart."""
+    n = len(PLACES[kind])
+    x = np.concatenate([PLACES[kind] + [20.0 * k, 0] for k in some])
+    return tv.Particles(x, radius=0.02, pinned=n * np.arange(len(some)))
+
+
+def world_of(kind, number: int) -> tv.World:
+    """So many of them, and what else acts."""
+    some = list(range(number))
+    features = [*kind(some), tv.Gravity(), tv.HalfSpace((0, 1), 0.0), tv.Contact()]
+    return tv.World(placed(kind, some), features, substeps=5, solver=tv.Jacobi() if kind is bodies else None)
+
+
+def extended(w: tv.World, kind, k: int) -> None:
+    """One more of them."""
+    w.add(placed(kind, [k]), extend=dict(zip(w.features, kind([k]), strict=False)))
+
+
+@pytest.mark.parametrize("kind", [ropes, bodies])
+def test_a_world_that_was_extended_is_the_one_that_has_all(kind, tmp_path):
+    whole, w = world_of(kind, 3), world_of(kind, 1)
+    for k in (1, 2):
+        extended(w, kind, k)
+    for _ in range(30):
+        assert w.step(1 / 60).residual == whole.step(1 / 60).residual
+    assert w.hash() == whole.hash()
+    with w.clone() as twin:
+        assert twin.hash() == w.hash()
+    whole.close()
+    # Between two frames: what was there goes on to the bit, and all can be gone back to and replayed.
+    n = len(w.particles)
+    with w.clone() as without, tv.Recorder(tmp_path / "more.rrd", w) as recorder, compiled() as names:
+        extended(w, kind, 3)
+        kept = checkpoint.keep(w)
+        for _ in range(10):
+            w.step(1 / 60)
+            recorder.log()
+            without.step(1 / 60)
+        if kind is ropes:  # else displacements are turned into velocities, for springs that come
+            np.testing.assert_array_equal(w.position[:n], without.position)
+    after = w.hash()
+    checkpoint.put_back(w, kept)
+    w.run(10 / 60)
+    assert w.hash() == after and tv.replay(tmp_path / "more.rrd").verify()
+    assert not patched or ARCH != "cpu" or set(names) <= {"velocities", "to_velocity"}  # which nothing has asked for before
+    w.close()
+
+
+def test_what_comes_moves_as_under_a_feature_of_its_own():
+    # One more link of a running rope; and one to a particle that was there, which starts where that is now.
+    def scene():
+        rope = tv.Distance(LINKS[:4])
+        particles = tv.Particles(np.concatenate([ROPE[:5], [[5.0, 3.0]]]), pinned=[0])
+        w = tv.World(particles, [tv.Gravity(), rope], precision="f64")
+        w.run(0.2)
+        return w, rope
+
+    (w, rope), (other, _) = scene(), scene()
+    place = w.position[[4]] + [0.2, 0.1]
+    w.add(tv.Particles(place), extend={rope: tv.Distance([[4, 6], [3, 5]])})
+    alone = tv.Distance([[4, 6], [3, 5]])
+    other.add(tv.Particles(place), [alone])
+    assert rope.count == 6 and rope.rest[-2:].tolist() == alone.rest.tolist()
+    for _ in range(30):
+        a, b = w.step(1 / 60), other.step(1 / 60)
+        assert a.clean and abs(a.energy - b.energy) < 1e-9
+    np.testing.assert_allclose(w.position, other.position, rtol=0, atol=1e-9)
+    w.close()
+    other.close()
+
+
+def test_a_feature_takes_its_own_kind_and_nothing_else():
+    def long(a, b):
+        """Their distance."""
+        return (a - b).norm()
+
+    link, user, elsewhere = tv.Distance([[0, 1]]), tv.Constraint(long, [[1, 2]], rest=1.0), tv.Distance([[0, 1]])
+    w = tv.World(tv.Particles([[0.0, 0], [1, 0], [2, 0]]), [link, user], substeps=2)
+    before, rest = w.hash(), link.rest
+    used = tv.Distance([[0, 1]])
+    other = tv.World(tv.Particles([[0.0, 0], [1, 0]]), [used], substeps=2)
+    for extend, error, text in [
+        ([link], TypeError, r"extend = \[Distance\] is a list; write"),
+        ({elsewhere: tv.Distance([[0, 1]])}, ValueError, "extend: Distance does not act in this world"),
+        ({link: tv.Rope([[0, 1]])}, TypeError, "Distance cannot take Rope, which is of another kind"),
+        ({link: [[0, 1]]}, TypeError, r"extend\[Distance\] = \[\[0, 1\]\] is a list"),
+        ({user: tv.Constraint(long, [[0, 1]])}, TypeError, r"Constraint\(long\) cannot take more constraints"),
+        ({link: used}, ValueError, "already acts in another world"),
+        ({link: link}, ValueError, "already acts"),
+        ({link: tv.Distance([[0, 3]])}, ValueError, r"Distance: pairs\[0\] = \(0, 3\), but there are 3 particles"),
+    ]:
+        with pytest.raises(error, match=text):
+            w.add(extend=extend)
+    assert w.hash() == before and link.count == 1 and (link.rest == rest).all()
+    w.close()
+    other.close()
