@@ -294,9 +294,8 @@ def test_what_a_link_draws_through_another_disc_is_flagged(world):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_discs_in_the_same_place_have_the_normal_along_which_they_part(world, dim):
-    w = world(
-        tv.Particles(np.zeros((3, dim)) + [[0.0] * dim, [0.0] * dim, [5.0] * dim], radius=0.1), [tv.Contact(push_out=0.25)], precision="f64"
-    )
+    x = np.array([[0.0] * dim, [0.0] * dim, [5.0] * dim])
+    w = world(tv.Particles(x, radius=0.1), [tv.Contact(push_out=0.25)], precision="f64")
     found = w.contacts
     np.testing.assert_array_equal(found.pairs, [[0, 1]])
     np.testing.assert_allclose(np.linalg.norm(found.normal, axis=1), 1.0, rtol=1e-12)
