@@ -59,6 +59,36 @@ def test_worlds_with_other_numbers_and_counts_and_clones_compile_nothing(world):
     assert alone == [w.hash() for w in shared]
 
 
+@pytest.mark.parametrize(
+    "solvers", [(tv.Chebyshev(), tv.Chebyshev(5.0)), (tv.Jacobi(), tv.Jacobi())], ids=["Chebyshev", "Jacobi"]
+)
+def test_what_solvers_are_made_for_is_in_no_kernel(world, solvers):
+    # Nor whether a pass meets all constraints at once, as it does where no two of them have a particle in common.
+    with compiled() as names:
+        for solver, links in zip(solvers, ([[0, 1], [2, 3]], [[0, 1], [1, 2], [2, 3]]), strict=True):
+            x = np.arange(4.0)[:, None] * [1.0, 0.1]
+            w = world(tv.Particles(x), [tv.Gravity(9.81), tv.Distance(links)], solver=solver, iterations=3, precision="f64")
+            w.step(1 / 60)
+    assert names.count("fused") == 1
+
+
+def test_worlds_of_higher_order_compile_nothing_more(world):
+    # Whose springs are forces: what they are made for is compliances, and kernels are made for none of these.
+    def sprung(points, compliance):
+        rope = tv.shapes.rope((0, 0), (1, 0.2), points=points)
+        features = [tv.Gravity(9.81), tv.Distance(rope.links, compliance=compliance)]
+        w = world(tv.Particles(rope.position, pinned=[0]), features, order=4, precision="f64", substeps=2)
+        w.run(0.1)
+        return w.hash()
+
+    sprung(5, 1e-2)
+    with compiled() as names:
+        shared = sprung(9, 1e-3)
+    assert names == []
+    with layout.unshared():
+        assert sprung(9, 1e-3) == shared
+
+
 def test_a_world_that_grows_compiles_nothing(world):
     # From 30 discs to 61 and back, with a list that is too short at first; with the bits that it has when all is compiled anew.
     def grown(compiles):

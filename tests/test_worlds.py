@@ -20,18 +20,19 @@ def spring(x):
     return -0.1 * x
 
 
-def every_constraint(dim, k):
-    """All constraints of this dimension, far from each other, each at corners that meet it, more or less."""
+def every_constraint(dim, k, part):
+    """Constraints of this dimension, far from each other, each at corners that meet it, more or less. part: which of `dim` parts
+    of all of them, since the time that they take to compile grows faster than their number."""
     made = {name: (row.points, row.make) for name, row in ROWS.items()} | {
         name: (p, make) for name, (p, make, _) in OTHERS.items()
     }
     x, features = [], []
-    for name, (points, make) in made.items():
-        m, d = points.shape
-        if d == dim and name != "Path":
-            corners = np.arange(m).reshape(1, m) + sum(map(len, x))
-            x.append(points + 4.0 * len(x) * np.eye(dim)[0] * ("Path" not in name))
-            features.append(make(corners, np.full(1, 0.5)) if name in ROWS else make(corners))
+    fitting = [(name, *made[name]) for name in made if made[name][0].shape[1] == dim and name != "Path"]
+    for name, points, make in fitting[part::dim]:
+        m = len(points)
+        corners = np.arange(m).reshape(1, m) + sum(map(len, x))
+        x.append(points + 4.0 * len(x) * np.eye(dim)[0] * ("Path" not in name))
+        features.append(make(corners, np.full(1, 0.5)) if name in ROWS else make(corners))
     x = np.concatenate(x)
     mass = 1.0 + 0.5 * k + np.arange(len(x)) % 3
     return tv.World(tv.Particles(x, mass=mass), [tv.Gravity(2.0 + k), *features], substeps=5)
@@ -77,8 +78,11 @@ def bricks(k):
 
 
 SCENES = {
-    "every constraint, 2D": lambda k: every_constraint(2, k),
-    "every constraint, 3D": lambda k: every_constraint(3, k),
+    **{
+        f"constraints in {dim}D, part {part + 1} of {dim}": lambda k, dim=dim, part=part: every_constraint(dim, k, part)
+        for dim in (2, 3)
+        for part in range(dim)
+    },
     "every force and wall": lambda k: every_force(3, k),
     "polygons": bricks,
     "Jacobi": lambda k: cloth(tv.Jacobi(), k),

@@ -11,9 +11,9 @@ from ..device.thread_team import Team
 from ..features.feature import Batch, Feature, Knob, Scene
 from ..features.material import Table
 from ..neighbours.cell_list import FARTHEST
+from ..neighbours.neighbour_list import MOVED
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..neighbours.queries import Contacts
-from ..neighbours.neighbour_list import MOVED
 from ..particles import Particles
 
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from . import runtime
-from .language import at, inline, ti
+from .language import at, current, impl, inline, ti
 from .number import OnDevice
 
 if TYPE_CHECKING:
@@ -61,6 +61,12 @@ def block(b, begin, end):
     return begin + b * BLOCK, ti.min(begin + (b + 1) * BLOCK, end)
 
 
+@inline
+def quotient(a, b):
+    """a // b of numbers that are not negative: that of i32 would look at the signs."""
+    return ti.cast(ti.cast(a, ti.u32) // ti.cast(b, ti.u32), ti.i32)
+
+
 class Team:
     """size: the number of threads; 1 where there is nobody to wait for, because Taichi itself spreads loops over threads or
     because there is one thread only. launched: which of the two; phase by phase, as on a GPU. A share of n is what a thread
@@ -81,6 +87,7 @@ class Team:
         self.piece = memory.number(self.piece_of(particles))
         self.spread = LEAST * size if size > 1 else 1
         self._alone, self._frames = 0, 0
+        self._in_substep: tuple[Any, Any] = (None, None)  # a kernel, and how many are at work in the substep it is in
         self.memory = memory
         if size > 1:
             self.arrived = memory.field("team.arrived", 2 * LINE, kind=ti.i32)
@@ -112,8 +119,19 @@ class Team:
 
     @inline
     def works(self, thread):
-        """Whether a thread takes part in the coming substep; all must ask."""
-        return self._works(thread) if self.size > 1 else True
+        """Whether a thread takes part in the coming substep; all must ask. Up to its end it knows how many do: each loop asks,
+        and a field takes as much code as twenty operations."""
+        if self.size == 1:
+            return True
+        works = self._works(thread)
+        self._in_substep = current().compiling_callable, impl.expr_init(at(self.active_threads, None))
+        return works
+
+    @inline
+    def active(self):
+        """How many are at work."""
+        kernel, number = self._in_substep
+        return number if kernel is current().compiling_callable else at(self.active_threads, None)
 
     @inline
     def left(self, n):
@@ -173,37 +191,39 @@ class Team:
 
     @ti.func
     def _share(self, n, k):
-        active = self.active_threads[None]
-        return ti.min(k * ((n + active - 1) // active), n)
+        return ti.min(k * quotient(n + self.active() - 1, self.active()), n)
 
     @ti.func
     def _dealt_count(self, n, unit, thread):
-        active, units = self.active_threads[None], (n + unit - 1) // unit
-        out = (units // active + ti.cast(self._place(units // active, thread) < units % active, ti.i32)) * unit
-        if self._place((units - 1) // active, (units - 1) % active) == thread:
+        active, units = self.active(), quotient(n + unit - 1, unit)
+        turns = quotient(units, active)
+        rest = units - turns * active
+        out = (turns + ti.cast(self._place(turns, thread) < rest, ti.i32)) * unit
+        last, place = ti.select(rest == 0, turns - 1, turns), ti.select(rest == 0, active, rest) - 1
+        if self._place(last, place) == thread:
             out -= units * unit - n
         return out
 
     @ti.func
     def _dealt_index(self, k, unit, thread):
-        before = ti.cast(ti.cast(k, ti.u32) // ti.cast(unit, ti.u32), ti.i32)  # i32 would look at the sign
-        return k + (before * (self.active_threads[None] - 1) + self._place(before, thread)) * unit
+        before = quotient(k, unit)
+        return k + (before * (self.active() - 1) + self._place(before, thread)) * unit
 
-    @ti.func
+    @inline
     def _place(self, turn, thread):
         """The place of a thread in a turn: there and back, so that it goes on where it was, and none has always the busier."""
-        return ti.select(turn & 1 == 0, thread, self.active_threads[None] - 1 - thread)
+        return ti.select(turn & 1 == 0, thread, self.active() - 1 - thread)
 
-    @ti.func
+    @inline
     def _wait(self):
-        self.wait_for(self.active_threads[None])
+        return self.wait_for(self.active())
 
     @ti.func
     def wait_for(self, active):
         """Wait for so many. The last one says so in another place than where all arrive, whom those who look would hold up."""
         if active > 1:
             before = ti.atomic_add(self.arrived[0], 1)
-            turn = before // active + 1
+            turn = quotient(before, active) + 1
             if before + 1 == turn * active:
                 ti.atomic_add(self.arrived[LINE], 1)
             else:

@@ -54,6 +54,8 @@ class Chebyshev(Solver):
 class ChebyshevPasses(SemiIteration):
     """The weights of the coming pass, from those of the one before."""
 
+    host_only = ("solver",)
+
     def __init__(self, solver: Chebyshev, scene: Scene):
         self.solver, self.memory, self.real = solver, scene.memory, scene.real
         self.weights = scene.memory.field("chebyshev.weights", None, width=3, kind=ti.f64)  # of last, of correction; rho

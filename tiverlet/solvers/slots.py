@@ -38,7 +38,7 @@ class Slots:
     as a whole is one, and each constraint that is relaxed by itself.
     """
 
-    host_only = ("total",)
+    host_only = ("total", "exact")
 
     def __init__(self, scene: Scene, batches: list[Batch], solver):
         memory, state, inv_mass = scene.memory, scene.state, scene.inv_mass

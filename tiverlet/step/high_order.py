@@ -99,6 +99,7 @@ class Composition:
     """The integrator of a world of order 4 or more: Verlet in stages, with springs as forces. Runs fused only."""
 
     uses_velocity = decays = half_kick = False
+    host_only = ("fastest",)
 
     def __init__(self, scene: Scene, forces: Forces, batches: list[Batch]):
         self.forces, self.state, self.slots = forces, scene.state, scene.slots

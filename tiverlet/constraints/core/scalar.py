@@ -70,7 +70,7 @@ class Scalar(Batch):
     compliance = Knob(lambda f, v: checks.per_item(repr(f), "compliance", v, f.count, least=0.0), "Of springs.", force=True)
     damping = Knob(lambda f, v: checks.per_item(repr(f), "damping", v, f.count, least=0.0), "Of the dashpot.", force=True)
     break_at = Knob(strength_of, "Load beyond which a constraint breaks, (m,); None for never.")
-    compiled_for = ("soft", "damped", "breaks", "limited", "cusp", "capped", "_strictly")
+    compiled_for = ("soft", "damped", "breaks", "limited", "cusp", "capped")
 
     each = ("rest", "compliance", "damping", "break_at")
     rest_name = "rest"
@@ -260,7 +260,7 @@ class Scalar(Batch):
 
     @property
     def _strictly(self) -> bytes | None:
-        """The compliances, where a world of higher order is made for these."""
+        """The compliances, where a world of higher order is made for these; its kernels are not."""
         return self.compliance.tobytes() if self.scene and self.scene.order > 2 else None
 
     def acts_as_force(self, scene: Scene) -> np.ndarray:
@@ -275,9 +275,12 @@ class Scalar(Batch):
 
     @property
     def outgrown(self) -> bool:
-        """Whether others than before are to be relaxed alone, too: a world is what its knobs say, not how they came there."""
-        solved = self.scene and self.acts and self.solvable_together
-        return super().outgrown or bool(solved and (self._alone != self.relaxed_alone(self.scene)).any())
+        """Whether others than before are to be relaxed alone, too, or a world of higher order has other forces: a world is what
+        its knobs say, not how they came there."""
+        if not (self.scene and self.acts):
+            return super().outgrown
+        others = self.solvable_together and bool((self._alone != self.relaxed_alone(self.scene)).any())
+        return super().outgrown or others or self._made_for != self._strictly
 
     def drive_of(self, scene: Scene) -> Drive:
         """What moves the rest values, where the batch is driven."""
@@ -313,7 +316,7 @@ class Scalar(Batch):
     def bind(self, scene: Scene) -> None:
         """Declare rest values, multipliers, springs and strengths; and, for solvers, which rows of a system constraints are."""
         super().bind(scene)
-        self._alone = self.relaxed_alone(scene)
+        self._alone, self._made_for = self.relaxed_alone(scene), self._strictly
         self.dev.forces = bool(self.acts_as_force(scene).any())
         start = self.rest_of(self.start.position) if self.count else np.zeros(0)
         scale = self.unit or (float(np.abs(start).mean()) if np.any(start) else self.start.size)

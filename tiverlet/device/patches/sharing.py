@@ -77,7 +77,8 @@ class Writing:
         self._numbers[id(value)] = len(self._numbers)
         self._alive.append(value)
         if isinstance(value, (tuple, list)):
-            out += (kind, len(value))
+            # Of our objects, kernels go through either alike; and a recording gives arguments back as lists.
+            out += ("row" if self._ours else kind, len(value))
             for one in value:
                 self.write(one)
         elif isinstance(value, (set, frozenset)):

@@ -26,10 +26,15 @@ from .. import output
 DT = 1 / 60  # [s] of a frame
 TITLE = "many worlds in one launch, beside MuJoCo, Newton and one large world"
 START = "import json, sys; from tiverlet.report.speed.worlds import main; main(json.loads(sys.argv[1]))"
-# Of the full report and of a quick one: worlds of a pendulum, a chain, a pile; worlds in comparisons; seconds of a turn, turns.
+METHODS = (
+    (2, 20, "f32"), (2, 20, "f64"), (4, 1, "f64"), (4, 2, "f64"), (4, 4, "f64"), (4, 20, "f64"),
+    (6, 1, "f64"), (6, 2, "f64"), (8, 1, "f64"),
+)  # fmt: skip
+# Of the full report and of a quick one: worlds of a pendulum, a chain, a pile; worlds in comparisons; seconds of a turn, turns;
+# order, substeps and precision of double pendulums.
 FULL: dict[str, Any] = {
     "pendulum": (1, 10, 100, 1000, 10_000), "chain": (1, 10, 100, 1000), "pile": (1, 10, 100, 1000), "count": 1000,
-    "seconds": 0.15, "turns": 5, "chains": 200, "discs": 100, "frames": 60,
+    "seconds": 0.15, "turns": 5, "chains": 200, "discs": 100, "frames": 60, "methods": METHODS,
 }  # fmt: skip
 QUICK = FULL | {
     "pendulum": (1, 3),
@@ -41,14 +46,11 @@ QUICK = FULL | {
     "chains": 2,
     "discs": 10,
     "frames": 4,
+    "methods": (METHODS[0], METHODS[2], METHODS[-1]),  # each other order is compiled anew
 }
 # Seconds after which errors of double pendulums are compared, and times a second at which they are looked at until then.
 LATE, LOOKS = 3.0, 15
 RATES = (30, 45, 60, 90, 120, 240, 480, 960, 1920, 3840)  # steps a second of MuJoCo; multiples of LOOKS
-METHODS = (
-    (2, 20, "f32"), (2, 20, "f64"), (4, 1, "f64"), (4, 2, "f64"), (4, 4, "f64"), (4, 20, "f64"),
-    (6, 1, "f64"), (6, 2, "f64"), (8, 1, "f64"),
-)  # fmt: skip
 # As near to points as its bodies can be: 1e-12 kg m2 shifts positions by less than 1e-11 m. All is off that it would not use.
 MODEL = """<mujoco><compiler inertiafromgeom="false"/>
 <option integrator="RK4" gravity="0 -9.81 0"><flag contact="disable" constraint="disable" limit="disable" equality="disable"
@@ -218,7 +220,7 @@ def pendulums(job: dict[str, Any], sizes: dict[str, Any]) -> Iterator[tuple]:
     times = np.arange(1, round(LATE * LOOKS) + 1) / LOOKS
     exact = double_pendulum(times)
     acts, errors = {}, {}
-    for order, substeps, precision in METHODS:
+    for order, substeps, precision in sizes["methods"]:
         particles, features = hung(2, 1.0)
         many = tv.Worlds(tv.World(particles, features, substeps=substeps, order=order, precision=precision), count)
         track = many.rollout(LATE, DT, every=frames // LOOKS).position[0, :, 1:]
