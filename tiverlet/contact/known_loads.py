@@ -1,0 +1,115 @@
+"""Piles that carry their loads: what contacts bear at rest, they give without being asked."""
+
+from typing import TYPE_CHECKING, Any
+
+from ..device import ti
+from ..features.feature import Acceleration
+from ..neighbours.neighbour_list import WORD, PairData, lowest_bit
+
+if TYPE_CHECKING:
+    from ..features.feature import Scene
+    from ..neighbours.neighbour_search import NeighbourSearch
+
+WINDOW = 128  # substeps over which is averaged what is missing; at their end sound has just been taken out
+STEADY = 0.1  # of the whole load: by how much that may differ from one window to the next
+GAIN = 0.8  # of what is missing is learnt at once, where a pile is low
+LAG, SLOW = 64, 0.3  # substeps that it takes to learn the load of k particles: LAG + SLOW k^2
+
+
+class Carried(Acceleration):
+    """What particles are given of the loads that their contacts know [m/s^2], as one more force. field: it, (n, dim)."""
+
+    uniform = True  # it has no stiffness: it changes by what is learnt
+
+    def __init__(self, scene: "Scene"):
+        self.field = scene.memory.field("Contact.carried", scene.count, width=scene.particles.dim, state=True)
+
+    @ti.func
+    def acceleration(self, i, x, v, t):
+        """Of particle i."""
+        return self.field[i]
+
+
+class KnownLoads:
+    """Each pair knows the load F [N] that it bears, and gives it in every substep like a force, before positions are looked at.
+    Contacts add what is missing, and may take back what was given, but never pull.
+
+    One pass per substep holds a load by an overlap, 2 k g h^2 for the k-th contact of a column; what is known needs none. F is
+    learnt by and by, which is integral control: over a window, contacts added `mean`, and if that is what they added in the
+    window before to within a tenth of F + mean, F += gain mean. A substep sees a constant force, so it is as stable as without.
+    What is learnt must not be faster than the slowest sound of the pile decays, see VelocityProjection: in a column of N in
+    0.1 N^2 substeps. So gain = WINDOW / (LAG + SLOW k^2), with k = F / (m g) the number of particles that a pair bears. An
+    impact has a large k, and is not learnt.
+
+    A pair that gives nothing in the end, because its particles have parted, forgets at once. A wall takes back in the same
+    substep what is pushed into it; for contacts to know, particles are where walls leave them while contacts are solved (`lean`),
+    and walls begin again with all that is pushed into them, which friction needs.
+
+    Warm starting (Box2D) of a single pass would be unstable: a mode of eigenvalue L has z^3 - 3 a z^2 + 3 a z - a, a = 1 - r L,
+    whose roots near 1 grow like (r L)^(1/3) / 2. push: what pairs got in the last substep.
+    """
+
+    def __init__(self, scene: "Scene"):
+        self.state = scene.state
+        self.load = PairData("load", 0, lasting=True, marked=True)  # [N]
+        self.borne = PairData("borne", 0, lasting=True, marked=True)  # what was missing of it in this window, summed up [N]
+        self.earlier = PairData("earlier", 0, lasting=True, marked=True)  # on average in the window before [N]
+        self.pair_data = [self.load, self.borne, self.earlier]
+        n, dim = scene.count, scene.particles.dim
+        self.carried = Carried(scene)
+        self.own = scene.memory.field("Contact.own_weight", n, state=True)  # what forces accelerate it by [m/s^2]
+        self.lean = scene.memory.field("Contact.lean", n, width=dim)  # how far walls moved it before contacts were solved [m]
+        self.in_state = {"carried": self.carried.field, "own": self.own}
+
+    def bind(self, grid: "NeighbourSearch", weight: Any) -> None:
+        """grid: has the pairs listed. weight: m_i w_i of each particle."""
+        self.grid, self.weight = grid, weight
+
+    def follow(self, integrator: Any) -> None:
+        """integrator: knows what else accelerates particles."""
+        self.integrator, self.forces = integrator, integrator.forces
+
+    @ti.func
+    def weigh(self, i, now):
+        """Note what accelerates particle i but the loads of its contacts."""
+        v = self.integrator.velocity_before(i, now.h, now.fresh)
+        a = self.forces.accelerate(i, self.state.place(i), v, now.time, self.forces.pull(now.time))
+        self.own[i] = (a - self.carried.field[i]).norm()
+
+    @ti.func
+    def kept(self, i, word, bits):
+        """Those of some entries of particle i that know a load, though they may not touch to the last digit."""
+        out, first = ti.u32(0), self.grid.first[i] + word * WORD
+        while bits != 0:
+            bit = bits & (~bits + ti.u32(1))
+            bits ^= bit
+            if self.load.field[first + lowest_bit(bit)] > 0:
+                out |= bit
+        return out
+
+    @ti.func
+    def given(self, e, now):
+        """What entry e was given in this substep, per inverse mass [kg m]."""
+        return self.load.field[e] * self.integrator.h2_effective(now.h, now.fresh)
+
+    @ti.func
+    def remember(self, i, j, e, part, push, now):
+        """Entry e, the pair of i and j, got `part` in this pass, and `push` in all. Returns what it gives from now on [N]."""
+        load, borne = self.load.field[e], self.borne.field[e]
+        if now.first != 0:
+            if now.fresh != 0:
+                borne *= 0
+            if (now.span.since + now.s) % WINDOW == 0:
+                mean = borne / WINDOW
+                whole = load + mean
+                if ti.abs(mean - self.earlier.field[e]) < STEADY * ti.abs(whole):
+                    k = ti.abs(whole) * ti.max(self.state.w.of(i), self.state.w.of(j))
+                    own = ti.max(self.own[i], self.own[j])
+                    gain = ti.min(WINDOW * own * own / (LAG * own * own + SLOW * k * k), GAIN)
+                    load, mean = ti.max(load + gain * mean, 0), (1 - gain) * mean
+                self.earlier.field[e] = mean
+                borne *= 0
+        load = ti.select(push > 0, load, 0)
+        self.load.field[e] = load
+        self.borne.field[e] = borne + part / self.integrator.h2_effective(now.h, now.fresh)
+        return load
