@@ -23,7 +23,10 @@ class DiscGeometry:
     grid: has the pairs listed. impulse: what the pairs of the list got in the last substep [kg m].
     """
 
-    def __init__(self, scene: Scene, grid: "NeighbourSearch", push_out: float = 0.0, impulse: PairData | None = None, has_loads: bool = False):  # fmt: skip
+    def __init__(
+        self, scene: Scene, grid: "NeighbourSearch", push_out: float = 0.0, impulse: PairData | None = None,
+        has_loads: bool = False,
+    ):  # fmt: skip
         self.scene, self.grid, self.push_out, self.impulse = scene, grid, push_out, impulse
         self.state, self.radius, self.real = scene.state, scene.radius, scene.real
         self.has_loads = has_loads

@@ -50,7 +50,8 @@ class PairContact(Feature):
     """Particles that do not overlap. A world has at most one.
 
     A subclass gives prepare() and join(), which makes `dev.geometry` and `dev.forces`, and for a pass of a substep, in this
-    order: detect(i, first), where it `detects`; count(begin, end) and busy(begin), by blocks of particles; relax(i, now); choose_impact(i) and apply_impact(i), in rounds while `dev.hit` is set, where any pair has restitution;
+    order: detect(i, first), where it `detects`; count(begin, end) and busy(begin), by blocks of particles; relax(i, now);
+    choose_impact(i) and apply_impact(i), in rounds while `dev.hit` is set, where any pair has restitution;
     apply_corrections(i, first); and at the end of a substep finish_substep(i).
     """
 
@@ -209,7 +210,7 @@ class PairContact(Feature):
 
     @ti.func
     def reaction(self, i, h):
-        """What forces of contacts moved particle i by in the last substep of a frame, of h [s] [m]; asked with a list of neighbours."""
+        """What forces of contacts moved particle i by in the last substep of a frame, h [s] long [m]; asked with a list."""
         return self.dev.forces.sum[i]
 
     @ti.func
