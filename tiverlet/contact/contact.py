@@ -238,7 +238,10 @@ class Contact(PairContact):
                         part = ti.select(paid > 0, lesser(part, paid / alone), ti.max(part, paid / alone))
                         part = ti.max(part, -push)
                         pressed = ti.select(first != 0, push, pressed)
-                        carried += w * self.dev.known.remember(i, j, e, part, push + part, now) * n
+                        bounces = False  # what bounces finds out by overlaps whether it rests
+                        if ti.static(self.dev.has_restitution):
+                            bounces = self.table.of(i, j)[2] > 0
+                        carried += w * self.dev.known.remember(i, j, e, part, push + part, now, not bounces) * n
                     else:
                         part = lesser(part, paid / alone)  # without a branch: it would be taken at random
                     pressed += part

@@ -2,9 +2,12 @@
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from ..device import ti
 from ..features.feature import Acceleration
 from ..neighbours.neighbour_list import WORD, PairData, lowest_bit
+from ..neighbours.queries import between
 
 if TYPE_CHECKING:
     from ..features.feature import Scene
@@ -14,6 +17,7 @@ WINDOW = 128  # substeps over which is averaged what is missing; at their end so
 STEADY = 0.1  # of the whole load: by how much that may differ from one window to the next
 GAIN = 0.8  # of what is missing is learnt at once, where a pile is low
 LAG, SLOW = 64, 0.3  # substeps that it takes to learn the load of k particles: LAG + SLOW k^2
+SAME = 1e-3  # of its length: by how much the line between a pair may change where particles are put elsewhere
 
 
 class Carried(Acceleration):
@@ -69,6 +73,28 @@ class KnownLoads:
         """integrator: knows what else accelerates particles."""
         self.integrator, self.forces = integrator, integrator.forces
 
+    def forget(self, scene: "Scene", x: np.ndarray) -> None:
+        """Before particles are put to x, (n, dim): pairs that are others there forget."""
+        pairs, values = self.grid.lasting_data()
+        if values["load"].any():
+            i, j = pairs.T
+            old = scene.state.get(scene.memory)
+            before = between(old[i], old[j], scene.periodic)
+            moved = np.linalg.norm(between(x[i], x[j], scene.periodic) - before, axis=1) > SAME * np.linalg.norm(before, axis=1)
+            for piece in self.pair_data:
+                values[piece.name][moved] = 0.0
+            self.grid.restore(pairs, values)
+        self.carry(scene, x, pairs, values)
+
+    def carry(self, scene: "Scene", x: np.ndarray, pairs: np.ndarray, values: dict[str, np.ndarray]) -> None:
+        """Give particles at x, (n, dim), what pairs (m, 2) know, of values as in NeighbourList.lasting_data()."""
+        i, j = pairs.T
+        r = between(x[i], x[j], scene.periodic)
+        length = np.linalg.norm(r, axis=1)
+        force = r * np.divide(values["load"], length, out=np.zeros_like(length), where=length > 0)[:, None]
+        sums = [np.bincount(i, column, minlength=len(x)) for column in force.T]
+        scene.memory.write(self.carried.field, scene.inv_mass[:, None] * np.stack(sums, axis=1))
+
     @ti.func
     def weigh(self, i, now):
         """Note what accelerates particle i but the loads of its contacts."""
@@ -93,8 +119,9 @@ class KnownLoads:
         return self.load.field[e] * self.integrator.h2_effective(now.h, now.fresh)
 
     @ti.func
-    def remember(self, i, j, e, part, push, now):
-        """Entry e, the pair of i and j, got `part` in this pass, and `push` in all. Returns what it gives from now on [N]."""
+    def remember(self, i, j, e, part, push, now, learns):
+        """Entry e, the pair of i and j, got `part` in this pass, and `push` in all. Returns what it gives from now on [N]; 0 of
+        pairs that do not learn."""
         load, borne = self.load.field[e], self.borne.field[e]
         if now.first != 0:
             if now.fresh != 0:
@@ -102,7 +129,7 @@ class KnownLoads:
             if (now.span.since + now.s) % WINDOW == 0:
                 mean = borne / WINDOW
                 whole = load + mean
-                if ti.abs(mean - self.earlier.field[e]) < STEADY * ti.abs(whole):
+                if learns and ti.abs(mean - self.earlier.field[e]) < STEADY * ti.abs(whole):
                     k = ti.abs(whole) * ti.max(self.state.w.of(i), self.state.w.of(j))
                     own = ti.max(self.own[i], self.own[j])
                     gain = ti.min(WINDOW * own * own / (LAG * own * own + SLOW * k * k), GAIN)
