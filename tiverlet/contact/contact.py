@@ -43,7 +43,7 @@ class Contact(PairContact):
     start, or after positions were assigned, part at this speed [m/s] at most: they act as if they were small enough to fit, and
     grow back. events: whether World.events() tells which pairs met and parted. sensors: pairs of groups that do not touch;
     World.events() tells which particles of the second group, the sensors, overlap with those of the first. It costs least where
-    sensors are few.
+    sensors are few. loads: pairs know what they bear at rest, and hold it without overlap; see known_loads.py.
 
     A Jacobi pass: each pair wants C back along the current n, split by mass, p = C / (m_i w_i + m_j w_j), which conserves
     momentum. A particle has its mass split m times, where m bounds the eigenvalues of S, the sum of n n^T over its overlapping

@@ -56,7 +56,7 @@ class KnownLoads:
     def __init__(self, scene: "Scene"):
         self.state = scene.state
         self.load = PairData("load", 0, lasting=True, marked=True)  # [N]
-        self.borne = PairData("borne", 0, lasting=True, marked=True)  # what was missing of it in this window, summed up [N]
+        self.borne = PairData("borne", 0, lasting=True, marked=True)  # what was missing of it in this window, summed up [kg m]
         self.earlier = PairData("earlier", 0, lasting=True, marked=True)  # on average in the window before [N]
         self.pair_data = [self.load, self.borne, self.earlier]
         n, dim = scene.count, scene.particles.dim
@@ -122,21 +122,27 @@ class KnownLoads:
     def remember(self, i, j, e, part, push, now, learns):
         """Entry e, the pair of i and j, got `part` in this pass, and `push` in all. Returns what it gives from now on [N]; 0 of
         pairs that do not learn."""
-        load, borne = self.load.field[e], self.borne.field[e]
+        load, borne = self.load.field[e], self.borne.field[e] + part
         if now.first != 0:
             if now.fresh != 0:
                 borne *= 0
             if (now.span.since + now.s) % WINDOW == 0:
-                mean = borne / WINDOW
-                whole = load + mean
-                if learns and ti.abs(mean - self.earlier.field[e]) < STEADY * ti.abs(whole):
-                    k = ti.abs(whole) * ti.max(self.state.w.of(i), self.state.w.of(j))
-                    own = ti.max(self.own[i], self.own[j])
-                    gain = ti.min(WINDOW * own * own / (LAG * own * own + SLOW * k * k), GAIN)
-                    load, mean = ti.max(load + gain * mean, 0), (1 - gain) * mean
-                self.earlier.field[e] = mean
-                borne *= 0
-        load = ti.select(push > 0, load, 0)
-        self.load.field[e] = load
-        self.borne.field[e] = borne + part / self.integrator.h2_effective(now.h, now.fresh)
+                load = self.learn(i, j, e, load, (borne - part) / (WINDOW * now.h * now.h), learns)
+                self.load.field[e] = load
+                borne = part
+        if push <= 0:
+            load *= 0
+            self.load.field[e] = load
+        self.borne.field[e] = borne
+        return load
+
+    @ti.func
+    def learn(self, i, j, e, load, mean, learns):
+        """At the end of a window, in which entry e lacked `mean` of its load: what it knows from now on [N]."""
+        whole = ti.abs(load + mean)
+        if learns and ti.abs(mean - self.earlier.field[e]) < STEADY * whole:
+            k, own = whole * ti.max(self.state.w.of(i), self.state.w.of(j)), ti.max(self.own[i], self.own[j])
+            gain = ti.min(WINDOW * own * own / (LAG * own * own + SLOW * k * k), GAIN)
+            load, mean = ti.max(load + gain * mean, 0), (1 - gain) * mean
+        self.earlier.field[e] = mean
         return load

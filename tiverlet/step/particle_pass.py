@@ -122,11 +122,15 @@ class ParticlePass:
                 for i in range(begin, end):
                     c.dev.known.weigh(i, now)
             if ti.static(len(self.walls) > 0):
-                for i in range(begin, end):
-                    lean = ti.zero(self.state.x[i])
-                    if self.state.moves(i) and c.dev.splitting.weight[i] > 0:
-                        lean = self.leave_walls(i, now)
-                    c.dev.known.lean[i] = lean
+                for b in range(blocks(begin, end)):
+                    low, high = block(b, begin, end)
+                    near = self.near_walls(low, high)
+                    for i in range(low, high):
+                        lean = ti.zero(self.state.x[i])
+                        if near != 0:
+                            if self.state.moves(i) and c.dev.splitting.weight[i] > 0:
+                                lean = self.leave_walls(i, now)
+                        c.dev.known.lean[i] = lean
 
     @ti.func
     def leave_walls(self, i, now):
@@ -214,11 +218,7 @@ class ParticlePass:
         elif ti.static(len(self.walls) > 0):
             for b in range(blocks(begin, end)):
                 low, high = block(b, begin, end)
-                near = 0
-                for i in range(low, high):
-                    for f in ti.static(self.walls):
-                        near |= f.may_touch(i, self.radius.of(i))
-                if near != 0:
+                if self.near_walls(low, high) != 0:
                     for i in range(low, high):
                         self.confine(i, now.h, now.frame_fraction)
         for c in ti.static(self.contacts):
@@ -236,6 +236,15 @@ class ParticlePass:
                     for i in range(begin, end):
                         if self.state.awake(i):
                             self.wall_turn[i] = self.wall_turn[i] + self.state.spin.s[i]
+
+    @ti.func
+    def near_walls(self, begin, end):
+        """0 where no wall is near any of some particles."""
+        near = 0
+        for i in range(begin, end):
+            for f in ti.static(self.walls):
+                near |= f.may_touch(i, self.radius.of(i))
+        return near
 
     @ti.func
     def confine(self, i, h, frame_fraction):
