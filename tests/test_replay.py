@@ -72,7 +72,7 @@ def solid(precision="f64", **settings):
         tv.Gravity((0, -9.81, 0)), tv.Distance([(0, 1), (0, 2), (0, 3), (1, 2), (2, 3), (1, 4)], compliance=1e-5),
         tv.Volume([(0, 1, 2, 3)], compliance=1e-4), tv.Dihedral([(0, 1, 2, 3)], compliance=0.1),
         tv.Motor([(0, 1, 2, 3)], 1.0, torque=0.5, compliance=0.1),
-        tv.Mesh(vertices, [(0, 2, 1), (0, 3, 2)], closed=False, restitution=0.3), tv.Contact(),
+        tv.Mesh(vertices, [(0, 2, 1), (0, 3, 2)], closed=False, restitution=0.3), tv.Contact(loads=True),
         tv.Periodic((-9, -9, -9), (9, 9, 9), (0, 2)), tv.Sleep(0.02, time=0.3),
     ]  # fmt: skip
     settings = {"solver": tv.ConjugateGradient(7), "substeps": 5, **settings}

@@ -459,6 +459,8 @@ def contacts(draw, s: Stage) -> Call | None:
         more["skin"] = pick(draw, 0.02, 1.0) * s.size
     if pick(draw, False, False, False, True):
         more["groups"] = [(0, 1)]
+    if pick(draw, False, False, False, True):
+        more["loads"] = True
     return Call("Contact", more | ({"events": True} if "friction" in more else {}))
 
 

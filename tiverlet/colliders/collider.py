@@ -169,7 +169,7 @@ class Collider(Feature):
 
     @ti.func
     def confine(self, i, radius, h, frame_fraction, turn):
-        """Move particle i out of the wall, with self.dev.surface.press(). turn: FIRST, AGAIN or GENTLY."""
+        """Move particle i out of the wall, with self.dev.surface.press(). turn: FIRST, AGAIN, GENTLY or AHEAD."""
 
 
 def _friction(wall: Collider, value: Any) -> Any:

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from .wall_log import WallLog
 
 # How a collider confines: as it comes; only what is further out than rounding; of that, without friction and bounces.
-FIRST, AGAIN, GENTLY = range(3)
+FIRST, AGAIN, GENTLY, AHEAD = range(4)
 TOUCH = 2.0**-20  # of the size of a wall: a start that is no deeper inside than this counts as on the surface
 ON = 1e-3  # of its distance from the middle of a wall: what is no deeper inside than this lies on it
 
@@ -107,7 +107,7 @@ class Surface:
     def press(self, i, depth, start_depth, n, moved, h, turn):
         """Take particle i out of a wall that it entered by `depth` [m], along the normal n; the wall itself moved by `moved`.
 
-        start_depth: how deep it was at the start of the substep, 0 or less outside [m]. turn: FIRST, AGAIN or GENTLY.
+        start_depth: how deep it was at the start of the substep, 0 or less outside [m]. turn: FIRST, AGAIN, GENTLY or AHEAD.
         What comes as close as the last digits of the position can tell touches: it does not sink, or slip, by these digits.
         Returns how the position was shifted.
         """
@@ -125,24 +125,25 @@ class Surface:
             if ti.static(self.has_restitution):
                 # Where the last bounce has put it back on a straight way, that way began at a height of `gap`.
                 gap = -depth - leaving
-                if gap >= 0 and leaving < 0 and turn != GENTLY:
+                if gap >= 0 and leaving < 0 and turn < GENTLY:
                     rise, after, left = self.bounce(gap, leaving, (self.state.before[i] - moved).dot(n), after)
             if ti.static(self.has_log):
-                self.log.note(i, depth, n, after - leaving, -leaving)
+                if turn != AHEAD:
+                    self.log.note(i, depth, n, after - leaving, -leaving)
             change = (after - leaving) * n
             if ti.static(self.state.keeps_wall_push):
                 self.state.wall_push[i] = self.state.wall_push[i] + change
             shift = (move + rise) * n
             stuck = False
             if ti.static(self.spins):
-                if turn != GENTLY:
+                if turn < GENTLY:
                     high, _lift = self.bounced(i)
                     held, rests = self.grip(i, n, d - leaving * n, after - leaving, rise > 0)
                     stuck = rests and rise == 0 and not high
                     change -= held
                     shift -= left * held  # from the impact on
             elif ti.static(self.has_friction):
-                if turn != GENTLY:
+                if turn < GENTLY:
                     slip = d - leaving * n
                     size, support = slip.norm(), after - leaving
                     if size > self.static() * support:

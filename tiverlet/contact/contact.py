@@ -19,6 +19,7 @@ from ..particles import Particles
 from .events import EventLog
 from .force_share import ForceShare
 from .friction import Friction
+from .known_loads import KnownLoads
 from .mass_splitting import MassSplitting, lesser
 from .narrow_phase import DiscGeometry
 from .pair_contact import PairContact
@@ -42,7 +43,7 @@ class Contact(PairContact):
     start, or after positions were assigned, part at this speed [m/s] at most: they act as if they were small enough to fit, and
     grow back. events: whether World.events() tells which pairs met and parted. sensors: pairs of groups that do not touch;
     World.events() tells which particles of the second group, the sensors, overlap with those of the first. It costs least where
-    sensors are few.
+    sensors are few. loads: pairs know what they bear at rest, and hold it without overlap; see known_loads.py.
 
     A Jacobi pass: each pair wants C back along the current n, split by mass, p = C / (m_i w_i + m_j w_j), which conserves
     momentum. A particle has its mass split m times, where m bounds the eigenvalues of S, the sum of n n^T over its overlapping
@@ -84,12 +85,13 @@ class Contact(PairContact):
 
     def __init__(
         self, friction: ArrayLike | Mapping = 0.0, restitution: ArrayLike | Mapping = 0.0, *, skin: float | str = "auto",
-        groups=None, push_out: float = 1.0, events: bool = False, sensors=(),
+        groups=None, push_out: float = 1.0, events: bool = False, sensors=(), loads: bool = False,
     ):  # fmt: skip
         self.groups, self.sensors, self.restitution, self.friction = groups, sensors, restitution, friction
-        self.skin, self.push_out, self.events = skin, push_out, events
+        self.skin, self.push_out, self.events, self.loads = skin, push_out, events, loads
 
     events = Knob(lambda f, v: checks.flag("Contact", "events", v), "Whether World.events() tells of pairs.", compiled=True)
+    loads = Knob(lambda f, v: checks.flag("Contact", "loads", v), "Whether pairs know what they bear.", compiled=True)
     sensors: Any = Knob(lambda f, v: f._surface("sensors", v), "The pairs of groups of which the second senses.", compiled=True)
     groups: Any = Knob(lambda f, v: f._surface("groups", v), "The pairs of groups that touch; None for all.", compiled=True)
     projects = True
@@ -145,9 +147,13 @@ class Contact(PairContact):
         dev.turn = PairData("turn", dev.axes, lasting=True) if dev.turns else None
         dev.slack = PairData("slack", 0, lasting=True)  # of the overlap, what no push is for
         dev.impulse = PairData("given", 0, lasting=True)  # pushes and impacts in the last substep [kg m]
+        dev.has_loads = self.has_loads
+        dev.known = KnownLoads(scene) if dev.has_loads else None
+        loads = dev.known.pair_data if dev.known else []
         struck, bouncing = PairData("struck", 0, lasting=False), [dev.slack] if dev.has_restitution else []
         pair_data = [
             dev.push,
+            *loads,
             *([dev.slip] if dev.has_friction else []),
             *([dev.turn] if dev.turn else []),
             *([*bouncing, struck, dev.impulse] if dev.has_restitution else []),
@@ -156,11 +162,16 @@ class Contact(PairContact):
         if dev.events:
             pair_data.append(dev.events.touched)
         dev.grid = NeighbourSearch(scene, self._listed, linked, self.table, pair_data, team, dev.move)
-        dev.geometry = DiscGeometry(scene, dev.grid, self.push_out, dev.impulse if dev.has_restitution else dev.push)
+        dev.geometry = DiscGeometry(
+            scene, dev.grid, self.push_out, dev.impulse if dev.has_restitution else dev.push, dev.has_loads
+        )
         if dev.events:
             dev.events.bind(dev.grid, dev.geometry)
         skips = not scene.memory.compiler.few and not dev.has_restitution  # in relax() what bounces forgets the last impact
-        dev.splitting = MassSplitting(scene, dev.geometry, dev.has_friction, skips, [dev.push, *bouncing], team)
+        ended = [dev.push, *loads, *bouncing]
+        dev.splitting = MassSplitting(scene, dev.geometry, dev.has_friction, skips, ended, team, dev.known)
+        if dev.known:
+            dev.known.bind(dev.grid, dev.splitting.weight)
         dev.forces = ForceShare(scene, sums=dev.has_friction, lasting=True)
         dev.fast = scene.memory.field("Contact.fast", None, kind=ti.i32)
         dev.friction = Friction(self.table)
@@ -185,10 +196,11 @@ class Contact(PairContact):
         return self.dev.splitting.busy(begin)
 
     @ti.func
-    def relax(self, i, first, fresh, final):
+    def relax(self, i, now):
         """What the pairs of particle i want of it."""
+        first, fresh, final = now.first, now.fresh, now.final
         total, w = ti.Vector.zero(self.scene.real, self.dev.state.dim), self.dev.w.of(i)
-        lift, forced = total, total
+        lift, forced, carried = total, total, total
         spin_change = ti.Vector.zero(self.scene.real, self.dev.axes)
         spin_forced = spin_change
         if ti.static(self.dev.has_restitution):
@@ -216,9 +228,23 @@ class Contact(PairContact):
                     part, push = paid * each, ti.zero(overlap)
                     if first == 0:
                         push = last
-                    elif fresh == 0:
-                        part += ti.max(ti.min(1 - alone * each, ti.static(CARRY)), 0) * last
-                    part = lesser(part, paid / alone)  # without a branch: it would be taken at random
+                    else:
+                        if ti.static(self.dev.has_loads):
+                            push = self.dev.known.given(e, now)
+                        if fresh == 0:
+                            part += ti.max(ti.min(1 - alone * each, ti.static(CARRY)), 0) * (last - push)
+                    pressed = ti.zero(overlap)
+                    if ti.static(self.dev.has_loads):
+                        part = ti.select(paid > 0, lesser(part, paid / alone), ti.max(part, paid / alone))
+                        part = ti.max(part, -push)
+                        pressed = ti.select(first != 0, push, pressed)
+                        bounces = False  # what bounces finds out by overlaps whether it rests
+                        if ti.static(self.dev.has_restitution):
+                            bounces = self.table.of(i, j)[2] > 0
+                        carried += w * self.dev.known.remember(i, j, e, part, push + part, now, not bounces) * n
+                    else:
+                        part = lesser(part, paid / alone)  # without a branch: it would be taken at random
+                    pressed += part
                     if ti.static(self.dev.has_restitution):
                         if given > 0:
                             self.dev.restitution.struck.field[e] = 1
@@ -226,13 +252,13 @@ class Contact(PairContact):
                                 self.dev.hit[None] = 1
                         if not rests:
                             part = ti.zero(part)
-                        self.dev.impulse.field[e] = self.dev.impulse.field[e] + part
+                        self.dev.impulse.field[e] = self.dev.impulse.field[e] + pressed
                     if ti.static(self.dev.reports):
-                        self.dev.events.note(i, j, e, n, part, final)
+                        self.dev.events.note(i, j, e, n, pressed, final)
                     push += part
                     want = part * n
                     if ti.static(self.dev.spins):
-                        tangential, turned = self.grip(i, j, e, n, reach, part + given / shared, given > 0)
+                        tangential, turned = self.grip(i, j, e, n, reach, pressed + given / shared, given > 0)
                         want += tangential
                         if ti.static(self.dev.has_restitution):
                             if given > 0:  # it acts from the time of impact on
@@ -241,18 +267,20 @@ class Contact(PairContact):
                         if final != 0:
                             before = self.dev.forces.before[i] - self.dev.forces.before[j]
                             approach = -self.dev.state.slid(before, i, j).dot(n)
-                            share = self.dev.forces.share(approach, part * alone) * w
+                            share = self.dev.forces.share(approach, pressed * alone) * w
                             forced += share * tangential
                             spin_forced += share * turned
                     elif ti.static(self.dev.has_friction):
-                        want -= self.held(i, j, n, part * shared + given, self.dev.slip.field[e]) / shared
+                        want -= self.held(i, j, n, pressed * shared + given, self.dev.slip.field[e]) / shared
                     total += w * want
                     if ti.static(self.dev.has_friction and not self.dev.spins):
                         if final != 0:
                             approach = -self.dev.state.slid(self.dev.forces.before[i] - self.dev.forces.before[j], i, j).dot(n)
-                            forced += self.dev.forces.share(approach, part * alone) * w * (want - part * n)
+                            forced += self.dev.forces.share(approach, pressed * alone) * w * (want - part * n)
                     self.dev.push.field[e] = push
         self.dev.move[i] = total
+        if ti.static(self.dev.has_loads):
+            self.dev.known.carried.field[i] = carried
         if ti.static(self.dev.spins):
             self.dev.spinning.change[i] = spin_change
             if final != 0:
@@ -285,8 +313,9 @@ class Contact(PairContact):
         return push, turned
 
     @ti.func
-    def reaction(self, i):
-        """Pushes along the normals at the present places, where they have no moment, and friction, known from the passes."""
+    def reaction(self, i, h):
+        """Pushes along the normals at the present places, where they have no moment, and friction, known from the passes; but not
+        what forces have of them."""
         total, w = 0 * self.dev.state.d[i], self.dev.w.of(i)
         if self.dev.splitting.weight[i] > 0:
             for word in range(self.dev.grid.words(i)):
@@ -300,7 +329,10 @@ class Contact(PairContact):
                     if push > 0 and length > 0:
                         n = r / length
                         approach = -self.dev.state.slid(self.dev.forces.before[i] - self.dev.forces.before[j], i, j).dot(n)
-                        total += self.dev.forces.share(approach, push * (w + self.dev.w.of(j))) * w * push * n
+                        share = self.dev.forces.share(approach, push * (w + self.dev.w.of(j)))
+                        if ti.static(self.dev.has_loads):
+                            push -= self.dev.known.load.field[e] * h * h
+                        total += share * w * push * n
         if ti.static(self.dev.has_friction):
             total += self.dev.forces.sum[i]
         return total
@@ -334,7 +366,10 @@ class Contact(PairContact):
                 j = self.dev.grid.neighbour[e]
                 overlap, n = self.dev.geometry.overlap(i, j, self.dev.geometry.contact_distance(i, j))
                 slip, turn = 0 * self.dev.state.x[i], ti.Vector.zero(self.scene.real, self.dev.axes)
-                if overlap > 0 and self.dev.push.field[e] > 0:
+                if ti.static(self.dev.has_loads):
+                    if overlap <= 0 and self.dev.push.field[e] > 0:
+                        overlap, n = self.dev.geometry.gap(i, j)
+                if (overlap > 0 or ti.static(self.dev.has_loads)) and self.dev.push.field[e] > 0:
                     shared = self.dev.splitting.weight[i] + self.dev.splitting.weight[j]
                     pressed = self.dev.push.field[e] * shared
                     if ti.static(self.dev.spins):

@@ -1,5 +1,7 @@
 """How often the mass of a particle is split, so that all contacts that it is in can be solved at once."""
 
+from typing import Any
+
 from ..device import ti
 from ..device.thread_team import BLOCK, Team
 from ..features.feature import Scene
@@ -16,10 +18,13 @@ class MassSplitting:
     """A disc or sphere i has its mass split m_i times, see Contact; `weight` is m_i w_i, 0 where it touches nothing.
 
     has_friction: whether pairs have it. skips: whether blocks of particles without contact are skipped. ended: what pairs
-    carry only while they touch. in_state: its fields that are part of the state.
+    carry only while they touch. known: the KnownLoads of pairs, or None. in_state: its fields that are part of the state.
     """
 
-    def __init__(self, scene: Scene, geometry: DiscGeometry, has_friction: bool, skips: bool, ended: list[PairData], team: Team):
+    def __init__(
+        self, scene: Scene, geometry: DiscGeometry, has_friction: bool, skips: bool, ended: list[PairData], team: Team, known: Any
+    ):
+        self.known, self.has_loads = known, known is not None
         self.geometry, self.grid, self.ended, self.has_friction, self.skips = geometry, geometry.grid, ended, has_friction, skips
         self.state, self.real, self.few = scene.state, scene.real, scene.memory.compiler.few
         self.weight = scene.memory.field("Contact.split_mass", scene.count, state=True)
@@ -64,7 +69,15 @@ class MassSplitting:
         """The same bits, of the first word as count() left them."""
         out = self.grid.touching[i]
         if word > 0:
-            out = self.touches(i, word)
+            out = self.together(i, word)
+        return out
+
+    @ti.func
+    def together(self, i, word):
+        """Bits for the entries of particle i that the word is for: which touch, or know a load."""
+        out = self.touches(i, word)
+        if ti.static(self.has_loads):
+            out |= self.known.kept(i, word, ti.select(word == 0, self.grid.touching[i], self.grid.all_bits(i, word)) & ~out)
         return out
 
     @ti.func
@@ -116,12 +129,12 @@ class MassSplitting:
     @ti.func
     def split(self, i):
         """Which pairs of particle i touch, and how often its mass is split. What does not touch has no push to keep."""
-        bits = self.touches(i, 0)
+        bits = self.together(i, 0)
         pairs = ti.math.popcnt(bits)
         self.clear(i, 0, self.grid.touching[i] & ~bits)
         self.grid.touching[i] = bits
         for word in range(1, self.grid.words(i)):
-            bits = self.touches(i, word)
+            bits = self.together(i, word)
             pairs += ti.math.popcnt(bits)
             self.clear(i, word, self.grid.all_bits(i, word) & ~bits)
         split = ti.cast(pairs, self.real)

@@ -23,9 +23,13 @@ class DiscGeometry:
     grid: has the pairs listed. impulse: what the pairs of the list got in the last substep [kg m].
     """
 
-    def __init__(self, scene: Scene, grid: "NeighbourSearch", push_out: float = 0.0, impulse: PairData | None = None):
+    def __init__(
+        self, scene: Scene, grid: "NeighbourSearch", push_out: float = 0.0, impulse: PairData | None = None,
+        has_loads: bool = False,
+    ):  # fmt: skip
         self.scene, self.grid, self.push_out, self.impulse = scene, grid, push_out, impulse
         self.state, self.radius, self.real = scene.state, scene.radius, scene.real
+        self.has_loads = has_loads
         self.shrinks, self.store, self.senses = False, None, grid.table.senses
 
     @ti.func
@@ -71,6 +75,13 @@ class DiscGeometry:
         return overlap, n
 
     @ti.func
+    def gap(self, i, j):
+        """The overlap of a pair that is apart, which is negative, and its normal."""
+        r = self.state.apart(i, j)
+        length = r.norm()
+        return self.contact_distance(i, j) - length, r / length
+
+    @ti.func
     def impact(self, i, j, contact_distance, shared):
         """Overlap, 1 / shared, and normal, as in overlap(), of a pair that touches; and how far from each other it was where its
         push acts, for particles that spin.
@@ -93,7 +104,7 @@ class DiscGeometry:
         d = self.state.slid(self.state.d[i] - self.state.d[j], i, j)
         r -= d
         c = r.dot(r) - contact_distance * contact_distance
-        if c > 0:
+        if c > 0 and (overlap > 0 or ti.static(not self.has_loads)):
             a, b = d.dot(d), r.dot(d)
             root = ti.sqrt(ti.max(b * b - a * c, 0)) - b
             if b < 0 and root > 0:

@@ -51,8 +51,8 @@ class PairContact(Feature):
     """Particles that do not overlap. A world has at most one.
 
     A subclass gives prepare() and join(), which makes `dev.geometry` and `dev.forces`, and for a pass of a substep, in this
-    order: detect(i, first), where it `detects`; count(begin, end) and busy(begin), by blocks of particles; relax(i, first, fresh,
-    final); choose_impact(i) and apply_impact(i), in rounds while `dev.hit` is set, where any pair has restitution;
+    order: detect(i, first), where it `detects`; count(begin, end) and busy(begin), by blocks of particles; relax(i, now);
+    choose_impact(i) and apply_impact(i), in rounds while `dev.hit` is set, where any pair has restitution;
     apply_corrections(i, first); and at the end of a substep finish_substep(i).
     """
 
@@ -108,6 +108,11 @@ class PairContact(Feature):
     def has_events(self) -> bool:
         """Whether World.events() tells of anything."""
         return bool(vars(self).get("events") or vars(self).get("sensors"))
+
+    @property
+    def has_loads(self) -> bool:
+        """Whether pairs know what they bear."""
+        return bool(vars(self).get("loads"))
 
     @property
     def shrinks(self) -> bool:
@@ -205,8 +210,8 @@ class PairContact(Feature):
         self.dev.forces.start(i, scale)
 
     @ti.func
-    def reaction(self, i):
-        """What forces of contacts moved particle i by in the last substep of a frame [m]; asked with a list of neighbours."""
+    def reaction(self, i, h):
+        """What forces of contacts moved particle i by in the last substep of a frame, h [s] long [m]; asked with a list."""
         return self.dev.forces.sum[i]
 
     @ti.func

@@ -144,8 +144,9 @@ class Polygons(PairContact):
                 self.dev.active[i] = active
 
     @ti.func
-    def relax(self, i, first, fresh, final):
+    def relax(self, i, now):
         """What the contacts of particle i want of it."""
+        first, final = now.first, now.final
         total, lifts, forced = 0 * self.dev.state.x[i], 0 * self.dev.state.x[i], 0 * self.dev.state.x[i]
         begin, roles = self.dev.grid.first[i], self.dev.geometry.roles(i)
         for e in range(begin, begin + ti.select(self.dev.active[i] > 0, self.dev.grid.number[i], 0)):

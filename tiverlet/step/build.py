@@ -157,8 +157,11 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     for feature in features:
         feature.new_force = False  # it was given when it was made
         feature.dev.built = feature.compiled() if not isinstance(feature, Batch) or feature.acts else None
-    forces = Forces(scene, accelerations)
+    known = contact.dev.known if contact and contact.has_loads else None
+    forces = Forces(scene, [*accelerations, known.carried] if known else accelerations)
     integrator = Verlet(scene, forces) if scene.order == 2 else high_order.Composition(scene, forces, batches)
+    if known:
+        known.follow(integrator)
     step = Step(scene, integrator, batches, drivers, contact, grid, walls, team)
     if state.sleepers:
         step.sleep = SleepPass(step, state.sleepers, drivers, batches)

@@ -12,7 +12,8 @@ from .clock import Clock
 if TYPE_CHECKING:
     from ..world import World
 
-CARRIED = ("Contact.push", "Contact.slip", "Contact.turn", "Contact.slack")  # by pairs, for the next substep
+LOADS = ("Contact.load", "Contact.borne", "Contact.earlier")
+CARRIED = ("Contact.push", "Contact.slip", "Contact.turn", "Contact.slack", *LOADS)  # by pairs, for the next substep
 TOLD = ("Contact.given", "Contact.touched")  # by pairs, of the last substep, for reports
 EVENTS = "events."  # names of what walls carry for reports begin so
 LATE = {"Contact.shrunk"}  # made when it is needed

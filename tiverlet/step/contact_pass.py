@@ -49,7 +49,7 @@ class ContactPass:
                     if c.busy(low) != 0:
                         for i in range(low, high):
                             if c.dev.state.awake(i):
-                                c.relax(i, now.first, now.fresh, now.final)
+                                c.relax(i, now)
                     elif now.final != 0:
                         if ti.static(c.has_friction):
                             for i in range(low, high):

@@ -74,6 +74,7 @@ def regroup(world: Any, change: Regrouping, added: Particles | None) -> None:
     if pairs:
         memory.write(runner.grid.number, 0)
         runner.grid.restore(*pairs)
+    runner.carry_loads()
 
 
 def grabbing(world: Any, some: np.ndarray) -> Regrouping | None:
@@ -113,6 +114,7 @@ def grab(world: Any, change: Regrouping) -> None:
         f.grab(change)
     for log in runner.logs:
         log.forget()
+    runner.carry_loads()
     if not alone:  # lists leave out pairs of which none can move
         runner.invalidate()
 

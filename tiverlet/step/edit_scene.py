@@ -337,6 +337,7 @@ def _give_contacts(world: Any, contact: PairContact, old: dict, number: np.ndarr
     both = (pairs >= 0).all(axis=1)
     nothing = {p.name: np.zeros((len(pairs), p.width) if p.width else len(pairs)) for p in grid.lasting}  # of what came just now
     grid.restore(pairs[both], {name: old.get(f"Contact.{name}", none)[both] for name, none in nothing.items()})
+    world._runner.carry_loads()
 
 
 def _launch(world: Any, first: int) -> None:

@@ -3,7 +3,7 @@ once."""
 
 from typing import TYPE_CHECKING, Any
 
-from ..colliders.surface import AGAIN, FIRST, GENTLY
+from ..colliders.surface import AGAIN, AHEAD, FIRST, GENTLY
 from ..contact.force_share import accumulate
 from ..device import ti
 from ..device.number import OnDevice
@@ -40,6 +40,7 @@ class ParticlePass:
         self.held = bool(batches)
         self.contacts = [contact] if contact else []
         self.acts = bool(batches or contact or walls)
+        self.knows_loads = bool(contact) and contact.has_loads
         self.rough = any(w.has_friction or w.has_restitution for w in walls)
         self.turned_by_walls = scene.state.spins and any(w.has_friction for w in walls)
         if walls:
@@ -104,6 +105,8 @@ class ParticlePass:
                 for i in range(first, end):
                     self.state.spin.begin(i, now.h)
         self.integrator.advance(first, end, now)
+        if ti.static(self.knows_loads):
+            self.look_ahead(first, end, now)
         for c in ti.static(self.contacts):
             stale, fast = 0, 0
             for i in range(first, end):
@@ -113,6 +116,56 @@ class ParticlePass:
             for i in range(first, end):
                 fast |= c.overshoots(i)
             c.note_motion(stale, fast)
+
+    @ti.func
+    def look_ahead(self, begin, end, now):
+        """Where pairs know their loads: what particles weigh, as a window ends; and for contacts to see, those that touch others
+        go to where walls will leave them."""
+        for c in ti.static(self.contacts):
+            if now.damps != 0:
+                for i in range(begin, end):
+                    c.dev.known.weigh(i, now)
+            if ti.static(len(self.walls) > 0):
+                for b in range(blocks(begin, end)):
+                    low, high = block(b, begin, end)
+                    near = self.near_walls(low, high)
+                    for i in range(low, high):
+                        lean = ti.zero(self.state.x[i])
+                        if near != 0:
+                            if self.state.moves(i) and c.dev.splitting.weight[i] > 0:
+                                lean = self.leave_walls(i, now)
+                        c.dev.known.lean[i] = lean
+
+    @ti.func
+    def leave_walls(self, i, now):
+        """Take particle i out of the walls, without friction and bounces; how far."""
+        d = self.state.d[i]
+        before = wall_push = ti.zero(d)
+        if ti.static(self.state.befores):
+            before = self.state.before[i]
+        if ti.static(self.state.keeps_wall_push):
+            wall_push = self.state.wall_push[i]
+        moving = True
+        for _ in range(SWEEPS):
+            if moving:
+                x, here = self.state.x[i], self.state.d[i]
+                for f in ti.static(self.walls):
+                    self.touch(f, i, now.h, now.frame_fraction, AHEAD)
+                moving = not ((self.state.d[i] == here).all() and (self.state.x[i] == x).all())
+        if ti.static(self.state.befores):
+            self.state.before[i] = before
+        if ti.static(self.state.keeps_wall_push):
+            self.state.wall_push[i] = wall_push
+        return self.state.d[i] - d
+
+    @ti.func
+    def look_back(self, begin, end):
+        """Particles go back to where they were before walls were looked at."""
+        for c in ti.static(self.contacts):
+            for i in range(begin, end):
+                lean = c.dev.known.lean[i]
+                if (lean != 0).any():
+                    self.state.shift(i, -lean)
 
     @ti.func
     def apply_constraints(self, thread):
@@ -145,6 +198,9 @@ class ParticlePass:
         if ti.static(self.gathers):
             for i in range(begin, end):
                 self.gather(i)
+        if ti.static(self.knows_loads and len(self.walls) > 0):
+            if now.first != 0:
+                self.look_back(begin, end)
         for c in ti.static(self.contacts):
             for b in range(blocks(begin, end)):
                 low, high = block(b, begin, end)
@@ -166,11 +222,7 @@ class ParticlePass:
         elif ti.static(len(self.walls) > 0):
             for b in range(blocks(begin, end)):
                 low, high = block(b, begin, end)
-                near = 0
-                for i in range(low, high):
-                    for f in ti.static(self.walls):
-                        near |= f.may_touch(i, self.radius.of(i))
-                if near != 0:
+                if self.near_walls(low, high) != 0:
                     for i in range(low, high):
                         self.confine(i, now.h, now.frame_fraction)
         for c in ti.static(self.contacts):
@@ -188,6 +240,15 @@ class ParticlePass:
                     for i in range(begin, end):
                         if self.state.awake(i):
                             self.wall_turn[i] = self.wall_turn[i] + self.state.spin.s[i]
+
+    @ti.func
+    def near_walls(self, begin, end):
+        """0 where no wall is near any of some particles."""
+        near = 0
+        for i in range(begin, end):
+            for f in ti.static(self.walls):
+                near |= f.may_touch(i, self.radius.of(i))
+        return near
 
     @ti.func
     def confine(self, i, h, frame_fraction):
@@ -273,7 +334,7 @@ class ParticlePass:
         if ti.static(self.held):
             reaction = self.slots.total_of(i)
         for c in ti.static(self.contacts):
-            reaction += firm * c.reaction(i)
+            reaction += firm * c.reaction(i, h)
         if ti.static(len(self.walls) > 0):
             push = firm * self.wall_displacement[i]
             v = self.state.d[i] / h

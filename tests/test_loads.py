@@ -1,0 +1,133 @@
+"""Contacts that know their loads hold them without overlap, as statics says, and let go of them at once."""
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+
+G, R = 10.0, 0.5
+
+
+def heap(n, dim=2):
+    """n^dim discs or spheres, hardly off columns, and how wide they are."""
+    rng = np.random.default_rng(0)
+    x = np.stack(np.meshgrid(*[np.arange(n)] * dim, indexing="ij"), axis=-1).reshape(-1, dim)[:, ::-1] * 1.05 + R
+    return x + rng.uniform(0, 0.03, x.shape), 1.05 * n + 0.1
+
+
+def pile(world, n=5, dim=2, friction: object = 0.5, spin=None, loads=True, restitution=0.0, **settings):
+    """A heap in a box."""
+    x, width = heap(n, dim)
+    low, high = np.zeros(dim), np.full(dim, width)
+    high[1] = np.inf
+    features = [
+        tv.Gravity(G),
+        tv.Contact(friction=friction, restitution=restitution, loads=loads),  # type: ignore[arg-type]
+        tv.Box(low, high, friction=friction),  # type: ignore[arg-type]
+    ]
+    return world(tv.Particles(x, radius=R, spin=spin), features, **({"substeps": 8, "precision": "f64"} | settings))
+
+
+def overlap(w):
+    """The mean of contacts, in diameters."""
+    return np.maximum(w.contacts.overlap, 0.0).mean() / (2 * R)
+
+
+@pytest.mark.parametrize(
+    "settings, most",
+    [({}, 1e-6), ({"dim": 3, "n": 3}, 1e-6), ({"precision": "f32"}, 1e-6), ({"substeps": 2}, 1e-5),
+     ({"spin": 0.0, "friction": (0.5, 0.5, 0.1, 0.0)}, 1e-6), ({"friction": 0.0}, 1e-6)],
+)  # fmt: skip
+def test_a_pile_at_rest_hardly_overlaps(world, settings, most):
+    # Without loads the k-th contact overlaps by 2 k g h^2: on average 1e-4 (8 substeps) and 2e-3 (2) of a diameter here.
+    w, without = (pile(world, loads=loads, **settings) for loads in (True, False))
+    start, highest = w.step(1 / 60).energy, -np.inf
+    for _ in range(900):
+        highest = max(highest, w.step(1 / 60).energy)
+    without.run(15.0)
+    assert highest <= start * (1 + 1e-6)
+    assert overlap(w) < most < 0.05 * overlap(without)
+    speed = np.linalg.norm(w.velocity, axis=1).max()
+    assert speed < (1e-3 if w.precision == "f32" or "spin" in settings else 1e-4)
+
+
+def test_a_column_bears_what_is_above(world):
+    # The k-th contact from the top bears k m g, and the ground all: known to rounding, and nothing overlaps.
+    n = 10
+    column = tv.Particles(np.stack([np.zeros(n), R + np.arange(n)], axis=1), radius=R, mass=2.0)
+    w = world(column, [tv.Gravity(G), tv.Contact(loads=True), tv.HalfSpace((0, 1))], substeps=8, precision="f64")
+    w.run(20.0)
+    found, h = w.contacts, 1 / 480
+    np.testing.assert_allclose(found.impulse / h, 2.0 * G * np.arange(n - 1, 0, -1), rtol=1e-7)
+    assert np.abs(found.overlap).max() < 1e-9
+    assert np.abs(w.velocity).max() < 1e-8
+
+
+def test_three_discs_bear_each_other_as_statics_says(world):
+    # Two lie between walls, one on them: N = m g / (2 cos a) on each, sin a = (half of their distance) / 2 R. Masses differ.
+    width = 2.5
+    half = (width - 2 * R) / 2
+    height = np.sqrt(4 * R * R - half * half)
+    x = [[R, R], [width - R, R], [R + half, R + height + 0.01]]
+    particles = tv.Particles(x, radius=R, mass=[1.0, 1.0, 3.0])
+    w = world(particles, [tv.Gravity(G), tv.Contact(loads=True), tv.Box((0, 0), (width, 9))], substeps=4, precision="f64")
+    w.run(20.0)
+    np.testing.assert_allclose(w.contacts.impulse * 240, 3.0 * G / (2 * height / (2 * R)), rtol=1e-6)
+    np.testing.assert_allclose(w.position[2], [R + half, R + height], atol=1e-8)
+
+
+def test_loads_are_gone_with_what_bore_them(world):
+    # Where the ground goes, all fall: what is above is given at most the loads of one more substep, k g h.
+    w = pile(world, friction=0.0)
+    w.run(10.0)
+    box = w.features[2]
+    box.lower = (0.0, -100.0)  # type: ignore[attr-defined]
+    v = [w.velocity for _ in range(30) if w.step(1 / 60)]
+    assert np.abs(v[-1][:, 1] - v[0][:, 1] + G * 29 / 60).max() < 5 * G / 480
+    assert np.ptp(v[-1][:, 1]) < 2 * 5 * G / 480
+    # What is taken away by hand falls as it would alone: nobody gives it anything.
+    w = pile(world)
+    w.run(10.0)
+    x = w.position.copy()
+    x[12] = [2.5, 30.0]
+    w.position = x
+    w.step(1 / 60)
+    np.testing.assert_allclose(w.position[12], [2.5, 30.0 - G / 60**2 / 2], atol=1e-4)
+    # And what is removed leaves the others to fall on what is below.
+    w = pile(world)
+    w.run(10.0)
+    top = w.position[24, 1]
+    w.remove([9])
+    speed = max(np.abs(w.velocity[:, 1]).max() for _ in range(60) if w.step(1 / 60))
+    assert top - w.position[23, 1] > 0.9 and speed < 1.1 * np.sqrt(2 * G * 1.0)
+    w.run(10.0)
+    assert overlap(w) < 1e-6
+
+
+def test_pairs_that_bounce_learn_nothing(world):
+    # They find out by their overlap whether they rest, so they keep that of the law.
+    w, law = (pile(world, restitution=0.5, loads=loads) for loads in (True, False))
+    w.run(10.0), law.run(10.0)
+    np.testing.assert_allclose(overlap(w), overlap(law), rtol=0.1)
+    assert np.abs(w.velocity).max() < 1e-3
+
+
+def test_loads_are_of_the_state(world):
+    # On all paths, in clones, and where they are asked for only later, to the same bits; in Worlds, too.
+    a, b, c = (pile(world, path=path) for path in ("fused", "parallel", "launched"))
+    for w in (a, b, c):
+        w.run(4.0)
+    assert a.hash() == b.hash() == c.hash()
+    with a.clone() as other, tv.Worlds(a, 2) as many:
+        for w in (a, other, many):
+            w.step(1 / 60)
+        assert other.hash() == a.hash()
+        np.testing.assert_array_equal(many.position[1], a.position)
+    late = pile(world, loads=False)
+    late.run(10.0)
+    before = overlap(late)
+    late.features[1].loads = True  # type: ignore[attr-defined]
+    late.run(10.0)
+    assert overlap(late) < 1e-2 * before
+    with pytest.raises(TypeError, match="loads"):
+        tv.Contact(loads="yes")  # type: ignore[arg-type]
