@@ -42,6 +42,7 @@ def release(runner: Any, h: float, longest: float) -> bool:
     energy, overlap = seen(runner)
     if not matters(overlap, ratio):
         return False
+    runner.list_neighbours()  # so that it does not matter when it was listed last
     jacobian = part(runner, Pairs(runner, contact, x), x, ratio)
     if runner.clock.energy is not None:  # of the whole frame, to second order
         energy = runner.clock.energy
