@@ -827,7 +827,7 @@ class Scalar(Batch):
     def energy(self, c, back, h2_effective, residual):
         """Elastic energy [J] at x - back d: F C / 2, which is C^2 / (2 alpha) once solved.
 
-        See Spring.solved(). h2_effective: F = -lam / h2_effective; 0 where there was no substep yet.
+        See Spring.solved() and Spring.energy(). h2_effective: F = -lam / h2_effective; 0 where there was no substep yet.
         """
         out = ti.cast(0, ti.f64)
         if ti.static(self.dev.spring.soft):
@@ -839,7 +839,23 @@ class Scalar(Batch):
                     out *= self.dev.spring.solved(
                         ti.abs(self.dev.lam[c]) * alpha, h2_effective, residual * self.residual_scale(c)
                     )
+                    force = ti.cast(self.dev.lam[c], ti.f64)
+                    if h2_effective > 0:
+                        force /= h2_effective
+                    out = self.dev.spring.energy(c, self.weight(c), h2_effective, out, force * force * alpha / 2)
         return out
+
+    @ti.func
+    def weight(self, c):
+        """The sum of w |grad f|^2."""
+        w = ti.cast(0, self.dev.real)
+        if ti.static(self.arity == 0):
+            w = self.dev.outline.weight(c)
+        else:
+            _, g = self.measure(c, self.corners(c, 0))
+            for k in ti.static(range(self.arity)):
+                w += self.dev.w.of(self.member(c, k)) * g[k, :].dot(g[k, :])
+        return w
 
     @ti.func
     def residual_scale(self, c):
