@@ -196,9 +196,9 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
         if f not in came:
             f.changed, f.moving = attributes[f].get("changed", True), attributes[f].get("moving", False)
             f.new_force = attributes[f].get("new_force", False)
-    for f, before in rests.items():
+    for f, values in rests.items():
         if f.acts:
-            f.put(before)  # from where they go to those that were assigned
+            f.put(values)  # from where they go to those that were assigned
     for memory in memories:
         memory.destroy()
     if any(isinstance(f, PairContact) for f in came):
