@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 CARRIED = ("Contact.push", "Contact.slip", "Contact.turn", "Contact.slack")  # by pairs, for the next substep
 TOLD = ("Contact.given", "Contact.touched")  # by pairs, of the last substep, for reports
 EVENTS = "events."  # names of what walls carry for reports begin so
-RESTS = "rests."  # and of rest values before a ramp, while knobs wait to be uploaded: with the number of the feature
+RESTS = "rests."  # and of rest values while knobs wait, before a ramp to others: with the number of the feature
 LATE = {"Contact.shrunk"}  # made when it is needed
 
 
@@ -37,9 +37,9 @@ class Checkpoint:
         return out.hexdigest()
 
     def _lasting(self) -> dict[str, np.ndarray]:
-        """Without what pairs carry for reports: a pair that has just bounced may be on the list or far off it, by the skin. And
-        without a field that is made when it is needed, where nobody needs it."""
-        values = {name: v for name, v in self.values.items() if (name not in LATE or v.any()) and not name.startswith(EVENTS)}
+        """Without what pairs carry for reports: a pair that has just bounced may be on the list or far off it, by the skin.
+        Without a field that is made when it is needed, where nobody needs it; and without what knobs were."""
+        values = {n: v for n, v in self.values.items() if (n not in LATE or v.any()) and not n.startswith((EVENTS, RESTS))}
         if not any(name in values for name in TOLD):
             return values
         carried = [name for name in CARRIED if name in values]

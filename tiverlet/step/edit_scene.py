@@ -198,7 +198,7 @@ def rebuild(world: Any, some: np.ndarray, added: Particles | None, features: tup
             f.new_force = attributes[f].get("new_force", False)
     for f, values in rests.items():
         if f.acts:
-            f.put(values)  # from where they go to those that were assigned
+            f.put([*values])  # from where they go to those that were assigned
     for memory in memories:
         memory.destroy()
     if any(isinstance(f, PairContact) for f in came):
