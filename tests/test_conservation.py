@@ -231,3 +231,24 @@ def test_a_force_that_was_just_turned_goes_along(world, tmp_path):
         recorder.log()
     assert tv.replay(tmp_path / "turned.rrd").verify()
     assert len(set(hashes)) == 1
+
+
+def test_a_stiff_spring_that_turns_stores_what_its_load_does(world):
+    # A mass m turns about a point at a distance L: m v^2 / 2, and alpha F^2 / 2 with F = m v^2 / L = 2.5 N, 3e-9 J. In the middle
+    # of a substep it is nearer by L phi^2 / 8, phi = v h / L, of which 1 / (2 alpha) would make up to 23 J. It turns by asin phi
+    # in a substep and is seen along the chord: (1 + phi^2 / 4) of the kinetic energy. The same for a cluster, and for what a
+    # stiff pin draws: m u^2 / 2 for a target with speed u.
+    alpha, L, v, u, m = 1e-9, 0.5, 2.5, 1.2, 0.2
+    x = np.array([[0, 0], [L, 0], [2, 0], [2 + L, 0], [2, L], [5, 0]])
+    speed = np.array([[0, 0], [0, v], [0, 0], [0, 0], [0, 0], [0, 0]])
+    center = x[2:5].mean(axis=0)
+    speed[2:5] = (x[2:5] - center)[:, ::-1] * [-v / L, v / L]
+    features = [
+        tv.Distance([[0, 1]], compliance=alpha), tv.ShapeMatch([[2, 3, 4]], compliance=alpha), tv.Pin([5], compliance=alpha)
+    ]  # fmt: skip
+    w = world(tv.Particles(x, velocity=speed, mass=m, pinned=[0]), features, precision="f64", substeps=2)
+    turning = m / 2 * (speed**2).sum()
+    for k in range(4):
+        features[2].target = [[5 + u * (k + 1) / 60, 0]]
+        report = w.step(1 / 60)
+        assert report.energy == pytest.approx(turning + m / 2 * u**2, rel=(v / L / 120) ** 2 / 3)

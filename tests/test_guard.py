@@ -273,3 +273,20 @@ def test_what_cannot_be_paid_or_said_in_numbers(world):
     reporter.figures[9] = np.inf
     report, _ = reporter(w.time, 1 / 1200, 20, 1, None, 0.0, 0.0)
     assert report.flags == {"softened"} and "Use about inf substeps" in report.notes[0]
+
+
+def test_what_an_impact_left_of_a_link_is_no_spring_where_a_wall_holds_it(world):
+    # Two masses over each other fall on the lower one, in a frame of one substep: the link is off by C = 0.3 L. Substeps that are
+    # 64 times shorter would make m (C / h)^2 / 4 of it, 1800 J. So it is taken out first; the lower end cannot go down, and the
+    # upper one is lifted by no more than C.
+    L, g, m = 0.3, 9.81, 1.0
+    w = world(
+        tv.Particles([[0.0, 0], [0, L]], mass=m, velocity=(0, -5)),
+        [tv.Gravity(g), tv.Distance([[0, 1]]), tv.HalfSpace((0, 1), 0)], substeps=1, solver=tv.Jacobi(), precision="f64",
+    )  # fmt: skip
+    for _ in range(2):
+        before = w.step(1 / 60)
+    assert before.residual > 0.25
+    w.substeps = 64
+    report = w.step(1 / 60)
+    assert report.residual < 1e-3 and report.energy < before.energy + m * g * L * before.residual

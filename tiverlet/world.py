@@ -149,6 +149,7 @@ class World:
             except BaseException:
                 self._broken_off()
                 raise
+            self._runner.arrive()
             report.__dict__["seconds"] = perf_counter() - clock  # which is no part of what it says
             self._last, self._clock.energy, self._undo, self._events = report, report.energy, None, None
             for watcher in self._watchers:
@@ -218,6 +219,7 @@ class World:
             if feature.changed:
                 feature.changed = feature.new_force = False
                 feature.upload()
+        self._runner.find_ramps()
 
     def run(
         self, seconds: float, dt: float = 1 / 60, recorder=None, progress: bool = False, *, tolerance: float | None = None,

@@ -1,5 +1,8 @@
 """Limbs and hinges: corners that turn only so far."""
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -23,7 +26,8 @@ class AngleLimit(Scalar):
     [0, pi]. Live.
     compliance: number or (m,) [rad/(N m)] of the stops; 0 is rigid. damping: [N m s/rad], while at a stop. break_at: [N m].
 
-    A rigid stop takes the impact inelastically. Moved in a jump it throws what it meets: move it bit by bit, or make it soft.
+    A rigid stop takes the impact inelastically. Limits that are assigned are reached in the course of the next frame, at a third
+    of a radian in one where rigid; what they meet has that speed then.
     `load` is the moment at either stop [N m].
     """
 
@@ -74,22 +78,26 @@ class AngleLimit(Scalar):
         """Of that, by each corner."""
         return differences(self.values, self.placed(position))
 
+    def tracks(self) -> list[tuple[Any, np.ndarray, Callable]]:
+        """Half of the range, and its middle."""
+        return [(self.dev.rest, self.rest, np.subtract), (self.dev.middle, self.middle, self.quantity.difference)]
+
     def violation(self, position: np.ndarray) -> np.ndarray:
         """C at the given positions."""
-        return self.rest_of(position) - self.rest
+        half, middle = self.now() if self.ramping else (self.rest, self.middle)
+        return np.abs(turned(super().values(self.placed(position)) - middle)) - half
 
     def bind(self, scene: Scene) -> None:
         """The middle of each range."""
         self.dev.middle = scene.memory.field("AngleLimit.middle", self.count, values=self.middle)
         super().bind(scene)
 
-    def upload(self) -> None:
-        """Write new limits."""
-        super().upload()
-        if self.acts:
-            self.scene.memory.write(self.dev.middle, self.middle)
+    uploads_all = False  # limits are checked against each other, of one
 
-    uploads_all = False  # middle is of one
+    @ti.func
+    def step_of_rest(self, c):
+        """None: the angle is counted from the middle, which moves, too."""
+        return ti.cast(0, self.dev.real)
 
     @ti.func
     def unwrap(self, f, other):

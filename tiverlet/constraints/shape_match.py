@@ -468,13 +468,18 @@ class ShapeMatch(Batch):
                     K += mu * self.dev.shape[e].outer_product(x)
                 s, q = s / total, q / total
                 R = rotation.matrix(rotation.fit(K - total * q.outer_product(s), self.dev.turn[c], LEAST))
-                most = ti.cast(0, self.dev.real)
+                most, borne = ti.cast(0, self.dev.real), ti.cast(0, ti.f64)
                 for e in range(self.dev.corners.starts[c], self.dev.corners.starts[c + 1]):
                     C = self.arm(e, i0, back) - s - R @ (self.dev.shape[e] - q)
                     if self.dev.w.of(self.dev.corners.members[e]) > 0:
                         out += C.dot(C) / (2 * alpha * mass * self.dev.w.of(self.dev.corners.members[e]))
                         most = ti.max(most, self.dev.pull[e].norm())
+                        pull = ti.cast(self.dev.pull[e].norm(), ti.f64)
+                        if h2_effective > 0:
+                            pull /= h2_effective
+                        borne += pull * pull * alpha * mass / (2 * self.dev.w.of(self.dev.corners.members[e]))
                 out *= self.dev.spring.solved(most * alpha * mass, h2_effective, residual * self.dev.size[c])
+                out = self.dev.spring.energy(c, 1 / mass, h2_effective, out, borne)
         return out
 
 

@@ -246,6 +246,7 @@ class Batch(Feature):
     drives = False  # puts its particles in place instead of relaxing them
     solvable_together = False  # its constraints may be solved together with others, by the System of a solver; see Scalar
     driven = False  # rest values move by themselves: what drive_of() gives, see Drive
+    ramping = False  # rest values go to others in the coming frame, see Ramp
     transcends = False  # takes angles, cube roots or exponentials, which SPIR-V has for f32 only
     members: Any  # FixedSize or VariableSize: the particles of each constraint
     bulk = 1.0

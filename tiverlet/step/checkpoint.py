@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..constraints.core.scalar import Scalar
 from ..neighbours.periodic import Periodic
 from .clock import Clock
 
@@ -16,6 +17,7 @@ LOADS = ("Contact.load", "Contact.borne", "Contact.earlier")
 CARRIED = ("Contact.push", "Contact.slip", "Contact.turn", "Contact.slack", *LOADS)  # by pairs, for the next substep
 TOLD = ("Contact.given", "Contact.touched")  # by pairs, of the last substep, for reports
 EVENTS = "events."  # names of what walls carry for reports begin so
+RESTS = "rests."  # and of rest values while knobs wait, before a ramp to others: with the number of the feature
 LATE = {"Contact.shrunk"}  # made when it is needed
 
 
@@ -36,9 +38,9 @@ class Checkpoint:
         return out.hexdigest()
 
     def _lasting(self) -> dict[str, np.ndarray]:
-        """Without what pairs carry for reports: a pair that has just bounced may be on the list or far off it, by the skin. And
-        without a field that is made when it is needed, where nobody needs it."""
-        values = {name: v for name, v in self.values.items() if (name not in LATE or v.any()) and not name.startswith(EVENTS)}
+        """Without what pairs carry for reports: a pair that has just bounced may be on the list or far off it, by the skin.
+        Without a field that is made when it is needed, where nobody needs it; and without what knobs were."""
+        values = {n: v for n, v in self.values.items() if (n not in LATE or v.any()) and not n.startswith((EVENTS, RESTS))}
         if not any(name in values for name in TOLD):
             return values
         carried = [name for name in CARRIED if name in values]
@@ -65,7 +67,7 @@ def state(world: "World", pairs: bool = True) -> dict[str, np.ndarray]:
     if world._runner.grid and pairs:
         out["Contact.pairs"], carried = world._runner.grid.lasting_data()
         out.update((f"Contact.{name}", values) for name, values in carried.items())
-    return out
+    return out | {f"{RESTS}{k}": np.stack(f.now()) for k, f in enumerate(world.features) if isinstance(f, Scalar) and f.waits}
 
 
 def keep(world: "World", pairs: bool = True) -> Checkpoint:
@@ -89,6 +91,9 @@ def put_back(world: "World", kept: Checkpoint) -> None:
     if grid:
         pieces = {piece.name: kept.values[f"Contact.{piece.name}"] for piece in grid.lasting}
         grid.restore(kept.values["Contact.pairs"], pieces)
+    for k, f in enumerate(world.features):
+        if f"{RESTS}{k}" in kept.values:
+            f.put(kept.values[f"{RESTS}{k}"])  # type: ignore[attr-defined]
     for log in world._runner.logs:
         log.forget()
     world._runner.invalidate()
@@ -110,7 +115,9 @@ def install(world: "World", kept: Checkpoint, flagged: list[list[bool]]) -> None
 def check(world: "World", kept: Checkpoint, flagged: list[list[bool]]) -> None:
     """Raise ValueError unless a state that came from elsewhere fits the world; above all what kernels take for indices."""
     present = keep(world)
-    if set(present.values) - LATE != set(kept.values) - LATE:
+    rests = {f"{RESTS}{k}": (len(f.tracks()), f.count) for k, f in enumerate(world.features) if isinstance(f, Scalar) and f.acts}
+    late = LATE | rests.keys()
+    if set(present.values) - late != set(kept.values) - late:
         raise ValueError("The state is not one of this scene: it has other fields.")
     pieces = {f"Contact.{piece.name}" for piece in world._runner.grid.lasting} if world._runner.grid else set()
     most = {"Contact.pairs": len(world.particles)}
@@ -119,7 +126,7 @@ def check(world: "World", kept: Checkpoint, flagged: list[list[bool]]) -> None:
             most |= {name: f.dev.pieces for name in kept.values if name.startswith("Path.piece")}  # type: ignore[attr-defined]
     for name, value in kept.values.items():
         ours, free = present.values.get(name), name in pieces or name in ("Contact.pairs", "Contact.shrunk")
-        shape = ours is None or ours.shape[free:] == value.shape[free:]
+        shape = value.shape == rests[name] if name in rests else ours is None or ours.shape[free:] == value.shape[free:]
         if not shape or (ours is not None and ours.dtype.kind != value.dtype.kind):
             raise ValueError(f"The state is not one of this scene: {name} has shape {value.shape} of {value.dtype}.")
         if name in most and value.size and not (value.min() >= 0 and value.max() < most[name]):
@@ -156,5 +163,8 @@ def transfer(old: "World", new: "World") -> None:
     for mine, other in zip(new.features, old.features, strict=True):
         if isinstance(mine, Periodic) and isinstance(other, Periodic):
             mine.continued(other)
+        if isinstance(mine, Scalar) and isinstance(other, Scalar) and other.waits:
+            mine.put(other.now())
+            mine.changed = True
     for broke, breaks in zip(old._runner.step.breakers, new._runner.step.breakers, strict=True):
         new._runner.memory.write(breaks.dev.strength.stamp, broke.stamps())

@@ -9,6 +9,7 @@ import numpy as np
 
 from .. import checks
 from ..colliders.collider import Collider
+from ..constraints.core.scalar import Scalar
 from ..contact.pair_contact import PairContact
 from ..contact.touches import ContactEvents
 from ..device.memory import Memory
@@ -186,6 +187,7 @@ def rebuild(
                 world._runner.restart(world.iterations)
         old = checkpoint.state(world) if turned else kept.values
         masks = {f: tuple(mask & (f not in came) for mask in f.kept_mask(number)) for f in before}
+        rests = {f: np.stack(f.now())[:, masks[f][0]] for f in features if isinstance(f, Scalar) and f.waits}
         for f in before:
             f.release()
             f.remap_indices(number, n + m)
@@ -223,6 +225,9 @@ def rebuild(
         if f not in came:
             f.changed, f.moving = attributes[f].get("changed", True), attributes[f].get("moving", False)
             f.new_force = attributes[f].get("new_force", False)
+    for f, values in rests.items():
+        if f.acts:
+            f.put([*values])  # from where they go to those that were assigned
     for memory in memories:
         memory.destroy()
     if any(isinstance(f, PairContact) for f in came):

@@ -66,6 +66,13 @@ def _rigid(batches: list[Batch]) -> list[Scalar]:
     return [b for b in batches if isinstance(b, Scalar) and b.count and (b.compliance == 0).any()]
 
 
+def tied(scene: Scene, batches: list[Batch], placed: int) -> np.ndarray:
+    """Which particles are of bodies of which any was placed anew, a mask (n,). placed: the first of those that were."""
+    body, bodies = _bodies([b for b in batches if isinstance(b, Scalar) and b.count], scene.inv_mass)
+    going = np.bincount(body[placed:], minlength=bodies) > 0
+    return (going[body] & (scene.inv_mass > 0)) | (np.arange(len(body)) >= placed)
+
+
 def remove(
     scene: Scene, batches: list[Batch], placed: int, ratio: float, stop: Callable[[np.ndarray], None]
 ) -> tuple[np.ndarray, float] | None:

@@ -37,6 +37,7 @@ NEWTON = 40  # steps, at most
 BEGIN, HARDEST, LEAST = 1e-3, 10.0, 1e-9  # mu of the first, and of the last try; the least
 LEFT = 0.01  # of what violations store: what may be left of it in the shorter substep
 DONE = 1e-6  # of its size: a violation that is none
+TURNS = 16  # with walls, at most: a link that stands on one halves its violation in each
 LARGEST = 300  # corners: outlines of more couple each with each
 
 
@@ -58,7 +59,7 @@ def project(runner: "Runner", h: float, longest: float) -> bool:
     if matters(stays, ratio):
         runner.released = stays
     if slots and slots.system and not slots.system.steps and not runner.clock.softened:  # it holds loads without a violation
-        batches = [b for b in batches if ((slots.rows(b) < 0) & ~b.idle(w)).any()]
+        batches = [b for b in batches if ((slots.rows(b) < 0) & ~b.idle(w)).any() or matters(_off(b, x), ratio)]
     batches += rigid_rows(runner.batches, w)
     if not batches:
         return True
@@ -67,20 +68,7 @@ def project(runner: "Runner", h: float, longest: float) -> bool:
     if not matters(float(np.abs(undone * start.close).max(initial=0.0)), ratio):
         return ratio < FAR
     rows = start = start.towards(start.C - (1 - ratio**2) * undone)
-    mu, enough, far, first = BEGIN, LEFT * ratio**2, None, rows.stored
     converges = slots.converges or slots.exact  # what they leave is moved at once in the next substep, and flies on
-    for _ in range(NEWTON):
-        move = rows.step(mu)
-        work = float((_over(np.ones_like(w), w)[:, None] * move**2).sum())
-        far = work if far is None else far
-        new = rows.at(x + move)
-        better = new.stored < rows.stored
-        mu = max(mu / 8, LEAST) if better else 8 * mu
-        if better:
-            x, rows = new.x, new
-        near = rows.stored <= enough * first and (not converges or work <= enough * far)
-        if near or rows.worst <= DONE or mu > HARDEST:
-            break
     kept = memory.read(state.d)
     v = kept.astype(np.float64)
     n = len(x)
@@ -90,9 +78,14 @@ def project(runner: "Runner", h: float, longest: float) -> bool:
     known = runner.clock.energy
     if known is not None:  # by the loads of the last substep: what springs of its violations would hold is not there
         energy = known
-    state.put(memory, x)
-    runner.stop_at_walls(before)
-    x = state.get(memory)
+    for _ in range(TURNS):
+        state.put(memory, _newton(rows, LEFT * ratio**2 * start.stored, LEFT * ratio**2, converges))
+        sent = state.get(memory)
+        runner.stop_at_walls(before)
+        x = state.get(memory)
+        if (x == sent).all():
+            break
+        rows = rows.at(x)  # what walls stop is lifted by the others
     memory.write(state.d, v)
     more, deeper = seen(runner)
     if deeper > overlap:
@@ -104,9 +97,34 @@ def project(runner: "Runner", h: float, longest: float) -> bool:
     return True
 
 
+def _newton(rows: "Rows", enough: float, share: float, converges: bool) -> np.ndarray:
+    """Places at which what violations store is `enough` [J s^2]; where the solver converges, steps also have to be small, by this
+    share of the work of the first."""
+    mu, far = BEGIN, None
+    for _ in range(NEWTON):
+        move = rows.step(mu)
+        work = float((_over(np.ones_like(rows.w), rows.w)[:, None] * move**2).sum())
+        far = work if far is None else far
+        new = rows.at(rows.x + move)
+        better = new.stored < rows.stored
+        mu = max(mu / 8, LEAST) if better else 8 * mu
+        if better:
+            rows = new
+        near = rows.stored <= enough and (not converges or work <= share * far)
+        if near or rows.worst <= DONE or mu > HARDEST:
+            break
+    return rows.x
+
+
 def matters(violation: float, ratio: float) -> bool:
     """Whether what a violation, as a share of its size, leaves to vibrate is worth a look."""
     return violation * (1 - ratio**2) ** 2 > ENOUGH * ratio**2
+
+
+def _off(batch: Scalar, x: np.ndarray) -> float:
+    """The worst violation of rigid constraints, as a share of their size: what Newton's method left of it, as after an impact."""
+    C = batch.violation(x) * batch.inverse_size(batch.start.position) * (batch.compliance == 0) * ~batch.broken
+    return float((np.abs(C) if batch.side == 0 else C * batch.side).max(initial=0.0))
 
 
 def seen(runner: Any) -> tuple[float, float]:

@@ -40,6 +40,8 @@ class Runner:
         self.jumped = False  # whether that was further than a particle is large
         self.sleepers, self.sleep = parts.scene.state.sleepers, parts.step.sleep
         self.released = 0.0  # the violation that its shorter substep turns into energy, as a share of its size
+        self.ramping: list[Any] = []  # whose rest values go to others in the coming frame
+        self.ramps: list[Any] = []  # the memories of what ramps need
         self.interruptible = False  # what handlers of signals raise in the middle of a frame is followed by an undo
         # Asked in every frame, and Taichi looks at each attribute of what has kernels.
         step = self.step
@@ -108,6 +110,7 @@ class Runner:
             return False
         self.wake()
         with self.memory.compiler():
+            self._jump()
             if h != clock.h or drag != clock.drag:
                 clock.longest = max(clock.longest, clock.h if clock.first_moved is None else 0.0)
                 self.restart(iterations)
@@ -149,6 +152,7 @@ class Runner:
 
     def advance(self, dt: float, substeps: int, iterations: int) -> StepReport:
         """One frame from where begin() left off."""
+        self.set_out()
         for semi_iteration in self.semi_iterations:
             with self.memory.compiler():
                 semi_iteration.prepare(iterations)
@@ -163,6 +167,32 @@ class Runner:
         report, self.moved, self.released = self.report(substeps, iterations), 0.0, 0.0
         clock.softened = "softened" in report.flags
         return report
+
+    def find_ramps(self) -> None:
+        """Knobs were uploaded: see whose rest values are others now."""
+        self.ramping = [b for b in self.batches if b.ramping]
+
+    def _jump(self) -> None:
+        """Of bodies of which any particle was placed anew, rest values are those that were assigned, and nothing goes there."""
+        if self.ramping and self.clock.first_moved is not None:
+            tied = initial_violation.tied(self.scene, self.batches, self.clock.first_moved)
+            for b in self.ramping:
+                b.jump(np.bincount(b.owner, tied[b.indices.ravel()], minlength=b.count) > 0)
+
+    def set_out(self) -> None:
+        """Have rest values that were assigned go there in the coming frame."""
+        if self.ramping:
+            new = [b.dev.ramp.memory for b in self.ramping if b.set_out()]
+            self.ramping = [b for b in self.ramping if b.ramping]
+            if new:
+                self.ramps = [*self.ramps, *new]
+                self.renew()
+
+    def arrive(self) -> None:
+        """They are there: the frame is over, and is not made again."""
+        for b in self.ramping:
+            b.arrive()
+        self.ramping = []
 
     def settle(self, dt: float) -> None:
         """After a frame of dt [s]: see who is slow, and who falls asleep."""
@@ -423,7 +453,7 @@ class Runner:
     def memories(self) -> list[Any]:
         """The trees of fields: one from the start, others where a list or a need has grown."""
         grown = [*(grid.store for grid in self.step.grids), *(c.store for c in self.step.contacts)]
-        return [self.memory, *(m for m in grown if m)]
+        return [self.memory, *(m for m in grown if m), *self.ramps]
 
 
 class Launcher:

@@ -199,7 +199,7 @@ class Worlds:
                 with self._open():
                     moved, released = self._begin(dt)
                     # Where a target is under way, the next frame ends it, and then the host is needed.
-                    some = 1 if any(f.moving for f in world.features) else min(at_once, frames - done)
+                    some = 1 if self._runner.ramping or any(f.moving for f in world.features) else min(at_once, frames - done)
                     report = self._launch(dt, some, moved, released, every, track, done)
                 worst, done = report if worst is None else worst.worse(report), done + some
                 if shown:
@@ -255,6 +255,7 @@ class Worlds:
         for f in changed:
             f.changed = False
             f.upload()
+        self._runner.find_ramps()
         return True
 
     def _look(self, some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -318,6 +319,7 @@ class Worlds:
     ) -> WorldsReport:  # fmt: skip
         """Frames in one launch, and as many more as lists have to grow. before: frames that are on the track already."""
         world, runner, clocks = self._world, self._runner, self._clocks
+        runner.set_out()
         substeps, iterations, stages = world.substeps, world.iterations, runner.integrator.stages
         with runner.memory.compiler():
             for semi_iteration in runner.semi_iterations:
@@ -339,6 +341,7 @@ class Worlds:
         flat = np.zeros(1) if track is None else track.reshape(-1)
         self._go(plan, np.arange(len(self)), sheets, dates, figures, flat)
         energy = np.where(clocks.known, clocks.energy, np.nan)
+        runner.arrive()
         clocks.advance(substeps, frames, started)
         with np.errstate(all="ignore"):  # energies may be infinite; flags say so
             self._last = self._report(figures, energy, moved, released, perf_counter() - begun)

@@ -185,6 +185,10 @@ class Anchored(Batch):
                 C = self.offset_now(c, back)
                 out = ti.cast(C.dot(C) / (2 * alpha), ti.f64)
                 out *= self.dev.spring.solved(self.dev.lam[c].norm() * alpha, h2_effective, residual * self.dev.size.now)
+                force, w = ti.cast(self.dev.lam[c].norm(), ti.f64), self.dev.w.of(self.member(c, 0))
+                if h2_effective > 0:
+                    force /= h2_effective
+                out = self.dev.spring.energy(c, w, h2_effective, out, force * force * alpha / 2)
         return out
 
 

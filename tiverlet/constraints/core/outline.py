@@ -64,6 +64,14 @@ class Outline:
         return sums[0] / self.dim, sums[1] / self.dim, sums[2], W, turn, sums[6], sums[7]
 
     @ti.func
+    def weight(self, c):
+        """The sum of w |grad|^2."""
+        w = ti.cast(0, self.real)
+        for b in range(self.corners.blocks[c], self.corners.blocks[c + 1]):
+            w += self.sums[b][2]
+        return w
+
+    @ti.func
     def relax(self, c, h, h2_effective, frame_fraction, first, fresh):
         """Find dlam."""
         f, f0, w, W, turn, extent, move = self.total(c)

@@ -1,6 +1,7 @@
 """Constraints that are one number, C = f - rest: how a substep fulfils them, from soft to rigid."""
 
 import warnings
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from ...geometry.ordered import distinct
 from .drive import Drive
 from .outline import Outline
 from .quantity import Quantity
+from .ramp import Ramp
 from .spring import Spring, stiff
 from .strength import Strength, strength_of
 
@@ -48,6 +50,8 @@ class Scalar(Batch):
     C_(n+1) and C_n.
     With drag, alpha' = alpha / (phi h^2) with the factor phi that the exact solution gives every other acceleration.
 
+    Rest values that are assigned are reached in the course of the next frame, see Ramp; at once where particles are placed.
+
     A rigid constraint takes out its whole violation in one substep, with the energy C^2 / (2 W h^2), as the spring would that one
     pass of relaxation is. Under a load that is right: C = W |lam| h^2-wise is what bears it. But C may come from elsewhere: a
     rest value that was changed in a jump, or a goal that others keep it from. Where f is `curved` (angles, areas, volumes), W
@@ -73,6 +77,8 @@ class Scalar(Batch):
     compiled_for = ("soft", "damped", "breaks", "limited", "cusp", "capped")
 
     each = ("rest", "compliance", "damping", "break_at")
+    kept_by_world = (*Batch.kept_by_world, "ramping")
+    host_only = ("ramping",)
     rest_name = "rest"
     uploads_all = True
     _scene_sized = False  # whether any of its lengths is that of the whole scene, in want of one of its own
@@ -194,9 +200,22 @@ class Scalar(Batch):
         """What f is to be, (m,)."""
         return self.rest
 
+    def tracks(self) -> list[tuple[Any, np.ndarray, Callable]]:
+        """What moves when rest values are assigned: fields, what they are to be, and how far values are from others."""
+        return [(self.dev.rest, self.goal, self.quantity.difference)]
+
+    def now(self) -> list[np.ndarray]:
+        """What tracks() have on the device: where a ramp begins, (m,) each; as a frame ends, what was assigned before it."""
+        return [self.scene.memory.read(field)[..., : self.count].astype(np.float64) for field, _, _ in self.tracks()]
+
+    @property
+    def waits(self) -> bool:
+        """Whether the device may have other rest values than were assigned."""
+        return (self.changed or self.ramping) and self.acts and not self.driven and self.count > 0
+
     def violation(self, position: np.ndarray) -> np.ndarray:
-        """C at the given positions, (m,)."""
-        return self.quantity.difference(self.rest_of(position), self.goal)
+        """C at the given positions, (m,), with the rest values of the state: those before a ramp that was not gone yet."""
+        return self.quantity.difference(self.rest_of(position), self.now()[0] if self.ramping else self.goal)
 
     def gradients(self, position: np.ndarray) -> np.ndarray:
         """grad_k f of every constraint at the given positions, (m, arity, dim); of outlines (total, dim)."""
@@ -343,7 +362,7 @@ class Scalar(Batch):
         self.dev.in_system, self.dev.outside = bool((rows >= 0).any()), bool((rows < 0).any())
         if self.dev.in_system:
             self.dev.row = add(f"{name}.row", m, kind=ti.i32, values=rows)
-        self.dev.cusp = self.cusp
+        self.dev.cusp, self.dev.ramps = self.cusp, False
         self.dev.converges = self.solvable_together and (self.dev.in_system or bool(scene.slots.semi_iteration))
         if self.dev.converges:
             self.dev.inverse_size = add(f"{name}.close", m, values=self.inverse_size(self.start.position))
@@ -357,14 +376,53 @@ class Scalar(Batch):
         self.dev.quantity = self.quantity.bind(scene, self)
 
     def upload(self) -> None:
-        """Write new rest values, stiffnesses and strengths."""
+        """Write new stiffnesses and strengths; rest values go to new ones in the coming frame."""
         if self.acts:
             if self.driven:
                 self.dev.drive.upload(*self.course(), self.largest)
             else:
-                self.scene.memory.write(self.dev.rest, self.goal)
+                self.ramping = self.ramping or self.dev.ramps or self._off_goal()
             self.dev.spring.upload(self.compliance, self.damping)
             self.dev.strength.upload(self.break_at)
+
+    def _off_goal(self) -> bool:
+        """Whether the device has other rest values than were assigned."""
+        real = np.float32 if self.scene.real == ti.f32 else np.float64
+        return any((now != goal.astype(real)).any() for now, (_, goal, _) in zip(self.now(), self.tracks(), strict=True))
+
+    def release(self) -> None:
+        """Forget the world, and what was under way there."""
+        super().release()
+        self.__dict__.pop("ramping", None)
+
+    def put(self, values: Sequence[np.ndarray]) -> None:
+        """Have rest values begin elsewhere: what now() gave, of another world or another time."""
+        for (field, _, _), rows in zip(self.tracks(), values, strict=True):
+            self.scene.memory.write(field, rows)
+
+    def jump(self, some: np.ndarray) -> None:
+        """Have some, a mask (m,), reach their goals before the frame: their particles are put to where they are met."""
+        self.put([np.where(some, goal, now) for now, (_, goal, _) in zip(self.now(), self.tracks(), strict=True)])
+
+    def set_out(self) -> bool:
+        """Have rest values reach their goals as the coming frame ends. Returns whether kernels have to be made for it."""
+        self.ramping = self._off_goal()
+        new = self.ramping and not self.dev.ramps
+        if new:
+            self.dev.ramp = Ramp(self.scene.memory, repr(self), [field for field, _, _ in self.tracks()], self.count)
+            self.dev.ramps = True
+        if self.dev.ramps:
+            tracks = list(zip(self.now(), self.tracks(), strict=True))
+            goals = [goal for _, (_, goal, _) in tracks]
+            self.dev.ramp.aim([goal + difference(now, goal) for now, (_, goal, difference) in tracks], goals)
+        return new
+
+    def arrive(self) -> None:
+        """The frame is over."""
+        goals = [goal for _, goal, _ in self.tracks()]
+        self.put(goals)
+        self.dev.ramp.aim(goals, goals)
+        self.ramping = False
 
     @property
     def load(self) -> np.ndarray:
@@ -490,9 +548,19 @@ class Scalar(Batch):
     def violation_then(self, c, f, ago: ti.template()):  # type: ignore[valid-type]
         """f - rest with the rest value of `ago` substeps ago."""
         C = f - self.dev.rest[c]
-        if ti.static(self.driven):
-            C += ago * self.dev.drive.step[c]
+        if ti.static(self.driven or self.dev.ramps):
+            C += ago * self.step_of_rest(c)
         return C
+
+    @ti.func
+    def step_of_rest(self, c):
+        """How far the rest value goes in this substep."""
+        step = ti.cast(0, self.dev.real)
+        if ti.static(self.driven):
+            step = self.dev.drive.step[c]
+        else:
+            step = self.dev.ramp.step[c]
+        return step
 
     @ti.func
     def clamped(self, c, lam):
@@ -506,7 +574,10 @@ class Scalar(Batch):
         """What of the violation is left for later substeps, see the class. share: of the frame, that the substep is; 0: none."""
         out = ti.cast(0, self.dev.real)
         if first != 0:
-            C = self.bounded(self.violation_then(c, f0, 1))
+            C = f0 - self.dev.rest[c]
+            if ti.static(self.driven):  # as fast as it is told to be, but what is assigned has no more than APPROACH
+                C += self.dev.drive.step[c]
+            C = self.bounded(C)
             borne = W * ti.abs(self.dev.lam[c])
             if ti.static(not self.collapses):
                 borne = ti.min(borne, BORNE * self.residual_scale(c))
@@ -665,6 +736,9 @@ class Scalar(Batch):
     @ti.func
     def relax(self, c, h, h2_effective, frame_fraction, first, fresh):
         """One Jacobi correction of constraint c."""
+        if ti.static(self.dev.ramps):
+            if first != 0:
+                self.dev.ramp.follow(c, frame_fraction)
         if ti.static(self.arity == 0):
             self.dev.outline.relax(c, h, h2_effective, frame_fraction, first, fresh)
         else:
@@ -831,7 +905,7 @@ class Scalar(Batch):
     def energy(self, c, back, h2_effective, residual):
         """Elastic energy [J] at x - back d: F C / 2, which is C^2 / (2 alpha) once solved.
 
-        See Spring.solved(). h2_effective: F = -lam / h2_effective; 0 where there was no substep yet.
+        See Spring.solved() and Spring.energy(). h2_effective: F = -lam / h2_effective; 0 where there was no substep yet.
         """
         out = ti.cast(0, ti.f64)
         if ti.static(self.dev.spring.soft):
@@ -843,7 +917,23 @@ class Scalar(Batch):
                     out *= self.dev.spring.solved(
                         ti.abs(self.dev.lam[c]) * alpha, h2_effective, residual * self.residual_scale(c)
                     )
+                    force = ti.cast(self.dev.lam[c], ti.f64)
+                    if h2_effective > 0:
+                        force /= h2_effective
+                    out = self.dev.spring.energy(c, self.weight(c), h2_effective, out, force * force * alpha / 2)
         return out
+
+    @ti.func
+    def weight(self, c):
+        """The sum of w |grad f|^2."""
+        w = ti.cast(0, self.dev.real)
+        if ti.static(self.arity == 0):
+            w = self.dev.outline.weight(c)
+        else:
+            _, g = self.measure(c, self.corners(c, 0))
+            for k in ti.static(range(self.arity)):
+                w += self.dev.w.of(self.member(c, k)) * g[k, :].dot(g[k, :])
+        return w
 
     @ti.func
     def residual_scale(self, c):

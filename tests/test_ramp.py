@@ -1,0 +1,141 @@
+"""Rest values that are assigned: where they go in the next frame, and what that costs."""
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+
+DT, L, M = 1 / 60, 0.5, 0.2
+
+
+def pendulum(world, *features, **options):
+    """One particle of mass M at a distance L from one that is pinned, without gravity."""
+    return world(tv.Particles([[0.0, 0], [L, 0]], mass=M, pinned=[0]), features, **options)
+
+
+@pytest.mark.parametrize("solver", [tv.Jacobi(), tv.Direct()], ids=str)
+def test_a_link_is_drawn_in_at_the_speed_of_the_frame(world, solver):
+    # The rest length goes from L to 0.9 L in a frame, so the particle goes at u = 0.1 L / dt, with m u^2 / 2, in however many
+    # substeps; a jump would be made in one of them, with m (0.1 L / h)^2 / 2. Then it stands still, for a link holds, too.
+    link = tv.Distance([[0, 1]])
+    w = pendulum(world, link, solver=solver, precision="f64")
+    w.step(DT)
+    assert not any("rest_at" in name for name in w.fields)
+    length = L
+    for substeps in (1, 7, 200):
+        w.substeps = substeps
+        w.step(DT)
+        link.rest, length = 0.9 * length, 0.9 * length
+        report = w.step(DT)
+        assert report.energy == pytest.approx(M * (length / 9 / DT) ** 2 / 2, rel=1e-9)
+        assert w.position[1, 0] == pytest.approx(length, rel=1e-12)
+        assert w.step(DT).energy == pytest.approx(0, abs=1e-18) and w.position[1, 0] == pytest.approx(length, rel=1e-12)
+
+
+def test_a_rope_that_was_drawn_in_is_slack(world):
+    # As above, but a rope does not stop what comes in: the next frame takes it as far.
+    rope = tv.Rope([[0, 1]])
+    w = pendulum(world, rope, substeps=50)
+    w.step(DT)
+    rope.rest = 0.9 * L
+    report = w.step(DT)
+    assert report.energy == pytest.approx(M * (0.1 * L / DT) ** 2 / 2, rel=1e-4)
+    w.step(DT)
+    assert w.position[1, 0] == pytest.approx(0.8 * L, rel=1e-5)
+
+
+def test_a_muscle_does_the_work_of_its_load(world):
+    # A mass that hangs is drawn up by a in n frames, by as much in each: m g a of work, but for the kinetic energy m u^2 / 2 of
+    # the last frame, which the next one takes back. The link changes its length at the speed of each frame, never faster.
+    n, a, g = 20, 0.1, 9.81
+    link = tv.Distance([[0, 1]])
+    w = world(
+        tv.Particles([[0.0, 0], [0, -L]], mass=M, pinned=[0]), [tv.Gravity(g), link], substeps=200, solver=tv.Jacobi(),
+        precision="f64",
+    )  # fmt: skip
+    before = w.step(DT).energy
+    speeds = []
+    for k in range(n):
+        link.rest = L - a * (k + 1) / n
+        w.step(DT)
+        speeds.append(abs(w.velocity[1, 1]))
+    # velocities are between that of the last substep, u, and that of the next, 0 in the mean of a half step
+    assert max(speeds) <= a / (n * DT) * (1 + 1e-6) + g * DT / 200
+    assert w.step(DT).energy - before == pytest.approx(M * g * a, rel=1e-6)
+
+
+def crowd():
+    """Of what has rest values some, apart from each other: particles, features, and a function that turns all knobs."""
+    x = [
+        (0.0, 0), (0.5, 0), (1, 0), (1.5, 0.2),  # links, stop, rope
+        (9, 0), (10, 0), (10, 1), (9, 1),  # loop
+    ]  # fmt: skip
+    features = [
+        tv.Distance([[0, 1], [1, 2]]), tv.AngleLimit([[0, 1, 2]], -0.2, 0.3), tv.Area([[4, 5, 6, 7]]), tv.Rope([[2, 3]])
+    ]  # fmt: skip
+
+    def turn(features, by):
+        link, stop, loop, rope = features
+        link.rest, stop.upper, rope.rest, loop.pressure = 0.5 * by, by - 0.7, 0.53 * by, 2 - by
+
+    return tv.Particles(x, mass=0.1), features, turn
+
+
+def test_what_a_ramp_brings_in_does_not_depend_on_the_substep(world):
+    # m (C / dt)^2 / 2 for each; as jumps, m (C / h)^2 / 2, 64 times as much in 8 times the substeps.
+    particles, features, turn = crowd()
+    w = world(particles, features, solver=tv.Jacobi())
+    energies = []
+    for substeps in (64, 512):
+        w.position, w.velocity, w.substeps = particles.position, np.zeros_like(particles.position), substeps
+        turn(features, 1.0)
+        w.step(DT)
+        turn(features, 0.95)
+        energies.append(w.step(DT).energy)
+    assert energies[0] > 0.01 and energies[1] == pytest.approx(energies[0], rel=0.03)
+
+
+def test_an_angle_goes_the_shorter_way(world):
+    # From 3 to -3 rad it is 2 pi - 6 = 0.283 rad, at L 0.283 / dt; the other way would be through 0, at 21 times that.
+    x = np.array([[0.0, 0], [L, 0], [L * (1 + np.cos(3.0)), L * np.sin(3.0)]])
+    bend = tv.Bend([[0, 1, 2]])
+    w = world(tv.Particles(x, pinned=[0, 1]), [bend, tv.Distance([[1, 2]])], substeps=50, precision="f64", solver=tv.Jacobi())
+    w.step(DT)
+    bend.rest = -3.0
+    assert w.step(DT).energy == pytest.approx((L * (2 * np.pi - 6) / DT) ** 2 / 2, rel=1e-2)
+    assert bend.rest_of(w.position) == pytest.approx(-3.0, abs=1e-3)
+
+
+def test_copies_edits_and_recordings_know_where_a_ramp_begins(world, tmp_path):
+    particles, features, turn = crowd()
+    w = world(particles, features, solver=tv.Jacobi())
+    w.step(DT)
+    turn(features, 0.95)
+    twin, many = w.clone(), tv.Worlds(w, 2)
+    for one in (w, twin, many):
+        one.step(DT)
+    assert w.hash() == twin.hash() == many.hash(1)
+    twin.close()
+    turn(many.features, 1.0)
+    turn(features, 1.0)
+    many.run(2 * DT)
+    w.run(2 * DT)
+    assert w.hash() == many.hash(0)
+    many.close()
+    with tv.Recorder(tmp_path / "a.rrd", w) as recorder:
+        for k in range(3):
+            turn(features, 1.0 - 0.05 * k)
+            if k == 1:
+                w.remove([3])
+            w.step(DT)
+            recorder.log()
+    assert tv.replay(tmp_path / "a.rrd").verify().kind == "intact"
+
+
+def test_what_is_placed_anew_has_its_rest_values_at_once(world):
+    # Positions and rest lengths that fit each other, assigned together: nothing moves.
+    link = tv.Distance([[0, 1]])
+    w = pendulum(world, link, substeps=200)
+    w.step(DT)
+    w.position, link.rest = [[0, 0], [0.3, 0]], 0.3
+    assert w.step(DT).energy == pytest.approx(0, abs=1e-9) and not w.last.flags
