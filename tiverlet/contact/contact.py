@@ -171,7 +171,7 @@ class Contact(PairContact):
         ended = [dev.push, *loads, *bouncing]
         dev.splitting = MassSplitting(scene, dev.geometry, dev.has_friction, skips, ended, team, dev.known)
         if dev.known:
-            dev.known.bind(dev.grid, dev.splitting.weight)
+            dev.known.bind(dev.grid)
         dev.forces = ForceShare(scene, sums=dev.has_friction, lasting=True)
         dev.fast = scene.memory.field("Contact.fast", None, kind=ti.i32)
         dev.friction = Friction(self.table)

@@ -50,7 +50,7 @@ class KnownLoads:
     and walls begin again with all that is pushed into them, which friction needs.
 
     Warm starting (Box2D) of a single pass would be unstable: a mode of eigenvalue L has z^3 - 3 a z^2 + 3 a z - a, a = 1 - r L,
-    whose roots near 1 grow like (r L)^(1/3) / 2. push: what pairs got in the last substep.
+    whose roots near 1 grow like (r L)^(1/3) / 2.
     """
 
     def __init__(self, scene: "Scene"):
@@ -65,9 +65,9 @@ class KnownLoads:
         self.lean = scene.memory.field("Contact.lean", n, width=dim)  # how far walls moved it before contacts were solved [m]
         self.in_state = {"carried": self.carried.field, "own": self.own}
 
-    def bind(self, grid: "NeighbourSearch", weight: Any) -> None:
-        """grid: has the pairs listed. weight: m_i w_i of each particle."""
-        self.grid, self.weight = grid, weight
+    def bind(self, grid: "NeighbourSearch") -> None:
+        """grid: has the pairs listed."""
+        self.grid = grid
 
     def follow(self, integrator: Any) -> None:
         """integrator: knows what else accelerates particles."""
