@@ -233,18 +233,17 @@ class Contact(PairContact):
                             push = self.dev.known.given(e, now)
                         if fresh == 0:
                             part += ti.max(ti.min(1 - alone * each, ti.static(CARRY)), 0) * (last - push)
-                    pressed = ti.zero(overlap)
+                    known = ti.zero(overlap)  # what of its push was given before
                     if ti.static(self.dev.has_loads):
+                        known = ti.select(first != 0, push, known)
                         part = ti.select(paid > 0, lesser(part, paid / alone), ti.max(part, paid / alone))
                         part = ti.max(part, -push)
-                        pressed = ti.select(first != 0, push, pressed)
                         bounces = False  # what bounces finds out by overlaps whether it rests
                         if ti.static(self.dev.has_restitution):
                             bounces = self.table.of(i, j)[2] > 0
                         carried += w * self.dev.known.remember(i, j, e, part, push + part, now, not bounces) * n
                     else:
                         part = lesser(part, paid / alone)  # without a branch: it would be taken at random
-                    pressed += part
                     if ti.static(self.dev.has_restitution):
                         if given > 0:
                             self.dev.restitution.struck.field[e] = 1
@@ -252,6 +251,8 @@ class Contact(PairContact):
                                 self.dev.hit[None] = 1
                         if not rests:
                             part = ti.zero(part)
+                    pressed = part + known
+                    if ti.static(self.dev.has_restitution):
                         self.dev.impulse.field[e] = self.dev.impulse.field[e] + pressed
                     if ti.static(self.dev.reports):
                         self.dev.events.note(i, j, e, n, pressed, final)
