@@ -124,9 +124,9 @@ ROWS3 = {
     "Contact": (
         lambda i, x, **k: tv.Contact(**k), DISCS,
         {"friction": {(0, 1): 0.5}, "restitution": {(0, 1): 0.5}, "skin": "auto", "groups": GROUPS, "push_out": 1.0,
-        "events": False, "sensors": ()},
+        "events": False, "sensors": (), "loads": False},
         {"friction": {(0, 0): 0.1, (0, 1): (0.3, 0.2)}, "restitution": {(0, 1): 0.9}, "skin": 0.2, "groups": [(0, 1)],
-        "push_out": 2.0, "events": True, "sensors": [(1, 2)]},
+        "push_out": 2.0, "events": True, "sensors": [(1, 2)], "loads": True},
     ),
     "Box": (
         lambda i, x, **k: tv.Box(**k), [[1, 8.78, 0], [1, 8.85, 1]],
@@ -255,7 +255,7 @@ def test_the_rows_have_every_feature():
     for name, like in LIKE.items():
         kind = getattr(tv, name)
         assert {*knobs_of(kind)} == {*knobs_of(like)} - (
-            {"groups", "events", "sensors"} if kind is tv.Polygons else set()
+            {"groups", "events", "sensors", "loads"} if kind is tv.Polygons else set()
         ) and kind.upload is like.upload
     assert knobs_of(tv.Force) == ()
 

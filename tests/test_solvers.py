@@ -301,7 +301,9 @@ def test_springs_that_are_not_solved_hold_no_energy_that_nobody_supplied(world):
 
 def test_pins_and_clusters_hold_the_energy_of_what_they_exert(world):
     # A spring of 1e-9 m/N draws a rod's end, and another a square, by 0.01 m from where rigid links keep them. At rest, sharing
-    # masses, they hold F C / 2, with F what they exert. C^2 / (2 alpha) would be 5e4 J each, m C^2 / h^2 of a pass is 1e3 J.
+    # masses, they hold alpha F^2 / 2, with F what they exert (of a corner with a quarter of a square's mass 4 alpha F^2 / 2).
+    # C^2 / (2 alpha) would be 5e4 J each, m C^2 / h^2 of a pass is 1e3 J, and F C / 2, which is no spring's, 20 J: of that what
+    # is not stiff, (alpha / h^2)^2, is in it.
     corner = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
     x = np.concatenate([[[-3.0, 0], [-2, 0]], corner])
     ring = np.stack([2 + np.arange(4), 2 + (np.arange(4) + 1) % 4], axis=1)
@@ -312,6 +314,7 @@ def test_pins_and_clusters_hold_the_energy_of_what_they_exert(world):
     w.run(1.0)
     off = np.linalg.norm(w.position[1] - pin.target[0])
     far = np.linalg.norm(w.position[2:] - w.position[2:].mean(axis=0), axis=1) - np.sqrt(0.5)
-    held = np.linalg.norm(pin.load[0]) * off / 2 + 4 * body.load[0] * np.abs(far).max() / 2
+    held = 1e-9 * np.linalg.norm(pin.load[0]) ** 2 / 2 + 4 * 4e-9 * body.load[0] ** 2 / 2
+    soft = (4e-9 * 1200**2) ** 2 * 4 * body.load[0] * np.abs(far).max() / 2
     assert np.abs(w.velocity).max() < 1e-3 and off > 1e-3 and np.abs(far).min() > 1e-3
-    assert w.step(1 / 60).energy == pytest.approx(held, rel=1e-2)
+    assert w.step(1 / 60).energy == pytest.approx(held + soft, rel=1e-2)

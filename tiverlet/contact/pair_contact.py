@@ -115,6 +115,11 @@ class PairContact(Feature):
         return bool(vars(self).get("loads"))
 
     @property
+    def known(self) -> Any:
+        """The KnownLoads of its pairs, in the kernels as they are, or None."""
+        return vars(self.dev).get("known")
+
+    @property
     def shrinks(self) -> bool:
         """Whether particles can be smaller than they are, in the kernels as they are."""
         return self.dev.geometry.shrinks

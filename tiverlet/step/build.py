@@ -157,7 +157,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     for feature in features:
         feature.new_force = False  # it was given when it was made
         feature.dev.built = feature.compiled() if not isinstance(feature, Batch) or feature.acts else None
-    known = contact.dev.known if contact and contact.has_loads else None
+    known = contact.known if contact else None
     forces = Forces(scene, [*accelerations, known.carried] if known else accelerations)
     integrator = Verlet(scene, forces) if scene.order == 2 else high_order.Composition(scene, forces, batches)
     if known:

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from ..constraints.core.scalar import Scalar
-from ..contact.contact import Contact
 from ..features.material import TOUCHES
 from ..neighbours.queries import between
 from .jacobian import Jacobian
@@ -36,7 +35,7 @@ def release(runner: Any, h: float, longest: float) -> bool:
     """
     state, memory, ratio = runner.scene.state, runner.memory, h / longest
     x = state.get(memory)
-    contact = next((c for c in runner.step.contacts if isinstance(c, Contact)), None)
+    contact = next((c for c in runner.step.contacts if not c.detects), None)  # of discs or spheres
     if contact is None or not np.isfinite(x).all():
         return False
     energy, overlap = seen(runner)
@@ -95,7 +94,7 @@ def part(runner: Any, pairs: "Pairs", x: np.ndarray, ratio: float) -> Jacobian |
 class Pairs:
     """Those of the neighbour list that push each other, who (m, 2), at positions x (n, dim) [m]."""
 
-    def __init__(self, runner: Any, contact: Contact, x: np.ndarray):
+    def __init__(self, runner: Any, contact: Any, x: np.ndarray):
         grid, particles, self.box = runner.grid, runner.scene.particles, runner.scene.periodic
         pairs, _ = grid.entries()
         some = (pairs[:, 0] < pairs[:, 1]) | (runner.scene.inv_mass[pairs[:, 1]] == 0)

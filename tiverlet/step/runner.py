@@ -228,14 +228,14 @@ class Runner:
         """Before particles are put elsewhere: of constraints and contacts that this changes no load is known."""
         initial_violation.forget(self.scene, self.batches, position)
         for c in self.step.contacts:
-            if c.has_loads:
-                c.dev.known.forget(self.scene, position)
+            if c.known:
+                c.known.forget(self.scene, position)
 
     def carry_loads(self) -> None:
         """Particles came or went, or are held by others: they carry what their contacts know."""
         for c in self.step.contacts:
-            if c.has_loads:
-                c.dev.known.carry(self.scene, self.scene.state.get(self.memory), *self.grid.lasting_data())
+            if c.known:
+                c.known.carry(self.scene, self.scene.state.get(self.memory), *self.grid.lasting_data())
 
     def restart(self, iterations: int) -> None:
         """Turn displacements into velocities, so that the next substep starts from the state at this time. iterations: of the
