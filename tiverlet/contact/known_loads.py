@@ -76,14 +76,15 @@ class KnownLoads:
     def forget(self, scene: "Scene", x: np.ndarray) -> None:
         """Before particles are put to x, (n, dim): pairs that are others there forget."""
         pairs, values = self.grid.lasting_data()
-        if values["load"].any():
-            i, j = pairs.T
-            old = scene.state.get(scene.memory)
-            before = between(old[i], old[j], scene.periodic)
-            moved = np.linalg.norm(between(x[i], x[j], scene.periodic) - before, axis=1) > SAME * np.linalg.norm(before, axis=1)
-            for piece in self.pair_data:
-                values[piece.name][moved] = 0.0
-            self.grid.restore(pairs, values)
+        if not values["load"].any():
+            return
+        i, j = pairs.T
+        old = scene.state.get(scene.memory)
+        before = between(old[i], old[j], scene.periodic)
+        moved = np.linalg.norm(between(x[i], x[j], scene.periodic) - before, axis=1) > SAME * np.linalg.norm(before, axis=1)
+        for piece in self.pair_data:
+            values[piece.name][moved] = 0.0
+        self.grid.restore(pairs, values)
         self.carry(scene, x, pairs, values)
 
     def carry(self, scene: "Scene", x: np.ndarray, pairs: np.ndarray, values: dict[str, np.ndarray]) -> None:

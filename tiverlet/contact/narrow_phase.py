@@ -216,8 +216,7 @@ class DiscGeometry:
             low = pairs[:, 0] < pairs[:, 1]
             pairs, push = pairs[low], push[low]
         if self.senses:
-            rank, table = self.grid.table.rows(self.scene.particles.group)
-            touch = table.reshape(rank.max() + 1, rank.max() + 1, -1)[rank[pairs[:, 0]], rank[pairs[:, 1]], 3] == TOUCHES
+            touch = self.grid.table.pushing(self.scene.particles.group, pairs)
             pairs, push = pairs[touch], push[touch]
         d = between(x[pairs[:, 0]], x[pairs[:, 1]], self.scene.periodic)
         length = np.linalg.norm(d, axis=1)

@@ -112,6 +112,14 @@ class Table:
         self.turns = any(v.rolling > 0 or v.twisting > 0 for v in rub) or any(v.tangential > 0 for v in bounce)
         self.has_friction = any(v.static > 0 for v in rub) or self.turns
 
+    def pushing(self, group: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+        """Which pairs (m, 2) of particles of these groups push each other, (m,)."""
+        if not self.senses:
+            return np.ones(len(pairs), dtype=bool)
+        rank, table = self.rows(group)
+        m = rank.max() + 1
+        return table.reshape(m, m, -1)[rank[pairs[:, 0]], rank[pairs[:, 1]], 3] == TOUCHES
+
     def rows(self, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The rank of each particle's group, (n,), and the table, (ranks * ranks, 7)."""
         named = {k for given in (self.friction, self.restitution) if isinstance(given, Mapping) for pair in given for k in pair}

@@ -16,10 +16,9 @@ from typing import Any
 import numpy as np
 
 from ..constraints.core.scalar import Scalar
-from ..features.material import TOUCHES
 from ..neighbours.queries import between
 from .jacobian import Jacobian
-from .projection import LARGEST, Rows, matters, paid, seen, sizes
+from .projection import LARGEST, Rows, matters, paid, seen, seen_before, sizes
 from .rigid_rows import rigid_rows
 
 SOFT, SOFTEST = 1e-2, 1e-5  # mu of the first round, and the least
@@ -38,13 +37,11 @@ def release(runner: Any, h: float, longest: float) -> bool:
     contact = next((c for c in runner.step.contacts if not c.detects), None)  # of discs or spheres
     if contact is None or not np.isfinite(x).all():
         return False
-    energy, overlap = seen(runner)
+    energy, overlap = seen_before(runner)
     if not matters(overlap, ratio):
         return False
     runner.list_neighbours()  # so that it does not matter when it was listed last
     jacobian = part(runner, Pairs(runner, contact, x), x, ratio)
-    if runner.clock.energy is not None:  # of the whole frame, to second order
-        energy = runner.clock.energy
     more = seen(runner)[0]
     if jacobian and more > energy:
         d = memory.read(state.d)
@@ -98,11 +95,7 @@ class Pairs:
         grid, particles, self.box = runner.grid, runner.scene.particles, runner.scene.periodic
         pairs, _ = grid.entries()
         some = (pairs[:, 0] < pairs[:, 1]) | (runner.scene.inv_mass[pairs[:, 1]] == 0)
-        if grid.table.senses:
-            rank, table = grid.table.rows(particles.group)
-            table = table.reshape(rank.max() + 1, rank.max() + 1, -1)
-            some &= table[rank[pairs[:, 0]], rank[pairs[:, 1]], 3] == TOUCHES
-        self.who = pairs[some]
+        self.who = pairs[some & grid.table.pushing(particles.group, pairs)]
         radius = particles.radius.copy()
         if contact.shrinks:
             radius -= contact.store.read(contact.dev.geometry.shrunk)[: len(x)]

@@ -140,22 +140,12 @@ class ParticlePass:
     def leave_walls(self, i, now):
         """Take particle i out of the walls, without friction and bounces; how far."""
         d = self.state.d[i]
-        before = wall_push = ti.zero(d)
-        if ti.static(self.state.befores):
-            before = self.state.before[i]
-        if ti.static(self.state.keeps_wall_push):
-            wall_push = self.state.wall_push[i]
+        before, wall_push = self.traces(i)
         moving = True
         for _ in range(SWEEPS):
             if moving:
-                x, here = self.state.x[i], self.state.d[i]
-                for f in ti.static(self.walls):
-                    self.touch(f, i, now.h, now.frame_fraction, AHEAD)
-                moving = not ((self.state.d[i] == here).all() and (self.state.x[i] == x).all())
-        if ti.static(self.state.befores):
-            self.state.before[i] = before
-        if ti.static(self.state.keeps_wall_push):
-            self.state.wall_push[i] = wall_push
+                moving = not self.touch_all(i, now.h, now.frame_fraction, AHEAD)
+        self.leave_traces(i, before, wall_push)
         return self.state.d[i] - d
 
     @ti.func
@@ -263,15 +253,38 @@ class ParticlePass:
                     if moving:
                         if k == SWEEPS + ROUNDS:
                             self.stay(i)
-                        x, d = self.state.x[i], self.state.d[i]
-                        for f in ti.static(self.walls):
-                            self.touch(f, i, h, frame_fraction, turn)
-                        settled = (self.state.d[i] == d).all() and (self.state.x[i] == x).all()
+                        settled = self.touch_all(i, h, frame_fraction, turn)
                         # With friction or bounces a round may come back to where it began, and not be free there.
                         moving = not (settled and (turn == GENTLY or ti.static(not self.rough)))
                         turn = FIRST if ti.static(len(self.walls) > 1) else AGAIN
                         if settled or k + 1 >= SWEEPS:
                             turn = GENTLY
+
+    @ti.func
+    def touch_all(self, i, h, frame_fraction, turn):
+        """A round over the walls; whether it changed nothing."""
+        x, d = self.state.x[i], self.state.d[i]
+        for f in ti.static(self.walls):
+            self.touch(f, i, h, frame_fraction, turn)
+        return (self.state.d[i] == d).all() and (self.state.x[i] == x).all()
+
+    @ti.func
+    def traces(self, i):
+        """What walls leave of particle i beside its place and displacement."""
+        before = wall_push = ti.zero(self.state.d[i])
+        if ti.static(self.state.befores):
+            before = self.state.before[i]
+        if ti.static(self.state.keeps_wall_push):
+            wall_push = self.state.wall_push[i]
+        return before, wall_push
+
+    @ti.func
+    def leave_traces(self, i, before, wall_push):
+        """As they were before walls were asked."""
+        if ti.static(self.state.befores):
+            self.state.before[i] = before
+        if ti.static(self.state.keeps_wall_push):
+            self.state.wall_push[i] = wall_push
 
     @ti.func
     def touch(self, wall: ti.template(), i, h, frame_fraction, turn):  # type: ignore[valid-type]
@@ -286,30 +299,21 @@ class ParticlePass:
     def stop(self, i, move):
         """Walls stop particle i, which the host has moved by `move` from x0. Only its position changes: no time goes by."""
         d = self.state.d[i]
-        d_low = before = wall_push = ti.zero(d)
+        d_low = ti.zero(d)
         if ti.static(self.state.carries):
             d_low = self.state.d_low[i]
-        if ti.static(self.state.befores):
-            before = self.state.before[i]
-        if ti.static(self.state.keeps_wall_push):
-            wall_push = self.state.wall_push[i]
+        before, wall_push = self.traces(i)
         self.state.d[i] = move
         moving = True
         for k in range(ROUNDS + 1):
             if moving:
                 if k == ROUNDS:
                     self.stay(i)
-                x, here = self.state.x[i], self.state.d[i]
-                for f in ti.static(self.walls):
-                    self.touch(f, i, 0 * d[0], ti.Vector([0, 0], self.real), GENTLY)
-                moving = not ((self.state.d[i] == here).all() and (self.state.x[i] == x).all())
+                moving = not self.touch_all(i, 0 * d[0], ti.Vector([0, 0], self.real), GENTLY)
         self.state.d[i] = d
         if ti.static(self.state.carries):
             self.state.d_low[i] = d_low
-        if ti.static(self.state.befores):
-            self.state.before[i] = before
-        if ti.static(self.state.keeps_wall_push):
-            self.state.wall_push[i] = wall_push
+        self.leave_traces(i, before, wall_push)
 
     @ti.func
     def stay(self, i):

@@ -74,10 +74,7 @@ def project(runner: "Runner", h: float, longest: float) -> bool:
     n = len(x)
     still = (undone != 0) & (start.theta > FIRM)
     v[:n] += rows.jacobian.solve(-rows.jacobian.rates(v[:n]) * still, still)
-    energy, overlap = seen(runner)
-    known = runner.clock.energy
-    if known is not None:  # by the loads of the last substep: what springs of its violations would hold is not there
-        energy = known
+    energy, overlap = seen_before(runner)
     for _ in range(TURNS):
         state.put(memory, _newton(rows, LEFT * ratio**2 * start.stored, LEFT * ratio**2, converges))
         sent = state.get(memory)
@@ -132,6 +129,13 @@ def seen(runner: Any) -> tuple[float, float]:
     runner.look()
     report = runner.report()
     return report.energy, report.overlap
+
+
+def seen_before(runner: Any) -> tuple[float, float]:
+    """The same before positions move; energy, where it is known, by the loads of the last substep: what springs of its violations
+    would hold is not there."""
+    energy, overlap = seen(runner)
+    return energy if runner.clock.energy is None else runner.clock.energy, overlap
 
 
 def sizes(batch: Scalar | RigidRows) -> np.ndarray:
