@@ -49,8 +49,9 @@ class Contact(PairContact):
     momentum. A particle has its mass split m times, where m bounds the eigenvalues of S, the sum of n n^T over its overlapping
     pairs: then sum w J J^T <= diag(sum w m) for the rows J of its pairs, and no eigenvalue of a pass exceeds 1. m is 3 for a disc
     among six neighbours (counting pairs gives 6) and 4 for a sphere among twelve. With friction tangents are taken back too;
-    n n^T and t t^T sum up to the count, which is taken then, and for up to two pairs. m rises at once and decays by
-    1/32 of its excess per pass; otherwise the stiffness would jump whenever a contact opens, and keep pairs moving.
+    n n^T and t t^T sum up to the count, which is taken then, and for up to two pairs. m is worked out when other pairs
+    touch than before, and every 8 substeps, for pairs slide. It rises at once and decays by 1/32 of its excess per pass;
+    otherwise the stiffness would jump whenever a contact opens, and keep pairs moving.
 
     Pushes are over-relaxed by r = 5/4, and a pair that overlapped in the last substep keeps a part of what it got. With M =
     m_i w_i + m_j w_j, p = r C / M + c p_last, but no more than what parts the pair alone, C / (w_i + w_j). For a mode with
@@ -169,7 +170,7 @@ class Contact(PairContact):
             dev.events.bind(dev.grid, dev.geometry)
         skips = not scene.memory.compiler.few and not dev.has_restitution  # in relax() what bounces forgets the last impact
         ended = [dev.push, *loads, *bouncing]
-        dev.splitting = MassSplitting(scene, dev.geometry, dev.has_friction, skips, ended, team, dev.known)
+        dev.splitting = MassSplitting(scene, dev.geometry, dev.has_friction, skips, dev.push, ended, team, dev.known)
         if dev.known:
             dev.known.bind(dev.grid)
         dev.forces = ForceShare(scene, sums=dev.has_friction, lasting=True)
@@ -186,9 +187,9 @@ class Contact(PairContact):
         return dev.grid
 
     @ti.func
-    def count(self, begin, end):
+    def count(self, begin, end, now):
         """Which pairs of some particles touch, and how often their masses are split."""
-        self.dev.splitting.count(begin, end)
+        self.dev.splitting.count(begin, end, now)
 
     @ti.func
     def busy(self, begin):
@@ -206,6 +207,7 @@ class Contact(PairContact):
         if ti.static(self.dev.has_restitution):
             if first != 0:
                 self.dev.restitution.clear(i, self.dev.splitting.weight[i])
+        idle = 0
         if self.dev.splitting.weight[i] > 0:
             for word in range(self.dev.grid.words(i)):
                 bits = self.dev.splitting.touching(i, word)
@@ -257,6 +259,7 @@ class Contact(PairContact):
                     if ti.static(self.dev.reports):
                         self.dev.events.note(i, j, e, n, pressed, final)
                     push += part
+                    idle |= ti.cast(push == 0, ti.i32)
                     want = part * n
                     if ti.static(self.dev.spins):
                         tangential, turned = self.grip(i, j, e, n, reach, pressed + given / shared, given > 0)
@@ -279,6 +282,8 @@ class Contact(PairContact):
                             approach = -self.dev.state.slid(self.dev.forces.before[i] - self.dev.forces.before[j], i, j).dot(n)
                             forced += self.dev.forces.share(approach, pressed * alone) * w * (want - part * n)
                     self.dev.push.field[e] = push
+            if idle != 0:
+                self.dev.splitting.doubt(i)
         self.dev.move[i] = total
         if ti.static(self.dev.has_loads):
             self.dev.known.carried.field[i] = carried

@@ -11,6 +11,7 @@ from .narrow_phase import SAME_PLACE, DiscGeometry
 # Of (|r| / contact distance)^2: down to here all pairs count as if they were as deep as the deepest, which spares a division for
 # each. Deeper that would split masses too often, and a heap that is compressed would stay so.
 DEEP = 0.8
+EVERY = 8  # substeps after which a bound is worked out again, for pairs slide
 FADE = 31 / 32  # of how much more often than needed a mass was split, what is left a pass later
 
 
@@ -22,13 +23,18 @@ class MassSplitting:
     """
 
     def __init__(
-        self, scene: Scene, geometry: DiscGeometry, has_friction: bool, skips: bool, ended: list[PairData], team: Team, known: Any
-    ):
+        self, scene: Scene, geometry: DiscGeometry, has_friction: bool, skips: bool, push: PairData, ended: list[PairData],
+        team: Team, known: Any,
+    ):  # fmt: skip
         self.known, self.has_loads = known, known is not None
-        self.geometry, self.grid, self.ended, self.has_friction, self.skips = geometry, geometry.grid, ended, has_friction, skips
+        self.geometry, self.grid, self.push, self.ended = geometry, geometry.grid, push, ended
+        self.has_friction, self.skips = has_friction, skips
         self.state, self.real, self.few = scene.state, scene.real, scene.memory.compiler.few
         self.weight = scene.memory.field("Contact.split_mass", scene.count, state=True)
         self.in_state = {"weight": self.weight}
+        if not has_friction:
+            self.bound = scene.memory.field("Contact.bound", scene.count, state=True)
+            self.in_state["bound"] = self.bound
         self.block = min(BLOCK, team.piece) if skips else BLOCK
         if skips:
             self.some = scene.memory.field("Contact.some_touch", self._blocks(scene.particles.count), kind=ti.i32)
@@ -81,7 +87,7 @@ class MassSplitting:
         return out
 
     @ti.func
-    def count(self, begin, end):
+    def count(self, begin, end, now):
         """Which pairs of some particles touch, and how often their masses are split.
 
         Fast path: a block without contact in the last pass is tested only for any contact. Small worlds compile faster without.
@@ -100,7 +106,7 @@ class MassSplitting:
         if some != 0:
             for i in range(begin, end):
                 if self.state.awake(i):
-                    self.split(i)
+                    self.split(i, now)
 
     @ti.func
     def busy(self, begin):
@@ -127,36 +133,63 @@ class MassSplitting:
         return ti.cast(gap < 0, ti.i32)
 
     @ti.func
-    def split(self, i):
+    def split(self, i, now):
         """Which pairs of particle i touch, and how often its mass is split. What does not touch has no push to keep."""
         bits = self.together(i, 0)
-        pairs = ti.math.popcnt(bits)
+        pairs, others = ti.math.popcnt(bits), self.grid.touching[i] != bits
         self.clear(i, 0, self.grid.touching[i] & ~bits)
         self.grid.touching[i] = bits
         for word in range(1, self.grid.words(i)):
             bits = self.together(i, word)
             pairs += ti.math.popcnt(bits)
+            if ti.static(not self.has_friction):
+                others = others or self.changes(i, word, bits)
             self.clear(i, word, self.grid.all_bits(i, word) & ~bits)
         split = ti.cast(pairs, self.real)
         if ti.static(not self.has_friction):
             if pairs > 2:
-                tensor = ti.Matrix.zero(self.real, self.state.dim, self.state.dim)
-                deepest = ti.cast(1, self.real)
-                for word in range(self.grid.words(i)):
-                    bits = self.touching(i, word)
-                    while bits != 0:
-                        j = self.grid.neighbour[self.grid.first[i] + word * WORD + lowest_bit(bits)]
-                        bits &= bits - ti.u32(1)
-                        r, contact_distance = self.state.apart(i, j), self.geometry.contact_distance(i, j)
-                        scale = 1 / (contact_distance * contact_distance)
-                        tensor += scale * r.outer_product(r)
-                        deepest = lesser(r.dot(r) * scale, deepest)
-                if deepest <= ti.static(DEEP):
-                    tensor, deepest = self.normals(i), ti.cast(1, self.real)
-                split = lesser(largest(tensor) / deepest, split)
+                split = self.bound[i]
+                if others or split == 0 or (now.span.since + now.s + i) % EVERY == 0:
+                    split = self.bound_of(i, ti.cast(pairs, self.real))
         split *= self.state.w.of(i)
         rest = ti.static(FADE) * ti.max(self.weight[i] - split, 0)
         self.weight[i] = ti.select(pairs > 0, split + rest, split)
+
+    @ti.func
+    def changes(self, i, word, bits):
+        """Whether of the entries that the word is for others touch than those that got a push: bits of behind the first word are
+        kept by nobody."""
+        out, begin = False, self.grid.first[i] + word * WORD
+        for k in range(ti.min(self.grid.number[i] - word * WORD, WORD)):
+            touch = bits >> ti.cast(k, ti.u32) & ti.u32(1)
+            out = out or (touch != 0) != (self.push.field[begin + k] != 0)
+        return out
+
+    @ti.func
+    def bound_of(self, i, pairs):
+        """What bounds the eigenvalues of S of particle i, no more than there are pairs."""
+        tensor = ti.Matrix.zero(self.real, self.state.dim, self.state.dim)
+        deepest = ti.cast(1, self.real)
+        for word in range(self.grid.words(i)):
+            bits = self.touching(i, word)
+            while bits != 0:
+                j = self.grid.neighbour[self.grid.first[i] + word * WORD + lowest_bit(bits)]
+                bits &= bits - ti.u32(1)
+                r, contact_distance = self.state.apart(i, j), self.geometry.contact_distance(i, j)
+                scale = 1 / (contact_distance * contact_distance)
+                tensor += scale * r.outer_product(r)
+                deepest = lesser(r.dot(r) * scale, deepest)
+        if deepest <= ti.static(DEEP):
+            tensor, deepest = self.normals(i), ti.cast(1, self.real)
+        m = lesser(largest(tensor) / deepest, pairs)
+        self.bound[i] = m
+        return m
+
+    @ti.func
+    def doubt(self, i):
+        """Particle i touches another that got no push, of which a new list would know nothing."""
+        if ti.static(not self.has_friction):
+            self.bound[i] = 0
 
     @ti.func
     def normals(self, i):

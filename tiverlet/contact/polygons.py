@@ -130,7 +130,7 @@ class Polygons(PairContact):
         self.note_motion(0, self.dev.geometry.too_long(i))
 
     @ti.func
-    def count(self, begin, end):
+    def count(self, begin, end, now):
         """How many contacts some particles are in. What is in no loop knows them from detect()."""
         for i in range(begin, end):
             if self.dev.geometry.after(i) >= 0:

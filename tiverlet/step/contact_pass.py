@@ -40,7 +40,7 @@ class ContactPass:
                 begin, end = self.particles.piece(k, now.thread)
                 for b in range(blocks(begin, end)):
                     low, high = block(b, begin, end)
-                    c.count(low, high)
+                    c.count(low, high, now)
             self.team.wait()
             for k in range(self.team.dealt_count(self.particles.pieces, 1, now.thread)):
                 begin, end = self.particles.piece(k, now.thread)
