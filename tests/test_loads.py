@@ -76,6 +76,39 @@ def test_three_discs_bear_each_other_as_statics_says(world):
     np.testing.assert_allclose(w.position[2], [R + half, R + height], atol=1e-8)
 
 
+def test_each_contact_of_a_pyramid_bears_what_statics_says(world):
+    # 55 discs in rows of 10 to 1, apart in a row, the lowest row held: 90 contacts, and sum f n = m g for 45 discs are as many
+    # equations. The normals are those where it stands.
+    rows, apart = 10, 1.02
+    up = np.sqrt(1 - (apart / 2) ** 2)
+    x = np.concatenate([np.stack([apart * (np.arange(rows - r) + r / 2), np.full(rows - r, r * up)], 1) for r in range(rows)])
+    mass = np.random.default_rng(0).uniform(1, 2, len(x))
+    particles = tv.Particles(x, radius=R, mass=mass, pinned=range(rows))
+    w = world(particles, [tv.Gravity(G), tv.Contact(loads=True)], substeps=8, precision="f64")
+    w.run(15.0)
+    found, free = w.contacts, np.arange(len(x)) >= rows
+    forces, c = np.zeros((len(x), 2, len(found))), np.arange(len(found))
+    forces[found.pairs[:, 0], :, c] = found.normal
+    forces[found.pairs[:, 1], :, c] = -found.normal
+    weight = np.stack([0 * mass, G * mass], axis=1)[free]
+    borne = np.linalg.solve(forces[free].reshape(weight.size, -1), weight.ravel())
+    np.testing.assert_allclose(found.impulse * 480, borne, rtol=1e-6)
+    assert np.abs(found.overlap).max() < 1e-9
+
+
+def test_the_floor_bears_the_weight(world):
+    # Walls without friction bear none of it: sum f = N m g on the floor, and the same on both sides.
+    x, width = heap(6)
+    walls = [tv.HalfSpace(n, offset, events=True) for n, offset in (((0, 1), 0.0), ((1, 0), 0.0), ((-1, 0), -width))]
+    features = [tv.Gravity(G), tv.Contact(friction=0.5, loads=True), *walls]
+    w = world(tv.Particles(x, radius=R), features, substeps=8)
+    w.run(15.0)
+    touches = w.wall_events().touches
+    floor, left, right = (touches.impulse[touches.pairs[:, 1] == k].sum() * 60 for k in (2, 3, 4))
+    assert floor == pytest.approx(36 * G, rel=1e-4)
+    assert left == pytest.approx(right, abs=36 * G * 1e-4)
+
+
 def test_loads_are_gone_with_what_bore_them(world):
     # Where the ground goes, all fall: what is above is given at most the loads of one more substep, k g h.
     w = pile(world, friction=0.0)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from ..neighbours.neighbour_search import NeighbourSearch
 
 WINDOW = 128  # substeps over which is averaged what is missing; at their end sound has just been taken out
-STEADY = 0.1  # of the whole load: by how much that may differ from one window to the next
+STEADY = 0.2  # of itself: by how much that may differ from one window to the next
 GAIN = 0.8  # of what is missing is learnt at once, where a pile is low
 LAG, SLOW = 64, 0.3  # substeps that it takes to learn the load of k particles: LAG + SLOW k^2
 SAME = 1e-3  # of its length: by how much the line between a pair may change where particles are put elsewhere
@@ -40,7 +40,7 @@ class KnownLoads:
 
     One pass per substep holds a load by an overlap, 2 k g h^2 for the k-th contact of a column; what is known needs none. F is
     learnt by and by, which is integral control: over a window, contacts added `mean`, and if that is what they added in the
-    window before to within a tenth of F + mean, F += gain mean. A substep sees a constant force, so it is as stable as without.
+    window before to within a fifth, F += gain mean. A substep sees a constant force, so it is as stable as without.
     What is learnt must not be faster than the slowest sound of the pile decays, see VelocityProjection: in a column of N in
     0.1 N^2 substeps. So gain = WINDOW / (LAG + SLOW k^2), with k = F / (m g) the number of particles that a pair bears. An
     impact has a large k, and is not learnt.
@@ -141,7 +141,7 @@ class KnownLoads:
     def learn(self, i, j, e, load, mean, learns):
         """At the end of a window, in which entry e lacked `mean` of its load: what it knows from now on [N]."""
         whole = ti.abs(load + mean)
-        if learns and ti.abs(mean - self.earlier.field[e]) < STEADY * whole:
+        if learns and ti.abs(mean - self.earlier.field[e]) < STEADY * ti.abs(mean):
             k, own = whole * ti.max(self.state.w.of(i), self.state.w.of(j)), ti.max(self.own[i], self.own[j])
             gain = ti.min(WINDOW * own * own / (LAG * own * own + SLOW * k * k), GAIN)
             load, mean = ti.max(load + gain * mean, 0), (1 - gain) * mean

@@ -173,20 +173,20 @@ class Session:
         frames, measure = self.frames(n, scene.substeps), others.MEASURE[name]
         with processes.world(self.job(name, n, threads), self.cache()) as ours:
             ours.ask()
-            target = processes.quality(ours, frames)[measure]
+            target = processes.quality(ours, frames, scene.settles)[measure]
             tried: list[tuple[float, tuple[int, int]]] = []
             fast = ours.ask("run 12")
             for setting in peer.settings:
                 with peer.process(name, n, threads, setting) as theirs:
                     theirs.ask()
-                    tried.append((processes.quality(theirs, frames)[measure], setting))
+                    tried.append((processes.quality(theirs, frames, scene.settles)[measure], setting))
                     slow = theirs.ask("run 12") > others.SLOWER * fast
                 if slow or tried[-1][0] <= target:
                     break
             quality, setting = tried[-1] if tried[-1][0] <= target else min(tried)
             with peer.process(name, n, threads, setting) as theirs:
                 count = theirs.ask()["particles"]
-                times = self.turns([ours, theirs], n, scene.substeps)
+                times = self.turns([ours, theirs], n, scene.substeps, scene.settles)
         return Peer(
             f"{peer.name} {peer.version()}", name, count, threads, setting,
             median(times[1]), median(times[0]), others.WORDS[measure], quality, target, quality <= target,
