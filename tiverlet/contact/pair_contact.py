@@ -15,6 +15,7 @@ from ..neighbours.neighbour_list import MOVED
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..neighbours.queries import Contacts
 from ..particles import Particles
+from .candidates import Candidates
 
 
 class Geometry(Protocol):
@@ -41,6 +42,10 @@ class Geometry(Protocol):
 
     def worst_overlap(self, i) -> Any:
         """For the report: contacts that particle i counts, and the worst overlap, relative to its size."""
+
+    def candidates(self, x: np.ndarray) -> Candidates:
+        """What may touch around positions x (n, dim) [m], which were diagnosed, for the host to move apart."""
+        ...
 
     def found(self, x: np.ndarray, h: float) -> Contacts:
         """The contacts of particles at x (n, dim) [m] after a substep h [s], for world.contacts."""

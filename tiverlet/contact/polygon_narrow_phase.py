@@ -11,6 +11,7 @@ from ..features.material import Table
 from ..neighbours.neighbour_list import PairData
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..neighbours.queries import Contacts
+from .candidates import EdgeCandidates
 from .narrow_phase import DiscGeometry
 
 SLACK = 1 / 512  # of an edge: as much further it goes at its ends, so that bodies of the same width stand on each other
@@ -411,6 +412,17 @@ class PolygonGeometry:
                 worst = ti.max(worst, found[0] / size)
                 touching += 1
         return touching, worst
+
+    def candidates(self, x: np.ndarray) -> EdgeCandidates:
+        """What may touch around positions x (n, 2) [m], for the host: what is listed, and was looked for there."""
+        pairs, at = self.grid.entries()
+        lone, allowed = self.outline.ends[:, 0] < 0, self.scene.memory.read(self.allowed)
+        both = lone[pairs].all(axis=1)
+        who = np.where(both, pairs.min(axis=1), pairs[:, 0])
+        found, pushed = self.grid.read(self.manifold, at), self.grid.read(self.impulse, at) > 0
+        ends, body, _ = self.outline
+        radius, allowed = self.scene.particles.radius, allowed.astype(np.float64)[who]
+        return EdgeCandidates(x, pairs, found, DISCS, pushed, ends, body, radius, allowed)
 
     def found(self, x: np.ndarray, h: float) -> Contacts:
         """Vertices and edges, and pairs of discs, by what detect() found last; also those that were pushed apart since."""

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ..constraints.core.scalar import Scalar
-from ..neighbours.queries import between
+from ..contact.candidates import Candidates
 from .jacobian import Jacobian
 from .projection import LARGEST, Rows, matters, paid, seen, seen_before, sizes
 from .rigid_rows import rigid_rows
@@ -34,14 +34,15 @@ def release(runner: Any, h: float, longest: float) -> bool:
     """
     state, memory, ratio = runner.scene.state, runner.memory, h / longest
     x = state.get(memory)
-    contact = next((c for c in runner.step.contacts if not c.detects), None)  # of discs or spheres
+    contact = next(iter(runner.step.contacts), None)
     if contact is None or not np.isfinite(x).all():
         return False
     energy, overlap = seen_before(runner)
     if not matters(overlap, ratio):
         return False
-    runner.list_neighbours()  # so that it does not matter when it was listed last
-    jacobian = part(runner, Pairs(runner, contact, x), x, ratio)
+    runner.invalidate()  # so that it does not matter when they were listed last
+    runner.look()
+    jacobian = part(runner, contact.dev.geometry.candidates(x), x, ratio)
     more = seen(runner)[0]
     if jacobian and more > energy:
         d = memory.read(state.d)
@@ -51,25 +52,27 @@ def release(runner: Any, h: float, longest: float) -> bool:
     return True
 
 
-def part(runner: Any, pairs: "Pairs", x: np.ndarray, ratio: float) -> Jacobian | None:
+def part(runner: Any, pairs: Candidates, x: np.ndarray, ratio: float) -> Jacobian | None:
     """Move particles from x, (n, dim), until their overlaps are ratio^2 of what they are, or as near to that as they get; returns
     the rows of the last round."""
     state, memory, w, jacobian = runner.scene.state, runner.memory, runner.scene.inv_mass, None
-    overlap = np.maximum(pairs.overlaps(x)[0], 0.0)
-    goal, active = ratio**2 * overlap, overlap > 0
+    overlap, gradient = pairs.at(x)
+    goal, active, known = ratio**2 * np.maximum(overlap, 0.0), overlap > 0, overlap > 0
     best, soft, tied, walls = x, SOFT, rigid(runner, x), Walls(x)
-    least = first = stored_by(overlap - goal)
+    if tied:
+        tied = tied.towards(ratio**2 * tied.C)
+    held = stored_by(overlap - goal, gradient, w[pairs.who])
+    least = first = held + tied.stored if tied else held
     for _ in range(ROUNDS):
         if least <= LEFT * ratio**2 * first:
             break
-        overlap, normal = pairs.overlaps(best)
+        overlap, gradient = pairs.at(best)
         some = np.flatnonzero(active)
         m, k = len(some), len(walls.who)
-        row, who = [np.arange(m), np.arange(m), m + np.arange(k)], [*pairs.who[some].T, walls.who]
-        J, right = [normal[some], -normal[some], walls.normal], [(overlap - goal)[some], np.zeros(k)]
+        row, who = [np.tile(np.arange(m), pairs.who.shape[1]), m + np.arange(k)], [*pairs.who[some].T, walls.who]
+        J, right = [*gradient[some].transpose(1, 0, 2), walls.normal], [(overlap - goal)[some], np.zeros(k)]
         if tied:
-            now = tied.at(best)
-            row, who, J, right = [*row, m + k + now.row], [*who, now.who], [*J, now.J], [*right, tied.C - now.C]
+            row, who, J, right = [*row, m + k + tied.row], [*who, tied.who], [*J, tied.J], [*right, -tied.C]
         wanted = np.concatenate(right)
         jacobian = Jacobian(len(wanted), np.concatenate(row), np.concatenate(who), w, np.concatenate(J))
         state.put(memory, best + jacobian.solve(wanted, enough=ENOUGH, steps=STEPS, soft=soft))
@@ -77,35 +80,19 @@ def part(runner: Any, pairs: "Pairs", x: np.ndarray, ratio: float) -> Jacobian |
         runner.stop_at_walls(best)
         new = state.get(memory)
         walls.push(new - sent)
-        more = pairs.overlaps(new)[0] - goal
+        overlap, gradient = pairs.at(new)
+        more = overlap - goal
         active = active | (more > 0)
-        stored = stored_by(more)
+        stored = stored_by(more, gradient, w[pairs.who])
+        now = tied.at(new) if tied else None
+        stored += now.stored if now else 0.0
         if stored < least:
-            best, least, soft = new, stored, max(soft / 4, SOFTEST)
+            best, least, tied, soft = new, stored, now, max(soft / 4, SOFTEST)
+            active = known | (more > 0)
         else:
             soft *= 10
     state.put(memory, best)
     return jacobian
-
-
-class Pairs:
-    """Those of the neighbour list that push each other, who (m, 2), at positions x (n, dim) [m]."""
-
-    def __init__(self, runner: Any, contact: Any, x: np.ndarray):
-        grid, particles, self.box = runner.grid, runner.scene.particles, runner.scene.periodic
-        pairs, _ = grid.entries()
-        some = (pairs[:, 0] < pairs[:, 1]) | (runner.scene.inv_mass[pairs[:, 1]] == 0)
-        self.who = pairs[some & grid.table.pushing(particles.group, pairs)]
-        radius = particles.radius.copy()
-        if contact.shrinks:
-            radius -= contact.store.read(contact.dev.geometry.shrunk)[: len(x)]
-        self.reach = radius[self.who].sum(axis=1)
-
-    def overlaps(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How deep they overlap [m], negative where apart, and their normals, at positions x."""
-        r = between(x[self.who[:, 0]], x[self.who[:, 1]], self.box)
-        length = np.linalg.norm(r, axis=1)
-        return self.reach - length, np.divide(r, length[:, None], out=np.zeros_like(r), where=length[:, None] > 0)
 
 
 class Walls:
@@ -131,6 +118,7 @@ def rigid(runner: Any, x: np.ndarray) -> Rows | None:
     return Rows(some, w, x, runner.scene.periodic) if some else None
 
 
-def stored_by(overlap: np.ndarray) -> float:
-    """What overlaps store, but for a factor."""
-    return float((np.maximum(overlap, 0.0) ** 2).sum())
+def stored_by(overlap: np.ndarray, gradient: np.ndarray, w: np.ndarray) -> float:
+    """What overlaps (m,) store, but for a factor; gradient: (m, k, dim), of particles with inverse masses w (m, k)."""
+    D = (w * (gradient**2).sum(axis=2)).sum(axis=1)
+    return float(np.divide(np.maximum(overlap, 0.0) ** 2, D, out=np.zeros_like(D), where=D > 0).sum())
