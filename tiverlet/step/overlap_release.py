@@ -20,6 +20,7 @@ from ..contact.candidates import Candidates
 from .jacobian import Jacobian
 from .projection import LARGEST, Rows, matters, paid, seen, seen_before, sizes
 from .rigid_rows import rigid_rows
+from .solids import Solids
 
 SOFT, SOFTEST = 1e-2, 1e-5  # mu of the first round, and the least
 STEPS, ENOUGH = 32, 1e-6  # of conjugate gradients, at most; what of r . z they leave
@@ -57,35 +58,44 @@ def part(runner: Any, pairs: Candidates, x: np.ndarray, ratio: float) -> Jacobia
     the rows of the last round."""
     state, memory, w, jacobian = runner.scene.state, runner.memory, runner.scene.inv_mass, None
     overlap, gradient = pairs.at(x)
-    goal, active, known = ratio**2 * np.maximum(overlap, 0.0), overlap > 0, overlap > 0
-    best, soft, tied, walls = x, SOFT, rigid(runner, x), Walls(x)
-    if tied:
-        tied = tied.towards(ratio**2 * tied.C)
-    held = stored_by(overlap - goal, gradient, w[pairs.who])
-    least = first = held + tied.stored if tied else held
+    known = active = overlap > 0
+    goal = ratio**2 * np.maximum(overlap, 0.0)
+    best, soft, tied, walls = x, SOFT, bound(runner, x, ratio), Walls(x)
+    solids = Solids(runner.batches, w, x, ratio**2)
+
+    def storing(x: np.ndarray, more: np.ndarray, gradient: np.ndarray, tied: Rows | None) -> float:
+        return stored_by(more, gradient, w[pairs.who]) + (tied.stored if tied else 0.0) + solids.off(x)
+
+    least = first = storing(x, overlap - goal, gradient, tied)
     for _ in range(ROUNDS):
         if least <= LEFT * ratio**2 * first:
             break
-        overlap, gradient = pairs.at(best)
+        begin = solids.fitted(best) if solids.count else best
+        now = tied.at(begin) if tied and solids.count else tied
+        overlap, gradient = pairs.at(begin)
         some = np.flatnonzero(active)
         m, k = len(some), len(walls.who)
         row, who = [np.tile(np.arange(m), pairs.who.shape[1]), m + np.arange(k)], [*pairs.who[some].T, walls.who]
-        J, right = [*gradient[some].transpose(1, 0, 2), walls.normal], [(overlap - goal)[some], np.zeros(k)]
-        if tied:
-            row, who, J, right = [*row, m + k + tied.row], [*who, tied.who], [*J, tied.J], [*right, -tied.C]
+        J, right = [*gradient[some].transpose(1, 0, 2), walls.normal], [(overlap - goal)[some], walls.back(best - begin)]
+        if now:
+            row, who, J, right = [*row, m + k + now.row], [*who, now.who], [*J, now.J], [*right, -now.C]
+        if solids.count:  # rows of nothing tell which particles hang together
+            row, who = [*row, sum(map(len, right)) + solids.owner], [*who, solids.who]
+            J, right = [*J, np.zeros((len(solids.who), x.shape[1]))], [*right, np.zeros(solids.count)]
         wanted = np.concatenate(right)
-        jacobian = Jacobian(len(wanted), np.concatenate(row), np.concatenate(who), w, np.concatenate(J))
-        state.put(memory, best + jacobian.solve(wanted, enough=ENOUGH, steps=STEPS, soft=soft))
+        jacobian = Jacobian(
+            len(wanted), np.concatenate(row), np.concatenate(who), w, np.concatenate(J), solids.at(begin)
+        )
+        move = jacobian.solve(wanted, enough=ENOUGH, steps=STEPS, soft=soft)
+        state.put(memory, solids.fitted(begin + move) if solids.count else begin + move)
         sent = state.get(memory)
         runner.stop_at_walls(best)
         new = state.get(memory)
         walls.push(new - sent)
         overlap, gradient = pairs.at(new)
-        more = overlap - goal
+        more, now = overlap - goal, tied.at(new) if tied else None
+        stored = storing(new, more, gradient, now)
         active = active | (more > 0)
-        stored = stored_by(more, gradient, w[pairs.who])
-        now = tied.at(new) if tied else None
-        stored += now.stored if now else 0.0
         if stored < least:
             best, least, tied, soft = new, stored, now, max(soft / 4, SOFTEST)
             active = known | (more > 0)
@@ -108,14 +118,22 @@ class Walls:
         self.who = np.concatenate([self.who, new])
         self.normal = np.concatenate([self.normal, way[new] / length[new, None]])
 
+    def back(self, way: np.ndarray) -> np.ndarray:
+        """How much of a way, (n, dim), is along the normals, (k,)."""
+        return (way[self.who] * self.normal).sum(axis=1)
 
-def rigid(runner: Any, x: np.ndarray) -> Rows | None:
-    """The rigid constraints of the world, and its rigid clusters, where there are any that are not too large."""
+
+def bound(runner: Any, x: np.ndarray, ratio: float) -> Rows | None:
+    """The constraints of the world that are not too large, and rigid clusters that share particles with others; with what they are
+    to give up, as in projection.py."""
     w = runner.scene.inv_mass
-    scalars = [b for b in runner.batches if isinstance(b, Scalar) and b.count and not b.compliance.any()]
+    scalars = [b for b in runner.batches if isinstance(b, Scalar) and b.count]
     some = [b for b in scalars if sizes(b).max() <= LARGEST and (~b.idle(w) & ~b.broken).any()]
-    some += rigid_rows(runner.batches, w)
-    return Rows(some, w, x, runner.scene.periodic) if some else None
+    some += rigid_rows([b for b in runner.batches if b.clusters], w)
+    if not some:
+        return None
+    rows = Rows(some, w, x, runner.scene.periodic)
+    return rows.towards(rows.C - (1 - ratio**2) * rows.undone(runner))
 
 
 def stored_by(overlap: np.ndarray, gradient: np.ndarray, w: np.ndarray) -> float:
