@@ -38,13 +38,13 @@ class DiscCandidates:
 class EdgeCandidates:
     """Vertices v and edges from a to b; or corners that touch as discs do, where b is a (2D).
 
-    C = (x_v - (1 - t) x_a - t x_b) . n - (r_v + (1 - t) r_a + t r_b) + allowed, as in Polygons. Over which edge a vertex has come
-    in stays what it is: where it was pushed last, or else what PolygonGeometry finds. What touched nothing may come in over an edge
-    that it was in front of, or a corner.
+    C = (x_v - (1 - t) x_a - t x_b) . n - (r_v + (1 - t) r_a + t r_b) + allowed, as in Polygons. A vertex is over the edge that
+    pushed it last, whichever is nearest now, or else over that which PolygonGeometry finds. What touched nothing may come in over
+    an edge that it was in front of, or a corner.
 
     pairs: (m, 2), v and a. found: (m, 4), overlap, t and normal at positions x. discs: what t is for discs. pushed: (m,), whether
-    they were pushed apart in the last substep. ends: (n, 2), of each particle the next and the one before around its body, -1 where
-    there is none; body: (n,), its number. allowed: (m,) [m].
+    they were pushed apart in the last substep. ends: (n, 2), of each particle the next and the one before around its body, -1
+    where there is none; body: (n,), its number. allowed: (m,) [m].
     """
 
     def __init__(
@@ -66,15 +66,14 @@ class EdgeCandidates:
         edge = known_edge | fresh_edge
         self.who = np.stack([v, a, np.where(edge, after[a], a)], axis=1)
         # What has passed an inner corner goes back over that: its normal is not that of the edge.
-        along = (normal * (x[self.who[:, 2]] - x[a])).sum(axis=1)
-        inner = known_edge & touches[some] & (along > 0.01 * np.linalg.norm(x[self.who[:, 2]] - x[a], axis=1))
+        edges = x[self.who[:, 2]] - x[a]
+        inner = known_edge & touches[some] & ((normal * edges).sum(axis=1) > 0.01 * np.linalg.norm(edges, axis=1))
         self.who[inner, 2] = a[inner]
         self.sign, self.edge = np.where(inner, -1.0, 1.0), edge & ~inner
         self.fresh_edge, self.fresh_disc = fresh_edge, fresh_disc
-        self.low, self.high = np.where(known_edge, -np.inf, 0.0), np.where(known_edge, np.inf, 1.0)
+        self.low, self.high = np.zeros(len(v)), np.ones(len(v))
         overlap, _, place = self._measured(x)
-        self.low, self.high = (np.where(known_edge, side, end) for side, end in (
-            (np.minimum(place, 0.0), 0.0), (np.maximum(place, 1.0), 1.0)))  # fmt: skip
+        self.low[known_edge], self.high[known_edge] = np.minimum(place, 0)[known_edge], np.maximum(place, 1)[known_edge]
         behind = fresh_edge & (overlap > 0)
         for name in ("who", "allowed", "sign", "edge", "fresh_edge", "fresh_disc", "low", "high"):
             setattr(self, name, vars(self)[name][~behind])
@@ -99,8 +98,7 @@ class EdgeCandidates:
         none = self.fresh_edge & (t != place)
         none[self.fresh_disc] = ~self._corners(x, *self.who[self.fresh_disc, :2].T)
         overlap[none], n[none] = 0.0, 0.0
-        t = t[:, None]
-        return overlap, np.stack([n, (t - 1) * n, -t * n], axis=1)
+        return overlap, np.stack([n, (t - 1)[:, None] * n, -t[:, None] * n], axis=1)
 
     def _corners(self, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Whether each of two particles is beside no edge of the other."""

@@ -14,7 +14,7 @@ DONE = 1e-12  # of r . z at the start of conjugate gradients: what is left
 class Jacobian:
     """J of m constraints between n particles.
 
-    Corner k belongs to row[k] and is particle who[k], with the gradient J[k], (corners, dim). w: inverse masses, (n,). whole: what
+    Corner k belongs to row[k] and is particle who[k], with the gradient J[k], (corners, dim). w: inverse masses, (n,). whole:
     makes moves of particles, (n, dim), moves of the bodies that they are in, see Solids; None where each moves alone.
     """
 
@@ -41,11 +41,14 @@ class Jacobian:
     def solve(
         self, right: np.ndarray, some: np.ndarray | float = 1.0, enough: float = DONE, steps: int = STEPS, soft: float = SOFT
     ) -> np.ndarray:  # fmt: skip
-        """w J^T lam with (J w J^T + mu) lam = right, for some rows; conjugate gradients, preconditioned by the diagonal."""
+        """w J^T lam with (J w J^T + mu) lam = right, for some rows."""
+        return self.moves(self.multipliers(right, some, enough, steps, soft))
+
+    def multipliers(self, right: np.ndarray, some: np.ndarray | float, enough: float, steps: int, soft: float) -> np.ndarray:
+        """lam, by conjugate gradients, preconditioned by the diagonal."""
         mu = soft * self.diagonal
         scale = np.divide(1, self.diagonal + mu, out=np.zeros_like(mu), where=self.diagonal > 0)
-        lam = conjugate_gradients(lambda p: some * self.rates(self.moves(p)) + mu * p, lambda r: scale * r, right, enough, steps)
-        return self.moves(lam)
+        return conjugate_gradients(lambda p: some * self.rates(self.moves(p)) + mu * p, lambda r: scale * r, right, enough, steps)
 
 
 def bodies_of(m: int, row: np.ndarray, who: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -6,9 +6,11 @@ the overlap (h' / h)^2 C, by the least moves in the metric of the masses, and ve
 
     x += w J^T lam,  (J w J^T + mu D) lam = C - (h' / h)^2 C_0,  D the diagonal of J w J^T
 
-for discs or spheres that overlap; those that the moves push into each other part again, C_0 = 0. What a wall has stopped does
-not move into it again, and rigid constraints keep what they measure. mu falls while that helps and rises where it does not
-(Levenberg and Marquardt). Motion pays for what is lifted, as in projection.py.
+for what overlaps, whatever its geometry (Candidates); what the moves push into each other parts again, C_0 = 0. Constraints go
+to where the same loads need them, as in projection.py: that alone would push bodies into each other again. Clusters move as a
+whole, and out of the shape that contacts and walls have left them in (Solids). Nothing moves into walls that stopped it, and
+these only push. mu falls while what is stored does, the sum of C^2 / D, and rises where it does not (Levenberg and Marquardt).
+Motion pays for what is lifted, as in projection.py.
 """
 
 from typing import Any
@@ -16,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ..constraints.core.scalar import Scalar
-from ..contact.candidates import Candidates
+from ..contact.candidates import Candidates, DiscCandidates
 from .jacobian import Jacobian
 from .projection import LARGEST, Rows, matters, paid, seen, seen_before, sizes
 from .rigid_rows import rigid_rows
@@ -25,6 +27,7 @@ from .solids import Solids
 SOFT, SOFTEST = 1e-2, 1e-5  # mu of the first round, and the least
 STEPS, ENOUGH = 32, 1e-6  # of conjugate gradients, at most; what of r . z they leave
 ROUNDS = 16  # of them, each with what particles were pushed into in the one before
+TURNS = 8  # at most, until nothing pulls that cannot
 LEFT = 0.01  # of what overlaps store: what may be left of it in the shorter substep
 
 
@@ -33,17 +36,22 @@ def release(runner: Any, h: float, longest: float) -> bool:
 
     h: the coming substep [s]; longest: since this was done last. Returns whether overlaps have been looked after.
     """
-    state, memory, ratio = runner.scene.state, runner.memory, h / longest
-    x = state.get(memory)
-    contact = next(iter(runner.step.contacts), None)
-    if contact is None or not np.isfinite(x).all():
+    state, memory, step, ratio = runner.scene.state, runner.memory, runner.step, h / longest
+    x, contact = state.get(memory), next(iter(step.contacts), None)
+    if not (contact or step.walls) or not np.isfinite(x).all():
+        return False
+    solids = Solids(runner, x, ratio)
+    if not (contact or solids.count):
         return False
     energy, overlap = seen_before(runner)
-    if not matters(overlap, ratio):
+    if not matters(max(overlap, solids.worst), ratio):
         return False
-    runner.invalidate()  # so that it does not matter when they were listed last
-    runner.look()
-    jacobian = part(runner, contact.dev.geometry.candidates(x), x, ratio)
+    pairs: Candidates = DiscCandidates(np.zeros((0, 2), dtype=np.int64), np.zeros(0), None)
+    if contact:
+        runner.invalidate()  # so that it does not matter when they were listed last
+        runner.look()
+        pairs = contact.dev.geometry.candidates(x)
+    jacobian = part(runner, pairs, solids, x, ratio)
     more = seen(runner)[0]
     if jacobian and more > energy:
         d = memory.read(state.d)
@@ -53,56 +61,73 @@ def release(runner: Any, h: float, longest: float) -> bool:
     return True
 
 
-def part(runner: Any, pairs: Candidates, x: np.ndarray, ratio: float) -> Jacobian | None:
-    """Move particles from x, (n, dim), until their overlaps are ratio^2 of what they are, or as near to that as they get; returns
-    the rows of the last round."""
+def part(runner: Any, pairs: Candidates, solids: Solids, x: np.ndarray, ratio: float) -> Jacobian | None:
+    """Move particles from x, (n, dim), until what they store is about ratio^4 of it, or as near to that as they get; returns the
+    rows of the last round."""
     state, memory, w, jacobian = runner.scene.state, runner.memory, runner.scene.inv_mass, None
-    overlap, gradient = pairs.at(x)
+    overlap = pairs.at(x)[0]
     known = active = overlap > 0
     goal = ratio**2 * np.maximum(overlap, 0.0)
-    best, soft, tied, walls = x, SOFT, bound(runner, x, ratio), Walls(x)
-    solids = Solids(runner.batches, w, x, ratio**2)
+    soft, tied, walls = SOFT, bound(runner, x, ratio), Walls(x)
 
-    def storing(x: np.ndarray, more: np.ndarray, gradient: np.ndarray, tied: Rows | None) -> float:
-        return stored_by(more, gradient, w[pairs.who]) + (tied.stored if tied else 0.0) + solids.off(x)
+    def seen_at(x: np.ndarray) -> tuple[float, np.ndarray, Rows | None]:
+        """What is stored there, how much deeper contacts are than they are to be, and the rows of constraints."""
+        overlap, gradient = pairs.at(x)
+        rows = tied.at(x) if tied else None
+        stored = stored_by(overlap - goal, gradient, w[pairs.who]) + solids.off(x)
+        return stored + (rows.stored if rows else 0.0), overlap - goal, rows
 
-    least = first = storing(x, overlap - goal, gradient, tied)
+    first = seen_at(x)[0]
+    best = moved(runner, x, solids.fitted(x))[1] if solids.count else x
+    least = seen_at(best)[0]
     for _ in range(ROUNDS):
         if least <= LEFT * ratio**2 * first:
             break
-        begin = solids.fitted(best) if solids.count else best
-        now = tied.at(begin) if tied and solids.count else tied
-        overlap, gradient = pairs.at(begin)
+        begin = solids.fitted(best)
+        gradient, (_, more, rows) = pairs.at(begin)[1], seen_at(begin)
         some = np.flatnonzero(active)
         m, k = len(some), len(walls.who)
         row, who = [np.tile(np.arange(m), pairs.who.shape[1]), m + np.arange(k)], [*pairs.who[some].T, walls.who]
-        J, right = [*gradient[some].transpose(1, 0, 2), walls.normal], [(overlap - goal)[some], walls.back(best - begin)]
-        if now:
-            row, who, J, right = [*row, m + k + now.row], [*who, now.who], [*J, now.J], [*right, -now.C]
-        if solids.count:  # rows of nothing tell which particles hang together
+        J, right = [*gradient[some].transpose(1, 0, 2), walls.normal], [more[some], walls.along(best - begin)]
+        if rows:
+            row, who, J, right = [*row, m + k + rows.row], [*who, rows.who], [*J, rows.J], [*right, -rows.C]
+        if solids.count:  # a row of nothing for each, which tells what hangs together
             row, who = [*row, sum(map(len, right)) + solids.owner], [*who, solids.who]
             J, right = [*J, np.zeros((len(solids.who), x.shape[1]))], [*right, np.zeros(solids.count)]
         wanted = np.concatenate(right)
-        jacobian = Jacobian(
-            len(wanted), np.concatenate(row), np.concatenate(who), w, np.concatenate(J), solids.at(begin)
-        )
-        move = jacobian.solve(wanted, enough=ENOUGH, steps=STEPS, soft=soft)
-        state.put(memory, solids.fitted(begin + move) if solids.count else begin + move)
-        sent = state.get(memory)
-        runner.stop_at_walls(best)
-        new = state.get(memory)
+        jacobian = Jacobian(len(wanted), np.concatenate(row), np.concatenate(who), w, np.concatenate(J), solids.whole(begin))
+        one_way = np.arange(len(wanted)) < m + k
+        one_way[:m] = ~known[some]
+        sent, new = moved(runner, best, solids.fitted(begin + one_sided(jacobian, wanted, one_way, soft)))
         walls.push(new - sent)
-        overlap, gradient = pairs.at(new)
-        more, now = overlap - goal, tied.at(new) if tied else None
-        stored = storing(new, more, gradient, now)
-        active = active | (more > 0)
+        stored, more, _ = seen_at(new)
         if stored < least:
-            best, least, tied, soft = new, stored, now, max(soft / 4, SOFTEST)
-            active = known | (more > 0)
+            best, least, soft, active = new, stored, max(soft / 4, SOFTEST), known | (more > 0)
         else:
-            soft *= 10
+            soft, active = 10 * soft, active | (more > 0)
     state.put(memory, best)
     return jacobian
+
+
+def moved(runner: Any, before: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Put particles to x, where they come from `before`: where they are then, and where walls stop them."""
+    state, memory = runner.scene.state, runner.memory
+    state.put(memory, x)
+    sent = state.get(memory)
+    runner.stop_at_walls(before)
+    return sent, state.get(memory)
+
+
+def one_sided(jacobian: Jacobian, right: np.ndarray, one_way: np.ndarray, soft: float) -> np.ndarray:
+    """The least moves, of which none is made by a row that goes one way and pulls."""
+    some = np.ones(len(right))
+    for _ in range(TURNS):
+        lam = jacobian.multipliers(right * some, some, ENOUGH, STEPS, soft)
+        pulls = one_way & (lam < 0)
+        if not pulls.any():
+            break
+        some[pulls] = 0.0
+    return jacobian.moves(lam)
 
 
 class Walls:
@@ -118,14 +143,14 @@ class Walls:
         self.who = np.concatenate([self.who, new])
         self.normal = np.concatenate([self.normal, way[new] / length[new, None]])
 
-    def back(self, way: np.ndarray) -> np.ndarray:
+    def along(self, way: np.ndarray) -> np.ndarray:
         """How much of a way, (n, dim), is along the normals, (k,)."""
         return (way[self.who] * self.normal).sum(axis=1)
 
 
 def bound(runner: Any, x: np.ndarray, ratio: float) -> Rows | None:
-    """The constraints of the world that are not too large, and rigid clusters that share particles with others; with what they are
-    to give up, as in projection.py."""
+    """The constraints of the world that are not too large, and rigid clusters that share particles with others; C is measured
+    from what it is to be, as in projection.py."""
     w = runner.scene.inv_mass
     scalars = [b for b in runner.batches if isinstance(b, Scalar) and b.count]
     some = [b for b in scalars if sizes(b).max() <= LARGEST and (~b.idle(w) & ~b.broken).any()]
