@@ -181,6 +181,20 @@ class DiscGeometry:
             self.shrunk[i] = ti.max(self.shrunk[i] - self.push_out * h / 2, 0)
 
     @ti.func
+    def is_eased(self, i):
+        """Whether particle i is smaller than it is."""
+        out = False
+        if ti.static(self.shrinks):
+            out = self.shrunk[i] > 0
+        return out
+
+    @ti.func
+    def push_each_other(self, i, j):
+        """Whether particles i and j overlap and push each other."""
+        r, distance = self.state.apart(i, j), self.contact_distance(i, j)
+        return r.dot(r) < distance * distance and self.pushes(i, j) != 0
+
+    @ti.func
     def worst_overlap(self, i):
         """For the report: contacts of particle i with later ones, and the worst overlap in radii of the smaller."""
         touching, worst = 0, ti.cast(0, ti.f64)

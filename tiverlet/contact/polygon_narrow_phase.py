@@ -62,7 +62,7 @@ class PolygonGeometry:
         self.step = float(outline.length[outline.body >= 0].min(initial=np.inf)) / 4
         self.allowed = add("Polygons.allowed", n, state=True)  # overlap [m]
         self.in_state = {"allowed": self.allowed}
-        self.h = add("Polygons.substep", None)
+        self.h = add("Polygons.substep", None, state=bool(scene.state.sleepers))  # the first particle may sleep, and not tell
         # For each entry the contact of which its particle is the vertex: overlap, place on the edge (DISCS: there is none) and
         # normal; where in the list of the other one those are in which it is the start, and the end, of the edge (-1: nowhere).
         self.manifold, self.back = PairData("met", 4, False, kept=False), PairData("back", 2, False, kept=False)
@@ -392,6 +392,30 @@ class PolygonGeometry:
         if i == 0:
             self.h[None] = h
         self.allowed[i] = ti.max(self.allowed[i] - self.push_out * h, 0)
+
+    @ti.func
+    def is_eased(self, i):
+        """Whether particle i is allowed to overlap."""
+        return self.allowed[i] > 0
+
+    @ti.func
+    def part(self, i):
+        """Particle i sleeps, and nothing is near that moves: no contact that it is the vertex of is one."""
+        for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
+            self.manifold.field[e] = ti.Vector([-1, 0, 0, 0], self.real)
+
+    @ti.func
+    def held_by(self, j):
+        """Who moves where an edge from j, or disc j, does: j, or where that cannot move the other end."""
+        out = j
+        if not self.w.positive(j) and self.after(j) >= 0:
+            out = self.after(j)
+        return out
+
+    @ti.func
+    def stays(self, i, e):
+        """Whether the contact of vertex i at entry e of its list is as it was: i cannot move, and the other one sleeps."""
+        return not self.w.positive(i) and not self.state.awake(self.held_by(self.grid.neighbour[e]))
 
     @ti.func
     def worst_overlap(self, i):
