@@ -399,7 +399,7 @@ class PolygonGeometry:
         return self.allowed[i] > 0
 
     @ti.func
-    def part(self, i):
+    def forget(self, i):
         """Particle i sleeps, and nothing is near that moves: no contact that it is the vertex of is one."""
         for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
             self.manifold.field[e] = ti.Vector([-1, 0, 0, 0], self.real)
@@ -415,7 +415,10 @@ class PolygonGeometry:
     @ti.func
     def stays(self, i, e):
         """Whether the contact of vertex i at entry e of its list is as it was: i cannot move, and the other one sleeps."""
-        return not self.w.positive(i) and not self.state.awake(self.held_by(self.grid.neighbour[e]))
+        out = False
+        if ti.static(bool(self.state.sleepers)):
+            out = not self.w.positive(i) and not self.state.awake(self.held_by(self.grid.neighbour[e]))
+        return out
 
     @ti.func
     def worst_overlap(self, i):

@@ -134,12 +134,14 @@ class Polygons(PairContact):
                         if ti.static(self.dev.has_restitution):
                             self.dev.restitution.aim.field[e] = 0 * self.dev.restitution.aim.field[e]
             self.note_motion(0, self.dev.geometry.too_long(i))
-        if self.dev.state.awake(i) or self.is_near(i):
+        if ti.static(not self.dev.state.sleepers):
+            self.dev.active[i] = self.dev.geometry.detect(i, True)
+        elif self.dev.state.awake(i) or self.is_near(i):
             active = self.dev.geometry.detect(i, True)
             if self.dev.state.awake(i):
                 self.dev.active[i] = active
         else:
-            self.dev.geometry.part(i)
+            self.dev.geometry.forget(i)
 
     @ti.func
     def is_near(self, i):
