@@ -518,7 +518,7 @@ def structures(draw) -> Structure:
             calls.append(call)
     if pick(draw, False, False, False, False, False, True):
         calls.append(boxes(draw, stage, float(np.max(args.get("radius", 0.0)))))
-    wide = any(call.name in ("Polygons", "PairForce") for call in calls)
+    wide = any(call.name == "PairForce" for call in calls)
     if order == 2 and not wide and pick(draw, False, False, False, False, False, True):
         calls.append(Call("Sleep", {"speed": size * pick(draw, 0.1, 1e-3, 3.0), "time": pick(draw, 1e-6, 0.02, 0.5)}))
     settings: dict[str, Any] = {"precision": precision}

@@ -160,8 +160,9 @@ class ShapeMatch(Batch):
         self.dev.pull = add(f"{name}.multiplier", self.corner_count, width=dim, state=True)
         self.dev.strength = Strength(scene, name, self)
         self.dev.turn = add(f"{name}.turn", m, width=len(turn), kind=ti.f64, values=[turn] * m, state=True)
-        self.dev.pose = add(f"{name}.pose", m, width=dim * dim, kind=ti.f64)
-        self.dev.place = add(f"{name}.place", m, width=dim, kind=ti.f64)
+        told = bool(scene.state.sleepers)  # what the report of a cluster that sleeps goes by, in a clone too
+        self.dev.pose = add(f"{name}.pose", m, width=dim * dim, kind=ti.f64, state=told)
+        self.dev.place = add(f"{name}.place", m, width=dim, kind=ti.f64, state=told)
 
         def moment(what, width):
             """A field with a row for each block, to be summed up."""
@@ -174,9 +175,9 @@ class ShapeMatch(Batch):
         self.dev.spring = Spring(scene, name, compliance, damping, np.zeros((self.corner_count, dim)))
         if self.dev.spring.soft:
             self.dev.v, self.dev.U = moment("v", dim), moment("U", dim * dim)
-            self.dev.fit = add(f"{name}.fit", m, width=dim * dim, kind=ti.f64)
+            self.dev.fit = add(f"{name}.fit", m, width=dim * dim, kind=ti.f64, state=told)
             self.dev.middle = add(f"{name}.middle", m, width=dim, kind=ti.f64)
-            self.dev.mean = add(f"{name}.mean", m, width=dim, kind=ti.f64)
+            self.dev.mean = add(f"{name}.mean", m, width=dim, kind=ti.f64, state=told)
         if self.dev.plastic:
             self.dev.creep = add(f"{name}.creep", m, values=self.creep)
             self.dev.yield_size = add(f"{name}.yield", m, values=self.yield_strain * self._radius)

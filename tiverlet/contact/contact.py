@@ -187,6 +187,29 @@ class Contact(PairContact):
         return dev.grid
 
     @ti.func
+    def presses(self, i, e):
+        """Whether particle i presses on the one at entry e of its list, which does on it."""
+        return self.dev.push.field[e] > 0 or self.dev.geometry.push_each_other(i, self.dev.grid.neighbour[e])
+
+    @ti.func
+    def held_by(self, j):
+        """Which particle it is that another one presses on by particle j."""
+        return j
+
+    @ti.func
+    def reached(self, i, e):
+        """The particle at entry e of the list of particle i where it sleeps and i touches it; if i is driven, also where i did as
+        the substep began."""
+        j, out = self.dev.grid.neighbour[e], -1
+        if not self.dev.state.awake(j):
+            met = self.dev.geometry.push_each_other(i, j)
+            if not self.dev.w.positive(i):
+                r, distance = self.dev.state.apart(i, j) - self.dev.state.d[i], self.dev.geometry.contact_distance(i, j)
+                met = met or r.dot(r) < distance * distance
+            out = ti.select(met, j, -1)
+        return out
+
+    @ti.func
     def count(self, begin, end, now):
         """Which pairs of some particles touch, and how often their masses are split."""
         self.dev.splitting.count(begin, end, now)

@@ -9,6 +9,7 @@ from ..features.feature import Scene
 from ..features.material import TOUCHES
 from ..neighbours.neighbour_list import PairData
 from ..neighbours.queries import Contacts, between
+from .candidates import DiscCandidates
 
 if TYPE_CHECKING:
     from ..neighbours.neighbour_search import NeighbourSearch
@@ -180,6 +181,20 @@ class DiscGeometry:
             self.shrunk[i] = ti.max(self.shrunk[i] - self.push_out * h / 2, 0)
 
     @ti.func
+    def is_eased(self, i):
+        """Whether particle i is smaller than it is."""
+        out = False
+        if ti.static(self.shrinks):
+            out = self.shrunk[i] > 0
+        return out
+
+    @ti.func
+    def push_each_other(self, i, j):
+        """Whether particles i and j overlap and push each other."""
+        r, distance = self.state.apart(i, j), self.contact_distance(i, j)
+        return r.dot(r) < distance * distance and self.pushes(i, j) != 0
+
+    @ti.func
     def worst_overlap(self, i):
         """For the report: contacts of particle i with later ones, and the worst overlap in radii of the smaller."""
         touching, worst = 0, ti.cast(0, ti.f64)
@@ -198,6 +213,16 @@ class DiscGeometry:
                 worst = ti.max(worst, overlap / small)
                 touching += 1
         return touching, worst
+
+    def candidates(self, x: np.ndarray) -> DiscCandidates:
+        """What may touch around positions x (n, dim) [m], for the host: the listed pairs."""
+        particles, (pairs, _) = self.scene.particles, self.grid.entries()
+        some = (pairs[:, 0] < pairs[:, 1]) | (self.scene.inv_mass[pairs[:, 1]] == 0)
+        who = pairs[some & self.grid.table.pushing(particles.group, pairs)]
+        radius = particles.radius.copy()
+        if self.store:
+            radius -= self.store.read(self.shrunk)[: len(radius)]
+        return DiscCandidates(who, radius[who].sum(axis=1), self.scene.periodic)
 
     def found(self, x: np.ndarray, h: float) -> Contacts:
         """The pairs that touch, of particles at x (n, dim) [m], for world.contacts."""

@@ -1,6 +1,7 @@
 """What all contact features have in common: their settings, and what a step asks of them."""
 
 import warnings
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,6 +16,7 @@ from ..neighbours.neighbour_list import MOVED
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..neighbours.queries import Contacts
 from ..particles import Particles
+from .candidates import Candidates
 
 
 class Geometry(Protocol):
@@ -39,8 +41,15 @@ class Geometry(Protocol):
     def restore(self, i, h) -> None:
         """Allow less overlap, at push_out."""
 
+    def is_eased(self, i) -> Any:
+        """Whether particle i is allowed to overlap."""
+
     def worst_overlap(self, i) -> Any:
         """For the report: contacts that particle i counts, and the worst overlap, relative to its size."""
+
+    def candidates(self, x: np.ndarray) -> Candidates:
+        """What may touch around positions x (n, dim) [m], which were diagnosed, for the host to move apart."""
+        ...
 
     def found(self, x: np.ndarray, h: float) -> Contacts:
         """The contacts of particles at x (n, dim) [m] after a substep h [s], for world.contacts."""
@@ -50,10 +59,14 @@ class Geometry(Protocol):
 class PairContact(Feature):
     """Particles that do not overlap. A world has at most one.
 
+    bodies: of particles, that sleep and wake as one.
+
     A subclass gives prepare() and join(), which makes `dev.geometry` and `dev.forces`, and for a pass of a substep, in this
     order: detect(i, first), where it `detects`; count(begin, end) and busy(begin), by blocks of particles; relax(i, now);
     choose_impact(i) and apply_impact(i), in rounds while `dev.hit` is set, where any pair has restitution;
-    apply_corrections(i, first); and at the end of a substep finish_substep(i).
+    apply_corrections(i, first); and at the end of a substep finish_substep(i). For what sleeps: presses(i, e), whether there is a
+    contact at entry e of the list of particle i, with held_by(j) of the other one; and reached(i, e), whom of those that sleep
+    particle i, which is awake, touches there, -1 for none.
     """
 
     friction = Knob(lambda f, v: f._surface("friction", v), "Of all pairs, or by pairs of groups.")
@@ -63,6 +76,7 @@ class PairContact(Feature):
     compiled_for = ("has_friction", "has_restitution", "turns", "uniform")
     _finest = _listed = 0.0  # the smallest radius, and how far beyond touching pairs are listed now [m]
     table: Table  # bound to one world
+    bodies: Sequence[np.ndarray] = ()
     matters = True
     bulk = 3.0
     room = 0  # entries of the list for each particle, at first, if that is more than discs have

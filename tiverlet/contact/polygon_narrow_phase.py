@@ -11,6 +11,7 @@ from ..features.material import Table
 from ..neighbours.neighbour_list import PairData
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..neighbours.queries import Contacts
+from .candidates import EdgeCandidates
 from .narrow_phase import DiscGeometry
 
 SLACK = 1 / 512  # of an edge: as much further it goes at its ends, so that bodies of the same width stand on each other
@@ -61,7 +62,7 @@ class PolygonGeometry:
         self.step = float(outline.length[outline.body >= 0].min(initial=np.inf)) / 4
         self.allowed = add("Polygons.allowed", n, state=True)  # overlap [m]
         self.in_state = {"allowed": self.allowed}
-        self.h = add("Polygons.substep", None)
+        self.h = add("Polygons.substep", None, state=bool(scene.state.sleepers))  # the first particle may sleep, and not tell
         # For each entry the contact of which its particle is the vertex: overlap, place on the edge (DISCS: there is none) and
         # normal; where in the list of the other one those are in which it is the start, and the end, of the edge (-1: nowhere).
         self.manifold, self.back = PairData("met", 4, False, kept=False), PairData("back", 2, False, kept=False)
@@ -393,6 +394,33 @@ class PolygonGeometry:
         self.allowed[i] = ti.max(self.allowed[i] - self.push_out * h, 0)
 
     @ti.func
+    def is_eased(self, i):
+        """Whether particle i is allowed to overlap."""
+        return self.allowed[i] > 0
+
+    @ti.func
+    def forget(self, i):
+        """Particle i sleeps, and nothing is near that moves: no contact that it is the vertex of is one."""
+        for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
+            self.manifold.field[e] = ti.Vector([-1, 0, 0, 0], self.real)
+
+    @ti.func
+    def held_by(self, j):
+        """Who moves where an edge from j, or disc j, does: j, or where that cannot move the other end."""
+        out = j
+        if not self.w.positive(j) and self.after(j) >= 0:
+            out = self.after(j)
+        return out
+
+    @ti.func
+    def stays(self, i, e):
+        """Whether the contact of vertex i at entry e of its list is as it was: i cannot move, and the other one sleeps."""
+        out = False
+        if ti.static(bool(self.state.sleepers)):
+            out = not self.w.positive(i) and not self.state.awake(self.held_by(self.grid.neighbour[e]))
+        return out
+
+    @ti.func
     def worst_overlap(self, i):
         """For the report: contacts that particle i is the vertex of, or the first disc, and the worst overlap.
 
@@ -411,6 +439,17 @@ class PolygonGeometry:
                 worst = ti.max(worst, found[0] / size)
                 touching += 1
         return touching, worst
+
+    def candidates(self, x: np.ndarray) -> EdgeCandidates:
+        """What may touch around positions x (n, 2) [m], for the host: what is listed, and was looked for there."""
+        pairs, at = self.grid.entries()
+        lone, allowed = self.outline.ends[:, 0] < 0, self.scene.memory.read(self.allowed)
+        both = lone[pairs].all(axis=1)
+        who = np.where(both, pairs.min(axis=1), pairs[:, 0])
+        found, pushed = self.grid.read(self.manifold, at), self.grid.read(self.impulse, at) > 0
+        ends, body, _ = self.outline
+        radius, allowed = self.scene.particles.radius, allowed.astype(np.float64)[who]
+        return EdgeCandidates(x, pairs, found, DISCS, pushed, ends, body, radius, allowed)
 
     def found(self, x: np.ndarray, h: float) -> Contacts:
         """Vertices and edges, and pairs of discs, by what detect() found last; also those that were pushed apart since."""

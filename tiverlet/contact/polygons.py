@@ -118,22 +118,73 @@ class Polygons(PairContact):
         dev.geometry.bind(dev.grid)
         return dev.grid
 
+    @property
+    def bodies(self) -> list[np.ndarray]:  # type: ignore[override]
+        """The loops."""
+        return self.loops
+
     @ti.func
     def detect(self, i, first):
         """Find the contacts of particle i, and note an edge that is too long for the list."""
-        if first != 0:
-            for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
-                self.dev.geometry.impulse.field[e] = 0
-                if ti.static(self.dev.has_restitution):
-                    self.dev.restitution.aim.field[e] = 0 * self.dev.restitution.aim.field[e]
-        self.dev.active[i] = self.dev.geometry.detect(i, True)
-        self.note_motion(0, self.dev.geometry.too_long(i))
+        if self.dev.state.awake(i):
+            if first != 0:
+                for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
+                    if not self.dev.geometry.stays(i, e):
+                        self.dev.geometry.impulse.field[e] = 0
+                        if ti.static(self.dev.has_restitution):
+                            self.dev.restitution.aim.field[e] = 0 * self.dev.restitution.aim.field[e]
+            self.note_motion(0, self.dev.geometry.too_long(i))
+        if ti.static(not self.dev.state.sleepers):
+            self.dev.active[i] = self.dev.geometry.detect(i, True)
+        elif self.dev.state.awake(i) or self.is_near(i):
+            active = self.dev.geometry.detect(i, True)
+            if self.dev.state.awake(i):
+                self.dev.active[i] = active
+        else:
+            self.dev.geometry.forget(i)
+
+    @ti.func
+    def is_near(self, i):
+        """Whether anything on the list of particle i moves."""
+        out = False
+        for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
+            j = self.dev.grid.neighbour[e]
+            d = self.dev.state.d[j]
+            if self.dev.state.awake(j) and (self.dev.w.positive(j) or d.dot(d) > 0):
+                out = True
+        return out
+
+    @ti.func
+    def presses(self, i, e):
+        """Whether particle i presses, as a vertex, on what is at entry e of its list, as it was found last."""
+        return self.dev.geometry.impulse.field[e] > 0 or self.dev.geometry.manifold.field[e][0] > 0
+
+    @ti.func
+    def held_by(self, j):
+        """Which particle it is that a vertex presses on by particle j."""
+        return self.dev.geometry.held_by(j)
+
+    @ti.func
+    def reached(self, i, e):
+        """Who sleeps at entry e of the list of particle i and is touched by it, as was found last; if it is driven, also who was
+        in the substep before."""
+        j, out = self.dev.grid.neighbour[e], -1
+        for role in range(self.dev.geometry.roles(i)):
+            at, v, a, b, t, part = self.dev.geometry.participants(i, e, role)
+            if at >= 0:
+                other = j if role != VERTEX else self.dev.geometry.held_by(j)
+                met = self.dev.geometry.manifold.field[at][0] > 0
+                if not self.dev.w.positive(i):
+                    met = met or self.dev.geometry.impulse.field[at] > 0
+                if met and not self.dev.state.awake(other):
+                    out = other
+        return out
 
     @ti.func
     def count(self, begin, end, now):
         """How many contacts some particles are in. What is in no loop knows them from detect()."""
         for i in range(begin, end):
-            if self.dev.geometry.after(i) >= 0:
+            if self.dev.geometry.after(i) >= 0 and self.dev.state.awake(i):
                 active = 0
                 for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
                     for role in range(3):
@@ -170,7 +221,8 @@ class Polygons(PairContact):
                                     if role == VERTEX:
                                         self.dev.restitution.aim.field[e] = aim * n
                         if role == VERTEX:
-                            self.dev.geometry.impulse.field[e] = self.dev.geometry.impulse.field[e] + back / shared
+                            if not self.dev.geometry.stays(i, e):
+                                self.dev.geometry.impulse.field[e] = self.dev.geometry.impulse.field[e] + back / shared
                         want = back * n
                         if ti.static(self.dev.has_friction):
                             want -= self.dev.friction.held(v, a, n, overlap + missing, self.dev.slip.field[at] + d)
@@ -190,7 +242,7 @@ class Polygons(PairContact):
     @ti.func
     def apply_corrections(self, i, first):
         """Move particle i as its contacts want; what bounced goes where it is at the end of the substep."""
-        if self.dev.w.of(i) > 0:
+        if self.dev.state.moves(i):
             if self.dev.active[i] > 0:
                 self.dev.state.shift(i, self.dev.move[i])
             if ti.static(self.dev.has_restitution):

@@ -392,8 +392,10 @@ class Batch(Feature):
     def awake(self, c):
         """Whether constraint c has a particle that is awake, or one that cannot move alone."""
         state = self.dev.state
-        if not state.sleepers or not self.arity or self.drives:
+        if not state.sleepers or self.drives:
             return ti.cast(1, ti.i32) > 0
+        if not self.arity:
+            return at(state.sleepers.asleep, at(self.dev.corners.mover, c)) == 0
         asleep = at(state.sleepers.asleep, self.member(c, 0))
         for k in range(1, self.arity):
             asleep = ti.max(asleep, at(state.sleepers.asleep, self.member(c, k)))

@@ -40,6 +40,8 @@ class ConjugateGradient(Solver):
     with W_j the diagonal of A = G w G^T and lambda_max the largest eigenvalue of W^-1 A: the condition number is then at most
     steps^2 + 1, for which so many steps suffice, and a link gives way as one of compliance sigma W h^2 would. The floor stays
     until particles are placed anew, and grows where it is still too low, or where the tension is near what the substep can stand.
+    Where rigid constraints contradict each other as particles are placed, the right side has a part in the null space of A, to
+    which steps give any multiplier: sigma = 1 from the first substep on bounds it by what a Jacobi pass gives.
 
     steps: of conjugate gradients in an iteration. Ropes, spacers and what is not one number are relaxed as by Jacobi beside it.
     """
@@ -107,9 +109,9 @@ class CGSystem(System):
         """A real number for each row."""
         return self.memory.field(f"system.{name}", self.rows)
 
-    def forget(self) -> None:
-        """Steps may converge from the new places."""
-        self.memory.write(self.floor, 0.0)
+    def forget(self, contradicts: bool = False) -> None:
+        """Steps may converge from the new places, but not where constraints contradict each other there."""
+        self.memory.write(self.floor, HIGHEST if contradicts else 0.0)
 
     @ti.func
     def set_row(self, r, violation, A, alpha, lam, W, geometric_stiffness):

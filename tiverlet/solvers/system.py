@@ -90,8 +90,9 @@ class System:
         """The number of constraints that are relaxed by themselves, of those with a particle that can move."""
         return sum(int((~b.idle(self.inv_mass) & (self.row(b) < 0)).sum()) for b in batches)
 
-    def forget(self) -> None:
-        """Particles were placed anew: what was found out on the way to where they were says nothing."""
+    def forget(self, contradicts: bool = False) -> None:
+        """Particles were placed anew: what was found out on the way to where they were says nothing. contradicts: whether there
+        are rigid constraints that cannot be met there."""
 
     @ti.func
     def set_row(self, r, violation, A, alpha, lam, W, geometric_stiffness):

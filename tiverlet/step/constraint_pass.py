@@ -26,7 +26,11 @@ class ConstraintPass:
         """The sums of constraints on many particles, by blocks. some: for which; those of the residual, or all."""
         for f in ti.static([f for f in self.ragged if f.reweighs or some]):
             for b in range(self.team.chunk_begin(f.blocks, thread), self.team.chunk_end(f.blocks, thread)):
-                f.reduce_block(b, h, h2_effective, first, fresh)
+                if ti.static(bool(f.dev.state.sleepers) and some):
+                    if f.awake(f.dev.corners.block[b][2]):
+                        f.reduce_block(b, h, h2_effective, first, fresh)
+                else:
+                    f.reduce_block(b, h, h2_effective, first, fresh)
             self.team.wait()
 
     @ti.func
@@ -34,7 +38,8 @@ class ConstraintPass:
         """The moves of constraints on many particles."""
         for f in ti.static(self.ragged):
             for e in range(self.team.chunk_begin(f.corner_count, thread), self.team.chunk_end(f.corner_count, thread)):
-                f.scatter_corner(e, h, h2_effective, first, fresh)
+                if f.awake(f.dev.corners.owner[e]):
+                    f.scatter_corner(e, h, h2_effective, first, fresh)
             self.team.wait()
 
     @ti.func

@@ -30,7 +30,7 @@ class ContactPass:
     def solve(self, now):
         """Which contacts there are, and what they want of their particles."""
         for c in ti.static(self.contacts):
-            if ti.static(c.detects):
+            if ti.static(c.detects and not c.dev.state.sleepers):  # else it has looked for those that sleep, see Step
                 for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
                     c.detect(i, now.first)
                 self.team.wait()

@@ -51,6 +51,15 @@ def forget(scene: Scene, batches: list[Batch], x: np.ndarray) -> None:
             scene.memory.write(b.dev.lam, lam)
 
 
+def left(batches: list[Batch], x: np.ndarray) -> float:
+    """By how much rigid constraints that act both ways are off at x, (n, dim): the worst, as a share of its size, above SEEN;
+    else 0. Where remove() leaves that, they contradict each other."""
+    some = [b for b in _rigid(batches) if b.side == 0]
+    off = [np.abs(b.violation(x) * b.inverse_size(x) * (b.compliance == 0) * ~b.broken).max() for b in some]
+    worst = float(max(off, default=0.0))
+    return worst if worst > SEEN else 0.0
+
+
 def first_off(features: list[Feature], x: np.ndarray) -> int | None:
     """The first particle of rigid constraints that are off by more than SEEN at x, (n, dim); None where none is."""
     out = []

@@ -1,5 +1,7 @@
 """Gradients of constraints by their corners: the least moves along them, in the metric of the masses, and the bodies they tie."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from ..solvers.elimination import components
@@ -12,11 +14,15 @@ DONE = 1e-12  # of r . z at the start of conjugate gradients: what is left
 class Jacobian:
     """J of m constraints between n particles.
 
-    Corner k belongs to row[k] and is particle who[k], with the gradient J[k], (corners, dim). w: inverse masses, (n,).
+    Corner k belongs to row[k] and is particle who[k], with the gradient J[k], (corners, dim). w: inverse masses, (n,). whole:
+    makes moves of particles, (n, dim), moves of the bodies that they are in, see Solids; None where each moves alone.
     """
 
-    def __init__(self, m: int, row: np.ndarray, who: np.ndarray, w: np.ndarray, J: np.ndarray):
-        self.m, self.row, self.who, self.w, self.J = m, row, who, w, J
+    def __init__(
+        self, m: int, row: np.ndarray, who: np.ndarray, w: np.ndarray, J: np.ndarray,
+        whole: Callable[[np.ndarray], np.ndarray] | None = None,
+    ):  # fmt: skip
+        self.m, self.row, self.who, self.w, self.J, self.whole = m, row, who, w, J, whole
         self.diagonal = np.bincount(row, w[who] * (J**2).sum(axis=1), minlength=m)  # of J w J^T
 
     def rates(self, v: np.ndarray) -> np.ndarray:
@@ -28,17 +34,21 @@ class Jacobian:
         return np.stack([np.bincount(self.who, column, minlength=len(self.w)) for column in values.T], axis=1)
 
     def moves(self, lam: np.ndarray) -> np.ndarray:
-        """w J^T lam."""
-        return self.w[:, None] * self.gathered(self.J * lam[self.row][:, None])
+        """w J^T lam, of whole bodies."""
+        moves = self.w[:, None] * self.gathered(self.J * lam[self.row][:, None])
+        return self.whole(moves) if self.whole else moves
 
     def solve(
         self, right: np.ndarray, some: np.ndarray | float = 1.0, enough: float = DONE, steps: int = STEPS, soft: float = SOFT
     ) -> np.ndarray:  # fmt: skip
-        """w J^T lam with (J w J^T + mu) lam = right, for some rows; conjugate gradients, preconditioned by the diagonal."""
+        """w J^T lam with (J w J^T + mu) lam = right, for some rows."""
+        return self.moves(self.multipliers(right, some, enough, steps, soft))
+
+    def multipliers(self, right: np.ndarray, some: np.ndarray | float, enough: float, steps: int, soft: float) -> np.ndarray:
+        """lam, by conjugate gradients, preconditioned by the diagonal."""
         mu = soft * self.diagonal
         scale = np.divide(1, self.diagonal + mu, out=np.zeros_like(mu), where=self.diagonal > 0)
-        lam = conjugate_gradients(lambda p: some * self.rates(self.moves(p)) + mu * p, lambda r: scale * r, right, enough, steps)
-        return self.moves(lam)
+        return conjugate_gradients(lambda p: some * self.rates(self.moves(p)) + mu * p, lambda r: scale * r, right, enough, steps)
 
 
 def bodies_of(m: int, row: np.ndarray, who: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

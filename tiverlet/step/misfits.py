@@ -67,8 +67,6 @@ def _refuse_torn(box: Periodic, batch: Batch) -> None:
 def refuse_restless(features: tuple[Feature, ...], order: int) -> None:
     """Raise ValueError for what Sleep does not know of."""
     for f in features:
-        if isinstance(f, Polygons):
-            raise ValueError("Sleep: it does not know when Polygons touch. Use Contact, for bodies made of discs.")
         if isinstance(f, Acceleration) and f.pairwise:
             raise ValueError(f"Sleep: {f!r} reaches through space, from one island to the next. Leave one of both out.")
         if getattr(f, "shear", 0.0):

@@ -6,9 +6,11 @@ the overlap (h' / h)^2 C, by the least moves in the metric of the masses, and ve
 
     x += w J^T lam,  (J w J^T + mu D) lam = C - (h' / h)^2 C_0,  D the diagonal of J w J^T
 
-for discs or spheres that overlap; those that the moves push into each other part again, C_0 = 0. What a wall has stopped does
-not move into it again, and rigid constraints keep what they measure. mu falls while that helps and rises where it does not
-(Levenberg and Marquardt). Motion pays for what is lifted, as in projection.py.
+for what overlaps, whatever its geometry (Candidates); what the moves push into each other parts again, C_0 = 0. Constraints go
+to where the same loads need them, as in projection.py: that alone would push bodies into each other again. Clusters move as a
+whole, and out of the shape that contacts and walls have left them in (Solids). Nothing moves into walls that stopped it, and
+these only push. mu falls while what is stored does, the sum of C^2 / D, and rises where it does not (Levenberg and Marquardt).
+Motion pays for what is lifted, as in projection.py.
 """
 
 from typing import Any
@@ -16,14 +18,16 @@ from typing import Any
 import numpy as np
 
 from ..constraints.core.scalar import Scalar
-from ..neighbours.queries import between
+from ..contact.candidates import Candidates, DiscCandidates
 from .jacobian import Jacobian
 from .projection import LARGEST, Rows, matters, paid, seen, seen_before, sizes
 from .rigid_rows import rigid_rows
+from .solids import Solids
 
 SOFT, SOFTEST = 1e-2, 1e-5  # mu of the first round, and the least
 STEPS, ENOUGH = 32, 1e-6  # of conjugate gradients, at most; what of r . z they leave
 ROUNDS = 16  # of them, each with what particles were pushed into in the one before
+TURNS = 8  # at most, until nothing pulls that cannot
 LEFT = 0.01  # of what overlaps store: what may be left of it in the shorter substep
 
 
@@ -32,16 +36,22 @@ def release(runner: Any, h: float, longest: float) -> bool:
 
     h: the coming substep [s]; longest: since this was done last. Returns whether overlaps have been looked after.
     """
-    state, memory, ratio = runner.scene.state, runner.memory, h / longest
-    x = state.get(memory)
-    contact = next((c for c in runner.step.contacts if not c.detects), None)  # of discs or spheres
-    if contact is None or not np.isfinite(x).all():
+    state, memory, step, ratio = runner.scene.state, runner.memory, runner.step, h / longest
+    x, contact = state.get(memory), next(iter(step.contacts), None)
+    if not (contact or step.walls) or not np.isfinite(x).all():
+        return False
+    solids = Solids(runner, x, ratio)
+    if not (contact or solids.count):
         return False
     energy, overlap = seen_before(runner)
-    if not matters(overlap, ratio):
+    if not matters(max(overlap, solids.worst), ratio):
         return False
-    runner.list_neighbours()  # so that it does not matter when it was listed last
-    jacobian = part(runner, Pairs(runner, contact, x), x, ratio)
+    pairs: Candidates = DiscCandidates(np.zeros((0, 2), dtype=np.int64), np.zeros(0), None)
+    if contact:
+        runner.invalidate()  # so that it does not matter when they were listed last
+        runner.look()
+        pairs = contact.dev.geometry.candidates(x)
+    jacobian = part(runner, pairs, solids, x, ratio)
     more = seen(runner)[0]
     if jacobian and more > energy:
         d = memory.read(state.d)
@@ -51,61 +61,73 @@ def release(runner: Any, h: float, longest: float) -> bool:
     return True
 
 
-def part(runner: Any, pairs: "Pairs", x: np.ndarray, ratio: float) -> Jacobian | None:
-    """Move particles from x, (n, dim), until their overlaps are ratio^2 of what they are, or as near to that as they get; returns
-    the rows of the last round."""
+def part(runner: Any, pairs: Candidates, solids: Solids, x: np.ndarray, ratio: float) -> Jacobian | None:
+    """Move particles from x, (n, dim), until what they store is about ratio^4 of it, or as near to that as they get; returns the
+    rows of the last round."""
     state, memory, w, jacobian = runner.scene.state, runner.memory, runner.scene.inv_mass, None
-    overlap = np.maximum(pairs.overlaps(x)[0], 0.0)
-    goal, active = ratio**2 * overlap, overlap > 0
-    best, soft, tied, walls = x, SOFT, rigid(runner, x), Walls(x)
-    least = first = stored_by(overlap - goal)
+    overlap = pairs.at(x)[0]
+    known = active = overlap > 0
+    goal = ratio**2 * np.maximum(overlap, 0.0)
+    soft, tied, walls = SOFT, bound(runner, x, ratio), Walls(x)
+
+    def seen_at(x: np.ndarray) -> tuple[float, np.ndarray, Rows | None]:
+        """What is stored there, how much deeper contacts are than they are to be, and the rows of constraints."""
+        overlap, gradient = pairs.at(x)
+        rows = tied.at(x) if tied else None
+        stored = stored_by(overlap - goal, gradient, w[pairs.who]) + solids.off(x)
+        return stored + (rows.stored if rows else 0.0), overlap - goal, rows
+
+    first = seen_at(x)[0]
+    best = moved(runner, x, solids.fitted(x))[1] if solids.count else x
+    least = seen_at(best)[0]
     for _ in range(ROUNDS):
         if least <= LEFT * ratio**2 * first:
             break
-        overlap, normal = pairs.overlaps(best)
+        begin = solids.fitted(best)
+        gradient, (_, more, rows) = pairs.at(begin)[1], seen_at(begin)
         some = np.flatnonzero(active)
         m, k = len(some), len(walls.who)
-        row, who = [np.arange(m), np.arange(m), m + np.arange(k)], [*pairs.who[some].T, walls.who]
-        J, right = [normal[some], -normal[some], walls.normal], [(overlap - goal)[some], np.zeros(k)]
-        if tied:
-            now = tied.at(best)
-            row, who, J, right = [*row, m + k + now.row], [*who, now.who], [*J, now.J], [*right, tied.C - now.C]
+        row, who = [np.tile(np.arange(m), pairs.who.shape[1]), m + np.arange(k)], [*pairs.who[some].T, walls.who]
+        J, right = [*gradient[some].transpose(1, 0, 2), walls.normal], [more[some], walls.along(best - begin)]
+        if rows:
+            row, who, J, right = [*row, m + k + rows.row], [*who, rows.who], [*J, rows.J], [*right, -rows.C]
+        if solids.count:  # a row of nothing for each, which tells what hangs together
+            row, who = [*row, sum(map(len, right)) + solids.owner], [*who, solids.who]
+            J, right = [*J, np.zeros((len(solids.who), x.shape[1]))], [*right, np.zeros(solids.count)]
         wanted = np.concatenate(right)
-        jacobian = Jacobian(len(wanted), np.concatenate(row), np.concatenate(who), w, np.concatenate(J))
-        state.put(memory, best + jacobian.solve(wanted, enough=ENOUGH, steps=STEPS, soft=soft))
-        sent = state.get(memory)
-        runner.stop_at_walls(best)
-        new = state.get(memory)
+        jacobian = Jacobian(len(wanted), np.concatenate(row), np.concatenate(who), w, np.concatenate(J), solids.whole(begin))
+        one_way = np.arange(len(wanted)) < m + k
+        one_way[:m] = ~known[some]
+        sent, new = moved(runner, best, solids.fitted(begin + one_sided(jacobian, wanted, one_way, soft)))
         walls.push(new - sent)
-        more = pairs.overlaps(new)[0] - goal
-        active = active | (more > 0)
-        stored = stored_by(more)
+        stored, more, _ = seen_at(new)
         if stored < least:
-            best, least, soft = new, stored, max(soft / 4, SOFTEST)
+            best, least, soft, active = new, stored, max(soft / 4, SOFTEST), known | (more > 0)
         else:
-            soft *= 10
+            soft, active = 10 * soft, active | (more > 0)
     state.put(memory, best)
     return jacobian
 
 
-class Pairs:
-    """Those of the neighbour list that push each other, who (m, 2), at positions x (n, dim) [m]."""
+def moved(runner: Any, before: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Put particles to x, where they come from `before`: where they are then, and where walls stop them."""
+    state, memory = runner.scene.state, runner.memory
+    state.put(memory, x)
+    sent = state.get(memory)
+    runner.stop_at_walls(before)
+    return sent, state.get(memory)
 
-    def __init__(self, runner: Any, contact: Any, x: np.ndarray):
-        grid, particles, self.box = runner.grid, runner.scene.particles, runner.scene.periodic
-        pairs, _ = grid.entries()
-        some = (pairs[:, 0] < pairs[:, 1]) | (runner.scene.inv_mass[pairs[:, 1]] == 0)
-        self.who = pairs[some & grid.table.pushing(particles.group, pairs)]
-        radius = particles.radius.copy()
-        if contact.shrinks:
-            radius -= contact.store.read(contact.dev.geometry.shrunk)[: len(x)]
-        self.reach = radius[self.who].sum(axis=1)
 
-    def overlaps(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How deep they overlap [m], negative where apart, and their normals, at positions x."""
-        r = between(x[self.who[:, 0]], x[self.who[:, 1]], self.box)
-        length = np.linalg.norm(r, axis=1)
-        return self.reach - length, np.divide(r, length[:, None], out=np.zeros_like(r), where=length[:, None] > 0)
+def one_sided(jacobian: Jacobian, right: np.ndarray, one_way: np.ndarray, soft: float) -> np.ndarray:
+    """The least moves, of which none is made by a row that goes one way and pulls."""
+    some = np.ones(len(right))
+    for _ in range(TURNS):
+        lam = jacobian.multipliers(right * some, some, ENOUGH, STEPS, soft)
+        pulls = one_way & (lam < 0)
+        if not pulls.any():
+            break
+        some[pulls] = 0.0
+    return jacobian.moves(lam)
 
 
 class Walls:
@@ -121,16 +143,25 @@ class Walls:
         self.who = np.concatenate([self.who, new])
         self.normal = np.concatenate([self.normal, way[new] / length[new, None]])
 
+    def along(self, way: np.ndarray) -> np.ndarray:
+        """How much of a way, (n, dim), is along the normals, (k,)."""
+        return (way[self.who] * self.normal).sum(axis=1)
 
-def rigid(runner: Any, x: np.ndarray) -> Rows | None:
-    """The rigid constraints of the world, and its rigid clusters, where there are any that are not too large."""
+
+def bound(runner: Any, x: np.ndarray, ratio: float) -> Rows | None:
+    """The constraints of the world that are not too large, and rigid clusters that share particles with others; C is measured
+    from what it is to be, as in projection.py."""
     w = runner.scene.inv_mass
-    scalars = [b for b in runner.batches if isinstance(b, Scalar) and b.count and not b.compliance.any()]
+    scalars = [b for b in runner.batches if isinstance(b, Scalar) and b.count]
     some = [b for b in scalars if sizes(b).max() <= LARGEST and (~b.idle(w) & ~b.broken).any()]
-    some += rigid_rows(runner.batches, w)
-    return Rows(some, w, x, runner.scene.periodic) if some else None
+    some += rigid_rows([b for b in runner.batches if b.clusters], w)
+    if not some:
+        return None
+    rows = Rows(some, w, x, runner.scene.periodic)
+    return rows.towards(rows.C - (1 - ratio**2) * rows.undone(runner))
 
 
-def stored_by(overlap: np.ndarray) -> float:
-    """What overlaps store, but for a factor."""
-    return float((np.maximum(overlap, 0.0) ** 2).sum())
+def stored_by(overlap: np.ndarray, gradient: np.ndarray, w: np.ndarray) -> float:
+    """What overlaps (m,) store, but for a factor; gradient: (m, k, dim), of particles with inverse masses w (m, k)."""
+    D = (w * (gradient**2).sum(axis=2)).sum(axis=1)
+    return float(np.divide(np.maximum(overlap, 0.0) ** 2, D, out=np.zeros_like(D), where=D > 0).sum())

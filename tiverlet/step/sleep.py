@@ -37,12 +37,12 @@ class Sleep(Feature):
     times time where it sleeps, for it would have crept by less.
 
     Decided by the state alone: on the same bits everywhere, in clones and replays too. What is pinned does not join two islands.
-    Never asleep are particles of ShapeMatch, of surfaces and loops, of motors and winches, and what is linked to what is driven.
+    Never asleep are particles of motors and winches, and what is linked to what is driven.
 
     StepReport.asleep says how many sleep. Where all do, a frame is not computed at all. (Box2D and others: sleeping islands.)
 
-    Raises ValueError beside Polygons, PairForce and a sheared Periodic box, which islands do not know of, in order above 2, and
-    in Worlds. A world has at most one.
+    Raises ValueError beside PairForce and a sheared Periodic box, which islands do not know of, in order above 2, and in Worlds.
+    A world has at most one.
     """
 
     speed = Knob(lambda f, v: checks.number("Sleep", "speed", v, above=0.0), "Below which a particle is slow [m/s].")
@@ -167,7 +167,7 @@ class SleepPass:
         self.contacts, self.forces = step.contacts, step.integrator.forces
         self.watches = any(not f.uniform for f in self.forces.all)
         memory, n = step.scene.memory, step.scene.particles.count
-        kept, pairs = linked(n, drivers, batches)
+        kept, pairs = linked(step.scene.inv_mass, drivers, batches, step.contacts)
         self.restless = memory.field("Sleep.restless", n, kind=ti.i32)  # by islands, while they are found
         self.kept_awake = memory.field("Sleep.kept_awake", n, kind=ti.i32, values=kept)
         self.links = memory.number(len(pairs))
@@ -236,8 +236,7 @@ class SleepPass:
         still, most = self.sleepers.still[i] + ti.cast(dt, self.real), self.sleepers.limits[None][0] * ti.cast(h, self.real)
         slow = way < most * most and self.kept_awake[i] == 0
         for c in ti.static(self.contacts):
-            if ti.static(c.shrinks):
-                slow = slow and c.dev.geometry.shrunk[i] == 0
+            slow = slow and not c.dev.geometry.is_eased(i)
         self.sleepers.still[i] = ti.select(slow, still, 0 * still)
 
     @ti.func
@@ -266,9 +265,9 @@ class SleepPass:
                 for i in range(self.n):
                     if self.drifts(i):
                         for e in range(c.dev.grid.first[i], c.dev.grid.first[i] + c.dev.grid.number[i]):
-                            j = c.dev.grid.neighbour[e]
-                            if j < i and self.drifts(j):
-                                if c.dev.push.field[e] > 0 or self.overlap(c, i, j):
+                            j = c.held_by(c.dev.grid.neighbour[e])
+                            if self.drifts(j) and self.sleepers.root(i) != self.sleepers.root(j):
+                                if c.presses(i, e):
                                     self.sleepers.join(i, j)
             for k in range(self.links):
                 i, j = self.pairs[k][0], self.pairs[k][1]
@@ -297,12 +296,6 @@ class SleepPass:
         return self.state.w.positive(i) and self.sleepers.awake(i)
 
     @ti.func
-    def overlap(self, contact: ti.template(), i, j):  # type: ignore[valid-type]
-        """Whether particles i and j push each other."""
-        r, distance = self.state.apart(i, j), contact.dev.geometry.contact_distance(i, j)
-        return r.dot(r) < distance * distance and contact.dev.geometry.pushes(i, j) != 0
-
-    @ti.func
     def note_blocks(self):
         """Of which blocks all sleep."""
         for b in range((self.n + (BLOCK - 1)) // BLOCK):
@@ -318,14 +311,9 @@ class SleepPass:
         for c in ti.static(self.contacts):
             if drifts or (self.sleepers.awake(i) and d.dot(d) > 0):
                 for e in range(c.dev.grid.first[i], c.dev.grid.first[i] + c.dev.grid.number[i]):
-                    j = c.dev.grid.neighbour[e]
-                    if not self.sleepers.awake(j):
-                        met = self.overlap(c, i, j)
-                        if not drifts:
-                            r, distance = self.state.apart(i, j) - d, c.dev.geometry.contact_distance(i, j)
-                            met = met or r.dot(r) < distance * distance
-                        if met:
-                            self.call(j)
+                    j = c.reached(i, e)
+                    if j >= 0:
+                        self.call(j)
 
     @ti.kernel
     def wake_called(
@@ -350,15 +338,20 @@ class SleepPass:
             self.note_blocks()
 
 
-def linked(n: int, drivers: list[Batch], batches: list[Batch]) -> tuple[np.ndarray, np.ndarray]:
-    """Which of n particles never sleep, a mask, because of constraints on them; and pairs of those that others hold together."""
-    driven, kept, pairs = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool), [np.zeros((0, 2), dtype=np.int64)]
+def linked(inv_mass: np.ndarray, drivers: list[Batch], batches: list[Batch], contacts: list) -> tuple[np.ndarray, np.ndarray]:
+    """Which particles never sleep, a mask, because of constraints on them; and pairs of those that constraints and bodies hold
+    together, of what can move."""
+    pairs, (driven, kept) = [np.zeros((0, 2), dtype=np.int64)], np.zeros((2, len(inv_mass)), dtype=bool)
     for b in drivers:
         driven[b.indices] = True
-    for b in batches:
-        if b.arity == 0 or b.clusters or b.blocks or b.driven:
-            kept[b.indices] = True
-        else:
-            kept[b.indices[driven[b.indices].any(axis=1)]] = True
-            pairs += [b.indices[:, k : k + 2] for k in range(b.arity - 1)]
-    return kept, np.concatenate(pairs)
+    rows = [(b.indices.ravel(), b.owner, b.driven) for b in batches]
+    for c in contacts:
+        sizes = [len(body) for body in c.bodies]
+        rows.append((np.concatenate([*c.bodies, pairs[0][:, 0]]), np.repeat(np.arange(len(sizes)), sizes), False))
+    for who, owner, restless in rows:
+        held = np.bincount(owner, driven[who], minlength=1)[owner] > 0
+        kept[who[held | restless]] = True
+        some = inv_mass[who] > 0
+        who, owner = who[some], owner[some]
+        pairs.append(np.stack([who[:-1], who[1:]], axis=1)[owner[:-1] == owner[1:]])
+    return kept, np.concatenate(pairs).astype(np.int64)

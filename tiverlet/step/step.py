@@ -107,6 +107,7 @@ class Step:
         self.hashes = bool(grid)
         self.sleepers = scene.state.sleepers
         self.looks = bool(grid) and bool(self.sleepers)  # for what touches those that sleep
+        self.detects = any(c.detects for c in self.contacts)
         apart = grid and grid.lone and not self.launched and not scene.memory.compiler.few
         self.strays: Any = Strays(scene, grid, team) if apart else None
         self.pair_forces: list[Any] = integrator.forces.pairwise
@@ -308,15 +309,22 @@ class Step:
                     if self.grid.need[None] > self.grid.capacity:
                         self.halt[None] = [1, now.s, half]  # all write the same
         if ti.static(self.looks):
-            if self.solves(now) and self.sleepers.count[None] > 0:
-                self.look_for_sleepers(now)
+            if self.solves(now) and (self.sleepers.count[None] > 0 or ti.static(self.detects)):
+                self.look_for_sleepers(self.turn(now, half))
                 if self.sleepers.calls[None] != 0:
                     self.halt[None] = [1, now.s, half]
 
     @ti.func
     def look_for_sleepers(self, now):
         """Call those that are touched; the frame stops for them to wake, before contacts are solved."""
-        for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
+        for c in ti.static(self.contacts):
+            if ti.static(c.detects):
+                n = ti.select(now.half % self.halves == self.halves - 1 or self.sleepers.count[None] > 0, self.n, 0)
+                for i in range(self.team.chunk_begin(n, now.thread), self.team.chunk_end(n, now.thread)):
+                    c.detect(i, now.first)
+                self.team.wait()
+        n = ti.select(self.sleepers.count[None] > 0, self.n, 0)
+        for i in range(self.team.chunk_begin(n, now.thread), self.team.chunk_end(n, now.thread)):
             self.sleep.look(i)
         self.team.wait()
 

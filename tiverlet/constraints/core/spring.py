@@ -45,7 +45,7 @@ class Spring:
         if compliance is not None:
             self.alpha = add(f"{name}.compliance", len(compliance), values=compliance)
             self.last = add(f"{name}.last", len(start), width=width, values=start, state=True)
-            self.history = add(f"{name}.history", len(start), width=width)
+            self.history = add(f"{name}.history", len(start), width=width, state=bool(scene.state.sleepers))
             self.in_state = {"last": self.last}
         if damping is not None:
             self.damping = add(f"{name}.damping", len(damping), values=damping)

@@ -126,6 +126,9 @@ class Corners:
         self.block = add(f"{name}.block", blocks, width=3, kind=ti.i32, values=np.stack([begin, end, owner], axis=1))
         self.blocks = add(f"{name}.blocks", count + 1, kind=ti.i32, values=first)
         self.places = add(f"{name}.slots", size, kind=ti.i32, values=places)
+        if scene.state.sleepers:  # of each constraint a particle that can move, or else its first one: all sleep or none does
+            first = np.lexsort((scene.inv_mass[members.indices] == 0, members.owner))[starts[:-1]]
+            self.mover = add(f"{name}.mover", count, kind=ti.i32, values=members.indices[first])
 
     @ti.func
     def give(self, e, move):

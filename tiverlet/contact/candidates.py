@@ -1,0 +1,111 @@
+"""What may touch where the host moves particles: overlaps and their gradients, in NumPy."""
+
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from ..neighbours.queries import between
+
+if TYPE_CHECKING:
+    from ..neighbours.periodic import Periodic
+
+
+class Candidates(Protocol):
+    """m contacts, of which some overlap, and others may once particles have moved. who: (m, k), the particles of each."""
+
+    who: np.ndarray
+
+    def at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """At positions x (n, dim): how deep each overlaps [m], (m,), negative where apart, and the gradients of C, which is the
+        opposite of it, (m, k, dim)."""
+        ...
+
+
+class DiscCandidates:
+    """Pairs of discs or spheres, who (m, 2). reach: at which distance each pair touches [m], (m,). box: the Periodic, or None."""
+
+    def __init__(self, who: np.ndarray, reach: np.ndarray, box: "Periodic | None"):
+        self.who, self.reach, self.box = who, reach, box
+
+    def at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """C = |x_i - x_j| - (r_i + r_j)."""
+        r = between(x[self.who[:, 0]], x[self.who[:, 1]], self.box)
+        length = np.linalg.norm(r, axis=1)
+        n = np.divide(r, length[:, None], out=np.zeros_like(r), where=length[:, None] > 0)
+        return self.reach - length, np.stack([n, -n], axis=1)
+
+
+class EdgeCandidates:
+    """Vertices v and edges from a to b; or corners that touch as discs do, where b is a (2D).
+
+    C = (x_v - (1 - t) x_a - t x_b) . n - (r_v + (1 - t) r_a + t r_b) + allowed, as in Polygons. A vertex is over the edge that
+    pushed it last, whichever is nearest now, or else over that which PolygonGeometry finds. What touched nothing may come in over
+    an edge that it was in front of, or a corner.
+
+    pairs: (m, 2), v and a. found: (m, 4), overlap, t and normal at positions x. discs: what t is for discs. pushed: (m,), whether
+    they were pushed apart in the last substep. ends: (n, 2), of each particle the next and the one before around its body, -1
+    where there is none; body: (n,), its number. allowed: (m,) [m].
+    """
+
+    def __init__(
+        self, x: np.ndarray, pairs: np.ndarray, found: np.ndarray, discs: float, pushed: np.ndarray, ends: np.ndarray,
+        body: np.ndarray, radius: np.ndarray, allowed: np.ndarray,
+    ):  # fmt: skip
+        self.radius, self.ends = radius, ends
+        (v, a), after, lone = pairs.T, ends[:, 0], ends[:, 0] < 0
+        both = v * (body.max(initial=0) + 1) + body[a]
+        told = ~lone[a] & np.isin(both, both[pushed & ~lone[a]])  # whose last push tells where it came in
+        touches = found[:, 0] > 0
+        known = np.where(told, pushed, touches)
+        at_edge = np.where(touches, found[:, 1] > discs, ~lone[a] & ~((radius[v] + radius[a] > 0) & self._corners(x, v, a)))
+        keeps = np.where(lone[v] == lone[a], v < a, lone[v]) & (radius[v] + radius[a] > 0)  # of two discs, one
+        kinds = known & at_edge, ~known & ~lone[a], known & ~at_edge & keeps, ~known & keeps
+        some = np.concatenate([np.flatnonzero(kind) for kind in kinds])
+        known_edge, fresh_edge, _, fresh_disc = np.repeat(np.eye(4, dtype=bool), [kind.sum() for kind in kinds], axis=1)
+        v, a, normal, self.allowed = v[some], a[some], found[some, 2:], allowed[some]
+        edge = known_edge | fresh_edge
+        self.who = np.stack([v, a, np.where(edge, after[a], a)], axis=1)
+        # What has passed an inner corner goes back over that: its normal is not that of the edge.
+        edges = x[self.who[:, 2]] - x[a]
+        inner = known_edge & touches[some] & ((normal * edges).sum(axis=1) > 0.01 * np.linalg.norm(edges, axis=1))
+        self.who[inner, 2] = a[inner]
+        self.sign, self.edge = np.where(inner, -1.0, 1.0), edge & ~inner
+        self.fresh_edge, self.fresh_disc = fresh_edge, fresh_disc
+        self.low, self.high = np.zeros(len(v)), np.ones(len(v))
+        overlap, _, place = self._measured(x)
+        self.low[known_edge], self.high[known_edge] = np.minimum(place, 0)[known_edge], np.maximum(place, 1)[known_edge]
+        behind = fresh_edge & (overlap > 0)
+        for name in ("who", "allowed", "sign", "edge", "fresh_edge", "fresh_disc", "low", "high"):
+            setattr(self, name, vars(self)[name][~behind])
+
+    def _measured(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Overlaps, normals, and where on the line of the edge each vertex is."""
+        v, a, b = self.who.T
+        r, u, one = x[v] - x[a], x[b] - x[a], np.ones(len(v))
+        uu, rr = (u**2).sum(axis=1), (r**2).sum(axis=1)
+        place = np.divide((r * u).sum(axis=1), uu, out=0 * one, where=self.edge & (uu > 0))
+        t = np.clip(place, self.low, self.high)
+        n = np.where(self.edge[:, None], np.stack([u[:, 1], -u[:, 0]], axis=1), self.sign[:, None] * r)
+        size = np.sqrt(np.where(self.edge, uu, rr))
+        n = np.divide(n, size[:, None], out=np.zeros_like(n), where=size[:, None] > 0)
+        reach = self.radius[v] + (1 - t) * self.radius[a] + t * self.radius[b] - self.allowed
+        return reach - (r * n).sum(axis=1), n, place
+
+    def at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where a vertex is beside no edge that it touched nothing of: neither an overlap nor a gradient."""
+        overlap, n, place = self._measured(x)
+        t = np.clip(place, self.low, self.high)
+        none = self.fresh_edge & (t != place)
+        none[self.fresh_disc] = ~self._corners(x, *self.who[self.fresh_disc, :2].T)
+        overlap[none], n[none] = 0.0, 0.0
+        return overlap, np.stack([n, (t - 1)[:, None] * n, -t[:, None] * n], axis=1)
+
+    def _corners(self, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+        """Whether each of two particles is beside no edge of the other."""
+        out = np.ones(len(v), dtype=bool)
+        for i, j in ((v, a), (a, v)):
+            after, before = self.ends[j].T
+            r, u, w = x[i] - x[j], x[after] - x[j], x[before] - x[j]
+            outer = u[:, 0] * w[:, 1] - u[:, 1] * w[:, 0] >= 0
+            out &= (after < 0) | (((r * u).sum(axis=1) <= 0) & ((r * w).sum(axis=1) <= 0) & outer)
+        return out
