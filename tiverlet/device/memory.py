@@ -54,6 +54,7 @@ class Memory:
         self._runtime = language.current()
         self._transfers: dict[tuple, Transfer] = {}  # compiled once, since that costs more than running them
         self._views: dict[int, np.ndarray] = {}  # see _seen()
+        self._rooms: dict[int, np.ndarray] = {}  # of fields that had other lengths, by number: arrays as long as they can be
         self._address = 0  # of the bytes
         self._room: Any = None  # the bytes, where they are not Taichi's own
         self._ends: Any = None  # frees it
@@ -162,7 +163,7 @@ class Memory:
         kept = first + len(behind)
         for k, e in enumerate(self.entries):
             if e.rows is rows:
-                moved = self._seen()[id(e)].take(behind, axis=0)
+                moved = self._seen()[id(e)].take(behind, axis=0) if len(behind) else 0
                 view = self._resized(k, count)
                 view[first:kept], view[kept:] = moved, 0
 
@@ -180,9 +181,12 @@ class Memory:
             return views[id(old)]
         assert self._layout
         self.entries[k] = new = old.of_length(length)
+        if k not in self._rooms:
+            shape = (self._layout.room, *old.whole[1:])
+            (self._rooms[k],) = self._layout.views(self._address, [(self._which[k], shape, old.kind)])
         del views[id(old)]
-        (views[id(new)],) = self._layout.views(self._address, [(self._which[k], new.whole, new.kind)])
-        return views[id(new)]
+        views[id(new)] = view = self._rooms[k][:length]
+        return view
 
     def _seen(self) -> dict[int, np.ndarray]:
         """Arrays that are the fields, by the id of the entry; none where the host cannot see them.
@@ -222,7 +226,7 @@ class Memory:
         elif self.entries and not patched:  # fields that are never placed would poison everything that Taichi does later
             self._declare_numbers()
             Layout(tuple(self._declared), [e.field for e in self.entries]).destroy()
-        self._layout, self._views, self._room = None, {}, None
+        self._layout, self._views, self._rooms, self._room = None, {}, {}, None
         self.entries = self.entries if self._ends else []
 
     def choose(self, copy: int | None) -> None:
