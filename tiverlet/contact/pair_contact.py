@@ -61,7 +61,6 @@ class PairContact(Feature):
     skin = Knob(lambda f, v: _skin(v), "How far beyond touching pairs are listed [m].", built=True)
     push_out = Knob(lambda f, v: checks.number("Contact", "push_out", v, least=0.0), "[m/s].", built=True)
     compiled_for = ("has_friction", "has_restitution", "turns", "uniform")
-    _asked: Any = None  # friction, restitution, groups and sensors; and the Table of these
     _finest = _listed = 0.0  # the smallest radius, and how far beyond touching pairs are listed now [m]
     table: Table  # bound to one world
     matters = True
@@ -89,9 +88,11 @@ class PairContact(Feature):
     def _pairs(self) -> Table:
         """The same, made once for what was assigned: it is asked many questions, and is bound to no world."""
         given = self.friction, self.restitution, vars(self).get("groups"), vars(self).get("sensors", ())
-        if self._asked is None or any(one is not other for one, other in zip(given, self._asked[0], strict=True)):
-            self._asked = given, self.wanted
-        return self._asked[1]
+        asked, table = vars(self).get("_asked", ((), None))
+        if table is None or any(one is not other for one, other in zip(given, asked, strict=True)):
+            table = self.wanted
+            self._asked = given, table
+        return table
 
     @property
     def uniform(self) -> bool:

@@ -88,7 +88,7 @@ class Feature(RecordsArguments):
     moving = new_force = lets_go = afresh = False
     scene: Any = None  # Scene, from bind() on
     periodic: Any = None  # the Periodic of its world, from before prepare() on
-    _stands: dict[str, Any] | None = None  # what the world was built for, of built_for(); None where the feature does nothing
+    _world_for: dict[str, Any] | None = None  # what the world was built for, of built_for(); None where the feature does nothing
     start: Any = None  # Particles, as they were when it came: what it takes from them is what it took then, when bound again too
 
     @functools.cached_property
@@ -134,7 +134,7 @@ class Feature(RecordsArguments):
 
         What once was compiled stays when a knob no longer needs it: friction of 0 where there was some costs no compiling.
         """
-        return self._stands is not None and self._stands != self.built_for()
+        return self._world_for is not None and self._world_for != self.built_for()
 
     def copy(self) -> "Feature":
         """The same feature, unbound: same arrays and knobs, ready for another world."""
@@ -145,7 +145,7 @@ class Feature(RecordsArguments):
 
     def release(self) -> None:
         """Forget the world that it acted in."""
-        for name in ("scene", "start", "periodic", "changed", "moving", "new_force", "dev", "_stands"):
+        for name in ("scene", "start", "periodic", "changed", "moving", "new_force", "dev", "_world_for"):
             self.__dict__.pop(name, None)
 
     def kept_mask(self, number: np.ndarray) -> tuple[np.ndarray, ...]:
