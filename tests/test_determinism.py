@@ -140,11 +140,11 @@ def test_all_paths_have_the_same_bits(world):
 
 @pytest.mark.filterwarnings("ignore:Contact. all radii are 0")
 def test_what_is_absent_has_no_field_and_no_kernel(world):
-    # A point in free flight: position, displacement, counts, and the survey. Each feature adds its own fields and nothing else; a
+    # A point in free flight: position, displacement and counts. Each feature adds its own fields and nothing else; a
     # mass for each particle is needed where one has another than the rest, as what is pinned has.
     plain = world(tv.Particles(np.zeros((10, 2))), [])
     names = {name.split(".")[0] for name in plain.fields}
-    assert names == {"position", "displacement", "numbers", "survey"}
+    assert names == {"position", "displacement", "numbers"}
     adds = {
         "Gravity": ([tv.Gravity(1.0)], {"Gravity"}),
         "Drag": ([tv.Drag(1.0)], {"decay"}),

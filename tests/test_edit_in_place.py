@@ -154,6 +154,22 @@ def test_an_edit_makes_and_compiles_nothing():
     w.close()
 
 
+def test_memory_that_stays_for_what_went_is_shown_and_given_back():
+    w, more = discs()
+    w.step(1 / 60)
+    w.add(more(20, 0))  # a world that has not lost anything has no spare room
+    most, said = sum(w.fields.values()), w.explain()
+    assert "stay for what went" not in said
+    w.remove(np.arange(40, 60))
+    less = sum(w.fields.values())
+    assert f"; {most - less} bytes more stay for what went" in w.explain() and 0 < most - less < less
+    w.remove(np.arange(5, 28))  # fewer than half of what there was
+    spare = sum(memory.spare for memory in w._runner.memories)
+    assert spare <= sum(w.fields.values()) < less
+    w.step(1 / 60)
+    w.close()
+
+
 @pytest.mark.parametrize("precision", ["f32", "f64"])
 def test_a_pin_takes_a_disc_in_place(precision):
     # As the Pin that would be made for it, to the bit; among others that are held, whose pairs the list leaves out.

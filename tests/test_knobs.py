@@ -248,6 +248,12 @@ LIKE = {  # settings that the same code writes for the same code to read; these 
 }  # fmt: skip
 
 
+def rebuilds(feature, setting: str) -> bool:
+    """Whether another value has the world built anew."""
+    knob = inspect.getattr_static(type(feature), setting)
+    return knob.compiled or knob.built
+
+
 def test_the_rows_have_every_feature():
     shown = {name.split(",")[0] for names in GROUPED.values() for name in names}
     exported = {name for package in (colliders, constraints, contact, forces) for name in package.__all__}
@@ -275,7 +281,7 @@ def test_every_setting_is_live(world, group):
         feature = scene.features[name]
         assert old.keys() == new.keys() == {k for k in knobs_of(type(feature)) if hasattr(feature, k) and k != "indices"}, name
         for setting in old:
-            if inspect.getattr_static(type(feature), setting).compiled or setting == "break_at" or old[setting] == new[setting]:
+            if rebuilds(feature, setting) or setting == "break_at" or old[setting] == new[setting]:
                 continue
             setattr(feature, setting, scene.values(name, True)[setting])
             moved = np.abs(scene.go() - before)
@@ -286,13 +292,13 @@ def test_every_setting_is_live(world, group):
     np.testing.assert_allclose(scene.go()[some], before[some], atol=1e-9)
     assert scene.world._runner.memory is memory and scene.world.fields == fields
 
-    # All of them together: as a world that was built so. What is compiled is compiled anew.
+    # All of them together: as a world that was built so. What is built for a setting is built anew.
     scene.assign(True)
     other = Scene(world, rows, True)
     np.testing.assert_allclose(scene.go()[some], other.go()[some], atol=1e-9)
     assert np.abs(scene.go() - before).max() > 1e-3
-    compiles = any(inspect.getattr_static(type(f), k).compiled for f in scene.features.values() for k in knobs_of(type(f)))
-    assert (scene.world._runner.memory is memory) != compiles
+    anew = any(rebuilds(f, setting) for f in scene.features.values() for setting in knobs_of(type(f)))
+    assert (scene.world._runner.memory is memory) != anew
     for name, feature in scene.features.items():
         if "break_at" in rows[name][2]:
             feature.break_at = 1e-9

@@ -92,7 +92,7 @@ class Pin(Anchored):
     def can_grab(self, change: Regrouping) -> bool:
         """Whether the others that are to be held now can be, while it stays bound, and while no other thing but their masses
         changes."""
-        return self._grabs and self.acts and vars(self.dev)["built"] == self.compiled()
+        return self._grabs and self.acts and self._world_for == self.built_for()
 
     def grab(self, change: Regrouping) -> None:
         """Hold them as a new Pin would."""

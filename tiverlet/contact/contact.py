@@ -93,8 +93,8 @@ class Contact(PairContact):
 
     events = Knob(lambda f, v: checks.flag("Contact", "events", v), "Whether World.events() tells of pairs.", compiled=True)
     loads = Knob(lambda f, v: checks.flag("Contact", "loads", v), "Whether pairs know what they bear.", compiled=True)
-    sensors: Any = Knob(lambda f, v: f._surface("sensors", v), "The pairs of groups of which the second senses.", compiled=True)
-    groups: Any = Knob(lambda f, v: f._surface("groups", v), "The pairs of groups that touch; None for all.", compiled=True)
+    sensors: Any = Knob(lambda f, v: f._surface("sensors", v), "The pairs of groups of which the second senses.", built=True)
+    groups: Any = Knob(lambda f, v: f._surface("groups", v), "The pairs of groups that touch; None for all.", built=True)
     projects = True
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:

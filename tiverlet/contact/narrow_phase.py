@@ -1,10 +1,11 @@
 """Discs and spheres: which of them touch, how deep and in which direction."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..device import ti
+from ..device.number import OnDevice
 from ..features.feature import Scene
 from ..features.material import TOUCHES
 from ..neighbours.neighbour_list import PairData
@@ -24,11 +25,13 @@ class DiscGeometry:
     grid: has the pairs listed. impulse: what the pairs of the list got in the last substep [kg m].
     """
 
+    push_out: Any = OnDevice()
+
     def __init__(
         self, scene: Scene, grid: "NeighbourSearch", push_out: float = 0.0, impulse: PairData | None = None,
         has_loads: bool = False,
     ):  # fmt: skip
-        self.scene, self.grid, self.push_out, self.impulse = scene, grid, push_out, impulse
+        self.scene, self.grid, self.push_out, self.impulse = scene, grid, scene.memory.number(push_out, scene.real), impulse
         self.state, self.radius, self.real = scene.state, scene.radius, scene.real
         self.has_loads = has_loads
         self.shrinks, self.store, self.senses = False, None, grid.table.senses

@@ -71,8 +71,8 @@ class PairContact(Feature):
 
     friction = Knob(lambda f, v: f._surface("friction", v), "Of all pairs, or by pairs of groups.")
     restitution = Knob(lambda f, v: f._surface("restitution", v), "Of all pairs, or by pairs of groups.")
-    skin = Knob(lambda f, v: _skin(v), "How far beyond touching pairs are listed [m].", compiled=True)
-    push_out = Knob(lambda f, v: checks.number("Contact", "push_out", v, least=0.0), "[m/s].", compiled=True)
+    skin = Knob(lambda f, v: _skin(v), "How far beyond touching pairs are listed [m].", built=True)
+    push_out = Knob(lambda f, v: checks.number("Contact", "push_out", v, least=0.0), "[m/s].", built=True)
     compiled_for = ("has_friction", "has_restitution", "turns", "uniform")
     _finest = _listed = 0.0  # the smallest radius, and how far beyond touching pairs are listed now [m]
     table: Table  # bound to one world
@@ -99,24 +99,34 @@ class PairContact(Feature):
         return Table("Contact", self.friction, self.restitution, vars(self).get("groups"), vars(self).get("sensors", ()))
 
     @property
+    def _pairs(self) -> Table:
+        """The same, made once for what was assigned: it is asked many questions, and is bound to no world."""
+        given = self.friction, self.restitution, vars(self).get("groups"), vars(self).get("sensors", ())
+        asked, table = vars(self).get("_asked", ((), None))
+        if table is None or any(one is not other for one, other in zip(given, asked, strict=True)):
+            table = self.wanted
+            self._asked = given, table
+        return table
+
+    @property
     def uniform(self) -> bool:
         """Whether all pairs are alike."""
-        return self.wanted.uniform
+        return self._pairs.uniform
 
     @property
     def has_friction(self) -> bool:
         """Whether any pair has friction, or had when kernels were compiled."""
-        return self.wanted.has_friction or vars(self.dev).get("has_friction", False)
+        return self._pairs.has_friction or vars(self.dev).get("has_friction", False)
 
     @property
     def has_restitution(self) -> bool:
         """Whether any pair has restitution, or had when kernels were compiled."""
-        return self.wanted.has_restitution or vars(self.dev).get("has_restitution", False)
+        return self._pairs.has_restitution or vars(self.dev).get("has_restitution", False)
 
     @property
     def turns(self) -> bool:
         """Whether any pair resists rolling, or bounces across the normal, or did when kernels were compiled."""
-        return self.wanted.turns or vars(self.dev).get("turns", False)
+        return self._pairs.turns or vars(self.dev).get("turns", False)
 
     @property
     def has_events(self) -> bool:

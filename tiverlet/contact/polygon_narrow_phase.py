@@ -53,10 +53,12 @@ class PolygonGeometry:
 
     shrinks, store = True, None  # its field is there from the start
 
+    push_out: Any = OnDevice()
+
     def __init__(self, scene: Scene, outline: Outline, push_out: float):
         n, add = scene.particles.count, scene.memory.field
         self.scene, self.state, self.radius, self.w, self.real = scene, scene.state, scene.radius, scene.state.w, scene.real
-        self.outline, self.push_out = outline, push_out
+        self.outline, self.push_out = outline, scene.memory.number(push_out, scene.real)
         self.loop = add("Polygons.loop", n, width=3, kind=ti.i32, values=np.c_[outline.ends, outline.body])
         self.longest = add("Polygons.longest_edge", n, values=outline.longest)
         self.step = float(outline.length[outline.body >= 0].min(initial=np.inf)) / 4

@@ -6,6 +6,7 @@ these into an error that says what to do, so that no other module has to know.
 """
 
 import contextlib
+import mmap
 import weakref
 from collections import Counter
 from typing import Any
@@ -54,8 +55,10 @@ class Memory:
         self._runtime = language.current()
         self._transfers: dict[tuple, Transfer] = {}  # compiled once, since that costs more than running them
         self._views: dict[int, np.ndarray] = {}  # see _seen()
+        self._rooms: dict[int, np.ndarray] = {}  # of fields that had other lengths, by number: arrays as long as they can be
         self._address = 0  # of the bytes
         self._room: Any = None  # the bytes, where they are not Taichi's own
+        self._most: dict[int, int] = {}  # of these fields: the most elements for which the system has given memory
         self._ends: Any = None  # frees it
         if copies and copies.number is None:
             copies.number = self.field("copy", None, kind=ti.i32, shared=True)
@@ -162,7 +165,7 @@ class Memory:
         kept = first + len(behind)
         for k, e in enumerate(self.entries):
             if e.rows is rows:
-                moved = self._seen()[id(e)].take(behind, axis=0)
+                moved = self._seen()[id(e)].take(behind, axis=0) if len(behind) else 0
                 view = self._resized(k, count)
                 view[first:kept], view[kept:] = moved, 0
 
@@ -180,9 +183,31 @@ class Memory:
             return views[id(old)]
         assert self._layout
         self.entries[k] = new = old.of_length(length)
+        if k not in self._rooms:
+            shape = (self._layout.room, *old.whole[1:])
+            (self._rooms[k],) = self._layout.views(self._address, [(self._which[k], shape, old.kind)])
         del views[id(old)]
-        (views[id(new)],) = self._layout.views(self._address, [(self._which[k], new.whole, new.kind)])
-        return views[id(new)]
+        views[id(new)] = view = self._rooms[k][:length]
+        most = max(length, self._most.get(k, old.length))
+        if most > 2 * length:
+            self._give_back(self._rooms[k][length:most])
+            most = length
+        self._most[k] = most
+        return view
+
+    def _give_back(self, rows: np.ndarray) -> None:
+        """Have the system take the memory of what went, page by page; what is there then is 0."""
+        if not (self._room and hasattr(mmap, "MADV_DONTNEED")):
+            return
+        begin = rows.ctypes.data - self._address
+        first, end = -(-begin // mmap.PAGESIZE) * mmap.PAGESIZE, (begin + rows.nbytes) // mmap.PAGESIZE * mmap.PAGESIZE
+        if first < end:
+            self._room.madvise(mmap.MADV_DONTNEED, first, end - first)
+
+    @property
+    def spare(self) -> int:
+        """Memory that stays for what went: at most as much again as there is [bytes]."""
+        return sum(max(0, most - self.entries[k].length) * self._rooms[k][:1].nbytes for k, most in self._most.items())
 
     def _seen(self) -> dict[int, np.ndarray]:
         """Arrays that are the fields, by the id of the entry; none where the host cannot see them.
@@ -222,7 +247,7 @@ class Memory:
         elif self.entries and not patched:  # fields that are never placed would poison everything that Taichi does later
             self._declare_numbers()
             Layout(tuple(self._declared), [e.field for e in self.entries]).destroy()
-        self._layout, self._views, self._room = None, {}, None
+        self._layout, self._views, self._rooms, self._most, self._room = None, {}, {}, {}, None
         self.entries = self.entries if self._ends else []
 
     def choose(self, copy: int | None) -> None:

@@ -20,11 +20,15 @@ class Knob:
     check: a function (feature, value) -> value that raises for a wrong one.
     force: it changes a force, so that displacements are turned into velocities first, see World._restart().
     compiled: kernels have its value in them, so that another one has the world built anew, see Feature.outgrown.
+    built: another one has the world built anew, too, but with the same kernels.
     device: the attribute that is its field, for kernels, which read the setting by the same name; None where they do not.
     """
 
-    def __init__(self, check: Callable, doc: str, *, force: bool = False, compiled: bool = False, device: str | None = None):
-        self.check, self.force, self.compiled, self.device = check, force, compiled, device
+    def __init__(
+        self, check: Callable, doc: str, *, force: bool = False, compiled: bool = False, built: bool = False,
+        device: str | None = None,
+    ):  # fmt: skip
+        self.check, self.force, self.compiled, self.built, self.device = check, force, compiled, built, device
         self.__doc__ = doc
 
     def __set_name__(self, owner, name: str) -> None:

@@ -88,6 +88,7 @@ class Feature(RecordsArguments):
     moving = new_force = lets_go = afresh = False
     scene: Any = None  # Scene, from bind() on
     periodic: Any = None  # the Periodic of its world, from before prepare() on
+    _world_for: dict[str, Any] | None = None  # what the world was built for, of built_for(); None where the feature does nothing
     start: Any = None  # Particles, as they were when it came: what it takes from them is what it took then, when bound again too
 
     @functools.cached_property
@@ -118,6 +119,11 @@ class Feature(RecordsArguments):
         knobs = [name for name in knobs_of(type(self)) if getattr(type(self), name).compiled]
         return {name: getattr(self, name) for name in (*knobs, *self.compiled_for)}
 
+    def built_for(self) -> dict[str, Any]:
+        """The same, and the values of knobs for which worlds are built, though kernels do not have them."""
+        knobs = [name for name in knobs_of(type(self)) if getattr(type(self), name).built]
+        return self.compiled() | {name: getattr(self, name) for name in knobs}
+
     def _built(self, part: str, what: str) -> bool:
         """Whether kernels were compiled for a part of it that is, say, soft."""
         return part in vars(self.dev) and getattr(vars(self.dev)[part], what)
@@ -128,8 +134,7 @@ class Feature(RecordsArguments):
 
         What once was compiled stays when a knob no longer needs it: friction of 0 where there was some costs no compiling.
         """
-        built = vars(self.dev).get("built")
-        return built is not None and built != self.compiled()
+        return self._world_for is not None and self._world_for != self.built_for()
 
     def copy(self) -> "Feature":
         """The same feature, unbound: same arrays and knobs, ready for another world."""
@@ -140,7 +145,7 @@ class Feature(RecordsArguments):
 
     def release(self) -> None:
         """Forget the world that it acted in."""
-        for name in ("scene", "start", "periodic", "changed", "moving", "new_force", "dev"):
+        for name in ("scene", "start", "periodic", "changed", "moving", "new_force", "dev", "_world_for"):
             self.__dict__.pop(name, None)
 
     def kept_mask(self, number: np.ndarray) -> tuple[np.ndarray, ...]:

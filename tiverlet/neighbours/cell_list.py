@@ -115,13 +115,15 @@ class CellList:
 
     def shapes(self, extent: np.ndarray) -> np.ndarray:
         """Bits of each axis of each table, (levels, dim): at least 2, the rest where there are most cells per bucket."""
-        out = np.full((self.levels, self.dim), 2)
+        out = []
         extent = np.where(np.isfinite(self._lengths), self._lengths, extent)
-        for m in range(self.levels):
-            cells = np.nan_to_num(extent / self.sizes[m], nan=1.0, posinf=1e30)
-            for _ in range(self.bits[m] - 2 * self.dim):
-                out[m, int(np.argmax(cells / 2.0 ** out[m]))] += 1
-        return out
+        for size, bits in zip(self.sizes, self.bits.tolist(), strict=True):
+            cells, of = np.nan_to_num(extent / size, nan=1.0, posinf=1e30).tolist(), [2] * self.dim
+            for _ in range(bits - 2 * self.dim):
+                each = [number / (1 << k) for number, k in zip(cells, of, strict=True)]
+                of[each.index(max(each))] += 1
+            out.append(of)
+        return np.array(out)
 
     def fit(self, extent: np.ndarray) -> bool:
         """Shape the tables for particles that fill a box of this size [m]; affects speed only. Returns whether they changed."""

@@ -156,7 +156,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     lists = [(f.join(scene, team), f.room) for f in accelerations if f.pairwise]
     for feature in features:
         feature.new_force = False  # it was given when it was made
-        feature.dev.built = feature.compiled() if not isinstance(feature, Batch) or feature.acts else None
+        feature._world_for = feature.built_for() if not isinstance(feature, Batch) or feature.acts else None
     known = contact.known if contact else None
     forces = Forces(scene, [*accelerations, known.carried] if known else accelerations)
     integrator = Verlet(scene, forces) if scene.order == 2 else high_order.Composition(scene, forces, batches)

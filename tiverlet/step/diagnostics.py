@@ -56,9 +56,11 @@ class Diagnostics:
             # As few as hold one thing each: the sums are the same, and small worlds a fifth as large.
             most = max([step.scene.particles.count, *(b.members.count for b in step.batches)], default=1)
             self.blocks = min(BLOCKS, 1 << max(2, (most - 1).bit_length()))
-        self.parts = add("survey.figures", self.blocks, width=self.width, kind=ti.f64)
-        self.low = add("survey.low", self.blocks, width=self.dim, kind=ti.f64)
-        self.high = add("survey.high", self.blocks, width=self.dim, kind=ti.f64)
+        self.alone = step.team.size == 1 and not step.team.launched  # one thread sums up, and has no need to keep the parts
+        if not self.alone:
+            self.parts = add("survey.figures", self.blocks, width=self.width, kind=ti.f64)
+            self.low = add("survey.low", self.blocks, width=self.dim, kind=ti.f64)
+            self.high = add("survey.high", self.blocks, width=self.dim, kind=ti.f64)
         self.details: dict[int, Residuals] = {}  # compiled when asked for
         self.sheet: Any = np.zeros(SHEET)
         self.report = Reporter(step, solver, self.sheet)
@@ -177,6 +179,13 @@ class Diagnostics:
         return figures, low, high
 
     @ti.func
+    def block_of(self, b, h64, t64, state_origin):
+        """One block, of the state as frames end, or as it came about otherwise."""
+        fresh, begin = ti.cast(state_origin == STARTED, ti.i32), ti.cast(state_origin == UNSTEPPED, ti.i32)
+        h, t, fraction = ti.cast(h64, self.step.real), ti.cast(t64, self.step.real), self.step.integrator.frame_fraction(0, 1)
+        return self.block(b, h, t, fraction, fresh, begin)
+
+    @ti.func
     def filled(self):
         """How many blocks there is anything in, at most; the others would change no bit."""
         out = self.blocks
@@ -205,21 +214,28 @@ class Diagnostics:
     def sum_up(self, thread, h64, t64, state_origin, sheet: ti.template()):  # type: ignore[valid-type]
         """By blocks, by blocks of these on a GPU, then by one thread."""
         filled = self.filled()
-        for k in range(self.team.chunk_begin(filled * self.stride, thread), self.team.chunk_end(filled * self.stride, thread)):
-            if k % self.stride == 0:
-                h, t, b = ti.cast(h64, self.step.real), ti.cast(t64, self.step.real), k // self.stride
-                fresh, begin = ti.cast(state_origin == STARTED, ti.i32), ti.cast(state_origin == UNSTEPPED, ti.i32)
-                fraction = self.step.integrator.frame_fraction(0, 1)
-                self.parts[b], self.low[b], self.high[b] = self.block(b, h, t, fraction, fresh, begin)
-        self.team.wait()
-        if ti.static(self.blocks > BLOCKS):
-            for k in range(BLOCKS):
-                self.parts[k * BLOCKS], self.low[k * BLOCKS], self.high[k * BLOCKS] = self.fold(k * BLOCKS, 1, BLOCKS)
+        if ti.static(not self.alone):
+            for k in range(
+                self.team.chunk_begin(filled * self.stride, thread), self.team.chunk_end(filled * self.stride, thread)
+            ):  # fmt: skip
+                if k % self.stride == 0:
+                    b = k // self.stride
+                    self.parts[b], self.low[b], self.high[b] = self.block_of(b, h64, t64, state_origin)
+            self.team.wait()
+            if ti.static(self.blocks > BLOCKS):
+                for k in range(BLOCKS):
+                    self.parts[k * BLOCKS], self.low[k * BLOCKS], self.high[k * BLOCKS] = self.fold(k * BLOCKS, 1, BLOCKS)
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread)):
             for k in range(FIGURES):
                 sheet[k] = 0  # what nobody writes comes back from a GPU as it was there
-            total, low, high = self.fold(0, max(1, self.blocks // BLOCKS), ti.min(filled, BLOCKS))
+            total, low, high = self.nothing()
+            if ti.static(self.alone):
+                for b in range(filled):
+                    part, lower, higher = self.block_of(b, h64, t64, state_origin)
+                    total, low, high = self.with_part(total, low, high, part, lower, higher)
+            else:
+                total, low, high = self.fold(0, max(1, self.blocks // BLOCKS), ti.min(filled, BLOCKS))
             for k in ti.static(range(6)):
                 sheet[k] = total[k]
             if ti.static(len(self.pair_forces) > 0):
@@ -248,16 +264,20 @@ class Diagnostics:
         total, low, high = self.nothing()
         for b in range(count):
             at = begin + b * step
-            part = self.parts[at]
-            total[0] += part[0]
-            total[4] += part[4]
-            for k in ti.static(range(6, self.width)):
-                total[k] += part[k]
-            for k in ti.static(range(1, 4)):
-                total[k] = ti.max(total[k], part[k])
-            total[5] = ti.min(total[5], part[5])
-            low, high = ti.min(low, self.low[at]), ti.max(high, self.high[at])
+            total, low, high = self.with_part(total, low, high, self.parts[at], self.low[at], self.high[at])
         return total, low, high
+
+    @ti.func
+    def with_part(self, total, low, high, part, lower, higher):
+        """Figures of one part more."""
+        total[0] += part[0]
+        total[4] += part[4]
+        for k in ti.static(range(6, self.width)):
+            total[k] += part[k]
+        for k in ti.static(range(1, 4)):
+            total[k] = ti.max(total[k], part[k])
+        total[5] = ti.min(total[5], part[5])
+        return total, ti.min(low, lower), ti.max(high, higher)
 
     def residuals(self, batch, h: float, fresh: bool) -> np.ndarray:
         """What the last substep left of each violation in a batch, (m,)."""

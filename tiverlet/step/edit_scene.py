@@ -135,13 +135,13 @@ def change(
     if planned is None:
         rebuild(world, some, added, features, extend)
         return
-    told, seen = world._all_events(), _seen(world, number, features)
-    if world._force_waits:
-        with world._runner.memory.compiler():
+    with world._runner.memory.compiler():
+        told, seen = world._all_events(), _seen(world, number, features)
+        if world._force_waits:
             world._runner.restart(world.iterations)
-    world._clock.parted = None
-    edit_in_place.regroup(world, planned, added)
-    _edited(world, some, added, told, seen, np.arange(len(features)), False)
+        world._clock.parted = None
+        edit_in_place.regroup(world, planned, added)
+        _edited(world, some, added, told, seen, np.arange(len(features)), False)
 
 
 def renew(world: Any) -> None:
@@ -155,9 +155,11 @@ def renew(world: Any) -> None:
     if world._force_waits or any(f.afresh and f.soft for f in world.features):
         with world._runner.memory.compiler():
             world._runner.restart(world.iterations)
-    world._clock.parted = None
+    world._clock.parted = world._clock.energy = None
     edit_in_place.grab(world, grabbing)
-    _edited(world, some, None, told, None, np.arange(len(world.features)), True)
+    world._events = told
+    for watcher in world._watchers:
+        watcher.regrouped()
 
 
 def rebuild(
@@ -361,8 +363,8 @@ def _launch(world: Any, first: int) -> None:
         memory.write_from(state.spin.s, first, h * state.spin.from_rates(world._particles.spin)[first:])
     share = max(decay(sum(f.rate for f in integrator.forces.drags), h)[0], NOTHING)
     with world._runner.memory.compiler():
-        seen = world._runner.velocity(world.iterations, touching=False)
-    d = h * want + h / share * (want - seen[first:])
+        seen = world._runner.velocity(world.iterations, came=first)
+    d = h * want + h / share * (want - seen)
     d[world._runner.scene.inv_mass[first:] == 0] = 0.0
     for field, rows in zip(fields, (d, 3 * d - 2 * h * want), strict=False):  # so that 3 d - earlier = 2 h v
         memory.write_from(field, first, rows)

@@ -22,6 +22,7 @@ from .span import ACTIVE_THREADS, BEFORE, END, GIVE, HALT, ORIGIN, H, Moment, Sp
 from .step import frame
 from .step_report import StepReport
 
+KEPT = 100_000  # velocities, the array for which stays; where there are more, Taichi's look at what it is given takes less
 LONG = 10_000_000  # particles and constraints, times passes, in a launch: it takes about a second
 
 
@@ -65,6 +66,7 @@ class Runner:
             self.frames = self.frames.of(self.step)
             self._fused = self.frames.launch_one(self.sheet)
         self._measure = CachedLaunch(self.diagnostics, "measure", self.memory.compiler, self.sheet)
+        self._velocity: CachedLaunch | None = None  # once it is asked for
         self._data, self._given, self._reporter = self.sheet.data, self.sheet.data[H:], self.diagnostics.report
 
     def renew(self) -> None:
@@ -257,24 +259,31 @@ class Runner:
         if self.step.walls:
             self.step.stopped(before)
 
-    def velocity(self, iterations: int, touching: bool = True) -> np.ndarray:
-        """Velocities as the user sees them, to the order of the world; without `touching` of particles that touch nothing yet."""
+    def velocity(self, iterations: int, came: int | None = None) -> np.ndarray:
+        """Velocities as the user sees them, to the order of the world; of all particles, or of those from number `came` on, which
+        touch nothing yet."""
         clock = self.clock
         if clock.d_is_velocity:
             out = self.memory.read(self.scene.state.d).astype(np.float64)
         elif self.probe:
             out = high_order.velocity(self.probe, clock, self.memory, iterations)
         else:
-            if touching:
+            if came is None:
                 self._list_again()
-            out = self._velocities()
-        return out[: self.n]
+            return self._velocities(came or 0)
+        return out[came or 0 : self.n]
 
-    def _velocities(self) -> np.ndarray:
+    def _velocities(self, first: int = 0) -> np.ndarray:
         """By the kernel, from displacements."""
-        out = np.zeros((max(1, self.n), self.step.dim))
-        self.step.velocities(self.clock.h, self.clock.time, *self.shares(), out)
-        return out
+        launch = self._velocity
+        if launch is None or len(launch.arrays[1]) < self.n:
+            room = np.zeros((1 << self.n.bit_length(), self.step.dim))
+            launch = CachedLaunch(self.step, "velocities", self.memory.compiler, np.zeros(5), room)
+        self._velocity = launch if self.n <= KEPT else None
+        given, out = launch.arrays
+        given[:] = self.clock.h, self.clock.time, *self.shares(), first
+        launch()
+        return out[first : self.n].copy()
 
     def _list_again(self) -> None:
         """Of a state that was put back, build the list that reactions of contacts are asked for with."""

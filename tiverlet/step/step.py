@@ -520,15 +520,15 @@ class Step:
                 out[i, k] = v[k]
 
     @ti.kernel
-    def velocities(self, h64: ti.f64, t: ti.f64, firm64: ti.f64, soft64: ti.f64, out: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
-        """Velocities as the user sees them. firm, soft: see Batch.push_reaction.
+    def velocities(self, given: ti.types.ndarray(ti.f64, 1), out: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
+        """Velocities as the user sees them. given: h, t, firm and soft of Batch.push_reaction, and the first particle.
 
         With the multipliers of the last substep along the directions at its end they are second order, and have the momentum and
         the angular momentum of the motion, sum m x_n x (x_n - x_(n-1)) / h and what forces from outside add in h / 2.
         """
-        self.constraints.reactions(ti.cast(firm64, self.real), ti.cast(soft64, self.real))
-        for i in range(self.n):
-            v = self.velocity_of(i, h64, t, firm64)
+        self.constraints.reactions(ti.cast(given[2], self.real), ti.cast(given[3], self.real))
+        for i in range(integer(given, 4), self.n):
+            v = self.velocity_of(i, given[0], given[1], given[2])
             for k in ti.static(range(self.dim)):
                 out[i, k] = v[k]
 

@@ -861,7 +861,7 @@ def _difference(ours: list[Any], theirs: list[Any]) -> tuple[str, str]:
 
 def _structure(world: World) -> dict[str, Any]:
     """What all of them must have in common."""
-    built = [(type(f).__name__, *(vars(f.dev).get("built") or {}).items()) for f in world.features]
+    built = [(type(f).__name__, *(f._world_for or {}).items()) for f in world.features]
     out: dict[str, Any] = {
         "settings": [(name, "=", repr(value)) for name, value in world.settings.items()],
         "features": built,

@@ -1,6 +1,6 @@
 """Particles drawn to a place, each by itself: what pins, paths and grids share."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -39,6 +39,7 @@ class Anchored(Batch):
     compliance = Knob(lambda f, v: f._compliance(v), "Inverse stiffness [m/N].", force=True)
     damping = Knob(lambda f, v: checks.per_item(repr(f), "damping", v, f.count, least=0.0), "Of the dashpot [N s/m].", force=True)
     compiled_for = ("soft",)
+    _asked: tuple[Any, bool] = (None, False)  # compliances, and whether any of them is above 0
 
     def setup(self, indices, compliance, damping) -> None:
         """Keep the arguments of __init__."""
@@ -56,7 +57,10 @@ class Anchored(Batch):
     @property
     def soft(self) -> bool:
         """Whether any of them is a spring, or was when kernels were compiled."""
-        return bool(np.any(self.compliance > 0)) or self._built("spring", "soft")
+        rows = self.compliance
+        if rows is not self._asked[0]:  # it is asked ten times when a pin takes others
+            self._asked = rows, bool((rows > 0).any())
+        return self._asked[1] or self._built("spring", "soft")
 
     def upload(self) -> None:
         """Write new stiffnesses."""

@@ -78,7 +78,7 @@ class Outline:
         violation, A, alpha, lam, W = self.of.equation(c, f, f0, w, W, h, h2_effective, first, fresh)
         if ti.static(self.limited):
             violation -= A * self.of.postpone(c, f0, W, frame_fraction[1] - frame_fraction[0], first)
-        new, left = self.of.jacobi_update(c, violation, A, alpha, lam, W, turn)
+        new = self.of.jacobi_update(c, violation, A, alpha, lam, W, turn)
         new = self.of.limit_collapse(c, lam, new, extent, move)
         self.of.dev.lam[c], self.change[c], self.astray[c] = new, new - lam, turn == FAR
 
@@ -108,7 +108,7 @@ class Outline:
         """The violation that is left."""
         f, f0, w, W, turn, extent, move = self.total(c)
         violation, A, alpha, lam, W = self.of.equation(c, f, f0, w, W, h, h2_effective, 0, fresh)
-        new, left = self.of.jacobi_update(c, violation, A, alpha, lam, W, turn)
+        left = self.of.removed(c, violation, A, alpha, lam, W)
         if w == 0:  # collapsed, or static
             for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
                 if self.w.of(self.corners.members[e]) > 0 and self.of.dev.strength.holds(c):

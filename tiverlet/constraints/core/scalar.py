@@ -651,18 +651,32 @@ class Scalar(Batch):
         return out
 
     @ti.func
-    def jacobi_update(self, c, violation, A, alpha, lam, W, turn):
-        """The multiplier of a Jacobi pass, and the size of the violation that it removes."""
-        new, size = lam, ti.cast(0, self.dev.real)
+    def multiplier_of(self, c, violation, A, alpha, lam, W):
+        """The multiplier of a Jacobi pass."""
+        new = lam
         if W > 0:
             new = lam - self.dev.slots.relaxation * violation / (A * W + alpha)
             if ti.static(self.side != 0):
                 new = -self.bounded(-new)
             new = self.clamped(c, new)
+        return new
+
+    @ti.func
+    def jacobi_update(self, c, violation, A, alpha, lam, W, turn):
+        """The same, of a pass that is made."""
+        new = self.multiplier_of(c, violation, A, alpha, lam, W)
+        if new != lam:
+            self.dev.slots.note_turn(turn)
+        return new
+
+    @ti.func
+    def removed(self, c, violation, A, alpha, lam, W):
+        """The size of the violation that a Jacobi pass would remove."""
+        size = ti.cast(0, self.dev.real)
+        if W > 0:
+            new = self.multiplier_of(c, violation, A, alpha, lam, W)
             size = ti.abs(new - lam) * (A * W + alpha) / self.dev.slots.relaxation
-            if new != lam:
-                self.dev.slots.note_turn(turn)
-        return new, size
+        return size
 
     @ti.func
     def limit_collapse(self, c, lam, new, extent, move):
@@ -757,7 +771,7 @@ class Scalar(Batch):
                 start, weight, new = lam, W, lam
                 if ti.static(self.dev.limited):
                     if W > 0:
-                        new, _ = self.jacobi_update(c, violation, A, alpha, lam, W, 0)
+                        new = self.multiplier_of(c, violation, A, alpha, lam, W)
                         new, far = self.limit_step(c, lam, new, n, frame_fraction[1] - frame_fraction[0], 1)
                         if far:  # the others follow: a row without a weight goes back by its multiplier
                             start, weight = lam - new, 0 * W
@@ -779,7 +793,7 @@ class Scalar(Batch):
                     self.dev.slots.note_turn(turn)
         if ti.static(self.dev.outside):
             if self.outside_systems(c):
-                new, _ = self.jacobi_update(c, violation, A, alpha, lam, W, turn)
+                new = self.jacobi_update(c, violation, A, alpha, lam, W, turn)
                 if ti.static(self.collapses > 0):
                     move = ti.cast(0, self.dev.real)
                     for k in ti.static(range(self.arity)):
@@ -888,15 +902,22 @@ class Scalar(Batch):
 
     @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
-        """The violation that is left, relative to the rest value (to the batch's mean f where that is 0)."""
+        """The violation that is left, relative to the rest value (to the batch's mean f where that is 0). What is worked out for
+        a pass along two directions is so along one: W has a part in it only where a load ends."""
         left = ti.cast(0, self.dev.real)
         if ti.static(self.arity == 0):
             left = self.dev.outline.violation_left(c, h, h2_effective, fresh)
         else:
-            violation, A, alpha, lam, W, _, _, _, _ = self.linearise(c, h, h2_effective, 0 * h, 0, fresh)
-            _, left = self.jacobi_update(c, violation, A, alpha, lam, W, 0)
+            f, g = self.measure(c, self.corners(c, 0))
+            f = self.unwrap(f, self.dev.rest[c])
+            w, W = ti.cast(0, self.dev.real), ti.cast(0, self.dev.real)
+            for k in ti.static(range(self.arity)):
+                i, gg = self.member(c, k), g[k, :].dot(g[k, :])
+                w += self.dev.w.of(i) * gg
+                W += self.dev.slots.split[i] * gg
+            violation, A, alpha, lam, W = self.equation(c, f, f, w, W, h, h2_effective, 0, fresh)
+            left = self.removed(c, violation, A, alpha, lam, W)
             if ti.static(self.collapses > 0):
-                f, g = self.measure(c, self.corners(c, 0))
                 if g.norm_sqr() == 0 and self.dev.strength.holds(c):
                     left = ti.abs(self.bounded(f - self.dev.rest[c]))
         return left / self.residual_scale(c)

@@ -32,6 +32,7 @@ LEAN = SAFE | {"cfg_optimization": False}  # and no analysis of control flow
 # take more than the launch, because the address of the fields is looked up again after every store. What Taichi would simplify to
 # other bits (LLVM does not), a power of 1/2 to a root, is to be written so.
 BRIEF = {"advanced_optimization": False}
+SETTINGS = (*LEAN, *BRIEF)
 FEW = 1000  # particles from which it pays
 _INSIDE = contextlib.nullcontext()
 _lock = threading.RLock()  # the type of literals is one for all threads
@@ -62,6 +63,7 @@ class Compiler:
         self.lean = LEAN | BRIEF if (few and not often) or long else LEAN
         self.thorough = not lean  # once and for all, since what Taichi fails to compile may be tried again
         self.config: Any = None  # of Taichi, while kernels compile
+        self._host: bool | None = None  # whether they are for the host, once that is asked: Taichi takes 6 us to say so
         self._settings: dict[str, Any] = {}  # that Taichi was started with
         self._thread = 0
         self.refused: Exception | None = None  # what is wrong with a function that is being compiled, see refuse()
@@ -86,10 +88,12 @@ class Compiler:
         with _lock:
             config, literals = runtime.prog.config(), runtime.default_fp
             self.config = config
-            before = {name: getattr(config, name) for name in LEAN | BRIEF}
+            before = {name: getattr(config, name) for name in SETTINGS}
             self._settings = active[0]._settings if active else before
             runtime.set_default_fp(self.real)
-            _set(config, self.lean if str(config.arch) in HOSTS and not self.thorough else SAFE)
+            if self._host is None:
+                self._host = str(config.arch) in HOSTS
+            _set(config, self.lean if self._host and not self.thorough else SAFE)
             active.append(self)
             self._thread = threading.get_ident()
             self.point()

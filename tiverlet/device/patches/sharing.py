@@ -26,8 +26,8 @@ from taichi.lang.kernel_impl import Func, Kernel
 from ..language import OURS, TAICHI, active
 
 OF_TAICHI = ("taichi", "numpy", "math")  # modules that stay as they are
-EQUAL = (int, str, bool, type(None), bytes, complex)  # told apart by what they are equal to, among their own type
-ITSELF = (type, types.ModuleType, types.BuiltinFunctionType, np.ufunc, np.dtype, type(ti.f32))
+EQUAL = frozenset((int, str, bool, type(None), bytes, complex))  # told apart by what they are equal to, among their own type
+ITSELF = frozenset((type, types.ModuleType, types.BuiltinFunctionType, np.ufunc, np.dtype, type(ti.f32)))
 
 
 class Same:
@@ -76,49 +76,70 @@ class Writing:
             return
         self._numbers[id(value)] = len(self._numbers)
         self._alive.append(value)
-        if isinstance(value, (tuple, list)):
-            # Of our objects, kernels go through either alike; and a recording gives arguments back as lists.
-            out += ("row" if self._ours else kind, len(value))
-            for one in value:
-                self.write(one)
-        elif isinstance(value, (set, frozenset)):
-            out.append(kind)
-            self.write(sorted(value, key=repr))
-        elif isinstance(value, dict):
-            out += (kind, len(value))
-            for key, one in value.items():
-                self.write(key)
-                self.write(one)
-        elif isinstance(value, np.ndarray):
-            out.append(kind)
-            if not self._ours:
-                out += (value.dtype.str, value.shape, value.tobytes())
-        elif isinstance(value, np.generic):
-            out += (kind, value.tobytes())
-        elif kind is types.FunctionType:
-            self._write_function(value)
-        elif kind is types.MethodType:
-            out.append(kind)
-            self.write(value.__func__)
-            self.write(value.__self__)
-        elif kind is partial:
-            out.append(kind)
-            self.write((value.func, value.args, value.keywords))
-        elif isinstance(value, (Func, Kernel)):
-            self.write(value.func)
-        elif isinstance(value, Field):
-            out.append(vars(value).get("place_name") or Same(value))
-        elif hasattr(value, "__dict__"):
-            before, self._ours = self._ours, kind.__module__.startswith("tiverlet.")
-            out.append(Same(kind))
-            for name in read_names(value):
-                out.append(name)
-                self.write(vars(value)[name])
-            if self._ours and hasattr(kind, "compiled"):
-                self.write(value.compiled())
-            self._ours = before
-        else:
-            out.append(Same(value))
+        _way(kind)(self, value)
+
+    def _write_row(self, value: Any) -> None:
+        """A list or a tuple: of our objects, kernels go through either alike; and a recording gives arguments back as lists."""
+        self.out += ("row" if self._ours else type(value), len(value))
+        for one in value:
+            self.write(one)
+
+    def _write_set(self, value: Any) -> None:
+        """A set, in an order of its own."""
+        self.out.append(type(value))
+        self.write(sorted(value, key=repr))
+
+    def _write_mapping(self, value: Any) -> None:
+        """A dictionary."""
+        self.out += (type(value), len(value))
+        for key, one in value.items():
+            self.write(key)
+            self.write(one)
+
+    def _write_array(self, value: Any) -> None:
+        """An array: of ours, kernels do not read what it holds."""
+        self.out.append(type(value))
+        if not self._ours:
+            self.out += (value.dtype.str, value.shape, value.tobytes())
+
+    def _write_number(self, value: Any) -> None:
+        """A number of NumPy."""
+        self.out += (type(value), value.tobytes())
+
+    def _write_method(self, value: Any) -> None:
+        """A function of an object."""
+        self.out.append(type(value))
+        self.write(value.__func__)
+        self.write(value.__self__)
+
+    def _write_partial(self, value: Any) -> None:
+        """A function with some of its arguments."""
+        self.out.append(type(value))
+        self.write((value.func, value.args, value.keywords))
+
+    def _write_kernel(self, value: Any) -> None:
+        """A function or kernel of Taichi."""
+        self.write(value.func)
+
+    def _write_field(self, value: Any) -> None:
+        """A field, by its place."""
+        self.out.append(vars(value).get("place_name") or Same(value))
+
+    def _write_object(self, value: Any) -> None:
+        """An object, by what of it kernels may read."""
+        kind, own = type(value), vars(value)
+        before, self._ours = self._ours, _is_ours(kind)
+        self.out.append(Same(kind))
+        for name in _read_of(kind, tuple(own)):
+            self.out.append(name)
+            self.write(own[name])
+        if self._ours and hasattr(kind, "compiled"):
+            self.write(value.compiled())
+        self._ours = before
+
+    def _write_itself(self, value: Any) -> None:
+        """What is equal to nothing else."""
+        self.out.append(Same(value))
 
     def _write_function(self, function: Any) -> None:
         """A function, with what it knows from around it."""
@@ -148,21 +169,45 @@ def _names(code: types.CodeType) -> list[str]:
     return [*code.co_names, *inside]
 
 
-def read_names(value: Any) -> list[str]:
-    """The attributes of an object that kernels may read."""
-    return sorted(name for name in vars(value) if may_read(type(value), name))
+@lru_cache(None)
+def _way(kind: type) -> Callable[[Writing, Any], None]:
+    """How objects of a class are written."""
+    if kind in (types.FunctionType, types.MethodType, partial):
+        ways = {types.FunctionType: Writing._write_function, types.MethodType: Writing._write_method}
+        return ways.get(kind, Writing._write_partial)
+    for kinds, way in WAYS:
+        if issubclass(kind, kinds):
+            return way
+    return Writing._write_object if kind.__dictoffset__ else Writing._write_itself
+
+
+@lru_cache(None)
+def _is_ours(kind: type) -> bool:
+    """Whether a class is ours, and not one of the user's."""
+    return kind.__module__.startswith("tiverlet.")
+
+
+@lru_cache(1000)
+def _read_of(kind: type, names: tuple[str, ...]) -> list[str]:
+    """The attributes that kernels may read, of an object of a class that has these."""
+    return sorted(name for name in names if may_read(kind, name))
 
 
 @lru_cache(None)
 def may_read(kind: type, name: str) -> bool:
     """Whether kernels may read an attribute of objects of a class."""
-    if kind.__module__.startswith("tiverlet.") and name.startswith("_"):
+    if _is_ours(kind) and name.startswith("_"):
         return False
     said = [vars(base) for base in kind.__mro__]
     only = next((base["kernels_read"] for base in said if "kernels_read" in base), (name,))
     return name in only and not any(name in base.get("host_only", ()) for base in said)
 
 
+WAYS: tuple[tuple[Any, Callable[[Writing, Any], None]], ...] = (
+    ((tuple, list), Writing._write_row), ((set, frozenset), Writing._write_set), (dict, Writing._write_mapping),
+    (np.ndarray, Writing._write_array), (np.generic, Writing._write_number), ((Func, Kernel), Writing._write_kernel),
+    (Field, Writing._write_field),
+)  # fmt: skip
 _known: dict[tuple, str] = {}  # writings in short, and by which name their kernels are known
 _names_of: weakref.WeakKeyDictionary[Any, dict[tuple, str]] = weakref.WeakKeyDictionary()  # by objects: their kernels
 _keys_of: weakref.WeakKeyDictionary[Any, tuple] = weakref.WeakKeyDictionary()  # by objects: their writings in short
