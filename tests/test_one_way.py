@@ -27,7 +27,7 @@ def test_what_comes_from_below_passes_and_what_comes_from_above_lands(world, nam
     start = tv.Particles(x, velocity=np.stack([0 * SPEED, SPEED], axis=1), radius=R)
     w = world(start, [tv.Gravity(G), make(one_way=(0, 3), friction=0.5)], precision=precision)
     for substeps in (1, 20):
-        w.position, w.velocity, w.substeps, t = start.position, start.velocity, substeps, 0.0
+        w.velocity, w.position, w.substeps, t = start.velocity, start.position, substeps, 0.0
         for frame in range(120):
             w.step(1 / 60)
             t += 1 / 60

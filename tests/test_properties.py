@@ -61,7 +61,7 @@ class Scene:
 
     def again(self, substeps: int = 1, iterations: int = 1) -> None:
         """Put everything back to where it started."""
-        self.world.position, self.world.velocity = self.x, self.v
+        self.world.velocity, self.world.position = self.v, self.x
         self.world.substeps, self.world.iterations = substeps, iterations
         unprojected(self.world)
 
@@ -261,7 +261,7 @@ def test_no_bad_start_flies(world, dim, solver):
     start = tv.Particles(bad.position, pinned=bad.pinned, mass=0.1)
     w = world(start, bad.features, precision="f64", solver=solver, iterations=8 if isinstance(solver, tv.Chebyshev) else 1)
     for substeps in (1, 20, 200):
-        w.position, w.velocity, w.substeps = bad.position, np.zeros_like(bad.position), substeps
+        w.velocity, w.position, w.substeps = np.zeros_like(bad.position), bad.position, substeps
         for frame in range(6):
             report = w.step(1 / 60)
             assert (bad.far(w.position) < 4).all() and ("moved" in report.flags) == (frame == 0)

@@ -304,7 +304,7 @@ def test_a_reset_starts_from_places_that_are_given(taichi):
         assert many.hash(0) == before and many.time.tolist() == [many.time[0], 0, many.time[0], 0]
         report = many.step(1 / 60)
         fresh = world.clone()
-        fresh.position, fresh.velocity = x, v
+        fresh.velocity, fresh.position = v, x
         alone = fresh.step(1 / 60)
         assert many.hash(1) == many.hash(3) == fresh.hash()
         assert report.energy_change[1] == alone.energy_change and report.of(1).flags == alone.flags
