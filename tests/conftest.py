@@ -35,6 +35,8 @@ os.environ.setdefault("TI_OFFLINE_CACHE_MAX_SIZE_OF_FILES", str(512 << 20))
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as it is in the background of a shell; tests send it
     signal.signal(signal.SIGINT, signal.default_int_handler)
 collect_ignore = [] if patched else ["test_compiling.py", "test_sharing.py"]  # which are about what is not there then
+# Files that take longest, which come first: else one worker would go on with one of them when the others are done.
+LONG = ("demos", "worlds", "fuzz", "properties", "sleep", "polygons", "speed", "events", "periodic", "determinism", "contact")
 ARCH = os.environ.get("TIVERLET_ARCH", "cpu")
 SOURCES = str(pathlib.Path(tv.__file__).parent)
 # Functions of tests are held to what ours are, see checked_assignments(); those of these files try what a user's may do.
@@ -42,6 +44,12 @@ USERS = ("test_free_motion", "test_walls")
 OURS = tuple(str(path) for path in pathlib.Path(__file__).parent.rglob("*.py") if path.stem not in USERS)
 CASES = {name: known(name) for name in entries()}
 CROSSOVER = build.CROSSOVER  # particles and constraints from which a world has a team of threads by default
+
+
+def pytest_collection_modifyitems(items):
+    """Sort them."""
+    turn = {f"test_{name}": k for k, name in enumerate(LONG)}
+    items.sort(key=lambda item: turn.get(item.path.stem, len(LONG)))
 
 
 @contextlib.contextmanager

@@ -331,12 +331,13 @@ def test_spins_are_the_same_on_all_ways(world, dim, tmp_path, read_here):
     again = replay.world(len(replay.frames) - 1)
     assert again.hash() == hashes and (again.spin == w.spin).all() and (again.orientation == w.orientation).all()
     again.close()
-    twin = w.clone()
-    many = tv.Worlds(w, 2)
-    for one in (w, twin, many):
+    # Many worlds in space alone, where there is all that there is in the plane, and orientations.
+    twin, many = w.clone(), [tv.Worlds(w, 2)] if dim == 3 else []
+    for one in (w, twin, *many):
         one.step(1 / 60)
-    assert twin.hash() == w.hash() == many.hash(1)
-    many.close()
+    assert {twin.hash(), *(some.hash(1) for some in many)} == {w.hash()}
+    for some in many:
+        some.close()
     w.remove([3, 30])
     spin = np.delete(twin.spin, [3, 30], axis=0)
     np.testing.assert_allclose(w.spin, spin, atol=1e-3 * np.abs(spin).max())
