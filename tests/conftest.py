@@ -47,7 +47,7 @@ CROSSOVER = build.CROSSOVER  # particles and constraints from which a world has 
 
 
 def pytest_collection_modifyitems(items):
-    """Sort them."""
+    """Those of LONG first."""
     turn = {f"test_{name}": k for k, name in enumerate(LONG)}
     items.sort(key=lambda item: turn.get(item.path.stem, len(LONG)))
 
@@ -117,10 +117,8 @@ def process():
         # The cores are all taken by workers: threads of one team would wait for those of another, for three times as long as one
         # takes for all. The bits are the same; who wants a team asks for path="parallel".
         build.CROSSOVER = sys.maxsize
-    if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
-        # Bytecode of what tests start is not to lie beside the sources, so it is kept elsewhere: without, a process compiles the
-        # whole package, which is half of what it takes to start.
-        os.environ.setdefault("PYTHONPYCACHEPREFIX", str(pathlib.Path.home() / ".cache" / "tiverlet-tests"))
+    # What tests start keeps bytecode as it does by default: to compile the package is half of what such a process takes to start.
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     # What has been imported is no garbage; to look through all of it again and again takes 4 % of a run that compiles nothing.
     gc.collect()
     gc.freeze()
