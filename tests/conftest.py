@@ -13,6 +13,10 @@ import tempfile
 from collections.abc import Iterator
 from typing import Any
 
+# Before NumPy is imported, here, in workers and in all that tests start: the cores are taken, and BLAS, which looks out for work
+# with as many threads, takes a fifth of the CPU time of a process that does no more than import.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import numpy as np
 import pytest
 
@@ -31,6 +35,8 @@ os.environ.setdefault("TI_OFFLINE_CACHE_MAX_SIZE_OF_FILES", str(512 << 20))
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as it is in the background of a shell; tests send it
     signal.signal(signal.SIGINT, signal.default_int_handler)
 collect_ignore = [] if patched else ["test_compiling.py", "test_sharing.py"]  # which are about what is not there then
+# Files that take longest, which come first: else one worker would go on with one of them when the others are done.
+LONG = ("demos", "worlds", "fuzz", "properties", "sleep", "polygons", "speed", "events", "periodic", "determinism", "contact")
 ARCH = os.environ.get("TIVERLET_ARCH", "cpu")
 SOURCES = str(pathlib.Path(tv.__file__).parent)
 # Functions of tests are held to what ours are, see checked_assignments(); those of these files try what a user's may do.
@@ -38,6 +44,12 @@ USERS = ("test_free_motion", "test_walls")
 OURS = tuple(str(path) for path in pathlib.Path(__file__).parent.rglob("*.py") if path.stem not in USERS)
 CASES = {name: known(name) for name in entries()}
 CROSSOVER = build.CROSSOVER  # particles and constraints from which a world has a team of threads by default
+
+
+def pytest_collection_modifyitems(items):
+    """Those of LONG first."""
+    turn = {f"test_{name}": k for k, name in enumerate(LONG)}
+    items.sort(key=lambda item: turn.get(item.path.stem, len(LONG)))
 
 
 @contextlib.contextmanager
@@ -105,6 +117,8 @@ def process():
         # The cores are all taken by workers: threads of one team would wait for those of another, for three times as long as one
         # takes for all. The bits are the same; who wants a team asks for path="parallel".
         build.CROSSOVER = sys.maxsize
+    # What tests start keeps bytecode as it does by default: to compile the package is half of what such a process takes to start.
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     # What has been imported is no garbage; to look through all of it again and again takes 4 % of a run that compiles nothing.
     gc.collect()
     gc.freeze()
@@ -218,8 +232,9 @@ def rms(position, reference) -> float:
 
 
 def rerun(w: tv.World, seconds: float, dt: float = 1 / 60, **settings) -> tv.World:
-    """Put a world back to its start and run it with other substeps or iterations, which costs no compilation."""
-    w.position, w.velocity = w.particles.position, w.particles.velocity
+    """Put a world back to its start and run it with other substeps or iterations, which costs no compilation: velocities come
+    first, or else a kernel would make those of the last frame, which nobody wants, out of displacements."""
+    w.velocity, w.position = w.particles.velocity, w.particles.position
     for name, value in settings.items():
         setattr(w, name, value)
     w.run(seconds, dt=dt)

@@ -1,5 +1,6 @@
 """Compiling in less time changes no bit, and nothing of what the user compiles."""
 
+import ast
 import gc
 import inspect
 import io
@@ -7,6 +8,7 @@ import re
 import sys
 import tempfile
 
+import numpy as np
 import pytest
 from rich.console import Console
 
@@ -95,6 +97,34 @@ assert own() == -200.0
 """,
         TI_OFFLINE_CACHE="0",
     )
+
+
+@ti.func
+def nested(x, n: ti.template()):  # type: ignore[valid-type]
+    """(n + 1)! x, by calls of itself: of one sum, the left part is there when the tree of the right one is gone through."""
+    out = x
+    if ti.static(n > 0):
+        out = nested(x, n - 1) + n * nested(x, n - 1)
+    return out
+
+
+@ti.func
+def spring(x):
+    """-24 x"""
+    return -nested(x, 3)
+
+
+def test_functions_are_parsed_once_and_hold_nothing(world):
+    # x = cos(omega t), omega^2 = 24. Functions that call themselves have a tree for each depth; what nodes came to is not kept,
+    # among it worlds.
+    w = world(tv.Particles([[1.0, 0.0]]), [tv.Force(spring)], precision="f64", substeps=200)
+    w.run(0.5)
+    assert w.position[0, 0] == pytest.approx(np.cos(24**0.5 * w.time), abs=1e-5)
+    kept = [tree for trees in source_cache._trees.values() for tree in trees]
+    assert len(source_cache._trees[nested.func.func]) == 4
+    for tree in kept:
+        for node in ast.walk(tree):
+            assert not {*vars(node)} - {*node._fields, *node._attributes, "decorator", "nodes", "source"}
 
 
 def test_statements_are_those_that_taichi_makes():

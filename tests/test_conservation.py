@@ -89,7 +89,7 @@ class Scene:
         self.world = world(start, [self.gravity, links], substeps=10, iterations=2, precision=precision)
 
     def end(self, change=lambda x: x, boost=0.0):
-        self.world.position, self.world.velocity = change(self.x), change(self.v) + boost
+        self.world.velocity, self.world.position = change(self.v) + boost, change(self.x)
         self.gravity.g = change(np.array([1.0, -9.81]))
         self.world.run(0.5)
         return self.world.position

@@ -70,7 +70,7 @@ def test_12_one_substep_of_a_tenth_of_a_second(world, solver):
     assert repr(w._solver) == ("Jacobi(relaxation=1)" if solver else "Direct(width=2)")
     start = [energy for energy, _ in chains.energies()]
     for iterations in (1, 20):
-        w.position, w.velocity = x, np.zeros_like(x)
+        w.velocity, w.position = np.zeros_like(x), x
         w.iterations = iterations
         for _ in range(100):
             before = w.position

@@ -128,7 +128,7 @@ def test_velocities_under_any_drag(world, precision, limit):
     drag, h = tv.Drag(0.0), 1e-3
     w = world(tv.Particles([[0.0, 0.0]]), [tv.Gravity(9.81), drag], substeps=1, precision=precision)
     for z in (1e-6, 1e-3, 0.5, 20, 90, 250, 1e4):
-        w.position, w.velocity, drag.rate = np.zeros((1, 2)), np.zeros((1, 2)), z / h
+        w.velocity, w.position, drag.rate = np.zeros((1, 2)), np.zeros((1, 2)), z / h
         t = 0.0
         for dt in (h, h, h / 2, h):
             w.step(dt)

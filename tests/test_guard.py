@@ -40,7 +40,7 @@ def test_it_finds_the_moment_that_needs_more(world):
     w = hung(world, name, substeps=20)
     assert scene.error(rerun(w, 0.75), name, 0.75) > 0.3
     rerun(w, 1 / 60, substeps="auto")
-    w.position, w.velocity = w.particles.position, w.particles.velocity
+    w.velocity, w.position = w.particles.velocity, w.particles.position
     total = sum(w.step(1 / 60).substeps for _ in range(45))
     assert scene.error(w, name, 0.75) < 5e-2 and total < 450
 
@@ -100,7 +100,7 @@ def test_a_tolerance_is_one_of_the_motion(world):
     name, scene = "D01_double_pendulum", Scene()
     w, scene.begin[name] = hung(world, name, substeps="auto"), 0
     for tolerance in (1e-4, 1e-5, 2e-6):
-        w.position, w.velocity, w._controller = w.particles.position, w.particles.velocity, StepController()
+        w.velocity, w.position, w._controller = w.particles.velocity, w.particles.position, StepController()
         assert w.run(2.0, tolerance=tolerance).clean
         assert 3 * tolerance < scene.error(w, name, 2.0) < 15 * tolerance
 
@@ -111,7 +111,7 @@ def test_a_tolerance_is_one_of_the_energy_of_rigid_bodies(world):
     w = world(tv.Particles(x, pinned=[0]), [tv.Gravity(9.81), tv.ShapeMatch([range(15)])], substeps="auto")
     supply, used = 9.81 * 14 * 0.4, []
     for tolerance in (None, 1e-4, 1e-5):
-        w.position, w.velocity, w._controller = x, 0 * x, StepController()
+        w.velocity, w.position, w._controller = 0 * x, x, StepController()
         w.substeps = "auto"
         energy = [w.step(1 / 60, tolerance=tolerance).energy for _ in range(60)]
         used.append((np.max(energy) - 9.81 * x[1:, 1].sum()) / supply)
@@ -142,7 +142,7 @@ def test_a_shorter_substep_does_not_turn_a_sag_into_energy(world):
     w = world(tv.Particles(x, mass=0.01, pinned=[0, 1]), [tv.Gravity(9.81), tv.Distance(pairs)], solver=tv.Jacobi())
     start = 0.01 * 9.81 * x[2:, 1].sum()
     for plan in (("auto",) * 90, (64,) * 30 + (512,) * 10, (8,) * 20 + (200,) * 10):
-        w.position, w.velocity = x, np.zeros_like(x)
+        w.velocity, w.position = np.zeros_like(x), x
         for w.substeps in plan:
             report = w.step(1 / 60)
             assert report.energy <= start + 1e-3 * 0.01 * 9.81 * 18, (plan[0], report)
@@ -161,7 +161,7 @@ def test_no_change_of_the_substep_brings_in_energy(world):
     down = [round(20 * 1.2**-f) for f in range(12)]
     for link.compliance in (1e-3, 0.0):
         for plan in (["auto"] * 40, [2] * 12 + [200] * 6, 2 * (down + down[::-1])):
-            w.position, w.velocity, w._controller = sheet.position, 0 * sheet.position, StepController()
+            w.velocity, w.position, w._controller = 0 * sheet.position, sheet.position, StepController()
             for w.substeps in plan:
                 report = w.step(1 / 60)
                 assert report.energy <= 1e-3 * m * 9.81 * n**2, (link.compliance[0], plan[-1], report)
@@ -179,7 +179,7 @@ def test_no_change_of_the_substep_brings_in_energy_of_bodies(world):
     w = world(start, features, solver=tv.Jacobi())
     energy = 0.01 * 9.81 * start.position[~start.pinned, 1].sum()
     for plan in (["auto"] * 150, [2] * 40 + [100] * 10):
-        w.position, w.velocity, w._controller = start.position, 0 * start.position, StepController()
+        w.velocity, w.position, w._controller = 0 * start.position, start.position, StepController()
         for w.substeps in plan:
             report = w.step(1 / 60)
             assert report.energy <= energy + 1e-3 * 0.01 * 9.81 * 14 * 0.7, (plan[-1], report)

@@ -225,9 +225,9 @@ class Scene:
         apart = self.x.copy()
         for name in ("Contact", "Polygons"):
             apart[self.indices.get(name, []), 1] += np.arange(len(self.indices.get(name, []))) / 2
-        self.world.position, self.world.velocity = apart, 0 * self.v
+        self.world.velocity, self.world.position = 0 * self.v, apart
         self.world.step(DT)
-        self.world.position, self.world.velocity = self.x, self.v
+        self.world.velocity, self.world.position = self.v, self.x
         out = [self.world.step(DT) and self.world.position for _ in range(frames)]
         return np.concatenate(out, axis=1)
 
@@ -365,7 +365,7 @@ def test_what_was_absent_is_compiled_when_it_is_first_asked_for(world):
     assert twin.hash() == w.hash() and handle.indices.tolist() == [3]
     twin.close()
     for one in (w, other):
-        one.position, one.velocity = start[0] + [0, 3], 0 * start[1]
+        one.velocity, one.position = 0 * start[1], start[0] + [0, 3]
         one.step(DT)  # in which pairs forget
         one.position, one.velocity = start
         one.run(0.2)
@@ -398,7 +398,7 @@ def test_what_was_turned_and_turned_back_leaves_no_trace(world):
         links.rest = rest
         w.step(DT)
     fresh, _ = hang([0.6, 0.5, 0.4])
-    w.position, w.velocity = w.particles.position, w.particles.velocity
+    w.velocity, w.position = w.particles.velocity, w.particles.position
     for _ in range(3):
         w.step(DT)
         fresh.step(DT)

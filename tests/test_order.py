@@ -58,7 +58,7 @@ def test_velocities_have_the_order_too(world):
         errors, across = [], []
         for n in (100, 200, 400):
             for w, v in ((orbit, [(0, np.sqrt(3.0), 0)]), (cone, [(0, 0, 0), (0, 0, speed)])):
-                w.position, w.velocity, w.substeps = w.particles.position, v, n
+                w.velocity, w.position, w.substeps = v, w.particles.position, n
                 w.run(2 * np.pi, dt=2 * np.pi)
             errors.append(np.abs(orbit.velocity[0] - [0, np.sqrt(3.0), 0]).max())
             across.append(abs(cone.velocity[1] @ (cone.position[1] - cone.position[0])))

@@ -55,7 +55,7 @@ def test_a_bead_on_a_helix(world):
     w = world(tv.Particles(points[[20, -5]], velocity=(0, -1, 0)), [tv.Gravity(9.81), path], precision="f64")
     errors = []
     for n in (3, 6, 12):
-        w.position, w.velocity, w.substeps = points[[20, -5]], [[0, 0, 0], [0, -50.0, 0]], n
+        w.velocity, w.position, w.substeps = [[0, 0, 0], [0, -50.0, 0]], points[[20, -5]], n
         w.run(1.0)
         along = path.curve.nearest(points[[20]])[0] + 9.81 * slope / 2
         errors.append(rms(w.position[0], path.place(np.array([along]))[0]))

@@ -270,10 +270,10 @@ def test_a_shear_is_live_and_survives_whatever_happens_to_the_world(world, tmp_p
     body = np.unique([[0, 1, 2], [5, 6, 3], [4, 4, 4]])
     single = np.setdiff1d(np.arange(len(drawn)), body)
     np.testing.assert_allclose(drawn[single], box.wrap(w.position)[single], atol=1e-5)
-    for copy in (w, twin, other, again):
+    assert other.features[0].strain == box.strain
+    for copy in (w, twin, again):
         copy.step(DT)
     assert twin.hash() == w.hash() == again.hash()
-    assert np.isclose(other.features[0].strain, 4 * DT)
     for copy in (twin, other, again):
         copy.close()
 

@@ -49,8 +49,7 @@ def test_soft_pins_are_springs(world):
 
 
 @pytest.mark.skipif(not patched or ARCH != "cpu", reason="every world has kernels of its own there")
-@pytest.mark.parametrize("compliance", [0.0, 1e-3])
-@pytest.mark.parametrize("precision", ["f32", "f64"])
+@pytest.mark.parametrize(("compliance", "precision"), [(0.0, "f64"), (1e-3, "f32")])
 def test_a_pin_that_takes_other_particles_is_as_a_new_one(world, compliance, precision):
     # To the bit, and nothing is compiled. What it held goes on freely.
     def scene():

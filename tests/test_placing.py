@@ -26,7 +26,7 @@ def test_links_of_other_lengths_bring_no_energy(world, solver):
         for factor in factors:
             links.rest = factor / N
             for substeps in (20, 200):
-                w.substeps, w.position, w.velocity = substeps, row(), np.zeros((N + 1, 2))
+                w.substeps, w.velocity, w.position = substeps, np.zeros((N + 1, 2)), row()
                 first = w.step(1 / 60)
                 reports = [w.step(1 / 60) for _ in range(20)]
                 assert not any("moved" in r.flags for r in reports) and ("moved" in first.flags) == (abs(factor - 1) > 2e-3)
@@ -64,7 +64,7 @@ def test_links_that_come_later_bring_no_energy(world, solver):
     x = row()[:, ::-1] * [1, -1]
     w = world(tv.Particles(x, mass=M, pinned=[0]), [tv.Gravity(G), tv.Distance(line(N))], solver=solver, precision="f64")
     for substeps in (20, 200):
-        w.substeps, w.position, w.velocity = substeps, x, np.zeros_like(x)
+        w.substeps, w.velocity, w.position = substeps, np.zeros_like(x), x
         w.run(0.1)
         tie = tv.Distance([[5, 10]], rest=0.2)
         w.add(features=[tie])

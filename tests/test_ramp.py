@@ -87,7 +87,7 @@ def test_what_a_ramp_brings_in_does_not_depend_on_the_substep(world):
     w = world(particles, features, solver=tv.Jacobi())
     energies = []
     for substeps in (64, 512):
-        w.position, w.velocity, w.substeps = particles.position, np.zeros_like(particles.position), substeps
+        w.velocity, w.position, w.substeps = np.zeros_like(particles.position), particles.position, substeps
         turn(features, 1.0)
         w.step(DT)
         turn(features, 0.95)

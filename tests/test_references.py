@@ -97,7 +97,7 @@ def test_modes_of_a_chain_of_springs(world):
     for j, iterations, limit in ((1, 4, 1e-5), (1, 1, 1e-3), (5, 4, 1e-4)):
         u = np.sin(j * np.pi * np.arange(n + 2) / (n + 1))
         u[-1] = 0
-        w.position, w.velocity, w.iterations = x + 0.01 * np.outer(u, [1, 0]), 0 * x, iterations
+        w.velocity, w.position, w.iterations = 0 * x, x + 0.01 * np.outer(u, [1, 0]), iterations
         times, q = [], []
         for _ in range(500):  # 10 s, h = 1e-3
             w.step(0.02)
@@ -120,7 +120,7 @@ def test_modes_of_a_hanging_chain(world):
     x[1:, 1] = -np.cumsum(np.sqrt(1 / n**2 - np.diff(x[:, 0]) ** 2))
     w = world(tv.Particles(x, pinned=[0]), [tv.Gravity(9.81), tv.Distance(line(n), 1 / n)], precision="f64")
     for iterations, limit in ((8, 1e-4), (1, 2e-4)):
-        w.position, w.velocity, w.iterations = x, 0 * x, iterations
+        w.velocity, w.position, w.iterations = 0 * x, x, iterations
         q = []
         for _ in range(600):
             w.step(DT)

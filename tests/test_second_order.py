@@ -150,7 +150,7 @@ def test_a_free_rod_spins_for_ever(world, dim):
     w = world(start, [tv.Distance([[0, 1]])], substeps=10, precision="f64", solver=tv.Jacobi())
     for (omega, h, t), iterations in product([(50.0, 1e-3, 1.0), (10.0, 1 / 600, 10.0), (100.0, 1 / 1200, 1.0)], (1, 3)):
         w.iterations = iterations
-        w.position, w.velocity = x, omega * np.array([[0, 0.25, 0], [0, -0.75, 0]])[:, :dim]
+        w.velocity, w.position = omega * np.array([[0, 0.25, 0], [0, -0.75, 0]])[:, :dim], x
         w.step(10 * h)
         turn = []
         for _ in range(2):
@@ -169,7 +169,7 @@ def test_a_free_rod_spins_for_ever(world, dim):
     # The velocities that the user reads: of the same angular momentum, and across the rod, from the first substep on and after a
     # change of h. With the force along the direction at the start of the substep the momentum was off by (omega h)^2 / 2 = 3e-4.
     omega, h, w.iterations = 37.0, 7e-4, 3
-    w.position, w.velocity = x, omega * np.array([[0, 0.25, 0], [0, -0.75, 0]])[:, :dim]
+    w.velocity, w.position = omega * np.array([[0, 0.25, 0], [0, -0.75, 0]])[:, :dim], x
     for substeps in (1, 1, 1, 2, 2, 1, 3):
         w.substeps = substeps
         w.step(h)
@@ -194,7 +194,7 @@ def test_changing_substeps_in_a_swing_costs_no_order(world):
     errors = []
     w = hang(world, "D01_double_pendulum", iterations=30)
     for n in (20, 40, 80):
-        w.position, w.velocity = w.particles.position, w.particles.velocity
+        w.velocity, w.position = w.particles.velocity, w.particles.position
         for k in range(120):
             w.substeps = n + (k % 2) * n // 4
             w.step(FRAME)

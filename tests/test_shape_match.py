@@ -79,7 +79,7 @@ def test_soft_shapes(world, dim):
     assert 1.9 <= order(errors) <= 2.1 and errors[-1] < 1e-5
     stored = (m @ ((swell - q) ** 2).sum(axis=1)) / (2 * alpha * m.sum())
     assert w.last.energy == pytest.approx(stored, rel=1e-4)
-    w.position, w.velocity = q + 0.2 * rng.normal(size=q.shape), rng.normal(size=q.shape)
+    w.velocity, w.position = rng.normal(size=q.shape), q + 0.2 * rng.normal(size=q.shape)
     w.substeps = 10
     first = w.step(1 / 60).energy
     p, spin = tv.measure.momentum(w), angular(w, m, 600)
@@ -120,12 +120,12 @@ def test_spins_beyond_the_step(world):
     w = world(tv.Particles(x), [tv.ShapeMatch([np.arange(4)])], precision="f64")
     w.iterations = 2
     for spin, load in ((10.0, 100.0), (20.0, 400.0)):  # m omega^2 r of the outermost
-        w.position, w.velocity = x, spin * np.stack([-x[:, 1], x[:, 0]], axis=1)
+        w.velocity, w.position = spin * np.stack([-x[:, 1], x[:, 0]], axis=1), x
         w.run(0.1)
         assert w.features[0].load == pytest.approx([load], rel=2 * (spin / 1200) ** 2)
     w.iterations = 1
     for spin in (600.0, 3000.0, 1e5):
-        w.position, w.velocity = x, spin * np.stack([-x[:, 1], x[:, 0]], axis=1)
+        w.velocity, w.position = spin * np.stack([-x[:, 1], x[:, 0]], axis=1), x
         kinetic = 0.5 * (w.velocity**2).sum()
         report = w.run(1.0)
         # sin(angle) = omega h of the start; the displacement is a chord, so d / h overstates v where both are large.

@@ -93,12 +93,12 @@ class Stage:
         self.m = len(x)
         self.place(at, turn)
         for world, pull in zip(self.worlds, self.pulls, strict=True):
-            world.position, world.velocity, pull.g = self.aside, 0 * self.aside, 0.0
+            world.velocity, world.position, pull.g = 0 * self.aside, self.aside, 0.0
             world.substeps = substeps
             world.step(1e-3)
             position, velocity = self.aside.copy(), 0 * self.aside
             position[: self.m], velocity[: self.m] = x, v
-            world.position, world.velocity, pull.g = position, velocity, gravity
+            world.velocity, world.position, pull.g = velocity, position, gravity
 
     def step(self, dt: float) -> None:
         """Both worlds."""

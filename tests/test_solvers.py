@@ -105,7 +105,7 @@ def test_chebyshev_converges_as_the_square_root(world):
     for solver in (tv.Jacobi(), tv.Chebyshev()):
         w = hung(world, solver)
         for k in (8, 24):
-            w.position, w.velocity, w.iterations = w.particles.position, w.particles.velocity, k
+            w.velocity, w.position, w.iterations = w.particles.velocity, w.particles.position, k
             left[type(solver), k] = np.median([w.step(1 / 60).residual for _ in range(30)])
             assert abs(w.last.energy) < 0.1 and w.last.energy < 1e-3
     assert left[tv.Chebyshev, 8] < left[tv.Jacobi, 8] / 4 and left[tv.Chebyshev, 24] < left[tv.Jacobi, 24] / 10
@@ -178,7 +178,7 @@ def test_passes_leave_of_each_mode_what_their_polynomial_says(world, solver, pol
         mode = np.cos(np.pi * j * i / (m - 1)) * np.where((i == 0) | (i == m - 1), 0.5, 1.0) * 1e-3
         x = start.position.copy()
         x[1:, 0] += np.cumsum(mode)
-        w.position, w.velocity, w.iterations = x, 0 * x, k
+        w.velocity, w.position, w.iterations = 0 * x, x, k
         unprojected(w).step(1 / 60)
         left = np.diff(w.position[:, 0]) - rest
         eigenvalue = (1 - np.cos(np.pi * j / (m - 1))) / 2
@@ -264,7 +264,7 @@ def test_what_is_drawn_straight_between_pins_gains_no_energy(world, solver, prec
         start, [tv.Gravity(9.81), tv.Distance(pairs)], solver=solver, precision=precision, iterations=iterations, path="fused"
     )
     for substeps in (2, 20, 200):
-        w.position, w.velocity, w.substeps = x, 0 * x, substeps
+        w.velocity, w.position, w.substeps = 0 * x, x, substeps
         most = max(w.step(1 / 60).energy for _ in range(40))
         assert most < 1e-3 * 0.144 * 9.81, substeps
         assert substeps == 2 or "unconverged" not in w.last.flags
@@ -281,7 +281,7 @@ def test_links_of_length_0_bring_in_no_energy(world, solver, iterations):
     links = tv.Distance(np.stack([k, k + 1], axis=1))
     w = world(particles, [tv.Gravity(9.81), links], precision="f64", solver=solver, iterations=iterations)
     for substeps in (2, 20, "auto"):
-        w.position, w.velocity, w.substeps = x, 0 * x, substeps
+        w.velocity, w.position, w.substeps = 0 * x, x, substeps
         reports = [w.step(1 / 60) for _ in range(120)]
         assert max(r.energy for r in reports) <= 9.81 * 0.01 * n * (2 + 1e-4)
         assert substeps == 2 or all(r.clean for r in reports)
@@ -294,7 +294,7 @@ def test_springs_that_are_not_solved_hold_no_energy_that_nobody_supplied(world):
     link = tv.Distance(pairs, compliance=np.geomspace(1e-6, 1e-2, len(pairs)))
     w = world(tv.Particles(x, mass=1e-3, pinned=[0, 11]), [tv.Gravity(9.81), link], path="fused", solver=tv.Jacobi())
     for substeps in (5, 20, 100):
-        w.position, w.velocity, w.substeps = x, 0 * x, substeps
+        w.velocity, w.position, w.substeps = 0 * x, x, substeps
         energy = [w.step(1 / 60).energy for _ in range(30)]
         assert max(energy) < 1e-3 * 0.144 * 9.81, substeps
 

@@ -1,7 +1,10 @@
 """The report on speed: its figures belong together. Nothing here is about how fast anything is."""
 
+import contextlib
+import itertools
 import json
 import pathlib
+import types
 from dataclasses import replace
 
 import numpy as np
@@ -9,15 +12,24 @@ import pytest
 
 import tiverlet as tv
 from tiverlet.__main__ import main
+from tiverlet.device import ti
 from tiverlet.report import speed
 from tiverlet.report.speed import SCENES, SpeedReport, c_baseline, counting, measure, peers, scenes, stripped, waits, worlds
 
 
 @pytest.fixture(scope="module")
-def report():
+def kept(taichi):
+    """A folder for what children compile, beside what is kept of the tests themselves: no second run compiles it again."""
+    return pathlib.Path(ti.cfg.offline_cache_file_path, "speed")
+
+
+@pytest.fixture(scope="module")
+def report(kept):
     """Two scenes of one size each, quickly, one of them by a copy of the package that lacks what it does not use."""
+    number = itertools.count()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(measure, "BLOCK", 1 << 22)
+        patch.setattr(measure.Session, "cache", lambda session: str(kept / str(next(number))))
         whole = speed(["pile"], sizes=[41], threads=[1], quick=True, peers=False, absent=False, waits=True)
         rope = speed(["rope"], sizes=[41], threads=[1], quick=True, peers=False, yardstick=False, waits=False)
     return replace(whole, runs=whole.runs + rope.runs, absent=rope.absent)
@@ -200,9 +212,12 @@ def test_command(capsys):
 
 
 @pytest.fixture(scope="module")
-def batch():
+def batch(kept):
     """Many worlds, few of them."""
-    return worlds.worlds(threads=(1,), quick=True, peers=False)
+    with pytest.MonkeyPatch.context() as patch:
+        folder = contextlib.nullcontext(str(kept / "worlds"))
+        patch.setattr(worlds, "tempfile", types.SimpleNamespace(TemporaryDirectory=lambda: folder))
+        return worlds.worlds(threads=(1,), quick=True, peers=False)
 
 
 def test_worlds_are_measured_or_left_out(batch):

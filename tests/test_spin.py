@@ -65,7 +65,7 @@ def test_what_slides_comes_to_roll(world, dim, body, k):
     w = world(start, [tv.Gravity(G), tv.HalfSpace(np.eye(dim)[1], friction=mu)], precision="f64")
     t1, errors = v0 / ((1 + k) * mu * G), []
     for substeps in (4, 40):
-        w.position, w.velocity, w.spin, w.substeps = start.position, start.velocity, start.spin, substeps
+        w.velocity, w.position, w.spin, w.substeps = start.velocity, start.position, start.spin, substeps
         begin = w.time
         w.run(1.0)
         t = w.time - begin
@@ -128,7 +128,7 @@ def test_two_that_collide_obey_the_law_of_impacts_to_rounding(world, dim):
         (1e3, 1, 1, 5),
     ):
         contact.friction, contact.restitution = mu, (e, beta)
-        w.position, w.velocity, w.spin, w.substeps = x, v, start.spin, substeps
+        w.velocity, w.position, w.spin, w.substeps = v, x, start.spin, substeps
         before = tv.measure.momentum(w), tv.measure.angular_momentum(w, about), tv.measure.kinetic_energy(w)
         w.run(0.5)
         t, velocity, spin, sticks = law(x, v, omega, m, r, k, e, mu, beta)
@@ -188,7 +188,7 @@ def test_what_rolls_off_another_does_so_to_second_order(world, dim):
         y = y + h / 6 * (a + 2 * b + 2 * c + fall(y + h * c))
     errors = []
     for substeps in (10, 20, 40):
-        w.position, w.velocity, w.spin, w.substeps = place, 0 * place, w.particles.spin, substeps
+        w.velocity, w.position, w.spin, w.substeps = 0 * place, place, w.particles.spin, substeps
         w.run(T, dt=0.05)
         x, y_ = w.position[1, :2]
         errors.append([np.arctan2(x, y_) - y[0], rate(w, 1) + y[1] * (R + r) / r])
@@ -208,7 +208,7 @@ def test_a_swarm_keeps_angular_momentum_and_loses_energy(world):
     momentum, angular = tv.measure.momentum(w), tv.measure.angular_momentum(w, (1, 2, 3))
     energy, off = tv.measure.kinetic_energy(w), []
     for substeps in (20, 200):
-        w.position, w.velocity, w.spin, w.substeps = x, start.velocity, start.spin, substeps
+        w.velocity, w.position, w.spin, w.substeps = start.velocity, x, start.spin, substeps
         lost = [w.step(1 / 60).energy_change for _ in range(60)]
         assert max(lost) <= 1e-13 * energy and sum(lost) < -0.5 * energy
         np.testing.assert_allclose(tv.measure.momentum(w), momentum, atol=1e-12)
@@ -331,12 +331,13 @@ def test_spins_are_the_same_on_all_ways(world, dim, tmp_path, read_here):
     again = replay.world(len(replay.frames) - 1)
     assert again.hash() == hashes and (again.spin == w.spin).all() and (again.orientation == w.orientation).all()
     again.close()
-    twin = w.clone()
-    many = tv.Worlds(w, 2)
-    for one in (w, twin, many):
+    # Many worlds in space alone, where there is all that there is in the plane, and orientations.
+    twin, many = w.clone(), [tv.Worlds(w, 2)] if dim == 3 else []
+    for one in (w, twin, *many):
         one.step(1 / 60)
-    assert twin.hash() == w.hash() == many.hash(1)
-    many.close()
+    assert {twin.hash(), *(some.hash(1) for some in many)} == {w.hash()}
+    for some in many:
+        some.close()
     w.remove([3, 30])
     spin = np.delete(twin.spin, [3, 30], axis=0)
     np.testing.assert_allclose(w.spin, spin, atol=1e-3 * np.abs(spin).max())

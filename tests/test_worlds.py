@@ -85,12 +85,10 @@ SCENES = {
     },
     "every force and wall": lambda k: every_force(3, k),
     "polygons": bricks,
-    "Jacobi": lambda k: cloth(tv.Jacobi(), k),
     "Chebyshev": lambda k: cloth(tv.Chebyshev(), k),
     "ConjugateGradient": lambda k: cloth(tv.ConjugateGradient(4), k),
     "Direct, compensated": lambda k: cloth(tv.Direct(), k, "f32-compensated"),
     "order 4": lambda k: cloth(None, k, "f64", 4, 2, 30),
-    "order 8": lambda k: cloth(None, k, "f64", 8, 1, 30),
 }
 
 
@@ -306,7 +304,7 @@ def test_a_reset_starts_from_places_that_are_given(taichi):
         assert many.hash(0) == before and many.time.tolist() == [many.time[0], 0, many.time[0], 0]
         report = many.step(1 / 60)
         fresh = world.clone()
-        fresh.position, fresh.velocity = x, v
+        fresh.velocity, fresh.position = v, x
         alone = fresh.step(1 / 60)
         assert many.hash(1) == many.hash(3) == fresh.hash()
         assert report.energy_change[1] == alone.energy_change and report.of(1).flags == alone.flags
@@ -316,9 +314,9 @@ def test_a_reset_starts_from_places_that_are_given(taichi):
 def test_worlds_of_the_same_structure_compile_nothing_more(taichi):
     with tv.Worlds(pendulum(), 100) as many:
         many.run(0.1)
-    with compiled() as names, tv.Worlds([pendulum(2.0, 3.0) for _ in range(700)]) as many:
+    with compiled() as names, tv.Worlds([pendulum(2.0, 3.0) for _ in range(450)]) as many:
         many.run(0.1)
-        many.reset(np.arange(700) % 2 == 0)
+        many.reset(np.arange(450) % 2 == 0)
         many.step(0.01)
     assert [name for name in names if name != "to_velocity"] == []
 

@@ -5,6 +5,7 @@ import pytest
 from .campaign import search
 from .finds import FINDS
 from .trials import Trial
+from .twins import WAYS
 
 # Kinds that are still being mended are left to campaigns.
 HARD = {"error", "nan", "bits", "overlap", "residual", "momentum", "spin", "twin", "wall"}
@@ -13,8 +14,8 @@ HARD = {"error", "nan", "bits", "overlap", "residual", "momentum", "spin", "twin
 @pytest.mark.parametrize("begin", (0, 4))
 def test_random_scenes_keep_their_promises(taichi, begin):
     # Passive energy, brute force, momentum, walls, the same bits: see trials.py. The scenes are the same in every run; each of
-    # twins.WAYS is gone at least once.
-    for k in range(begin, begin + 4):
+    # twins.WAYS is gone once.
+    for k in range(begin, min(begin + 4, len(WAYS))):
         searcher = search(1, k, 5, HARD)
         assert not searcher.found, searcher.says()
 

@@ -24,6 +24,7 @@ from ..language import HOME, OURS, TAICHI, active
 CLOSING = (")", "]", "}")  # what the last lines of a function may begin with that are not in its code
 NOTHING = 8  # bytes of code of a function that has nothing but a docstring
 _lines: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()  # of functions, as inspect finds them
+_trees: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()  # of functions: those that are not in use
 
 
 def _lines_of(function) -> tuple[list[str], int]:
@@ -85,6 +86,30 @@ def _place_of(self: Any, node: Any) -> str:
     return self.place
 
 
+def _read(self: Any, *more: Any, is_kernel: bool = True, is_real_function: bool = False, **options: Any) -> Any:
+    """The tree of a function, and what it is compiled in: a tree that was read before and is not in use, see _transformed()."""
+    spare = _trees.get(self.func) if active and not (is_kernel or is_real_function or more) else None
+    if not spare:
+        return _parse(self, *more, is_kernel=is_kernel, is_real_function=is_real_function, **options)
+    tree = spare.pop()
+    around = {"func": self, "global_vars": kernel_impl._get_global_vars(self.func), "argument_data": options["args"]}
+    return tree, ASTTransformerContext(is_kernel=False, ast_builder=options["ast_builder"], **around, **tree.source)
+
+
+def _transformed(tree: Any, ctx: Any) -> Any:
+    """Make statements of a tree. That of a ti.func is kept for the next call of it, without what its nodes came to."""
+    out = _transform(tree, ctx)
+    if active and not ctx.is_kernel and not ctx.is_real_function:
+        if not hasattr(tree, "nodes"):
+            tree.nodes = [node for node in ast.walk(tree) if not isinstance(node, ast.expr_context)]
+            tree.source = {"src": ctx.src, "start_lineno": ctx.lineno_offset + 1, "file": ctx.file}
+        for node in tree.nodes:
+            node.__dict__.pop("ptr", None)
+            node.__dict__.pop("caller", None)
+        _trees.setdefault(ctx.func.func, []).append(tree)
+    return out
+
+
 def _in_class(level_of_class_stackframe: int) -> bool:
     """Whether a decorator is at work in the body of a class; Taichi looks for the source of the statement around it, which for
     all of ours took half of the time that importing them took."""
@@ -106,6 +131,7 @@ def apply() -> None:
     """Put these in the place of what Taichi calls."""
     kernel_impl.getsourcelines, kernel_impl._inside_class = _lines_of, _in_class
     kernel_impl.textwrap = SimpleNamespace(fill=_filled, dedent=_dedented)
+    kernel_impl._get_tree_and_ctx, kernel_impl.transform_tree = _read, _transformed
     context: Any = ASTTransformerContext
     context.get_pos_info, context.line, context.place = _place_of, 0, ""
     impl.get_traceback = matrix.get_traceback = snode.get_traceback = _trace
@@ -113,5 +139,7 @@ def apply() -> None:
 
 _find_lines: Any = kernel_impl.getsourcelines
 _look_around: Any = kernel_impl._inside_class
+_parse: Any = kernel_impl._get_tree_and_ctx
+_transform: Any = kernel_impl.transform_tree
 _draw: Any = ASTTransformerContext.get_pos_info
 _who: Any = snode.get_traceback
