@@ -21,6 +21,7 @@ RESIDUAL, OVERLAP = 1e-2, 0.1  # what is good where the user asks for nothing el
 TENSION = 2.0  # (omega h)^2: half the limit of stability
 RISKS = {"tunnelling-risk", "stiff-force", "non-finite"}
 GAIN = 1.4  # by which twice the effort has to lower the figures; of second order they fall by 4, of first order by 2
+FEW = 16  # substeps with which what does not help yet may help later
 IDLE = {"substeps": 2, "iterations": 1}  # doublings without a gain that are enough
 ROOM = 6.0  # by which the figures have to be better than asked before less is tried
 PATIENCE = 64  # frames, at most, until it is tried again
@@ -37,7 +38,7 @@ class StepController:
     A frame is undone, and made again with twice the substeps, when in one of them a constraint turned by more than 26 degrees
     (cos < 0.9, where SHAKE's direction is no longer good), a residual above 1e-2 or an overlap above a tenth of a radius was
     left, a tension made particles vibrate with (omega h)^2 > 2, or when it has a flag that shorter substeps remove. Where twice
-    the substeps bring no gain, twice the iterations are tried; where they bring none either, the flag is "stuck": the frame is
+    the substeps, 16 or more, bring no gain, twice the iterations are tried; where they bring none, it is "stuck": the frame is
     the one with the least effort of those that are as good, and what stays wrong is asked for no more in the next frames.
     A body that turns by phi in a substep does so by phi^2 / 24 of that too fast or too slowly, a relative error as a residual is:
     the 26 degrees above are one of 1e-2, and a tolerance that is asked for is asked of the turns of rigid constraints, too.
@@ -96,7 +97,7 @@ class StepController:
                 gains = any(f * GAIN <= b for f, b, w in zip(figures, best, wrong, strict=True) if w)
                 idle = 0 if gains else idle + 1
                 best = tuple(map(min, figures, best))
-                if idle >= IDLE[kind]:
+                if idle >= IDLE[kind] and n >= FEW:
                     if kind == "iterations" or k >= PASSES:
                         verdict = "stuck"
                         stuck = tuple(max(s, GAIN * f) if w else s for s, f, w in zip(stuck, figures, wrong, strict=True))

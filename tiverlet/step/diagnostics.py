@@ -414,9 +414,9 @@ class Reporter:
             )
         if released > 0:
             return (
-                f"Constraints were off by {100 * released:.3g} % of their size as the frame began: large clusters or loops, as "
-                "the substep became shorter, which turns that into energy; or links that contradict each other, which lets all "
-                "give way. Give all frames as many substeps, or these constraints compliance, or lengths that fit."
+                f"Large clusters or loops, or links that contradict each other, were off by {100 * released:.3g} % of their size "
+                "as the frame began. A shorter substep turns that into energy; contradictions let all links give way. Give all "
+                "frames as many substeps, or these constraints compliance, or lengths that fit."
             )
         need = np.ceil(substeps * residual / UNCONVERGED)  # of order h^2 under loads, h after impacts
         if self.remedy is None:
