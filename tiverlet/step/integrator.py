@@ -1,10 +1,15 @@
 """How one particle moves on its own: position Verlet in displacement form, with drag that is exact."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..device import ti
 from ..features.feature import Acceleration, Scene
 from ..tools import golden_steps
+
+if TYPE_CHECKING:
+    from .clock import Clock
 
 # Multiples of the golden ratio of two dimensions, mod 1, are the most even sequence of pairs: one for each of the two sums.
 DITHER = golden_steps(2)
@@ -205,3 +210,8 @@ def decay(rate: float, h: float) -> list[float]:
 
 
 FREE = decay(0.0, 1.0)  # what no drag makes of a substep
+
+
+def h2_effective_of(clock: "Clock") -> float:
+    """What a constant acceleration added to the displacement in the last substep, per m/s^2 [s^2]."""
+    return clock.h**2 * (clock.drag or FREE)[2 if clock.started else 1]

@@ -23,12 +23,11 @@ import numpy as np
 from ..constraints.core.scalar import Scalar
 from ..neighbours.queries import between
 from .block_matrix import BlockMatrix
-from .integrator import FREE
+from .integrator import h2_effective_of
 from .jacobian import Jacobian, bodies_of
 from .rigid_rows import RigidRows, left_out, rigid_rows
 
 if TYPE_CHECKING:
-    from .clock import Clock
     from .runner import Runner
 
 ENOUGH = 1e-3  # of its size: a violation that matters, over (r - 1)^2 / r with r = (h / h')^2: what one jump leaves to vibrate
@@ -139,11 +138,6 @@ def seen_before(runner: Any) -> tuple[float, float]:
     return energy if runner.clock.energy is None else runner.clock.energy, overlap
 
 
-def effective(clock: "Clock") -> float:
-    """What a constant acceleration added to the displacement in the last substep, per m/s^2 [s^2]."""
-    return clock.h**2 * (clock.drag or FREE)[2 if clock.started else 1]
-
-
 def sizes(batch: Scalar | RigidRows) -> np.ndarray:
     """The number of corners of each constraint, (m,)."""
     return np.bincount(batch.owner, minlength=batch.count)
@@ -237,7 +231,7 @@ class Rows:
         shared = np.bincount(self.row, split[self.who] * (self.J**2).sum(axis=1), minlength=self.m)
         self.weight = self._rigid(alpha, shared * h * h)
         gamma = self.theta + damping * alpha / h
-        h2_effective = effective(runner.clock)
+        h2_effective = h2_effective_of(runner.clock)
         springs = [b.dev.spring for b in self.batches]
         before = [
             read(s.last)[: b.count] - b.goal if s.soft else np.zeros(b.count) for b, s in zip(self.batches, springs, strict=True)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from .projection import effective
+from .integrator import h2_effective_of
 from .rigid_rows import HEAVY
 
 
@@ -25,7 +25,7 @@ class Solids:
             some = (np.maximum.reduceat(degree[b.indices], b.members.starts[:-1]) == 1) & ~b.idle(w) & ~b.broken
             if some.any():
                 owner = self.count + np.cumsum(some) - 1
-                columns = b.indices, owner[b.owner], *_state(b, w, h, effective(runner.clock))
+                columns = b.indices, owner[b.owner], *_state(b, w, h, h2_effective_of(runner.clock))
                 parts.append([column[some[b.owner]] for column in columns])
                 self.count += int(some.sum())
         if not self.count:
