@@ -50,8 +50,8 @@ class Contact(PairContact):
     pairs: then sum w J J^T <= diag(sum w m) for the rows J of its pairs, and no eigenvalue of a pass exceeds 1. m is 3 for a disc
     among six neighbours (counting pairs gives 6) and 4 for a sphere among twelve. With friction tangents are taken back too;
     n n^T and t t^T sum up to the count, which is taken then, and for up to two pairs. m is worked out when other pairs
-    touch than before, and every 8 substeps, for pairs slide. It rises at once and decays by 1/32 of its excess per pass;
-    otherwise the stiffness would jump whenever a contact opens, and keep pairs moving.
+    touch than before, where i moves by a 64th of its radius, and every 8 substeps, for pairs slide. It rises at once and decays
+    by 1/32 of its excess per pass; otherwise the stiffness would jump whenever a contact opens, and keep pairs moving.
 
     Pushes are over-relaxed by r = 5/4, and a pair that overlapped in the last substep keeps a part of what it got. With M =
     m_i w_i + m_j w_j, p = r C / M + c p_last, but no more than what parts the pair alone, C / (w_i + w_j). For a mode with

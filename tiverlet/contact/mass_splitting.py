@@ -12,6 +12,7 @@ from .narrow_phase import SAME_PLACE, DiscGeometry
 # each. Deeper that would split masses too often, and a heap that is compressed would stay so.
 DEEP = 0.8
 EVERY = 8  # substeps after which a bound is worked out again, for pairs slide
+SLOW = 1 / 64  # of its radius in a substep: what moves further has it worked out in each; in 8 a normal turns by 1/8 at most
 FADE = 31 / 32  # of how much more often than needed a mass was split, what is left a pass later
 
 
@@ -149,11 +150,17 @@ class MassSplitting:
         if ti.static(not self.has_friction):
             if pairs > 2:
                 split = self.bound[i]
-                if others or split == 0 or (now.span.since + now.s + i) % EVERY == 0:
+                if others or split == 0 or self.hurries(i) or (now.span.since + now.s + i) % EVERY == 0:
                     split = self.bound_of(i, ti.cast(pairs, self.real))
         split *= self.state.w.of(i)
         rest = ti.static(FADE) * ti.max(self.weight[i] - split, 0)
         self.weight[i] = ti.select(pairs > 0, split + rest, split)
+
+    @ti.func
+    def hurries(self, i):
+        """Whether particle i moves so far in a substep that its normals turn."""
+        d, slow = self.state.d[i], ti.static(SLOW) * self.geometry.radius.of(i)
+        return d.dot(d) > slow * slow
 
     @ti.func
     def changes(self, i, word, bits):
