@@ -13,7 +13,7 @@ from ..features.feature import Batch, Knob, Scene
 from ..features.material import refuse_turning
 from ..features.regrouping import Regrouping
 from ..geometry.ordered import median
-from ..neighbours.neighbour_list import WORD, PairData, lowest_bit
+from ..neighbours.neighbour_list import PairData
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
 from .events import EventLog
@@ -235,7 +235,7 @@ class Contact(PairContact):
             for word in range(self.dev.grid.words(i)):
                 bits = self.dev.splitting.touching(i, word)
                 while bits != 0:
-                    e = self.dev.grid.first[i] + word * WORD + lowest_bit(bits)
+                    e = self.dev.grid.entry(i, word, bits)
                     bits &= bits - ti.u32(1)
                     j = self.dev.grid.neighbour[e]
                     last = self.dev.push.field[e]
@@ -350,7 +350,7 @@ class Contact(PairContact):
             for word in range(self.dev.grid.words(i)):
                 bits = ti.select(word == 0, self.dev.grid.touching[i], self.dev.grid.all_bits(i, word))
                 while bits != 0:
-                    e = self.dev.grid.first[i] + word * WORD + lowest_bit(bits)
+                    e = self.dev.grid.entry(i, word, bits)
                     bits &= bits - ti.u32(1)
                     j, push = self.dev.grid.neighbour[e], self.dev.push.field[e]
                     r = self.dev.state.apart(i, j)

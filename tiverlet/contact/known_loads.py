@@ -140,9 +140,9 @@ class KnownLoads:
     @ti.func
     def learn(self, i, j, e, load, mean, learns):
         """At the end of a window, in which entry e lacked `mean` of its load: what it knows from now on [N]."""
-        whole = ti.abs(load + mean)
         if learns and ti.abs(mean - self.earlier.field[e]) < STEADY * ti.abs(mean):
-            k, own = whole * ti.max(self.state.w.of(i), self.state.w.of(j)), ti.max(self.own[i], self.own[j])
+            k = ti.abs(load + mean) * ti.max(self.state.w.of(i), self.state.w.of(j))
+            own = ti.max(self.own[i], self.own[j])
             gain = ti.min(WINDOW * own * own / (LAG * own * own + SLOW * k * k), GAIN)
             load, mean = ti.max(load + gain * mean, 0), (1 - gain) * mean
         self.earlier.field[e] = mean

@@ -180,7 +180,7 @@ class MassSplitting:
         for word in range(self.grid.words(i)):
             bits = self.touching(i, word)
             while bits != 0:
-                j = self.grid.neighbour[self.grid.first[i] + word * WORD + lowest_bit(bits)]
+                j = self.grid.neighbour[self.grid.entry(i, word, bits)]
                 bits &= bits - ti.u32(1)
                 r, contact_distance = self.state.apart(i, j), self.geometry.contact_distance(i, j)
                 scale = 1 / (contact_distance * contact_distance)
@@ -205,7 +205,7 @@ class MassSplitting:
         for word in range(self.grid.words(i)):
             bits = self.touching(i, word)
             while bits != 0:
-                j = self.grid.neighbour[self.grid.first[i] + word * WORD + lowest_bit(bits)]
+                j = self.grid.neighbour[self.grid.entry(i, word, bits)]
                 bits &= bits - ti.u32(1)
                 r, contact_distance = self.state.apart(i, j), self.geometry.contact_distance(i, j)
                 rr = r.dot(r)
@@ -220,7 +220,7 @@ class MassSplitting:
     def clear(self, i, word, gone):
         """Some pairs do not touch any more."""
         while gone != 0:
-            e = self.grid.first[i] + word * WORD + lowest_bit(gone)
+            e = self.grid.entry(i, word, gone)
             for piece in ti.static(self.ended):
                 piece.field[e] = 0
             gone &= gone - ti.u32(1)

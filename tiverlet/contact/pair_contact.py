@@ -96,12 +96,17 @@ class PairContact(Feature):
     @property
     def wanted(self) -> Table:
         """What pairs are to be like."""
-        return Table("Contact", self.friction, self.restitution, vars(self).get("groups"), vars(self).get("sensors", ()))
+        return Table("Contact", *self._given)
+
+    @property
+    def _given(self) -> tuple:
+        """What was said of them."""
+        return self.friction, self.restitution, vars(self).get("groups"), vars(self).get("sensors", ())
 
     @property
     def _pairs(self) -> Table:
         """The same, made once for what was assigned: it is asked many questions, and is bound to no world."""
-        given = self.friction, self.restitution, vars(self).get("groups"), vars(self).get("sensors", ())
+        given = self._given
         asked, table = vars(self).get("_asked", ((), None))
         if table is None or any(one is not other for one, other in zip(given, asked, strict=True)):
             table = self.wanted

@@ -299,6 +299,11 @@ class NeighbourList:
         return bits
 
     @ti.func
+    def entry(self, i, word, bits):
+        """Where the entry of particle i is that the lowest of some bits is for."""
+        return self.first[i] + word * WORD + lowest_bit(bits)
+
+    @ti.func
     def words(self, i):
         """How many words of bits the list of particle i has entries for."""
         return (self.number[i] + (WORD - 1)) >> 5  # a division by WORD would look at the sign
