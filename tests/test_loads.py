@@ -164,3 +164,90 @@ def test_loads_are_of_the_state(world):
     assert overlap(late) < 1e-2 * before
     with pytest.raises(TypeError, match="loads"):
         tv.Contact(loads="yes")  # type: ignore[arg-type]
+
+
+def hung(n=10):
+    """A chain of n links of 0.1 m that hangs down from a pin."""
+    x = np.stack([np.zeros(n + 1), -0.1 * np.arange(n + 1)], axis=1)
+    return tv.Particles(x, mass=0.2, pinned=[0]), np.stack([np.arange(n), np.arange(1, n + 1)], axis=1)
+
+
+@pytest.mark.parametrize("kind, precision, substeps", [(tv.Distance, "f64", 4), (tv.Rope, "f32", 16)])
+def test_what_hangs_is_not_stretched(world, kind, precision, substeps):
+    # The k-th link from below bears k m g. One pass holds that by a violation W h^2 k m g, 4 k g h^2; what is known, by none.
+    particles, pairs = hung()
+    links = kind(pairs, 0.1, break_at=1e3)
+    w = world(
+        particles, [tv.Gravity(G), links, tv.Drag(1.0)], solver=tv.Jacobi(loads=True), precision=precision, substeps=substeps
+    )
+    highest = max(w.step(1 / 60).energy for _ in range(900))
+    rounding = 0.2 * 2.0**-24 * (60 * substeps) ** 2 if precision == "f32" else 0.0  # of positions of 1 m, m ulp / h^2
+    np.testing.assert_allclose(links.load, 0.2 * G * np.arange(10, 0, -1), rtol=1e-3, atol=rounding)
+    sag = 4 * 10 * G / (60 * substeps) ** 2
+    stretch = np.linalg.norm(np.diff(w.position, axis=0), axis=1) - 0.1
+    assert np.abs(stretch).max() < 1e-3 * sag
+    # It is not above where it began, and what is known breaks links, too.
+    assert highest <= -0.2 * G * 0.1 * 55 + 1e-5
+    for most in (10.5, 9.5):
+        links.break_at = most * 0.2 * G
+        w.step(1 / 60)
+        assert links.broken.tolist() == [most < 10] + 9 * [False]
+
+
+def test_links_that_move_are_as_they_were(world):
+    # What swings through 2 rad in half a second turns by more within a window than its load explains, and nothing is learnt.
+    particles, pairs = hung(5)
+    particles = tv.Particles(particles.position[:, ::-1], mass=0.2, pinned=[0])
+    known, plain = (
+        world(particles, [tv.Gravity(G), tv.Distance(pairs, 0.1)], solver=solver, substeps=20, precision="f64")
+        for solver in (tv.Jacobi(loads=True), tv.Jacobi())
+    )
+    for w in (known, plain):
+        w.run(0.5)
+    np.testing.assert_array_equal(known.position, plain.position)
+
+
+def test_a_start_finds_the_loads_that_links_know(world):
+    # Velocities that are assigned begin the next substep anew, in which forces act for half a kick, and so do loads; where
+    # particles are put elsewhere all together, links know what they did, and where one is, its own have forgotten.
+    particles, pairs = hung()
+    links = tv.Distance(pairs, 0.1)
+    w = world(particles, [tv.Gravity(G), links, tv.Drag(1.0)], solver=tv.Jacobi(loads=True), precision="f64", substeps=8)
+    w.run(15.0)
+    height = w.position[10, 1]
+    for change in (lambda: setattr(w, "velocity", 0 * w.position), lambda: setattr(w, "position", w.position + [3.0, 0.0])):
+        change()
+        for _ in range(30):
+            w.step(1 / 60)
+        assert w.position[10, 1] == pytest.approx(height, abs=1e-6)
+        np.testing.assert_allclose(links.load, 0.2 * G * np.arange(10, 0, -1), rtol=1e-3)
+    known = w._runner.memory.read(links.dev.known.load)[:10]
+    moved = w.position.copy()
+    moved[10, 0] += 0.05
+    w.position = moved
+    forgotten = w._runner.memory.read(links.dev.known.load)[:10]
+    assert forgotten[9] == 0.0 and (forgotten[:9] == known[:9]).all() and (known > 0).all()
+
+
+def test_loads_of_links_are_of_the_state(world):
+    # On all paths, in clones and in Worlds, to the same bits; particles that come leave them as they are.
+    particles, pairs = hung()
+
+    def made(path):
+        """One of them."""
+        features = [tv.Gravity(G), tv.Distance(pairs, 0.1), tv.Drag(1.0)]
+        return world(particles, features, solver=tv.Jacobi(loads=True), substeps=8, path=path)
+
+    a, b, c = map(made, ("fused", "parallel", "launched"))
+    for w in (a, b, c):
+        w.run(3.0)
+    assert a.hash() == b.hash() == c.hash()
+    with a.clone() as other, tv.Worlds(a, 2) as many:
+        for w in (a, other, many):
+            w.step(1 / 60)
+        assert other.hash() == a.hash()
+        np.testing.assert_array_equal(many.position[1], a.position)
+        other.add(tv.Particles([(5.0, 5.0)]), [tv.HalfSpace((0, 1), -9.0)])
+        for w in (a, other):
+            w.step(1 / 60)
+        np.testing.assert_array_equal(other.position[:11], a.position)

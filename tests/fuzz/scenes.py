@@ -219,7 +219,7 @@ def doubled(n, dim):
 
 LAYOUTS = (cloud, line, lattice, ring, slope, doubled, point)
 COMPLIANCE = (0.0, 0.0, 0.0, 1e-3, 1e-6, 1.0, 1e-12, 1e3)
-CLOTHS = {"Jacobi": {}, "Direct": {"width": 16}, "Chebyshev": {}, "ConjugateGradient": {"steps": 8}}
+CLOTHS = {"Jacobi": {"loads": True}, "Direct": {"width": 16}, "Chebyshev": {}, "ConjugateGradient": {"steps": 8}}
 
 
 def pick(draw, *values):

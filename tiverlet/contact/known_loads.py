@@ -1,11 +1,12 @@
 """Piles that carry their loads: what contacts bear at rest, they give without being asked."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..device import ti
 from ..features.feature import Acceleration
+from ..features.learning import gain, steady
 from ..neighbours.neighbour_list import WORD, PairData, lowest_bit
 from ..neighbours.queries import between
 
@@ -14,9 +15,7 @@ if TYPE_CHECKING:
     from ..neighbours.neighbour_search import NeighbourSearch
 
 WINDOW = 128  # substeps over which is averaged what is missing; at their end sound has just been taken out
-STEADY = 0.2  # of itself: by how much that may differ from one window to the next
-GAIN = 0.8  # of what is missing is learnt at once, where a pile is low
-LAG, SLOW = 64, 0.3  # substeps that it takes to learn the load of k particles: LAG + SLOW k^2
+SLOW = 0.3  # substeps that it takes to learn the load of k particles, per k^2
 SAME = 1e-3  # of its length: by how much the line between a pair may change where particles are put elsewhere
 
 
@@ -54,24 +53,19 @@ class KnownLoads:
     """
 
     def __init__(self, scene: "Scene"):
-        self.state = scene.state
+        self.state, self.weights = scene.state, scene.own_weight
         self.load = PairData("load", 0, lasting=True, marked=True)  # [N]
         self.borne = PairData("borne", 0, lasting=True, marked=True)  # what was missing of it in this window, summed up [kg m]
         self.earlier = PairData("earlier", 0, lasting=True, marked=True)  # on average in the window before [N]
         self.pair_data = [self.load, self.borne, self.earlier]
         n, dim = scene.count, scene.particles.dim
         self.carried = Carried(scene)
-        self.own = scene.memory.field("Contact.own_weight", n, state=True)  # what forces accelerate it by [m/s^2]
         self.lean = scene.memory.field("Contact.lean", n, width=dim)  # how far walls moved it before contacts were solved [m]
-        self.in_state = {"carried": self.carried.field, "own": self.own}
+        self.in_state = {"carried": self.carried.field}
 
     def bind(self, grid: "NeighbourSearch") -> None:
         """grid: has the pairs listed."""
         self.grid = grid
-
-    def follow(self, integrator: Any) -> None:
-        """integrator: knows what else accelerates particles."""
-        self.integrator, self.forces = integrator, integrator.forces
 
     def forget(self, scene: "Scene", x: np.ndarray) -> None:
         """Before particles are put to x, (n, dim): pairs that are others there forget."""
@@ -97,13 +91,6 @@ class KnownLoads:
         scene.memory.write(self.carried.field, scene.inv_mass[:, None] * np.stack(sums, axis=1))
 
     @ti.func
-    def weigh(self, i, now):
-        """Note what accelerates particle i but the loads of its contacts."""
-        v = self.integrator.velocity_before(i, now.h, now.fresh)
-        a = self.forces.accelerate(i, self.state.place(i), v, now.time, self.forces.pull(now.time))
-        self.own[i] = (a - self.carried.field[i]).norm()
-
-    @ti.func
     def kept(self, i, word, bits):
         """Those of some entries of particle i that know a load, though they may not touch to the last digit."""
         out, first = ti.u32(0), self.grid.first[i] + word * WORD
@@ -117,7 +104,7 @@ class KnownLoads:
     @ti.func
     def given(self, e, now):
         """What entry e was given in this substep, per inverse mass [kg m]."""
-        return self.load.field[e] * self.integrator.h2_effective(now.h, now.fresh)
+        return self.load.field[e] * self.weights.integrator.h2_effective(now.h, now.fresh)
 
     @ti.func
     def remember(self, i, j, e, part, push, now, learns):
@@ -140,10 +127,10 @@ class KnownLoads:
     @ti.func
     def learn(self, i, j, e, load, mean, learns):
         """At the end of a window, in which entry e lacked `mean` of its load: what it knows from now on [N]."""
-        if learns and ti.abs(mean - self.earlier.field[e]) < STEADY * ti.abs(mean):
+        if learns and steady(mean, self.earlier.field[e]):
             k = ti.abs(load + mean) * ti.max(self.state.w.of(i), self.state.w.of(j))
-            own = ti.max(self.own[i], self.own[j])
-            gain = ti.min(WINDOW * own * own / (LAG * own * own + SLOW * k * k), GAIN)
-            load, mean = ti.max(load + gain * mean, 0), (1 - gain) * mean
+            own = ti.max(self.weights.field[i], self.weights.field[j])
+            share = gain(own * own, SLOW * k * k, WINDOW)
+            load, mean = ti.max(load + share * mean, 0), (1 - share) * mean
         self.earlier.field[e] = mean
         return load

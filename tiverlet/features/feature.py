@@ -55,6 +55,7 @@ class Scene:
     inv_mass: np.ndarray  # (n,) after pins: 0 means that constraints cannot move it
     radius: Any = None  # where something asks for radii
     slots: Any = None  # where constraints leave their moves
+    own_weight: Any = None  # the OwnWeight of particles, where loads become known
     residuals: Any = None  # batch -> what the last substep left of each of its violations
     order: int = 2  # of the substep in h
     periodic: Any = None  # the Periodic of the world

@@ -20,9 +20,12 @@ class Jacobi(Solver):
     lambda_max <= 1, whatever the geometry. A net has less (a square one 0.66, cloth with shear 0.53) as long as it is not folded
     up: when the world is built, power iteration finds the value of the scene as it starts. What exceeds the law is refused then,
     and "auto" takes 1.2 / lambda_max, or 1 where constraints are soft (their stiffness would change) or not one number.
+
+    loads: whether rigid links learn the loads that they bear at rest, and pull them without being stretched. See KnownLoad.
     """
 
-    def __init__(self, relaxation: float | str = 1.0):
+    def __init__(self, relaxation: float | str = 1.0, *, loads: bool = False):
+        self.loads = checks.flag("Jacobi", "loads", loads)
         if relaxation != "auto":
             relaxation = checks.number("Jacobi", "relaxation", relaxation, above=0.0)
         self.relaxation = relaxation
@@ -57,6 +60,5 @@ class Jacobi(Solver):
         return super().explain(batches, slots) + factor
 
     def __repr__(self) -> str:
-        return (
-            f"Jacobi(relaxation={self.relaxation!r})" if self.relaxation == "auto" else f"Jacobi(relaxation={self.relaxation:g})"
-        )
+        factor = repr(self.relaxation) if self.relaxation == "auto" else f"{self.relaxation:g}"
+        return f"Jacobi(relaxation={factor}{', loads=True' if self.loads else ''})"

@@ -6,8 +6,10 @@ import numpy as np
 
 from ..device import ti
 from ..device.memory import Memory
+from ..device.number import OnDevice
 from ..features.feature import BENT, FAR, Batch, Scene
 from ..features.regrouping import Regrouping
+from .elimination import components
 from .system import solvable
 
 # Where constraints converge within a substep, SHAKE is an explicit method for what is across them, with a limit:
@@ -34,9 +36,13 @@ class Slots:
     The slots of one particle stand side by side, so that a particle adds them in an order that depends on nothing else. Corners
     that cannot move have no slot.
 
-    split: the mass-split weight n w of each particle, for the n blocks of constraints that it belongs to: a system that is solved
-    as a whole is one, and each constraint that is relaxed by itself.
+    loads: whether constraints that are relaxed by themselves know their loads. bears: where they do, for each body how many
+    particles the constraint bears that bears most, as a window ends. split: the mass-split weight n w of each particle, for the n
+    blocks of constraints that it belongs to: a system that is solved as a whole is one, and each constraint that is relaxed by
+    itself.
     """
+
+    bodies: Any = OnDevice()
 
     host_only = ("total", "exact")
 
@@ -48,7 +54,7 @@ class Slots:
         self.move = memory.field("slots.move", self.total, width=state.dim)
         self.begin = memory.field("slots.begin", len(begin), kind=ti.i32, values=begin)
         self.semi_iteration = solver.semi_iteration(scene)
-        self.converges = solver.converges
+        self.converges, self.loads = solver.converges, solver.loads
         if self.converges:
             self.tension = memory.field("slots.tension", None, kind=ti.f64)
         self.turned = memory.field("slots.turned", None, kind=ti.i32)  # the worst turn since the last survey
@@ -61,8 +67,28 @@ class Slots:
         self.exact = bool(scalars) and (not self.system.steps if self.system else bool(degree.max(initial=0) <= 1))
         self._scalars = bool(scalars)
         blocks = self.system.blocks if self.system else degree
+        if self.loads:
+            self._bodies = self._tied(batches, inv_mass)
+            self.bodies = memory.number(1 + max(int(b.max(initial=0)) for b in self._bodies.values()))
+            self.bears = memory.field("slots.bears", self.bodies)
         self.split = memory.field("slots.split_mass", scene.count, values=blocks * inv_mass)
         self.relaxation = solver.relaxed_by(scene, batches, blocks * inv_mass)
+
+    @staticmethod
+    def _tied(batches: list[Batch], inv_mass: np.ndarray) -> dict[int, np.ndarray]:
+        """The body of each constraint, by the batch's id: what hangs together by particles that can move."""
+        ends = np.cumsum([b.count for b in batches])
+        owner, item = (
+            np.concatenate([b.owner + end - b.count for b, end in zip(batches, ends, strict=True)]),
+            np.concatenate([b.indices.ravel() for b in batches]),
+        )
+        free = inv_mass[item] > 0
+        parts = np.split(components(int(ends[-1]), owner[free], item[free]), ends[:-1])
+        return {id(b): part for b, part in zip(batches, parts, strict=True)}
+
+    def body(self, batch: Batch) -> np.ndarray:
+        """The body of each constraint of a batch, where loads become known."""
+        return self._bodies[id(batch)]
 
     def regroup(self, memory: Memory, change: Regrouping) -> None:
         """Particles that no constraint holds came and went."""

@@ -41,6 +41,7 @@ class Solver(RecordsArguments):
     solvers/__init__.py, and a row in tests/test_solvers.py.
     """
 
+    loads = False  # whether what is relaxed by itself learns the loads that it bears, see KnownLoad
     converges = False  # within a substep, so that tensions can be too large for it
 
     def check(self, iterations: int) -> None:

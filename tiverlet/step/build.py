@@ -13,6 +13,7 @@ from ..device.memory import Memory
 from ..device.patches.compiler import FEW
 from ..device.thread_team import PIECES, Team, size_of
 from ..features.feature import Acceleration, Batch, Feature, Scene
+from ..features.learning import OwnWeight
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..neighbours.periodic import Periodic
 from ..particles import Particles, Radii, State
@@ -137,6 +138,8 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     surfaces = [*walls, *([contact] if contact else [])]
     has_friction, bounces = any(f.has_friction for f in surfaces), any(f.has_restitution for f in surfaces)
     solver = solver or (by_structure(batches, scene.inv_mass) if scene.order == 2 else Direct())
+    if (batches and solver.loads) or (contact and contact.has_loads):
+        scene.own_weight = OwnWeight(scene)
     if batches:
         scene.slots = Slots(scene, batches, solver)
         if not state.double and (state.compensated or (scene.slots.exact and sums_exactly())):
@@ -160,8 +163,8 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     known = contact.known if contact else None
     forces = Forces(scene, [*accelerations, known.carried] if known else accelerations)
     integrator = Verlet(scene, forces) if scene.order == 2 else high_order.Composition(scene, forces, batches)
-    if known:
-        known.follow(integrator)
+    if scene.own_weight:
+        scene.own_weight.follow(integrator, [known.carried] if known else [])
     step = Step(scene, integrator, batches, drivers, contact, grid, walls, team)
     if state.sleepers:
         step.sleep = SleepPass(step, state.sleepers, drivers, batches)

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from ..constraints.core.known_load import WINDOW
 from ..device import ti
 from ..device.thread_team import Team
 from ..features.feature import Batch, Scene
@@ -19,7 +20,8 @@ class ConstraintPass:
         self.semi_iterations = [scene.slots.semi_iteration] if scene.slots and scene.slots.semi_iteration else []
         self.in_systems = [b for b in batches if b.solvable_together and b.dev.in_system]
         self.ragged = [b for b in batches if b.blocks]
-        self.springs = any(b.soft for b in batches)
+        self.learners = [b for b in batches if b.arity and b.solvable_together and b.dev.known.learns]
+        self.springs = any(b.soft for b in batches) or bool(self.learners)
 
     @ti.func
     def reduce_blocks(self, thread, h, h2_effective, first, fresh, some: ti.template()):  # type: ignore[valid-type]
@@ -70,6 +72,27 @@ class ConstraintPass:
         if ti.static(len(self.batches) > 0):
             self.team.wait()
         self.scatter_blocks(now.thread, now.h, h2_effective, now.first, fresh)
+
+    @ti.func
+    def learn(self, now):
+        """As a window ends: loads that were steady become known, the slower the more a body bears."""
+        if ti.static(len(self.learners) > 0):
+            ends = ti.cast((now.span.since + now.s) % WINDOW == WINDOW - 1, ti.i32)
+            n = ends * self.slots.bodies
+            for b in range(self.team.chunk_begin(n, now.thread), self.team.chunk_end(n, now.thread)):
+                self.slots.bears[b] = 0
+            self.team.wait()
+            for f in ti.static(self.learners):
+                n = ends * f.count
+                for c in range(self.team.chunk_begin(n, now.thread), self.team.chunk_end(n, now.thread)):
+                    if f.awake(c):
+                        f.weigh_load(c)
+            self.team.wait()
+            for f in ti.static(self.learners):
+                n = ends * f.count
+                for c in range(self.team.chunk_begin(n, now.thread), self.team.chunk_end(n, now.thread)):
+                    if f.awake(c):
+                        f.learn_load(c, now.h)
 
     @ti.func
     def solve_systems(self, thread):

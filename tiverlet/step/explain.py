@@ -143,6 +143,7 @@ def _absent(world: "World") -> list[str]:
         (not world.particles.spins and bool(step.walls or step.grid), "spin: particles have none"),
         (not step.state.images, "nearest images: no Periodic"),
         (any(not c.has_loads and not c.detects for c in step.contacts), "loads that pairs know: no Contact(loads=True)"),
+        (bool(step.batches) and not step.constraints.learners, "loads that links know: no Jacobi(loads=True)"),
         (not step.sleepers, "islands and who sleeps: no Sleep"),
         (not step.integrator.forces.all, "accelerations: no force"),
         (not step.integrator.decays, "exponential drag: no Drag or Wind"),

@@ -49,6 +49,7 @@ def forget(scene: Scene, batches: list[Batch], x: np.ndarray) -> None:
             off = np.abs(b.violation(x) - b.violation(old)) * b.inverse_size(b.start.position) > SEEN
             lam[: b.count][off] = 0.0
             scene.memory.write(b.dev.lam, lam)
+            b.forget_loads(off)
 
 
 def left(batches: list[Batch], x: np.ndarray) -> float:
@@ -125,6 +126,7 @@ def remove(
         others = (going & (far > ENOUGH))[body[b.indices.ravel()]]
         here = np.logical_or.reduceat(others, np.searchsorted(b.owner, np.arange(b.count)))
         memory.write(b.dev.lam, np.where(here, 0.0, lam))  # they bear nothing there yet
+        b.forget_loads(here)
     return np.linalg.norm(new - x, axis=1), float(far[going].max())
 
 
@@ -143,7 +145,7 @@ def _borne(scene: Scene, batches: list[Scalar], x: np.ndarray, others: np.ndarra
         who = b.indices.ravel()
         W = np.bincount(b.owner, split[who] * (g**2).sum(axis=1), minlength=b.count)
         gone = np.bincount(b.owner, others[who], minlength=b.count) > 0
-        lam = scene.memory.read(b.dev.lam)[: b.count].astype(np.float64)
+        lam = b.sagging
         out.append(np.where((scene.slots.rows(b) >= 0) | gone, 0.0, -part * W * lam))
     return out
 

@@ -41,6 +41,7 @@ class ParticlePass:
         self.contacts = [contact] if contact else []
         self.acts = bool(batches or contact or walls)
         self.knows_loads = bool(contact) and contact.has_loads
+        self.weights = [scene.own_weight] if scene.own_weight else []
         self.rough = any(w.has_friction or w.has_restitution for w in walls)
         self.turned_by_walls = scene.state.spins and any(w.has_friction for w in walls)
         if walls:
@@ -105,7 +106,11 @@ class ParticlePass:
                 for i in range(first, end):
                     self.state.spin.begin(i, now.h)
         self.integrator.advance(first, end, now)
-        if ti.static(self.knows_loads):
+        for weights in ti.static(self.weights):
+            if now.damps != 0:
+                for i in range(first, end):
+                    weights.weigh(i, now)
+        if ti.static(self.knows_loads and len(self.walls) > 0):
             self.look_ahead(first, end, now)
         for c in ti.static(self.contacts):
             stale, fast = 0, 0
@@ -119,22 +124,17 @@ class ParticlePass:
 
     @ti.func
     def look_ahead(self, begin, end, now):
-        """Where pairs know their loads: what particles weigh, as a window ends; and for contacts to see, those that touch others
-        go to where walls will leave them."""
+        """Where pairs know their loads: for contacts to see, particles that touch others go to where walls will leave them."""
         for c in ti.static(self.contacts):
-            if now.damps != 0:
-                for i in range(begin, end):
-                    c.dev.known.weigh(i, now)
-            if ti.static(len(self.walls) > 0):
-                for b in range(blocks(begin, end)):
-                    low, high = block(b, begin, end)
-                    near = self.near_walls(low, high)
-                    for i in range(low, high):
-                        lean = ti.zero(self.state.x[i])
-                        if near != 0:
-                            if self.state.moves(i) and c.dev.splitting.weight[i] > 0:
-                                lean = self.leave_walls(i, now)
-                        c.dev.known.lean[i] = lean
+            for b in range(blocks(begin, end)):
+                low, high = block(b, begin, end)
+                near = self.near_walls(low, high)
+                for i in range(low, high):
+                    lean = ti.zero(self.state.x[i])
+                    if near != 0:
+                        if self.state.moves(i) and c.dev.splitting.weight[i] > 0:
+                            lean = self.leave_walls(i, now)
+                    c.dev.known.lean[i] = lean
 
     @ti.func
     def leave_walls(self, i, now):

@@ -103,7 +103,7 @@ class Step:
         self.has_restitution, self.projects_velocities = self.contact_pass.has_restitution, self.contact_pass.projects_velocities
         self.orients = self.state.spins and self.state.spin.orients
         keeps = self.contact_pass.remembers or bool(self.breakers)
-        self.finishes = keeps or self.orients or bool(self.wall_logs)
+        self.finishes = keeps or self.orients or bool(self.wall_logs) or bool(self.constraints.learners)
         self.hashes = bool(grid)
         self.sleepers = scene.state.sleepers
         self.looks = bool(grid) and bool(self.sleepers)  # for what touches those that sleep
@@ -397,14 +397,15 @@ class Step:
 
     @ti.func
     def finish_substep(self, now):
-        """What bears too much breaks; contacts keep what friction and restitution need; the orientation of what spins follows; as
-        a frame ends, walls keep what touches them.
+        """What bears too much breaks; loads become known; contacts keep what friction and restitution need; the orientation of
+        what spins follows; as a frame ends, walls keep what touches them.
 
         A rigid constraint may find a whole kick in a start that follows another step, so loads are never taken for half a kick.
         """
         for f in ti.static(self.breakers):
             for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
                 f.break_overloaded(c, self.integrator.h2_effective(now.h, 0), now.tick)
+        self.constraints.learn(now)
         self.contact_pass.finish(now)
         if ti.static(self.orients):
             for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):

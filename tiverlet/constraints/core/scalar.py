@@ -13,6 +13,7 @@ from ...features.members import FixedSize
 from ...features.regrouping import Regrouping
 from ...geometry.ordered import distinct
 from .drive import Drive
+from .known_load import KnownLoad
 from .outline import Outline
 from .quantity import Quantity
 from .ramp import Ramp
@@ -332,6 +333,11 @@ class Scalar(Batch):
         """Whether constraints of the batch can be solved together with others: few corners, and a direction everywhere."""
         return self.arity > 0 and not self.collapses
 
+    @property
+    def learns_loads(self) -> bool:
+        """Whether its constraints may know their loads: few corners, and straight; of these, those that are rigid do."""
+        return self.arity > 0 and not (self.driven or self.curved or self.collapses)
+
     def bind(self, scene: Scene) -> None:
         """Declare rest values, multipliers, springs and strengths; and, for solvers, which rows of a system constraints are."""
         super().bind(scene)
@@ -371,6 +377,7 @@ class Scalar(Batch):
         )
         if self.dev.steps:
             self.dev.step = add(f"{name}.step", m)
+        self.dev.known = KnownLoad(scene, name, self)
         if not self.arity:
             self.dev.outline = Outline(scene, self)
         self.dev.quantity = self.quantity.bind(scene, self)
@@ -439,6 +446,18 @@ class Scalar(Batch):
             return np.zeros(self.count)
         scale = 1 / self.scene.h2_effective if self.scene.h2_effective else 0.0
         return -scale * self.scene.memory.read(self.dev.lam)[: self.count].astype(np.float64)
+
+    @property
+    def sagging(self) -> np.ndarray:
+        """The multipliers of the last substep that violations bear, (m,): all but the loads that are known."""
+        known = self.dev.known
+        lam = self.scene.memory.read(self.dev.lam)[: self.count].astype(np.float64)
+        return lam - self.scene.memory.read(known.given)[: self.count] if known.learns else lam
+
+    def forget_loads(self, some: np.ndarray) -> None:
+        """Of some, a mask (m,), no load is known: their particles were put elsewhere."""
+        if self.dev.known.learns:
+            self.dev.known.forget(some)
 
     @ti.func
     def measure(self, c, q):
@@ -793,6 +812,9 @@ class Scalar(Batch):
                     self.dev.slots.note_turn(turn)
         if ti.static(self.dev.outside):
             if self.outside_systems(c):
+                if ti.static(self.dev.known.learns):
+                    if first != 0:
+                        violation += self.known_violation(c, violation - moved, W, h, h2_effective)
                 new = self.jacobi_update(c, violation, A, alpha, lam, W, turn)
                 if ti.static(self.collapses > 0):
                     move = ti.cast(0, self.dev.real)
@@ -817,8 +839,40 @@ class Scalar(Batch):
                 if ti.static(self.dev.steps):
                     self.dev.step[c] = step
                 self.dev.lam[c] = new
+                if ti.static(self.dev.known.learns):
+                    if new == 0 and (W == 0 or ti.static(self.side != 0)):
+                        self.dev.known.let_go(c)
         for k in ti.static(range(self.arity)):
             self.push(c, k, self.dev.w.of(self.member(c, k)) * step * n[k, :])
+
+    @ti.func
+    def known_violation(self, c, start, W, h, h2_effective):
+        """The violation that would ask for the load that constraint c knows; `start` is the one at the start of the substep."""
+        out = 0 * start
+        if W > 0 and self.dev.spring.is_rigid(c) and not self.has_cusp(c):
+            missing = self.dev.slots.relaxation * start / W
+            if ti.static(self.side != 0):
+                missing = ti.select(self.side * (missing + h2_effective * self.dev.known.load[c]) > 0, missing, 0 * missing)
+            out = -self.dev.known.give(c, missing, h, h2_effective) * W / self.dev.slots.relaxation
+        return out
+
+    @ti.func
+    def weigh_load(self, c):
+        """As a window ends, see KnownLoad."""
+        most, own = ti.cast(0, self.dev.real), ti.cast(0, self.dev.real)
+        _, g = self.measure(c, self.corners(c, 0))
+        for k in ti.static(range(self.arity)):
+            i = self.member(c, k)
+            most = ti.max(most, self.dev.w.of(i) * g[k, :].norm())
+            own = ti.max(own, self.dev.known.weights.field[i])
+        self.dev.known.weigh(c, most, own)
+
+    @ti.func
+    def learn_load(self, c, h):
+        """Then, see KnownLoad."""
+        _, g = self.measure(c, self.corners(c, 0))
+        _, W, _, fastest = self.motion(c, g, 0)
+        self.dev.known.learn(c, h * h * W, self.residual_scale(c), ti.sqrt(fastest))
 
     @ti.func
     def geometric_stiffness(self, c, W):
@@ -849,7 +903,7 @@ class Scalar(Batch):
     def push_spring_force(self, c, h):
         """h^2 w_j F grad_j C with F = -(1 - theta) (C / alpha + damping dC/dt).
 
-        Rigid links find their force in the next substep.
+        Rigid links find their force in the next substep, but for the load that they know.
         """
         if ti.static(self.arity == 0):
             self.dev.outline.push_spring_force(c, h)
@@ -882,12 +936,18 @@ class Scalar(Batch):
                         force -= resolved * self.dev.spring.damping[c] * (f - f0) / h
                 if ti.static(self.driven):
                     force = self.dev.drive.clamp_force(c, force)
+        if ti.static(self.dev.known.learns):
+            if self.dev.spring.is_rigid(c):
+                force = -self.dev.known.load[c]
         return force
 
     @ti.func
     def push_reaction(self, c, firm, soft):
         """scale w_j lam grad_j C(x_n)."""
         pull = self.dev.lam[c] * ti.select(self.dev.spring.is_rigid(c), firm, soft)
+        if ti.static(self.dev.known.learns):
+            if self.dev.spring.is_rigid(c):
+                pull += (soft - firm) * self.dev.known.given[c]
         if ti.static(self.arity == 0):
             self.dev.outline.push_reaction(c, pull)
         else:
