@@ -7,7 +7,9 @@ ABOUT = "speed, memory and starts; beside a pile in C, and other engines"
 
 def add(parser: argparse.ArgumentParser) -> None:
     """The arguments."""
-    parser.add_argument("scenes", nargs="*", help="pile, settled, spheres, cloth, ropes, rope, mixed; all without any; or worlds")
+    parser.add_argument(
+        "scenes", nargs="*", help="pile, settled, loaded, spheres, cloth, ropes, rope, mixed; none: all; or worlds"
+    )
     parser.add_argument("--sizes", type=int, nargs="+", metavar="N", help="numbers of particles; default: a ladder of each scene")
     parser.add_argument("--threads", type=int, nargs="+", metavar="T", help="numbers of CPU threads; default 1, 2, 4, ... all")
     parser.add_argument("--arch", default="cpu", help="cpu, cuda, metal or vulkan (default cpu)")

@@ -269,7 +269,7 @@ def restored(kind: type, row: dict[str, Any]) -> Any:
 
 def percent(share: float | None) -> str:
     """Of a diameter; nothing for nothing."""
-    return f"{100 * share:.2f}%" if share else ""
+    return f"{100 * share:.2g}%" if share else ""
 
 
 def started(r: Run) -> tuple[str, ...]:

@@ -13,8 +13,8 @@ class SpeedScene:
     """A scene of any size: build(n) -> (particles, features); of about n particles, where a scene cannot have just any number.
 
     sizes: those of a full report; quick: those of a quick one. needs: the files of features that it uses, without which the
-    package must run it all the same (None: not tried). settles: frames that are run before any is timed. in_c: whether pile.c is
-    the same scene.
+    package must run it all the same (None: not tried). settles: frames that are run before any is timed, each of `settling`
+    substeps (0: as many as later). in_c: substeps of pile.c, which is the same scene but for friction; 0: it is not.
     """
 
     title: str
@@ -24,7 +24,8 @@ class SpeedScene:
     quick: tuple[int, ...]
     needs: frozenset[str] | None = None
     settles: int = 0
-    in_c: bool = False
+    settling: int = 0
+    in_c: int = 0
 
 
 def scattered(k: np.ndarray) -> np.ndarray:
@@ -49,6 +50,14 @@ def pile(n: int, dim: int = 2):
     box = tv.Box([0] * dim, [2.0 * side if k == 1 else 1.3 * side for k in range(dim)])
     x = np.stack(at, axis=1) * 1.1 + 0.5 + 0.05 * jitter
     return tv.Particles(x, radius=0.5), [tv.Gravity(9.81), box, tv.Contact()]
+
+
+def loaded(n: int):
+    """The pile with friction, where contacts know their loads."""
+    import tiverlet as tv
+
+    particles, (gravity, box, _) = pile(n)
+    return particles, [gravity, tv.Box(box.lower, box.upper, friction=0.5), tv.Contact(friction=0.5, loads=True)]
 
 
 def cloth(n: int):
@@ -119,10 +128,18 @@ def mixed(n: int):
 LINE = 41  # particles of one of many ropes
 TEN = tuple(10**k for k in range(1, 7))
 SCENES = {
-    "pile": SpeedScene(
-        "discs that fall into a box", pile, 8, TEN, (100, 1000), frozenset({"gravity", "box", "contact"}), in_c=True
+    "pile": SpeedScene("discs that fall into a box", pile, 8, TEN, (100, 1000), frozenset({"gravity", "box", "contact"}), in_c=8),
+    "settled": SpeedScene("the same discs at rest, after 400 frames", pile, 8, TEN[1:5], (100,), settles=400, in_c=8),
+    "loaded": SpeedScene(
+        "the same with friction, which knew their loads after 1500 frames of 20 substeps; C has none, and takes 8",
+        loaded,
+        2,
+        TEN[1:4],
+        (100,),
+        settles=1500,
+        settling=20,
+        in_c=8,
     ),
-    "settled": SpeedScene("the same discs at rest, after 400 frames", pile, 8, TEN[1:5], (100,), settles=400, in_c=True),
     "spheres": SpeedScene("spheres that fall into a box", lambda n: pile(n, 3), 8, TEN, (100, 1000)),
     "cloth": SpeedScene("a cloth that is held here and there", cloth, 20, TEN[1:5], (100, 400)),
     "ropes": SpeedScene("ropes of 40 links", ropes, 20, (10 * LINE, 100 * LINE, 1000 * LINE, 10_000 * LINE), (LINE, 10 * LINE)),
