@@ -351,12 +351,12 @@ class World:
             return np.zeros((0, 2), dtype=np.int64)
         box = self._runner.scene.periodic
         points = points if box is None else box.wrap(points)
-        if not self._runner.grid:
+        if not self._runner.search:
             return near_by_all(self.position, points, radius, box)
         with whole:
             self._runner.list_neighbours()
             with self._runner.memory.compiler():
-                self._search = self._search or PointSearch(self._runner.grid)
+                self._search = self._search or PointSearch(self._runner.search)
                 return self._search.near(points, radius)
 
     def nearest(self, points) -> tuple[np.ndarray, np.ndarray]:
@@ -364,10 +364,8 @@ class World:
         points = checks.points("World.nearest", "points", points, dim=self._particles.dim)
         if not len(self._particles):
             raise ValueError("World.nearest: there are no particles.")
-        position = self.position
-        start = (
-            self._runner.grid.finest if self._runner.grid else 2 * float(np.abs(position).max() + np.abs(points).max(initial=1.0))
-        )
+        position, search = self.position, self._runner.search
+        start = search.finest if search else 2 * float(np.abs(position).max() + np.abs(points).max(initial=1.0))
         return nearest(self.near, position, points, start, self._runner.scene.periodic)
 
     def ray(
@@ -415,7 +413,7 @@ class World:
     def contacts(self) -> Contacts:
         """What touches now, as arrays: discs or spheres, and vertices and edges of Polygons. Empty without a Contact."""
         self._runner.memory.check()
-        if not self._runner.grid:
+        if not self._runner.search:
             none, index = np.zeros(0), np.zeros((0, 2), dtype=np.int64)
             vectors = np.zeros((0, self._particles.dim))
             return Contacts(index, index[:, 0], none, none, vectors, vectors, none)
