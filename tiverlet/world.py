@@ -86,7 +86,7 @@ class World:
         """starts: for each feature the particles as they were when it came; None if it comes now."""
         check_settings(precision, path, order, features)
         self._requested = checked_solver(solver), path  # None where the solver is to be chosen
-        self._solver, self._precision, self._order = self._requested[0] or Solver(), precision, order
+        self._solver, self._precision, self._order = self._requested[0] or Jacobi(), precision, order
         self._controller = StepController()
         self.substeps, self.iterations = substeps, iterations
         self._clock = Clock()
@@ -276,6 +276,7 @@ class World:
 
     @position.setter
     def position(self, value) -> None:
+        """Move particles to (n, dim) [m]; velocities are kept, and lists are built anew."""
         value = checks.points("World", "position", value, dim=self._particles.dim, count=len(self._particles))
         in_range("World", "position", value)
         if self._runner.step.contacts:
@@ -299,6 +300,7 @@ class World:
 
     @velocity.setter
     def velocity(self, value) -> None:
+        """Have particles go on with (n, dim) [m/s]; the next substep is a start."""
         value = checks.points("World", "velocity", value, dim=self._particles.dim, count=len(self._particles))
         self._runner.memory.check()
         with whole:
@@ -318,6 +320,7 @@ class World:
 
     @spin.setter
     def spin(self, value) -> None:
+        """Have particles turn at (n,) in 2D, (n, 3) in 3D [rad/s]. ValueError where they do not spin."""
         if not self._particles.spins:
             raise ValueError("World.spin: these particles do not spin. Make them with tv.Particles(..., spin=0).")
         value = spin_of("World", value, self._particles)
@@ -518,6 +521,7 @@ class World:
 
     @substeps.setter
     def substeps(self, value: int | str) -> None:
+        """At least 1, or "auto", from the next frame on."""
         if isinstance(value, str) and value != "auto":
             raise ValueError(f'World: substeps = {value!r}, but it must be an integer of at least 1, or "auto".')
         self._controller.auto = value == "auto"
@@ -531,6 +535,7 @@ class World:
 
     @iterations.setter
     def iterations(self, value: int) -> None:
+        """At least 1, and what the solver allows, from the next frame on."""
         value = checks.integer("World", "iterations", value, least=1)
         self._solver.check(value)
         self._iterations = value

@@ -545,6 +545,7 @@ class Worlds:
 
     @position.setter
     def position(self, value) -> None:
+        """Move particles of all worlds to (worlds, n, dim), or (n, dim) for each [m]; velocities are kept."""
         with self._open():
             self._place(self._per_particle("position", value, len(self)), np.arange(len(self)))
 
@@ -590,6 +591,7 @@ class Worlds:
 
     @velocity.setter
     def velocity(self, value) -> None:
+        """Have them go on with (worlds, n, dim), or (n, dim) for each [m/s]."""
         with self._open():
             self._start_from(self._per_particle("velocity", value, len(self)), np.arange(len(self)))
 
@@ -624,6 +626,7 @@ class Worlds:
 
     @substeps.setter
     def substeps(self, value: int) -> None:
+        """At least 1, of all worlds, from the next frame on."""
         self._world.substeps = checks.integer("Worlds", "substeps", value, least=1)
 
     @property
@@ -633,6 +636,7 @@ class Worlds:
 
     @iterations.setter
     def iterations(self, value: int) -> None:
+        """At least 1, and what the solver allows, of all worlds, from the next frame on."""
         self._world.iterations = value
 
     @property
