@@ -22,6 +22,7 @@ from .features.feature import Acceleration, Batch, Feature
 from .features.read_only import assign_whole, read_only, structure
 from .neighbours.queries import Contacts, PointSearch, near_by_all, nearest
 from .particles import Particles, at_rest, in_range, spin_of
+from .solvers.jacobi import Jacobi
 from .solvers.solver import Solver
 from .step import checkpoint, edit_scene
 from .step.adaptive import StepController
