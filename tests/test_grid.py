@@ -180,6 +180,8 @@ def test_a_few_that_fly_far_have_no_list_built_until_they_meet_something(world):
                 w.step(1.0)
                 at = w._runner.memory.read(search.origin)
                 built, origin = built + (not np.array_equal(at, origin)), at
+                if always:
+                    continue
                 x, (listed, _) = w.position, search.list.entries()
                 square = (x**2).sum(axis=1)
                 near = np.argwhere(square[:, None] + square - 2 * x @ x.T < (1 + 0.019 * search.skin) ** 2) @ (len(x), 1)
