@@ -18,7 +18,6 @@ from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
 from .events import EventLog
 from .force_share import ForceShare
-from .friction import Friction
 from .known_loads import KnownLoads
 from .mass_splitting import MassSplitting, lesser
 from .narrow_phase import DiscGeometry
@@ -176,7 +175,6 @@ class Contact(PairContact):
             dev.known.bind(dev.list)
         dev.forces = ForceShare(scene, sums=dev.has_friction, lasting=True)
         dev.fast = scene.memory.field("Contact.fast", None, kind=ti.i32)
-        dev.friction = Friction(self.table)
         dev.restitution = None
         if dev.has_restitution:
             noted = dev.events if dev.reports else None
@@ -325,7 +323,7 @@ class Contact(PairContact):
     def held(self, i, j, n, normal, slip):
         """The part of a pair's slip, with the present displacements, that friction takes back for a normal displacement."""
         moved = self.dev.state.slid(slip + self.dev.state.d[i] - self.dev.state.d[j], i, j)
-        return self.dev.friction.held(i, j, n, normal, moved)
+        return self.table.held(i, j, n, normal, moved)
 
     @ti.func
     def grip(self, i, j, e, n, reach, pressed, bounces):
@@ -336,7 +334,7 @@ class Contact(PairContact):
         if ti.static(self.dev.turns and self.dev.has_restitution):
             if bounces:
                 slip *= 1 + self.table.of(i, j)[6]
-        push = -self.dev.friction.held(i, j, n, pressed * split_mass, slip) / split_mass
+        push = -self.table.held(i, j, n, pressed * split_mass, slip) / split_mass
         turned = self.dev.spinning.turned(i, m, push)
         if ti.static(self.dev.turns):
             turned += self.dev.spinning.resist(i, j, e, n, m, push, pressed)
@@ -406,7 +404,7 @@ class Contact(PairContact):
                         pressed = ti.max(overlap, pressed) / shared
                         reach = pressed * self.dev.spinning.split_mass(i, j)
                         slip = self.dev.slip.field[e] + self.dev.spinning.slip(i, j, self.dev.spinning.arm(i, j, n))
-                        slip = self.dev.friction.held(i, j, n, reach, slip)
+                        slip = self.table.held(i, j, n, reach, slip)
                         if ti.static(self.dev.turns):
                             turn = self.dev.spinning.left(i, j, e, n, pressed)
                     else:

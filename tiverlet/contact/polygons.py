@@ -15,7 +15,6 @@ from ..neighbours.neighbour_list import PairData
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
 from .force_share import ForceShare
-from .friction import Friction
 from .loops import checked, laid, refuse_deep
 from .pair_contact import PairContact
 from .polygon_narrow_phase import VERTEX, Beside, Outline, PolygonGeometry
@@ -102,7 +101,7 @@ class Polygons(PairContact):
         dev.active = add("Contact.active", n, kind=ti.i32)  # contacts that each particle is in
         dev.fast = add("Contact.fast", None, kind=ti.i32)
         self.table.bind(scene, asked=True)
-        dev.friction, dev.slip = Friction(self.table), PairData("slip", 2, lasting=True)
+        dev.slip = PairData("slip", 2, lasting=True)
         if dev.has_restitution:
             dev.restitution = PolygonRestitution(scene, dev.geometry, self.table)
             dev.hit = dev.restitution.hit
@@ -226,7 +225,7 @@ class Polygons(PairContact):
                                 self.dev.geometry.impulse.field[e] = self.dev.geometry.impulse.field[e] + back / shared
                         want = back * n
                         if ti.static(self.dev.has_friction):
-                            want -= self.dev.friction.held(v, a, n, overlap + missing, self.dev.slip.field[at] + d)
+                            want -= self.table.held(v, a, n, overlap + missing, self.dev.slip.field[at] + d)
                         total += share * want
                         if final != 0:
                             approach = -self.dev.geometry.relative(self.dev.forces.before, v, a, b, t).dot(n)
@@ -271,7 +270,7 @@ class Polygons(PairContact):
                     found = self.dev.geometry.manifold.field[at]
                     if found[0] > 0:
                         n, d = ti.Vector([found[2], found[3]]), self.dev.geometry.relative(self.dev.state.d, v, a, b, t)
-                        slip = self.dev.friction.held(v, a, n, found[0], self.dev.slip.field[e] + d)
+                        slip = self.table.held(v, a, n, found[0], self.dev.slip.field[e] + d)
                 self.dev.slip.field[e] = slip
 
 
