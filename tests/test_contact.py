@@ -254,8 +254,8 @@ def test_what_a_failed_frame_left_behind_is_gone(world):
     ends = []
     for failed in (False, True):
         if failed:
-            for piece in w._runner.grid.pair_data:
-                w._runner.grid.store.write(piece.field, np.nan)
+            for piece in w._runner.search.list.pair_data:
+                w._runner.search.list.store.write(piece.field, np.nan)
         checkpoint.put_back(w, kept)
         w.run(0.2)
         ends.append(w.hash())

@@ -67,20 +67,18 @@ def test_the_first_page_is_short_and_leads_to_all_others():
 
 
 def undocumented(tree: ast.Module) -> list[str]:
-    """Names without a docstring, nested ones too; not what a setter is for, which its property says, nor what begins with _."""
+    """Names without a docstring, nested ones and what sets properties too; not what begins with _."""
     out = []
     for node in ast.walk(tree):
         if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) or node.name.startswith("_"):
-            continue
-        if any(isinstance(d, ast.Attribute) and d.attr == "setter" for d in node.decorator_list):
             continue
         out += [] if ast.get_docstring(node) else [f"{node.lineno} {node.name}"]
     return out
 
 
 def test_every_public_name_says_what_it_is():
-    # Modules, classes, functions, methods and properties of the package, and what is defined inside of them; and live settings,
-    # which say it when they are made.
+    # Modules, classes, functions, methods and properties of the package, what sets these, and what is defined inside of them; and
+    # live settings, which say it when they are made.
     missing = []
     for path in ROOT.glob("tiverlet/**/*.py"):
         tree = ast.parse(path.read_text())

@@ -307,9 +307,9 @@ def test_nothing_is_lost_where_lists_grow(world):
         [tv.Contact(sensors=[(0, 1), (1, 1)])],
         substeps=100,
     )
-    room = w._runner.grid.room
+    room = w._runner.search.list.room
     w.step(1 / 20)
-    assert w._runner.grid.room > room
+    assert w._runner.search.list.room > room
     assert len(w.events([(1, 1)]).begun) == 60 * 59 // 2 and not len(w.events([(1, 1)]).ended)
     through = w.events([(0, 1)])
     assert rows(through.begun.pairs) == rows(through.ended.pairs) == {(i, j) for i in range(60) for j in (60, 61)}

@@ -134,5 +134,5 @@ def test_34_thousands_in_one_cell(world):
     w = world(tv.Particles(x, radius=0.5), [tv.Contact()])
     with pytest.warns(UserWarning, match="near pairs per particle"):
         w._runner.list_neighbours()
-    np.testing.assert_array_equal(w._runner.memory.read(w._runner.grid.number), n - 1)
-    assert w._runner.grid.need[None] * w._runner.grid.blocks >= n * (n - 1)
+    np.testing.assert_array_equal(w._runner.memory.read(w._runner.search.list.number), n - 1)
+    assert w._runner.search.list.need[None] * w._runner.search.list.blocks >= n * (n - 1)

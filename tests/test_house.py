@@ -1,11 +1,13 @@
-"""The layout: how much lies at the root of the package, how deep classes inherit, and that imports go one way, not deep."""
+"""The layout: how much lies at the root of the package, how classes inherit, and that imports go one way, not deep."""
 
 import ast
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1] / "tiverlet"
 DEPTH = 16  # modules, one importing the next
-CONTRACTS = ("Acceleration", "Batch", "Collider", "PairContact", "Solver")  # what a step asks of each kind of object
+# What a step asks of each kind of object, says its contract: its methods do nothing, or what most do.
+CONTRACTS = ("Acceleration", "Batch", "Collider", "PairContact", "Quantity", "SemiIteration", "Solver", "System")
+GROUND = 2  # classes below a contract: what all that a recording can make again have, and what acts on particles
 
 
 def modules() -> dict[str, ast.Module]:
@@ -20,19 +22,24 @@ def modules() -> dict[str, ast.Module]:
 MODULES = modules()
 
 
+def named(module: str, node: ast.AST) -> dict[str, tuple[str, str]]:
+    """What an import of ours names there: by each name the module, and what of it, "" for the module itself."""
+    if not isinstance(node, ast.ImportFrom) or not node.level:
+        return {}
+    package = module if (ROOT.parent / module.replace(".", "/")).is_dir() else module.rpartition(".")[0]
+    base = ".".join([*package.split(".")[: len(package.split(".")) + 1 - node.level], *filter(None, [node.module])])
+    return {a.asname or a.name: (m, "") if (m := f"{base}.{a.name}") in MODULES else (base, a.name) for a in node.names}
+
+
 def imported(name: str) -> list[str]:
     """The modules of ours that a module imports when it is imported itself."""
-    package = name if (ROOT.parent / name.replace(".", "/")).is_dir() else name.rpartition(".")[0]
     out: list[str] = []
 
     def look(body: list[ast.stmt]) -> None:
         """What statements import, those in functions and under TYPE_CHECKING left out."""
         for node in body:
-            if isinstance(node, ast.ImportFrom) and node.level:
-                base = ".".join(package.split(".")[: len(package.split(".")) + 1 - node.level] + (node.module or "").split("."))
-                base = base.rstrip(".")
-                out.extend(f"{base}.{a.name}" if f"{base}.{a.name}" in MODULES else base for a in node.names)
-            elif isinstance(node, ast.If) and "TYPE_CHECKING" not in ast.unparse(node.test):
+            out.extend(module for module, _ in named(name, node).values())
+            if isinstance(node, ast.If) and "TYPE_CHECKING" not in ast.unparse(node.test):
                 look(node.body + node.orelse)
 
     look(MODULES[name].body)
@@ -69,22 +76,45 @@ def test_imports_are_shallow():
     assert chain("tiverlet.world")[-1] == "tiverlet.device.language"  # and imports are seen
 
 
+KINDS = {(m, node.name): node for m, tree in MODULES.items() for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
+ORIGINS = {m: {k: v for node in ast.walk(tree) for k, v in named(m, node).items()} for m, tree in MODULES.items()}
+
+
+def kind_of(module: str, said: ast.expr) -> tuple[str, str] | None:
+    """The class of ours, by its module and its name, that an expression means there."""
+    if isinstance(said, ast.Attribute) and isinstance(said.value, ast.Name):
+        module, name = ORIGINS[module].get(said.value.id, ("", ""))[0], said.attr
+    else:
+        name = said.id if isinstance(said, ast.Name) else ""
+    while module and (module, name) not in KINDS:
+        module, name = ORIGINS[module].get(name, ("", ""))
+    return (module, name) if module else None
+
+
+BASES = {kind: [b for said in node.bases if (b := kind_of(kind[0], said))] for kind, node in KINDS.items()}
+
+
+def depth(kind: tuple[str, str], ground: tuple[str, ...] = CONTRACTS) -> int:
+    """How many classes of ours are below one, those of the ground and what is below these left out."""
+    return 0 if kind[1] in ground else max((1 + depth(b, ground) for b in BASES[kind]), default=0)
+
+
 def test_classes_are_at_most_two_below_a_contract():
-    # A contract of CONTRACTS counts as the ground, as does what is no class of ours.
-    kinds: dict[str, list[ast.ClassDef]] = {}
-    for tree in MODULES.values():
-        for node in ast.walk(tree):
-            if isinstance(node, ast.ClassDef):
-                kinds.setdefault(node.name, []).append(node)
+    # And a contract is at most GROUND above what has no class of ours below it.
+    by = {kind[1]: kind for kind in KINDS}
+    assert {kind: d for kind in KINDS if (d := depth(kind)) > 2} == {}
+    assert {name: d for name in CONTRACTS if (d := depth(by[name], ())) > GROUND} == {}
+    assert depth(by["Distance"]) == depth(by["Mesh"]) == 2 and depth(by["Gravity"]) == depth(by["Direct"]) == 1
+    assert depth(by["Distance"], ()) == 2 + GROUND
 
-    def depth(name: str) -> int:
-        """Of the deepest class of that name."""
-        bases = [ast.unparse(b).rpartition(".")[2] for kind in kinds.get(name, []) for b in kind.bases]
-        return 0 if name in CONTRACTS or not bases else max(1 + depth(b) if b in kinds else 0 for b in bases if b != name)
 
-    assert all(name in kinds for name in CONTRACTS)
-    assert {name: d for name in kinds if (d := depth(name)) > 2} == {}
-    assert depth("Distance") == depth("Mesh") == 2 and depth("Gravity") == depth("Direct") == 1
+def test_classes_are_abstract_or_final():
+    # What others inherit from is never made itself: who wants its code holds an object.
+    abstract = {b for bases in BASES.values() for b in bases}
+    calls = {m: [node for node in ast.walk(tree) if isinstance(node, ast.Call)] for m, tree in MODULES.items()}
+    made = {kind for m, some in calls.items() for node in some if (kind := kind_of(m, node.func))}
+    assert abstract & made == set()
+    assert ("tiverlet.features.feature", "Batch") in abstract and ("tiverlet.neighbours.neighbour_list", "NeighbourList") in made
 
 
 def test_the_root_of_the_package_can_be_taken_in_at_a_glance():

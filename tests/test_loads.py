@@ -39,14 +39,18 @@ def overlap(w):
      ({"spin": 0.0, "friction": (0.5, 0.5, 0.1, 0.0)}, 1e-6), ({"friction": 0.0}, 1e-6)],
 )  # fmt: skip
 def test_a_pile_at_rest_hardly_overlaps(world, settings, most):
-    # Without loads the k-th contact overlaps by 2 k g h^2: on average 1e-4 (8 substeps) and 2e-3 (2) of a diameter here.
-    w, without = (pile(world, loads=loads, **settings) for loads in (True, False))
+    # Without loads the k-th contact overlaps by 2 k g h^2: on average 1e-4 (8 substeps) and 2e-3 (2) of a diameter here; that it
+    # does is shown by the two that share their kernels.
+    w = pile(world, **settings)
     start, highest = w.step(1 / 60).energy, -np.inf
     for _ in range(900):
         highest = max(highest, w.step(1 / 60).energy)
-    without.run(15.0)
     assert highest <= start * (1 + 1e-6)
-    assert overlap(w) < most < 0.05 * overlap(without)
+    assert overlap(w) < most
+    if settings.keys() <= {"substeps"}:
+        without = pile(world, loads=False, **settings)
+        without.run(15.0)
+        assert most < 0.05 * overlap(without)
     speed = np.linalg.norm(w.velocity, axis=1).max()
     assert speed < (1e-3 if w.precision == "f32" or "spin" in settings else 1e-4)
 

@@ -11,7 +11,7 @@ from .conftest import CROSSOVER
 
 def roomy(w: tv.World, entries: int) -> None:
     """Give the list of near pairs room before anything compiles; a list that grows makes all compile anew."""
-    w._runner.grid.allocate(entries)
+    w._runner.search.list.allocate(entries)
     w._runner.renew()
 
 
@@ -68,16 +68,16 @@ def test_pairs_equal_brute_force(world, path, name, radius, several):
     for (position, filled), want in zip(several, wanted, strict=True):
         position = np.asarray(position)
         w._runner.memory.write(w._runner.scene.state.x, position)
-        w._runner.grid.fit(np.ptp(position, axis=0))
-        w._runner.grid.stale[None] = 1
+        w._runner.search.fit(np.ptp(position, axis=0))
+        w._runner.search.list.stale[None] = 1
         w._runner.list_neighbours()
-        pairs, _ = w._runner.grid.entries()
+        pairs, _ = w._runner.search.list.entries()
         pairs = pairs[pairs[:, 0] < pairs[:, 1]]
         np.testing.assert_array_equal(pairs, want)
-        found = w._runner.memory.read(w._runner.grid.number)
+        found = w._runner.memory.read(w._runner.search.list.number)
         np.testing.assert_array_equal(found, np.bincount(pairs.ravel(), minlength=len(position)))  # each by both
         if filled:
-            in_bucket = np.diff(w._runner.grid.cells.edge.to_numpy()[: w._runner.grid.cells.buckets + 2])
+            in_bucket = np.diff(w._runner.search.cells.edge.to_numpy()[: w._runner.search.cells.buckets + 2])
             assert ((in_bucket > 0).sum(), in_bucket.max()) == filled
         if path == "parallel" and name != "plane":
             continue  # frames of a team are compiled for one cloud; what they come to is summed up alike for all
@@ -100,8 +100,8 @@ def test_many_particles(world, monkeypatch):
     w = world(tv.Particles(position, radius=radius), [tv.Contact(skin=0.05)], precision="f64")
     assert w.path == ("parallel" if tv.runtime.cores() > 1 else "fused")
     w._runner.list_neighbours()
-    first, number = (w._runner.memory.read(field) for field in (w._runner.grid.first, w._runner.grid.number))
-    near = w._runner.grid.store.read(w._runner.grid.neighbour)
+    first, number = (w._runner.memory.read(field) for field in (w._runner.search.list.first, w._runner.search.list.number))
+    near = w._runner.search.list.store.read(w._runner.search.list.neighbour)
     i = np.repeat(np.arange(len(position)), number)
     j = near[np.repeat(first, number) + np.arange(len(i)) - np.repeat(np.cumsum(number) - number, number)]
     assert (np.diff(j)[np.diff(i) == 0] > 0).all()  # sorted, no pair twice
@@ -128,7 +128,7 @@ def test_neither_room_nor_skin_nor_path_changes_a_bit(world):
             roomy(w, capacity)
             w.run(0.2)
             hashes.add(w.hash())
-            assert w._runner.grid.capacity * w._runner.grid.blocks >= len(w._runner.grid.entries()[0]) > 0
+            assert w._runner.search.list.capacity * w._runner.search.list.blocks >= len(w._runner.search.list.entries()[0]) > 0
     assert len(hashes) == 1
 
 

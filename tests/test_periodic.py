@@ -81,7 +81,7 @@ def test_no_pair_is_missed_whichever_image_is_near(world, name):
     found = 0
     for frame in range(8):
         w.step(DT)
-        listed = set(map(tuple, w._runner.grid.entries()[0].tolist()))  # that of the frame, as old as it is
+        listed = set(map(tuple, w._runner.search.list.entries()[0].tolist()))  # that of the frame, as old as it is
         there = touching(w.position, radius, length, axes, box.offset, 1e-4)
         assert there <= listed
         found += len(there)

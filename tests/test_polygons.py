@@ -232,12 +232,13 @@ def test_discs_beside_wide_bodies_list_what_they_may_touch(world):
     body = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 1.46], [0.0, 1.46]])
     start = tv.Particles([*body, *discs], radius=np.r_[np.zeros(4), np.full(100, 0.1)])
     w = world(start, [tv.Polygons([range(4)])])
-    assert w._runner.grid.skin == pytest.approx(0.75 * 0.1) and w._runner.grid.finest == pytest.approx(2 * 0.1 + 0.075, rel=1e-3)
+    search = w._runner.search
+    assert search.skin == pytest.approx(0.75 * 0.1) and search.finest == pytest.approx(2 * 0.1 + 0.075, rel=1e-3)
     w._runner.list_neighbours()
-    pairs, _ = w._runner.grid.entries()
+    pairs, _ = search.list.entries()
     both = pairs[(pairs >= 4).all(axis=1)]
     apart = np.linalg.norm(start.position[both[:, 0]] - start.position[both[:, 1]], axis=1)
-    assert (apart < 0.2 + w._runner.grid.skin).all()
+    assert (apart < 0.2 + search.skin).all()
     listed, some = {tuple(p) for p in pairs.tolist()}, 0
     for a in range(4):
         b = (a + 1) % 4

@@ -100,7 +100,7 @@ def test_a_world_that_grows_compiles_nothing(world):
             with compiled() as more:
                 if k < 3:
                     w.add(tv.Particles(x[: 10 * (k % 2 + 1) - 3] + [0.0, 4.0 + 3 * k], velocity=(0.1, -1), radius=0.45))
-                    assert w._runner.grid.capacity < 1000
+                    assert w._runner.search.list.capacity < 1000
                 else:
                     w.remove(np.arange(25, len(w.particles)))
                 w.run(0.3)

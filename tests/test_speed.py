@@ -76,7 +76,7 @@ def test_yardstick_starts_where_the_scene_does(tmp_path):
     program, how = c_baseline.build(tmp_path)
     if program is None:
         pytest.skip(how)
-    with c_baseline.Yardstick(program, 1000, 8, 1) as talker:
+    with c_baseline.started(program, 1000, 8, 1) as talker:
         assert talker.ask("quality")["overlap"] == 0
         assert talker.ask("run 2") > 0
 

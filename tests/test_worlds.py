@@ -148,15 +148,15 @@ def test_a_list_that_is_too_short_in_one_grows_in_all(taichi):
     alone = [heap(k) for k in range(3)]
     many = tv.Worlds([heap(k) for k in range(3)])
     with many:
-        grid = many._runner.grid
-        grid.store.destroy()
-        grid.store = None
-        grid.allocate(40)
+        near = many._runner.search.list
+        near.store.destroy()
+        near.store = None
+        near.allocate(40)
         many._runner.renew()
         for seconds in (1 / 60, 0.7):
             report = many.run(seconds)
             contacts = [w.run(seconds).contacts for w in alone]
-        assert grid.capacity > 80
+        assert near.capacity > 80
         assert [many.hash(k) for k in range(3)] == [w.hash() for w in alone]
         assert report.contacts.tolist() == contacts and min(contacts) > 0
         assert many.each(lambda world: len(world.contacts)) == [len(w.contacts) for w in alone]

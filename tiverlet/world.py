@@ -22,6 +22,7 @@ from .features.feature import Acceleration, Batch, Feature
 from .features.read_only import assign_whole, read_only, structure
 from .neighbours.queries import Contacts, PointSearch, near_by_all, nearest
 from .particles import Particles, at_rest, in_range, spin_of
+from .solvers.jacobi import Jacobi
 from .solvers.solver import Solver
 from .step import checkpoint, edit_scene
 from .step.adaptive import StepController
@@ -86,7 +87,7 @@ class World:
         """starts: for each feature the particles as they were when it came; None if it comes now."""
         check_settings(precision, path, order, features)
         self._requested = checked_solver(solver), path  # None where the solver is to be chosen
-        self._solver, self._precision, self._order = self._requested[0] or Solver(), precision, order
+        self._solver, self._precision, self._order = self._requested[0] or Jacobi(), precision, order
         self._controller = StepController()
         self.substeps, self.iterations = substeps, iterations
         self._clock = Clock()
@@ -276,6 +277,7 @@ class World:
 
     @position.setter
     def position(self, value) -> None:
+        """Move particles to (n, dim) [m]; velocities are kept, and lists are built anew."""
         value = checks.points("World", "position", value, dim=self._particles.dim, count=len(self._particles))
         in_range("World", "position", value)
         if self._runner.step.contacts:
@@ -299,6 +301,7 @@ class World:
 
     @velocity.setter
     def velocity(self, value) -> None:
+        """Have particles go on with (n, dim) [m/s]; the next substep is a start."""
         value = checks.points("World", "velocity", value, dim=self._particles.dim, count=len(self._particles))
         self._runner.memory.check()
         with whole:
@@ -318,6 +321,7 @@ class World:
 
     @spin.setter
     def spin(self, value) -> None:
+        """Have particles turn at (n,) in 2D, (n, 3) in 3D [rad/s]. ValueError where they do not spin."""
         if not self._particles.spins:
             raise ValueError("World.spin: these particles do not spin. Make them with tv.Particles(..., spin=0).")
         value = spin_of("World", value, self._particles)
@@ -351,12 +355,12 @@ class World:
             return np.zeros((0, 2), dtype=np.int64)
         box = self._runner.scene.periodic
         points = points if box is None else box.wrap(points)
-        if not self._runner.grid:
+        if not self._runner.search:
             return near_by_all(self.position, points, radius, box)
         with whole:
             self._runner.list_neighbours()
             with self._runner.memory.compiler():
-                self._search = self._search or PointSearch(self._runner.grid)
+                self._search = self._search or PointSearch(self._runner.search)
                 return self._search.near(points, radius)
 
     def nearest(self, points) -> tuple[np.ndarray, np.ndarray]:
@@ -364,10 +368,8 @@ class World:
         points = checks.points("World.nearest", "points", points, dim=self._particles.dim)
         if not len(self._particles):
             raise ValueError("World.nearest: there are no particles.")
-        position = self.position
-        start = (
-            self._runner.grid.finest if self._runner.grid else 2 * float(np.abs(position).max() + np.abs(points).max(initial=1.0))
-        )
+        position, search = self.position, self._runner.search
+        start = search.finest if search else 2 * float(np.abs(position).max() + np.abs(points).max(initial=1.0))
         return nearest(self.near, position, points, start, self._runner.scene.periodic)
 
     def ray(
@@ -415,7 +417,7 @@ class World:
     def contacts(self) -> Contacts:
         """What touches now, as arrays: discs or spheres, and vertices and edges of Polygons. Empty without a Contact."""
         self._runner.memory.check()
-        if not self._runner.grid:
+        if not self._runner.search:
             none, index = np.zeros(0), np.zeros((0, 2), dtype=np.int64)
             vectors = np.zeros((0, self._particles.dim))
             return Contacts(index, index[:, 0], none, none, vectors, vectors, none)
@@ -520,6 +522,7 @@ class World:
 
     @substeps.setter
     def substeps(self, value: int | str) -> None:
+        """At least 1, or "auto", from the next frame on."""
         if isinstance(value, str) and value != "auto":
             raise ValueError(f'World: substeps = {value!r}, but it must be an integer of at least 1, or "auto".')
         self._controller.auto = value == "auto"
@@ -533,6 +536,7 @@ class World:
 
     @iterations.setter
     def iterations(self, value: int) -> None:
+        """At least 1, and what the solver allows, from the next frame on."""
         value = checks.integer("World", "iterations", value, least=1)
         self._solver.check(value)
         self._iterations = value

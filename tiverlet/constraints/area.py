@@ -9,6 +9,7 @@ from .. import checks
 from ..device import ti
 from ..features.feature import Knob, Scene
 from ..features.members import FixedSize
+from ..geometry.intervals import cross
 from ..particles import Particles
 from .core.outline import PRESSURE
 from .core.quantity import Quantity
@@ -86,7 +87,7 @@ class Triangles(Quantity):
         if x.shape[2] == 2:
             (ux, uy), (vx, vy) = (b - a).T, (c - a).T
             return (ux * vy - uy * vx) / 2
-        return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+        return np.linalg.norm(cross(b - a, c - a), axis=1) / 2
 
     @ti.func
     def reach(self, q):

@@ -19,6 +19,14 @@ from .core.scalar import Scalar
 WRONG = 1e-4  # relative difference between a gradient and differences of the function that is not rounding
 
 
+class Function(Quantity):
+    """f that the user gives, of any corners, in the unit that is given: their Constraint measures it."""
+
+    def __init__(self, members: Any, unit: float | None):
+        super().__init__(members)
+        self.unit = unit
+
+
 class Constraint(Scalar):
     """C(x) = function(x_0, x_1, ...) - rest = 0, or <= 0, or >= 0: the user's own constraint, soft or rigid like all others.
 
@@ -74,9 +82,7 @@ class Constraint(Scalar):
 
     def quantity_of(self, indices) -> Quantity:
         """That of any corners, in the unit that is given."""
-        quantity = Quantity(self.fixed(indices, self.arity))
-        quantity.unit = self._unit
-        return quantity
+        return Function(self.fixed(indices, self.arity), self._unit)
 
     def __repr__(self) -> str:
         return f"Constraint({self.name})"

@@ -9,6 +9,7 @@ from .. import checks
 from ..device import ti
 from ..features.feature import Knob, Scene
 from ..features.members import FixedSize
+from ..geometry.intervals import cross
 from ..particles import Particles
 from .core.outline import PRESSURE
 from .core.quantity import Quantity
@@ -104,7 +105,7 @@ class Tetrahedra(Quantity):
     def values(self, x: np.ndarray) -> np.ndarray:
         """Signed volumes."""
         a, b, c, d = (x[:, k] for k in range(4))
-        return np.einsum("ij,ij->i", b - a, np.cross(c - a, d - a)) / 6
+        return np.einsum("ij,ij->i", b - a, cross(c - a, d - a)) / 6
 
     @ti.func
     def reach(self, q):
@@ -153,7 +154,7 @@ class Surfaces(Quantity):
     def values(self, x: np.ndarray) -> np.ndarray:
         """Signed volumes."""
         a, b, c = self._seen(x)
-        parts = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6
+        parts = np.einsum("ij,ij->i", a, cross(b, c)) / 6
         return np.bincount(self.surface, weights=parts, minlength=self.members.count)
 
     def _seen(self, x: np.ndarray) -> np.ndarray:
@@ -165,7 +166,7 @@ class Surfaces(Quantity):
         """Their gradients by each corner, (total, 3)."""
         members, corner = self.members, self._corner
         a, b, c = self._seen(x)
-        parts = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1).reshape(-1, 3) / 6
+        parts = np.stack([cross(b, c), cross(c, a), cross(a, b)], axis=1).reshape(-1, 3) / 6
         return np.stack([np.bincount(corner, part, minlength=len(members.indices)) for part in parts.T], axis=1)
 
     @property

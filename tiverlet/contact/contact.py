@@ -18,7 +18,6 @@ from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
 from .events import EventLog
 from .force_share import ForceShare
-from .friction import Friction
 from .known_loads import KnownLoads
 from .mass_splitting import MassSplitting, lesser
 from .narrow_phase import DiscGeometry
@@ -119,8 +118,8 @@ class Contact(PairContact):
         if not self.matters:
             return not bool((now.radius > 0).any())
         alike = self.table.can_be(change.before.group, now.group)
-        splits = dev.splitting.can_regroup(dev.grid.team.piece_of(now.count))
-        return alike and splits and bool((now.radius > 0).any()) and dev.grid.can_regroup(change)
+        splits = dev.splitting.can_regroup(dev.list.team.piece_of(now.count))
+        return alike and splits and bool((now.radius > 0).any()) and dev.search.can_regroup(change)
 
     def regroup(self, change: Regrouping) -> None:
         """They came and went, and the team knows."""
@@ -129,9 +128,9 @@ class Contact(PairContact):
         dev, n = self.dev, change.now.count
         self._measure(change.now.radius)
         self.table.regroup(self.scene, change.now.group)
-        dev.grid.regroup(change, self._listed)
+        dev.search.regroup(change, self._listed)
         dev.splitting.regroup(n)
-        dev.projection.regroup(n, dev.grid.team)
+        dev.projection.regroup(n, dev.list.team)
 
     def join(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
         """Declare the fields, among them the neighbour list's, which is returned."""
@@ -162,20 +161,20 @@ class Contact(PairContact):
         dev.events = EventLog(scene, self.table) if dev.has_events else None
         if dev.events:
             pair_data.append(dev.events.touched)
-        dev.grid = NeighbourSearch(scene, self._listed, linked, self.table, pair_data, team, dev.move)
+        dev.search = NeighbourSearch(scene, self._listed, linked, self.table, pair_data, team, dev.move)
+        dev.list = dev.search.list
         dev.geometry = DiscGeometry(
-            scene, dev.grid, self.push_out, dev.impulse if dev.has_restitution else dev.push, dev.has_loads
+            scene, dev.search, self.push_out, dev.impulse if dev.has_restitution else dev.push, dev.has_loads
         )
         if dev.events:
-            dev.events.bind(dev.grid, dev.geometry)
+            dev.events.bind(dev.list, dev.geometry)
         skips = not scene.memory.compiler.few and not dev.has_restitution  # in relax() what bounces forgets the last impact
         ended = [dev.push, *loads, *bouncing]
         dev.splitting = MassSplitting(scene, dev.geometry, dev.has_friction, skips, dev.push, ended, team, dev.known)
         if dev.known:
-            dev.known.bind(dev.grid)
+            dev.known.bind(dev.list)
         dev.forces = ForceShare(scene, sums=dev.has_friction, lasting=True)
         dev.fast = scene.memory.field("Contact.fast", None, kind=ti.i32)
-        dev.friction = Friction(self.table)
         dev.restitution = None
         if dev.has_restitution:
             noted = dev.events if dev.reports else None
@@ -183,13 +182,13 @@ class Contact(PairContact):
             dev.hit = dev.restitution.hit
         if dev.spins:
             dev.spinning = Spinning(scene, self.table, dev.splitting.weight, dev.turn)
-        dev.projection = VelocityProjection(scene, dev.grid, dev.push, dev.splitting.weight, dev.restitution, dev.move, team)
-        return dev.grid
+        dev.projection = VelocityProjection(scene, dev.list, dev.push, dev.splitting.weight, dev.restitution, dev.move, team)
+        return dev.search
 
     @ti.func
     def presses(self, i, e):
         """Whether particle i presses on the one at entry e of its list, which does on it."""
-        return self.dev.push.field[e] > 0 or self.dev.geometry.push_each_other(i, self.dev.grid.neighbour[e])
+        return self.dev.push.field[e] > 0 or self.dev.geometry.push_each_other(i, self.dev.list.neighbour[e])
 
     @ti.func
     def held_by(self, j):
@@ -200,7 +199,7 @@ class Contact(PairContact):
     def reached(self, i, e):
         """The particle at entry e of the list of particle i where it sleeps and i touches it; if i is driven, also where i did as
         the substep began."""
-        j, out = self.dev.grid.neighbour[e], -1
+        j, out = self.dev.list.neighbour[e], -1
         if not self.dev.state.awake(j):
             met = self.dev.geometry.push_each_other(i, j)
             if not self.dev.w.positive(i):
@@ -232,12 +231,12 @@ class Contact(PairContact):
                 self.dev.restitution.clear(i, self.dev.splitting.weight[i])
         idle = 0
         if self.dev.splitting.weight[i] > 0:
-            for word in range(self.dev.grid.words(i)):
+            for word in range(self.dev.list.words(i)):
                 bits = self.dev.splitting.touching(i, word)
                 while bits != 0:
-                    e = self.dev.grid.entry(i, word, bits)
+                    e = self.dev.list.entry(i, word, bits)
                     bits &= bits - ti.u32(1)
-                    j = self.dev.grid.neighbour[e]
+                    j = self.dev.list.neighbour[e]
                     last = self.dev.push.field[e]
                     shared = self.dev.splitting.weight[i] + self.dev.splitting.weight[j]
                     overlap, each, n, reach = self.dev.geometry.impact(i, j, self.dev.geometry.contact_distance(i, j), shared)
@@ -324,7 +323,7 @@ class Contact(PairContact):
     def held(self, i, j, n, normal, slip):
         """The part of a pair's slip, with the present displacements, that friction takes back for a normal displacement."""
         moved = self.dev.state.slid(slip + self.dev.state.d[i] - self.dev.state.d[j], i, j)
-        return self.dev.friction.held(i, j, n, normal, moved)
+        return self.table.held(i, j, n, normal, moved)
 
     @ti.func
     def grip(self, i, j, e, n, reach, pressed, bounces):
@@ -335,7 +334,7 @@ class Contact(PairContact):
         if ti.static(self.dev.turns and self.dev.has_restitution):
             if bounces:
                 slip *= 1 + self.table.of(i, j)[6]
-        push = -self.dev.friction.held(i, j, n, pressed * split_mass, slip) / split_mass
+        push = -self.table.held(i, j, n, pressed * split_mass, slip) / split_mass
         turned = self.dev.spinning.turned(i, m, push)
         if ti.static(self.dev.turns):
             turned += self.dev.spinning.resist(i, j, e, n, m, push, pressed)
@@ -347,12 +346,12 @@ class Contact(PairContact):
         what forces have of them."""
         total, w = 0 * self.dev.state.d[i], self.dev.w.of(i)
         if self.dev.splitting.weight[i] > 0:
-            for word in range(self.dev.grid.words(i)):
-                bits = ti.select(word == 0, self.dev.grid.touching[i], self.dev.grid.all_bits(i, word))
+            for word in range(self.dev.list.words(i)):
+                bits = ti.select(word == 0, self.dev.list.touching[i], self.dev.list.all_bits(i, word))
                 while bits != 0:
-                    e = self.dev.grid.entry(i, word, bits)
+                    e = self.dev.list.entry(i, word, bits)
                     bits &= bits - ti.u32(1)
-                    j, push = self.dev.grid.neighbour[e], self.dev.push.field[e]
+                    j, push = self.dev.list.neighbour[e], self.dev.push.field[e]
                     r = self.dev.state.apart(i, j)
                     length = r.norm()
                     if push > 0 and length > 0:
@@ -391,8 +390,8 @@ class Contact(PairContact):
         """At the end of a substep: add to each pair's slip what it has moved, as far as friction can hold it; a pair that parted
         has no slack. What came to overlap after pairs were pushed, which a list with a narrow skin may not know yet, waits."""
         if ti.static(self.dev.has_friction):
-            for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
-                j = self.dev.grid.neighbour[e]
+            for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):
+                j = self.dev.list.neighbour[e]
                 overlap, n = self.dev.geometry.overlap(i, j, self.dev.geometry.contact_distance(i, j))
                 slip, turn = 0 * self.dev.state.x[i], ti.Vector.zero(self.scene.real, self.dev.axes)
                 if ti.static(self.dev.has_loads):
@@ -405,7 +404,7 @@ class Contact(PairContact):
                         pressed = ti.max(overlap, pressed) / shared
                         reach = pressed * self.dev.spinning.split_mass(i, j)
                         slip = self.dev.slip.field[e] + self.dev.spinning.slip(i, j, self.dev.spinning.arm(i, j, n))
-                        slip = self.dev.friction.held(i, j, n, reach, slip)
+                        slip = self.table.held(i, j, n, reach, slip)
                         if ti.static(self.dev.turns):
                             turn = self.dev.spinning.left(i, j, e, n, pressed)
                     else:
@@ -415,9 +414,9 @@ class Contact(PairContact):
                     self.dev.turn.field[e] = turn
         if ti.static(self.dev.has_restitution):
             if self.dev.splitting.weight[i] > 0:
-                for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
+                for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):
                     if self.dev.slack.field[e] > 0:
-                        j = self.dev.grid.neighbour[e]
+                        j = self.dev.list.neighbour[e]
                         overlap, _n = self.dev.geometry.overlap(i, j, self.dev.geometry.contact_distance(i, j))
                         if overlap <= 0:
                             self.dev.slack.field[e] = 0

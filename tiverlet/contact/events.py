@@ -20,7 +20,7 @@ from ..neighbours.neighbour_list import Column, PairData
 from .touches import BEFORE, NEVER, ContactEvents, Touches, span
 
 if TYPE_CHECKING:
-    from ..neighbours.neighbour_search import NeighbourSearch
+    from ..neighbours.neighbour_list import NeighbourList
     from .narrow_phase import DiscGeometry
 
 
@@ -33,7 +33,7 @@ class EventLog:
     from the other; point [m].
     """
 
-    grid: "NeighbourSearch"
+    list: "NeighbourList"
     geometry: "DiscGeometry"
 
     def __init__(self, scene: Scene, table: Table):
@@ -51,10 +51,10 @@ class EventLog:
             some = (rows[:, 3].reshape(ranks, ranks) == SENSES).any(axis=1)
             self.is_sensor = add("events.is_sensor", ranks, kind=ti.i32, values=some)
 
-    def bind(self, grid: "NeighbourSearch", geometry: "DiscGeometry") -> None:
+    def bind(self, pairs: "NeighbourList", geometry: "DiscGeometry") -> None:
         """Have the columns made with the list."""
-        self.grid, self.geometry = grid, geometry
-        grid.columns = [self.pair, self.when, self.impulse, self.speed, self.normal, self.point]
+        self.list, self.geometry = pairs, geometry
+        pairs.columns = [self.pair, self.when, self.impulse, self.speed, self.normal, self.point]
 
     @ti.func
     def start(self, s, first):
@@ -68,12 +68,12 @@ class EventLog:
         """As a frame begins: a row for each pair of some particles that touched when the last one ended."""
         number = 0
         for i in range(begin, end):
-            for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
+            for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
                 number += ti.cast(self.touched.field[e] != 0, ti.i32)
         if number > 0:
             row = ti.atomic_add(self.rows[None], number)
             for i in range(begin, end):
-                for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
+                for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
                     if self.touched.field[e] != 0:
                         self.enter(row, i, e, BEFORE, BEFORE)
                         row += 1
@@ -82,7 +82,7 @@ class EventLog:
     def enter(self, row, i, e, began, last):
         """Begin a row."""
         self.touched.field[e] = row + 1
-        self.pair.field[row] = [i, self.grid.neighbour[e]]
+        self.pair.field[row] = [i, self.list.neighbour[e]]
         self.when.field[row] = [began, last]
         self.impulse.field[row] = 0
         self.speed.field[row] = 0
@@ -131,8 +131,8 @@ class EventLog:
         """At the end of a substep, what particle i overlaps as a sensor."""
         rank = self.table.rank[i]
         if self.is_sensor[rank] != 0:
-            for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
-                j = self.grid.neighbour[e]
+            for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
+                j = self.list.neighbour[e]
                 if ti.cast(self.table.of(i, j)[3], ti.i32) == SENSES and (rank != self.table.rank[j] or i < j):
                     overlap, n = self.geometry.overlap(i, j, self.radius.of(i) + self.radius.of(j))
                     if overlap > 0:
@@ -141,12 +141,12 @@ class EventLog:
     @ti.func
     def close(self, i):
         """As a frame ends: keep which pairs of particle i touch."""
-        for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
+        for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
             row = self.touched.field[e] - 1
             if row >= 0:
                 began, last = self.when.field[row][0], self.when.field[row][1]
                 if began == BEFORE and last != self.substep[None]:
-                    j = self.grid.neighbour[e]
+                    j = self.list.neighbour[e]
                     r = self.state.apart(i, j)
                     length = r.norm()
                     if length > 0:
@@ -164,14 +164,14 @@ class EventLog:
 
     def forget(self) -> None:
         """Empty the table, for another state than that of a frame that has just been made."""
-        self.grid.memory.write(self.made, 0)
+        self.list.memory.write(self.made, 0)
 
     def read(self, h: float, time: float) -> ContactEvents:
         """What the last frame, of substeps h [s], which ended at `time` [s], came to."""
-        memory, store = self.grid.memory, self.grid.store
+        memory, store = self.list.memory, self.list.store
         assert store
         count, substeps = int(memory.read(self.rows)[0]), int(memory.read(self.substep)[0])
-        pair, when, *values = (store.read(column.field)[:count] for column in self.grid.columns)
+        pair, when, *values = (store.read(column.field)[:count] for column in self.list.columns)
         impulse, speed, normal, point = (value.astype(np.float64) for value in values)
         pairs = np.sort(pair, axis=1).astype(np.int64)
         normal[pair[:, 0] > pair[:, 1]] *= -1

@@ -12,7 +12,7 @@ from ..neighbours.queries import between
 
 if TYPE_CHECKING:
     from ..features.feature import Scene
-    from ..neighbours.neighbour_search import NeighbourSearch
+    from ..neighbours.neighbour_list import NeighbourList
 
 WINDOW = 128  # substeps over which is averaged what is missing; at their end sound has just been taken out
 SLOW = 0.3  # substeps that it takes to learn the load of k particles, per k^2
@@ -63,13 +63,13 @@ class KnownLoads:
         self.lean = scene.memory.field("Contact.lean", n, width=dim)  # how far walls moved it before contacts were solved [m]
         self.in_state = {"carried": self.carried.field}
 
-    def bind(self, grid: "NeighbourSearch") -> None:
-        """grid: has the pairs listed."""
-        self.grid = grid
+    def bind(self, pairs: "NeighbourList") -> None:
+        """pairs: those that are listed."""
+        self.list = pairs
 
     def forget(self, scene: "Scene", x: np.ndarray) -> None:
         """Before particles are put to x, (n, dim): pairs that are others there forget."""
-        pairs, values = self.grid.lasting_data()
+        pairs, values = self.list.lasting_data()
         if not values["load"].any():
             return
         i, j = pairs.T
@@ -78,7 +78,7 @@ class KnownLoads:
         moved = np.linalg.norm(between(x[i], x[j], scene.periodic) - before, axis=1) > SAME * np.linalg.norm(before, axis=1)
         for piece in self.pair_data:
             values[piece.name][moved] = 0.0
-        self.grid.restore(pairs, values)
+        self.list.restore(pairs, values)
         self.carry(scene, x, pairs, values)
 
     def carry(self, scene: "Scene", x: np.ndarray, pairs: np.ndarray, values: dict[str, np.ndarray]) -> None:
@@ -93,7 +93,7 @@ class KnownLoads:
     @ti.func
     def kept(self, i, word, bits):
         """Those of some entries of particle i that know a load, though they may not touch to the last digit."""
-        out, first = ti.u32(0), self.grid.first[i] + word * WORD
+        out, first = ti.u32(0), self.list.first[i] + word * WORD
         while bits != 0:
             bit = bits & (~bits + ti.u32(1))
             bits ^= bit

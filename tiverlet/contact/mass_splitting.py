@@ -28,7 +28,7 @@ class MassSplitting:
         team: Team, known: Any,
     ):  # fmt: skip
         self.known, self.has_loads = known, known is not None
-        self.geometry, self.grid, self.push, self.ended = geometry, geometry.grid, push, ended
+        self.geometry, self.list, self.push, self.ended = geometry, geometry.list, push, ended
         self.has_friction, self.skips = has_friction, skips
         self.state, self.real, self.few = scene.state, scene.real, scene.memory.compiler.few
         self.weight = scene.memory.field("Contact.split_mass", scene.count, state=True)
@@ -50,14 +50,14 @@ class MassSplitting:
     def regroup(self, n: int) -> None:
         """There are n particles now."""
         if self.skips:
-            self.grid.memory.resize(self.some, self._blocks(n))
+            self.list.memory.resize(self.some, self._blocks(n))
 
     @ti.func
     def touches(self, i, word):
         """Bits for the entries of particle i that the word is for: which touch, as in overlap(), to the last digit."""
-        out, begin = ti.u32(0), self.grid.first[i] + word * WORD
-        for k in range(ti.min(self.grid.number[i] - word * WORD, WORD)):
-            j = self.grid.neighbour[begin + k]
+        out, begin = ti.u32(0), self.list.first[i] + word * WORD
+        for k in range(ti.min(self.list.number[i] - word * WORD, WORD)):
+            j = self.list.neighbour[begin + k]
             r, contact_distance = self.state.apart(i, j), self.geometry.contact_distance(i, j)
             out |= ti.cast(r.dot(r) < contact_distance * contact_distance, ti.u32) << ti.cast(
                 k, ti.u32
@@ -67,14 +67,14 @@ class MassSplitting:
             while left != 0:
                 bit = left & (~left + ti.u32(1))
                 left ^= bit
-                if self.geometry.pushes(i, self.grid.neighbour[begin + lowest_bit(bit)]) == 0:
+                if self.geometry.pushes(i, self.list.neighbour[begin + lowest_bit(bit)]) == 0:
                     out ^= bit
         return out
 
     @ti.func
     def touching(self, i, word):
         """The same bits, of the first word as count() left them."""
-        out = self.grid.touching[i]
+        out = self.list.touching[i]
         if word > 0:
             out = self.together(i, word)
         return out
@@ -84,7 +84,7 @@ class MassSplitting:
         """Bits for the entries of particle i that the word is for: which touch, or know a load."""
         out = self.touches(i, word)
         if ti.static(self.has_loads):
-            out |= self.known.kept(i, word, ti.select(word == 0, self.grid.touching[i], self.grid.all_bits(i, word)) & ~out)
+            out |= self.known.kept(i, word, ti.select(word == 0, self.list.touching[i], self.list.all_bits(i, word)) & ~out)
         return out
 
     @ti.func
@@ -121,9 +121,9 @@ class MassSplitting:
     def any_contact(self, i):
         """1 if any pair of particle i touches, to the last digit: a difference is below 0 if and only if one is the lesser."""
         same = ti.static(self.geometry.radius.uniform and not self.geometry.shrinks)
-        gap, begin = ti.cast(ti.math.inf, self.real), self.grid.first[i]
-        for e in range(begin, begin + self.grid.number[i]):
-            j = self.grid.neighbour[e]
+        gap, begin = ti.cast(ti.math.inf, self.real), self.list.first[i]
+        for e in range(begin, begin + self.list.number[i]):
+            j = self.list.neighbour[e]
             r = self.state.apart(i, j)
             rr = r.dot(r)
             if ti.static(not same):
@@ -137,15 +137,15 @@ class MassSplitting:
     def split(self, i, now):
         """Which pairs of particle i touch, and how often its mass is split. What does not touch has no push to keep."""
         bits = self.together(i, 0)
-        pairs, others = ti.math.popcnt(bits), self.grid.touching[i] != bits
-        self.clear(i, 0, self.grid.touching[i] & ~bits)
-        self.grid.touching[i] = bits
-        for word in range(1, self.grid.words(i)):
+        pairs, others = ti.math.popcnt(bits), self.list.touching[i] != bits
+        self.clear(i, 0, self.list.touching[i] & ~bits)
+        self.list.touching[i] = bits
+        for word in range(1, self.list.words(i)):
             bits = self.together(i, word)
             pairs += ti.math.popcnt(bits)
             if ti.static(not self.has_friction):
                 others = others or self.changes(i, word, bits)
-            self.clear(i, word, self.grid.all_bits(i, word) & ~bits)
+            self.clear(i, word, self.list.all_bits(i, word) & ~bits)
         split = ti.cast(pairs, self.real)
         if ti.static(not self.has_friction):
             if pairs > 2:
@@ -166,8 +166,8 @@ class MassSplitting:
     def changes(self, i, word, bits):
         """Whether of the entries that the word is for others touch than those that got a push: bits of behind the first word are
         kept by nobody."""
-        out, begin = False, self.grid.first[i] + word * WORD
-        for k in range(ti.min(self.grid.number[i] - word * WORD, WORD)):
+        out, begin = False, self.list.first[i] + word * WORD
+        for k in range(ti.min(self.list.number[i] - word * WORD, WORD)):
             touch = bits >> ti.cast(k, ti.u32) & ti.u32(1)
             out = out or (touch != 0) != (self.push.field[begin + k] != 0)
         return out
@@ -177,10 +177,10 @@ class MassSplitting:
         """What bounds the eigenvalues of S of particle i, no more than there are pairs."""
         tensor = ti.Matrix.zero(self.real, self.state.dim, self.state.dim)
         deepest = ti.cast(1, self.real)
-        for word in range(self.grid.words(i)):
+        for word in range(self.list.words(i)):
             bits = self.touching(i, word)
             while bits != 0:
-                j = self.grid.neighbour[self.grid.entry(i, word, bits)]
+                j = self.list.neighbour[self.list.entry(i, word, bits)]
                 bits &= bits - ti.u32(1)
                 r, contact_distance = self.state.apart(i, j), self.geometry.contact_distance(i, j)
                 scale = 1 / (contact_distance * contact_distance)
@@ -202,10 +202,10 @@ class MassSplitting:
     def normals(self, i):
         """S, the sum of n n^T over the pairs of particle i that touch, and of the identity for those in the same place."""
         tensor = ti.Matrix.zero(self.real, self.state.dim, self.state.dim)
-        for word in range(self.grid.words(i)):
+        for word in range(self.list.words(i)):
             bits = self.touching(i, word)
             while bits != 0:
-                j = self.grid.neighbour[self.grid.entry(i, word, bits)]
+                j = self.list.neighbour[self.list.entry(i, word, bits)]
                 bits &= bits - ti.u32(1)
                 r, contact_distance = self.state.apart(i, j), self.geometry.contact_distance(i, j)
                 rr = r.dot(r)
@@ -220,7 +220,7 @@ class MassSplitting:
     def clear(self, i, word, gone):
         """Some pairs do not touch any more."""
         while gone != 0:
-            e = self.grid.entry(i, word, gone)
+            e = self.list.entry(i, word, gone)
             for piece in ti.static(self.ended):
                 piece.field[e] = 0
             gone &= gone - ti.u32(1)

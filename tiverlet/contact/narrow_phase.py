@@ -22,19 +22,20 @@ class DiscGeometry:
     """Pairs of discs or spheres, C(x) = |x_i - x_j| - (r_i + r_j), with the normal n = (x_i - x_j) / |x_i - x_j| from j to i.
 
     Particles that the user put into each other may be smaller than they are, for a while; they grow back at push_out [m/s].
-    grid: has the pairs listed. impulse: what the pairs of the list got in the last substep [kg m].
+    search: has the pairs listed. impulse: what the pairs of the list got in the last substep [kg m].
     """
 
     push_out: Any = OnDevice()
 
     def __init__(
-        self, scene: Scene, grid: "NeighbourSearch", push_out: float = 0.0, impulse: PairData | None = None,
+        self, scene: Scene, search: "NeighbourSearch", push_out: float = 0.0, impulse: PairData | None = None,
         has_loads: bool = False,
     ):  # fmt: skip
-        self.scene, self.grid, self.push_out, self.impulse = scene, grid, scene.memory.number(push_out, scene.real), impulse
+        self.scene, self.search, self.list, self.impulse = scene, search, search.list, impulse
+        self.push_out = scene.memory.number(push_out, scene.real)
         self.state, self.radius, self.real = scene.state, scene.radius, scene.real
         self.has_loads = has_loads
-        self.shrinks, self.store, self.senses = False, None, grid.table.senses
+        self.shrinks, self.store, self.senses = False, None, search.table.senses
 
     @ti.func
     def contact_distance(self, i, j):
@@ -49,7 +50,7 @@ class DiscGeometry:
         """1 if particles i and j push each other where they overlap, 0 where one of them only senses the other."""
         out = 1
         if ti.static(self.senses):
-            out = ti.cast(ti.cast(self.grid.table.of(i, j)[3], ti.i32) == TOUCHES, ti.i32)
+            out = ti.cast(ti.cast(self.search.table.of(i, j)[3], ti.i32) == TOUCHES, ti.i32)
         return out
 
     @ti.func
@@ -169,8 +170,8 @@ class DiscGeometry:
         """Make particle i small enough: each pair with a particle from number `first` on gives up its overlap in proportion to
         the radii."""
         less = ti.select(first > 0, self.shrunk[i], ti.cast(0, self.real))
-        for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
-            j = self.grid.neighbour[e]
+        for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
+            j = self.list.neighbour[e]
             if ti.max(i, j) >= first and self.pushes(i, j) != 0:
                 contact_distance = self.radius.of(i) + self.radius.of(j)
                 overlap, _ = self.overlap(i, j, contact_distance)
@@ -201,10 +202,10 @@ class DiscGeometry:
     def worst_overlap(self, i):
         """For the report: contacts of particle i with later ones, and the worst overlap in radii of the smaller."""
         touching, worst = 0, ti.cast(0, ti.f64)
-        number = self.grid.number[i]
-        last = self.grid.first[i] + number - 1
+        number = self.list.number[i]
+        last = self.list.first[i] + number - 1
         for k in range(number):
-            j = self.grid.neighbour[last - k]
+            j = self.list.neighbour[last - k]
             if j < i:  # and so are the rest
                 break
             a, b = self.radius.of(i), self.radius.of(j)
@@ -219,9 +220,9 @@ class DiscGeometry:
 
     def candidates(self, x: np.ndarray) -> DiscCandidates:
         """What may touch around positions x (n, dim) [m], for the host: the listed pairs."""
-        particles, (pairs, _) = self.scene.particles, self.grid.entries()
+        particles, (pairs, _) = self.scene.particles, self.list.entries()
         some = (pairs[:, 0] < pairs[:, 1]) | (self.scene.inv_mass[pairs[:, 1]] == 0)
-        who = pairs[some & self.grid.table.pushing(particles.group, pairs)]
+        who = pairs[some & self.search.table.pushing(particles.group, pairs)]
         radius = particles.radius.copy()
         if self.store:
             radius -= self.store.read(self.shrunk)[: len(radius)]
@@ -231,9 +232,9 @@ class DiscGeometry:
         """The pairs that touch, of particles at x (n, dim) [m], for world.contacts."""
         assert self.impulse
         r = self.scene.particles.radius
-        pairs, at = self.grid.entries()
-        push = self.grid.read(self.impulse, at)
-        if self.grid.has_static:
+        pairs, at = self.list.entries()
+        push = self.list.read(self.impulse, at)
+        if self.search.has_static:
             # What is static does not keep what it gives, nor the pair in its list when it is far: the other one of the pair does.
             n = len(self.scene.particles)
             keys, which = np.unique(pairs.min(axis=1) * n + pairs.max(axis=1), return_inverse=True)
@@ -244,7 +245,7 @@ class DiscGeometry:
             low = pairs[:, 0] < pairs[:, 1]
             pairs, push = pairs[low], push[low]
         if self.senses:
-            touch = self.grid.table.pushing(self.scene.particles.group, pairs)
+            touch = self.search.table.pushing(self.scene.particles.group, pairs)
             pairs, push = pairs[touch], push[touch]
         d = between(x[pairs[:, 0]], x[pairs[:, 1]], self.scene.periodic)
         length = np.linalg.norm(d, axis=1)

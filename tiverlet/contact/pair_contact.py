@@ -217,8 +217,8 @@ class PairContact(Feature):
     def note_motion(self, stale, fast):
         """Write down what was noticed; threads that all write to the same place would wait for each other."""
         if stale != 0:
-            if self.dev.grid.stale[None] == 0:
-                self.dev.grid.stale[None] = MOVED
+            if self.dev.list.stale[None] == 0:
+                self.dev.list.stale[None] = MOVED
         if fast != 0:
             if self.dev.fast[None] == 0:
                 self.dev.fast[None] = 1

@@ -71,9 +71,9 @@ class PolygonGeometry:
         self.impulse = PairData("given", 0, lasting=True)  # pushes and impacts in the last substep [kg m]
         self.carried = [self.manifold, self.back, self.impulse]
 
-    def bind(self, grid: NeighbourSearch) -> None:
+    def bind(self, search: NeighbourSearch) -> None:
         """Take the neighbour list, which asks for pairs by `Beside`."""
-        self.grid, self.discs = grid, DiscGeometry(self.scene, grid)
+        self.list, self.discs = search.list, DiscGeometry(self.scene, search)
 
     @ti.func
     def after(self, i):
@@ -226,8 +226,8 @@ class PolygonGeometry:
         Edges that face away from the body of v, which lies in the direction `back`, are no way out for it.
         """
         out = True
-        for e in range(self.grid.first[v], self.grid.first[v] + self.grid.number[v]):
-            j = self.grid.neighbour[e]
+        for e in range(self.list.first[v], self.list.first[v] + self.list.number[v]):
+            j = self.list.neighbour[e]
             if j != a and j != shared and self.loop[j][2] == self.loop[a][2]:
                 r, u = self.state.apart(v, j), self.state.apart(self.after(j), j)
                 uu, faces = u.dot(u), u[1] * back[0] - u[0] * back[1] >= 0
@@ -247,8 +247,8 @@ class PolygonGeometry:
         and the nearest edges: before the first substep after a start, d is the velocity.
         """
         active = 0
-        for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
-            j = self.grid.neighbour[e]
+        for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
+            j = self.list.neighbour[e]
             if self.after(i) < 0 and self.after(j) < 0:
                 overlap, n = self.discs.overlap(i, j, self.radius.of(i) + self.radius.of(j))
                 if ti.static(moved):
@@ -294,18 +294,18 @@ class PolygonGeometry:
     @ti.func
     def find(self, v, a):
         """Where a is in the list of v, counted from its begin; -1 if it is not."""
-        low, end = self.grid.first[v], self.grid.first[v] + self.grid.number[v]
+        low, end = self.list.first[v], self.list.first[v] + self.list.number[v]
         high = end
         while low < high:
             middle = (low + high) // 2
-            if self.grid.neighbour[middle] < a:
+            if self.list.neighbour[middle] < a:
                 low = middle + 1
             else:
                 high = middle
         out = -1
         if low < end:
-            if self.grid.neighbour[low] == a:
-                out = low - self.grid.first[v]
+            if self.list.neighbour[low] == a:
+                out = low - self.list.first[v]
         return out
 
     @ti.func
@@ -315,7 +315,7 @@ class PolygonGeometry:
         Returns the entry that keeps it (-1: there is none), its particles v, a, b, where on the edge, and the part of its move
         that is that of i: 1, -(1 - t) or -t. Two discs are an edge of which only the start is touched.
         """
-        j = self.grid.neighbour[e]
+        j = self.list.neighbour[e]
         at, v, a = e, i, j
         if role != VERTEX:
             back = self.back.field[e]
@@ -323,7 +323,7 @@ class PolygonGeometry:
             if role == END:
                 a, at = self.before(i), ti.cast(back[1], ti.i32)
             if at >= 0:
-                at += self.grid.first[j]
+                at += self.list.first[j]
         b, t, part = a, 0 * self.w.of(i), 0 * self.w.of(i) + 1
         if at >= 0:
             t = self.manifold.field[at][1]
@@ -382,8 +382,8 @@ class PolygonGeometry:
         """Allow particle i the overlap that it has as a vertex, as far as particles from number `first` on have to do with it."""
         self.detect(i, False)
         allowed = ti.select(first > 0, self.allowed[i], 0 * self.w.of(i))
-        for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
-            j, found = self.grid.neighbour[e], self.manifold.field[e]
+        for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
+            j, found = self.list.neighbour[e], self.manifold.field[e]
             if ti.max(i, j) >= first and (found[1] > DISCS or self.keeps(i, j)):
                 allowed = ti.max(allowed, found[0])
         self.allowed[i] = allowed
@@ -403,7 +403,7 @@ class PolygonGeometry:
     @ti.func
     def forget(self, i):
         """Particle i sleeps, and nothing is near that moves: no contact that it is the vertex of is one."""
-        for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
+        for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
             self.manifold.field[e] = ti.Vector([-1, 0, 0, 0], self.real)
 
     @ti.func
@@ -419,7 +419,7 @@ class PolygonGeometry:
         """Whether the contact of vertex i at entry e of its list is as it was: i cannot move, and the other one sleeps."""
         out = False
         if ti.static(bool(self.state.sleepers)):
-            out = not self.w.positive(i) and not self.state.awake(self.held_by(self.grid.neighbour[e]))
+            out = not self.w.positive(i) and not self.state.awake(self.held_by(self.list.neighbour[e]))
         return out
 
     @ti.func
@@ -430,8 +430,8 @@ class PolygonGeometry:
         """
         touching, worst = 0, ti.cast(0, ti.f64)
         self.detect(i, False)
-        for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
-            j, found = self.grid.neighbour[e], self.manifold.field[e]
+        for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
+            j, found = self.list.neighbour[e], self.manifold.field[e]
             if found[0] > 0 and (found[1] > DISCS or self.keeps(i, j)):
                 size = ti.min(self.radius.of(i), self.radius.of(j))
                 if found[1] > DISCS:
@@ -444,20 +444,20 @@ class PolygonGeometry:
 
     def candidates(self, x: np.ndarray) -> EdgeCandidates:
         """What may touch around positions x (n, 2) [m], for the host: what is listed, and was looked for there."""
-        pairs, at = self.grid.entries()
+        pairs, at = self.list.entries()
         lone, allowed = self.outline.ends[:, 0] < 0, self.scene.memory.read(self.allowed)
         both = lone[pairs].all(axis=1)
         who = np.where(both, pairs.min(axis=1), pairs[:, 0])
-        found, pushed = self.grid.read(self.manifold, at), self.grid.read(self.impulse, at) > 0
+        found, pushed = self.list.read(self.manifold, at), self.list.read(self.impulse, at) > 0
         ends, body, _ = self.outline
         radius, allowed = self.scene.particles.radius, allowed.astype(np.float64)[who]
         return EdgeCandidates(x, pairs, found, DISCS, pushed, ends, body, radius, allowed)
 
     def found(self, x: np.ndarray, h: float) -> Contacts:
         """Vertices and edges, and pairs of discs, by what detect() found last; also those that were pushed apart since."""
-        grid, r = self.grid, self.scene.particles.radius
-        pairs, at = grid.entries()
-        found, push = grid.read(self.manifold, at), grid.read(self.impulse, at)
+        r = self.scene.particles.radius
+        pairs, at = self.list.entries()
+        found, push = self.list.read(self.manifold, at), self.list.read(self.impulse, at)
         after = self.outline.ends[:, 0]
         some = ((found[:, 0] > 0) | (push > 0)) & ((after[pairs] >= 0).any(axis=1) | (pairs[:, 0] < pairs[:, 1]))
         pairs, found, push = pairs[some], found[some], push[some]

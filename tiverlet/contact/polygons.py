@@ -15,7 +15,6 @@ from ..neighbours.neighbour_list import PairData
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
 from .force_share import ForceShare
-from .friction import Friction
 from .loops import checked, laid, refuse_deep
 from .pair_contact import PairContact
 from .polygon_narrow_phase import VERTEX, Beside, Outline, PolygonGeometry
@@ -102,7 +101,7 @@ class Polygons(PairContact):
         dev.active = add("Contact.active", n, kind=ti.i32)  # contacts that each particle is in
         dev.fast = add("Contact.fast", None, kind=ti.i32)
         self.table.bind(scene, asked=True)
-        dev.friction, dev.slip = Friction(self.table), PairData("slip", 2, lasting=True)
+        dev.slip = PairData("slip", 2, lasting=True)
         if dev.has_restitution:
             dev.restitution = PolygonRestitution(scene, dev.geometry, self.table)
             dev.hit = dev.restitution.hit
@@ -114,9 +113,10 @@ class Polygons(PairContact):
             *([dev.restitution.aim] if dev.has_restitution else []),
         ]
         beside: Any = Beside(dev.geometry, self.table, scene.memory.number(self._listed, scene.real))
-        dev.grid = NeighbourSearch(scene, self._listed, linked, beside, pair_data, team, dev.move, dev.outline.reach)
-        dev.geometry.bind(dev.grid)
-        return dev.grid
+        dev.search = NeighbourSearch(scene, self._listed, linked, beside, pair_data, team, dev.move, dev.outline.reach)
+        dev.list = dev.search.list
+        dev.geometry.bind(dev.search)
+        return dev.search
 
     @property
     def bodies(self) -> list[np.ndarray]:  # type: ignore[override]
@@ -128,7 +128,7 @@ class Polygons(PairContact):
         """Find the contacts of particle i, and note an edge that is too long for the list."""
         if self.dev.state.awake(i):
             if first != 0:
-                for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
+                for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):
                     if not self.dev.geometry.stays(i, e):
                         self.dev.geometry.impulse.field[e] = 0
                         if ti.static(self.dev.has_restitution):
@@ -147,8 +147,8 @@ class Polygons(PairContact):
     def is_near(self, i):
         """Whether anything on the list of particle i moves."""
         out = False
-        for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
-            j = self.dev.grid.neighbour[e]
+        for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):
+            j = self.dev.list.neighbour[e]
             d = self.dev.state.d[j]
             if self.dev.state.awake(j) and (self.dev.w.positive(j) or d.dot(d) > 0):
                 out = True
@@ -168,7 +168,7 @@ class Polygons(PairContact):
     def reached(self, i, e):
         """Who sleeps at entry e of the list of particle i and is touched by it, as was found last; if it is driven, also who was
         in the substep before."""
-        j, out = self.dev.grid.neighbour[e], -1
+        j, out = self.dev.list.neighbour[e], -1
         for role in range(self.dev.geometry.roles(i)):
             at, v, a, b, t, part = self.dev.geometry.participants(i, e, role)
             if at >= 0:
@@ -186,7 +186,7 @@ class Polygons(PairContact):
         for i in range(begin, end):
             if self.dev.geometry.after(i) >= 0 and self.dev.state.awake(i):
                 active = 0
-                for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
+                for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):
                     for role in range(3):
                         at, _, _, _, _, _ = self.dev.geometry.participants(i, e, role)
                         if at >= 0:
@@ -199,8 +199,8 @@ class Polygons(PairContact):
         """What the contacts of particle i want of it."""
         first, final = now.first, now.final
         total, lifts, forced = 0 * self.dev.state.x[i], 0 * self.dev.state.x[i], 0 * self.dev.state.x[i]
-        begin, roles = self.dev.grid.first[i], self.dev.geometry.roles(i)
-        for e in range(begin, begin + ti.select(self.dev.active[i] > 0, self.dev.grid.number[i], 0)):
+        begin, roles = self.dev.list.first[i], self.dev.geometry.roles(i)
+        for e in range(begin, begin + ti.select(self.dev.active[i] > 0, self.dev.list.number[i], 0)):
             for role in range(roles):
                 at, v, a, b, t, part = self.dev.geometry.participants(i, e, role)
                 if at >= 0:
@@ -225,7 +225,7 @@ class Polygons(PairContact):
                                 self.dev.geometry.impulse.field[e] = self.dev.geometry.impulse.field[e] + back / shared
                         want = back * n
                         if ti.static(self.dev.has_friction):
-                            want -= self.dev.friction.held(v, a, n, overlap + missing, self.dev.slip.field[at] + d)
+                            want -= self.table.held(v, a, n, overlap + missing, self.dev.slip.field[at] + d)
                         total += share * want
                         if final != 0:
                             approach = -self.dev.geometry.relative(self.dev.forces.before, v, a, b, t).dot(n)
@@ -263,14 +263,14 @@ class Polygons(PairContact):
     def finish_substep(self, i):
         """At the end of a substep: add to the slip of each contact what it has moved, as far as friction can hold it."""
         if ti.static(self.dev.has_friction):
-            for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
+            for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):
                 slip = 0 * self.dev.state.x[i]
                 at, v, a, b, t, _ = self.dev.geometry.participants(i, e, VERTEX)
                 if at >= 0:
                     found = self.dev.geometry.manifold.field[at]
                     if found[0] > 0:
                         n, d = ti.Vector([found[2], found[3]]), self.dev.geometry.relative(self.dev.state.d, v, a, b, t)
-                        slip = self.dev.friction.held(v, a, n, found[0], self.dev.slip.field[e] + d)
+                        slip = self.table.held(v, a, n, found[0], self.dev.slip.field[e] + d)
                 self.dev.slip.field[e] = slip
 
 
@@ -303,8 +303,8 @@ class PolygonRestitution:
         """One Jacobi pass over displacements alone: what the contacts of particle i that bounce lack."""
         total = 0 * self.state.x[i]
         if self.active[i] > 0:
-            begin = self.geometry.grid.first[i]
-            for e in range(begin, begin + self.geometry.grid.number[i]):
+            begin = self.geometry.list.first[i]
+            for e in range(begin, begin + self.geometry.list.number[i]):
                 for role in range(self.geometry.roles(i)):
                     at, v, a, b, t, part = self.geometry.participants(i, e, role)
                     if at >= 0:

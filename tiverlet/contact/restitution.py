@@ -21,7 +21,7 @@ class Restitution:
         events: Any,
     ):  # fmt: skip
         n, dim, add = scene.count, scene.particles.dim, scene.memory.field
-        self.geometry, self.grid, self.table, self.state = geometry, geometry.grid, table, scene.state
+        self.geometry, self.list, self.table, self.state = geometry, geometry.list, table, scene.state
         self.struck, self.slack, self.impulse, self.events = struck, slack, impulse, events
         self.has_events = events is not None
         self.weight = add("Contact.struck", n)  # the split mass of the first pass, 0 where nothing touched
@@ -36,7 +36,7 @@ class Restitution:
     def clear(self, i, weight):
         """Before the first pass: no pair of particle i has been struck."""
         self.weight[i] = weight
-        for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
+        for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
             self.struck.field[e] = 0
             self.impulse.field[e] = 0
 
@@ -78,9 +78,9 @@ class Restitution:
         """The first of the pairs of particle i that were struck and still come together, and what it does to i."""
         first, partner, most, w = -1, -1, 0 * self.weight[i], self.state.w.of(i)
         if self.weight[i] > 0:
-            for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
+            for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
                 if self.struck.field[e] > 0:
-                    j = self.grid.neighbour[e]
+                    j = self.list.neighbour[e]
                     overlap, _each, n, _reach = self.geometry.impact(i, j, self.geometry.contact_distance(i, j), self.weight[i])
                     given, here, a = self.target(i, j, n)
                     if overlap > 0 and a > 0 and given > 0:

@@ -10,8 +10,7 @@ from ..neighbours.neighbour_list import WORD, lowest_bit
 if TYPE_CHECKING:
     from ..device.thread_team import Team
     from ..features.feature import Scene
-    from ..neighbours.neighbour_list import PairData
-    from ..neighbours.neighbour_search import NeighbourSearch
+    from ..neighbours.neighbour_list import NeighbourList, PairData
 
 EVERY = 32  # substeps from one projection to the next
 PASSES = 32
@@ -34,13 +33,13 @@ class VelocityProjection:
     """
 
     def __init__(
-        self, scene: "Scene", grid: "NeighbourSearch", push: "PairData", weight: Any, restitution: Any, change: Any, team: "Team"
+        self, scene: "Scene", pairs: "NeighbourList", push: "PairData", weight: Any, restitution: Any, change: Any, team: "Team"
     ):  # fmt: skip
-        self.grid, self.push, self.weight, self.restitution = grid, push, weight, restitution
+        self.list, self.push, self.weight, self.restitution = pairs, push, weight, restitution
         self.state, self.change, self.has_restitution = scene.state, change, restitution is not None
         # The fields of the old list, which is needed only while lists are built, are free: here they hold the loaded pairs of
         # each particle, how many they are, and the particles that have any, piece by piece.
-        self.number, self.loaded = self.grid.old_number, self.grid.old_first
+        self.number, self.loaded = self.list.old_number, self.list.old_first
         self.count = scene.memory.field("Contact.loaded", self._pieces(scene.particles.count, team), kind=ti.i32)
         self.factors = scene.memory.field("Contact.chebyshev", PASSES, values=chebyshev(PASSES, CONDITION))
 
@@ -50,7 +49,7 @@ class VelocityProjection:
 
     def regroup(self, n: int, team: "Team") -> None:
         """There are n particles now."""
-        self.grid.memory.resize(self.count, self._pieces(n, team))
+        self.list.memory.resize(self.count, self._pieces(n, team))
 
     @ti.func
     def bears(self, i, e):
@@ -64,22 +63,22 @@ class VelocityProjection:
     @ti.func
     def list_loaded(self, i):
         """List the loaded pairs of particle i, each with what all passes multiply by; returns how many there are."""
-        first, w = self.grid.first[i], self.state.w.of(i)
+        first, w = self.list.first[i], self.state.w.of(i)
         at = first
         if self.weight[i] > 0 and self.state.awake(i):
-            for word in range(self.grid.words(i)):
+            for word in range(self.list.words(i)):
                 # Not touches(): the pair may have parted in this pass, and both of it have to agree.
-                bits = ti.select(word == 0, self.grid.touching[i], self.grid.all_bits(i, word))
+                bits = ti.select(word == 0, self.list.touching[i], self.list.all_bits(i, word))
                 while bits != 0:
                     e = first + word * WORD + lowest_bit(bits)
                     bits &= bits - ti.u32(1)
                     if self.bears(i, e):
-                        j = self.grid.neighbour[e]
+                        j = self.list.neighbour[e]
                         r = self.state.apart(i, j)
                         rr = r.dot(r)
                         if rr > 0:
                             shared = self.weight[i] + self.weight[j]
-                            self.grid.old_neighbour[at] = j
+                            self.list.old_neighbour[at] = j
                             self.push.old[at] = w / (rr * shared)
                             at += 1
         return at - first
@@ -99,9 +98,9 @@ class VelocityProjection:
     @ti.func
     def relax(self, i, k):
         """Pass k for particle i: what changes d. change' = (factor - 1) change + factor 2 / (1 + 1 / CONDITION) want."""
-        want, first = 0 * self.state.d[i], self.grid.first[i]
+        want, first = 0 * self.state.d[i], self.list.first[i]
         for e in range(first, first + self.number[i]):
-            j = self.grid.old_neighbour[e]
+            j = self.list.old_neighbour[e]
             r = self.state.apart(i, j)
             want -= self.push.old[e] * self.state.slid(self.state.d[i] - self.state.d[j], i, j).dot(r) * r
         if ti.static(self.state.keeps_wall_push):

@@ -187,6 +187,13 @@ class Table:
             row = self.rank[i] * self.groups + self.rank[j]
         return self.entries[row]
 
+    @ti.func
+    def held(self, i, j, n, normal, slip):
+        """The part of a slip [m] of particles i and j that friction takes back, for a normal displacement along n [m]: up to
+        friction times that (Cundall and Strack 1979)."""
+        s, row = slip - slip.dot(n) * n, self.of(i, j)
+        return limited(s, row[0] * normal, row[1] * normal)
+
     @inline
     def reach(self, radius, i, j):
         """How far from each other particles i and j may touch."""

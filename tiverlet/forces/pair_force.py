@@ -83,12 +83,13 @@ class PairForce(Acceleration):
     def join(self, scene: Scene, team: Any) -> NeighbourSearch | None:
         """Declare the neighbour list; None without a radius."""
         dev = self.dev
-        dev.grid = None
+        dev.search = dev.list = None
         if self.radius is not None:
             dev.cutoff = Cutoff(scene, self.radius)
             none, half = np.zeros((0, 2), dtype=np.int32), np.full(scene.particles.count, self.radius / 2)
-            dev.grid = NeighbourSearch(scene, SKIN * self.radius, none, dev.cutoff, [], team, dev.last, radius=half)
-        return dev.grid
+            dev.search = NeighbourSearch(scene, SKIN * self.radius, none, dev.cutoff, [], team, dev.last, radius=half)
+            dev.list = dev.search.list
+        return dev.search
 
     def kept_mask(self, number: np.ndarray) -> tuple[np.ndarray, ...]:
         """Its fields are those of the particles."""
@@ -142,8 +143,8 @@ class PairForce(Acceleration):
         total, w = ti.zero(self.dev.now[i]), self.dev.w.of(i)
         if w > 0:
             if ti.static(self.listed):
-                for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
-                    total += self.pull(i, self.dev.grid.neighbour[e])
+                for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):
+                    total += self.pull(i, self.dev.list.neighbour[e])
             else:
                 for j in range(self.dev.n.now):
                     if j != i:
@@ -177,8 +178,8 @@ class PairForce(Acceleration):
         """The share of particle i in the energy of all pairs [J]."""
         out = ti.cast(0, ti.f64)
         if ti.static(self.listed):
-            for e in range(self.dev.grid.first[i], self.dev.grid.first[i] + self.dev.grid.number[i]):
-                out += self.energy_between(i, self.dev.grid.neighbour[e], back)
+            for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):
+                out += self.energy_between(i, self.dev.list.neighbour[e], back)
         else:
             for j in range(self.dev.n.now):
                 if j != i:

@@ -60,7 +60,7 @@ class NeighbourList:
     told_apart = True  # as a Feature
 
     def __init__(self, memory: "Memory", count: Number, rooms: Number, pair_data: list[PairData], team: Team, short: int):
-        self.team, self.n, self.memory, self.real, self.short = team, count, memory, memory.real, short
+        self.team, self.n, self.memory, self.short = team, count, memory, short
         self.capacity, self.pitch = memory.number(0), memory.number(0)
         self.pair_data = pair_data
         self.lasting, self.transferred = [p for p in pair_data if p.lasting], [p for p in pair_data if p.kept]

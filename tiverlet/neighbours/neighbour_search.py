@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 APPEND, COUNT, FILL = range(3)  # what a scan of the cells around a particle does with the neighbours that it finds
 
 
-class NeighbourSearch(NeighbourList):
-    """The list of near pairs, from a hash of cells.
+class NeighbourSearch:
+    """What fills `list`, the list of near pairs, from `cells`, a hash of cells.
 
     skin: what is listed beyond touching [m]. linked: (m, 2) pairs that are never listed. table: which pairs are near, as Table
     says it. pair_data: what each pair remembers. scratch: a field of vectors, (n,), to use while the list is built. reach: (n,)
@@ -40,18 +40,21 @@ class NeighbourSearch(NeighbourList):
     skin: Any = OnDevice()
     too_far: Any = OnDevice()  # the square of the way after which the list is stale
     farthest: Any = OnDevice()  # how far apart pairs are listed [m], at most
+    n: Any = OnDevice()  # particles
+    told_apart = True  # as a Feature
 
     def __init__(
         self, scene: "Scene", skin: float, linked: np.ndarray, table: Any, pair_data: list[PairData], team: Team, scratch: Any,
         reach: np.ndarray | None = None, radius: np.ndarray | None = None,
     ):  # fmt: skip
         n, dim, add = scene.particles.count, scene.particles.dim, scene.memory.field
+        self.n, self.memory, self.real, self.team = scene.count, scene.memory, scene.real, team
         self.sums = Sums(n, team, capped=True)  # with a room of its own where the team is launched
         # Entries of a list that is sorted without branches; to compile that takes an eighth of all.
         short = 1 if scene.memory.compiler.few else 8 if dim == 2 else 16
         rooms = self.sums.room if team.launched else scene.count
-        super().__init__(scene.memory, scene.count, rooms, pair_data, team, short)
-        self.network = sorting_network(self.short)
+        self.list = NeighbourList(scene.memory, scene.count, rooms, pair_data, team, short)
+        self.network = sorting_network(short)
         self.dim, self.state, self.radius = dim, scene.state, scene.radius
         self.table = table
         number, real = scene.memory.number, scene.real
@@ -68,7 +71,7 @@ class NeighbourSearch(NeighbourList):
         self.lone = not self.several_levels and not self.state.images and not reach.any()
         self.counts = self.several_levels or team.launched  # before it lists
         self.serial = not self.counts or (team.size == 1 and not team.launched)  # one thread makes a list, in order
-        self.blocks = number(self._blocks(n))
+        self.list.blocks = number(self._blocks(n))
         self.origin = add("grid.built_at", scene.count, width=dim)
         if self.sheared:
             self.strain = add("grid.built_strain", None, kind=ti.f64)
@@ -81,6 +84,9 @@ class NeighbourSearch(NeighbourList):
             begin = np.searchsorted(both[:, 0], np.arange(n + 1))
             self.excluded = add("grid.linked", len(both), kind=ti.i32, values=both[:, 1])
             self.excluded_begin = add("grid.linked_begin", n + 1, kind=ti.i32, values=begin)
+
+    def __repr__(self) -> str:
+        return repr(self.list)
 
     def _skin(self, skin: float, radius: np.ndarray, reach: np.ndarray) -> float:
         """What can be listed beyond touching [m]. In a shear, within half of the height the nearest image along y is the nearest
@@ -96,7 +102,8 @@ class NeighbourSearch(NeighbourList):
     def can_regroup(self, change: Regrouping) -> bool:
         """Whether particles can come and go where it is; its reach is 0, and its radii are theirs."""
         radius, n = change.now.radius, change.now.count
-        room = bool(self.store) and self.store.holds(self.room + (self.short + 1) * (n + 1))  # type: ignore[union-attr]
+        store = self.list.store
+        room = store is not None and store.holds(self.list.room + (self.list.short + 1) * (n + 1))
         static = bool((change.inv_mass == 0).any()) == self.has_static
         return room and static and not self.team.launched and self.cells.can_regroup(radius, 0 * radius)
 
@@ -104,21 +111,21 @@ class NeighbourSearch(NeighbourList):
         """They came and went, and the team knows. The list stays, but for pairs of what went, unless it is another one that
         would be built now; what came is on no list, as a stray is that has gone far. Where the old list is saved, what pairs
         remember is to be given to the next list by restore()."""
-        radius, n, stale = change.now.radius, change.now.count, int(self.memory.seen(self.stale)[0])
-        if change.goes and not self.saved:
-            self.drop(change.number)
+        radius, n, stale = change.now.radius, change.now.count, int(self.memory.seen(self.list.stale)[0])
+        if change.goes and not self.list.saved:
+            self.list.drop(change.number)
             self.cells.drop(change.number)
         skin = self._skin(skin, radius, 0 * radius)
-        stays = self.lone and not self.saved and stale != 1 and skin == self.skin
+        stays = self.lone and not self.list.saved and stale != 1 and skin == self.skin
         self.skin, self.too_far = skin, (STALE * skin) ** 2
         stays &= self.cells.regroup(radius, 0 * radius, skin, np.array(change.now.extent))
         if self.sheared:
             self.farthest = float(self.cells.sizes.max())
         self.sums.room = n
-        if self.blocks != self._blocks(n):
-            room = self.room  # where the old list stands
-            self.blocks = self._blocks(n)
-            self.allocate(room)
+        if self.list.blocks != self._blocks(n):
+            room = self.list.room  # where the old list stands
+            self.list.blocks = self._blocks(n)
+            self.list.allocate(room)
         if self.linked:
             begin = self.memory.seen(self.excluded_begin)[change.first]
             self.memory.resize(self.excluded_begin, n + 1)
@@ -126,7 +133,7 @@ class NeighbourSearch(NeighbourList):
         came = n - change.kept
         if came:
             self.memory.write_from(self.origin, change.kept, np.full((came, self.dim), np.nan))
-        self.memory.write(self.stale, (MOVED if came else stale) if stays else 1)
+        self.memory.write(self.list.stale, (MOVED if came else stale) if stays else 1)
 
     @property
     def finest(self) -> float:
@@ -139,7 +146,7 @@ class NeighbourSearch(NeighbourList):
             if not abs(new - old) <= old / 8:
                 self._extent = extent
                 if self.cells.fit(np.asarray(extent)):
-                    self.invalidate()
+                    self.list.invalidate()
                 return
 
     @ti.func
@@ -157,67 +164,67 @@ class NeighbourSearch(NeighbourList):
     @ti.func
     def build(self, thread):
         """Sort the particles into cells, then list the near ones of each. `thread`: see Team."""
-        self.save_old_list(thread)
+        self.list.save_old_list(thread)
         self.cells.sort(thread)
         if ti.static(self.counts):
             self.pair_up(thread)
         else:
-            for k in range(self.team.dealt_count(self.blocks, 1, thread)):
+            for k in range(self.team.dealt_count(self.list.blocks, 1, thread)):
                 self.fill(self.team.dealt_index(k, 1, thread))
         for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
             self.origin[i] = self.state.x[i]
         self.team.wait()
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread)):
-            self.stale[None] = 0
+            self.list.stale[None] = 0
             if ti.static(self.sheared):
                 self.strain[None] = self.state.images.strain[None]
-            if self.need[None] <= self.capacity:
-                self.old_saved[None] = 0
+            if self.list.need[None] <= self.list.capacity:
+                self.list.old_saved[None] = 0
         self.team.wait()
 
     @ti.func
     def fill(self, block):
         """One level: list the neighbours of a block of particles, one after the other. Beyond the room they are only counted."""
-        start, room = block * self.pitch, self.capacity
-        size = (self.n + self.blocks - 1) // self.blocks
+        start, room = block * self.list.pitch, self.list.capacity
+        size = (self.n + self.list.blocks - 1) // self.list.blocks
         used = 0
         for i in range(block * size, ti.min((block + 1) * size, self.n)):
-            self.first[i] = start + ti.min(used, room)
+            self.list.first[i] = start + ti.min(used, room)
             begin = used
             used = self.scan(i, APPEND, start, ti.min(used, MOST))
-            self.number[i] = ti.max(ti.min(used, room) - begin, 0)
+            self.list.number[i] = ti.max(ti.min(used, room) - begin, 0)
         for i in range(block * size, ti.min((block + 1) * size, self.n)):
             self.finish(i)
-        ti.atomic_max(self.need[None], used)
+        ti.atomic_max(self.list.need[None], used)
 
     @ti.func
     def pair_up(self, thread):
         """Count, then list: on a GPU, by a thread for each particle; and for several levels, each pair that one of the two finds
         with both. What does not fit is only counted."""
         for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
-            self.number[i] = 0
+            self.list.number[i] = 0
         self.team.wait()
         for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
-            add_to(self.number, i, self.scan(i, COUNT, 0, 0), self.serial)
+            add_to(self.list.number, i, self.scan(i, COUNT, 0, 0), self.serial)
         self.team.wait()
         for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
-            self.first[i] = self.number[i]
+            self.list.first[i] = self.list.number[i]
         self.team.wait()
-        self.sums.run(self.first, thread)
+        self.sums.run(self.list.first, thread)
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread)):
-            self.need[None] = self.first[self.n - 1]
+            self.list.need[None] = self.list.first[self.n - 1]
         self.team.wait()
         for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
-            self.first[i] = self.first[i] - self.number[i]
-            self.number[i] = 0
+            self.list.first[i] = self.list.first[i] - self.list.number[i]
+            self.list.number[i] = 0
         self.team.wait()
         for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
-            if self.need[None] <= self.capacity:
-                used = self.scan(i, FILL, self.first[i], 0)
+            if self.list.need[None] <= self.list.capacity:
+                used = self.scan(i, FILL, self.list.first[i], 0)
                 if ti.static(not self.several_levels):
-                    self.number[i] = used
+                    self.list.number[i] = used
         self.team.wait()
         for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
             self.finish(i)
@@ -225,8 +232,8 @@ class NeighbourSearch(NeighbourList):
     @ti.func
     def finish(self, i):
         """Put the list of particle i in order."""
-        self.order(self.first[i], self.number[i])
-        self.touching[i] = self.transfer_pair_data(i)
+        self.order(self.list.first[i], self.list.number[i])
+        self.list.touching[i] = self.list.transfer_pair_data(i)
 
     @ti.func
     def scan(self, i, what: ti.template(), start, used):  # type: ignore[valid-type]
@@ -244,31 +251,31 @@ class NeighbourSearch(NeighbourList):
                         listed = self.listed(i, j, self.cells.apart(i, e))
                         if ti.static(what == APPEND):
                             # No branch: it would be taken at random. What is not listed is written over by the next.
-                            self.neighbour[start + ti.min(used, self.capacity)] = j
+                            self.list.neighbour[start + ti.min(used, self.list.capacity)] = j
                             used += listed
                         elif ti.static(what == COUNT):
                             used += listed
                             if ti.static(self.several_levels):
                                 if m < own and listed != 0:
-                                    add_to(self.number, j, 1, self.serial)
+                                    add_to(self.list.number, j, 1, self.serial)
                         elif listed != 0:
                             at = used
                             if ti.static(self.several_levels):  # others write to this list, too
-                                at = add_to(self.number, i, 1, self.serial)
+                                at = add_to(self.list.number, i, 1, self.serial)
                                 if m < own:
-                                    self.neighbour[self.first[j] + add_to(self.number, j, 1, self.serial)] = i
-                            self.neighbour[start + at] = j
+                                    self.list.neighbour[self.list.first[j] + add_to(self.list.number, j, 1, self.serial)] = i
+                            self.list.neighbour[start + at] = j
                             used += 1
-        for old in range(self.old_first[i], self.old_first[i] + self.old_number[i]):
-            j = self.old_neighbour[old]
+        for old in range(self.list.old_first[i], self.list.old_first[i] + self.list.old_number[i]):
+            j = self.list.old_neighbour[old]
             if self.listed(i, j, self.state.apart(i, j)) == 0:
                 if ti.static(what == APPEND):
-                    self.neighbour[start + ti.min(used, self.capacity)] = j
+                    self.list.neighbour[start + ti.min(used, self.list.capacity)] = j
                 elif ti.static(what == FILL):
                     at = used
                     if ti.static(self.several_levels):
-                        at = add_to(self.number, i, 1, self.serial)
-                    self.neighbour[start + at] = j
+                        at = add_to(self.list.number, i, 1, self.serial)
+                    self.list.neighbour[start + at] = j
                 used += 1
         return used
 
@@ -293,10 +300,10 @@ class NeighbourSearch(NeighbourList):
     @ti.func
     def order(self, begin, count):
         """Sort by index, which makes every sum over the list independent of the table."""
-        if ti.static(self.several_levels or self.short == 1):
-            sort(self.neighbour, begin, count, self.serial)
-        elif count > ti.static(self.short):
-            sort(self.neighbour, begin, count, self.serial)
+        if ti.static(self.several_levels or self.list.short == 1):
+            sort(self.list.neighbour, begin, count, self.serial)
+        elif count > ti.static(self.list.short):
+            sort(self.list.neighbour, begin, count, self.serial)
         else:
             # Where neighbours in space are neighbours in number too, they are in order as they come.
-            exchange(self.neighbour, begin, count, self.network, self.short)
+            exchange(self.list.neighbour, begin, count, self.network, self.list.short)

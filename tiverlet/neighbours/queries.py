@@ -40,9 +40,9 @@ class Contacts:
 class PointSearch:
     """Particles within a distance of points, by the cells of the contact grid, which has to be sorted."""
 
-    def __init__(self, grid: "NeighbourSearch"):
-        self.cells, self.state, self.dim, self.levels = grid.cells, grid.state, grid.dim, grid.cells.levels
-        self.real = grid.real
+    def __init__(self, search: "NeighbourSearch"):
+        self.cells, self.state, self.dim, self.levels = search.cells, search.state, search.dim, search.cells.levels
+        self.real = search.real
 
     @ti.func
     def visit(self, point, radius, row, number, at, out: ti.template(), fill: ti.template()):  # type: ignore[valid-type]

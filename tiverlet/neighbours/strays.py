@@ -28,8 +28,9 @@ class Strays:
     n: Any = OnDevice()  # particles
     most: Any = OnDevice()  # strays
 
-    def __init__(self, scene: "Scene", grid: "NeighbourSearch", team: "Team"):
-        self.grid, self.cells, self.team, self.state, self.real = grid, grid.cells, team, scene.state, scene.real
+    def __init__(self, scene: "Scene", search: "NeighbourSearch", team: "Team"):
+        self.search, self.list, self.cells, self.team = search, search.list, search.cells, team
+        self.state, self.real = scene.state, scene.real
         most = min(MOST, scene.particles.count // SHARE)
         self.n, self.most = scene.count, scene.memory.number(most)
         self.stray = scene.memory.field("grid.strays", max(1, most), kind=ti.i32)
@@ -39,7 +40,7 @@ class Strays:
     @ti.func
     def keep_list(self, thread):
         """Where few have moved too far, and none of them is near what is not on its list, that is not stale any more."""
-        if self.grid.stale[None] == MOVED:
+        if self.list.stale[None] == MOVED:
             ti.loop_config(serialize=True)
             for _ in range(self.team.one(1, thread)):
                 self.number[None], self.met[None] = 0, 0
@@ -55,7 +56,7 @@ class Strays:
             ti.loop_config(serialize=True)
             for _ in range(self.team.one(1, thread)):
                 if number <= self.most and self.met[None] == 0:
-                    self.grid.stale[None] = 0
+                    self.list.stale[None] = 0
             self.team.wait()
 
     @ti.func
@@ -65,10 +66,10 @@ class Strays:
             low, high = block(b, begin, end)
             far = 0
             for i in range(low, high):
-                far |= self.grid.moved_too_far(i)
+                far |= self.search.moved_too_far(i)
             if far != 0 and self.number[None] <= self.most:
                 for i in range(low, high):
-                    if self.grid.moved_too_far(i) != 0:
+                    if self.search.moved_too_far(i) != 0:
                         k = ti.atomic_add(self.number[None], 1)
                         if k < self.most:
                             self.stray[k] = i
@@ -91,11 +92,11 @@ class Strays:
     @ti.func
     def missing(self, i, j):
         """1 if a pair is as near as it gets while a list is good, and belongs on the list, but is not there."""
-        near = self.grid.table.reach(self.grid.radius, i, j) + ti.static(1 - 2 * STALE) * ti.cast(self.grid.skin, self.real)
+        near = self.search.table.reach(self.search.radius, i, j) + ti.static(1 - 2 * STALE) * ti.cast(self.search.skin, self.real)
         r, out = self.state.apart(i, j), 0
         if r.dot(r) < near * near:
-            out = self.grid.listed(i, j, r)
-            for e in range(self.grid.first[i], self.grid.first[i] + self.grid.number[i]):
-                if self.grid.neighbour[e] == j:
+            out = self.search.listed(i, j, r)
+            for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
+                if self.list.neighbour[e] == j:
                     out = 0
         return out

@@ -496,13 +496,14 @@ class Shared:
         return ti.cast(1, ti.i32) > 0 if self.all_positive else self.of(i) > 0
 
 
-class Radii(Shared):
+class Radii:
     """Radii on the device."""
 
     least: Any = OnDevice()
 
     def __init__(self, memory: "Memory", radius: np.ndarray, number: Number):
-        super().__init__(memory, "radius", radius, number)
+        self.shared = Shared(memory, "radius", radius, number)
+        self.uniform, self.real = self.shared.uniform, memory.real
         least, self.points, self.discs = self._kinds(radius)
         self.least = memory.number(least, memory.real)
 
@@ -514,12 +515,17 @@ class Radii(Shared):
 
     def can_be(self, values: np.ndarray) -> bool:
         """Whether its kernels are those for other radii, too."""
-        return super().can_be(values) and self._kinds(values)[1:] == (self.points, self.discs)
+        return self.shared.can_be(values) and self._kinds(values)[1:] == (self.points, self.discs)
 
     def become(self, memory: "Memory", values: np.ndarray) -> None:
         """Take other radii, as can_be() says."""
-        super().become(memory, values)
+        self.shared.become(memory, values)
         self.least = self._kinds(values)[0]
+
+    @inline
+    def of(self, i):
+        """That of particle i."""
+        return self.shared.of(i)
 
     @ti.func
     def stride(self, i):

@@ -65,6 +65,7 @@ class StepController:
 
     @memory.setter
     def memory(self, value: tuple) -> None:
+        """Go on from what it was at another time."""
         self.substeps, self.iterations, self.dt, self.wait, self.patience, *stuck = value
         self.stuck = tuple(stuck) if len(stuck) > 1 else NOTHING
 

@@ -60,7 +60,7 @@ class Assembly:
     memory: Memory
     scene: Scene
     batches: list[Batch]
-    grid: NeighbourSearch | None
+    search: NeighbourSearch | None
     step: Step
     diagnostics: Diagnostics
     frames: Frames | None  # where there are copies
@@ -151,12 +151,12 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     )
     size = size_of(path, scale.work)
     team = Team(memory, size, len(particles), path == "parallel" and size == 1, pieces=PIECES if contact else size)
-    grid = contact.join(scene, batches, team) if contact else None
+    search = contact.join(scene, batches, team) if contact else None
     for feature in of(Batch):
         feature.scene = scene  # also of those that do nothing, because all of their particles are held
     for feature in [*accelerations, *drivers, *batches, *walls]:
         feature.bind(scene)
-    lists = [(f.join(scene, team), f.room) for f in accelerations if f.pairwise]
+    searches = [(f.join(scene, team), f.room) for f in accelerations if f.pairwise]
     for feature in features:
         feature.new_force = False  # it was given when it was made
         feature._world_for = feature.built_for() if not isinstance(feature, Batch) or feature.acts else None
@@ -165,18 +165,18 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     integrator = Verlet(scene, forces) if scene.order == 2 else high_order.Composition(scene, forces, batches)
     if scene.own_weight:
         scene.own_weight.follow(integrator, [known.carried] if known else [])
-    step = Step(scene, integrator, batches, drivers, contact, grid, walls, team)
+    step = Step(scene, integrator, batches, drivers, contact, search, walls, team)
     if state.sleepers:
         step.sleep = SleepPass(step, state.sleepers, drivers, batches)
     diagnostics = Diagnostics(step, solver)
-    if grid and contact:
-        grid.allocate(int(len(particles) * max(ROOM[scene.radius.uniform][particles.dim - 2], contact.room)) + 64)
-    for pairs, each in lists:
-        if pairs:
-            pairs.allocate(len(particles) * each + 64)
+    if search and contact:
+        search.list.allocate(int(len(particles) * max(ROOM[scene.radius.uniform][particles.dim - 2], contact.room)) + 64)
+    for each, room in searches:
+        if each:
+            each.list.allocate(len(particles) * room + 64)
     frames = Frames(step, memory) if memory.copies else None
     memory.place()
-    return Assembly(scale, path, solver, memory, scene, batches, grid, step, diagnostics, frames)
+    return Assembly(scale, path, solver, memory, scene, batches, search, step, diagnostics, frames)
 
 
 def checked_features(features: Iterable[Feature]) -> tuple[Feature, ...]:

@@ -64,8 +64,8 @@ def state(world: "World", pairs: bool = True) -> dict[str, np.ndarray]:
     Without `pairs` that is left out, which takes a fraction of the time; it shows in the next frame.
     """
     out = {name: values for memory in world._runner.memories for name, values in memory.state().items()}
-    if world._runner.grid and pairs:
-        out["Contact.pairs"], carried = world._runner.grid.lasting_data()
+    if world._runner.search and pairs:
+        out["Contact.pairs"], carried = world._runner.search.list.lasting_data()
         out.update((f"Contact.{name}", values) for name, values in carried.items())
     return out | {f"{RESTS}{k}": np.stack(f.now()) for k, f in enumerate(world.features) if isinstance(f, Scalar) and f.waits}
 
@@ -83,14 +83,14 @@ def flags(world: "World") -> list[list[bool]]:
 def put_back(world: "World", kept: Checkpoint) -> None:
     """Return to an earlier state, bit for bit."""
     world._runner.set_substep(kept.clock.h, kept.clock.drag)
-    grid, stores = world._runner.grid, list(map(id, world._runner.memories))
+    search, stores = world._runner.search, list(map(id, world._runner.memories))
     if "Contact.shrunk" in kept.values:
         world._runner.step.contacts[0].enable_shrink()
     for memory in world._runner.memories:
         memory.restore(kept.values)
-    if grid:
-        pieces = {piece.name: kept.values[f"Contact.{piece.name}"] for piece in grid.lasting}
-        grid.restore(kept.values["Contact.pairs"], pieces)
+    if search:
+        pieces = {piece.name: kept.values[f"Contact.{piece.name}"] for piece in search.list.lasting}
+        search.list.restore(kept.values["Contact.pairs"], pieces)
     for k, f in enumerate(world.features):
         if f"{RESTS}{k}" in kept.values:
             f.put(kept.values[f"{RESTS}{k}"])  # type: ignore[attr-defined]
@@ -119,7 +119,7 @@ def check(world: "World", kept: Checkpoint, flagged: list[list[bool]]) -> None:
     late = LATE | rests.keys()
     if set(present.values) - late != set(kept.values) - late:
         raise ValueError("The state is not one of this scene: it has other fields.")
-    pieces = {f"Contact.{piece.name}" for piece in world._runner.grid.lasting} if world._runner.grid else set()
+    pieces = {f"Contact.{piece.name}" for piece in world._runner.search.list.lasting} if world._runner.search else set()
     most = {"Contact.pairs": len(world.particles)}
     for f in world.features:
         if hasattr(f.dev, "pieces"):  # of a Path

@@ -322,8 +322,8 @@ class Reporter:
 
     def regroup(self) -> None:
         """Particles came or went."""
-        grid, self.n = self._step.grid, self._step.n
-        self.farthest = min(LARGEST, grid.finest * FARTHEST) if grid else LARGEST
+        search, self.n = self._step.search, self._step.n
+        self.farthest = min(LARGEST, search.finest * FARTHEST) if search else LARGEST
 
     def __call__(
         self,

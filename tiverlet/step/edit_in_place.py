@@ -46,7 +46,7 @@ def regroup(world: Any, change: Regrouping, added: Particles | None) -> None:
     """Do what was planned."""
     runner, count = world._runner, change.now.count
     scene, step, memory = runner.scene, runner.step, runner.memory
-    pairs = _pairs(runner.grid, change) if runner.grid and runner.grid.saved and change.goes else None
+    pairs = _pairs(runner.search.list, change) if runner.search and runner.search.list.saved and change.goes else None
     rows = scene.count
     for one in runner.memories:
         one.regroup(rows, change.first, change.stay[change.first :], count)
@@ -72,8 +72,8 @@ def regroup(world: Any, change: Regrouping, added: Particles | None) -> None:
     for log in runner.logs:
         log.forget()
     if pairs:
-        memory.write(runner.grid.number, 0)
-        runner.grid.restore(*pairs)
+        memory.write(runner.search.list.number, 0)
+        runner.search.list.restore(*pairs)
     runner.carry_loads()
 
 
@@ -93,7 +93,7 @@ def grabbing(world: Any, some: np.ndarray) -> Regrouping | None:
     change, touched = Regrouping(some, np.arange(len(some)), scene.particles, now, inv_mass), inv_mass != scene.inv_mass
     free = not any(touched[b.indices].any() for b in runner.batches)
     free = free and (all(f.drives for f in pins) or scene.slots.can_grab(change, runner.batches))
-    static = not runner.grid or runner.grid.has_static == bool((inv_mass == 0).any())
+    static = not runner.search or runner.search.has_static == bool((inv_mass == 0).any())
     if not (free and static and scene.state.can_regroup(change) and all(f.can_grab(change) for f in pins)):
         return None
     refuse_held_twice(now, world.features)
@@ -119,9 +119,9 @@ def grab(world: Any, change: Regrouping) -> None:
         runner.invalidate()
 
 
-def _pairs(grid: Any, change: Regrouping) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def _pairs(near: Any, change: Regrouping) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """What pairs of particles that stay remember, by their new numbers."""
-    pairs, values = grid.lasting_data()
+    pairs, values = near.lasting_data()
     pairs = change.number[pairs]
     both = np.flatnonzero((pairs[:, 0] >= 0) & (pairs[:, 1] >= 0))
     return pairs.take(both, axis=0), {name: value.take(both, axis=0) for name, value in values.items()}

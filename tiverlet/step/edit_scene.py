@@ -339,11 +339,12 @@ def _give_contacts(world: Any, contact: PairContact, old: dict, number: np.ndarr
         values = less.state()
         values["Contact.shrunk"][: some.sum()] = old["Contact.shrunk"][some]
         less.restore(values)
-    grid, pairs = world._runner.grid, number[old["Contact.pairs"]]
-    assert grid
+    search, pairs = world._runner.search, number[old["Contact.pairs"]]
+    assert search
     both = (pairs >= 0).all(axis=1)
-    nothing = {p.name: np.zeros((len(pairs), p.width) if p.width else len(pairs)) for p in grid.lasting}  # of what came just now
-    grid.restore(pairs[both], {name: old.get(f"Contact.{name}", none)[both] for name, none in nothing.items()})
+    # Of what came just now pairs remember nothing.
+    nothing = {p.name: np.zeros((len(pairs), p.width) if p.width else len(pairs)) for p in search.list.lasting}
+    search.list.restore(pairs[both], {name: old.get(f"Contact.{name}", none)[both] for name, none in nothing.items()})
     world._runner.carry_loads()
 
 

@@ -87,8 +87,8 @@ def _launches(world: "World") -> str:
     solved = world.iterations * (step.constraints.steps + 1) if step.constraints.steps else 0
     rounds = REBOUNDS + 1 if step.has_restitution else 0
     each = (world.iterations * step.halves if step.particles.acts else 1) + solved + rounds
-    more = ", and those behind a stale list again, once it was built" if step.grids else ""
-    return f"{world.substeps * each + 1 + bool(step.grids)} launches per frame, of which the host waits for one{more}"
+    more = ", and those behind a stale list again, once it was built" if step.searches else ""
+    return f"{world.substeps * each + 1 + bool(step.searches)} launches per frame, of which the host waits for one{more}"
 
 
 def _present(world: "World") -> list[str]:
@@ -110,9 +110,8 @@ def _present(world: "World") -> list[str]:
         elif isinstance(f, Sleep):
             slow = f"slower than {f.speed:g} m/s for {f.time:g} s"
             out.append(f"{f!r}: leaves out islands that were {slow}; {world.last.asleep if world.last else 0} asleep")
-        elif world._runner.grid:
-            grid = world._runner.grid
-            out.append(f"{f!r}: {_listed(grid)}")
+        elif world._runner.search:
+            out.append(f"{f!r}: {_listed(world._runner.search)}")
         else:
             out.append(f"{f!r}: nothing, since all radii are 0")
     if world.particles.spins:
@@ -122,25 +121,24 @@ def _present(world: "World") -> list[str]:
 
 def _pairs(f: Acceleration) -> str:
     """How pairs are found that a force acts on."""
-    grid = f.dev.grid
-    if not grid:
+    if not f.dev.search:
         return f"{f!r}: all pairs, before the loop over particles"
-    return f"{f!r}: before the loop over particles; {_listed(grid)}"
+    return f"{f!r}: before the loop over particles; {_listed(f.dev.search)}"
 
 
-def _listed(grid: NeighbourSearch) -> str:
+def _listed(search: NeighbourSearch) -> str:
     """How near pairs are found."""
-    sizes = ", ".join(f"{size:.3g}" for size in grid.cells.sizes)
-    return f"grid with cells of {sizes} m, neighbour list with a skin of {grid.skin:.3g} m"
+    sizes = ", ".join(f"{size:.3g}" for size in search.cells.sizes)
+    return f"grid with cells of {sizes} m, neighbour list with a skin of {search.skin:.3g} m"
 
 
 def _absent(world: "World") -> list[str]:
     step = world._runner.step
     rows = [
-        (not step.grid, "grid, neighbour list, contacts: no Contact between particles with radii"),
+        (not step.search, "grid, neighbour list, contacts: no Contact between particles with radii"),
         (not step.batches, "slots and gathers: no constraint on particles that can move"),
         (not step.walls, "wall pass: no wall"),
-        (not world.particles.spins and bool(step.walls or step.grid), "spin: particles have none"),
+        (not world.particles.spins and bool(step.walls or step.search), "spin: particles have none"),
         (not step.state.images, "nearest images: no Periodic"),
         (any(not c.has_loads and not c.detects for c in step.contacts), "loads that pairs know: no Contact(loads=True)"),
         (bool(step.batches) and not step.constraints.learners, "loads that links know: no Jacobi(loads=True)"),

@@ -19,7 +19,7 @@ ROUNDS = 32  # more of them, without friction and bounces
 
 
 class ParticlePass:
-    """The motion of particles, and what they gather of constraints, contacts and walls. contact and grid may be None.
+    """The motion of particles, and what they gather of constraints, contacts and walls. contact and search may be None.
 
     n: particles. pieces: of them, see Team. tile: particles in one. each: tiles of a piece.
     """
@@ -29,13 +29,13 @@ class ParticlePass:
     tile: Any = OnDevice()
     each: Any = OnDevice()
 
-    def __init__(self, scene: Scene, integrator: Any, batches: list[Batch], contact, grid, walls: "list[Collider]", team: Team):
+    def __init__(self, scene: Scene, integrator: Any, batches: list[Batch], contact, search, walls: "list[Collider]", team: Team):
         self.integrator, self.forces, self.team = integrator, integrator.forces, team
         self.state, self.n, self.real = scene.state, scene.count, scene.real
         number = scene.memory.number
         self.pieces, self.tile, self.each = map(number, self._parts(scene.particles.count, team))
         self.few = scene.memory.compiler.few
-        self.slots, self.grid, self.walls, self.radius = scene.slots, grid, walls, scene.radius
+        self.slots, self.search, self.walls, self.radius = scene.slots, search, walls, scene.radius
         self.gathers = bool(batches) and not contact  # else the moves of constraints are applied before contacts are solved
         self.held = bool(batches)
         self.contacts = [contact] if contact else []
@@ -117,7 +117,7 @@ class ParticlePass:
             for i in range(first, end):
                 c.restore(i, now.h)
             for i in range(first, end):
-                stale |= self.grid.moved_too_far(i)
+                stale |= self.search.moved_too_far(i)
             for i in range(first, end):
                 fast |= c.overshoots(i)
             c.note_motion(stale, fast)
@@ -163,7 +163,7 @@ class ParticlePass:
         for c in ti.static(self.contacts):
             for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
                 self.gather(i)
-                c.note_motion(self.grid.moved_too_far(i), c.overshoots(i))
+                c.note_motion(self.search.moved_too_far(i), c.overshoots(i))
             self.team.wait()
 
     @ti.func
@@ -219,7 +219,7 @@ class ParticlePass:
             if now.checks_list != 0:
                 stale = 0
                 for i in range(begin, end):
-                    stale |= self.grid.moved_too_far(i)
+                    stale |= self.search.moved_too_far(i)
                 c.note_motion(stale, 0)
         if ti.static(len(self.walls) > 0):
             if now.final != 0:

@@ -33,7 +33,7 @@ class Runner:
     """
 
     def __init__(self, parts: Any, clock: Clock):
-        self.memory, self.scene, self.batches, self.grid = parts.memory, parts.scene, parts.batches, parts.grid
+        self.memory, self.scene, self.batches, self.search = parts.memory, parts.scene, parts.batches, parts.search
         self.step, self.diagnostics, self.path, self.solver = parts.step, parts.diagnostics, parts.path, parts.solver
         self.frames: Frames | None = parts.frames
         self.clock = clock
@@ -240,7 +240,7 @@ class Runner:
         """Particles came or went, or are held by others: they carry what their contacts know."""
         for c in self.step.contacts:
             if c.known:
-                c.known.carry(self.scene, self.scene.state.get(self.memory), *self.grid.lasting_data())
+                c.known.carry(self.scene, self.scene.state.get(self.memory), *self.search.list.lasting_data())
 
     def restart(self, iterations: int) -> None:
         """Turn displacements into velocities, so that the next substep starts from the state at this time. iterations: of the
@@ -287,7 +287,7 @@ class Runner:
 
     def _list_again(self) -> None:
         """Of a state that was put back, build the list that reactions of contacts are asked for with."""
-        if self.grid and self.memory.read(self.grid.old_saved)[0]:
+        if self.search and self.memory.read(self.search.list.old_saved)[0]:
             self.list_neighbours()
 
     def spin(self) -> np.ndarray:
@@ -376,14 +376,14 @@ class Runner:
         """Phase by phase. Whether the frame waits for a list is all that the host asks, when all is launched."""
         try:
             frame(self.launcher, span)
-            while self.step.grids and self._data[HALT]:
+            while self.step.searches and self._data[HALT]:
                 span.resumed, span.begin, span.half = self.stopped()
                 self.list_neighbours()
                 self.wake_called(span.substeps, span.iterations, span.begin, span.half)
                 frame(self.launcher, span)
         except BaseException:  # as signals raise
             self.launcher.waiting.clear()
-            if self.step.grids:
+            if self.step.searches:
                 self.memory.write(self.step.halt, 0)
             raise
 
@@ -409,23 +409,24 @@ class Runner:
             self.look()  # whose kernel is there anyway, and lists
             return
         with self.memory.compiler():
-            for k, grid in enumerate(self.step.grids):
-                while self.step.listed(k) > grid.capacity:
+            for k, search in enumerate(self.step.searches):
+                while self.step.listed(k) > search.list.capacity:
                     self.grow()
 
     def grow(self) -> None:
         """More room for near pairs, and kernels that know of it. Nothing is lost: what did not fit was counted."""
-        short = [grid for grid in self.step.grids if self.memory.read(grid.need)[0] > grid.capacity]
-        if any([grid.grow() for grid in short]):
+        lists = [search.list for search in self.step.searches]
+        short = [each for each in lists if self.memory.read(each.need)[0] > each.capacity]
+        if any([each.grow() for each in short]):
             self.renew()
 
     def invalidate(self, some: np.ndarray | None = None) -> None:
         """Have lists of neighbours built anew in the next frame; of some copies, where there are many."""
-        for grid in self.step.grids:
+        for search in self.step.searches:
             if some is None:
-                grid.invalidate()
+                search.list.invalidate()
             else:
-                self.memory.write_some(grid.stale, 1, some)
+                self.memory.write_some(search.list.stale, 1, some)
 
     def ease(self, first: int) -> None:
         """Let particles part gently that the user put into each other, from number `first` on."""
@@ -444,8 +445,8 @@ class Runner:
         report, extent = self._reporter(
             clock.time, clock.h, substeps, iterations, clock.energy, self.moved, self.released, asleep
         )
-        for grid in self.step.grids:
-            grid.fit(extent)
+        for search in self.step.searches:
+            search.fit(extent)
         return report
 
     def residuals(self, batch) -> np.ndarray:
@@ -464,7 +465,7 @@ class Runner:
     @property
     def memories(self) -> list[Any]:
         """The trees of fields: one from the start, others where a list or a need has grown."""
-        grown = [*(grid.store for grid in self.step.grids), *(c.store for c in self.step.contacts)]
+        grown = [*(search.list.store for search in self.step.searches), *(c.store for c in self.step.contacts)]
         return [self.memory, *(m for m in grown if m), *self.ramps]
 
 
@@ -569,7 +570,7 @@ class Launcher:
         """Here the frame may have to wait for a list."""
         if half and not half % self.halves:
             self.runner.raise_signals()
-        self.put(self.turn(now, half), "ask_for_list", bool(self.runner.grid))
+        self.put(self.turn(now, half), "ask_for_list", bool(self.runner.search))
         if self.looks and self.solves(now):
             self.put(self.turn(now, half), "look_for_sleepers")
             self.put(self.turn(now, half), "ask_to_wake")

@@ -264,8 +264,8 @@ class SleepPass:
             for c in ti.static(self.contacts):
                 for i in range(self.n):
                     if self.drifts(i):
-                        for e in range(c.dev.grid.first[i], c.dev.grid.first[i] + c.dev.grid.number[i]):
-                            j = c.held_by(c.dev.grid.neighbour[e])
+                        for e in range(c.dev.list.first[i], c.dev.list.first[i] + c.dev.list.number[i]):
+                            j = c.held_by(c.dev.list.neighbour[e])
                             if self.drifts(j) and self.sleepers.root(i) != self.sleepers.root(j):
                                 if c.presses(i, e):
                                     self.sleepers.join(i, j)
@@ -310,7 +310,7 @@ class SleepPass:
         drifts, d = self.drifts(i), self.state.d[i]
         for c in ti.static(self.contacts):
             if drifts or (self.sleepers.awake(i) and d.dot(d) > 0):
-                for e in range(c.dev.grid.first[i], c.dev.grid.first[i] + c.dev.grid.number[i]):
+                for e in range(c.dev.list.first[i], c.dev.list.first[i] + c.dev.list.number[i]):
                     j = c.reached(i, e)
                     if j >= 0:
                         self.call(j)

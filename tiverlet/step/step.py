@@ -82,12 +82,12 @@ class Step:
     n: Any = OnDevice()  # particles
 
     def __init__(
-        self, scene: Scene, integrator: Any, batches: list[Batch], drivers: list[Batch], contact: Any, grid: Any,
+        self, scene: Scene, integrator: Any, batches: list[Batch], drivers: list[Batch], contact: Any, search: Any,
         walls: "list[Collider]", team: Team,
     ):  # fmt: skip
         self.scene, self.state, self.slots, self.team = scene, scene.state, scene.slots, team
         self.n, self.dim, self.real = scene.count, scene.particles.dim, scene.real
-        self.integrator, self.grid, self.walls, self.drivers, self.batches = integrator, grid, walls, drivers, batches
+        self.integrator, self.search, self.walls, self.drivers, self.batches = integrator, search, walls, drivers, batches
         self.posed = [w for w in walls if w.poses]
         self.wall_logs: list[Any] = [w.dev.log for w in walls if w.dev.log]
         self.sheared = bool(scene.state.images and scene.state.images.sheared)
@@ -95,7 +95,7 @@ class Step:
         self.launched = team.launched
         # Iterations of a loop for each of few pieces of work: to each CPU thread Taichi gives LEAST of them, at least.
         self.stride = LEAST if self.launched and runtime.architecture() == "cpu" else 1
-        self.particles = ParticlePass(scene, integrator, batches, contact, grid, walls, team)
+        self.particles = ParticlePass(scene, integrator, batches, contact, search, walls, team)
         self.constraints = ConstraintPass(scene, integrator, batches, team, self.stride)
         self.contact_pass = ContactPass(scene, contact, self.particles, team)
         self.contacts = self.particles.contacts
@@ -104,17 +104,17 @@ class Step:
         self.orients = self.state.spins and self.state.spin.orients
         keeps = self.contact_pass.remembers or bool(self.breakers)
         self.finishes = keeps or self.orients or bool(self.wall_logs) or bool(self.constraints.learners)
-        self.hashes = bool(grid)
+        self.hashes = bool(search)
         self.sleepers = scene.state.sleepers
-        self.looks = bool(grid) and bool(self.sleepers)  # for what touches those that sleep
+        self.looks = bool(search) and bool(self.sleepers)  # for what touches those that sleep
         self.detects = any(c.detects for c in self.contacts)
-        apart = grid and grid.lone and not self.launched and not scene.memory.compiler.few
-        self.strays: Any = Strays(scene, grid, team) if apart else None
+        apart = search and search.lone and not self.launched and not scene.memory.compiler.few
+        self.strays: Any = Strays(scene, search, team) if apart else None
         self.pair_forces: list[Any] = integrator.forces.pairwise
         self.has_pair_forces = bool(self.pair_forces)
-        self.listed_forces = [f for f in self.pair_forces if f.dev.grid]
-        self.grids = [*([grid] if grid else []), *(f.dev.grid for f in self.listed_forces)]
-        if self.grids:
+        self.listed_forces = [f for f in self.pair_forces if f.dev.search]
+        self.searches = [*([search] if search else []), *(f.dev.search for f in self.listed_forces)]
+        if self.searches:
             self.halt = scene.memory.field("halt", None, width=3, kind=ti.i32)
             if self.launched:
                 team.halt = self.halt
@@ -227,9 +227,9 @@ class Step:
         """Their lists, built anew where they are stale. Where one has no room for all pairs, the frame stops."""
         self.look_for_motion(now)
         for f in ti.static(self.listed_forces):
-            if f.dev.grid.stale[None] != 0:
-                f.dev.grid.build(now.thread)
-                if f.dev.grid.need[None] > f.dev.grid.capacity:
+            if f.dev.list.stale[None] != 0:
+                f.dev.search.build(now.thread)
+                if f.dev.list.need[None] > f.dev.list.capacity:
                     self.halt[None] = [1, now.s, BEFORE]  # all write the same
         self.team.wait()
 
@@ -238,8 +238,8 @@ class Step:
         """Which of their lists are stale."""
         for f in ti.static(self.listed_forces):
             for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
-                if f.dev.grid.moved_too_far(i) != 0:
-                    f.dev.grid.stale[None] = 1
+                if f.dev.search.moved_too_far(i) != 0:
+                    f.dev.list.stale[None] = 1
         self.team.wait()
 
     @ti.func
@@ -249,7 +249,7 @@ class Step:
         for f in ti.static(self.listed_forces):
             ti.loop_config(serialize=True)
             for _ in range(self.team.one(1, now.thread)):
-                if f.dev.grid.stale[None] != 0:
+                if f.dev.list.stale[None] != 0:
                     self.halt[None] = [1, now.s, BEFORE]
 
     @ti.func
@@ -294,7 +294,7 @@ class Step:
                 if ti.static(self.state.befores):  # at the velocity with which it is driven, others meet it
                     self.state.before[f.member(c, 0)] = self.state.d[f.member(c, 0)]
                 for k in ti.static(self.contacts):
-                    k.note_motion(self.grid.moved_too_far(f.member(c, 0)), k.overshoots(f.member(c, 0)))
+                    k.note_motion(self.search.moved_too_far(f.member(c, 0)), k.overshoots(f.member(c, 0)))
             self.team.wait()
 
     @ti.func
@@ -305,8 +305,8 @@ class Step:
                 if ti.static(bool(self.strays)):
                     self.strays.keep_list(now.thread)
                 if self.is_stale() != 0:
-                    self.grid.build(now.thread)
-                    if self.grid.need[None] > self.grid.capacity:
+                    self.search.build(now.thread)
+                    if self.search.list.need[None] > self.search.list.capacity:
                         self.halt[None] = [1, now.s, half]  # all write the same
         if ti.static(self.looks):
             if self.solves(now) and (self.sleepers.count[None] > 0 or ti.static(self.detects)):
@@ -434,13 +434,13 @@ class Step:
         """1 when the neighbour list has to be built anew."""
         out = 0
         if ti.static(self.hashes):
-            out = self.grid.stale[None]
+            out = self.search.list.stale[None]
         return out
 
     @ti.func
     def tell_halt(self, sheet: ti.template()):  # type: ignore[valid-type]
         """Whether, and where, the frame stopped to have the list grown, or built."""
-        if ti.static(len(self.grids) > 0):
+        if ti.static(len(self.searches) > 0):
             for k in ti.static(range(3)):
                 sheet[HALT + k] = self.halt[None][k]
 
@@ -448,15 +448,15 @@ class Step:
     def halted(self):
         """1 when the frame waits for a longer list."""
         out = 0
-        if ti.static(len(self.grids) > 0):
+        if ti.static(len(self.searches) > 0):
             out = self.halt[None][0]
         return out
 
     @ti.kernel
     def listed(self, k: ti.template()) -> ti.i32:  # type: ignore[valid-type]
         """Build the k-th neighbour list where frames do not; returns the largest number of entries that a block needs."""
-        self.grids[k].build(0)
-        return self.grids[k].need[None]
+        self.searches[k].build(0)
+        return self.searches[k].list.need[None]
 
     @ti.kernel
     def shrunk(self, first: ti.i32):

@@ -99,11 +99,11 @@ class Worlds:
         """Give copy k what a world has."""
         runner = self._runner
         runner.memory.choose(k)
-        numbers = [(grid.capacity, grid.pitch) for grid in runner.step.grids]
+        numbers = [(search.list.capacity, search.list.pitch) for search in runner.step.searches]
         runner.memory.take(world._runner.memory)
-        for grid, (capacity, pitch) in zip(runner.step.grids, numbers, strict=True):
-            grid.capacity_number.set(capacity)
-            grid.pitch_number.set(pitch)
+        for search, (capacity, pitch) in zip(runner.step.searches, numbers, strict=True):
+            search.list.capacity_number.set(capacity)
+            search.list.pitch_number.set(pitch)
         self._world._clock = runner.clock = self._clocks.of(k)
         checkpoint.put_back(self._world, checkpoint.keep(world))
         self._clocks.put(k, runner.clock)
@@ -363,7 +363,7 @@ class Worlds:
                 CachedLaunch(self._kernels, "run", memory.compiler, plan, which, figures.reshape(-1), track)()
             finally:
                 self._show_knobs(None)
-            if not runner.step.grids:
+            if not runner.step.searches:
                 return
             sheets = memory.read(self._kernels.sheet)
             some = some[kernel.waits(sheets[some])]
@@ -402,9 +402,9 @@ class Worlds:
         )  # fmt: skip
         clocks.energy, clocks.known = energy[:, -1].copy(), np.ones(len(self), dtype=bool)
         clocks.first_moved = np.full(len(self), NONE)
-        if runner.grid:
+        if runner.search:
             extent = figures[:, -1, 11 : 11 + dim]
-            runner.grid.fit(extent.max(0))
+            runner.search.fit(extent.max(0))
         return report
 
     # Knobs and states of some.
@@ -545,6 +545,7 @@ class Worlds:
 
     @position.setter
     def position(self, value) -> None:
+        """Move particles of all worlds to (worlds, n, dim), or (n, dim) for each [m]; velocities are kept."""
         with self._open():
             self._place(self._per_particle("position", value, len(self)), np.arange(len(self)))
 
@@ -572,7 +573,7 @@ class Worlds:
     def _velocities(self) -> np.ndarray:
         runner, clocks = self._runner, self._clocks
         out = runner.memory.read(runner.scene.state.d)[:, : runner.n].astype(np.float64)
-        saved = runner.memory.read(runner.grid.old_saved)[:, 0] if runner.grid else np.zeros(len(self))
+        saved = runner.memory.read(runner.search.list.old_saved)[:, 0] if runner.search else np.zeros(len(self))
         alone = ~clocks.d_is_velocity & ((saved != 0) | bool(runner.probe))
         alone[list(clocks.parted)] = True
         some = np.flatnonzero(~clocks.d_is_velocity & ~alone).astype(np.int32)
@@ -590,6 +591,7 @@ class Worlds:
 
     @velocity.setter
     def velocity(self, value) -> None:
+        """Have them go on with (worlds, n, dim), or (n, dim) for each [m/s]."""
         with self._open():
             self._start_from(self._per_particle("velocity", value, len(self)), np.arange(len(self)))
 
@@ -624,6 +626,7 @@ class Worlds:
 
     @substeps.setter
     def substeps(self, value: int) -> None:
+        """At least 1, of all worlds, from the next frame on."""
         self._world.substeps = checks.integer("Worlds", "substeps", value, least=1)
 
     @property
@@ -633,6 +636,7 @@ class Worlds:
 
     @iterations.setter
     def iterations(self, value: int) -> None:
+        """At least 1, and what the solver allows, of all worlds, from the next frame on."""
         self._world.iterations = value
 
     @property
@@ -701,9 +705,9 @@ class _Start:
             if (values == values[:1]).all():
                 self.values[name] = values[:1].copy()
         self.pairs: list[Any] = []  # of each, with what they remember; of copies that were not stepped yet, one for all
-        for k in range(len(worlds) if worlds._sources else 1) if runner.grid else ():
+        for k in range(len(worlds) if worlds._sources else 1) if runner.search else ():
             with worlds._at(k):
-                self.pairs.append(runner.grid.lasting_data())
+                self.pairs.append(runner.search.list.lasting_data())
 
     def put_back(self, worlds: Worlds, chosen: np.ndarray) -> None:
         """Return to it."""
@@ -711,14 +715,14 @@ class _Start:
         state = {name: values[chosen] if len(values) > 1 else values for name, values in self.values.items()}
         for memory in runner.memories:
             memory.restore_some(state, chosen)
-        if runner.grid:
-            for field, value in ((runner.grid.old_number, 0), (runner.grid.old_saved, 1)):
+        if runner.search:
+            for field, value in ((runner.search.list.old_number, 0), (runner.search.list.old_saved, 1)):
                 runner.memory.write_some(field, value, chosen)
             for k in chosen:
                 pairs = self.pairs[k if len(self.pairs) > 1 else 0]
                 if len(pairs[0]):
                     with worlds._at(k):
-                        runner.grid.restore(*pairs)
+                        runner.search.list.restore(*pairs)
         for log in runner.logs:
             runner.memory.write_some(log.made, 0, chosen)
         runner.invalidate(chosen)

@@ -5,6 +5,7 @@ import numpy as np
 from ... import checks
 from ...device import ti
 from ...features.feature import Knob
+from ...geometry.intervals import cross
 from .quantity import Quantity
 
 TURN = 2 * np.pi
@@ -93,7 +94,7 @@ def path_angles(i: np.ndarray, j: np.ndarray, k: np.ndarray) -> np.ndarray:
     dot = (a * b).sum(axis=1)
     if i.shape[1] == 2:
         return np.arctan2(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], dot)
-    return np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), dot)
+    return np.arctan2(np.linalg.norm(cross(a, b), axis=1), dot)
 
 
 @ti.func
@@ -143,7 +144,7 @@ def dihedral_angles(i: np.ndarray, j: np.ndarray, k: np.ndarray, l: np.ndarray) 
     e, a, b = (end - i for end in (j, k, l))
     e = e / np.maximum(np.linalg.norm(e, axis=1, keepdims=True), 1e-300)
     p, q = (r - e * (r * e).sum(axis=1, keepdims=True) for r in (a, b))
-    return np.arctan2((e * np.cross(p, q)).sum(axis=1), -(p * q).sum(axis=1))
+    return np.arctan2((e * cross(p, q)).sum(axis=1), -(p * q).sum(axis=1))
 
 
 @ti.func

@@ -58,7 +58,7 @@ def pile(n: int, dim: int, substeps: int) -> dict[str, float]:
 
 def pile_in_c(program: str, n: int, substeps: int) -> dict[str, float]:
     """The same discs by hand: mean overlap and time of a frame, on as many threads."""
-    with c_baseline.Yardstick(program, n, substeps, runtime.threads()) as talker:
+    with c_baseline.started(program, n, substeps, runtime.threads()) as talker:
         talker.ask("restart")
         seconds = talker.ask(f"run {FRAMES}") / FRAMES
         return {"overlap": talker.ask("quality")["overlap"], "seconds": seconds}

@@ -25,10 +25,7 @@ def build(folder) -> tuple[str | None, str]:
     return program, " ".join([pathlib.Path(compiler).name, *FLAGS])
 
 
-class Yardstick(Talker):
+def started(program: str, n: int, substeps: int, threads: int) -> Talker:
     """The program at work on n discs; see pile.c for what it obeys."""
-
-    def __init__(self, program: str, n: int, substeps: int, threads: int):
-        # Each thread on a core of its own, as Taichi's are: Linux wakes them on one, and takes milliseconds to move them.
-        settings = {"OMP_NUM_THREADS": str(threads), "OMP_PROC_BIND": "true"}
-        super().__init__([program, str(n), str(substeps)], settings)
+    # Each thread on a core of its own, as Taichi's are: Linux wakes them on one, and takes milliseconds to move them.
+    return Talker([program, str(n), str(substeps)], {"OMP_NUM_THREADS": str(threads), "OMP_PROC_BIND": "true"})

@@ -25,7 +25,7 @@ def traffic(world, frames: int) -> dict[str, tuple[float, float]]:
         main, *stores = clone._runner.memories
         lengths = {id(e.field): (max(1, e.length), e.bytes // max(1, e.length)) for e in main.entries}
         if stores:
-            listed = int(main.read(clone._runner.grid.number).sum())
+            listed = int(main.read(clone._runner.search.list.number).sum())
             lengths |= {id(e.field): (min(e.length, listed), e.bytes // e.length) for m in stores for e in m.entries}
         moved = {name: k * sum(s.bytes(lengths) for s in tracer.sweeps.get(name, ())) for name, k in count.items()}
         return {name: (moved[name] / frames, count.seconds[name] / frames) for name in count}

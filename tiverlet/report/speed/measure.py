@@ -140,7 +140,7 @@ class Session:
                 warm = ours.ask()
                 both = [ours]
                 if self.program and scene.in_c:
-                    both.append(stack.enter_context(c_baseline.Yardstick(self.program, n, scene.in_c, threads)))
+                    both.append(stack.enter_context(c_baseline.started(self.program, n, scene.in_c, threads)))
                 times = self.turns(both, n, scene.substeps, scene.settles)
                 if not same:
                     qualities = [processes.quality(talker, frames, scene.settles) for talker in both]
