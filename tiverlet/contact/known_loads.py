@@ -7,7 +7,7 @@ import numpy as np
 from ..device import ti
 from ..features.feature import Acceleration
 from ..features.learning import gain, steady
-from ..neighbours.neighbour_list import WORD, PairData, lowest_bit
+from ..neighbours.neighbour_list import PairData
 from ..neighbours.queries import between
 
 if TYPE_CHECKING:
@@ -89,17 +89,6 @@ class KnownLoads:
         force = r * np.divide(values["load"], length, out=np.zeros_like(length), where=length > 0)[:, None]
         sums = [np.bincount(i, column, minlength=len(x)) for column in force.T]
         scene.memory.write(self.carried.field, scene.inv_mass[:, None] * np.stack(sums, axis=1))
-
-    @ti.func
-    def kept(self, i, word, bits):
-        """Those of some entries of particle i that know a load, though they may not touch to the last digit."""
-        out, first = ti.u32(0), self.list.first[i] + word * WORD
-        while bits != 0:
-            bit = bits & (~bits + ti.u32(1))
-            bits ^= bit
-            if self.load.field[first + lowest_bit(bit)] > 0:
-                out |= bit
-        return out
 
     @ti.func
     def given(self, e, now):

@@ -54,14 +54,16 @@ class MassSplitting:
 
     @ti.func
     def touches(self, i, word):
-        """Bits for the entries of particle i that the word is for: which touch, as in overlap(), to the last digit."""
+        """Bits for the entries of particle i that the word is for: which touch, as in overlap(), to the last digit, or know a
+        load."""
         out, begin = ti.u32(0), self.list.first[i] + word * WORD
         for k in range(ti.min(self.list.number[i] - word * WORD, WORD)):
             j = self.list.neighbour[begin + k]
             r, contact_distance = self.state.apart(i, j), self.geometry.contact_distance(i, j)
-            out |= ti.cast(r.dot(r) < contact_distance * contact_distance, ti.u32) << ti.cast(
-                k, ti.u32
-            )  # no branch: it would be taken at random
+            one = ti.cast(r.dot(r) < contact_distance * contact_distance, ti.u32)  # no branch: it would be taken at random
+            if ti.static(self.has_loads):
+                one |= ti.cast(self.known.load.field[begin + k] > 0, ti.u32)
+            out |= one << ti.cast(k, ti.u32)
         if ti.static(self.geometry.senses):
             left = out
             while left != 0:
@@ -76,15 +78,7 @@ class MassSplitting:
         """The same bits, of the first word as count() left them."""
         out = self.list.touching[i]
         if word > 0:
-            out = self.together(i, word)
-        return out
-
-    @ti.func
-    def together(self, i, word):
-        """Bits for the entries of particle i that the word is for: which touch, or know a load."""
-        out = self.touches(i, word)
-        if ti.static(self.has_loads):
-            out |= self.known.kept(i, word, ti.select(word == 0, self.list.touching[i], self.list.all_bits(i, word)) & ~out)
+            out = self.touches(i, word)
         return out
 
     @ti.func
@@ -136,12 +130,12 @@ class MassSplitting:
     @ti.func
     def split(self, i, now):
         """Which pairs of particle i touch, and how often its mass is split. What does not touch has no push to keep."""
-        bits = self.together(i, 0)
+        bits = self.touches(i, 0)
         pairs, others = ti.math.popcnt(bits), self.list.touching[i] != bits
         self.clear(i, 0, self.list.touching[i] & ~bits)
         self.list.touching[i] = bits
         for word in range(1, self.list.words(i)):
-            bits = self.together(i, word)
+            bits = self.touches(i, word)
             pairs += ti.math.popcnt(bits)
             if ti.static(not self.has_friction):
                 others = others or self.changes(i, word, bits)
