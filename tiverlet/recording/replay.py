@@ -1,6 +1,7 @@
 """Reading a recording back: its picture, a world that goes on from any frame, and the proof that both are true."""
 
 import functools
+import inspect
 import os
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
@@ -50,10 +51,12 @@ class Verdict:
 
 def _clear(function):
     """Let what a damaged file makes Python say become one clear error."""
+    signature = inspect.signature(function)
 
     @functools.wraps(function)
     def guarded(self, *args, **kwargs):
         """The same method; what it stumbles over in a damaged file is a ValueError that names it."""
+        signature.bind(self, *args, **kwargs)  # a call that it cannot take says so itself
         try:
             return function(self, *args, **kwargs)
         except (KeyError, IndexError, TypeError, AttributeError, OverflowError, RecursionError, AssertionError) as e:
