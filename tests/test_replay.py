@@ -183,7 +183,7 @@ def test_an_empty_world_is_replayed(tmp_path):
     recording = tv.replay(tmp_path / "e.rrd")
     assert list(recording.frames) == [0, 1, 2, 3] and recording.position(3).shape == (0, 3) and recording.verify()
     with pytest.raises(TypeError, match="frame"):  # the call is wrong, and not the file
-        recording.world()
+        recording.world()  # type: ignore[call-arg]
 
 
 def test_what_comes_and_goes_is_replayed(world, tmp_path):
