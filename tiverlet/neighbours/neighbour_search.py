@@ -99,19 +99,18 @@ class NeighbourSearch:
         """Parts of the list of n particles."""
         return max(1, -(-n // self.team.piece)) if self.team.size > 1 and not self.counts else 1
 
-    def can_regroup(self, change: Regrouping) -> bool:
-        """Whether particles can come and go where it is; its reach is 0, and its radii are theirs."""
-        radius, n = change.now.radius, change.now.count
-        store = self.list.store
+    def can_regroup(self, change: Regrouping, radius: np.ndarray) -> bool:
+        """Whether particles can come and go where it is; its reach is 0. radius: as many as there are now [m]."""
+        n, store = change.now.count, self.list.store
         room = store is not None and store.holds(self.list.room + (self.list.short + 1) * (n + 1))
         static = bool((change.inv_mass == 0).any()) == self.has_static
         return room and static and not self.team.launched and self.cells.can_regroup(radius, 0 * radius)
 
-    def regroup(self, change: Regrouping, skin: float) -> None:
+    def regroup(self, change: Regrouping, skin: float, radius: np.ndarray) -> None:
         """They came and went, and the team knows. The list stays, but for pairs of what went, unless it is another one that
         would be built now; what came is on no list, as a stray is that has gone far. Where the old list is saved, what pairs
         remember is to be given to the next list by restore()."""
-        radius, n, stale = change.now.radius, change.now.count, int(self.memory.seen(self.list.stale)[0])
+        n, stale = change.now.count, int(self.memory.seen(self.list.stale)[0])
         if change.goes and not self.list.saved:
             self.list.drop(change.number)
             self.cells.drop(change.number)

@@ -36,6 +36,7 @@ BRIEF = LEAN | {"advanced_optimization": False}
 UNSEARCHED = LEAN | {"opt_level": 0}
 SETTINGS = {*BRIEF, *UNSEARCHED}
 FEW = 1000  # particles from which it pays
+MADE = 20_000  # objects; what else is done in between makes fewer, and is looked through as ever
 _INSIDE = contextlib.nullcontext()
 _lock = threading.RLock()  # the type of literals is one for all threads
 
@@ -185,8 +186,8 @@ class CachedLaunch:
 
 
 def _pass_over() -> None:
-    """Have Python take all that there is for old: most of what compiling made stays, and looking through it took 50 ms."""
-    if not gc.get_freeze_count():  # of the user's, who would not have it thawed
+    """Have Python take what there is for old where a kernel was compiled, most of which stays: looking through it took 50 ms."""
+    if gc.get_count()[0] > MADE and not gc.get_freeze_count():  # or it would thaw what the user froze
         gc.freeze()
         gc.unfreeze()
 
