@@ -96,6 +96,13 @@ def charges():
     return tv.World(tv.Particles(places(40), radius=RADIUS), features, substeps=5), drops
 
 
+def asleep():
+    """Discs on the ground, all of which sleep when the first come."""
+    lying = np.stack([0.25 * np.arange(40) + 0.15, np.full(40, RADIUS)], axis=1)
+    features = [tv.Gravity(), tv.HalfSpace((0, 1), 0.0), tv.Contact(), tv.Sleep(0.05, 0.05), tv.Hand((0.2, 3.0), rate=0.0)]
+    return tv.World(tv.Particles(lying, radius=RADIUS), features, substeps=5), drops
+
+
 def steps_of(w) -> list:
     """A few frames, by all that is seen of them."""
     out = []
@@ -141,7 +148,7 @@ def edited(scene, anew: bool) -> tuple[list, int]:
     return seen, sum(taken)
 
 
-@pytest.mark.parametrize("scene", [discs, grains, beside_a_rope, crowd, charges])
+@pytest.mark.parametrize("scene", [discs, grains, beside_a_rope, crowd, charges, asleep])
 def test_in_place_is_to_the_bit_as_built_anew(scene):
     seen, count = edited(scene, anew=False)
     known, none = edited(scene, anew=True)

@@ -141,6 +141,7 @@ def change(
             world._runner.restart(world.iterations)
         world._clock.parted = None
         edit_in_place.regroup(world, planned, added)
+        world._runner.wake()
         _edited(world, some, added, told, seen, np.arange(len(features)), False)
 
 
