@@ -33,6 +33,7 @@ class Capsule(Collider):
     to where it meets the surface (sphere tracing, Hart 1996). Nothing can be drawn through either.
     """
 
+    bulk = 0.6
     a, b = _end("a"), _end("b")
     radius = Knob(lambda f, v: checks.number("Capsule", "radius", v, above=0.0), "Of the rod [m].", device="size")
 
