@@ -7,6 +7,7 @@ import io
 import re
 import sys
 import tempfile
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,8 @@ from rich.console import Console
 import tiverlet as tv
 from tiverlet.device import ti
 from tiverlet.device.patches import patched, source_cache, timing
+from tiverlet.device.patches.compiler import BRIEF, LEAN, UNSEARCHED
+from tiverlet.step import build
 
 from .conftest import ARCH, python
 
@@ -189,6 +192,29 @@ def test_compiling_leaves_nothing_behind(world):
 
 
 @pytest.mark.skipif(ARCH != "cpu" or not patched, reason="of the patches of Taichi on a CPU")
+def test_long_kernels_are_compiled_without_a_search_to_the_same_bits(world, monkeypatch):
+    rods = [tv.Capsule((0.2 * k, 0.0), (0.2 * k, 1.0), 0.02, friction=0.3) for k in range(4)]
+    hourglass = [tv.Gravity(), tv.Contact(), tv.Ball((9.0, 9.0), 1.0), tv.Box((-9, -9), (9999, 99)), *rods]
+
+    def passes(n: int, features: list) -> Any:
+        """What the kernels of so many particles are compiled with."""
+        x = np.stack([np.arange(n), np.arange(n) % 7], axis=1) + 0.5
+        with tv.World(tv.Particles(x, radius=0.1), [f.copy() for f in features]) as w:
+            return w._runner.memory.compiler.passes
+
+    assert passes(999, hourglass) is BRIEF
+    assert passes(1000, hourglass) is passes(3999, hourglass) is UNSEARCHED
+    assert passes(4000, hourglass) is passes(1000, hourglass[:-2]) is LEAN
+
+    x, hashes = np.stack([0.09 * np.arange(12), np.full(12, 0.5)], axis=1), set()
+    for settings in (LEAN, UNSEARCHED, BRIEF):
+        monkeypatch.setattr(build, "_passes", lambda *_, settings=settings: settings)
+        w = world(tv.Particles(x, velocity=x * (9, 0) - (5, 3), radius=0.01), [tv.Gravity(), rods[1].copy(), rods[3].copy()])
+        w.run(0.2)
+        hashes.add(w.hash())
+    assert len(hashes) == 1
+
+
 def test_who_waits_is_told_what_for(world, monkeypatch):
     # On a terminal, a line while LLVM works; afterwards explain() says how long it took, and what for. All times add up.
     shown = io.StringIO()

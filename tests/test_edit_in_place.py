@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
-from tiverlet.device import runtime
+from tiverlet.device import runtime, ti
 from tiverlet.device.patches import patched
 from tiverlet.step import edit_in_place
 
@@ -72,6 +72,37 @@ def crowd():
     return w, lambda k, turn: tv.Particles(drops(k, 19 + turn).position, velocity=(0.2, -20.0), radius=RADIUS)
 
 
+@ti.func
+def hill(p):
+    """Waves of the ground."""
+    return p[1] + 0.1 * ti.cos(p[0])
+
+
+@ti.func
+def near(r):
+    """What ends at a distance."""
+    return 0.02 * r * (0.25 - r.dot(r))
+
+
+@ti.func
+def numbered(r, i, j):
+    """What depends on who they are."""
+    return 1e-3 * (i - j) * r
+
+
+def charges():
+    """Discs that push each other, near ones and all, over a hill that is a function, without a Contact."""
+    features = [tv.Gravity(), tv.Sdf(hill, friction=0.2), tv.PairForce(near, 0.5), tv.PairForce(numbered), tv.Drag(0.5)]
+    return tv.World(tv.Particles(places(40), radius=RADIUS), features, substeps=5), drops
+
+
+def asleep():
+    """Discs on the ground, all of which sleep when the first come."""
+    lying = np.stack([0.25 * np.arange(40) + 0.15, np.full(40, RADIUS)], axis=1)
+    features = [tv.Gravity(), tv.HalfSpace((0, 1), 0.0), tv.Contact(), tv.Sleep(0.05, 0.05), tv.Hand((0.2, 3.0), rate=0.0)]
+    return tv.World(tv.Particles(lying, radius=RADIUS), features, substeps=5), drops
+
+
 def steps_of(w) -> list:
     """A few frames, by all that is seen of them."""
     out = []
@@ -117,7 +148,7 @@ def edited(scene, anew: bool) -> tuple[list, int]:
     return seen, sum(taken)
 
 
-@pytest.mark.parametrize("scene", [discs, grains, beside_a_rope, crowd])
+@pytest.mark.parametrize("scene", [discs, grains, beside_a_rope, crowd, charges, asleep])
 def test_in_place_is_to_the_bit_as_built_anew(scene):
     seen, count = edited(scene, anew=False)
     known, none = edited(scene, anew=True)

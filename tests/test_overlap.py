@@ -19,14 +19,28 @@ def test_overlap_is_what_comparing_all_pairs_finds():
         free = rng.random(n) < 0.8
         pairs, _ = tv.measure.overlapping(x, radius)
         want = bool(free[pairs].any())
-        scene: Any = Some(periodic=None, particles=Some(position=x, radius=radius), inv_mass=free * 2.0)
+        state = Some(double=True, compensated=False)
+        scene: Any = Some(periodic=None, particles=Some(position=x, radius=radius), inv_mass=free * 2.0, state=state)
         assert overlapping(scene, []) == want
         seen[want] += 1
     assert min(seen) > 30
 
 
+def test_what_rounding_makes_overlap_is_known_too(world):
+    """0.1 k in f32: neighbours at 0.1 m are 0.3 - 0.2 > 0.1 or 0.4 - 0.3 < 0.1 apart. So frames are compiled once."""
+    row = np.stack([np.arange(5) * 0.1, np.zeros(5)], axis=1)
+    apart = np.diff(row[:, 0].astype(np.float32))
+    assert min(apart) < np.float32(0.05) * 2 <= max(apart)
+    w = world(tv.Particles(row, radius=0.05), [tv.Contact()])
+    assert "Contact.shrunk" in w.fields
+    step = w._runner.step
+    assert w.step(1e-3).clean and w._runner.step is step
+    wide = world(tv.Particles(row * 1.001, radius=0.05), [tv.Contact()])
+    assert "Contact.shrunk" not in wide.fields
+
+
 def test_only_scenes_that_start_with_overlap_have_the_field_for_it(world):
-    x = np.array([[0.0, 0.0], [0.19, 0.0], [0.5, 0.0], [0.7, 0.0]])
+    x = np.array([[0.0, 0.0], [0.19, 0.0], [0.5, 0.0], [0.75, 0.0]])
     for features, start, want in (
         ([tv.Contact()], x, True),
         ([tv.Contact(), tv.Distance([[1, 0]])], x, False),  # linked

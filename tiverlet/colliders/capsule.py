@@ -33,6 +33,7 @@ class Capsule(Collider):
     to where it meets the surface (sphere tracing, Hart 1996). Nothing can be drawn through either.
     """
 
+    bulk = 0.6
     a, b = _end("a"), _end("b")
     radius = Knob(lambda f, v: checks.number("Capsule", "radius", v, above=0.0), "Of the rod [m].", device="size")
 
@@ -124,28 +125,36 @@ class Capsule(Collider):
     def confine(self, i, radius, h, frame_fraction, turn):
         """The surface where it was met, or where it is nearest."""
         a, b = self.dev.a.at(frame_fraction[1]), self.dev.b.at(frame_fraction[1])
+        a_moved, b_moved = self.dev.a.step(frame_fraction), self.dev.b.step(frame_fraction)
         middle, contact_distance = (a + b) / 2, ti.cast(self.radius, self.dev.real) + radius
         x = self.dev.state.around(self.dev.state.place(i), middle)
         t, length, n = self.nearest(x, a, b)
         depth = contact_distance - length
-        moved = self.dev.a.step(frame_fraction) * (1 - t) + self.dev.b.step(frame_fraction) * t
+        moved = a_moved * (1 - t) + b_moved * t
         d = self.dev.surface.path(i, moved)
-        if (self.dev.a.step(frame_fraction) != self.dev.b.step(frame_fraction)).any():
+        if (a_moved != b_moved).any():
             d = x - self.along(x - self.dev.surface.path(i, 0 * x), a, b, frame_fraction)
         way = d.norm()
-        _t, gap, _n = self.nearest(x - d, a, b)  # not twice the same name: Taichi would assign a vector to a number
-        gap -= contact_distance
-        start_depth = -gap
-        # It was outside, or touched, and may have come in: walk along the path, never further than the surface is away.
-        if gap > -TOUCH * contact_distance and gap < way:
-            s = ti.max(gap, 0) / way
-            for k in range(MARCH):
-                if s < 1:
-                    _t, gap, _n = self.nearest(x - (1 - s) * d, a, b)
-                    s += ti.max(gap - contact_distance, 0) / way
-            depth = 0 * depth
-            if s < 1:
-                _t, _gap, n = self.nearest(x - (1 - s) * d, a, b)
-                depth = (s - 1) * d.dot(n)
-        if not self.dev.surface.lets_through(i, n, start_depth, contact_distance):
-            self.dev.surface.press(i, depth, start_depth, n, moved, h, turn)
+        # Else its path begins further from the rod than it is long, whatever is rounded.
+        if depth + 2 * way > -TOUCH * (abs(a).sum() + abs(b).sum() + abs(x).sum() + contact_distance):
+            s, start_depth, k = 0 * length, 0 * length, 0
+            # If it was outside, or touched, it may have come in: walk along the path, never further than the surface is away.
+            while k < MARCH + 2:
+                _t, distance, m = self.nearest(x - (1 - s) * d, a, b)
+                gap = distance - contact_distance
+                if k == 0:
+                    start_depth = -gap
+                    if gap <= -TOUCH * contact_distance or gap >= way:
+                        k = MARCH + 2
+                if k < MARCH + 2:
+                    further = s
+                    if k <= MARCH:
+                        further += ti.max(gap, 0) / way
+                    k += 1
+                    if not (further < 1) or further == s:  # past the end, or where the surface is
+                        k, depth = MARCH + 2, 0 * depth
+                        if further < 1:
+                            n, depth = m, (s - 1) * d.dot(m)
+                    s = further
+            if not self.dev.surface.lets_through(i, n, start_depth, contact_distance):
+                self.dev.surface.press(i, depth, start_depth, n, moved, h, turn)

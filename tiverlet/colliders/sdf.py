@@ -10,7 +10,6 @@ from ..device import runtime, ti
 from ..device.language import is_kernel_function, undecorated
 from ..device.patches.compiler import Compiler
 from ..features.feature import Scene
-from ..features.regrouping import Regrouping
 from ..particles import Particles
 from ..tools import golden
 from .moving import Moving
@@ -65,6 +64,15 @@ class Sdf(Moving):
         """Check the dimension, and refuse a function that is not finite, or not a distance, around the particles."""
         vars(self.dev).pop("probe", None)  # it may be of an earlier start of Taichi
         Moving.prepare(self, particles, inv_mass)
+        self._try_around(particles)
+
+    def check_added(self, particles: Particles, first: int) -> None:
+        """The same around particles that come in place; else prepare() has done it."""
+        if self.scene is not None and first < particles.count:
+            self._try_around(particles)
+
+    def _try_around(self, particles: Particles) -> None:
+        """Evaluate the function where particles are, and around."""
         x = particles.position
         if not len(x):
             return
@@ -98,10 +106,6 @@ class Sdf(Moving):
                 raise ValueError(
                     f"Sdf: gradient is off by {off[k]:.3g} at {_at(points[k])}, compared with differences of function."
                 )
-
-    def can_regroup(self, change: Regrouping) -> bool:
-        """No: the function is tried around all particles."""
-        return False
 
     def outline(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
         """Where the surface meets the plane of a 2D scene, or the three planes through the middle of a 3D one."""

@@ -103,10 +103,10 @@ class Pin(Anchored):
         if self.soft:
             memory.write(self.dev.lam, np.zeros_like(here))
             self.dev.spring.begin(self.compliance, self.damping)
+            self.dev.size.set(self.start.size)
         memory.write(self.dev.members, self.indices)
         memory.write(self.dev.source, here)
         memory.write(self.dev.target, here)
-        self.dev.size.set(self.start.size)
 
     def select(self, some: np.ndarray, number: np.ndarray) -> None:
         """Keep some, by their new numbers."""

@@ -119,7 +119,7 @@ class Contact(PairContact):
             return not bool((now.radius > 0).any())
         alike = self.table.can_be(change.before.group, now.group)
         splits = dev.splitting.can_regroup(dev.list.team.piece_of(now.count))
-        return alike and splits and bool((now.radius > 0).any()) and dev.search.can_regroup(change)
+        return alike and splits and bool((now.radius > 0).any()) and dev.search.can_regroup(change, now.radius)
 
     def regroup(self, change: Regrouping) -> None:
         """They came and went, and the team knows."""
@@ -128,7 +128,7 @@ class Contact(PairContact):
         dev, n = self.dev, change.now.count
         self._measure(change.now.radius)
         self.table.regroup(self.scene, change.now.group)
-        dev.search.regroup(change, self._listed)
+        dev.search.regroup(change, self._listed, change.now.radius)
         dev.splitting.regroup(n)
         dev.projection.regroup(n, dev.list.team)
 

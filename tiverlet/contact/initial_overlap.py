@@ -5,6 +5,7 @@ from itertools import product
 import numpy as np
 
 from ..features.feature import Batch, Scene
+from ..particles import State
 
 FEW = 1_000_000  # pairs that are looked at one by one
 MANY = 20_000  # particles for which it is not worth the time
@@ -12,8 +13,11 @@ CROWD = 16  # in a cell, likewise
 
 
 def overlapping(scene: Scene, batches: list[Batch], first: int = 0) -> bool | None:
-    """Whether discs or spheres overlap, one of them free to move and one of them from number `first` on, by more than what f32
-    rounds; what is linked never touches. None where finding out would take long.
+    """Whether discs or spheres overlap, one of them free to move and one of them from number `first` on; what is linked never
+    touches. None where finding out would take long.
+
+    From 0 on all that the device will see counts, with what it rounds, for that is what a world is compiled for; else what f32
+    rounds does not.
     """
     x, radius, free = scene.particles.position, scene.particles.radius, scene.inv_mass > 0
     count, number = len(x), np.arange(len(x))
@@ -22,17 +26,35 @@ def overlapping(scene: Scene, batches: list[Batch], first: int = 0) -> bool | No
         radius, free = radius[number], free[number]
     close = 2.0**-20 * float(np.abs(x).max(initial=0.0) + radius.max(initial=0.0))
     begin = first if len(x) == count else 0
-    pairs = _by_all(x, radius, begin) if (len(x) - begin) * len(x) <= FEW else _by_cells(x, radius)
+    wide = radius + (0.0 if first else close / 2)  # what only rounding may have overlap is looked at, too
+    pairs = _by_all(x, wide, begin) if (len(x) - begin) * len(x) <= FEW else _by_cells(x, wide)
     if pairs is None:
         return None
     i, j = pairs[(number[pairs] >= first).any(axis=1)].T
-    near = ((x[i] - x[j]) ** 2).sum(axis=1) < np.maximum(radius[i] + radius[j] - close, 0) ** 2
+    if first:
+        near = ((x[i] - x[j]) ** 2).sum(axis=1) < np.maximum(radius[i] + radius[j] - close, 0) ** 2
+    else:
+        near = _meet(scene.state, x, radius, i, j)
     pairs = number[np.stack([i, j], axis=1)[near & (free[i] | free[j])]]
     if not len(pairs):
         return False
     linked = np.concatenate([*(b.excluded_pairs(b.start) for b in batches), pairs[:0]])
     some, without = (np.sort(p, axis=1).astype(np.int64) @ [count, 1] for p in (pairs, linked))
     return not np.isin(some, without).all()
+
+
+def _meet(state: State, x: np.ndarray, radius: np.ndarray, i: np.ndarray, j: np.ndarray) -> np.ndarray:
+    """Which pairs overlap as the device works it out, see NarrowPhase.overlap()."""
+    real = np.float64 if state.double else np.float32
+    high, r = x.astype(real), radius.astype(real)
+    apart = high[i] - high[j]
+    if state.compensated:
+        low = (x - high).astype(real)
+        apart += low[i] - low[j]
+    square, reach = apart[:, 0] * apart[:, 0], r[i] + r[j]
+    for k in range(1, x.shape[1]):
+        square += apart[:, k] * apart[:, k]
+    return (square < reach * reach) & (np.sqrt(square) < reach)
 
 
 def _by_all(x: np.ndarray, radius: np.ndarray, first: int) -> np.ndarray:

@@ -9,6 +9,7 @@ import contextlib
 import mmap
 import weakref
 from collections import Counter
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from .language import ti
 from .layout import Declared, Layout
 from .number import Number
 from .patches import patched
-from .patches.compiler import Compiler
+from .patches.compiler import LEAN, Compiler
 
 GROUP = 16  # fields that one transfer kernel serves; Taichi unrolls the loop over them
 
@@ -28,21 +29,21 @@ GROUP = 16  # fields that one transfer kernel serves; Taichi unrolls the loop ov
 class Memory:
     """The fields of one world: declared first, then placed together, freed together.
 
-    `real` is ti.f32 or ti.f64; few: whether the world has few particles, long: whether its kernels are, often: whether they run
-    often, see Compiler. copies: where there are many of the world; what is written, read, kept and put back is then that of the
-    chosen one, or of all. Every method that touches the fields checks first that they still exist.
+    `real` is ti.f32 or ti.f64; few: whether the world has few particles, passes: of its kernels, see Compiler. copies:
+    where there are many of the world; what is written, read, kept and put back is then that of the chosen one, or of all. Every
+    method that touches the fields checks first that they still exist.
     """
 
     kernels_read = ("real",)
 
     def __init__(
-        self, real, few: bool = False, long: bool = False, often: bool = False, compiler: Compiler | None = None,
+        self, real, few: bool = False, passes: Mapping[str, Any] = LEAN, compiler: Compiler | None = None,
         copies: Copies | None = None,
     ):  # fmt: skip
         if not patched:  # whose fields need a place once they are made
             layout.check_trees()
         self.real, self.copies = real, copies
-        self.compiler = compiler or Compiler(real, few, long, often)
+        self.compiler = compiler or Compiler(real, few, passes)
         self.entries: list[Entry] = []
         self._at: dict[int, int] = {}  # by the ids of fields: which entry they are
         self._named: Counter[str] = Counter()

@@ -9,6 +9,7 @@ from ..device import inline, ti
 from ..device.language import undecorated
 from ..device.number import OnDevice
 from ..features.feature import Acceleration, Scene
+from ..features.regrouping import Regrouping
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
 from .force import check_function, check_vector
@@ -86,10 +87,24 @@ class PairForce(Acceleration):
         dev.search = dev.list = None
         if self.radius is not None:
             dev.cutoff = Cutoff(scene, self.radius)
-            none, half = np.zeros((0, 2), dtype=np.int32), np.full(scene.particles.count, self.radius / 2)
+            none, half = np.zeros((0, 2), dtype=np.int32), self._half(scene.particles.count)
             dev.search = NeighbourSearch(scene, SKIN * self.radius, none, dev.cutoff, [], team, dev.last, radius=half)
             dev.list = dev.search.list
         return dev.search
+
+    def _half(self, count: int) -> np.ndarray:
+        """What lists take for the radii of so many particles [m]."""
+        return np.full(count, self.radius / 2)  # type: ignore[operator]
+
+    def can_regroup(self, change: Regrouping) -> bool:
+        """Whether particles can come and go: not while its list is about to be made longer."""
+        search = self.dev.search
+        return search is None or (not search.list.saved and search.can_regroup(change, self._half(change.now.count)))
+
+    def regroup(self, change: Regrouping) -> None:
+        """They came and went, and the team knows."""
+        if self.dev.search:
+            self.dev.search.regroup(change, SKIN * self.radius, self._half(change.now.count))  # type: ignore[operator]
 
     def kept_mask(self, number: np.ndarray) -> tuple[np.ndarray, ...]:
         """Its fields are those of the particles."""

@@ -25,7 +25,7 @@ from .neighbour_list import MOVED, STALE, NeighbourList, PairData
 if TYPE_CHECKING:
     from ..features.feature import Scene
 
-APPEND, COUNT, FILL = range(3)  # what a scan of the cells around a particle does with the neighbours that it finds
+COUNT, FILL = range(2)  # what a scan of the cells around a particle does with the neighbours that it finds
 
 
 class NeighbourSearch:
@@ -99,19 +99,18 @@ class NeighbourSearch:
         """Parts of the list of n particles."""
         return max(1, -(-n // self.team.piece)) if self.team.size > 1 and not self.counts else 1
 
-    def can_regroup(self, change: Regrouping) -> bool:
-        """Whether particles can come and go where it is; its reach is 0, and its radii are theirs."""
-        radius, n = change.now.radius, change.now.count
-        store = self.list.store
+    def can_regroup(self, change: Regrouping, radius: np.ndarray) -> bool:
+        """Whether particles can come and go where it is; its reach is 0. radius: as many as there are now [m]."""
+        n, store = change.now.count, self.list.store
         room = store is not None and store.holds(self.list.room + (self.list.short + 1) * (n + 1))
         static = bool((change.inv_mass == 0).any()) == self.has_static
         return room and static and not self.team.launched and self.cells.can_regroup(radius, 0 * radius)
 
-    def regroup(self, change: Regrouping, skin: float) -> None:
+    def regroup(self, change: Regrouping, skin: float, radius: np.ndarray) -> None:
         """They came and went, and the team knows. The list stays, but for pairs of what went, unless it is another one that
         would be built now; what came is on no list, as a stray is that has gone far. Where the old list is saved, what pairs
         remember is to be given to the next list by restore()."""
-        radius, n, stale = change.now.radius, change.now.count, int(self.memory.seen(self.list.stale)[0])
+        n, stale = change.now.count, int(self.memory.seen(self.list.stale)[0])
         if change.goes and not self.list.saved:
             self.list.drop(change.number)
             self.cells.drop(change.number)
@@ -192,7 +191,7 @@ class NeighbourSearch:
         for i in range(block * size, ti.min((block + 1) * size, self.n)):
             self.list.first[i] = start + ti.min(used, room)
             begin = used
-            used = self.scan(i, APPEND, start, ti.min(used, MOST))
+            used = self.scan(i, FILL, start, ti.min(used, MOST))
             self.list.number[i] = ti.max(ti.min(used, room) - begin, 0)
         for i in range(block * size, ti.min((block + 1) * size, self.n)):
             self.finish(i)
@@ -205,9 +204,33 @@ class NeighbourSearch:
         for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
             self.list.number[i] = 0
         self.team.wait()
+        if ti.static(self.team.launched):  # where loops are at the top of a kernel, or serial
+            self.scan_all(COUNT, thread)
+            self.make_room(thread)
+            self.scan_all(FILL, thread)
+        else:
+            for what in range(FILL + 1):  # the code of it is there once
+                self.scan_all(what, thread)
+                if what == COUNT:
+                    self.make_room(thread)
         for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
-            add_to(self.list.number, i, self.scan(i, COUNT, 0, 0), self.serial)
+            self.finish(i)
+
+    @ti.func
+    def scan_all(self, what: ti.template(), thread):  # type: ignore[valid-type]
+        """COUNT the neighbours of every particle, or FILL its list."""
+        for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
+            if what == COUNT or self.list.need[None] <= self.list.capacity:
+                used = self.scan(i, what, self.list.first[i], 0)
+                if what == COUNT:
+                    add_to(self.list.number, i, used, self.serial)
+                elif ti.static(not self.several_levels):
+                    self.list.number[i] = used
         self.team.wait()
+
+    @ti.func
+    def make_room(self, thread):
+        """Where each list begins, by how many neighbours were counted."""
         for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
             self.list.first[i] = self.list.number[i]
         self.team.wait()
@@ -220,14 +243,6 @@ class NeighbourSearch:
             self.list.first[i] = self.list.first[i] - self.list.number[i]
             self.list.number[i] = 0
         self.team.wait()
-        for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
-            if self.list.need[None] <= self.list.capacity:
-                used = self.scan(i, FILL, self.list.first[i], 0)
-                if ti.static(not self.several_levels):
-                    self.list.number[i] = used
-        self.team.wait()
-        for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
-            self.finish(i)
 
     @ti.func
     def finish(self, i):
@@ -238,7 +253,7 @@ class NeighbourSearch:
     @ti.func
     def scan(self, i, what: ti.template(), start, used):  # type: ignore[valid-type]
         """Look for neighbours in the cells around particle i, at its own level and the coarser ones. Its list begins at `start`
-        and has `used` entries; returns how many it has then."""
+        and has `used` entries; returns how many it has then. what: COUNT or FILL, where they are counted first."""
         own = self.cells.level_of(i)
         for m in range(own + 1):
             cell = self.cells.cell_of(i, m)
@@ -249,29 +264,27 @@ class NeighbourSearch:
                     for e in range(self.cells.edge[b + 1], self.cells.edge[b + span + 1]):
                         j = self.cells.sorted[e]
                         listed = self.listed(i, j, self.cells.apart(i, e))
-                        if ti.static(what == APPEND):
+                        if ti.static(not self.counts):
                             # No branch: it would be taken at random. What is not listed is written over by the next.
                             self.list.neighbour[start + ti.min(used, self.list.capacity)] = j
-                            used += listed
-                        elif ti.static(what == COUNT):
-                            used += listed
-                            if ti.static(self.several_levels):
-                                if m < own and listed != 0:
-                                    add_to(self.list.number, j, 1, self.serial)
-                        elif listed != 0:
-                            at = used
+                        elif (what != COUNT or m < own) and listed != 0:
+                            at, theirs = used, 0
                             if ti.static(self.several_levels):  # others write to this list, too
-                                at = add_to(self.list.number, i, 1, self.serial)
                                 if m < own:
-                                    self.list.neighbour[self.list.first[j] + add_to(self.list.number, j, 1, self.serial)] = i
-                            self.list.neighbour[start + at] = j
-                            used += 1
+                                    theirs = add_to(self.list.number, j, 1, self.serial)
+                                if what != COUNT:
+                                    at = add_to(self.list.number, i, 1, self.serial)
+                                    if m < own:
+                                        self.list.neighbour[self.list.first[j] + theirs] = i
+                            if what != COUNT:
+                                self.list.neighbour[start + at] = j
+                        used += listed
         for old in range(self.list.old_first[i], self.list.old_first[i] + self.list.old_number[i]):
             j = self.list.old_neighbour[old]
             if self.listed(i, j, self.state.apart(i, j)) == 0:
-                if ti.static(what == APPEND):
+                if ti.static(not self.counts):
                     self.list.neighbour[start + ti.min(used, self.list.capacity)] = j
-                elif ti.static(what == FILL):
+                elif what != COUNT:
                     at = used
                     if ti.static(self.several_levels):
                         at = add_to(self.list.number, i, 1, self.serial)

@@ -1,6 +1,6 @@
 """Building a world: what of its scene exists on the device, and in which order it comes to be."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -10,7 +10,7 @@ from ..contact.pair_contact import PairContact
 from ..device import runtime, ti
 from ..device.copies import Copies
 from ..device.memory import Memory
-from ..device.patches.compiler import FEW
+from ..device.patches.compiler import BRIEF, FEW, LEAN, UNSEARCHED
 from ..device.thread_team import PIECES, Team, size_of
 from ..features.feature import Acceleration, Batch, Feature, Scene
 from ..features.learning import OwnWeight
@@ -40,10 +40,12 @@ ROOM = {True: (6.5, 14), False: (12, 32)}
 # pile, 0.122 and 0.136 ms with 500 discs, 0.169 and 0.170 with 1000, 0.50 and 0.37 with 4000; of 20 substeps of cloth with 225
 # particles (1200 with constraints) 0.55 and 0.35; of ropes with 205 (405) 0.18 and 0.18, with 820 (1620) 0.64 and 0.40.
 CROSSOVER = 1000
-# Kernels of so many times the code of a Distance in 2D are long. A hundred figures on stairs (13) took 13 to 17 s to compile when
-# Taichi simplified them and 5 s without, and frames took as long; discs, ropes and soft balls (6) 9.5 and 3.8 s, but frames a
-# fifth more.
-LONG = 10.0
+# Kernels of so many times the code of a Distance in 2D are long, or endless. A hundred figures on stairs (13) took 13 to 17 s to
+# compile when Taichi simplified them and 5 s without, and frames took as long; discs, ropes and soft balls (6) 8.2 and 2.5 s, but
+# frames a tenth more, and 3.1 s without its search for equal expressions. So did an hourglass (6): 6.5 s, 3.0 s without that,
+# which frames take 1 to 3 % more for. In a pile, which compiles in 1.9 s, they would take 8 % more.
+LONG, ENDLESS = 5.5, 10.0
+MANY = 4 * FEW  # particles from which frames take so long that the search pays for long kernels
 # So many copies of a world run its kernels so often that those which are not middling are simplified, though the world is small:
 # frames of a double pendulum (1.3) take 8 to 13 % less, of 100 discs (3.6) 5 to 17 %, of discs, ropes and soft balls (6) 5 %, and
 # compile in 0.6 s, 0.7 to 1.4 s, and 7 to 14 s more.
@@ -105,9 +107,8 @@ def assemble(
     now = Scale(len(particles), len(particles) + sum(f.count for f in features if isinstance(f, Batch)))
     scale = scale if scale and scale.holds(now) else now
     path = _chosen(path, scale) if order == 2 and not copies else "fused"
-    bulk = sum({type(f): f.bulk for f in features}.values()) * (1.5 if particles.dim == 3 else 1.0)
-    often = copies is not None and copies.count >= COPIES and bulk < MIDDLING
-    memory = Memory(PRECISIONS[precision], scale.particles < FEW, bulk > LONG, often, copies=copies)
+    few = scale.particles < FEW
+    memory = Memory(PRECISIONS[precision], few, _passes(particles, features, scale, copies), copies=copies)
     try:
         state = State(memory, particles, inv_mass, precision == "f32-compensated")
         if particles.spins:
@@ -118,6 +119,16 @@ def assemble(
         for feature in features:
             feature.scene = None
         raise
+
+
+def _passes(particles: Particles, features: tuple[Feature, ...], scale: Scale, copies: Copies | None) -> Mapping[str, Any]:
+    """Which passes of Taichi's the kernels do without. Of walls, each has code of its own; of other features, each kind."""
+    code = {f if isinstance(f, Collider) else type(f): f.bulk for f in features}
+    bulk = sum(code.values()) * (1.5 if particles.dim == 3 else 1.0)
+    often = copies is not None and copies.count >= COPIES and bulk < MIDDLING
+    if bulk > ENDLESS or (scale.particles < FEW and not often):
+        return BRIEF
+    return UNSEARCHED if bulk > LONG and scale.particles < MANY else LEAN
 
 
 def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, path: str, scale: Scale) -> Assembly:

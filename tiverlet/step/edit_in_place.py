@@ -104,9 +104,9 @@ def grab(world: Any, change: Regrouping) -> None:
     """Do what was asked for."""
     runner = world._runner
     scene = runner.scene
-    alone = max(int((inv_mass == 0).sum()) for inv_mass in (scene.inv_mass, change.inv_mass)) <= 1
+    alone = min(np.count_nonzero(inv_mass) for inv_mass in (scene.inv_mass, change.inv_mass)) >= len(change.inv_mass) - 1
     scene.particles, scene.inv_mass = change.now, change.inv_mass
-    scene.state.regroup(runner.memory, change)
+    scene.state.w.become(runner.memory, change.inv_mass)
     pins = [f for f in world.features if f.afresh]
     if any(f.soft for f in pins):
         scene.slots.grab(runner.memory, change, runner.batches)

@@ -137,10 +137,11 @@ def change(
         return
     with world._runner.memory.compiler():
         told, seen = world._all_events(), _seen(world, number, features)
-        if world._force_waits:
+        if world._force_waits or world._runner.step.has_pair_forces:  # of others than before
             world._runner.restart(world.iterations)
         world._clock.parted = None
         edit_in_place.regroup(world, planned, added)
+        world._runner.wake()
         _edited(world, some, added, told, seen, np.arange(len(features)), False)
 
 

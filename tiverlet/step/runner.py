@@ -84,6 +84,8 @@ class Runner:
         self.n = self.step.n
         self.passes_at_once = self._passes_at_once()
         self.diagnostics.report.regroup()
+        if self.sleep:
+            self.sleep.regroup()
 
     # Frames.
 

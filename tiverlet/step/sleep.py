@@ -10,6 +10,7 @@ from ..device import at, inline, ti
 from ..device.number import OnDevice
 from ..device.thread_team import BLOCK
 from ..features.feature import Batch, Feature, Knob, Scene
+from ..features.regrouping import Regrouping
 from .span import Span
 
 if TYPE_CHECKING:
@@ -60,11 +61,24 @@ class Sleep(Feature):
         self.dev.islands = scene.state.sleepers = Sleepers(scene, self.speed, self.time)
         self.changed = False
 
+    def can_regroup(self, change: Regrouping) -> bool:
+        """Particles can come and go, and all wake then."""
+        return True
+
+    def regroup(self, change: Regrouping) -> None:
+        """They came and went."""
+        self.dev.islands.regroup()
+
     def upload(self) -> None:
         """Write both."""
         islands = self.dev.islands
         islands.time = self.time
         self.scene.memory.write(islands.limits, [self.speed, self.time])
+
+
+def blocks_of(n: int) -> int:
+    """Blocks that n particles are."""
+    return -(-max(1, n) // BLOCK)
 
 
 class Sleepers:
@@ -81,13 +95,13 @@ class Sleepers:
     pull: Any
 
     def __init__(self, scene: Scene, speed: float, time: float):
-        n, add = scene.particles.count, scene.memory.field
-        self.scene, self.n, self.time = scene, scene.count, time
+        n, add = scene.count, scene.memory.field
+        self.scene, self.n, self.time = scene, n, time
         self.asleep = add("Sleep.asleep", n, kind=ti.i32, state=True)
         self.still = add("Sleep.still", n, state=True)
         self.island = add("Sleep.island", n, kind=ti.i32, state=True)
         self.count = add("Sleep.count", None, kind=ti.i32, state=True)
-        self.blocks = add("Sleep.blocks", -(-max(1, n) // BLOCK), kind=ti.i32, values=1)
+        self.blocks = add("Sleep.blocks", blocks_of(scene.particles.count), kind=ti.i32, values=1)
         self.called = add("Sleep.called", n, kind=ti.i32)
         self.calls = add("Sleep.calls", None, kind=ti.i32)
         self.limits = add("Sleep.limits", None, width=2, values=[speed, time])
@@ -139,11 +153,16 @@ class Sleepers:
         memory.write(self.still, still)
         self.review()
 
+    def regroup(self) -> None:
+        """Particles came and went."""
+        self.scene.memory.resize(self.blocks, blocks_of(self.scene.particles.count))
+        self.review()
+
     def review(self) -> None:
         """Note how many sleep, and of which blocks all do."""
         memory, n = self.scene.memory, self.scene.particles.count
         asleep = memory.read(self.asleep)
-        padded = np.zeros(-(-max(1, n) // BLOCK) * BLOCK, dtype=asleep.dtype)
+        padded = np.zeros(blocks_of(n) * BLOCK, dtype=asleep.dtype)
         padded[:n] = asleep[:n] == 0
         memory.write(self.blocks, padded.reshape(-1, BLOCK).any(axis=1))
         memory.write(self.count, int((asleep[:n] != 0).sum()))
@@ -166,7 +185,7 @@ class SleepPass:
         self.sleepers, self.state, self.n, self.real = sleepers, step.state, step.scene.count, step.real
         self.contacts, self.forces = step.contacts, step.integrator.forces
         self.watches = any(not f.uniform for f in self.forces.all)
-        memory, n = step.scene.memory, step.scene.particles.count
+        memory, n = step.scene.memory, step.scene.count
         kept, pairs = linked(step.scene.inv_mass, drivers, batches, step.contacts)
         self.restless = memory.field("Sleep.restless", n, kind=ti.i32)  # by islands, while they are found
         self.kept_awake = memory.field("Sleep.kept_awake", n, kind=ti.i32, values=kept)
@@ -174,12 +193,16 @@ class SleepPass:
         self.pairs = memory.field("Sleep.links", len(pairs), width=2, kind=ti.i32, values=pairs)
         if self.watches:
             sleepers.pull = memory.field("Sleep.pull", n, width=step.dim, state=True)
-        # What is driven goes on, and what cannot move keeps turning, where orientations are asked for.
-        turns = step.orients and bool((step.scene.inv_mass == 0).any())
-        self.sheet, self.rests, self.goes_on = np.zeros(CALLED + 1), False, turns or bool(drivers)
+        self.sheet, self.rests = np.zeros(CALLED + 1), False
+        self.regroup()
 
     def __repr__(self) -> str:
         return "sleep"
+
+    def regroup(self) -> None:
+        """Of the particles that there are: what is driven goes on; what cannot move keeps turning, where that is asked for."""
+        turns = self.step.orients and bool((self.step.scene.inv_mass == 0).any())
+        self.goes_on = turns or bool(self.step.drivers)
 
     def compile(self, clock: "Clock") -> None:
         """Now, so that nobody waits for it later: nothing is ready to sleep yet, and none is called."""

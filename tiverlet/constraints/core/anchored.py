@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def one_each(who: str, indices, count: int = checks.ANY) -> FixedSize:
     """Particles of `count`, each of which has a place."""
     rows = checks.indices(who, "indices", indices, count)
-    if len(np.unique(rows)) < len(rows):
+    if len(rows) > 1 and len(np.unique(rows)) < len(rows):
         values, counts = np.unique(rows, return_counts=True)
         raise ValueError(f"{who}: particle {values[counts > 1][0]} is named twice, and can have only one place.")
     return FixedSize(who, rows[:, None])

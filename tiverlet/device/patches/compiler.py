@@ -13,7 +13,7 @@ one, every launch goes through the door.
 import contextlib
 import gc
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -31,9 +31,12 @@ LEAN = SAFE | {"cfg_optimization": False}  # and no analysis of control flow
 # In small worlds no simplifying either: compiling takes two thirds of the time. Frames with contacts take a tenth more where they
 # take more than the launch, because the address of the fields is looked up again after every store. What Taichi would simplify to
 # other bits (LLVM does not), a power of 1/2 to a root, is to be written so.
-BRIEF = {"advanced_optimization": False}
-SETTINGS = (*LEAN, *BRIEF)
+BRIEF = LEAN | {"advanced_optimization": False}
+# Between the two: simplified, but without a search for equal expressions, which takes most of that time where kernels are long.
+UNSEARCHED = LEAN | {"opt_level": 0}
+SETTINGS = {*BRIEF, *UNSEARCHED}
 FEW = 1000  # particles from which it pays
+MADE = 20_000  # objects; what else is done in between makes fewer, and is looked through as ever
 _INSIDE = contextlib.nullcontext()
 _lock = threading.RLock()  # the type of literals is one for all threads
 
@@ -51,16 +54,13 @@ class Compiler:
 
     real: the type of their literals. Taichi rounds the literal 0.1 to its default type even next to f64 operands; a world of
     precision "f64" (and the user's own functions in it) must not lose half of the digits that way. few: whether they are
-    for fewer than FEW particles. long: whether they are so long that Taichi, which simplifies in a time that grows with the
-    square of their length, would be at it for many seconds. often: whether they run so often that simplifying pays for few
-    particles, too. Kernels compile at their first launch.
+    for fewer than FEW particles. passes: settings of Taichi's, LEAN, UNSEARCHED or BRIEF. Kernels compile at their first launch.
     """
 
-    kernels_read = ("real", "few", "lean", "thorough")
+    kernels_read = ("real", "few", "passes", "thorough")
 
-    def __init__(self, real, few: bool = False, long: bool = False, often: bool = False):
-        self.real, self.few = real, few
-        self.lean = LEAN | BRIEF if (few and not often) or long else LEAN
+    def __init__(self, real, few: bool = False, passes: Mapping[str, Any] = LEAN):
+        self.real, self.few, self.passes = real, few, passes
         self.thorough = not lean  # once and for all, since what Taichi fails to compile may be tried again
         self.config: Any = None  # of Taichi, while kernels compile
         self._host: bool | None = None  # whether they are for the host, once that is asked: Taichi takes 6 us to say so
@@ -93,7 +93,7 @@ class Compiler:
             runtime.set_default_fp(self.real)
             if self._host is None:
                 self._host = str(config.arch) in HOSTS
-            _set(config, self.lean if self._host and not self.thorough else SAFE)
+            _set(config, self.passes if self._host and not self.thorough else SAFE)
             active.append(self)
             self._thread = threading.get_ident()
             self.point()
@@ -113,6 +113,7 @@ class Compiler:
                 runtime.set_default_fp(literals)
                 _set(config, before)
                 if collects:
+                    _pass_over()
                     gc.enable()
 
     def beware(self) -> None:
@@ -184,6 +185,13 @@ class CachedLaunch:
         return context
 
 
-def _set(config, settings: dict[str, Any]) -> None:
+def _pass_over() -> None:
+    """Have Python take what there is for old where a kernel was compiled, most of which stays: looking through it took 50 ms."""
+    if gc.get_count()[0] > MADE and not gc.get_freeze_count():  # or it would thaw what the user froze
+        gc.freeze()
+        gc.unfreeze()
+
+
+def _set(config, settings: Mapping[str, Any]) -> None:
     for name, value in settings.items():
         setattr(config, name, value)

@@ -221,7 +221,7 @@ def _ensured(self: Any, *args: Any) -> Any:
     known = _names_of.setdefault(args[0], {})
     which = (self.func, *features[1:])
     if which not in known:
-        options = (compiler.real, compiler.thorough, tuple(compiler.lean.items()))
+        options = (compiler.real, compiler.thorough, tuple(compiler.passes.items()))
         if args[0] not in _keys_of:
             _keys_of[args[0]] = Writing(args[0]).key
         writing = (self.func, options, features[1:], _keys_of[args[0]])

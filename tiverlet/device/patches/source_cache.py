@@ -13,6 +13,7 @@ import linecache
 import sys
 import textwrap
 import weakref
+from functools import cache
 from types import CodeType, SimpleNamespace
 from typing import Any
 
@@ -22,6 +23,7 @@ from taichi.lang.ast import ASTTransformerContext
 from ..language import HOME, OURS, TAICHI, active
 
 CLOSING = (")", "]", "}")  # what the last lines of a function may begin with that are not in its code
+PLAIN = ("ctx", "op", "ops", "id", "attr", "arg", "name", "names", "type_comment")  # what nodes have that is no node of a tree
 NOTHING = 8  # bytes of code of a function that has nothing but a docstring
 _lines: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()  # of functions, as inspect finds them
 _trees: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()  # of functions: those that are not in use
@@ -101,13 +103,33 @@ def _transformed(tree: Any, ctx: Any) -> Any:
     out = _transform(tree, ctx)
     if active and not ctx.is_kernel and not ctx.is_real_function:
         if not hasattr(tree, "nodes"):
-            tree.nodes = [node for node in ast.walk(tree) if not isinstance(node, ast.expr_context)]
+            tree.nodes = _nodes(tree)
             tree.source = {"src": ctx.src, "start_lineno": ctx.lineno_offset + 1, "file": ctx.file}
         for node in tree.nodes:
             node.__dict__.pop("ptr", None)
             node.__dict__.pop("caller", None)
         _trees.setdefault(ctx.func.func, []).append(tree)
     return out
+
+
+@cache
+def _inside(kind: type) -> tuple[str, ...]:
+    """Where nodes of a kind have others, and not a text, a number or the name of an operation."""
+    return () if kind is ast.Constant else tuple(name for name in kind._fields if name not in PLAIN)  # type: ignore[attr-defined]
+
+
+def _nodes(tree: Any) -> list[Any]:
+    """The nodes of a tree that come to something; ast.walk takes twice the time."""
+    nodes = [tree]
+    for node in nodes:
+        known = node.__dict__
+        for name in _inside(type(node)):
+            value = known[name]
+            if type(value) is list:
+                nodes += [one for one in value if isinstance(one, ast.AST)]
+            elif isinstance(value, ast.AST):
+                nodes.append(value)
+    return nodes
 
 
 def _in_class(level_of_class_stackframe: int) -> bool:
