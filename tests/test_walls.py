@@ -309,3 +309,13 @@ def test_what_is_moved_between_substeps_stays_outside_too(world, name, dim):
     assert outside(w.position).min() > 0.01 - 1e-6
     assert np.abs(np.linalg.norm(w.position[k] - w.position[k + len(k)], axis=1) - 0.15).max() < 1e-3
     assert report.energy < 1e-3  # of particles of 1 kg without forces, so none is faster than 0.045 m/s
+
+
+def test_what_comes_near_a_rod_does_not_touch_it(world):
+    # A ball that flies 10 cm along a rod and 2 cm towards it, to 3 cm above it, has not met it yet.
+    rod = tv.Capsule((-1.0, 0.0), (1.0, 0.0), 0.1, restitution=0.8, friction=0.5)
+    start, v, h = np.array([[0.0, 0.25]]), np.array([[6.0, -1.2]]), 1 / 60
+    w = world(tv.Particles(start, velocity=v, radius=0.1), [rod], substeps=1, precision="f64")
+    w.step(h)
+    np.testing.assert_allclose(w.position, start + h * v, atol=1e-12)
+    np.testing.assert_allclose(w.velocity, v, atol=1e-12)

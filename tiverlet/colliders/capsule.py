@@ -152,7 +152,7 @@ class Capsule(Collider):
                         further += ti.max(gap, 0) / way
                     k += 1
                     if not (further < 1) or further == s:  # past the end, or where the surface is
-                        k, depth = MARCH + 2, 0 * depth
+                        k, depth = MARCH + 2, ti.min(depth, 0)
                         if further < 1:
                             n, depth = m, (s - 1) * d.dot(m)
                     s = further
