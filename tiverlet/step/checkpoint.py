@@ -150,6 +150,7 @@ def transfer(old: "World", new: "World") -> None:
     kept = keep(old)
     if new._precision == old._precision and new._order == old._order:
         install(new, kept, flags(old))
+        new._runner.scene.h2_effective = old._runner.scene.h2_effective  # by which loads are known
         return
     ours, theirs = new._clock, old._clock
     ours.time, ours.tick, ours.since, ours.frame = theirs.time, theirs.tick, theirs.since, theirs.frame
