@@ -166,9 +166,9 @@ class Polygons(PairContact):
         return self.dev.geometry.held_by(j)
 
     @ti.func
-    def reached(self, i, e):
+    def reached(self, i, e, margin):
         """Who sleeps at entry e of the list of particle i and is touched by it, as was found last; if it is driven, also who was
-        in the substep before."""
+        in the substep before. Edges know no margin."""
         j, out = self.dev.list.neighbour[e], -1
         for role in range(self.dev.geometry.roles(i)):
             at, v, a, b, t, part = self.dev.geometry.participants(i, e, role)
