@@ -110,6 +110,9 @@ def install(world: "World", kept: Checkpoint, flagged: list[list[bool]]) -> None
     """Give a world that was just built the state of another one of the same scene, knobs and precision, bit for bit."""
     world._upload()
     undo(world, kept, flagged)
+    for k, f in enumerate(world.features):
+        if isinstance(f, Scalar) and f.waits and f"{RESTS}{k}" not in kept.values:  # no rest value was on its way there
+            f.arrive()
 
 
 def check(world: "World", kept: Checkpoint, flagged: list[list[bool]]) -> None:
