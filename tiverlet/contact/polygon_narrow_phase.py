@@ -262,6 +262,9 @@ class PolygonGeometry:
                 front = self.corner(i, j)
                 if self.after(j) >= 0:
                     overlap, n, t = self.edge(i, j, front, moved)
+                    if overlap > 0:
+                        if self.find(i, self.after(j)) < 0:
+                            overlap = -overlap  # the edge is so long that its end knows nothing of i: momentum would be lost
                 if overlap <= 0 and front > 0 and self.keeps(i, j):
                     overlap, n = self.discs.overlap(i, j, self.radius.of(i) + self.radius.of(j))
                     if overlap > 0:
