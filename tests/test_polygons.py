@@ -245,8 +245,8 @@ def test_edges_that_are_too_long_keep_momentum(world):
     # Loops that hold nothing together, pulled apart to many times their size: an end of an edge may be too far for the list, and
     # then a vertex must not push the other end alone.
     x = np.stack(np.divmod(np.arange(12), 4)[::-1], axis=1) * 0.3
-    v = [(1.3, -1.3), (6.4, 1.0), (-5.4, 3.6), (13.0, 9.5), (-7.0, -12.7), (-6.2, 0.4), (-23.3, -2.2), (-12.5, -7.3), (-5.4, -3.2),
-         (4.1, 10.4), (-1.3, 13.7), (-6.7, 3.5)]  # fmt: skip
+    v = [(1.3, -1.3), (6.4, 1.0), (-5.4, 3.6), (13.0, 9.5), (-7.0, -12.7), (-6.2, 0.4), (-23.3, -2.2), (-12.5, -7.3),
+         (-5.4, -3.2), (4.1, 10.4), (-1.3, 13.7), (-6.7, 3.5)]  # fmt: skip
     loops = [range(6), range(6, 12)]
     features = [tv.Area([range(12)], pressure=0.5, compliance=1e-3), tv.Polygons(loops, restitution=1.0)]
     w = world(tv.Particles(x, velocity=v, radius=np.tile([0, 0.1], 6)), features, precision="f64")

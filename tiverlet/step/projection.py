@@ -41,10 +41,11 @@ TURNS = 16  # with walls, at most: a link that stands on one halves its violatio
 LARGEST = 300  # corners: outlines of more couple each with each
 
 
-def project(runner: "Runner", h: float, longest: float) -> bool:
+def project(runner: "Runner", h: float, longest: float) -> bool | None:
     """Take out what violations would store; d holds velocities. Nothing happens where they are small, or would overlap.
 
-    h: the coming substep [s]; longest: since this was done last. Returns whether positions have been looked after.
+    h: the coming substep [s]; longest: since this was done last. Returns whether positions have been looked after; None where
+    contacts are in the way.
     """
     ratio = h / longest
     slots = runner.scene.slots
@@ -88,7 +89,8 @@ def project(runner: "Runner", h: float, longest: float) -> bool:
     if deeper > overlap:
         state.put(memory, before)
         memory.write(state.d, kept)
-    elif more > energy:
+        return None
+    if more > energy:
         v[:n] = paid(start.jacobian, v[:n], x - before, more - energy)
         memory.write(state.d, v)
     return True

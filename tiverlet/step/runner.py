@@ -120,7 +120,10 @@ class Runner:
                 self.restart(iterations)
                 if h < clock.longest and not self.probe:
                     released = release(self, h, clock.longest)
-                    if project(self, h, clock.longest) or released:
+                    projected = project(self, h, clock.longest)
+                    if projected is None and not released:  # links and contacts have to move together
+                        released = release(self, h, clock.longest, small=True)
+                    if projected or projected is None or released:
                         clock.longest = h
             if clock.d_is_velocity:
                 clock.since = 0
