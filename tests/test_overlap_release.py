@@ -191,7 +191,7 @@ def test_moves_of_whole_bodies(world, dim):
 
 
 def test_a_bridge_under_a_cart_gains_no_energy(world):
-    # Under "auto": a cart falls onto a truss whose links Jacobi holds. What links are to take back pushes the truss into the wheels,
+    # Under "auto": a cart falls onto a truss whose links Jacobi holds. What links are to take back pushes the truss into wheels,
     # so both have to move together; where they did not, the frame after next had twice the energy of the first, and no flag.
     truss = tv.shapes.bridge((0, 0), (4, 0), panels=12, height=0.4)
     n = len(truss.position)
