@@ -107,11 +107,15 @@ class CGSystem(System):
         self.sums = scene.memory.field("system.sums", None, width=4, kind=ti.f64)
         least = 1.2 * largest(scene, scalars, self.blocks * scene.inv_mass, POWER) / steps**2
         self.least = self.memory.number(least, scene.real)
-        _, self._part = np.unique(components(len(rows), row[free], who[free]), return_inverse=True)
-        count = int(self._part.max(initial=0)) + 1
-        self.part, self.groups = self.ints("part", self._part), self.memory.number(count)
+        _, part = np.unique(components(len(rows), row[free], who[free]), return_inverse=True)
+        self._part_of = np.zeros(scene.particles.count, dtype=np.int32)  # of each particle, from 1 on; 0 for none
+        self._part_of[who[free]] = part[row[free]] + 1
+        self.part, self.lead = self.ints("part", part + 1), self.ints("lead", who[free][order][ends[:-1]])
+        self.part_of = scene.memory.field("system.part_of", scene.count, kind=ti.i32, values=self._part_of)
+        count = int(part.max(initial=0)) + 2
+        self.groups = self.memory.number(count)
         self.strained = self.ints("strained", np.zeros(count, dtype=np.int32))  # parts whose floor is too low
-        self.floor = scene.memory.field("system.floor", count, kind=ti.f64, state=True)
+        self.floor = scene.memory.field("system.floor", scene.count, kind=ti.f64, state=True)  # of its part, for each particle
 
     def vector(self, name: str):
         """A real number for each row."""
@@ -119,10 +123,10 @@ class CGSystem(System):
 
     def forget(self, off: "Sequence[tuple[Batch, np.ndarray]]" = ()) -> None:
         """Steps may converge from the new places, but not where constraints contradict each other there."""
-        floor = np.zeros(int(self._part.max(initial=0)) + 1)
+        floor = np.zeros(len(self._part_of))
         for batch, share in off:
-            rows = self.row(batch)[share > 0]
-            floor[self._part[rows[rows >= 0]]] = HIGHEST
+            some = (share > 0) & (self.row(batch) >= 0)
+            floor[np.isin(self._part_of, self._part_of[batch.indices[some]]) & (self._part_of > 0)] = HIGHEST
         self.memory.write(self.floor, floor)
 
     @ti.func
@@ -132,7 +136,7 @@ class CGSystem(System):
         zero = 0 * violation
         self.step[r] = ti.select(W > 0, ti.cast(0, ti.f64), -ti.cast(lam, ti.f64))
         self.residual[r] = ti.select(W > 0, -violation / A, zero)
-        self.shift[r] = ti.select(W > 0, alpha / A + ti.cast(self.floor[self.part[r]], self.real) * W, zero)
+        self.shift[r] = ti.select(W > 0, alpha / A + ti.cast(self.floor[self.lead[r]], self.real) * W, zero)
         self.inverse_diagonal[r] = ti.select(W > 0, 1 / (W + self.shift[r]), zero)
         self.direction[r] = self.inverse_diagonal[r] * self.residual[r]
 
@@ -180,10 +184,12 @@ class CGSystem(System):
                 if self.rows * ti.cast(self.inverse_diagonal[r] * self.residual[r], ti.f64) * self.residual[r] > share:
                     self.strained[self.part[r]] = 1  # all write the same
         self.team.wait()
+        for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
+            if self.strained[self.part_of[i]] != 0:
+                self.floor[i] = ti.max(self.least, ti.min(GROWTH * self.floor[i], HIGHEST))
+        self.team.wait()
         for p in range(self.team.chunk_begin(self.groups, thread), self.team.chunk_end(self.groups, thread)):
-            if self.strained[p] != 0:
-                self.floor[p] = ti.max(self.least, ti.min(GROWTH * self.floor[p], HIGHEST))
-                self.strained[p] = 0
+            self.strained[p] = 0
         self.team.wait()
 
     @ti.func
