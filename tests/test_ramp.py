@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
+from tiverlet.step import checkpoint
 
 DT, L, M = 1 / 60, 0.5, 0.2
 
@@ -30,6 +31,23 @@ def test_a_link_is_drawn_in_at_the_speed_of_the_frame(world, solver):
         assert report.energy == pytest.approx(M * (length / 9 / DT) ** 2 / 2, rel=1e-9)
         assert w.position[1, 0] == pytest.approx(length, rel=1e-12)
         assert w.step(DT).energy == pytest.approx(0, abs=1e-18) and w.position[1, 0] == pytest.approx(length, rel=1e-12)
+
+
+def test_a_state_before_a_rest_value_was_assigned_knows_of_none(world):
+    # Back at a state in which nothing was on its way, by a knob that was put back meanwhile: the same bits as the first time.
+    link = tv.Distance([[0, 1]], rest=L)
+    w, hashes = pendulum(world, link), []
+    w.step(DT)
+    kept, flagged = checkpoint.keep(w), checkpoint.flags(w)
+    for _ in range(2):
+        w.step(DT)
+        hashes.append(w.hash())
+        link.rest = 0.9 * L
+        w.step(DT)
+        link.rest = L
+        w._adapt()
+        checkpoint.install(w, kept, flagged)
+    assert hashes[0] == hashes[1]
 
 
 def test_a_rope_that_was_drawn_in_is_slack(world):

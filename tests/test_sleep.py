@@ -221,6 +221,23 @@ def test_linked_particles(world, solver):
     assert w.last.asleep == 0 and 1.5 < w.time < 1.65  # when the ball came down: sqrt(2 * 12 / g) = 1.56 s
 
 
+def test_what_is_grazed_wakes_before_its_links_are_solved(world):
+    """A pendulum that would fly past a hanging disc in a substep, but for its link: the disc wakes early enough for its own links
+    to hold it in that substep, too. It hung at rest to rounding, so it goes on as where nothing sleeps."""
+    angle = np.radians(80)
+    x = [(0, 0), (-np.sin(angle), -np.cos(angle)), (0, 1), (0, 0.4), (0, -0.8 - 1e-5)]
+    start = tv.Particles(x, radius=[0.01, 0.1, 0.01, 0.01, 0.1], mass=[1, 1, 1, 0.1, 5], pinned=[0, 2])
+    ends = []
+    for sleep in ([tv.Sleep(0.02, 0.1)], []):
+        w = world(start, [tv.Gravity(), tv.Distance([(0, 1), (2, 3), (3, 4)]), tv.Contact(), *sleep], precision="f64", substeps=8)
+        w.run(0.3)
+        assert w.last.asleep == 2 * len(sleep)
+        w.run(0.3)
+        assert w.last.asleep == 0 and w.velocity[4, 0] > 1e-5
+        ends.append(w.position)
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-9)
+
+
 def test_what_never_sleeps(world):
     """What is linked to what is driven stays awake. A rigid body of discs does not, nor a disc alone."""
     body = heap(4, 4, apart=2.0)

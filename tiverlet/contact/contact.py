@@ -188,7 +188,7 @@ class Contact(PairContact):
     @ti.func
     def presses(self, i, e):
         """Whether particle i presses on the one at entry e of its list, which does on it."""
-        return self.dev.push.field[e] > 0 or self.dev.geometry.push_each_other(i, self.dev.list.neighbour[e])
+        return self.dev.push.field[e] > 0 or self.dev.geometry.push_each_other(i, self.dev.list.neighbour[e], 0)
 
     @ti.func
     def held_by(self, j):
@@ -196,12 +196,12 @@ class Contact(PairContact):
         return j
 
     @ti.func
-    def reached(self, i, e):
-        """The particle at entry e of the list of particle i where it sleeps and i touches it; if i is driven, also where i did as
-        the substep began."""
+    def reached(self, i, e, margin):
+        """The particle at entry e of the list of particle i where it sleeps and i is no further from it than the margin; if i is
+        driven, also where it touched it as the substep began."""
         j, out = self.dev.list.neighbour[e], -1
         if not self.dev.state.awake(j):
-            met = self.dev.geometry.push_each_other(i, j)
+            met = self.dev.geometry.push_each_other(i, j, margin)
             if not self.dev.w.positive(i):
                 r, distance = self.dev.state.apart(i, j) - self.dev.state.d[i], self.dev.geometry.contact_distance(i, j)
                 met = met or r.dot(r) < distance * distance

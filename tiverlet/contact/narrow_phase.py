@@ -193,9 +193,9 @@ class DiscGeometry:
         return out
 
     @ti.func
-    def push_each_other(self, i, j):
-        """Whether particles i and j overlap and push each other."""
-        r, distance = self.state.apart(i, j), self.contact_distance(i, j)
+    def push_each_other(self, i, j, margin):
+        """Whether particles i and j push each other, and overlap or are no further from that than the margin."""
+        r, distance = self.state.apart(i, j), self.contact_distance(i, j) + margin
         return r.dot(r) < distance * distance and self.pushes(i, j) != 0
 
     @ti.func

@@ -19,6 +19,7 @@ STRETCH = 1.25  # of an edge, beyond which a contact in its middle might not be 
 BEYOND = 1 / 4  # of an edge, how far beyond its end a contact may be
 REACH = 1.35  # of an edge, from one end to where a contact may be: (1 + BEYOND, 1 / 2)
 CLOSE = 1e-4  # edges whose distances differ by less are equally near: the first of them counts
+TILT = 1 / 16  # the sine of an angle by which edges that lie on each other may lean, as bodies give way
 TINY = 1e-30
 DISCS = -1  # as a place on an edge: there is no edge, two discs touch
 OVER_EDGE = 1  # what tips_cross() returns where the way out is over the edge of the second corner
@@ -143,13 +144,15 @@ class PolygonGeometry:
                 out, back = contact_distance - height, 0 * r
                 if ti.static(moved):
                     out -= self.allowed[v]
+                if height < 0 and tips != OVER_EDGE:
+                    back = self.inward(v)
+                    came = came and back.dot(n) >= 0
                 if not came:
                     if ti.static(moved):
                         out = ti.min(out, self.push_out * self.h[None] - self.relative(self.state.d, v, a, b, t).dot(n))
-                        back = self.inward(v)
                     if tips == OVER_EDGE:
                         came = True
-                    elif back.dot(n) >= 0 and self.inside(v, a):
+                    elif back.dot(n) >= 0 and self.inside(r + (ti.min(ti.max(t, SLACK), 1 - SLACK) - t) * u, a):
                         came = self.nearest(v, a, shared, height, back)
                 if came:
                     overlap = out
@@ -179,8 +182,7 @@ class PolygonGeometry:
                 if over_p > 0:
                     own, other, turn = q, p, -1
                 # Both corners leave over the edge that the other one is behind, and the edges in front are crossed.
-                leaves = side * p.cross(behind) >= 0 and side * q.cross(behind) >= 0
-                leaves = leaves and turn * a.cross(own) >= 0 and turn * b.cross(own) >= 0
+                leaves = turns(p, side * behind) and turns(q, side * behind) and turns(a, turn * own) and turns(b, turn * own)
                 if (
                     leaves
                     and segments_cross(r, other, front)
@@ -193,16 +195,16 @@ class PolygonGeometry:
         return out
 
     @ti.func
-    def inside(self, v, a):
-        """Whether v is inside of the body of a: a ray from it along +x crosses the loop an odd number of times.
+    def inside(self, p, a):
+        """Whether a point, p from a, is inside of the body of a: a ray from it along +x crosses the loop an odd number of times.
 
         What is behind one edge may be in front of the next, where they meet at less than 90 degrees.
         """
-        out, k, r = False, a, self.state.apart(a, v)
+        out, k, r = False, a, -p
         going = True
         while going:
             k = self.after(k)
-            s = self.state.apart(k, v)
+            s = self.state.apart(k, a) - p
             up = s[1] > 0
             if (r[1] > 0) != up and (r.cross(s) > 0) == up:
                 out = not out
@@ -260,6 +262,9 @@ class PolygonGeometry:
                 front = self.corner(i, j)
                 if self.after(j) >= 0:
                     overlap, n, t = self.edge(i, j, front, moved)
+                    if overlap > 0:
+                        if self.find(i, self.after(j)) < 0:
+                            overlap = -overlap  # the edge is so long that its end knows nothing of i: momentum would be lost
                 if overlap <= 0 and front > 0 and self.keeps(i, j):
                     overlap, n = self.discs.overlap(i, j, self.radius.of(i) + self.radius.of(j))
                     if overlap > 0:
@@ -351,10 +356,13 @@ class PolygonGeometry:
         return self.w.of(v) + (1 - t) * (1 - t) * self.w.of(a) + t * t * self.w.of(b)
 
     @ti.func
-    def split_mass(self, count: ti.template(), v, a, b, t):  # type: ignore[valid-type]
-        """The same where the mass of each particle is split by the number of contacts that it is in."""
-        at_a, at_b = (1 - t) * (1 - t) * count[a] * self.w.of(a), t * t * count[b] * self.w.of(b)
-        return count[v] * self.w.of(v) + at_a + at_b
+    def split_mass(self, split: ti.template(), v, a, b, t):  # type: ignore[valid-type]
+        """The same where masses are split, each among the contacts of its particle by what part it has in them.
+
+        With parts p_ki of contact k and m_i = sum_k p_ki, (sum_k p_ki y_k)^2 <= m_i sum_k p_ki y_k^2: so J w J^T <= diag(sum_i
+        p_ki m_i w_i).
+        """
+        return split[v] * self.w.of(v) + (1 - t) * split[a] * self.w.of(a) + t * split[b] * self.w.of(b)
 
     @ti.func
     def too_long(self, i):
@@ -482,6 +490,12 @@ def segments_cross(r, s, q):
     if d < 0:
         d, at_s, at_q = -d, -at_s, -at_q
     return d > 0 and 0 <= at_s <= d and 0 <= at_q <= d
+
+
+@ti.func
+def turns(r, s):
+    """Whether s is counterclockwise from r, or the two are as good as parallel."""
+    return r.cross(s) >= -TILT * r.norm() * s.norm()
 
 
 class Beside:

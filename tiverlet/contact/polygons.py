@@ -32,12 +32,13 @@ class Polygons(PairContact):
     a body together is up to others (Distance, Area, ShapeMatch); it may bend, and stretch by a quarter. friction, restitution: as
     in Contact, and so are all particles that are in no loop. push_out: about the speed at which bodies that overlap part [m/s].
 
-    A Jacobi pass: each contact wants C back, split by mass and by the number n_i of active contacts of each particle,
-    p = -C / (n_v w_v + (1 - t)^2 n_a w_a + t^2 n_b w_b). That conserves momentum, and angular momentum but for the slip within a
-    substep; friction at a radius is a torque that nothing takes up. Corners that face each other touch as discs, by their radii.
-    A vertex that is inside of another body goes out through the edge over which it came, or the nearest that faces its own body,
-    if it is not deeper than half the length of that edge: in a substep nothing should get there, and the step flags
-    "tunnelling-risk" where it might. Particles that start deeper are refused.
+    A Jacobi pass: each contact wants C back, split by mass, p = -C / (m_v w_v + (1 - t) m_a w_a + t m_b w_b), where m_i sums up
+    the parts, 1, 1 - t or t, that particle i has in its contacts. By Cauchy's inequality no eigenvalue of a pass exceeds 1, and m
+    changes no faster than contacts slide. That conserves momentum, and angular momentum but for the slip within a substep;
+    friction at a radius is a torque that nothing takes up. Corners that face each other touch as discs, by their radii. A vertex
+    that is inside of another body goes out through the edge over which it came, or the nearest that faces its own body, if it is
+    not deeper than half the length of that edge: in a substep nothing should get there, and the step flags "tunnelling-risk"
+    where it might. Particles that start deeper are refused.
 
     Two sharp corners may pass each other, so that neither is inside of the other body but their edges cross. They part over that
     of their edges which is nearer, C as above with t beyond the end of the edge. Other bodies that cross each other without a
@@ -98,7 +99,7 @@ class Polygons(PairContact):
         dev.forces = ForceShare(scene, sums=True, lasting=False)
         dev.geometry = PolygonGeometry(scene, dev.outline, self.push_out)
         dev.move = add("Contact.move", n, width=2)
-        dev.active = add("Contact.active", n, kind=ti.i32)  # contacts that each particle is in
+        dev.split = add("Contact.split", n)  # how often the mass of each particle is split, see split_mass()
         dev.fast = add("Contact.fast", None, kind=ti.i32)
         self.table.bind(scene, asked=True)
         dev.slip = PairData("slip", 2, lasting=True)
@@ -135,11 +136,11 @@ class Polygons(PairContact):
                             self.dev.restitution.aim.field[e] = 0 * self.dev.restitution.aim.field[e]
             self.note_motion(0, self.dev.geometry.too_long(i))
         if ti.static(not self.dev.state.sleepers):
-            self.dev.active[i] = self.dev.geometry.detect(i, True)
+            self.dev.split[i] = self.dev.geometry.detect(i, True)
         elif self.dev.state.awake(i) or self.is_near(i):
-            active = self.dev.geometry.detect(i, True)
+            contacts = self.dev.geometry.detect(i, True)
             if self.dev.state.awake(i):
-                self.dev.active[i] = active
+                self.dev.split[i] = contacts
         else:
             self.dev.geometry.forget(i)
 
@@ -165,9 +166,9 @@ class Polygons(PairContact):
         return self.dev.geometry.held_by(j)
 
     @ti.func
-    def reached(self, i, e):
+    def reached(self, i, e, margin):
         """Who sleeps at entry e of the list of particle i and is touched by it, as was found last; if it is driven, also who was
-        in the substep before."""
+        in the substep before. Edges know no margin."""
         j, out = self.dev.list.neighbour[e], -1
         for role in range(self.dev.geometry.roles(i)):
             at, v, a, b, t, part = self.dev.geometry.participants(i, e, role)
@@ -182,17 +183,17 @@ class Polygons(PairContact):
 
     @ti.func
     def count(self, begin, end, now):
-        """How many contacts some particles are in. What is in no loop knows them from detect()."""
+        """How often the masses of some particles are split. What is in no loop knows it from detect()."""
         for i in range(begin, end):
             if self.dev.geometry.after(i) >= 0 and self.dev.state.awake(i):
-                active = 0
+                parts = 0 * self.dev.w.of(i)
                 for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):
                     for role in range(3):
-                        at, _, _, _, _, _ = self.dev.geometry.participants(i, e, role)
+                        at, _, _, _, _, part = self.dev.geometry.participants(i, e, role)
                         if at >= 0:
                             if self.dev.geometry.manifold.field[at][0] > 0:
-                                active += 1
-                self.dev.active[i] = active
+                                parts += abs(part)
+                self.dev.split[i] = parts
 
     @ti.func
     def relax(self, i, now):
@@ -200,7 +201,7 @@ class Polygons(PairContact):
         first, final = now.first, now.final
         total, lifts, forced = 0 * self.dev.state.x[i], 0 * self.dev.state.x[i], 0 * self.dev.state.x[i]
         begin, roles = self.dev.list.first[i], self.dev.geometry.roles(i)
-        for e in range(begin, begin + ti.select(self.dev.active[i] > 0, self.dev.list.number[i], 0)):
+        for e in range(begin, begin + ti.select(self.dev.split[i] > 0, self.dev.list.number[i], 0)):
             for role in range(roles):
                 at, v, a, b, t, part = self.dev.geometry.participants(i, e, role)
                 if at >= 0:
@@ -208,7 +209,7 @@ class Polygons(PairContact):
                     overlap, n = found[0], ti.Vector([found[2], found[3]])
                     if overlap > 0:
                         d = self.dev.geometry.relative(self.dev.state.d, v, a, b, t)
-                        shared = self.dev.geometry.split_mass(self.dev.active, v, a, b, t)
+                        shared = self.dev.geometry.split_mass(self.dev.split, v, a, b, t)
                         share, missing = part * self.dev.w.of(i) / shared, 0 * overlap
                         back = overlap  # what is taken back of the position and of the displacement
                         if ti.static(self.dev.has_restitution):
@@ -237,13 +238,13 @@ class Polygons(PairContact):
         if ti.static(self.dev.has_restitution):
             if first != 0:
                 self.dev.restitution.lift[i] = lifts
-                self.dev.restitution.active[i] = self.dev.active[i]
+                self.dev.restitution.split[i] = self.dev.split[i]
 
     @ti.func
     def apply_corrections(self, i, first):
         """Move particle i as its contacts want; what bounced goes where it is at the end of the substep."""
         if self.dev.state.moves(i):
-            if self.dev.active[i] > 0:
+            if self.dev.split[i] > 0:
                 self.dev.state.shift(i, self.dev.move[i])
             if ti.static(self.dev.has_restitution):
                 if first != 0:
@@ -280,7 +281,7 @@ class PolygonRestitution:
     def __init__(self, scene: Scene, geometry: PolygonGeometry, table: Table):
         n, add = scene.particles.count, scene.memory.field
         self.geometry, self.table, self.state = geometry, table, scene.state
-        self.active = add("Contact.struck", n, kind=ti.i32)  # contacts that each particle was in in the first pass
+        self.split = add("Contact.struck", n)  # as it was in the first pass
         self.d_change = add("Contact.d_change", n, width=2)
         self.lift = add("Contact.lift", n, width=2)  # moves the position alone
         self.hit = add("Contact.hit", None, kind=ti.i32)
@@ -302,7 +303,7 @@ class PolygonRestitution:
     def choose(self, i):
         """One Jacobi pass over displacements alone: what the contacts of particle i that bounce lack."""
         total = 0 * self.state.x[i]
-        if self.active[i] > 0:
+        if self.split[i] > 0:
             begin = self.geometry.list.first[i]
             for e in range(begin, begin + self.geometry.list.number[i]):
                 for role in range(self.geometry.roles(i)):
@@ -314,7 +315,7 @@ class PolygonRestitution:
                             n = aim / size
                             lack = size - self.geometry.relative(self.state.d, v, a, b, t).dot(n)
                             if lack > 0:
-                                shared = self.geometry.split_mass(self.active, v, a, b, t)
+                                shared = self.geometry.split_mass(self.split, v, a, b, t)
                                 self.hit[None] = 1
                                 total += part * self.state.w.of(i) * lack / shared * n
                                 if role == VERTEX:

@@ -1,5 +1,6 @@
 """Preconditioned conjugate gradients on the constraints of a scene: cloth and nets that converge."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -8,6 +9,7 @@ from .. import checks
 from ..device import ti
 from ..device.number import OnDevice
 from ..features.feature import Batch, Scene
+from .elimination import components
 from .slots import TENSEST, Slots
 from .solver import Solver
 from .spectrum import largest
@@ -40,8 +42,9 @@ class ConjugateGradient(Solver):
     with W_j the diagonal of A = G w G^T and lambda_max the largest eigenvalue of W^-1 A: the condition number is then at most
     steps^2 + 1, for which so many steps suffice, and a link gives way as one of compliance sigma W h^2 would. The floor stays
     until particles are placed anew, and grows where it is still too low, or where the tension is near what the substep can stand.
-    Where rigid constraints contradict each other as particles are placed, the right side has a part in the null space of A, to
-    which steps give any multiplier: sigma = 1 from the first substep on bounds it by what a Jacobi pass gives.
+    Each part, of what hangs together, has its own, which is raised where a row has more than its share, of all rows, of the r . z
+    that is left. Where rigid constraints contradict each other as particles are placed, the right side is partly in the null
+    space of A, to which steps give any multiplier: sigma = 1 from the first substep on bounds it by what a Jacobi pass gives.
 
     steps: of conjugate gradients in an iteration. Ropes, spacers and what is not one number are relaxed as by Jacobi beside it.
     """
@@ -76,6 +79,7 @@ class CGSystem(System):
 
     n: Any = OnDevice()
     least: Any = OnDevice()
+    groups: Any = OnDevice()  # parts
 
     def __init__(self, scene: Scene, batches: list[Batch], slots: Slots, scalars: "list[Scalar]", steps: int):
         places = [slots.places(b) for b in scalars]
@@ -99,19 +103,31 @@ class CGSystem(System):
         self.partial, self.worst = self.reals("partial_sums", BLOCKS), self.reals("worst", BLOCKS)
         if self.limits_steps:
             self.gain, self.over = self.reals("gain", BLOCKS), self.reals("over", BLOCKS)
-        # r . z, the coming weight, what is taken back; r . z at the start, and the worst tension since
-        self.sums = scene.memory.field("system.sums", None, width=5, kind=ti.f64)
+        # r . z, the coming weight, what is taken back, and r . z at the start
+        self.sums = scene.memory.field("system.sums", None, width=4, kind=ti.f64)
         least = 1.2 * largest(scene, scalars, self.blocks * scene.inv_mass, POWER) / steps**2
         self.least = self.memory.number(least, scene.real)
-        self.floor = scene.memory.field("system.floor", None, kind=ti.f64, state=True)
+        _, part = np.unique(components(len(rows), row[free], who[free]), return_inverse=True)
+        self._part_of = np.zeros(scene.particles.count, dtype=np.int32)  # of each particle, from 1 on; 0 for none
+        self._part_of[who[free]] = part[row[free]] + 1
+        self.part, self.lead = self.ints("part", part + 1), self.ints("lead", who[free][order][ends[:-1]])
+        self.part_of = scene.memory.field("system.part_of", scene.count, kind=ti.i32, values=self._part_of)
+        count = int(part.max(initial=0)) + 2
+        self.groups = self.memory.number(count)
+        self.strained = self.ints("strained", np.zeros(count, dtype=np.int32))  # parts whose floor is too low
+        self.floor = scene.memory.field("system.floor", scene.count, kind=ti.f64, state=True)  # of its part, for each particle
 
     def vector(self, name: str):
         """A real number for each row."""
         return self.memory.field(f"system.{name}", self.rows)
 
-    def forget(self, contradicts: bool = False) -> None:
+    def forget(self, off: "Sequence[tuple[Batch, np.ndarray]]" = ()) -> None:
         """Steps may converge from the new places, but not where constraints contradict each other there."""
-        self.memory.write(self.floor, HIGHEST if contradicts else 0.0)
+        floor = np.zeros(len(self._part_of))
+        for batch, share in off:
+            some = (share > 0) & (self.row(batch) >= 0)
+            floor[np.isin(self._part_of, self._part_of[batch.indices[some]]) & (self._part_of > 0)] = HIGHEST
+        self.memory.write(self.floor, floor)
 
     @ti.func
     def set_row(self, r, violation, A, alpha, lam, W, geometric_stiffness):
@@ -120,7 +136,7 @@ class CGSystem(System):
         zero = 0 * violation
         self.step[r] = ti.select(W > 0, ti.cast(0, ti.f64), -ti.cast(lam, ti.f64))
         self.residual[r] = ti.select(W > 0, -violation / A, zero)
-        self.shift[r] = ti.select(W > 0, alpha / A + ti.cast(self.floor[None], self.real) * W, zero)
+        self.shift[r] = ti.select(W > 0, alpha / A + ti.cast(self.floor[self.lead[r]], self.real) * W, zero)
         self.inverse_diagonal[r] = ti.select(W > 0, 1 / (W + self.shift[r]), zero)
         self.direction[r] = self.inverse_diagonal[r] * self.residual[r]
 
@@ -156,16 +172,24 @@ class CGSystem(System):
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread)):
             now = self.summed()
-            self.sums[None] = ti.Vector([now, 0, 0, now, 0], ti.f64)
+            self.sums[None] = ti.Vector([now, 0, 0, now], ti.f64)
         self.team.wait()
 
     @ti.func
     def end(self, thread):
-        """Raise the floor where the steps have not converged, or have come to a tension that is hard to stand."""
-        ti.loop_config(serialize=True)
-        for _ in range(self.team.one(1, thread)):
-            if self.sums[None][0] > CONVERGED * self.sums[None][3] or self.sums[None][4] > TENSEST / 2:
-                self.floor[None] = ti.max(self.least, ti.min(GROWTH * self.floor[None], HIGHEST))
+        """Raise the floors of parts where the steps have not converged, or have come to a tension that is hard to stand."""
+        for r in range(self.team.chunk_begin(self.rows, thread), self.team.chunk_end(self.rows, thread)):
+            share = CONVERGED * self.sums[None][3]
+            if self.sums[None][0] > share:
+                if self.rows * ti.cast(self.inverse_diagonal[r] * self.residual[r], ti.f64) * self.residual[r] > share:
+                    self.strained[self.part[r]] = 1  # all write the same
+        self.team.wait()
+        for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
+            if self.strained[self.part_of[i]] != 0:
+                self.floor[i] = ti.max(self.least, ti.min(GROWTH * self.floor[i], HIGHEST))
+        self.team.wait()
+        for p in range(self.team.chunk_begin(self.groups, thread), self.team.chunk_end(self.groups, thread)):
+            self.strained[p] = 0
         self.team.wait()
 
     @ti.func
@@ -208,7 +232,10 @@ class CGSystem(System):
                     left = self.residual[r] - ti.cast(far, self.real) * self.applied[r]
                     self.residual[r] = left
                     total += ti.cast(self.inverse_diagonal[r] * left, ti.f64) * left
-                    worst = ti.max(worst, self.geometric_stiffness[r] * ti.abs(self.lam[r] + self.step[r]))
+                    tension = self.geometric_stiffness[r] * ti.abs(self.lam[r] + self.step[r])
+                    worst = ti.max(worst, tension)
+                    if tension > TENSEST / 2:
+                        self.strained[self.part[r]] = 1
                     if ti.static(self.limits_steps):
                         if self.scale[r] != 0:
                             change = self.violation[r] + self.scale[r] * (left + self.shift[r] * self.step[r])
@@ -236,8 +263,8 @@ class CGSystem(System):
             back = ti.select(worst > TENSEST, self.sums[None][1], 0 * now)
             if worst > TENSEST:
                 now = 0
-            first, worst = self.sums[None][3], ti.max(worst, self.sums[None][4])
-            self.sums[None] = ti.Vector([now, ti.select(before > 0, now / before, 0 * now), back, first, worst], ti.f64)
+            first = self.sums[None][3]
+            self.sums[None] = ti.Vector([now, ti.select(before > 0, now / before, 0 * now), back, first], ti.f64)
         self.team.wait()
         for r in range(self.team.chunk_begin(self.rows, thread), self.team.chunk_end(self.rows, thread)):
             if self.sums[None][2] != 0:

@@ -1,5 +1,6 @@
 """Constraints that are solved together: what they tell, and what particles make of the answer."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -90,9 +91,9 @@ class System:
         """The number of constraints that are relaxed by themselves, of those with a particle that can move."""
         return sum(int((~b.idle(self.inv_mass) & (self.row(b) < 0)).sum()) for b in batches)
 
-    def forget(self, contradicts: bool = False) -> None:
-        """Particles were placed anew: what was found out on the way to where they were says nothing. contradicts: whether there
-        are rigid constraints that cannot be met there."""
+    def forget(self, off: "Sequence[tuple[Batch, np.ndarray]]" = ()) -> None:
+        """Particles were placed anew: what was found out on the way to where they were says nothing. off: of batches, (m,), by
+        how much rigid constraints cannot be met there."""
 
     @ti.func
     def set_row(self, r, violation, A, alpha, lam, W, geometric_stiffness):

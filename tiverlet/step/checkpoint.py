@@ -110,6 +110,9 @@ def install(world: "World", kept: Checkpoint, flagged: list[list[bool]]) -> None
     """Give a world that was just built the state of another one of the same scene, knobs and precision, bit for bit."""
     world._upload()
     undo(world, kept, flagged)
+    for k, f in enumerate(world.features):
+        if isinstance(f, Scalar) and f.waits and f"{RESTS}{k}" not in kept.values:  # no rest value was on its way there
+            f.arrive()
 
 
 def check(world: "World", kept: Checkpoint, flagged: list[list[bool]]) -> None:
@@ -150,6 +153,7 @@ def transfer(old: "World", new: "World") -> None:
     kept = keep(old)
     if new._precision == old._precision and new._order == old._order:
         install(new, kept, flags(old))
+        new._runner.scene.h2_effective = old._runner.scene.h2_effective  # by which loads are known
         return
     ours, theirs = new._clock, old._clock
     ours.time, ours.tick, ours.since, ours.frame = theirs.time, theirs.tick, theirs.since, theirs.frame

@@ -415,8 +415,8 @@ class Reporter:
         if released > 0:
             return (
                 f"Large clusters or loops, or links that contradict each other, were off by {100 * released:.3g} % of their size "
-                "as the frame began. A shorter substep turns that into energy; contradictions let all links give way. Give all "
-                "frames as many substeps, or these constraints compliance, or lengths that fit."
+                "as the frame began. A shorter substep turns that into energy; contradictions let all that hangs together with "
+                "them give way. Give all frames as many substeps, or these constraints compliance, or lengths that fit."
             )
         need = np.ceil(substeps * residual / UNCONVERGED)  # of order h^2 under loads, h after impacts
         if self.remedy is None:

@@ -52,13 +52,12 @@ def forget(scene: Scene, batches: list[Batch], x: np.ndarray) -> None:
             b.forget_loads(off)
 
 
-def left(batches: list[Batch], x: np.ndarray) -> float:
-    """By how much rigid constraints that act both ways are off at x, (n, dim): the worst, as a share of its size, above SEEN;
+def left(batches: list[Batch], x: np.ndarray) -> list[tuple[Batch, np.ndarray]]:
+    """By how much rigid constraints that act both ways are off at x, (n, dim), as shares of their sizes, (m,), where above SEEN;
     else 0. Where remove() leaves that, they contradict each other."""
     some = [b for b in _rigid(batches) if b.side == 0]
-    off = [np.abs(b.violation(x) * b.inverse_size(x) * (b.compliance == 0) * ~b.broken).max() for b in some]
-    worst = float(max(off, default=0.0))
-    return worst if worst > SEEN else 0.0
+    off = [(b, np.abs(b.violation(x) * b.inverse_size(x) * (b.compliance == 0) * ~b.broken)) for b in some]
+    return [(b, np.where(share > SEEN, share, 0.0)) for b, share in off]
 
 
 def first_off(features: list[Feature], x: np.ndarray) -> int | None:

@@ -31,8 +31,8 @@ TURNS = 8  # at most, until nothing pulls that cannot
 LEFT = 0.01  # of what overlaps store: what may be left of it in the shorter substep
 
 
-def release(runner: Any, h: float, longest: float) -> bool:
-    """Take out what overlaps would store; d holds velocities. Nothing happens where they are small.
+def release(runner: Any, h: float, longest: float, small: bool = False) -> bool:
+    """Take out what overlaps would store; d holds velocities. Nothing happens where they are small, unless `small` asks for it.
 
     h: the coming substep [s]; longest: since this was done last. Returns whether overlaps have been looked after.
     """
@@ -44,7 +44,7 @@ def release(runner: Any, h: float, longest: float) -> bool:
     if not (contact or solids.count):
         return False
     energy, overlap = seen_before(runner)
-    if not matters(max(overlap, solids.worst), ratio):
+    if not small and not matters(max(overlap, solids.worst), ratio):
         return False
     pairs: Candidates = DiscCandidates(np.zeros((0, 2), dtype=np.int64), np.zeros(0), None)
     if contact:

@@ -35,16 +35,18 @@ FIRM = 0.9  # theta of what velocities do not change
 FAR = 0.75  # of the longest: a substep in which what is small now has had its chance
 NEWTON = 40  # steps, at most
 BEGIN, HARDEST, LEAST = 1e-3, 10.0, 1e-9  # mu of the first, and of the last try; the least
+SLIGHT = 0.01  # of the kinetic energy: what violations may become where contacts are in the way
 LEFT = 0.01  # of what violations store: what may be left of it in the shorter substep
 DONE = 1e-6  # of its size: a violation that is none
 TURNS = 16  # with walls, at most: a link that stands on one halves its violation in each
 LARGEST = 300  # corners: outlines of more couple each with each
 
 
-def project(runner: "Runner", h: float, longest: float) -> bool:
+def project(runner: "Runner", h: float, longest: float) -> bool | None:
     """Take out what violations would store; d holds velocities. Nothing happens where they are small, or would overlap.
 
-    h: the coming substep [s]; longest: since this was done last. Returns whether positions have been looked after.
+    h: the coming substep [s]; longest: since this was done last. Returns whether positions have been looked after; None where
+    contacts are in the way of what would be more than a hundredth of the kinetic energy.
     """
     ratio = h / longest
     slots = runner.scene.slots
@@ -88,7 +90,10 @@ def project(runner: "Runner", h: float, longest: float) -> bool:
     if deeper > overlap:
         state.put(memory, before)
         memory.write(state.d, kept)
-    elif more > energy:
+        stake = _over(start.weight * undone**2, start.diagonal).sum() / (2 * h * h)
+        kinetic = (_over(np.ones_like(w), w)[:, None] * kept[:n].astype(np.float64) ** 2).sum() / 2
+        return None if stake > SLIGHT * kinetic else True
+    if more > energy:
         v[:n] = paid(start.jacobian, v[:n], x - before, more - energy)
         memory.write(state.d, v)
     return True

@@ -120,7 +120,10 @@ class Runner:
                 self.restart(iterations)
                 if h < clock.longest and not self.probe:
                     released = release(self, h, clock.longest)
-                    if project(self, h, clock.longest) or released:
+                    projected = project(self, h, clock.longest)
+                    if projected is None and not released:  # links and contacts have to move together
+                        released = release(self, h, clock.longest, small=True)
+                    if projected or projected is None or released:
                         clock.longest = h
             if clock.d_is_velocity:
                 clock.since = 0
@@ -138,9 +141,9 @@ class Runner:
                 bare = clock.first_moved < self.n and not any((b.indices >= clock.first_moved).any() for b in self.batches)
                 if self.scene.slots.system and not bare:  # particles that came without constraints are nothing to it
                     system, x = self.scene.slots.system, self.scene.state.get(self.memory)
-                    left = initial_violation.left(self.batches, x) if system.steps else 0.0
-                    self.released = max(self.released, left)
-                    system.forget(left > 0)
+                    left = initial_violation.left(self.batches, x) if system.steps else []
+                    self.released = max(self.released, *(float(share.max()) for _, share in left), 0.0)
+                    system.forget(left)
             self.set_substep(h, drag)
         return True
 

@@ -328,13 +328,16 @@ class SleepPass:
             self.sleepers.blocks[b] = stirs
 
     @ti.func
-    def look(self, i):
-        """Call the islands that particle i touches; if it is driven, also those that it touched as the substep began."""
+    def look(self, i, before):
+        """Call the islands that particle i touches; if it is driven, also those that it touched as the substep began. before: 1
+        if constraints come first: also those that it would touch if they moved it as far as it moves by itself, for what wakes
+        after them has gone without them."""
         drifts, d = self.drifts(i), self.state.d[i]
+        margin = before * d.norm()
         for c in ti.static(self.contacts):
             if drifts or (self.sleepers.awake(i) and d.dot(d) > 0):
                 for e in range(c.dev.list.first[i], c.dev.list.first[i] + c.dev.list.number[i]):
-                    j = c.reached(i, e)
+                    j = c.reached(i, e, margin)
                     if j >= 0:
                         self.call(j)
 

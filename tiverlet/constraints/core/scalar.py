@@ -425,10 +425,11 @@ class Scalar(Batch):
         return new
 
     def arrive(self) -> None:
-        """The frame is over."""
+        """Rest values are what was assigned: the frame is over, or nothing was on its way."""
         goals = [goal for _, goal, _ in self.tracks()]
         self.put(goals)
-        self.dev.ramp.aim(goals, goals)
+        if self.dev.ramps:
+            self.dev.ramp.aim(goals, goals)
         self.ramping = False
 
     @property
