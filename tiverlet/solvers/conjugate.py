@@ -126,7 +126,7 @@ class CGSystem(System):
         floor = np.zeros(len(self._part_of))
         for batch, share in off:
             some = (share > 0) & (self.row(batch) >= 0)
-            floor[np.isin(self._part_of, self._part_of[batch.indices[some]]) & (self._part_of > 0)] = HIGHEST
+            floor[np.isin(self._part_of, self._part_of[batch.indices.ravel()[some[batch.owner]]]) & (self._part_of > 0)] = HIGHEST
         self.memory.write(self.floor, floor)
 
     @ti.func
