@@ -123,10 +123,11 @@ class CGSystem(System):
 
     def forget(self, off: "Sequence[tuple[Batch, np.ndarray]]" = ()) -> None:
         """Steps may converge from the new places, but not where constraints contradict each other there."""
-        floor = np.zeros(len(self._part_of))
+        floor = np.zeros(self.n)
+        part_of = self._part_of[: self.n]  # particles that came and went since are in none, and stand behind those that are
         for batch, share in off:
             some = (share > 0) & (self.row(batch) >= 0)
-            floor[np.isin(self._part_of, self._part_of[batch.indices.ravel()[some[batch.owner]]]) & (self._part_of > 0)] = HIGHEST
+            floor[: len(part_of)][np.isin(part_of, part_of[batch.indices.ravel()[some[batch.owner]]]) & (part_of > 0)] = HIGHEST
         self.memory.write(self.floor, floor)
 
     @ti.func
