@@ -276,3 +276,16 @@ def test_a_thousand_links_on_one_particle(world):
     w = world(tv.Particles(star, velocity=v), [tv.Distance(spokes)], precision="f64", solver=tv.Jacobi())
     report = w.run(5.0)
     assert np.isfinite(w.position).all() and report.energy <= 0.5 * (v**2).sum() * 1.01 and w.last.residual < 0.1
+
+
+def test_the_energy_of_springs_is_a_number_where_what_is_left_underflows(world):
+    # A spring that a rigid link keeps at its length leaves so little of its violation at h = 1e-6 s that f32 cannot tell it,
+    # times h^2, from 0.
+    x = np.array([[0.0, 0.0, 0.0], [0.3612324426117109, 0.29591168792099837, 0.24240272111714103]])
+    v = np.array([[0.1257302210933933, -0.1321048632913019, 0.6404226504432821],
+                  [0.10490011715303971, -0.535669373161111, 0.36159505490948474]])  # fmt: skip
+    at_least = np.linalg.norm(x[1])
+    features = [tv.Spacer([[0, 1]], [at_least]), tv.Spacer([[0, 1]], [at_least], compliance=1e-6)]
+    w = world(tv.Particles(x, velocity=v, mass=[np.inf, 10.0]), features, substeps=1)
+    energy = [w.step(1e-6).energy for _ in range(2)]
+    np.testing.assert_allclose(energy, 5.0 * np.sum(np.square(v[1])), rtol=0.1)

@@ -86,9 +86,9 @@ class Spring:
         adds), and 1 / alpha would count energy that nobody supplied. borne: alpha |lam|, for the part alpha |lam| / h2_effective,
         which is 0 where there was no substep yet.
         """
-        out = ti.cast(1, self.real)
-        if h2_effective > 0 and left > 0:
-            out = borne / (borne + left * h2_effective)
+        out, gone = ti.cast(1, self.real), left * h2_effective  # 0 where both are small
+        if h2_effective > 0 and gone > 0:
+            out = borne / (borne + gone)
         return out
 
     @ti.func
