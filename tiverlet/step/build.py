@@ -41,10 +41,10 @@ ROOM = {True: (6.5, 14), False: (12, 32)}
 # particles (1200 with constraints) 0.55 and 0.35; of ropes with 205 (405) 0.18 and 0.18, with 820 (1620) 0.64 and 0.40.
 CROSSOVER = 1000
 # Kernels of so many times the code of a Distance in 2D are long, or endless. A hundred figures on stairs (13) took 13 to 17 s to
-# compile when Taichi simplified them and 5 s without, and frames took as long; discs, ropes and soft balls (6) 8.2 and 2.5 s, but
-# frames a tenth more, and 3.1 s without its search for equal expressions. So did an hourglass (6): 6.5 s, 3.0 s without that,
-# which frames take 1 to 3 % more for. In a pile, which compiles in 1.9 s, they would take 8 % more.
-LONG, ENDLESS = 5.5, 10.0
+# compile when Taichi simplified them and 5 s without, and frames took as long. An hourglass (6) takes 6.5 s, and 3.0 s without
+# its search for equal expressions, which frames take 1 to 3 % more for. Discs, ropes and soft balls (5.6) take 8.2 and 3.1 s, but
+# frames 6 to 11 % more, and a pile (3.6) 1.9 s, and frames 8 % more: these are searched.
+LONG, ENDLESS = 5.8, 10.0
 MANY = 4 * FEW  # particles from which frames take so long that the search pays for long kernels
 # So many copies of a world run its kernels so often that those which are not middling are simplified, though the world is small:
 # frames of a double pendulum (1.3) take 8 to 13 % less, of 100 discs (3.6) 5 to 17 %, of discs, ropes and soft balls (6) 5 %, and
