@@ -229,6 +229,18 @@ def test_links_that_move_are_as_they_were(world):
     np.testing.assert_array_equal(known.position, plain.position)
 
 
+def test_links_without_a_weight_to_compare_with_learn_nothing(world):
+    # Ten links of 0.095 m between pins 1 m apart contradict each other: no load takes their violations C away, 0.05 m in all. What
+    # they pull with, C / (W h^2), is equal, and W = 4 w, for those of a pin 2 w: theirs are half of the others', 0.05 / 9.
+    x = np.stack([np.linspace(0, 1, 11), np.zeros(11)], axis=1)
+    links = tv.Distance(hung()[1], 0.095)
+    w = world(tv.Particles(x, mass=0.2, pinned=[0, 10]), [links, tv.Drag(1.0)], solver=tv.Jacobi(loads=True), precision="f64")
+    w.run(8.0)
+    assert (w._runner.memory.read(links.dev.known.load) == 0).all()
+    lengths = 0.095 + 0.05 / 9 * np.r_[0.5, np.ones(8), 0.5]
+    np.testing.assert_allclose(w.position[1:, 0], np.cumsum(lengths), atol=1e-9)
+
+
 def test_a_start_finds_the_loads_that_links_know(world):
     # Velocities that are assigned begin the next substep anew, in which forces act for half a kick, and so do loads; where
     # particles are put elsewhere all together, links know what they did, and where one is, its own have forgotten.

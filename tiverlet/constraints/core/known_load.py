@@ -66,7 +66,8 @@ class KnownLoad:
     def weigh(self, c, most, own):
         """As a window ends: how many particles the body of constraint c bears.
 
-        most: what 1 N accelerates a corner of c by, at most; own: what forces do.
+        most: what 1 N accelerates a corner of c by, at most; own: what forces do. Without these it bears any number, and learns
+        nothing.
         """
         pull = ti.abs(self.load[c] + self.missing[c] / WINDOW) * most
         if pull > 0:
@@ -81,7 +82,7 @@ class KnownLoad:
         load, mean = self.load[c], self.missing[c] / WINDOW
         if steady(mean, self.earlier[c]) and WINDOW * moved < STILL * give * ti.abs(load + mean):
             k = self.bears[self.body[c]]
-            share = gain(1 + 0 * k, SLOW * k * k, WINDOW)
+            share = gain(1.0, SLOW * k * k, WINDOW)
             load, mean = load + share * mean, (1 - share) * mean
             load = ti.max(-MOST * size / give, ti.min(load, MOST * size / give))
         self.load[c], self.earlier[c], self.missing[c] = load, mean, 0 * mean
