@@ -10,7 +10,8 @@ for each body by itself, that is, for constraints that hang together by particle
 falls; no particle moves further in a step than its body is large, and no leg of an angle changes by more than half. From afar
 an angle is flat: Newton's step, pi r^2 / L for one that has to be straight between two pins L apart, would throw its corner away,
 or into one of the pins. Where constraints contradict each other, bodies go to where sum C^2 / W is least, that is, where passes,
-which split masses, find nothing to do, and the report says what is left. Systems soften all rows alike, so theirs have the same
+which split masses, find nothing to do, and the report says what is left. Newton's steps know J alone, so across what is pulled in a
+line they do not get there; the last of the way is gone in passes. Systems soften all rows alike, so theirs have the same
 weight. A straight rope that is too long for its two pins has no direction to give way in, so a body whose links are pushed bulges
 first: across all in which it extends, and down where it can. Walls have the last word: what they stop goes on, in turns.
 
@@ -34,6 +35,7 @@ DONE = 1e-6  # of its size: a violation that is none, but for rounding
 ROUNDING = {ti.f32: 8 * 2.0**-24, ti.f64: 8 * 2.0**-53}  # of coordinates: what lengths lose, and the Newton steps with them
 NEWTON = 60  # steps at most
 STEPS, LEFT = 1000, 1e-8  # of conjugate gradients in each, at most; what of r . z they may leave
+PASSES, FLAT = 300, 1e-10  # after them, at most; what sum C^2 / W falls by in one, of it, where it is least
 TURNS = 16  # with walls, at most: a link that stands on one halves its violation in each
 LEAST = 1e-2  # part of a step: where even less does not help, nothing does
 BETTER = 0.999  # of its square: a violation that falls by less in a step contradicts others
@@ -154,11 +156,11 @@ def met(rows: "Rows", body: np.ndarray, going: np.ndarray) -> np.ndarray:
 
     body: that of each particle (n,). going: which bodies move.
     """
-    rows = _newton(rows, body, going)
+    rows = _relaxed(_newton(rows, body, going), body, going)
     worst, left = _violation(rows, body, len(going))
     pushed = going & (worst > SEEN) & _pushed(rows, body, len(going))
     if pushed.any():
-        bulged = _newton(rows.at(_bulged(rows, body, pushed, worst)), body, pushed)
+        bulged = _relaxed(_newton(rows.at(_bulged(rows, body, pushed, worst)), body, pushed), body, pushed)
         better = pushed & (_violation(bulged, body, len(going))[1] < BETTER * left)
         return np.where(better[body][:, None], bulged.x, rows.x)
     return rows.x
@@ -187,6 +189,21 @@ def _newton(rows: "Rows", body: np.ndarray, going: np.ndarray) -> "Rows":
             tried &= ~stuck
         far = np.minimum(1.0, 2 * far)
         rows = rows.at(x)
+    return rows
+
+
+def _relaxed(rows: "Rows", body: np.ndarray, going: np.ndarray) -> "Rows":
+    """The rows where passes leave those bodies whose constraints contradict each other."""
+    worst, size = _violation(rows, body, len(going))
+    going = going & (worst > SEEN)
+    for _ in range(PASSES):
+        if not going.any():
+            break
+        tried = rows.at(rows.x + np.where(going[body][:, None], rows.relaxed(), 0.0))
+        _, less = _violation(tried, body, len(going))
+        better = going & (less < size)
+        rows = tried if (better == going).all() else rows.at(np.where(better[body][:, None], tried.x, rows.x))
+        going, size = better & (less < (1 - FLAT) * size), np.where(better, less, size)
     return rows
 
 
@@ -334,3 +351,9 @@ class Rows:
         """The least moves that take C to 0, as far as it is linear."""
         scaled = Jacobian(len(self.C), self.row, self.who, self.w, self.J * self.scale[self.row, None])
         return scaled.solve(-self.C * self.scale, enough=LEFT, steps=STEPS)
+
+    def relaxed(self) -> np.ndarray:
+        """The moves of one pass, -w J^T C / W."""
+        push = -self.J * (self.scale**2 * self.C)[self.row, None]
+        sums = [np.bincount(self.who, column, minlength=len(self.w)) for column in push.T]
+        return self.w[:, None] * np.stack(sums, axis=1)
