@@ -470,7 +470,7 @@ def test_a_picture_without_a_window(falling, tmp_path, monkeypatch):
     (tmp_path / "temporary").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
     places = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d", "/usr/local/share/vulkan/icd.d")
-    if not any(pathlib.Path(place).glob("*.json") for place in places):
+    if not any(True for place in places for _ in pathlib.Path(place).glob("*.json")):
         pytest.skip("no Vulkan driver here; apt-get install mesa-vulkan-drivers")
     one, other = viewer.picture(str(falling), str(tmp_path / "%d.png"), [0, 20], scene=True)
     assert not list((tmp_path / "temporary").iterdir())

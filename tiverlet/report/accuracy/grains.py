@@ -157,7 +157,10 @@ def drum(n: int, friction: float, resistance: float, turn: float = 0.8, seconds:
 
 @dataclass(frozen=True)
 class Silo:
-    """Grains in a silo of `width` [m] on a floor of fixed discs of a fourth of SIZE, without friction there unless said."""
+    """Grains in a silo of `width` [m] on a floor of fixed discs of a fourth of SIZE, without friction there unless said.
+
+    loads: whether contacts learn what they bear.
+    """
 
     n: int
     width: float
@@ -166,6 +169,7 @@ class Silo:
     rolling: float = 0.05
     floor_friction: float = 0.0
     seed: int = 0
+    loads: bool = False
 
     def build(self) -> tuple[World, list[Polygon]]:
         """It and its two walls."""
@@ -187,7 +191,7 @@ class Silo:
             (0, 1): (self.floor_friction, self.floor_friction, self.rolling),
         }
         ground = HalfSpace((0, 1), -2.5, friction=(0.5, 0.5, 0.0))
-        return World(start, [Gravity(G), Contact(friction=grip), *walls, ground], substeps=SUBSTEPS), walls
+        return World(start, [Gravity(G), Contact(friction=grip, loads=self.loads), *walls, ground], substeps=SUBSTEPS), walls
 
 
 def borne(world: World) -> float:
