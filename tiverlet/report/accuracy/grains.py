@@ -362,15 +362,16 @@ def silos(counts: Sequence[int]) -> Table:
     """Loads on the floor."""
     table = Table("H / width", title="Load on the floor over the weight, silo of 10 diameters, friction 0.5 between grains")
     columns, heights = [], []
-    for friction in (0.0, 0.25, 0.5):
-        table.add_column(f"wall {friction}", justify="right")
-        found = np.array([janssen(Silo(n, 10 * SIZE, wall_friction=friction)) for n in counts])
+    for friction, loads in ((0.0, False), (0.25, False), (0.5, False), (0.5, True)):
+        name = f"wall {friction}" + (", known loads" if loads else "")
+        table.add_column(name, justify="right")
+        found = np.array([janssen(Silo(n, 10 * SIZE, wall_friction=friction, loads=loads)) for n in counts])
         heights, shares = found[:, 0] / (10 * SIZE), found[:, 2] / found[:, 1]
         columns.append([f"{share:.3f}" for share in shares])
         if friction:
             length, off = saturation(heights, shares)
             fit = f"lambda {length:.2f} w, K = w / (2 mu lambda) = {1 / (2 * friction * length):.2f}, within {off:.2f}"
-            table.caption = (f"{table.caption}\n" if table.caption else "") + f"wall {friction}: {fit}"
+            table.caption = (f"{table.caption}\n" if table.caption else "") + f"{name}: {fit}"
     for height, *cells in zip(heights, *columns, strict=True):
         table.add_row(f"{height:.2f}", *cells)
     return table
