@@ -230,8 +230,8 @@ def test_links_that_move_are_as_they_were(world):
 
 
 def test_links_without_a_weight_to_compare_with_learn_nothing(world):
-    # Ten links of 0.095 m between pins 1 m apart contradict each other: no load takes their violations C away, 0.05 m in all. What
-    # they pull with, C / (W h^2), is equal, and W = 4 w, for those of a pin 2 w: theirs are half of the others', 0.05 / 9.
+    # Ten links of 0.095 m between pins 1 m apart contradict each other: no load takes their violations C away, 0.05 m in all.
+    # What they pull with, C / (W h^2), is equal, and W = 4 w, for those of a pin 2 w: theirs are half of the others', 0.05 / 9.
     x = np.stack([np.linspace(0, 1, 11), np.zeros(11)], axis=1)
     links = tv.Distance(hung()[1], 0.095)
     w = world(tv.Particles(x, mass=0.2, pinned=[0, 10]), [links, tv.Drag(1.0)], solver=tv.Jacobi(loads=True), precision="f64")

@@ -10,8 +10,8 @@ for each body by itself, that is, for constraints that hang together by particle
 falls; no particle moves further in a step than its body is large, and no leg of an angle changes by more than half. From afar
 an angle is flat: Newton's step, pi r^2 / L for one that has to be straight between two pins L apart, would throw its corner away,
 or into one of the pins. Where constraints contradict each other, bodies go to where sum C^2 / W is least, that is, where passes,
-which split masses, find nothing to do, and the report says what is left. Newton's steps know J alone, so across what is pulled in a
-line they do not get there; the last of the way is gone in passes. Systems soften all rows alike, so theirs have the same
+which split masses, find nothing to do, and the report says what is left. Newton's steps know J alone, so across what is pulled in
+a line they do not get there; the last of the way is gone in passes. Systems soften all rows alike, so theirs have the same
 weight. A straight rope that is too long for its two pins has no direction to give way in, so a body whose links are pushed bulges
 first: across all in which it extends, and down where it can. Walls have the last word: what they stop goes on, in turns.
 
