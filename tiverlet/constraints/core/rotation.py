@@ -140,8 +140,11 @@ def turn(K, X, U, body, stiff, soft, kept, least, deforms: ti.template()):  # ty
     Stiff, this says that what moves places p to D R q has no moment about the places s at the start; then it is one step of a
     free rigid body (Moser and Veselov 1991), and nothing is lost. Soft, deformations are turned back into the frame at the
     start first, and U is what else pulls (body: given in the frame of the body). deforms: whether anything is soft.
+    A body whose shape is a point does not turn: all that there is of it would be deformed.
     """
     start, end, cosine, pull = kept, kept, 1 + 0 * stiff, axial(U)
+    if K.norm() == 0:
+        soft *= 0
     if ti.static(kept.n == 2):
         # sin(angle) a + cos(angle) b = c
         start = fit(K, kept, least)
