@@ -114,6 +114,9 @@ def test_queries_find_the_nearest_image(world, contact):
     inside = box.wrap(w.position)
     assert (inside >= -1e-12).all() and (inside < length + 1e-12).all()
     np.testing.assert_allclose(w.position - inside, box.away(box.boxes(w.position)), atol=1e-12)
+    # What has exploded is nowhere, and nothing is said of it.
+    nowhere = np.array([[np.inf, 1.0], [1.0, -1e300], [np.nan, 0.0]])
+    np.testing.assert_array_equal(np.isfinite(box.difference(nowhere, points[:3])).all(axis=1), [False, True, False])
 
 
 def crowd(shift, moved, contact, shear=0.0, n=30, **settings):

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 AXES = "xyz"
 SPARE = 2.2  # contact distances, that a sheared box is long at least
+COUNTED = 2.0**62  # boxes
 
 
 class Periodic(Feature):
@@ -212,12 +213,18 @@ class Periodic(Feature):
         return np.concatenate(found), np.concatenate(places)
 
     def _turns(self, r: np.ndarray) -> np.ndarray:
-        """How many boxes along each axis are nearest to r."""
+        """How many boxes along each axis are nearest to r; none where that is no number, or too many to be counted."""
         out = np.zeros(r.shape, dtype=np.int64)
+
+        def count(k: int) -> None:
+            """Along axis k."""
+            boxes = np.floor(r[..., k] / self.lengths[k] + 0.5)
+            out[..., k] = np.where(np.abs(boxes) < COUNTED, boxes, 0)
+
         if FLOW in self.axes and GRADIENT in self.axes:
-            out[..., GRADIENT] = np.floor(r[..., GRADIENT] / self.lengths[GRADIENT] + 0.5)
+            count(GRADIENT)
             r = r.copy()
             r[..., FLOW] -= out[..., GRADIENT] * self.offset
         for k in self.axes:
-            out[..., k] = np.floor(r[..., k] / self.lengths[k] + 0.5)
+            count(k)
         return out
