@@ -137,22 +137,21 @@ class Capsule(Collider):
         way = d.norm()
         # Else its path begins further from the rod than it is long, whatever is rounded.
         if depth + 2 * way > -TOUCH * (abs(a).sum() + abs(b).sum() + abs(x).sum() + contact_distance):
-            s, start_depth, k = 0 * length, 0 * length, 0
+            s, start_depth, k, going = 0 * length, 0 * length, 0, True
             # If it was outside, or touched, it may have come in: walk along the path, never further than the surface is away.
-            while k < MARCH + 2:
+            while going:
                 _t, distance, m = self.nearest(x - (1 - s) * d, a, b)
                 gap = distance - contact_distance
                 if k == 0:
                     start_depth = -gap
-                    if gap <= -TOUCH * contact_distance or gap >= way:
-                        k = MARCH + 2
-                if k < MARCH + 2:
+                    going = not (gap <= -TOUCH * contact_distance or gap >= way)
+                if going:
                     further = s
                     if k <= MARCH:
                         further += ti.max(gap, 0) / way
                     k += 1
                     if not (further < 1) or further == s:  # past the end, or where the surface is
-                        k, depth = MARCH + 2, ti.min(depth, 0)
+                        going, depth = False, ti.min(depth, 0)
                         if further < 1:
                             n, depth = m, (s - 1) * d.dot(m)
                     s = further
