@@ -20,7 +20,7 @@ class ConstraintPass:
         self.semi_iterations = [scene.slots.semi_iteration] if scene.slots and scene.slots.semi_iteration else []
         self.in_systems = [b for b in batches if b.solvable_together and b.dev.in_system]
         self.ragged = [b for b in batches if b.blocks]
-        self.learners = [b for b in batches if b.arity and b.solvable_together and b.dev.known.learns]
+        self.learners = [b for b in batches if b.solvable_together and b.dev.known.learns]
         self.springs = any(b.soft for b in batches) or bool(self.learners)
 
     @ti.func

@@ -32,7 +32,7 @@ class KnownLoad:
     """
 
     def __init__(self, scene: "Scene", name: str, batch: Any):
-        self.learns, self.in_state = scene.own_weight is not None and scene.slots.loads and batch.learns_loads, {}
+        self.learns, self.in_state = scene.slots.loads and batch.learns_loads, {}
         if self.learns:
             self._memory, self.weights, self.bears = scene.memory, scene.own_weight, scene.slots.bears
             self.load = scene.memory.field(f"{name}.load", batch.count, state=True)  # [N]

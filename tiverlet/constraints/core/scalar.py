@@ -860,12 +860,11 @@ class Scalar(Batch):
     @ti.func
     def weigh_load(self, c):
         """As a window ends, see KnownLoad."""
-        most, own = ti.cast(0, self.dev.real), ti.cast(0, self.dev.real)
         _, g = self.measure(c, self.corners(c, 0))
+        _, _, most, _ = self.motion(c, g, 0)
+        own = ti.cast(0, self.dev.real)
         for k in ti.static(range(self.arity)):
-            i = self.member(c, k)
-            most = ti.max(most, self.dev.w.of(i) * g[k, :].norm())
-            own = ti.max(own, self.dev.known.weights.field[i])
+            own = ti.max(own, self.dev.known.weights.field[self.member(c, k)])
         self.dev.known.weigh(c, most, own)
 
     @ti.func
