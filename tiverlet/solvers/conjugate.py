@@ -9,7 +9,8 @@ from .. import checks
 from ..device import ti
 from ..device.number import OnDevice
 from ..features.feature import Batch, Scene
-from .elimination import components
+from ..geometry.ordered import distinct
+from .corners import components
 from .slots import TENSEST, Slots
 from .solver import Solver
 from .spectrum import largest
@@ -107,7 +108,7 @@ class CGSystem(System):
         self.sums = scene.memory.field("system.sums", None, width=4, kind=ti.f64)
         least = 1.2 * largest(scene, scalars, self.blocks * scene.inv_mass, POWER) / steps**2
         self.least = self.memory.number(least, scene.real)
-        _, part = np.unique(components(len(rows), row[free], who[free]), return_inverse=True)
+        _, part, _ = distinct(components(len(rows), row[free], who[free]))
         self._part_of = np.zeros(scene.particles.count, dtype=np.int32)  # of each particle, from 1 on; 0 for none
         self._part_of[who[free]] = part[row[free]] + 1
         self.part, self.lead = self.ints("part", part + 1), self.ints("lead", who[free][order][ends[:-1]])
@@ -123,11 +124,13 @@ class CGSystem(System):
 
     def forget(self, off: "Sequence[tuple[Batch, np.ndarray]]" = ()) -> None:
         """Steps may converge from the new places, but not where constraints contradict each other there."""
-        floor = np.zeros(self.n)
+        floor, contradicted = np.zeros(self.n), np.zeros(self.groups, dtype=bool)
         part_of = self._part_of[: self.n]  # particles that came and went since are in none, and stand behind those that are
         for batch, share in off:
             some = (share > 0) & (self.row(batch) >= 0)
-            floor[: len(part_of)][np.isin(part_of, part_of[batch.indices.ravel()[some[batch.owner]]]) & (part_of > 0)] = HIGHEST
+            contradicted[part_of[batch.indices.ravel()[some[batch.owner]]]] = True
+        contradicted[0] = False
+        floor[: len(part_of)] = HIGHEST * contradicted[part_of]
         self.memory.write(self.floor, floor)
 
     @ti.func

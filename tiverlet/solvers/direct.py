@@ -8,6 +8,7 @@ from .. import checks
 from ..device import ti
 from ..device.number import OnDevice
 from ..features.feature import Batch, Scene
+from .corners import corners_of
 from .elimination import Plan, plan
 from .slots import TENSEST, Slots
 from .solver import WIDTH, Solver
@@ -69,11 +70,10 @@ class Direct(Solver):
         if not scalars:
             return None
         slot = np.concatenate([slots.places(b).ravel() for b in scalars])
-        item = np.concatenate([b.indices.ravel() for b in scalars])
-        arity = np.repeat([b.arity for b in scalars], [b.count for b in scalars])
-        owner = np.repeat(np.arange(len(arity)), arity)
-        free = (slot >= 0) & ~np.concatenate([b.relaxed_alone(scene) for b in scalars])[owner]
-        found = plan(len(arity), owner[free], item[free], self.width)
+        owner, item = corners_of(scalars)
+        alone = np.concatenate([b.relaxed_alone(scene) for b in scalars])
+        free = (slot >= 0) & ~alone[owner]
+        found = plan(len(alone), owner[free], item[free], self.width)
         return Elimination(scene, batches, slots, scalars, found, slot[free], item[free]) if found.parts else None
 
     def explain(self, batches: list[Batch], slots: Slots) -> str:

@@ -8,6 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from ..geometry.ordered import distinct
+from .corners import components, corners_of
 
 SHORT = 4096  # corners of a part up to which its plan is kept
 COUNTED = (("entry", "column"), ("product", "product"), ("update", "update"))  # what rows have some of, and the array of it
@@ -37,29 +38,11 @@ class Plan:
         return len(self.part_begin) - 1
 
 
-def components(n: int, owner: np.ndarray, item: np.ndarray) -> np.ndarray:
-    """Labels of n owners: equal where a chain of shared items leads from one to the other. (owner, item): what has what."""
-    label, items = np.arange(n), int(item.max(initial=-1)) + 1
-    while True:
-        least = np.full(items, n)
-        np.minimum.at(least, item, label[owner])
-        new = label.copy()
-        np.minimum.at(new, owner, least[item])
-        np.minimum.at(new, label, new.copy())  # what is known of one is known of all with its label
-        while not np.array_equal(new, new[new]):
-            new = new[new]
-        if np.array_equal(new, label):
-            return label
-        label = new
-
-
 def plan_of(links: list, inv_mass: np.ndarray, width: int) -> Plan:
     """The parts of these batches, see plan(); particles that cannot move couple nothing."""
-    arity = np.repeat([b.arity for b in links], [b.count for b in links])
-    item = np.concatenate([b.indices.ravel() for b in links])
-    owner = np.repeat(np.arange(len(arity)), arity)
+    owner, item = corners_of(links)
     free = inv_mass[item] > 0
-    return plan(len(arity), owner[free], item[free], width)
+    return plan(sum(b.count for b in links), owner[free], item[free], width)
 
 
 def plan(count: int, owner: np.ndarray, item: np.ndarray, width: int) -> Plan:

@@ -9,7 +9,7 @@ from ..device.memory import Memory
 from ..device.number import OnDevice
 from ..features.feature import BENT, FAR, Batch, Scene
 from ..features.regrouping import Regrouping
-from .elimination import components
+from .corners import bodies_of, corners_of
 from .system import solvable
 
 # Where constraints converge within a substep, SHAKE is an explicit method for what is across them, with a limit:
@@ -18,7 +18,7 @@ TENSEST = 4.0  # (omega h)^2 of a vibration across a tension, beyond which Verle
 
 def arranged(batches: list[Batch], inv_mass: np.ndarray) -> tuple[dict[int, np.ndarray], np.ndarray]:
     """The slots of the corners of each batch, by its id, -1 for what cannot move; and how many each particle has, (n,)."""
-    n, members = len(inv_mass), np.concatenate([b.indices.ravel() for b in batches])
+    n, members = len(inv_mass), corners_of(batches)[1]
     movable = inv_mass[members] > 0
     order = np.argsort(np.where(movable, members, n), kind="stable")
     place = np.empty(len(members), dtype=np.int64)
@@ -78,12 +78,7 @@ class Slots:
     def _tied(batches: list[Batch], inv_mass: np.ndarray) -> dict[int, np.ndarray]:
         """The body of each constraint, by the batch's id: what hangs together by particles that can move."""
         ends = np.cumsum([b.count for b in batches])
-        owner, item = (
-            np.concatenate([b.owner + end - b.count for b, end in zip(batches, ends, strict=True)]),
-            np.concatenate([b.indices.ravel() for b in batches]),
-        )
-        free = inv_mass[item] > 0
-        parts = np.split(components(int(ends[-1]), owner[free], item[free]), ends[:-1])
+        parts = np.split(bodies_of(int(ends[-1]), *corners_of(batches), inv_mass)[0], ends[:-1])
         return {id(b): part for b, part in zip(batches, parts, strict=True)}
 
     def body(self, batch: Batch) -> np.ndarray:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..tools import golden
+from .corners import corners_of
 
 if TYPE_CHECKING:
     from ..constraints.core.scalar import Scalar
@@ -16,10 +17,8 @@ ROUNDS = 300  # of power iteration; it converges from below, and the margin of 1
 def largest(scene: "Scene", scalars: "list[Scalar]", split: np.ndarray, rounds: int = ROUNDS) -> float:
     """lambda_max of D^-1 A for the scene as it starts, A = G w G^T and D its diagonal in mass-split weights."""
     w, n, dim = scene.inv_mass, len(scene.inv_mass), scene.particles.dim
-    slopes = [b.gradients(b.start.position) for b in scalars]
-    who = np.concatenate([b.indices.ravel() for b in scalars])
-    row = np.repeat(np.arange(sum(b.count for b in scalars)), np.repeat([b.arity for b in scalars], [b.count for b in scalars]))
-    G = np.concatenate([g.reshape(-1, dim) for g in slopes])
+    row, who = corners_of(scalars)
+    G = np.concatenate([b.gradients(b.start.position).reshape(-1, dim) for b in scalars])
     D = np.bincount(row, split[who] * (G**2).sum(axis=1))
     scale = np.divide(1, np.sqrt(D), out=np.zeros(len(D)), where=D > 0)
     x = np.asarray(golden(np.arange(len(D)))) - 0.5

@@ -161,7 +161,7 @@ def turned(world: "World") -> float:
         rigid = np.broadcast_to(getattr(b, "compliance", 0.0) == 0, b.count)
         if b.count and b.indices.size > b.count and rigid.any() and not getattr(b, "side", 0):
             starts = np.arange(b.count + 1) * b.arity if b.arity else b.members.starts
-            who, owner = b.indices.ravel(), np.repeat(np.arange(b.count), np.diff(starts))
+            who, owner = b.indices.ravel(), b.owner
             hub = who[starts[owner]]
             r, u = x[who] - x[hub], d[who] - d[hub]
             size = np.where((r**2).sum(axis=1) > 0, (r**2).sum(axis=1), np.inf)

@@ -27,7 +27,8 @@ from ..constraints.core.scalar import Scalar
 from ..device import ti
 from ..features.feature import Batch, Feature, Scene
 from ..neighbours.queries import between
-from .jacobian import Jacobian, bodies_of
+from ..solvers.corners import bodies_of, corners_of
+from .jacobian import Jacobian
 
 SEEN = 1e-3  # of its size: a violation from where on the report says that it was taken out
 ENOUGH = 0.2  # of its size: a violation after which loads are others
@@ -209,10 +210,8 @@ def _relaxed(rows: "Rows", body: np.ndarray, going: np.ndarray) -> "Rows":
 
 def _bodies(batches: list[Scalar], w: np.ndarray) -> tuple[np.ndarray, int]:
     """The body of each particle, the last one for those that no constraint can move; and how many there are."""
-    ends = np.cumsum([0] + [b.count for b in batches])
-    owner = np.concatenate([b.owner + end for b, end in zip(batches, ends[:-1], strict=True)])
-    who = np.concatenate([b.indices.ravel() for b in batches])
-    return bodies_of(int(ends[-1]), owner, who, w)[1], int(ends[-1]) + 1
+    m = sum(b.count for b in batches)
+    return bodies_of(m, *corners_of(batches), w)[1], m + 1
 
 
 def _violation(rows: "Rows", body: np.ndarray, bodies: int) -> tuple[np.ndarray, np.ndarray]:

@@ -1,10 +1,9 @@
-"""Gradients of constraints by their corners: the least moves along them, in the metric of the masses, and the bodies they tie."""
+"""Gradients of constraints by their corners: the least moves along them, in the metric of the masses."""
 
 from collections.abc import Callable
 
 import numpy as np
 
-from ..solvers.elimination import components
 from .block_matrix import STEPS, conjugate_gradients
 
 SOFT = 1e-6  # of the diagonal: what has hardly a direction to move in stays
@@ -49,12 +48,3 @@ class Jacobian:
         mu = soft * self.diagonal
         scale = np.divide(1, self.diagonal + mu, out=np.zeros_like(mu), where=self.diagonal > 0)
         return conjugate_gradients(lambda p: some * self.rates(self.moves(p)) + mu * p, lambda r: scale * r, right, enough, steps)
-
-
-def bodies_of(m: int, row: np.ndarray, who: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which of m constraints and of the particles hang together by what can move: labels, (m,) and (n,); m: no row moves it."""
-    free = w[who] > 0
-    label = components(m, row[free], who[free])
-    body = np.full(len(w), m)
-    body[who[free]] = label[row[free]]
-    return label, body

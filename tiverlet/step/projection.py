@@ -22,9 +22,10 @@ import numpy as np
 
 from ..constraints.core.scalar import Scalar
 from ..neighbours.queries import between
+from ..solvers.corners import bodies_of
 from .block_matrix import BlockMatrix
 from .integrator import h2_effective_of
-from .jacobian import Jacobian, bodies_of
+from .jacobian import Jacobian
 from .rigid_rows import RigidRows, left_out, rigid_rows
 
 if TYPE_CHECKING:

@@ -1,0 +1,42 @@
+"""Corners of constraints: which particles they are, and what hangs together by those that can move."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from ..features.feature import Batch
+
+
+def corners_of(batches: "Sequence[Batch]") -> tuple[np.ndarray, np.ndarray]:
+    """Of every corner, batch by batch, the constraint, numbered through, and the particle."""
+    first = np.cumsum([0] + [b.count for b in batches])
+    owner = np.concatenate([b.owner + k for b, k in zip(batches, first, strict=False)])
+    return owner, np.concatenate([b.indices.ravel() for b in batches])
+
+
+def components(n: int, owner: np.ndarray, item: np.ndarray) -> np.ndarray:
+    """Labels of n owners: equal where a chain of shared items leads from one to the other. (owner, item): what has what."""
+    label, items = np.arange(n), int(item.max(initial=-1)) + 1
+    while True:
+        least = np.full(items, n)
+        np.minimum.at(least, item, label[owner])
+        new = label.copy()
+        np.minimum.at(new, owner, least[item])
+        np.minimum.at(new, label, new.copy())  # what is known of one is known of all with its label
+        while not np.array_equal(new, new[new]):
+            new = new[new]
+        if np.array_equal(new, label):
+            return label
+        label = new
+
+
+def bodies_of(m: int, row: np.ndarray, who: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which of m constraints and of the particles hang together by what can move: labels, (m,) and (n,); m: no row moves it."""
+    free = w[who] > 0
+    label = components(m, row[free], who[free])
+    body = np.full(len(w), m)
+    body[who[free]] = label[row[free]]
+    return label, body
