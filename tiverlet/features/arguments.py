@@ -1,10 +1,14 @@
-"""The arguments that an object was made with, what a recording needs to make it again; and which of them can be set later."""
+"""The arguments that an object was made with, what a recording needs to make it again; and which of them can be set later.
+
+Feature and Solver, and so all that is below them, keep them in `arguments`. Once __init__ is over only knobs can be set, and
+names that begin with an underscore: what else an object consists of is compiled into kernels. Its own methods set such an
+attribute by self._keep(name=value). Arrays become read-only, since no kernel would see what is written to them.
+"""
 
 import difflib
 import functools
 import inspect
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -51,50 +55,46 @@ class Knob:
             feature.new_force = True
 
 
-class RecordsArguments:
-    """Objects whose class keeps the arguments of __init__ in `arguments`, by name, as they were then.
+def record_arguments(kind: Any) -> None:
+    """Have a class, as it is made, keep the arguments of its __init__, by name, as they were when an object was made."""
+    live = tuple(name for name, value in vars(kind).items() if isinstance(value, Knob))
+    kind.host_only = (*vars(kind).get("host_only", ()), *live)  # what kernels have of them is compiled()
+    if "__init__" in vars(kind):
+        kind.__init__ = _recording(kind.__init__)
 
-    Once __init__ is over only knobs can be set, and names that begin with an underscore: what else an object consists of is
-    compiled into kernels. Its own methods set such an attribute by self._keep(name=value). Arrays become read-only, since no
-    kernel would see what is written to them.
-    """
 
-    arguments: Mapping[str, Any] = MappingProxyType({})
-    kept_by_world: tuple[str, ...] = ()  # attributes that a world sets
-    host_only: tuple[str, ...] = ()  # attributes that kernels do not read
+def set_attribute(thing: Any, name: str, value: Any) -> None:
+    """The __setattr__ of what records its arguments: once it is made, only knobs and what a world keeps in it can be set."""
+    if name.startswith("_") or name in thing.kept_by_world or isinstance(getattr(type(thing), name, None), Knob):
+        object.__setattr__(thing, name, value)
+    elif "arguments" in thing.__dict__:
+        raise AttributeError(_refused(thing, name))
+    else:
+        keep(thing, **{name: value})
 
-    def __init_subclass__(cls, **kwargs) -> None:
-        super().__init_subclass__(**kwargs)
-        live = tuple(name for name, value in vars(cls).items() if isinstance(value, Knob))
-        cls.host_only = (*vars(cls).get("host_only", ()), *live)  # what kernels have of them is compiled()
-        if "__init__" in vars(cls):
-            type.__setattr__(cls, "__init__", _recording(cls.__init__))
 
-    def __setattr__(self, name: str, value: Any) -> None:
-        if name.startswith("_") or name in self.kept_by_world or isinstance(getattr(type(self), name, None), Knob):
-            object.__setattr__(self, name, value)
-        elif "arguments" in self.__dict__:
-            raise AttributeError(self._refused(name))
-        else:
-            self._keep(**{name: value})
+def keep(thing: Any, **values: Any) -> None:
+    """Set attributes that cannot be set from outside."""
+    for name, value in values.items():
+        object.__setattr__(thing, name, handed_out(value, structure(type(thing).__name__, name)))
 
-    def _keep(self, **values: Any) -> None:
-        """Set attributes that cannot be set from outside."""
-        for name, value in values.items():
-            object.__setattr__(self, name, handed_out(value, structure(type(self).__name__, name)))
 
-    def __delattr__(self, name: str) -> None:
-        raise AttributeError(f"{self!r}.{name} cannot be deleted.")
+def refuse_deletion(thing: Any, name: str) -> None:
+    """The __delattr__ of what records its arguments."""
+    raise AttributeError(f"{thing!r}.{name} cannot be deleted.")
 
-    def _refused(self, name: str) -> str:
-        live, given = knobs_of(type(self)), [*inspect.signature(type(self)).parameters]
-        can = f"Live are {', '.join(live)}" if live else "Nothing of it is live"
-        if name in given or inspect.getattr_static(self, name, None) is not None:
-            return (
-                f"{self!r}.{name} cannot be set: it is fixed when {type(self).__name__} is made. {can}. For another {name} make "
-                f"a new {type(self).__name__}; in a world, world.remove(features=[old]) and world.add(features=[new])."
-            )
-        return f"{self!r} has no {name!r}{meant(name, [*live, *given])}. {can}."
+
+def _refused(thing: Any, name: str) -> str:
+    """Why an attribute cannot be set, and what to do instead."""
+    kind = type(thing)
+    live, given = knobs_of(kind), [*inspect.signature(kind).parameters]
+    can = f"Live are {', '.join(live)}" if live else "Nothing of it is live"
+    if name in given or inspect.getattr_static(thing, name, None) is not None:
+        return (
+            f"{thing!r}.{name} cannot be set: it is fixed when {kind.__name__} is made. {can}. For another {name} make "
+            f"a new {kind.__name__}; in a world, world.remove(features=[old]) and world.add(features=[new])."
+        )
+    return f"{thing!r} has no {name!r}{meant(name, [*live, *given])}. {can}."
 
 
 @functools.cache

@@ -22,8 +22,9 @@ that begins with an underscore: from outside only Knobs can be set.
 """
 
 import functools
+from collections.abc import Mapping
 from dataclasses import dataclass
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,7 +33,7 @@ from ..device import at, inline, ti
 from ..device.language import inside_kernel
 from ..device.number import Number
 from .arguments import Knob as Knob
-from .arguments import RecordsArguments, knobs_of
+from .arguments import keep, knobs_of, record_arguments, refuse_deletion, set_attribute
 from .read_only import assign_whole, handed_out
 
 if TYPE_CHECKING:
@@ -72,12 +73,14 @@ class Scene:
         return self.memory.real
 
 
-class Feature(RecordsArguments):
+class Feature:
     """Base of all. `arguments` are those that it was made with; `changed` says that a knob waits to be uploaded, `new_force`
     that it changes a force, `lets_go` that it no longer bears what it bore, `afresh` that it begins anew where the world is built
     anew, `moving` that a target is under way."""
 
-    kept_by_world = ("scene", "start", "periodic", "changed", "moving", "new_force", "arguments")
+    arguments: Mapping[str, Any] = MappingProxyType({})
+    # Attributes that a world sets.
+    kept_by_world: tuple[str, ...] = ("scene", "start", "periodic", "changed", "moving", "new_force", "arguments")
     # What kernels do not read of it.
     host_only: tuple[str, ...] = ("start", "periodic", "changed", "moving", "new_force", "arguments")
     uploads_all = False  # upload() and end_motion() do as well for many worlds, where knobs have one more axis, the first
@@ -91,6 +94,12 @@ class Feature(RecordsArguments):
     periodic: Any = None  # the Periodic of its world, from before prepare() on
     _world_for: dict[str, Any] | None = None  # what the world was built for, of built_for(); None where the feature does nothing
     start: Any = None  # Particles, as they were when it came: what it takes from them is what it took then, when bound again too
+
+    __setattr__, __delattr__, _keep = set_attribute, refuse_deletion, keep
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        record_arguments(cls)
 
     @functools.cached_property
     def dev(self) -> Any:

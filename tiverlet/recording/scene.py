@@ -15,7 +15,7 @@ from .. import colliders, constraints, contact, forces, neighbours, solvers
 from ..colliders.collider import Collider
 from ..device import runtime
 from ..device.language import is_kernel_function, undecorated
-from ..features.arguments import RecordsArguments, knobs_of
+from ..features.arguments import knobs_of
 from ..features.feature import Batch, Feature
 from ..particles import TURNING, Particles
 from ..solvers.solver import Solver
@@ -28,7 +28,7 @@ PARTICLES = ("position", "velocity", "mass", "radius", "pinned", "group", *TURNI
 PUBLIC = {
     name: kind for module in (colliders, constraints, contact, forces, neighbours, solvers)
     for name, kind in vars(module).items()
-    if isinstance(kind, type) and issubclass(kind, RecordsArguments)
+    if isinstance(kind, type) and issubclass(kind, (Feature, Solver))
 } | {"Sleep": Sleep}  # fmt: skip
 Turned = tuple[int, dict[str, Any]]  # the number of a feature, and its knobs
 TAKES = {

@@ -1,11 +1,13 @@
 """What a solver is asked, and the answers of one that does nothing special."""
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from ..device import ti
-from ..features.arguments import RecordsArguments
+from ..features.arguments import keep, record_arguments, refuse_deletion, set_attribute
 from ..features.feature import Batch, Scene
 from .elimination import plan_of
 from .system import solvable
@@ -33,7 +35,7 @@ class SemiIteration:
         return correction
 
 
-class Solver(RecordsArguments):
+class Solver:
     """How the constraints of a world are solved.
 
     A solver may take constraints out of the relaxation and solve them together, by a System. What is left is relaxed one by one,
@@ -43,6 +45,13 @@ class Solver(RecordsArguments):
 
     loads = False  # whether what is relaxed by itself learns the loads that it bears, see KnownLoad
     converges = False  # within a substep, so that tensions can be too large for it
+    arguments: Mapping[str, Any] = MappingProxyType({})
+    kept_by_world: tuple[str, ...] = ()  # attributes that a world sets
+    __setattr__, __delattr__, _keep = set_attribute, refuse_deletion, keep
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        record_arguments(cls)
 
     def check(self, iterations: int) -> None:
         """Raise ValueError where so many iterations make no sense."""
