@@ -121,7 +121,7 @@ def test_a_constraint_does_what_all_constraints_do(world, name):
         w.step(dt)
         left.append(abs(scene.C("off")))
         if name == "Bend 2D":
-            size = scene.feature.unit or abs(scene.feature.rest[1])
+            size = scene.feature.quantity.unit or abs(scene.feature.rest[1])
             assert scene.feature.residual[1] * size == pytest.approx(left[-1], rel=1e-6, abs=1e-12)
     assert (np.diff(left) <= 1e-15).all() and left[-1] <= 1e-3 * scale
 
@@ -244,8 +244,8 @@ def test_nothing_explodes_where_a_constraint_has_no_direction(world, name):
         report = w.step(1 / 60)
         assert "non-finite" not in report.flags and np.isfinite(report.residual) and np.isfinite(feature.load).all()
         if frame == 0:  # later, what a violent correction has set in motion flies on
-            size = 0 if row.internal else np.abs(x).max(axis=(1, 2))
-            size += np.ptp(x, axis=1).max(axis=1) + (0 if feature.unit else abs(rest)) + 1e-6 * np.abs(x).max(axis=(1, 2))
+            size = (0 if row.internal else np.abs(x).max(axis=(1, 2))) + (0 if feature.quantity.unit else abs(rest))
+            size += np.ptp(x, axis=1).max(axis=1) + 1e-6 * np.abs(x).max(axis=(1, 2))
             moved = np.abs(w.position.reshape(x.shape) - x).max(axis=(1, 2))
             assert (moved <= 5 * size).all(), (np.argmax(moved / (size + 1e-300)), np.c_[moved, size])
 

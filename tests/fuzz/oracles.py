@@ -119,7 +119,7 @@ def rigid(features: list[Any], free: np.ndarray, x: np.ndarray) -> tuple[float, 
     for f in features:
         if not isinstance(f, Batch) or getattr(f, "drives", False) or not f.count:
             continue
-        if not isinstance(f, Scalar) or not f.arity or f.collapses or (f.compliance > 0).any():
+        if not isinstance(f, Scalar) or not f.arity or f.quantity.collapses or (f.compliance > 0).any():
             whole = False
         if isinstance(f, Scalar) and (f.driven or (f.side and (f.load > 0).any())):  # what still pulls where it is slack counts
             whole = False
@@ -128,8 +128,8 @@ def rigid(features: list[Any], free: np.ndarray, x: np.ndarray) -> tuple[float, 
         C = f.violation(x)
         C = np.maximum(f.side * C, 0) if f.side else np.abs(C)
         start = f.rest_of(f.start.position)
-        unit = f.unit or (float(np.abs(start).mean()) if np.any(start) else f.start.size)
-        size = np.full(f.count, unit) if f.unit else np.where(f.goal != 0, np.abs(f.goal), unit)
+        unit = f.quantity.unit or (float(np.abs(start).mean()) if np.any(start) else f.start.size)
+        size = np.full(f.count, unit) if f.quantity.unit else np.where(f.goal != 0, np.abs(f.goal), unit)
         some = (f.compliance == 0) & ~f.broken & ~f.idle(free) & ~shapeless(f, x)
         worst = max(worst, float((C / size)[some].max(initial=0.0)))
         if f.arity and f.count:
@@ -203,9 +203,10 @@ def feasible(features: list[Any], particles: Any, free: np.ndarray, x: np.ndarra
             return False
         if name == "Polygons":
             return False
-        if not built and isinstance(f, Batch) and (not isinstance(f, Scalar) or f.collapses) and (f.compliance == 0).any():
+        collapses = isinstance(f, Scalar) and f.quantity.collapses
+        if not built and isinstance(f, Batch) and (not isinstance(f, Scalar) or collapses) and (f.compliance == 0).any():
             return False
-        if isinstance(f, Scalar) and f.collapses and (np.abs(f.violation(x)) > 1e-9 * np.abs(f.goal)).any():
+        if collapses and (np.abs(f.violation(x)) > 1e-9 * np.abs(f.goal)).any():
             return False
     return True
 

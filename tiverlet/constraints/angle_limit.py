@@ -84,7 +84,7 @@ class AngleLimit(Scalar):
 
     def violation(self, position: np.ndarray) -> np.ndarray:
         """C at the given positions."""
-        half, middle = self.now() if self.ramping else (self.rest, self.middle)
+        half, middle = self.ramp.now() if self.ramp and self.ramp.under_way else (self.rest, self.middle)
         return np.abs(turned(super().values(self.placed(position)) - middle)) - half
 
     def bind(self, scene: Scene) -> None:

@@ -93,6 +93,7 @@ class Feature:
     scene: Any = None  # Scene, from bind() on
     periodic: Any = None  # the Periodic of its world, from before prepare() on
     _world_for: dict[str, Any] | None = None  # what the world was built for, of built_for(); None where the feature does nothing
+    ramp: Any = None  # the Ramp of its rest values, where it has one, while it is bound
     start: Any = None  # Particles, as they were when it came: what it takes from them is what it took then, when bound again too
 
     __setattr__, __delattr__, _keep = set_attribute, refuse_deletion, keep
@@ -261,7 +262,6 @@ class Batch(Feature):
     drives = False  # puts its particles in place instead of relaxing them
     solvable_together = False  # its constraints may be solved together with others, by the System of a solver; see Scalar
     driven = False  # rest values move by themselves: what drive_of() gives, see Drive
-    ramping = False  # rest values go to others in the coming frame, see Ramp
     transcends = False  # takes angles, cube roots or exponentials, which SPIR-V has for f32 only
     members: Any  # FixedSize or VariableSize: the particles of each constraint
     bulk = 1.0

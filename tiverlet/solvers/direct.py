@@ -121,7 +121,7 @@ class Elimination(System):
         least = np.concatenate([np.where(p > 0, p, np.inf).min(axis=1, initial=np.inf) for p in parts])[found.rows]
         small = np.where(np.isfinite(least), SMALL_PIVOT * least, 0.0)
         self.small_pivot = scene.memory.field("system.small", self.rows, kind=ti.f64, values=small)
-        self.precise = [(k, b) for k, b in enumerate(scalars) if b.precise and scene.real == ti.f32]
+        self.precise = [(k, b) for k, b in enumerate(scalars) if b.quantity.precise and scene.real == ti.f32]
         if self.precise:
             batch = np.repeat(np.arange(len(scalars)), [b.count for b in scalars])[found.rows]
             number = np.concatenate([np.arange(b.count) for b in scalars])[found.rows]

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..constraints.core.scalar import Scalar
 from ..neighbours.periodic import Periodic
 from .clock import Clock
 
@@ -67,7 +66,7 @@ def state(world: "World", pairs: bool = True) -> dict[str, np.ndarray]:
     if world._runner.search and pairs:
         out["Contact.pairs"], carried = world._runner.search.list.lasting_data()
         out.update((f"Contact.{name}", values) for name, values in carried.items())
-    return out | {f"{RESTS}{k}": np.stack(f.now()) for k, f in enumerate(world.features) if isinstance(f, Scalar) and f.waits}
+    return out | {f"{RESTS}{k}": np.stack(f.ramp.now()) for k, f in enumerate(world.features) if f.ramp and f.ramp.waits}
 
 
 def keep(world: "World", pairs: bool = True) -> Checkpoint:
@@ -93,7 +92,7 @@ def put_back(world: "World", kept: Checkpoint) -> None:
         search.list.restore(kept.values["Contact.pairs"], pieces)
     for k, f in enumerate(world.features):
         if f"{RESTS}{k}" in kept.values:
-            f.put(kept.values[f"{RESTS}{k}"])  # type: ignore[attr-defined]
+            f.ramp.put(kept.values[f"{RESTS}{k}"])
     for log in world._runner.logs:
         log.forget()
     world._runner.invalidate()
@@ -111,14 +110,14 @@ def install(world: "World", kept: Checkpoint, flagged: list[list[bool]]) -> None
     world._upload()
     undo(world, kept, flagged)
     for k, f in enumerate(world.features):
-        if isinstance(f, Scalar) and f.waits and f"{RESTS}{k}" not in kept.values:  # no rest value was on its way there
-            f.arrive()
+        if f.ramp and f.ramp.waits and f"{RESTS}{k}" not in kept.values:  # no rest value was on its way there
+            f.ramp.arrive()
 
 
 def check(world: "World", kept: Checkpoint, flagged: list[list[bool]]) -> None:
     """Raise ValueError unless a state that came from elsewhere fits the world; above all what kernels take for indices."""
     present = keep(world)
-    rests = {f"{RESTS}{k}": (len(f.tracks()), f.count) for k, f in enumerate(world.features) if isinstance(f, Scalar) and f.acts}
+    rests = {f"{RESTS}{k}": f.ramp.shape for k, f in enumerate(world.features) if f.ramp}
     late = LATE | rests.keys()
     if set(present.values) - late != set(kept.values) - late:
         raise ValueError("The state is not one of this scene: it has other fields.")
@@ -167,8 +166,8 @@ def transfer(old: "World", new: "World") -> None:
     for mine, other in zip(new.features, old.features, strict=True):
         if isinstance(mine, Periodic) and isinstance(other, Periodic):
             mine.continued(other)
-        if isinstance(mine, Scalar) and isinstance(other, Scalar) and other.waits:
-            mine.put(other.now())
+        if mine.ramp and other.ramp and other.ramp.waits:
+            mine.ramp.put(other.ramp.now())
             mine.changed = True
     for broke, breaks in zip(old._runner.step.breakers, new._runner.step.breakers, strict=True):
         new._runner.memory.write(breaks.dev.strength.stamp, broke.stamps())

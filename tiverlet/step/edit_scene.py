@@ -9,7 +9,6 @@ import numpy as np
 
 from .. import checks
 from ..colliders.collider import Collider
-from ..constraints.core.scalar import Scalar
 from ..contact.pair_contact import PairContact
 from ..contact.touches import ContactEvents
 from ..device.memory import Memory
@@ -190,7 +189,7 @@ def rebuild(
                 world._runner.restart(world.iterations)
         old = checkpoint.state(world) if turned else kept.values
         masks = {f: tuple(mask & (f not in came) for mask in f.kept_mask(number)) for f in before}
-        rests = {f: np.stack(f.now())[:, masks[f][0]] for f in features if isinstance(f, Scalar) and f.waits}
+        rests = {f: np.stack(f.ramp.now())[:, masks[f][0]] for f in features if f.ramp and f.ramp.waits}
         for f in before:
             f.release()
             f.remap_indices(number, n + m)
@@ -229,8 +228,8 @@ def rebuild(
             f.changed, f.moving = attributes[f].get("changed", True), attributes[f].get("moving", False)
             f.new_force = attributes[f].get("new_force", False)
     for f, values in rests.items():
-        if f.acts:
-            f.put([*values])  # from where they go to those that were assigned
+        if f.ramp:
+            f.ramp.put([*values])  # from where they go to those that were assigned
     for memory in memories:
         memory.destroy()
     if any(isinstance(f, PairContact) for f in came):

@@ -341,9 +341,8 @@ class Rows:
     @property
     def legs(self) -> np.ndarray:
         """The corners of angles from which a leg leads to the next."""
-        angle = np.concatenate([
-            np.full(some.sum(), b.curved and not b.collapses) for b, some in zip(self.batches, self.corners, strict=True)
-        ])  # fmt: skip
+        angles = [b.quantity.curved and not b.quantity.collapses for b in self.batches]
+        angle = np.repeat(angles, [some.sum() for some in self.corners])
         return np.flatnonzero(angle[:-1] & (self.row[:-1] == self.row[1:]))
 
     def newton(self) -> np.ndarray:

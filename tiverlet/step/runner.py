@@ -41,7 +41,7 @@ class Runner:
         self.jumped = False  # whether that was further than a particle is large
         self.sleepers, self.sleep = parts.scene.state.sleepers, parts.step.sleep
         self.released = 0.0  # the violation that its shorter substep turns into energy, as a share of its size
-        self.ramping: list[Any] = []  # whose rest values go to others in the coming frame
+        self.ramping: list[Any] = []  # batches whose rest values go to others in the coming frame
         self.ramps: list[Any] = []  # the memories of what ramps need
         self.interruptible = False  # what handlers of signals raise in the middle of a frame is followed by an undo
         # Asked in every frame, and Taichi looks at each attribute of what has kernels.
@@ -180,20 +180,20 @@ class Runner:
 
     def find_ramps(self) -> None:
         """Knobs were uploaded: see whose rest values are others now."""
-        self.ramping = [b for b in self.batches if b.ramping]
+        self.ramping = [b for b in self.batches if b.ramp and b.ramp.under_way]
 
     def _jump(self) -> None:
         """Of bodies of which any particle was placed anew, rest values are those that were assigned, and nothing goes there."""
         if self.ramping and self.clock.first_moved is not None:
             tied = initial_violation.tied(self.scene, self.batches, self.clock.first_moved)
             for b in self.ramping:
-                b.jump(np.bincount(b.owner, tied[b.indices.ravel()], minlength=b.count) > 0)
+                b.ramp.jump(np.bincount(b.owner, tied[b.indices.ravel()], minlength=b.count) > 0)
 
     def set_out(self) -> None:
         """Have rest values that were assigned go there in the coming frame."""
         if self.ramping:
-            new = [b.dev.ramp.memory for b in self.ramping if b.set_out()]
-            self.ramping = [b for b in self.ramping if b.ramping]
+            new = [b.ramp.memory for b in self.ramping if b.ramp.set_out()]
+            self.ramping = [b for b in self.ramping if b.ramp.under_way]
             if new:
                 self.ramps = [*self.ramps, *new]
                 self.renew()
@@ -201,7 +201,7 @@ class Runner:
     def arrive(self) -> None:
         """They are there: the frame is over, and is not made again."""
         for b in self.ramping:
-            b.arrive()
+            b.ramp.arrive()
         self.ramping = []
 
     def settle(self, dt: float) -> None:

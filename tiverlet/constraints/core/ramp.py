@@ -9,7 +9,7 @@ from ...device.memory import Memory
 
 
 class Ramp:
-    """Fields of a batch that go straight to their goals in a frame, as a Pin goes to its target:
+    """The rest values of a batch, which go straight to their goals in a frame, as a Pin goes to its target:
 
         rest(s) = goal - (goal - begin) (1 - s),   s: the fraction of the frame at the end of a substep.
 
@@ -17,20 +17,83 @@ class Ramp:
     corners with speeds of C / h; so they have speeds of C / dt, whatever the substep. Where nothing is on its way, begin = goal,
     which gives the bits of the goal.
 
-    memory: where room for it is taken from, in a world that is there already: it is made when it is needed. fields: what moves,
-    (m,) each; `step` is that of the first in this substep.
+    batch: the Scalar, whose tracks() say what moves. What a ramp needs on the device is `made` when rest values are assigned for
+    the first time, in a `memory` of its own: until then it costs nothing. under_way: whether rest values go to others in the
+    coming frame. step: how far the first of the tracks goes in this substep.
     """
 
-    host_only = ("memory",)
+    host_only = ("memory", "under_way")
 
-    def __init__(self, memory: Memory, name: str, fields: list[Any], count: int):
-        self.memory, self.fields = memory.more(), fields
-        self.begin = [self.memory.field(f"{name}.rest_at_begin", count) for _ in fields]
-        self.goal = [self.memory.field(f"{name}.rest_at_end", count) for _ in fields]
-        self.step = self.memory.field(f"{name}.step_of_rest", count)
+    def __init__(self, memory: Memory, batch: Any):
+        self._memory, self._batch, self.memory = memory, batch, memory
+        self.made = self.under_way = False
+
+    @property
+    def waits(self) -> bool:
+        """Whether the device may have other rest values than were assigned."""
+        return (self._batch.changed or self.under_way) and not self._batch.driven and self._batch.count > 0
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Of what now() gives, as one array."""
+        return len(self._batch.tracks()), self._batch.count
+
+    def now(self) -> list[np.ndarray]:
+        """What the device has: where a ramp begins, (m,) each; as a frame ends, what was assigned before it."""
+        m = self._batch.count
+        return [self._memory.read(field)[..., :m].astype(np.float64) for field, _, _ in self._batch.tracks()]
+
+    def put(self, values: list[np.ndarray]) -> None:
+        """Have rest values begin elsewhere: what now() gave, of another world or another time."""
+        for (field, _, _), rows in zip(self._batch.tracks(), values, strict=True):
+            self._memory.write(field, rows)
+
+    def assigned(self) -> None:
+        """Knobs were assigned: find out whether rest values are others now."""
+        self.under_way = self.under_way or self.made or self._off_goal()
+
+    def _off_goal(self) -> bool:
+        """Whether the device has other rest values than were assigned."""
+        real = np.float32 if self._memory.real == ti.f32 else np.float64
+        goals = [goal for _, goal, _ in self._batch.tracks()]
+        return any((now != goal.astype(real)).any() for now, goal in zip(self.now(), goals, strict=True))
+
+    def jump(self, some: np.ndarray) -> None:
+        """Have some, a mask (m,), reach their goals before the frame: their particles are put to where they are met."""
+        goals = [goal for _, goal, _ in self._batch.tracks()]
+        self.put([np.where(some, goal, now) for now, goal in zip(self.now(), goals, strict=True)])
+
+    def set_out(self) -> bool:
+        """Have rest values reach their goals as the coming frame ends. Returns whether kernels have to be made for it."""
+        self.under_way = self._off_goal()
+        new = self.under_way and not self.made
+        if new:
+            self._make()
+        if self.made:
+            tracks = list(zip(self.now(), self._batch.tracks(), strict=True))
+            goals = [goal for _, (_, goal, _) in tracks]
+            self._aim([goal + difference(now, goal) for now, (_, goal, difference) in tracks], goals)
+        return new
+
+    def arrive(self) -> None:
+        """Rest values are what was assigned: the frame is over, or nothing was on its way."""
+        goals = [goal for _, goal, _ in self._batch.tracks()]
+        self.put(goals)
+        if self.made:
+            self._aim(goals, goals)
+        self.under_way = False
+
+    def _make(self) -> None:
+        """Take room, in a world that is there already."""
+        self.fields = [field for field, _, _ in self._batch.tracks()]
+        self.memory, name, m = self._memory.more(), repr(self._batch), self._batch.count
+        self.begin = [self.memory.field(f"{name}.rest_at_begin", m) for _ in self.fields]
+        self.goal = [self.memory.field(f"{name}.rest_at_end", m) for _ in self.fields]
+        self.step = self.memory.field(f"{name}.step_of_rest", m)
         self.memory.place()
+        self.made = True
 
-    def aim(self, begin: list[np.ndarray], goal: list[np.ndarray]) -> None:
+    def _aim(self, begin: list[np.ndarray], goal: list[np.ndarray]) -> None:
         """Go from here to there in the coming frame."""
         for field, values in zip([*self.begin, *self.goal], [*begin, *goal], strict=True):
             self.memory.write(field, values)

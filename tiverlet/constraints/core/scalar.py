@@ -1,7 +1,7 @@
 """Constraints that are one number, C = f - rest: how a substep fulfils them, from soft to rigid."""
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -78,8 +78,6 @@ class Scalar(Batch):
     compiled_for = ("soft", "damped", "breaks", "limited", "cusp", "capped")
 
     each = ("rest", "compliance", "damping", "break_at")
-    kept_by_world = (*Batch.kept_by_world, "ramping")
-    host_only = ("ramping",)
     rest_name = "rest"
     uploads_all = True
     _scene_sized = False  # whether any of its lengths is that of the whole scene, in want of one of its own
@@ -126,26 +124,6 @@ class Scalar(Batch):
                 "They act together: the same result where rigid, stiffer by their number where compliant.",
                 stacklevel=5,
             )
-
-    @property
-    def unit(self) -> float | None:
-        """What residuals are relative to; None: the rest value."""
-        return self.quantity.unit
-
-    @property
-    def precise(self) -> bool:
-        """Whether exactly() measures to all the digits that positions have."""
-        return self.quantity.precise
-
-    @property
-    def curved(self) -> bool:
-        """Whether f is so curved that Newton's step from afar means nothing."""
-        return self.quantity.curved
-
-    @property
-    def collapses(self) -> int:
-        """The power of a length that f is, where gradients vanish with the size of the body; else 0."""
-        return self.quantity.collapses
 
     @property
     def transcends(self) -> bool:
@@ -205,18 +183,15 @@ class Scalar(Batch):
         """What moves when rest values are assigned: fields, what they are to be, and how far values are from others."""
         return [(self.dev.rest, self.goal, self.quantity.difference)]
 
-    def now(self) -> list[np.ndarray]:
-        """What tracks() have on the device: where a ramp begins, (m,) each; as a frame ends, what was assigned before it."""
-        return [self.scene.memory.read(field)[..., : self.count].astype(np.float64) for field, _, _ in self.tracks()]
-
     @property
-    def waits(self) -> bool:
-        """Whether the device may have other rest values than were assigned."""
-        return (self.changed or self.ramping) and self.acts and not self.driven and self.count > 0
+    def ramp(self) -> Ramp | None:
+        """The way to other rest values, while it is bound."""
+        return vars(self.dev).get("ramp")
 
     def violation(self, position: np.ndarray) -> np.ndarray:
         """C at the given positions, (m,), with the rest values of the state: those before a ramp that was not gone yet."""
-        return self.quantity.difference(self.rest_of(position), self.now()[0] if self.ramping else self.goal)
+        rest = self.ramp.now()[0] if self.ramp and self.ramp.under_way else self.goal
+        return self.quantity.difference(self.rest_of(position), rest)
 
     def gradients(self, position: np.ndarray) -> np.ndarray:
         """grad_k f of every constraint at the given positions, (m, arity, dim); of outlines (total, dim)."""
@@ -326,17 +301,17 @@ class Scalar(Batch):
     @property
     def limited(self) -> bool:
         """Whether steps of the batch have to be limited, or had to be when kernels were compiled: f is curved, and some rigid."""
-        return self.curved and bool((self.compliance == 0).any()) or bool(vars(self.dev).get("limited", False))
+        return self.quantity.curved and bool((self.compliance == 0).any()) or bool(vars(self.dev).get("limited", False))
 
     @property
     def solvable_together(self) -> bool:
         """Whether constraints of the batch can be solved together with others: few corners, and a direction everywhere."""
-        return self.arity > 0 and not self.collapses
+        return self.arity > 0 and not self.quantity.collapses
 
     @property
     def learns_loads(self) -> bool:
         """Whether its constraints may know their loads: few corners, and straight; of these, those that are rigid do."""
-        return self.arity > 0 and not (self.driven or self.curved or self.collapses)
+        return self.arity > 0 and not (self.driven or self.quantity.curved or self.quantity.collapses)
 
     def bind(self, scene: Scene) -> None:
         """Declare rest values, multipliers, springs and strengths; and, for solvers, which rows of a system constraints are."""
@@ -344,8 +319,8 @@ class Scalar(Batch):
         self._alone, self._made_for = self.relaxed_alone(scene), self._strictly
         self.dev.forces = bool(self.acts_as_force(scene).any())
         start = self.rest_of(self.start.position) if self.count else np.zeros(0)
-        scale = self.unit or (float(np.abs(start).mean()) if np.any(start) else self.start.size)
-        self._scene_sized = not self.unit and not np.any(start)
+        scale = self.quantity.unit or (float(np.abs(start).mean()) if np.any(start) else self.start.size)
+        self._scene_sized = not self.quantity.unit and not np.any(start)
         self.dev.scale = scene.memory.number(scale, scene.real)
         name, m, add = repr(self), self.count, scene.memory.field
         self.dev.rest = add(f"{name}.rest", m, values=self.goal, state=self.driven)
@@ -368,7 +343,7 @@ class Scalar(Batch):
         self.dev.in_system, self.dev.outside = bool((rows >= 0).any()), bool((rows < 0).any())
         if self.dev.in_system:
             self.dev.row = add(f"{name}.row", m, kind=ti.i32, values=rows)
-        self.dev.cusp, self.dev.ramps = self.cusp, False
+        self.dev.cusp, self.dev.ramp = self.cusp, Ramp(scene.memory, self)
         self.dev.converges = self.solvable_together and (self.dev.in_system or bool(scene.slots.semi_iteration))
         if self.dev.converges:
             self.dev.inverse_size = add(f"{name}.close", m, values=self.inverse_size(self.start.position))
@@ -388,49 +363,9 @@ class Scalar(Batch):
             if self.driven:
                 self.dev.drive.upload(*self.course(), self.largest)
             else:
-                self.ramping = self.ramping or self.dev.ramps or self._off_goal()
+                self.dev.ramp.assigned()
             self.dev.spring.upload(self.compliance, self.damping)
             self.dev.strength.upload(self.break_at)
-
-    def _off_goal(self) -> bool:
-        """Whether the device has other rest values than were assigned."""
-        real = np.float32 if self.scene.real == ti.f32 else np.float64
-        return any((now != goal.astype(real)).any() for now, (_, goal, _) in zip(self.now(), self.tracks(), strict=True))
-
-    def release(self) -> None:
-        """Forget the world, and what was under way there."""
-        super().release()
-        self.__dict__.pop("ramping", None)
-
-    def put(self, values: Sequence[np.ndarray]) -> None:
-        """Have rest values begin elsewhere: what now() gave, of another world or another time."""
-        for (field, _, _), rows in zip(self.tracks(), values, strict=True):
-            self.scene.memory.write(field, rows)
-
-    def jump(self, some: np.ndarray) -> None:
-        """Have some, a mask (m,), reach their goals before the frame: their particles are put to where they are met."""
-        self.put([np.where(some, goal, now) for now, (_, goal, _) in zip(self.now(), self.tracks(), strict=True)])
-
-    def set_out(self) -> bool:
-        """Have rest values reach their goals as the coming frame ends. Returns whether kernels have to be made for it."""
-        self.ramping = self._off_goal()
-        new = self.ramping and not self.dev.ramps
-        if new:
-            self.dev.ramp = Ramp(self.scene.memory, repr(self), [field for field, _, _ in self.tracks()], self.count)
-            self.dev.ramps = True
-        if self.dev.ramps:
-            tracks = list(zip(self.now(), self.tracks(), strict=True))
-            goals = [goal for _, (_, goal, _) in tracks]
-            self.dev.ramp.aim([goal + difference(now, goal) for now, (_, goal, difference) in tracks], goals)
-        return new
-
-    def arrive(self) -> None:
-        """Rest values are what was assigned: the frame is over, or nothing was on its way."""
-        goals = [goal for _, goal, _ in self.tracks()]
-        self.put(goals)
-        if self.dev.ramps:
-            self.dev.ramp.aim(goals, goals)
-        self.ramping = False
 
     @property
     def load(self) -> np.ndarray:
@@ -474,7 +409,7 @@ class Scalar(Batch):
     def excess(self, c, f):
         """f - rest."""
         C = f - self.dev.rest[c]
-        if ti.static(self.precise):
+        if ti.static(self.dev.quantity.precise):
             C = self.dev.quantity.excess(self.member(c, 0), self.member(c, 1), f, self.dev.rest[c])
         return C
 
@@ -568,7 +503,7 @@ class Scalar(Batch):
     def violation_then(self, c, f, ago: ti.template()):  # type: ignore[valid-type]
         """f - rest with the rest value of `ago` substeps ago."""
         C = f - self.dev.rest[c]
-        if ti.static(self.driven or self.dev.ramps):
+        if ti.static(self.driven or self.dev.ramp.made):
             C += ago * self.step_of_rest(c)
         return C
 
@@ -599,7 +534,7 @@ class Scalar(Batch):
                 C += self.dev.drive.step[c]
             C = self.bounded(C)
             borne = W * ti.abs(self.dev.lam[c])
-            if ti.static(not self.collapses):
+            if ti.static(not self.dev.quantity.collapses):
                 borne = ti.min(borne, BORNE * self.residual_scale(c))
             over = ti.abs(C) - borne - APPROACH * share * self.residual_scale(c)
             if over > 0 and self.dev.spring.is_rigid(c):
@@ -705,10 +640,10 @@ class Scalar(Batch):
         extent: squared size of the body. move: squared size of what a multiplier of 1 moves.
         """
         size = ti.abs(self.dev.rest[c])
-        if ti.static(self.collapses == 2):
+        if ti.static(self.dev.quantity.collapses == 2):
             size = ti.sqrt(size)
         else:
-            size = ti.pow(size, ti.static(1 / self.collapses))
+            size = ti.pow(size, ti.static(1 / self.dev.quantity.collapses))
         reach = ti.sqrt(extent) + size
         far = ti.abs(new - lam) * ti.sqrt(move)
         if far > reach:
@@ -770,7 +705,7 @@ class Scalar(Batch):
     @ti.func
     def relax(self, c, h, h2_effective, frame_fraction, first, fresh):
         """One Jacobi correction of constraint c."""
-        if ti.static(self.dev.ramps):
+        if ti.static(self.dev.ramp.made):
             if first != 0:
                 self.dev.ramp.follow(c, frame_fraction)
         if ti.static(self.arity == 0):
@@ -817,7 +752,7 @@ class Scalar(Batch):
                     if first != 0:
                         violation += self.known_violation(c, violation - moved, W, h, h2_effective)
                 new = self.jacobi_update(c, violation, A, alpha, lam, W, turn)
-                if ti.static(self.collapses > 0):
+                if ti.static(self.dev.quantity.collapses > 0):
                     move = ti.cast(0, self.dev.real)
                     for k in ti.static(range(self.arity)):
                         w = self.dev.w.of(self.member(c, k))
@@ -977,7 +912,7 @@ class Scalar(Batch):
                 W += self.dev.slots.split[i] * gg
             violation, A, alpha, lam, W = self.equation(c, f, f, w, W, h, h2_effective, 0, fresh)
             left = self.removed(c, violation, A, alpha, lam, W)
-            if ti.static(self.collapses > 0):
+            if ti.static(self.dev.quantity.collapses > 0):
                 if g.norm_sqr() == 0 and self.dev.strength.holds(c):
                     left = ti.abs(self.bounded(f - self.dev.rest[c]))
         return left / self.residual_scale(c)
@@ -1020,7 +955,7 @@ class Scalar(Batch):
     def residual_scale(self, c):
         """What the residual of constraint c is relative to."""
         size = self.dev.scale.now
-        if ti.static(not self.unit):
+        if ti.static(not self.dev.quantity.unit):
             if self.dev.rest[c] != 0:
                 size = ti.abs(self.dev.rest[c])
         return size
