@@ -20,7 +20,7 @@ class Outline:
     def __init__(self, scene: Scene, batch: Any):
         name, add = repr(batch), scene.memory.field
         self.of, self.corners, self.slots, self.w = batch, batch.dev.corners, scene.slots, scene.state.w
-        self.real, self.dim, self.limited = scene.real, scene.state.dim, batch.dev.limited
+        self.real, self.dim, self.limited = scene.real, scene.state.dim, batch.dev.limit.acts
         self.sums = add(f"{name}.sums", batch.blocks, width=8)
         self.start = add(f"{name}.gradient", batch.corner_count, width=self.dim)
         self.change = add(f"{name}.change", batch.count)
@@ -79,7 +79,7 @@ class Outline:
         if ti.static(self.limited):
             violation -= A * self.of.postpone(c, f0, W, frame_fraction[1] - frame_fraction[0], first)
         new = self.of.jacobi_update(c, violation, A, alpha, lam, W, turn)
-        new = self.of.limit_collapse(c, lam, new, extent, move)
+        new = self.of.dev.limit.limit_collapse(lam, new, self.of.dev.rest[c], extent, move)
         self.of.dev.lam[c], self.change[c], self.astray[c] = new, new - lam, turn == FAR
 
     @ti.func

@@ -18,15 +18,11 @@ from .outline import Outline
 from .quantity import Quantity
 from .ramp import Ramp
 from .spring import Spring, stiff
+from .step_limit import TRUST, StepLimit
 from .strength import Strength, strength_of
 
 if TYPE_CHECKING:
     from ...particles import Particles
-
-# Where f is curved, Newton's step is an explicit method for large violations, with limits:
-APPROACH = 1 / 3  # of its size (1 rad for angles), in a frame: how fast a constraint gives up a violation that no load explains
-BORNE = 0.25  # of its size: an angle that is off by more than this is off by more than a load explains
-TRUST = 0.5  # of its reach, by which a pass moves a corner: beyond, f is not what its gradient says
 
 RESOLVED = 4.0  # alpha' / W: from where on the substep resolves a spring
 LOST = 0.015  # violation at the start of a substep, relative to the size, from where on its direction would bring in energy
@@ -51,20 +47,8 @@ class Scalar(Batch):
     C_(n+1) and C_n.
     With drag, alpha' = alpha / (phi h^2) with the factor phi that the exact solution gives every other acceleration.
 
-    Rest values that are assigned are reached in the course of the next frame, see Ramp; at once where particles are placed.
-
-    A rigid constraint takes out its whole violation in one substep, with the energy C^2 / (2 W h^2), as the spring would that one
-    pass of relaxation is. Under a load that is right: C = W |lam| h^2-wise is what bears it. But C may come from elsewhere: a
-    rest value that was changed in a jump, or a goal that others keep it from. Where f is `curved` (angles, areas, volumes), W
-    falls as corners go away (from afar an angle between two pins L apart has the gradient L / r^2), and that spring is a pump. So
-    what exceeds the multiplier of the last substep, |C_n| - W |lam|, is given up by at most APPROACH of its size in a frame. And
-    where a violation is postponed so, or a pass would move a corner by more than TRUST of its reach, angles only take out motion:
-    with u = sum_j grad_j C . d_j, the motion along the constraint in this substep,
-
-        |u + W dlam| <= max(|u|, pace)
-
-    where `pace` is APPROACH of a frame, and 0 where corners are faster than twice that. With mass-split W, in which every
-    constraint has particles of its own, kinetic energy then never grows by more than what the pace is.
+    Rest values that are assigned are reached in the course of the next frame, see Ramp; at once where particles are placed. Where
+    f is curved (angles, areas, volumes), steps of rigid constraints are limited, see StepLimit.
     """
 
     index_name = "pairs"
@@ -301,7 +285,7 @@ class Scalar(Batch):
     @property
     def limited(self) -> bool:
         """Whether steps of the batch have to be limited, or had to be when kernels were compiled: f is curved, and some rigid."""
-        return self.quantity.curved and bool((self.compliance == 0).any()) or bool(vars(self.dev).get("limited", False))
+        return self.quantity.curved and bool((self.compliance == 0).any()) or self._built("limit", "acts")
 
     @property
     def solvable_together(self) -> bool:
@@ -332,14 +316,8 @@ class Scalar(Batch):
         self.dev.strength = Strength(scene, name, self)
         self.changed = False
         rows = scene.slots.rows(self)
-        self.dev.limited = self.limited and scene.order == 2
-        if self.dev.limited:
-            self.dev.postponed = add(f"{name}.postponed", m)
-            if self.arity:
-                corner = self.placed(self.start.position)
-                span = np.linalg.norm(corner - corner[:, :1], axis=2).max(axis=1, initial=0.0)
-                self.dev.span = add(f"{name}.span", m, values=np.where(span > 0, span, self.start.size))
-                self._scene_sized |= not span.all()
+        self.dev.limit = StepLimit(scene, name, self)
+        self._scene_sized |= self.dev.limit.scene_sized
         self.dev.in_system, self.dev.outside = bool((rows >= 0).any()), bool((rows < 0).any())
         if self.dev.in_system:
             self.dev.row = add(f"{name}.row", m, kind=ti.i32, values=rows)
@@ -526,22 +504,17 @@ class Scalar(Batch):
 
     @ti.func
     def postpone(self, c, f0, W, share, first):
-        """What of the violation is left for later substeps, see the class. share: of the frame, that the substep is; 0: none."""
+        """What of the violation is left for later substeps, see StepLimit. share: of the frame, that the substep is; 0: none."""
         out = ti.cast(0, self.dev.real)
         if first != 0:
             C = f0 - self.dev.rest[c]
-            if ti.static(self.driven):  # as fast as it is told to be, but what is assigned has no more than APPROACH
+            if ti.static(self.driven):  # as fast as it is told to be, but what is assigned has no more than a share of its size
                 C += self.dev.drive.step[c]
-            C = self.bounded(C)
-            borne = W * ti.abs(self.dev.lam[c])
-            if ti.static(not self.dev.quantity.collapses):
-                borne = ti.min(borne, BORNE * self.residual_scale(c))
-            over = ti.abs(C) - borne - APPROACH * share * self.residual_scale(c)
-            if over > 0 and self.dev.spring.is_rigid(c):
-                out = ti.select(C > 0, over, -over)
-            self.dev.postponed[c] = out
+            if self.dev.spring.is_rigid(c):
+                out = self.dev.limit.postpone(c, self.bounded(C), W * ti.abs(self.dev.lam[c]), self.residual_scale(c), share)
+            self.dev.limit.postponed[c] = out
         elif share > 0:
-            out = self.dev.postponed[c]
+            out = self.dev.limit.postponed[c]
         return out
 
     @ti.func
@@ -593,7 +566,7 @@ class Scalar(Batch):
             f0 = self.unwrap(f0, self.dev.rest[c])
             f = self.unwrap(f, f0)
         violation, A, alpha, lam, W = self.equation(c, f, f0, w, both, h, h2_effective, first, fresh)
-        if ti.static(self.dev.limited):
+        if ti.static(self.dev.limit.acts):
             violation -= A * self.postpone(c, f0, W, share, first)
         return violation, A, alpha, lam, W, n, g, turn * ti.cast(self.direction_reliable(f, f0), ti.i32), f - f0
 
@@ -634,23 +607,6 @@ class Scalar(Batch):
         return size
 
     @ti.func
-    def limit_collapse(self, c, lam, new, extent, move):
-        """Next to where it has no direction, f is curved: no pass moves corners further than they are, or are to be, apart.
-
-        extent: squared size of the body. move: squared size of what a multiplier of 1 moves.
-        """
-        size = ti.abs(self.dev.rest[c])
-        if ti.static(self.dev.quantity.collapses == 2):
-            size = ti.sqrt(size)
-        else:
-            size = ti.pow(size, ti.static(1 / self.dev.quantity.collapses))
-        reach = ti.sqrt(extent) + size
-        far = ti.abs(new - lam) * ti.sqrt(move)
-        if far > reach:
-            new = lam + (new - lam) * (reach / far)
-        return new
-
-    @ti.func
     def motion(self, c, n, together):
         """The motion u along n in this substep, its weight W, the largest move by a multiplier of 1, the largest move squared.
 
@@ -683,13 +639,8 @@ class Scalar(Batch):
         far = False
         if self.dev.spring.is_rigid(c):
             u, W, longest, fastest = self.motion(c, n, together)
-            reach = self.dev.quantity.reach(self.corners(c, 0))
-            if W > 0 and (self.dev.postponed[c] != 0 or ti.abs(new - lam) * longest > TRUST * reach):
-                pace = APPROACH * share * ti.min(self.residual_scale(c), W * ti.min(reach, self.dev.span[c]) / longest)
-                if fastest * W * W > (2 * pace * longest) ** 2:
-                    pace *= 0
-                most = ti.max(ti.abs(u), pace)
-                new, far = lam + ti.max((-u - most) / W, ti.min(new - lam, (most - u) / W)), True
+            reach, size = self.dev.quantity.reach(self.corners(c, 0)), self.residual_scale(c)
+            new, far = self.dev.limit.limit(c, lam, new, u, W, longest, fastest, reach, size, share)
         return new, far
 
     @ti.func
@@ -715,71 +666,81 @@ class Scalar(Batch):
 
     @ti.func
     def relax_corners(self, c, h, h2_effective, frame_fraction, first, fresh):
-        """Move each corner by w_j dlam grad_j C; a constraint that belongs to a system tells it what it knows."""
-        violation, A, alpha, lam, W, n, g, turn, moved = self.linearise(
-            c, h, h2_effective, frame_fraction[1] - frame_fraction[0], first, fresh
-        )
+        """Move each corner by w_j dlam grad_j C. Where c belongs to a system, dlam comes from there: c tells it what it knows, and
+        leaves w_j grad_j C."""
+        share = frame_fraction[1] - frame_fraction[0]
+        violation, A, alpha, lam, W, n, g, turn, moved = self.linearise(c, h, h2_effective, share, first, fresh)
         step = ti.cast(1, self.dev.real)
         if ti.static(self.dev.in_system):
-            row = self.dev.row[c]
-            if row >= 0:
-                start, weight, new = lam, W, lam
-                if ti.static(self.dev.limited):
-                    if W > 0:
-                        new = self.multiplier_of(c, violation, A, alpha, lam, W)
-                        new, far = self.limit_step(c, lam, new, n, frame_fraction[1] - frame_fraction[0], 1)
-                        if far:  # the others follow: a row without a weight goes back by its multiplier
-                            start, weight = lam - new, 0 * W
-                self.dev.slots.system.set_row(row, violation, A, alpha, start, weight, self.geometric_stiffness(c, weight))
-                if ti.static(self.dev.slots.system.limits_steps):
-                    u, split, longest, _ = self.motion(c, n, 0)
-                    spare, most = ti.math.inf + 0 * u, ti.math.inf + 0 * u
-                    if split > 0 and self.dev.spring.is_rigid(c):
-                        spare = 2 * (violation - moved) ** 2 / split
-                        if ti.static(self.dev.limited):
-                            most = TRUST * self.dev.quantity.reach(self.corners(c, 0)) / longest
-                    self.dev.slots.system.limit_row(row, u, spare, most, lam - new)
-                for k in ti.static(range(self.arity)):
-                    self.dev.slots.system.set_gradient(self.dev.places[c][k], self.member(c, k), g[k, :])
-                acts = violation != 0
-                if ti.static(self.side != 0):  # one that is slack has a direction, but does nothing along it
-                    acts = self.side * violation > 0 or lam != 0
-                if acts:
-                    self.dev.slots.note_turn(turn)
+            if self.dev.row[c] >= 0:
+                self.tell_system(c, violation, A, alpha, lam, W, n, g, turn, moved, share)
         if ti.static(self.dev.outside):
             if self.outside_systems(c):
                 if ti.static(self.dev.known.learns):
                     if first != 0:
                         violation += self.known_violation(c, violation - moved, W, h, h2_effective)
-                new = self.jacobi_update(c, violation, A, alpha, lam, W, turn)
-                if ti.static(self.dev.quantity.collapses > 0):
-                    move = ti.cast(0, self.dev.real)
-                    for k in ti.static(range(self.arity)):
-                        w = self.dev.w.of(self.member(c, k))
-                        move += w * w * n[k, :].dot(n[k, :])
-                    new = self.limit_collapse(c, lam, new, self.corners(c, 0).norm_sqr(), move)
-                step = new - lam
-                if ti.static(self.dev.steps):
-                    last, wanted = self.dev.step[c], new
-                    if first != 0:
-                        last = 0
-                    if not self.has_cusp(c):  # there the last step went elsewhere
-                        wanted = lam + self.dev.slots.semi_iteration.step(last, step)
-                    step = self.dev.slots.limited(wanted, self.geometric_stiffness(c, W / 2)) - lam  # split by two in a chain
-                    new = lam + step
-                if ti.static(self.dev.limited):
-                    if W > 0:
-                        new, _ = self.limit_step(c, lam, new, n, frame_fraction[1] - frame_fraction[0], 0)
-                        new = self.clamped(c, new)
-                        step = new - lam
-                if ti.static(self.dev.steps):
-                    self.dev.step[c] = step
-                self.dev.lam[c] = new
-                if ti.static(self.dev.known.learns):
-                    if new == 0 and (W == 0 or ti.static(self.side != 0)):
-                        self.dev.known.let_go(c)
+                step = self.relax_alone(c, violation, A, alpha, lam, W, n, turn, share, first)
         for k in ti.static(range(self.arity)):
             self.push(c, k, self.dev.w.of(self.member(c, k)) * step * n[k, :])
+
+    @ti.func
+    def tell_system(self, c, violation, A, alpha, lam, W, n, g, turn, moved, share):
+        """Fill in the row of constraint c, from what linearise() returns. share: of the frame, that the substep is."""
+        row, start, weight, new = self.dev.row[c], lam, W, lam
+        if ti.static(self.dev.limit.acts):
+            if W > 0:
+                new = self.multiplier_of(c, violation, A, alpha, lam, W)
+                new, far = self.limit_step(c, lam, new, n, share, 1)
+                if far:  # the others follow: a row without a weight goes back by its multiplier
+                    start, weight = lam - new, 0 * W
+        self.dev.slots.system.set_row(row, violation, A, alpha, start, weight, self.geometric_stiffness(c, weight))
+        if ti.static(self.dev.slots.system.limits_steps):
+            u, split, longest, _ = self.motion(c, n, 0)
+            spare, most = ti.math.inf + 0 * u, ti.math.inf + 0 * u
+            if split > 0 and self.dev.spring.is_rigid(c):
+                spare = 2 * (violation - moved) ** 2 / split
+                if ti.static(self.dev.limit.acts):
+                    most = TRUST * self.dev.quantity.reach(self.corners(c, 0)) / longest
+            self.dev.slots.system.limit_row(row, u, spare, most, lam - new)
+        for k in ti.static(range(self.arity)):
+            self.dev.slots.system.set_gradient(self.dev.places[c][k], self.member(c, k), g[k, :])
+        acts = violation != 0
+        if ti.static(self.side != 0):  # one that is slack has a direction, but does nothing along it
+            acts = self.side * violation > 0 or lam != 0
+        if acts:
+            self.dev.slots.note_turn(turn)
+
+    @ti.func
+    def relax_alone(self, c, violation, A, alpha, lam, W, n, turn, share, first):
+        """The step of the multiplier of constraint c, which belongs to no system; it is taken."""
+        new = self.jacobi_update(c, violation, A, alpha, lam, W, turn)
+        if ti.static(self.dev.quantity.collapses > 0):
+            move = ti.cast(0, self.dev.real)
+            for k in ti.static(range(self.arity)):
+                w = self.dev.w.of(self.member(c, k))
+                move += w * w * n[k, :].dot(n[k, :])
+            new = self.dev.limit.limit_collapse(lam, new, self.dev.rest[c], self.corners(c, 0).norm_sqr(), move)
+        step = new - lam
+        if ti.static(self.dev.steps):
+            last, wanted = self.dev.step[c], new
+            if first != 0:
+                last = 0
+            if not self.has_cusp(c):  # there the last step went elsewhere
+                wanted = lam + self.dev.slots.semi_iteration.step(last, step)
+            step = self.dev.slots.limited(wanted, self.geometric_stiffness(c, W / 2)) - lam  # split by two in a chain
+            new = lam + step
+        if ti.static(self.dev.limit.acts):
+            if W > 0:
+                new, _ = self.limit_step(c, lam, new, n, share, 0)
+                new = self.clamped(c, new)
+                step = new - lam
+        if ti.static(self.dev.steps):
+            self.dev.step[c] = step
+        self.dev.lam[c] = new
+        if ti.static(self.dev.known.learns):
+            if new == 0 and (W == 0 or ti.static(self.side != 0)):
+                self.dev.known.let_go(c)
+        return step
 
     @ti.func
     def known_violation(self, c, start, W, h, h2_effective):
