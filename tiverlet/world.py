@@ -262,7 +262,7 @@ class World:
 
     def hash(self) -> str:
         """SHA-256 of the exact state: equal if and only if two worlds of the same scene will go on alike, bit for bit."""
-        return checkpoint.keep(self).digest()
+        return checkpoint.digest(self, checkpoint.keep(self))
 
     def explain(self) -> str:
         """What was compiled and what was left out, with fields, bytes and launches, and how long compiling took."""

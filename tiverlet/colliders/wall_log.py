@@ -24,7 +24,7 @@ class WallLog:
     def __init__(self, scene: "Scene", name: str):
         n, dim, add = scene.count, scene.particles.dim, scene.memory.field
         self._scene, self.state, self.radius = scene, scene.state, scene.radius
-        self.touching = add(f"events.{name}.touching", n, kind=ti.i32, state=True)
+        self.touching = add(f"events.{name}.touching", n, kind=ti.i32, state=True, told=True)
         self.when = add(f"events.{name}.when", n, width=2, kind=ti.i32)
         self.impulse, self.speed = add(f"events.{name}.impulse", n), add(f"events.{name}.speed", n)
         self.normal, self.point = add(f"events.{name}.normal", n, width=dim), add(f"events.{name}.point", n, width=dim)

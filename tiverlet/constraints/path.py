@@ -126,7 +126,7 @@ class Path(Anchored):
         )
         self.dev.lengths = add("Path.lengths", self.dev.pieces, values=c.lengths)
         piece, rest = c.split(self._start)
-        self.dev.piece = add("Path.piece", m, kind=ti.i32, values=piece, state=True)
+        self.dev.piece = add("Path.piece", m, kind=ti.i32, values=piece, state=True, below=self.dev.pieces)
         self.dev.rest = add("Path.rest", m, values=rest, state=True)
         self.dev.least = float(np.ptp(self.points, axis=0).max()) * (2.0**-22 if scene.real == ti.f32 else 2.0**-44)
         if self.drives:

@@ -15,6 +15,7 @@ from .candidates import DiscCandidates
 if TYPE_CHECKING:
     from ..neighbours.neighbour_search import NeighbourSearch
 
+SHRUNK = "Contact.shrunk"  # the name of how much smaller particles are
 SAME_PLACE = 2.0**-80  # two particles are in the same place: their distance over that at which they touch, squared
 
 
@@ -26,6 +27,7 @@ class DiscGeometry:
     """
 
     push_out: Any = OnDevice()
+    late = (SHRUNK,)
 
     def __init__(
         self, scene: Scene, search: "NeighbourSearch", push_out: float = 0.0, impulse: PairData | None = None,
@@ -161,7 +163,7 @@ class DiscGeometry:
         """From now on particles may be smaller than they are; the field for it exists only once it is needed."""
         if not self.shrinks:
             self.store = self.scene.memory.more()
-            self.shrunk = self.store.field("Contact.shrunk", self.scene.count, state=True)
+            self.shrunk = self.store.field(SHRUNK, self.scene.count, state=True)
             self.store.place()
             self.shrinks = True
 

@@ -28,6 +28,7 @@ class Geometry(Protocol):
 
     shrinks: bool  # whether particles may be smaller than they are, or are allowed to overlap
     store: Any  # the Memory of a field that is made when it is needed, or None
+    late: tuple[str, ...]  # the name of such a field in the state
 
     def overshoots(self, i) -> Any:
         """1 if particle i moves so far in one substep that a contact may be missed."""
@@ -157,6 +158,11 @@ class PairContact(Feature):
     def store(self) -> Any:
         """The Memory of what was made when it was needed, or None."""
         return self.dev.geometry.store if "geometry" in vars(self.dev) else None
+
+    @property
+    def late(self) -> tuple[str, ...]:
+        """The names of fields of the state that enable_shrink() makes, and that are 0 before."""
+        return self.dev.geometry.late
 
     def join(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
         """Declare the fields, among them the neighbour list's, which is returned."""

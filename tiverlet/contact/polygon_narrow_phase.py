@@ -52,7 +52,7 @@ class PolygonGeometry:
     or C of two discs, see DiscGeometry, of which one may be a corner. push_out: at which speed what is inside goes out [m/s].
     """
 
-    shrinks, store = True, None  # its field is there from the start
+    shrinks, store, late = True, None, ()  # its field is there from the start
 
     push_out: Any = OnDevice()
 
@@ -69,7 +69,7 @@ class PolygonGeometry:
         # For each entry the contact of which its particle is the vertex: overlap, place on the edge (DISCS: there is none) and
         # normal; where in the list of the other one those are in which it is the start, and the end, of the edge (-1: nowhere).
         self.manifold, self.back = PairData("met", 4, False, kept=False), PairData("back", 2, False, kept=False)
-        self.impulse = PairData("given", 0, lasting=True)  # pushes and impacts in the last substep [kg m]
+        self.impulse = PairData("given", 0, lasting=True, told=True)  # pushes and impacts in the last substep [kg m]
         self.carried = [self.manifold, self.back, self.impulse]
 
     def bind(self, search: NeighbourSearch) -> None:

@@ -23,10 +23,14 @@ class Entry:
     state: bool  # part of the exact state, hence of hash() and clone()
     copies: int = 0  # of which each has so many elements; 0 where it is one for all
     rows: Any = None  # the Number of what it has an element for each of; None where that is not told
+    told: bool = False  # part of the state for reports alone, hence not of hash()
+    below: int | None = None  # where kernels take its elements for indices: how many there are of what these mean
 
     def of_length(self, length: int) -> "Entry":
         """The same field with so many elements; replace() takes three times as long."""
-        return Entry(self.name, self.field, self.width, length, self.kind, self.state, self.copies, self.rows)
+        return Entry(
+            self.name, self.field, self.width, length, self.kind, self.state, self.copies, self.rows, self.told, self.below
+        )  # fmt: skip
 
     @property
     def shape(self) -> tuple[int, ...]:

@@ -70,23 +70,24 @@ class Memory:
 
     def field(
         self, name: str, length: int | Number | None, *, width: int = 0, kind=None, values=None, state: bool = False,
-        shared: bool = False,
+        shared: bool = False, told: bool = False, below: int | None = None,
     ) -> Any:  # fmt: skip
         """Declare a field of `length` elements (None: a single one, of 0 dimensions) and give it its first values. A Number: one
-        for each of what it counts, see regroup(). shared: it is one for all copies."""
+        for each of what it counts, see regroup(). shared: it is one for all copies. state, told, below: see Entry."""
         kind, rows = self.real if kind is None else kind, None
         if isinstance(length, Number):
             rows, length = length, int(length.now)
         length = 0 if length is None else max(1, length)  # a field of 0 elements poisons the runtime
         made = layout.field(kind, width)
-        self._declare(name, made, length, width, kind, state, shared, rows)
+        self._declare(name, made, length, width, kind, state, shared, rows, told, below)
         if values is not None and np.size(values):
             self._later.append((self.entries[-1], np.asarray(values, dtype=np.float64)))
         return made
 
     def _declare(
-        self, name: str, made: Any, length: int, width: int, kind: Any, state: bool, shared: bool = False, rows: Any = None
-    ) -> None:
+        self, name: str, made: Any, length: int, width: int, kind: Any, state: bool, shared: bool = False, rows: Any = None,
+        told: bool = False, below: int | None = None,
+    ) -> None:  # fmt: skip
         copies = 0 if shared or not self.copies else self.copies.count
         in_all = max(1, length) * copies if copies else length
         if in_all >= 2**31:
@@ -96,7 +97,7 @@ class Memory:
         same = self._named[name]
         name = f"{name} #{same}" if same > 1 else name  # two batches of a kind
         self._at[id(made)] = len(self.entries)
-        self.entries.append(Entry(name, made, width, length, np.dtype(_NUMPY[kind]), state, copies, rows))
+        self.entries.append(Entry(name, made, width, length, np.dtype(_NUMPY[kind]), state, copies, rows, told, below))
 
     def number(self, value: float, kind=None) -> Number:
         """A number that kernels find in a field, so that others share them: an integer, unless `kind` says so."""

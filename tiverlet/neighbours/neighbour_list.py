@@ -22,7 +22,8 @@ WORD, FULL = 32, 2**32 - 1  # entries that one word of bits is for
 class PairData:
     """What each pair remembers: a number, or a vector of `width`.
 
-    lasting: it is part of the state, beyond a substep. kept: it is transferred to the next list; what is not is computed anew.
+    lasting: it is part of the state, beyond a substep. told: for reports alone. kept: it is transferred to the next list; what is
+    not is computed anew.
     marked: only pairs whose bit in NeighbourList.touching is set have other than 0. kind: of the numbers; None for those of the
     world. field, old: the data of the list, and of the old one while a new one is built.
     """
@@ -30,8 +31,11 @@ class PairData:
     field: Any
     old: Any
 
-    def __init__(self, name: str, width: int, lasting: bool, kept: bool = True, marked: bool = False, kind: Any = None):
+    def __init__(
+        self, name: str, width: int, lasting: bool, kept: bool = True, marked: bool = False, kind: Any = None, told: bool = False
+    ):  # fmt: skip
         self.name, self.width, self.lasting, self.kept, self.marked, self.kind = name, width, lasting, kept, marked, kind
+        self.told = told
 
 
 class Column:

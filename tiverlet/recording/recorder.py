@@ -277,7 +277,7 @@ class Recorder:
         x = picture.drawing.shown(now.position(len(world.particles)))
         x32 = x.astype(np.float32)
         picture.frame(number, now, x, x32, journal.rounded(), journal.scenes, journal.stirred)
-        journal.frame_drawn({"time": world.time, "hash": brief(now.digest()), "crc": zlib.crc32(x32.tobytes())})
+        journal.frame_drawn({"time": world.time, "hash": brief(checkpoint.digest(world, now)), "crc": zlib.crc32(x32.tobytes())})
         self.frames += 1
 
     @interrupts.uncut

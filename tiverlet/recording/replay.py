@@ -142,7 +142,7 @@ class Replay:
         world = None
         try:
             for world, entry in self._run(start, goal):
-                if entry.kind == "frame" and journal.brief(checkpoint.keep(world, pairs=False).digest()) != entry.data["hash"]:
+                if entry.kind == "frame" and _brief(world, checkpoint.keep(world, pairs=False)) != entry.data["hash"]:
                     raise RuntimeError(f"replay: frame {entry.frame} of {self.path} does not come out as recorded. {self._why()}")
             assert world
             return world
@@ -181,7 +181,7 @@ class Replay:
                 redraw.watch(world)
                 if entry.kind == "frame":
                     now = checkpoint.keep(world, pairs=False)
-                    same = journal.brief(now.digest()) == entry.data["hash"] and world.time == entry.data["time"]
+                    same = _brief(world, now) == entry.data["hash"] and world.time == entry.data["time"]
                     x = redraw.shown(now.position(len(world.particles)))
                     x32 = x.astype(np.float32)
                     off = _differing(x32, self._shown(entry.frame, x32.shape))
@@ -193,7 +193,7 @@ class Replay:
                     why = redraw.frame(entry, now, x, x32)
                 elif entry.kind == "state":
                     now, then = checkpoint.keep(world), _kept(entry, world)
-                    same = now.digest() == then.digest()
+                    same = checkpoint.digest(world, now) == checkpoint.digest(world, then)
                     changed = (k for k, v in now.values.items() if k in then.values and len(v) == len(world.particles))
                     found = (_differing(now.values[k], then.values[k]) for k in changed)
                     off = next((i for i in found if i is not None), None)
@@ -390,6 +390,11 @@ def _compiler(environment: dict[str, Any]) -> str:
 def _settle(world: "World", settings: list) -> None:
     """Set what the user had set, and what the controller remembered."""
     world.substeps, world.iterations, world._controller.memory = *settings[:2], tuple(settings[2])
+
+
+def _brief(world: "World", kept: checkpoint.Checkpoint) -> str:
+    """The hash of a state, as entries have it."""
+    return journal.brief(checkpoint.digest(world, kept))
 
 
 def _kept(entry: Entry, world: "World") -> checkpoint.Checkpoint:

@@ -2,7 +2,7 @@
 
 import hashlib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,12 +12,8 @@ from .clock import Clock
 if TYPE_CHECKING:
     from ..world import World
 
-LOADS = ("Contact.load", "Contact.borne", "Contact.earlier")
-CARRIED = ("Contact.push", "Contact.slip", "Contact.turn", "Contact.slack", *LOADS)  # by pairs, for the next substep
-TOLD = ("Contact.given", "Contact.touched")  # by pairs, of the last substep, for reports
-EVENTS = "events."  # names of what walls carry for reports begin so
+PAIRS, PAIR = "Contact.pairs", "Contact."  # names of the pairs that remember anything, and of what they do, before its own
 RESTS = "rests."  # and of rest values while knobs wait, before a ramp to others: with the number of the feature
-LATE = {"Contact.shrunk"}  # made when it is needed
 
 
 @dataclass(frozen=True)
@@ -27,27 +23,6 @@ class Checkpoint:
     values: dict[str, np.ndarray]
     clock: Clock
     controller: tuple
-
-    def digest(self) -> str:
-        """SHA-256 of the exact state, the clock, and what the controller remembers."""
-        out = hashlib.sha256(repr((*self.clock.hashed, *self.controller)).encode())
-        for name, values in self._lasting().items():
-            out.update(name.encode())
-            out.update(values.tobytes())
-        return out.hexdigest()
-
-    def _lasting(self) -> dict[str, np.ndarray]:
-        """Without what pairs carry for reports: a pair that has just bounced may be on the list or far off it, by the skin.
-        Without a field that is made when it is needed, where nobody needs it; and without what knobs were."""
-        values = {n: v for n, v in self.values.items() if (n not in LATE or v.any()) and not n.startswith((EVENTS, RESTS))}
-        if not any(name in values for name in TOLD):
-            return values
-        carried = [name for name in CARRIED if name in values]
-        some = np.zeros(len(values["Contact.pairs"]), dtype=bool)
-        for name in carried:
-            some |= values[name].any(axis=tuple(range(1, values[name].ndim)))
-        rows = {name: values[name][some] for name in ("Contact.pairs", *carried)}
-        return {name: rows.get(name, v) for name, v in values.items() if name not in TOLD}
 
     def position(self, count: int) -> np.ndarray:
         """Positions [m] of `count` particles, in f64 where there is more than one word of f32."""
@@ -64,14 +39,53 @@ def state(world: "World", pairs: bool = True) -> dict[str, np.ndarray]:
     """
     out = {name: values for memory in world._runner.memories for name, values in memory.state().items()}
     if world._runner.search and pairs:
-        out["Contact.pairs"], carried = world._runner.search.list.lasting_data()
-        out.update((f"Contact.{name}", values) for name, values in carried.items())
+        out[PAIRS], carried = world._runner.search.list.lasting_data()
+        out.update((f"{PAIR}{name}", values) for name, values in carried.items())
     return out | {f"{RESTS}{k}": np.stack(f.ramp.now()) for k, f in enumerate(world.features) if f.ramp and f.ramp.waits}
 
 
 def keep(world: "World", pairs: bool = True) -> Checkpoint:
     """A copy of the exact state."""
     return Checkpoint(state(world, pairs), world._clock.copy(), world._controller.memory)
+
+
+def digest(world: "World", kept: Checkpoint) -> str:
+    """SHA-256 of a state of the world, its clock, and what its controller remembers."""
+    out = hashlib.sha256(repr((*kept.clock.hashed, *kept.controller)).encode())
+    for name, values in _hashed(world, kept.values).items():
+        out.update(name.encode())
+        out.update(values.tobytes())
+    return out.hexdigest()
+
+
+def _hashed(world: "World", values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """A state without what is for reports alone, without what knobs were, and without fields that are made when they are needed,
+    where nobody needs them. A pair that has just bounced may be on the list or far off it, by the skin: what it tells is left out,
+    too, and the pair itself where it remembers nothing else."""
+    told = {e.name for memory in world._runner.memories for e in memory.entries if e.told}
+    late = _late(world)
+    values = {n: v for n, v in values.items() if not (n in told or n.startswith(RESTS) or (n in late and not v.any()))}
+    if PAIRS not in values:
+        return values
+    pieces = _pieces(world)
+    some = np.zeros(len(values[PAIRS]), dtype=bool)
+    for name in pieces:
+        if not pieces[name].told:
+            some |= values[name].any(axis=tuple(range(1, values[name].ndim)))
+    return {
+        name: v[some] if name == PAIRS or name in pieces else v for name, v in values.items()
+        if name not in pieces or not pieces[name].told
+    }  # fmt: skip
+
+
+def _late(world: "World") -> set[str]:
+    """Names of fields that are made when they are needed, and 0 before."""
+    return {name for contact in world._runner.step.contacts for name in contact.late}
+
+
+def _pieces(world: "World") -> dict[str, Any]:
+    """What pairs remember, by its name."""
+    return {f"{PAIR}{piece.name}": piece for piece in world._runner.search.list.lasting} if world._runner.search else {}
 
 
 def flags(world: "World") -> list[list[bool]]:
@@ -83,13 +97,13 @@ def put_back(world: "World", kept: Checkpoint) -> None:
     """Return to an earlier state, bit for bit."""
     world._runner.set_substep(kept.clock.h, kept.clock.drag)
     search, stores = world._runner.search, list(map(id, world._runner.memories))
-    if "Contact.shrunk" in kept.values:
-        world._runner.step.contacts[0].enable_shrink()
+    for contact in world._runner.step.contacts:
+        if any(name in kept.values for name in contact.late):
+            contact.enable_shrink()
     for memory in world._runner.memories:
         memory.restore(kept.values)
     if search:
-        pieces = {piece.name: kept.values[f"Contact.{piece.name}"] for piece in search.list.lasting}
-        search.list.restore(kept.values["Contact.pairs"], pieces)
+        search.list.restore(kept.values[PAIRS], {piece.name: kept.values[name] for name, piece in _pieces(world).items()})
     for k, f in enumerate(world.features):
         if f"{RESTS}{k}" in kept.values:
             f.ramp.put(kept.values[f"{RESTS}{k}"])
@@ -118,22 +132,20 @@ def check(world: "World", kept: Checkpoint, flagged: list[list[bool]]) -> None:
     """Raise ValueError unless a state that came from elsewhere fits the world; above all what kernels take for indices."""
     present = keep(world)
     rests = {f"{RESTS}{k}": f.ramp.shape for k, f in enumerate(world.features) if f.ramp}
-    late = LATE | rests.keys()
-    if set(present.values) - late != set(kept.values) - late:
+    late, pieces = _late(world), _pieces(world)
+    optional = late | rests.keys()
+    if set(present.values) - optional != set(kept.values) - optional:
         raise ValueError("The state is not one of this scene: it has other fields.")
-    pieces = {f"Contact.{piece.name}" for piece in world._runner.search.list.lasting} if world._runner.search else set()
-    most = {"Contact.pairs": len(world.particles)}
-    for f in world.features:
-        if hasattr(f.dev, "pieces"):  # of a Path
-            most |= {name: f.dev.pieces for name in kept.values if name.startswith("Path.piece")}  # type: ignore[attr-defined]
+    most = {e.name: e.below for memory in world._runner.memories for e in memory.entries if e.below is not None}
+    most[PAIRS] = len(world.particles)
     for name, value in kept.values.items():
-        ours, free = present.values.get(name), name in pieces or name in ("Contact.pairs", "Contact.shrunk")
+        ours, free = present.values.get(name), name in pieces or name == PAIRS or name in late
         shape = value.shape == rests[name] if name in rests else ours is None or ours.shape[free:] == value.shape[free:]
         if not shape or (ours is not None and ours.dtype.kind != value.dtype.kind):
             raise ValueError(f"The state is not one of this scene: {name} has shape {value.shape} of {value.dtype}.")
         if name in most and value.size and not (value.min() >= 0 and value.max() < most[name]):
             raise ValueError(f"The state is not one of this scene: {name} has {value.min()} to {value.max()}, of {most[name]}.")
-    if len({len(value) for name, value in kept.values.items() if name in pieces or name == "Contact.pairs"}) > 1:
+    if len({len(value) for name, value in kept.values.items() if name in pieces or name == PAIRS}) > 1:
         raise ValueError("The state is not one of this scene: pairs in contact carry other numbers of values.")
     right = len(flagged) == len(world.features) and all(type(b) is bool for pair in flagged for b in pair)
     if not right or not kept.clock.sound(len(world.particles), world.particles.dim):
