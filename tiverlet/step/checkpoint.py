@@ -59,9 +59,9 @@ def digest(world: "World", kept: Checkpoint) -> str:
 
 
 def _hashed(world: "World", values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """A state without what is for reports alone, without what knobs were, and without fields that are made when they are needed,
-    where nobody needs them. A pair that has just bounced may be on the list or far off it, by the skin: what it tells is left out,
-    too, and the pair itself where it remembers nothing else."""
+    """The state without what is for reports alone, without rest values that knobs tell as well, and without fields that were made
+    when they were needed and are 0. A pair that has just bounced may be on the list or not, by the skin: pairs that remember
+    nothing but what is for reports are left out."""
     told = {e.name for memory in world._runner.memories for e in memory.entries if e.told}
     late = _late(world)
     values = {n: v for n, v in values.items() if not (n in told or n.startswith(RESTS) or (n in late and not v.any()))}

@@ -666,8 +666,8 @@ class Scalar(Batch):
 
     @ti.func
     def relax_corners(self, c, h, h2_effective, frame_fraction, first, fresh):
-        """Move each corner by w_j dlam grad_j C. Where c belongs to a system, dlam comes from there: c tells it what it knows, and
-        leaves w_j grad_j C."""
+        """Move each corner by w_j dlam grad_j C. Where c belongs to a system, dlam comes from there: c tells it what it is about,
+        and leaves w_j grad_j C."""
         share = frame_fraction[1] - frame_fraction[0]
         violation, A, alpha, lam, W, n, g, turn, moved = self.linearise(c, h, h2_effective, share, first, fresh)
         step = ti.cast(1, self.dev.real)
