@@ -1,7 +1,6 @@
 """Questions about what is where: what rays meet first, and which particles are inside of a shape."""
 
-from .hits import Hits
 from .inside import inside
-from .ray import ray
+from .ray import Hits, ray
 
 __all__ = ["Hits", "inside", "ray"]

@@ -1,6 +1,7 @@
 """What rays meet first."""
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -8,15 +9,42 @@ import numpy as np
 from ... import checks
 from ...colliders.collider import Collider
 from ...features.feature import Feature
+from ...geometry.bounding_tree import BoundingTree, ahead
+from ...geometry.intervals import ball, capsule, entry, rounding
+from ...geometry.nearest import away, on_segment
 from ...neighbours.queries import between
 from ...particles import in_range
-from .hits import Hits
-from .targets import Rods
 
 if TYPE_CHECKING:
     from ...world import World
 
 WHO = "World.ray"
+
+
+@dataclass(frozen=True)
+class Hits:
+    """What each of k rays meets first: a particle, a link or a wall. Of one ray, given as (dim,), all is without the first axis.
+
+    distance: (k,) from the origin [m], inf where nothing is met. point: (k, dim), on the surface [m]. normal: (k, dim), unit, out
+    of what is met, towards the side of the origin. Both are NaN where nothing is met.
+    particle: (k,) its index. link: (k, 2), the number of the feature in world.features and that of the link in it. wall: (k,) the
+    number of the feature. All are -1 where it is something else, or nothing.
+    """
+
+    distance: np.ndarray
+    point: np.ndarray
+    normal: np.ndarray
+    particle: np.ndarray
+    link: np.ndarray
+    wall: np.ndarray
+
+    @property
+    def met(self) -> np.ndarray:
+        """Whether there is anything, Boolean (k,)."""
+        return self.distance < np.inf
+
+    def __len__(self) -> int:
+        return len(self.distance)
 
 
 def ray(
@@ -62,6 +90,37 @@ def ray(
     point = origin + at * direction - radius * normal
     found = (distance, point, normal, particle, link, wall)
     return Hits(*(array[0] if single else array for array in found))
+
+
+class Rods:
+    """Particles and links as rays see them: m rods with round ends from a to b, (m, dim) [m], of a radius (m,) [m]; without b,
+    discs and spheres around a.
+
+    They are convex, so a ray that starts inside of one has left it for good.
+    """
+
+    def __init__(self, radius: np.ndarray, a: np.ndarray, b: np.ndarray | None = None):
+        self._discs = b is None
+        b = a if b is None else b
+        self._a, self._b, self._radius = a, b, radius
+        reach = radius[:, None]
+        self._tree = BoundingTree(np.minimum(a, b) - reach, np.maximum(a, b) + reach)
+
+    def first(self, origin: np.ndarray, direction: np.ndarray, most: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How far each ray goes until it enters one, (k,), within most (k,); and which, -1 where there is none."""
+
+        def value(q: np.ndarray, i: np.ndarray) -> np.ndarray:
+            """Where ray q[.] enters rod i[.]."""
+            o, d, a, b, radius = origin[q], direction[q], self._a[i], self._b[i], self._radius[i]
+            way = ball(o, d, a, radius) if self._discs else capsule(o, d, a, b, radius)
+            return entry(way, rounding(o, a, b))
+
+        return self._tree.first(len(origin), most, ahead(origin, direction, 0.0), value)
+
+    def normal(self, point: np.ndarray, direction: np.ndarray, which: np.ndarray) -> np.ndarray:
+        """Unit normals at points (k, dim) on the surface of rods, met by rays in these directions."""
+        a, b = self._a[which], self._b[which]
+        return away(point, on_segment(point, a, b)[0], direction, b - a, rounding(point, a, b))
 
 
 def _rays(origin: Any, direction: Any, dim: int) -> tuple[bool, np.ndarray, np.ndarray]:
