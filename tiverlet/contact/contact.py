@@ -366,16 +366,6 @@ class Contact(PairContact):
         return total
 
     @ti.func
-    def choose_impact(self, i):
-        """The first impact of particle i in a round."""
-        self.dev.restitution.choose(i)
-
-    @ti.func
-    def apply_impact(self, i):
-        """Let particle i bounce, if the other of the pair chose the same impact."""
-        self.dev.restitution.apply(i)
-
-    @ti.func
     def apply_corrections(self, i, first):
         """Move particle i as its pairs want."""
         if self.dev.state.moves(i):  # what touches nothing moves by 0, without a branch

@@ -251,16 +251,6 @@ class Polygons(PairContact):
                     self.dev.state.advance(i, self.dev.restitution.lift[i])
 
     @ti.func
-    def choose_impact(self, i):
-        """What impacts lack of the velocities that contacts of particle i leave with."""
-        self.dev.restitution.choose(i)
-
-    @ti.func
-    def apply_impact(self, i):
-        """Change the displacement of particle i by it."""
-        self.dev.restitution.apply(i)
-
-    @ti.func
     def finish_substep(self, i):
         """At the end of a substep: add to the slip of each contact what it has moved, as far as friction can hold it."""
         if ti.static(self.dev.has_friction):

@@ -85,11 +85,11 @@ class ContactPass:
                     n *= self.bounces[None]
                 for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
                     if c.dev.state.awake(i):
-                        c.choose_impact(i)
+                        c.dev.restitution.choose(i)
                 self.team.wait()
                 for i in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
                     if c.dev.state.awake(i):
-                        c.apply_impact(i)
+                        c.dev.restitution.apply(i)
                 self.team.wait()
 
     @ti.func
