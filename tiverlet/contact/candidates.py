@@ -92,7 +92,7 @@ class EdgeCandidates:
         return reach - (r * n).sum(axis=1), n, place
 
     def at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where a vertex is beside no edge that it touched nothing of: neither an overlap nor a gradient."""
+        """As in the class. A vertex that touched nothing and is beside no edge has neither an overlap nor a gradient."""
         overlap, n, place = self._measured(x)
         t = np.clip(place, self.low, self.high)
         none = self.fresh_edge & (t != place)

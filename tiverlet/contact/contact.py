@@ -122,7 +122,7 @@ class Contact(PairContact):
         return alike and splits and bool((now.radius > 0).any()) and dev.search.can_regroup(change, now.radius)
 
     def regroup(self, change: Regrouping) -> None:
-        """They came and went, and the team knows."""
+        """Particles came and went, and the team knows."""
         if not self.matters:
             return
         dev, n = self.dev, change.now.count

@@ -89,8 +89,8 @@ class EventLog:
 
     @ti.func
     def note(self, i, j, e, n, impulse, final):
-        """Entry e of particle i, with j, touches in this pass, where both sides of a pair come by; one of them writes, and not
-        one that does not move, which comes by never."""
+        """Note that entry e of particle i, with j, touches in this pass. Both sides of a pair come by, but for one that cannot
+        move; one of them writes."""
         if i < j or not self.state.w.positive(j):
             self.write(i, j, e, n, impulse, final)
 

@@ -158,8 +158,7 @@ class MassSplitting:
 
     @ti.func
     def changes(self, i, word, bits):
-        """Whether of the entries that the word is for others touch than those that got a push: bits of behind the first word are
-        kept by nobody."""
+        """Whether, of the entries of this word, others touch than those that got a push; bits of later words are kept nowhere."""
         out, begin = False, self.list.first[i] + word * WORD
         for k in range(ti.min(self.list.number[i] - word * WORD, WORD)):
             touch = bits >> ti.cast(k, ti.u32) & ti.u32(1)
@@ -188,7 +187,8 @@ class MassSplitting:
 
     @ti.func
     def doubt(self, i):
-        """Particle i touches another that got no push, of which a new list would know nothing."""
+        """Have the bound of particle i worked out again: it touches a particle that gave it no push, which a new list would not
+        remember."""
         if ti.static(not self.has_friction):
             self.bound[i] = 0
 
@@ -212,7 +212,7 @@ class MassSplitting:
 
     @ti.func
     def clear(self, i, word, gone):
-        """Some pairs do not touch any more."""
+        """Take from pairs that do not touch any more what they carry only while they touch."""
         while gone != 0:
             e = self.list.entry(i, word, gone)
             for piece in ti.static(self.ended):

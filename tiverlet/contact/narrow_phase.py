@@ -15,7 +15,7 @@ from .candidates import DiscCandidates
 if TYPE_CHECKING:
     from ..neighbours.neighbour_search import NeighbourSearch
 
-SHRUNK = "Contact.shrunk"  # the name of how much smaller particles are
+SHRUNK = "Contact.shrunk"  # the name of the field of how much smaller each particle is than its radius
 SAME_PLACE = 2.0**-80  # two particles are in the same place: their distance over that at which they touch, squared
 
 
@@ -182,13 +182,13 @@ class DiscGeometry:
 
     @ti.func
     def restore(self, i, h):
-        """Let particle i grow back."""
+        """Let particle i grow back to its radius."""
         if ti.static(self.shrinks):
             self.shrunk[i] = ti.max(self.shrunk[i] - self.push_out * h / 2, 0)
 
     @ti.func
     def is_eased(self, i):
-        """Whether particle i is smaller than it is."""
+        """Whether particle i is smaller than its radius for a while."""
         out = False
         if ti.static(self.shrinks):
             out = self.shrunk[i] > 0

@@ -85,7 +85,7 @@ class PairContact(Feature):
     projects = False  # knows which pairs bear a load, see velocity_projection.py
 
     def _surface(self, name: str, value):
-        """Check what pairs are like, with what was said so far."""
+        """Check a setting of pairs together with the others that are given."""
         if name in ("groups", "sensors") and value is not None:
             value = checks.rows("Contact", name, value, "a list of pairs of groups, such as [(0, 1)],")
         elif isinstance(value, list):
@@ -96,17 +96,17 @@ class PairContact(Feature):
 
     @property
     def wanted(self) -> Table:
-        """What pairs are to be like."""
+        """The table that the settings ask for."""
         return Table("Contact", *self._given)
 
     @property
     def _given(self) -> tuple:
-        """What was said of them."""
+        """The settings of pairs."""
         return self.friction, self.restitution, vars(self).get("groups"), vars(self).get("sensors", ())
 
     @property
     def _pairs(self) -> Table:
-        """The same, made once for what was assigned: it is asked many questions, and is bound to no world."""
+        """The same table, made once for each assignment and bound to no world: it is asked many questions."""
         given = self._given
         asked, table = vars(self).get("_asked", ((), None))
         if table is None or any(one is not other for one, other in zip(given, asked, strict=True)):
@@ -169,7 +169,7 @@ class PairContact(Feature):
         raise NotImplementedError
 
     def enter(self, scene: Scene) -> None:
-        """What comes first when fields are declared."""
+        """Take the scene, and note what kernels are to have; before fields are declared."""
         dev = self.dev
         self.scene, dev.state, dev.w = scene, scene.state, scene.state.w
         dev.has_friction, dev.has_restitution, dev.turns = self.has_friction, self.has_restitution, self.turns
@@ -236,7 +236,7 @@ class PairContact(Feature):
 
     @ti.func
     def restore(self, i, h):
-        """Allow less of it, after a substep."""
+        """Allow less overlap, after a substep."""
         self.dev.geometry.restore(i, h)
 
     @ti.func

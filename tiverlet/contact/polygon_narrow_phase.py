@@ -83,7 +83,7 @@ class PolygonGeometry:
 
     @ti.func
     def before(self, i):
-        """The one before."""
+        """The previous particle around the body of particle i; -1 if it has none."""
         return self.loop[i][1]
 
     @ti.func
@@ -352,7 +352,7 @@ class PolygonGeometry:
 
     @ti.func
     def inverse_mass(self, v, a, b, t):
-        """That of a contact which is the only one."""
+        """The inverse mass of a contact whose particles are in no other."""
         return self.w.of(v) + (1 - t) * (1 - t) * self.w.of(a) + t * t * self.w.of(b)
 
     @ti.func

@@ -39,7 +39,8 @@ class Spinning:
 
     @ti.func
     def arm(self, i, j, n):
-        """The same after the pass."""
+        """The same, worked out again after the pass: from where the pair was at the start of the substep, or along n where it did
+        not touch there."""
         distance = self.radius.of(i) + self.radius.of(j)
         r = self.state.apart(i, j) - self.state.slid(self.state.d[i] - self.state.d[j], i, j)
         return ti.select(r.dot(r) > distance * distance, n, r / distance)

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from ..constraints.core.scalar import Scalar
 
 POWER = 30  # rounds of power iteration for lambda_max
-GROWTH, HIGHEST = 1.1, 1.0  # of the floor, by which it grows, and up to where, a link gives way as much as by itself
-CONVERGED = 1e-2  # of r . z at the start of an iteration: what is left at its end
+GROWTH, HIGHEST = 1.1, 1.0  # of the floor: the factor by which it grows, and its limit, where a link gives way as by itself
+CONVERGED = 1e-2  # of r . z at the start of an iteration: what may be left at its end
 BLOCKS = 64  # partial sums: their number is fixed, so the total has the same bits on any number of threads
 
 
@@ -104,12 +104,12 @@ class CGSystem(System):
         self.partial, self.worst = self.reals("partial_sums", BLOCKS), self.reals("worst", BLOCKS)
         if self.limits_steps:
             self.gain, self.over = self.reals("gain", BLOCKS), self.reals("over", BLOCKS)
-        # r . z, the coming weight, what is taken back, and r . z at the start
+        # r . z; by how much the last direction counts in the next; how far a step is taken back; r . z at the start
         self.sums = scene.memory.field("system.sums", None, width=4, kind=ti.f64)
         least = 1.2 * largest(scene, scalars, self.blocks * scene.inv_mass, POWER) / steps**2
         self.least = self.memory.number(least, scene.real)
         _, part, _ = distinct(components(len(rows), row[free], who[free]))
-        self._part_of = np.zeros(scene.particles.count, dtype=np.int32)  # of each particle, from 1 on; 0 for none
+        self._part_of = np.zeros(scene.particles.count, dtype=np.int32)  # the part of each particle, from 1 on; 0 for none
         self._part_of[who[free]] = part[row[free]] + 1
         self.part, self.lead = self.ints("part", part + 1), self.ints("lead", who[free][order][ends[:-1]])
         self.part_of = scene.memory.field("system.part_of", scene.count, kind=ti.i32, values=self._part_of)
@@ -119,11 +119,12 @@ class CGSystem(System):
         self.floor = scene.memory.field("system.floor", scene.count, kind=ti.f64, state=True)  # of its part, for each particle
 
     def vector(self, name: str):
-        """A real number for each row."""
+        """A field of real numbers, one for each row."""
         return self.memory.field(f"system.{name}", self.rows)
 
     def forget(self, off: "Sequence[tuple[Batch, np.ndarray]]" = ()) -> None:
-        """Steps may converge from the new places, but not where constraints contradict each other there."""
+        """Take the floors back, for steps may converge from the new places. Where constraints contradict each other there, floors
+        begin at HIGHEST."""
         floor, contradicted = np.zeros(self.n), np.zeros(self.groups, dtype=bool)
         part_of = self._part_of[: self.n]  # particles that came and went since are in none, and stand behind those that are
         for batch, share in off:
@@ -262,7 +263,7 @@ class CGSystem(System):
                 for b in range(1, BLOCKS):
                     gain += self.gain[b]
                     over += self.over[b]
-                if gain > 0 and over > 0:  # as Elimination.hold; such a step is taken back, too
+                if gain > 0 and over > 0:  # as in Elimination.limit_steps; such a step is taken back, too
                     worst = 2 * TENSEST
             back = ti.select(worst > TENSEST, self.sums[None][1], 0 * now)
             if worst > TENSEST:

@@ -11,14 +11,14 @@ if TYPE_CHECKING:
 
 
 def corners_of(batches: "Sequence[Batch]") -> tuple[np.ndarray, np.ndarray]:
-    """Of every corner, batch by batch, the constraint, numbered through, and the particle."""
+    """The constraint, numbered through all batches, and the particle of every corner, batch by batch."""
     first = np.cumsum([0] + [b.count for b in batches])
     owner = np.concatenate([b.owner + k for b, k in zip(batches, first, strict=False)])
     return owner, np.concatenate([b.indices.ravel() for b in batches])
 
 
 def components(n: int, owner: np.ndarray, item: np.ndarray) -> np.ndarray:
-    """Labels of n owners: equal where a chain of shared items leads from one to the other. (owner, item): what has what."""
+    """Labels of n owners: equal where a chain of shared items leads from one to the other. Owner owner[k] has item item[k]."""
     label, items = np.arange(n), int(item.max(initial=-1)) + 1
     while True:
         least = np.full(items, n)
@@ -34,7 +34,11 @@ def components(n: int, owner: np.ndarray, item: np.ndarray) -> np.ndarray:
 
 
 def bodies_of(m: int, row: np.ndarray, who: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which of m constraints and of the particles hang together by what can move: labels, (m,) and (n,); m: no row moves it."""
+    """Bodies: constraints and particles that hang together by particles that can move. Returns their labels, (m,) and (n,); those
+    of particles that no constraint can move are m.
+
+    Corner k belongs to constraint row[k] of m, and is particle who[k]. w: inverse masses, (n,).
+    """
     free = w[who] > 0
     label = components(m, row[free], who[free])
     body = np.full(len(w), m)

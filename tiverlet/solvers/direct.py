@@ -280,9 +280,10 @@ class Elimination(System):
 
     @ti.func
     def limit_steps(self, begin, end):
-        """Whether steps leave where gradients are trusted and bring in energy, sum step (u + A step / 2), A step = -violation.
+        """Whether steps go beyond where gradients are trusted and bring in energy, sum step (u + A step / 2) with A step =
+        -violation.
 
-        Then the rows of which f is curved take the step that they would by themselves, and the others have to follow.
+        Then rows with a curved f take the step that they would take by themselves, and the others have to follow.
         """
         gain, spare, too_far, found = ti.cast(0, ti.f64), ti.cast(0, ti.f64), False, 0
         for r in range(begin, end):
@@ -332,7 +333,7 @@ class Elimination(System):
 
     @ti.func
     def stay(self, begin, end):
-        """No steps."""
+        """Make no step."""
         for r in range(begin, end):
             self.step[r] = 0
 
@@ -346,7 +347,7 @@ class Elimination(System):
 
     @ti.func
     def limit_tensions(self, begin, end):
-        """No multiplier beyond what its tension may be."""
+        """Limit each multiplier to the largest tension that the substep can stand."""
         for r in range(begin, end):
             if self.geometric_stiffness[r] > 0:
                 most = SOFTENED_TO * self.stretch(r) / self.geometric_stiffness[r]

@@ -11,7 +11,7 @@ from ..geometry.ordered import distinct
 from .corners import components, corners_of
 
 SHORT = 4096  # corners of a part up to which its plan is kept
-COUNTED = (("entry", "column"), ("product", "product"), ("update", "update"))  # what rows have some of, and the array of it
+COUNTED = (("entry", "column"), ("product", "product"), ("update", "update"))  # what X_begin counts, row by row, and its array
 
 
 @dataclass

@@ -76,7 +76,8 @@ class Slots:
 
     @staticmethod
     def _tied(batches: list[Batch], inv_mass: np.ndarray) -> dict[int, np.ndarray]:
-        """The body of each constraint, by the batch's id: what hangs together by particles that can move."""
+        """The body of each constraint, by the batch's id. Constraints that share particles that can move, directly or through
+        others, are of one body."""
         ends = np.cumsum([b.count for b in batches])
         parts = np.split(bodies_of(int(ends[-1]), *corners_of(batches), inv_mass)[0], ends[:-1])
         return {id(b): part for b, part in zip(batches, parts, strict=True)}
@@ -92,14 +93,15 @@ class Slots:
         memory.write_from(self.begin, first, np.full(n + 1 - first, self.total))
 
     def can_grab(self, change: Regrouping, batches: list[Batch]) -> bool:
-        """Whether constraints can act on others than before: each by itself, in as many slots, and as exactly."""
+        """Whether constraints can act on other particles than before, with the same kernels: each is relaxed by itself, and they
+        need as many slots and are as exact as before."""
         if self.system or self.semi_iteration or not all(b.arity for b in batches):
             return False
         degree = arranged(batches, change.inv_mass)[1]
         return int(degree.sum()) == self.total and self.exact == (self._scalars and bool(degree.max(initial=0) <= 1))
 
     def grab(self, memory: Memory, change: Regrouping, batches: list[Batch]) -> None:
-        """They do."""
+        """Have constraints act on other particles than before."""
         self._places, degree = arranged(batches, change.inv_mass)
         memory.write(self.begin, np.concatenate([[0], np.cumsum(degree)]))
         memory.write(self.split, degree * change.inv_mass)
@@ -116,7 +118,8 @@ class Slots:
 
     @ti.func
     def limited(self, wanted, geometric_stiffness):
-        """A multiplier, at most what the substep can stand, (omega h)^2 = geometric_stiffness |multiplier| = TENSEST; noted."""
+        """The multiplier `wanted`, limited so that (omega h)^2 = geometric_stiffness |multiplier| is at most TENSEST; what is
+        beyond is noted."""
         most = TENSEST / geometric_stiffness
         if ti.abs(wanted) >= most:
             ti.atomic_max(self.tension[None], ti.cast(TENSEST * ti.abs(wanted) / most, ti.f64))

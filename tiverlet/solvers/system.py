@@ -17,7 +17,7 @@ SLACK = 0.1  # of |step violation|: how much energy steps may bring in by their 
 
 
 def solvable(batches: "list[Batch]") -> list[Any]:
-    """Those of which a System may solve the constraints: each is a Scalar."""
+    """Batches whose constraints a System may solve: each is a Scalar."""
     return [b for b in batches if b.solvable_together]
 
 
@@ -92,8 +92,8 @@ class System:
         return sum(int((~b.idle(self.inv_mass) & (self.row(b) < 0)).sum()) for b in batches)
 
     def forget(self, off: "Sequence[tuple[Batch, np.ndarray]]" = ()) -> None:
-        """Particles were placed anew: what was found out on the way to where they were says nothing. off: of batches, (m,), by
-        how much rigid constraints cannot be met there."""
+        """Particles were placed anew: forget what was found out on the way to their old places. off: of batches, (m,), by how
+        much rigid constraints cannot be met at the new ones."""
 
     @ti.func
     def set_row(self, r, violation, A, alpha, lam, W, geometric_stiffness):
@@ -103,8 +103,8 @@ class System:
 
     @ti.func
     def limit_row(self, r, motion, spare_energy, trusted_step, own_step):
-        """Where steps are limited, see Scalar: the motion along row r in this substep, the energy that it may bring in, the step
-        up to which its gradient is trusted, and minus the step that it takes where the others' brings in energy."""
+        """Where steps are limited, see StepLimit: the motion along row r in this substep, the energy that it may bring in, the
+        step up to which its gradient is trusted, and minus the step that it takes where the others' brings in energy."""
         self.motion[r], self.spare_energy[r] = motion, spare_energy
         self.trusted_step[r], self.own_step[r] = trusted_step, own_step
 

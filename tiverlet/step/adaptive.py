@@ -120,7 +120,7 @@ class StepController:
         return told(report, max(figures), risks, verdict, tries)
 
     def prepare(self, iterations: int, dt: float, tolerance: float | None, budget: float | None) -> None:
-        """The effort to begin with."""
+        """Choose the effort to begin with."""
         self.iterations = max(self.iterations, iterations)
         if self.dt and dt != self.dt:
             self.substeps = max(1, min(round(self.substeps * dt / self.dt), MOST))
@@ -139,7 +139,8 @@ class StepController:
         self.cost = min(cost, self.cost + 0.3 * (cost - self.cost)) if self.cost else cost
 
     def look_ahead(self, iterations: int, report: StepReport, figure: float, verdict: str, tries: int) -> None:
-        """Less for the next frame, if this one leaves room for it; and patience where that has just failed."""
+        """Choose less effort for the next frame, if this one leaves room for it; wait longer with the next try where that has
+        just failed."""
         if verdict != "good" or tries > 1:
             self.patience = min(2 * self.patience, PATIENCE) if tries > 1 else self.patience
             self.wait = self.patience

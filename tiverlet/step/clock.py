@@ -52,31 +52,31 @@ class Clock:
             setattr(self, field.name, getattr(kept, field.name))
 
     def named(self) -> dict[str, Any]:
-        """What it consists of, by the names in recordings."""
+        """Its values, by their names in recordings."""
         return {name: getattr(self, own) for name, own in NAMES.items()}
 
     @staticmethod
     def of(named: dict[str, Any]) -> "Clock":
-        """The one of which named() tells."""
+        """The clock with these values, by their names in recordings."""
         if set(named) != set(NAMES):
             raise ValueError("The state is not one of this scene: it has other fields.")
         return Clock(**{own: named[name] for name, own in NAMES.items()})
 
     def counted(self, dt: float) -> tuple[float, float, int]:
-        """When frames of this length began, their length, and their number, with one more: frames of the same length are counted,
-        not summed, so that they add no rounding errors."""
+        """When frames of this length began, their length, and their number with the coming one. Frames of one length are counted,
+        not summed up, so that they add no rounding errors."""
         since, length, count = self.frame
         return (since, dt, count + 1) if dt == length else (self.time, dt, 1)
 
     def advance(self, substeps: int, frame: tuple[float, float, int], started: bool) -> None:
-        """So many substeps have gone by, and with them a frame."""
+        """Note that so many substeps have gone by, and with them a frame."""
         self.tick, self.since = (self.tick + substeps) % 2**31, (self.since + substeps) % 2**31
         self.started, self.d_is_velocity, self.parted = started, False, None
         self.frame, self.time = frame, frame[0] + frame[1] * frame[2]
 
     @property
     def hashed(self) -> list[Any]:
-        """What the future depends on, and the past does not tell."""
+        """What of it is hashed: what the next frames depend on."""
         later: list[Any] = [self.longest] if self.longest > self.h else []  # seen when h changes
         later += ["softened"] if self.softened else []
         return [self.time, self.tick, self.since, self.h, self.d_is_velocity, *later]

@@ -109,19 +109,19 @@ class ConstraintPass:
 
     @ti.func
     def start_systems(self, thread):
-        """The same in pieces: what comes before the steps of those that iterate."""
+        """Where phases are launched: begin the systems that iterate."""
         for system in ti.static(self.systems):
             system.start(thread)
 
     @ti.func
     def iterate_systems(self, thread):
-        """One of their steps."""
+        """Where phases are launched: one iteration of theirs."""
         for system in ti.static(self.systems):
             system.iterate(thread)
 
     @ti.func
     def update_multipliers(self, now):
-        """What systems found goes to the multipliers."""
+        """Add the steps that systems found to the multipliers."""
         for system in ti.static(self.systems):
             if ti.static(system.steps > 0):
                 system.end(now.thread)
@@ -134,7 +134,7 @@ class ConstraintPass:
 
     @ti.func
     def reactions(self, firm, soft):
-        """What constraints added to h^2 a in the last substep, to the slots; see Batch.push_reaction."""
+        """Write what constraints added to h^2 a in the last substep to the slots, see Batch.push_reaction."""
         for f in ti.static(self.batches):
             for c in range(f.count):
                 f.push_reaction(c, firm, soft)

@@ -78,7 +78,7 @@ class Diagnostics:
 
     @ti.func
     def finite(self, x):
-        """By the bits of the exponent: comparisons with NaN are not to be trusted in Taichi."""
+        """Whether x is finite, by the bits of its exponent: Taichi's comparisons with NaN are not reliable."""
         out = 1
         for k in ti.static(range(x.n)):
             if ti.static(self.single):
@@ -131,7 +131,7 @@ class Diagnostics:
 
     @ti.func
     def nothing(self):
-        """Figures to begin with."""
+        """Figures before anything is summed up."""
         zero, figures = ti.Vector.zero(ti.f64, self.dim), ti.Vector.zero(ti.f64, self.width)
         figures[5] = 2.0**31
         return figures, zero + ti.math.inf, zero - ti.math.inf
@@ -187,7 +187,7 @@ class Diagnostics:
 
     @ti.func
     def filled(self):
-        """How many blocks there is anything in, at most; the others would change no bit."""
+        """How many blocks have anything in them, at most; the others would change no bit."""
         out = self.blocks
         if ti.static(self.blocks <= BLOCKS):
             most = ti.cast(self.n, ti.i32)
@@ -260,7 +260,7 @@ class Diagnostics:
 
     @ti.func
     def fold(self, begin, step: ti.template(), count):  # type: ignore[valid-type]
-        """Of so many parts, `step` apart."""
+        """Sum up `count` parts, `step` apart, from `begin` on."""
         total, low, high = self.nothing()
         for b in range(count):
             at = begin + b * step
@@ -269,7 +269,7 @@ class Diagnostics:
 
     @ti.func
     def with_part(self, total, low, high, part, lower, higher):
-        """Figures of one part more."""
+        """Figures, with those of one more part."""
         total[0] += part[0]
         total[4] += part[4]
         for k in ti.static(range(6, self.width)):

@@ -115,7 +115,7 @@ class Composition:
         self.fastest = (float(np.abs(g).max()) / self.first) ** 2 * fastest(batches, scene)
 
     def passes(self, iterations: int) -> int:
-        """Over the constraints, in each stage."""
+        """Passes over the constraints in each stage."""
         return max(iterations, self.solved) if self.solved else 0
 
     @ti.func
@@ -162,7 +162,7 @@ class Composition:
 
     @ti.func
     def velocity_after(self, i, h, t, reaction):
-        """That at a start; velocity() finds all others."""
+        """The velocity at a start, where d is one. See velocity() for all other times."""
         return self.state.d[i]
 
 

@@ -65,7 +65,7 @@ class Verlet:
             self.decay = scene.memory.field("decay", None, width=5)
 
     def passes(self, iterations: int) -> int:
-        """Over the constraints, in each stage."""
+        """Passes over the constraints in each stage."""
         return iterations
 
     @ti.func

@@ -67,7 +67,7 @@ class ParticlePass:
 
     @ti.func
     def tile_of(self, k, thread):
-        """Those of the k-th tile of a thread."""
+        """The particles of the k-th tile of a thread."""
         first, end = k * self.tile, self.n  # of the one piece that there is, without a division
         if ti.static(self.team.size > 1):
             tile = self.team.dealt_index(k, self.each, thread)
@@ -262,7 +262,7 @@ class ParticlePass:
 
     @ti.func
     def touch_all(self, i, h, frame_fraction, turn):
-        """A round over the walls; whether it changed nothing."""
+        """Ask every wall once; returns whether none changed anything."""
         x, d = self.state.x[i], self.state.d[i]
         for f in ti.static(self.walls):
             self.touch(f, i, h, frame_fraction, turn)
@@ -270,7 +270,7 @@ class ParticlePass:
 
     @ti.func
     def traces(self, i):
-        """What walls leave of particle i beside its place and displacement."""
+        """What walls change of particle i beside its position and displacement."""
         before = wall_push = ti.zero(self.state.d[i])
         if ti.static(self.state.befores):
             before = self.state.before[i]
@@ -280,7 +280,7 @@ class ParticlePass:
 
     @ti.func
     def leave_traces(self, i, before, wall_push):
-        """As they were before walls were asked."""
+        """Take back what walls changed: give particle i what traces() returned."""
         if ti.static(self.state.befores):
             self.state.before[i] = before
         if ti.static(self.state.keeps_wall_push):
@@ -288,7 +288,7 @@ class ParticlePass:
 
     @ti.func
     def touch(self, wall: ti.template(), i, h, frame_fraction, turn):  # type: ignore[valid-type]
-        """One wall, if it is there."""
+        """Ask one wall, if it is there."""
         if ti.static(wall.dev.surface.has_switch):
             if wall.dev.surface.active[None] != 0:
                 wall.confine(i, self.radius.of(i), h, frame_fraction, turn)

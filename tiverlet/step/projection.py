@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from .runner import Runner
 
 ENOUGH = 1e-3  # of its size: a violation that matters, over (r - 1)^2 / r with r = (h / h')^2: what one jump leaves to vibrate
-FIRM = 0.9  # theta of what velocities do not change
+FIRM = 0.9  # theta from where on velocities may not change a constraint
 FAR = 0.75  # of the longest: a substep in which what is small now has had its chance
 NEWTON = 40  # steps, at most
 BEGIN, HARDEST, LEAST = 1e-3, 10.0, 1e-9  # mu of the first, and of the last try; the least

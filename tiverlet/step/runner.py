@@ -22,7 +22,7 @@ from .span import ACTIVE_THREADS, BEFORE, END, GIVE, HALT, ORIGIN, H, Moment, Sp
 from .step import frame
 from .step_report import StepReport
 
-KEPT = 100_000  # velocities, the array for which stays; where there are more, Taichi's look at what it is given takes less
+KEPT = 100_000  # particles up to which the array for velocities is kept: with more, making one takes next to nothing beside them
 LONG = 10_000_000  # particles and constraints, times passes, in a launch: it takes about a second
 
 
@@ -70,13 +70,13 @@ class Runner:
         self._data, self._given, self._reporter = self.sheet.data, self.sheet.data[H:], self.diagnostics.report
 
     def renew(self) -> None:
-        """Kernels that know of a new field; Taichi compiles them for each Step anew."""
+        """Make kernels anew that know of a new field: Taichi compiles them for each Step."""
         self.step = copy.copy(self.step)
         self.diagnostics = self.diagnostics.of(self.step)
         self._prepare()
 
     def _passes_at_once(self) -> int:
-        """Over the constraints, in a launch."""
+        """How many passes over the constraints a launch makes."""
         return max(1, LONG // (1 + self.n + sum(b.count for b in self.batches)))
 
     def regroup(self) -> None:
@@ -90,8 +90,8 @@ class Runner:
     # Frames.
 
     def begin(self, substep: float, iterations: int) -> None:
-        """Take a length [s] for the substep; with another one than before, displacements mean something else: start anew from
-        velocities."""
+        """Begin a frame with substeps of this length [s]. Where it differs from the last one, displacements stand for other
+        velocities: they are turned into velocities first, and the frame is a start."""
         if self.prepare(substep, iterations):
             with self.memory.compiler():
                 if self.clock.energy is None:
@@ -106,7 +106,7 @@ class Runner:
                 self.placed()
 
     def prepare(self, substep: float, iterations: int) -> bool:
-        """The first half of begin(): all but for what has to be seen first. Returns whether there is more to do."""
+        """The first half of begin(). Returns whether there is a second: the state was changed, and has to be diagnosed."""
         h, clock, self.released, self.jumped = substep * self.integrator.first, self.clock, 0.0, False
         drag = decay(sum(f.rate for f in self.drags), h) if self.drags else None
         known = clock.energy is not None and clock.first_moved is None
@@ -139,7 +139,7 @@ class Runner:
                     self.jumped = bool((way > self.scene.particles.radius).any()) and self.moved > 0
                     self.invalidate()
                 bare = clock.first_moved < self.n and not any((b.indices >= clock.first_moved).any() for b in self.batches)
-                if self.scene.slots.system and not bare:  # particles that came without constraints are nothing to it
+                if self.scene.slots.system and not bare:  # it has nothing to do with particles that came without constraints
                     system, x = self.scene.slots.system, self.scene.state.get(self.memory)
                     left = initial_violation.left(self.batches, x) if system.steps else []
                     self.released = max(self.released, *(float(share.max()) for _, share in left), 0.0)
@@ -148,13 +148,13 @@ class Runner:
         return True
 
     def looked(self, energy: float, overlap: float) -> None:
-        """The second half: what was seen of the state that frames start from."""
+        """The second half of begin(), with the energy [J] and the overlap of the state that the frame starts from."""
         self.clock.energy = energy
         if overlap > 0 and self.clock.first_moved is not None:
             self.ease(self.clock.first_moved)
 
     def placed(self) -> None:
-        """The end of it: particles are where they were placed, or where constraints had them go."""
+        """The end of begin(): nothing is left to be done about particles that were placed anew."""
         if self.jumped:
             for contact in self.step.contacts:  # for the report of the frame: others may have been passed
                 self.memory.write(contact.dev.fast, 1)
@@ -179,11 +179,11 @@ class Runner:
         return report
 
     def find_ramps(self) -> None:
-        """Knobs were uploaded: see whose rest values are others now."""
+        """After knobs were uploaded: find the batches whose rest values are others now."""
         self.ramping = [b for b in self.batches if b.ramp and b.ramp.under_way]
 
     def _jump(self) -> None:
-        """Of bodies of which any particle was placed anew, rest values are those that were assigned, and nothing goes there."""
+        """In bodies of which any particle was placed anew, rest values jump to what was assigned."""
         if self.ramping and self.clock.first_moved is not None:
             tied = initial_violation.tied(self.scene, self.batches, self.clock.first_moved)
             for b in self.ramping:
@@ -199,13 +199,13 @@ class Runner:
                 self.renew()
 
     def arrive(self) -> None:
-        """They are there: the frame is over, and is not made again."""
+        """End the ramps of rest values: the frame is over, and is not made again."""
         for b in self.ramping:
             b.ramp.arrive()
         self.ramping = []
 
     def settle(self, dt: float) -> None:
-        """After a frame of dt [s]: see who is slow, and who falls asleep."""
+        """After a frame of dt [s]: find out who is slow, and let islands fall asleep."""
         sleep, clock = self.sleep, self.clock
         if sleep.rests and not sleep.watches:
             return
@@ -221,7 +221,7 @@ class Runner:
             self.sleepers.wake(particles)
 
     def set_substep(self, h: float, drag: list[float] | None) -> None:
-        """Take h, and what drag makes of it."""
+        """Take h, and the factors of drag for it."""
         if drag and drag != self.clock.drag:
             self.memory.write(self.integrator.decay, drag)
         self.clock.h, self.clock.drag = h, drag
@@ -235,14 +235,14 @@ class Runner:
         self.clock.energy, self.clock.first_moved = None, 0
 
     def forget_loads(self, position: np.ndarray) -> None:
-        """Before particles are put elsewhere: of constraints and contacts that this changes no load is known."""
+        """Before particles are put elsewhere: forget known loads of constraints and contacts that this changes."""
         initial_violation.forget(self.scene, self.batches, position)
         for c in self.step.contacts:
             if c.known:
                 c.known.forget(self.scene, position)
 
     def carry_loads(self) -> None:
-        """Particles came or went, or are held by others: they carry what their contacts know."""
+        """After particles came or went, or are held by others: tell them the loads that their contacts know."""
         for c in self.step.contacts:
             if c.known:
                 c.known.carry(self.scene, self.scene.state.get(self.memory), *self.search.list.lasting_data())
@@ -279,7 +279,7 @@ class Runner:
         return out[came or 0 : self.n]
 
     def _velocities(self, first: int = 0) -> np.ndarray:
-        """By the kernel, from displacements."""
+        """Have the kernel make velocities of displacements."""
         launch = self._velocity
         if launch is None or len(launch.arrays[1]) < self.n:
             room = np.zeros((1 << self.n.bit_length(), self.step.dim))
@@ -291,12 +291,12 @@ class Runner:
         return out[first : self.n].copy()
 
     def _list_again(self) -> None:
-        """Of a state that was put back, build the list that reactions of contacts are asked for with."""
+        """After a state was put back: build the neighbour list, which reactions of contacts need."""
         if self.search and self.memory.read(self.search.list.old_saved)[0]:
             self.list_neighbours()
 
     def spin(self) -> np.ndarray:
-        """Velocities r omega of the surfaces of particles, (n, axes) [m/s], likewise."""
+        """Velocities r omega of the surfaces of particles, (n, axes) [m/s], of the same order as velocity()."""
         clock, spin = self.clock, self.scene.state.spin
         if clock.d_is_velocity:
             return self.memory.read(spin.s).astype(np.float64)[: self.n]
@@ -315,8 +315,9 @@ class Runner:
         return np.divide(moments(particles), r, out=np.zeros(len(r)), where=r > 0)[:, None] * half * (2 / clock.h)
 
     def shares(self) -> tuple[float, float]:
-        """What multipliers of the last substep are to be taken for: h^2 over what an acceleration added to the displacement. A
-        start from velocities without what rigid constraints did in half a substep left that to them, too."""
+        """By what multipliers of the last substep become h^2 times accelerations, for rigid and for soft constraints: h^2 over
+        what a constant acceleration added to the displacement. In a start from velocities that lacked half a kick of rigid
+        constraints, these gave that, too."""
         clock = self.clock
         drag = clock.drag or FREE
         if not clock.started:
@@ -438,7 +439,7 @@ class Runner:
         contact = self.step.contacts[0]
         if not contact.shrinks:
             if first and overlapping(self.scene, self.batches, first) is False:
-                return  # others do, under their loads
+                return  # what overlaps does so under its load
             contact.enable_shrink()
             self.renew()
         self.step.shrunk(first)
@@ -464,7 +465,7 @@ class Runner:
 
     @property
     def logs(self) -> list[Any]:
-        """Where events are noted."""
+        """The logs of events: of contacts and of walls."""
         return [*(c.dev.events for c in self.step.contacts if c.dev.events), *self.step.wall_logs]
 
     @property
@@ -499,7 +500,7 @@ class Launcher:
         self.now: Any = None  # the half of a pass that they are in
 
     def flush(self) -> None:
-        """Launch what waits."""
+        """Launch the phases that wait."""
         if self.waiting:
             names, now, span = template(" ".join(self.waiting)), self.now, self.now.span
             self.waiting = []
@@ -508,7 +509,8 @@ class Launcher:
             )
 
     def put(self, now: Moment, name: str, there: bool = True) -> None:
-        """One more phase that waits, if the scene has it; in a launch of its own if others wait that are in another half."""
+        """Have one more phase wait for the next launch, if the scene has it. Phases of another half of a pass are launched
+        before."""
         if there:
             if self.waiting and (self.now.s, self.now.half) != (now.s, now.half):
                 self.flush()
@@ -528,7 +530,7 @@ class Launcher:
         return now.of(half // self.halves, half < self.halves, half=half)
 
     def works(self, now: Moment) -> bool:
-        """Between two substeps, signals are heeded."""
+        """Always; between two substeps signals are handled."""
         self.runner.raise_signals()
         return True
 
@@ -559,20 +561,20 @@ class Launcher:
         return not self.again(now)
 
     def evaluate_pair_forces(self, now: Moment) -> None:
-        """The first of a substep, where the frame may have to wait for lists."""
+        """The first phases of a substep; the frame may have to wait for lists."""
         self.put(now, "ask_for_pairs", self.lists_pairs)
         self.put(now, "sum_pair_forces")
 
     def integrate(self, now: Moment) -> None:
-        """How it begins."""
+        """Put the phase of this name; so do those below, where the scene has it."""
         self.put(now, "integrate")
 
     def drive(self, now: Moment) -> None:
-        """Behind it."""
+        """Where anything is driven."""
         self.put(now, "drive", self.drives)
 
     def update_neighbours(self, now: Moment, half: int) -> None:
-        """Here the frame may have to wait for a list."""
+        """Have the list checked; the frame may have to wait for a new one here."""
         if half and not half % self.halves:
             self.runner.raise_signals()
         self.put(self.turn(now, half), "ask_for_list", bool(self.runner.search))
@@ -581,11 +583,11 @@ class Launcher:
             self.put(self.turn(now, half), "ask_to_wake")
 
     def solve_constraints(self, now: Moment) -> None:
-        """Behind it, and so on."""
+        """Where there are constraints."""
         self.put(now, "solve_constraints", self.constrains)
 
     def solve_systems(self, now: Moment) -> None:
-        """Steps of systems that iterate are launches of their own."""
+        """Iterations of systems are launches of their own."""
         self.put(now, "start_systems" if self.steps else "solve_systems", self.systems)
         for _ in range(self.steps):
             self.flush()
@@ -594,19 +596,19 @@ class Launcher:
             self.flush()
 
     def update_multipliers(self, now: Moment) -> None:
-        """What they found."""
+        """Where there are systems."""
         self.put(now, "update_multipliers", self.systems)
 
     def apply_constraints(self, now: Moment) -> None:
-        """The last of the first half."""
+        """The last phase of the first half of a pass."""
         self.put(now, "apply_constraints", self.halves == 2)
 
     def solve_contacts(self, now: Moment) -> None:
-        """The first of the second half."""
+        """The first phase of the second half."""
         self.put(now, "solve_contacts", self.touches)
 
     def struck(self) -> bool:
-        """Whether a pair bounces, which nobody asks: rounds in which none does have nothing to do."""
+        """Always: the host does not ask whether a pair bounces, and rounds in which none does do nothing."""
         return True
 
     def rebound(self, now: Moment) -> None:
@@ -616,11 +618,11 @@ class Launcher:
         self.flush()
 
     def apply_corrections(self, now: Moment) -> None:
-        """The last of a pass."""
+        """The last phase of a pass."""
         self.put(now, "apply_corrections", self.acts)
 
     def finish_substep(self, now: Moment) -> None:
-        """Once, behind the last pass."""
+        """Once, after the last pass."""
         self.put(self.now if self.waiting else now, "finish_substep")
 
     def project_contact_velocities(self, now: Moment) -> None:

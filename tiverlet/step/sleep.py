@@ -250,7 +250,7 @@ class SleepPass:
 
     @ti.func
     def time_still(self, i, dt, h):
-        """One frame more, or none."""
+        """Count one more frame in which particle i was slow, or begin anew if it was not."""
         d = self.state.d[i]
         way = d.dot(d)
         if ti.static(self.state.spins):

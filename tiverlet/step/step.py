@@ -224,7 +224,8 @@ class Step:
 
     @ti.func
     def list_pairs(self, now):
-        """Their lists, built anew where they are stale. Where one has no room for all pairs, the frame stops."""
+        """Build the lists of forces between particles anew where they are stale. Where one has no room for all pairs, the frame
+        stops."""
         self.look_for_motion(now)
         for f in ti.static(self.listed_forces):
             if f.dev.list.stale[None] != 0:
@@ -235,7 +236,7 @@ class Step:
 
     @ti.func
     def look_for_motion(self, now):
-        """Which of their lists are stale."""
+        """Find out which of these lists are stale."""
         for f in ti.static(self.listed_forces):
             for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
                 if f.dev.search.moved_too_far(i) != 0:
@@ -254,7 +255,7 @@ class Step:
 
     @ti.func
     def sum_pair_forces(self, now):
-        """With good lists."""
+        """Sum up the forces between particles, with good lists."""
         for f in ti.static(self.pair_forces):
             for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
                 f.evaluate(i)
@@ -356,17 +357,17 @@ class Step:
 
     @ti.func
     def start_systems(self, now):
-        """The same in pieces: the start,"""
+        """Where phases are launched: begin the systems that iterate."""
         self.constraints.start_systems(now.thread)
 
     @ti.func
     def iterate_systems(self, now):
-        """and a step."""
+        """Where phases are launched: one iteration of theirs."""
         self.constraints.iterate_systems(now.thread)
 
     @ti.func
     def update_multipliers(self, now):
-        """What was found goes to the multipliers."""
+        """Add the steps that systems found to the multipliers."""
         self.constraints.update_multipliers(now)
 
     @ti.func
@@ -419,12 +420,12 @@ class Step:
 
     @ti.func
     def project_contact_velocities(self, now):
-        """Now and then: take the sound out of loaded contacts."""
+        """Every 32 substeps: take the sound out of loaded contacts."""
         self.contact_pass.project_velocities(now.thread, now.it)
 
     @ti.func
     def diagnose(self, now):
-        """What the frame came to."""
+        """Sum up the figures of the frame."""
         self.diagnostics.reduce_blocks(now.thread, now.span.h64, now.span.state_origin)
         self.diagnostics.sum_up(now.thread, now.span.h64, now.span.end, now.span.state_origin, now.span.sheet)
         self.team.reset_wait_count()
@@ -439,7 +440,7 @@ class Step:
 
     @ti.func
     def tell_halt(self, sheet: ti.template()):  # type: ignore[valid-type]
-        """Whether, and where, the frame stopped to have the list grown, or built."""
+        """Write on the sheet whether, and where, the frame stopped to have the list grown, or built."""
         if ti.static(len(self.searches) > 0):
             for k in ti.static(range(3)):
                 sheet[HALT + k] = self.halt[None][k]
@@ -513,7 +514,7 @@ class Step:
 
     @ti.kernel
     def spins(self, h64: ti.f64, t: ti.f64, firm64: ti.f64, soft64: ti.f64, out: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
-        """The same of spins: velocities r omega of surfaces."""
+        """Velocities r omega of surfaces, (n, axes), with the arguments of velocities()."""
         self.constraints.reactions(ti.cast(firm64, self.real), ti.cast(soft64, self.real))
         for i in range(self.n):
             v = self.particles.surface_velocity(i, ti.cast(h64, self.real), ti.cast(t, self.real), ti.cast(firm64, self.real))
@@ -535,7 +536,7 @@ class Step:
 
     @ti.func
     def velocity_of(self, i, h64, t, firm64):
-        """That of one particle, once constraints have said what they did."""
+        """The velocity of one particle, once reactions() of constraints are in the slots."""
         h, time, firm = ti.cast(h64, self.real), ti.cast(t, self.real), ti.cast(firm64, self.real)
         reaction, _part = self.particles.reaction(i, h, time, firm)
         return self.integrator.velocity_after(i, h, time, reaction)

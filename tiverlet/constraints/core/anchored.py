@@ -51,7 +51,7 @@ class Anchored(Batch):
 
     @property
     def listing(self) -> np.ndarray:
-        """One particle each."""
+        """The particle of each constraint."""
         return self.indices[:, 0]
 
     @property
@@ -76,7 +76,7 @@ class Anchored(Batch):
         return not (self.indices >= change.first).any()
 
     def regroup(self, change: Regrouping) -> None:
-        """Its violations are relative to the size of the scene."""
+        """Violations are relative to the size of the scene, which is another one now."""
         if self.acts:
             self.dev.size.set(self.start.size)
 
@@ -85,7 +85,7 @@ class Anchored(Batch):
         return np.zeros((self.count, position.shape[1]))
 
     def bind(self, scene: Scene) -> None:
-        """For what is not driven its multiplier, and for springs their memory."""
+        """Declare multipliers where particles are not driven, and the memory of springs."""
         super().bind(scene)
         self.dev.size = scene.memory.number(self.start.size, scene.real)
         if not self.drives:
@@ -120,7 +120,7 @@ class Anchored(Batch):
 
     @ti.func
     def offset_change(self, c):
-        """How far C changed in the last substep, by the motion of the particle."""
+        """How far C changed in the last substep by the motion of the particle."""
         return self.dev.state.d[self.member(c, 0)]
 
     @ti.func
@@ -175,7 +175,7 @@ class Anchored(Batch):
 
     @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
-        """What is left, relative to the size of the scene."""
+        """The violation that is left, relative to the size of the scene."""
         _, _, size = self.solve(c, h, h2_effective, frame_fraction, 0, fresh)
         return size / self.dev.size.now
 

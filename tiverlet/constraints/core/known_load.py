@@ -43,7 +43,7 @@ class KnownLoad:
             self.in_state = {"load": self.load, "missing": self.missing, "earlier": self.earlier, "given": self.given}
 
     def forget(self, some: Any) -> None:
-        """Of these constraints, a mask (m,), no load is known."""
+        """Forget the loads of some constraints, a mask (m,)."""
         for field in self.in_state.values():
             values = self._memory.read(field)
             values[: len(some)][some] = 0.0
@@ -59,7 +59,7 @@ class KnownLoad:
 
     @ti.func
     def let_go(self, c):
-        """Constraint c is slack, or broken."""
+        """Forget the load of constraint c, which is slack or broken."""
         self.load[c] = self.missing[c] = self.earlier[c] = self.given[c] = 0 * self.load[c]
 
     @ti.func

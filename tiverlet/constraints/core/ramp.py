@@ -39,7 +39,7 @@ class Ramp:
         return len(self._batch.tracks()), self._batch.count
 
     def now(self) -> list[np.ndarray]:
-        """What the device has: where a ramp begins, (m,) each; as a frame ends, what was assigned before it."""
+        """The rest values that the device has, (m,) for each track: where a ramp begins."""
         m = self._batch.count
         return [self._memory.read(field)[..., :m].astype(np.float64) for field, _, _ in self._batch.tracks()]
 

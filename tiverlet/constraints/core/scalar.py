@@ -39,9 +39,9 @@ class Scalar(Batch):
     W = sum_j n_j w_j grad_j C(x_(n+1)) . grad_j C(x_n) is the mass-split weight: particle j belongs to n_j constraints, and
     gives each an n_j-th of its mass (Tonge 2012), which keeps the sum of all corrections stable and conserves momentum.
     The direction is that at the start of the step, x_n (SHAKE, Ryckaert 1977): second order and no loss of energy. When a
-    constraint turns by more than 41 degrees in a step, or has no direction at x_n, the current direction takes its place. Not so
-    of springs that the step resolves, alpha' >= RESOLVED W: those that are pushed through their own middle would get the push of
-    the other side before they are there, in every such step, which is a pump. In the direction of x_n it is Verlet's kick.
+    constraint turns by more than 41 degrees in a step, or has no direction at x_n, the current direction takes its place; but
+    springs that the step resolves, alpha' >= RESOLVED W, keep that of x_n, and are Verlet's kick. With the current one, a spring
+    that goes through length 0 would get the push of the other side a step too early, each time, and gain energy.
 
     In the first substep after a start (`fresh`) the force acts for half a kick, alpha' = alpha / (h^2 / 2), and C* is made of
     C_(n+1) and C_n.
@@ -64,7 +64,7 @@ class Scalar(Batch):
     each = ("rest", "compliance", "damping", "break_at")
     rest_name = "rest"
     uploads_all = True
-    _scene_sized = False  # whether any of its lengths is that of the whole scene, in want of one of its own
+    _scene_sized = False  # whether any of its constraints, which has no size of its own, has that of the whole scene
     grows = True
 
     def setup(self, indices, rest, compliance, damping, break_at=None) -> None:
@@ -79,15 +79,15 @@ class Scalar(Batch):
         self._warn_duplicates()
 
     def quantity_of(self, indices) -> Quantity:
-        """f of these particles, as the user gives them."""
+        """f of these particles, given as the user gives them."""
         return self.measures(self.fixed(indices, self.measures.arity))
 
     def fixed(self, indices, arity: int) -> FixedSize:
-        """These particles, checked, as many for each constraint."""
+        """The same number of particles for each constraint, checked."""
         return FixedSize(type(self).__name__, checks.indices(repr(self), self.index_name, indices, checks.ANY, arity=arity))
 
     def hold(self, quantity: Quantity) -> None:
-        """Act on the particles of this f."""
+        """Take this f, and act on its particles."""
         self._keep(quantity=quantity, members=quantity.members, arity=getattr(quantity.members, "arity", 0))
 
     def check_indices(self, particles: "Particles") -> None:
@@ -116,17 +116,18 @@ class Scalar(Batch):
 
     @property
     def cusp(self) -> bool:
-        """Whether any goal is f = 0, where gradients end and directions mean nothing, or was when kernels were compiled."""
+        """Whether any rest value is an f at which gradients end (f = 0), or was when kernels were compiled: directions mean
+        nothing there."""
         return self.quantity.ends and bool((self.goal == 0).any()) or vars(self.dev).get("cusp", False)
 
     @property
     def reweighs(self) -> bool:
-        """Outlines do."""
+        """Whether residual_of() needs reduce_block(), as for outlines."""
         return self.arity == 0
 
     @property
     def listing(self) -> Any:
-        """As the user gives them."""
+        """The particles of each constraint, as the user gives them."""
         return self.quantity.listing
 
     def select(self, some: np.ndarray, number: np.ndarray) -> None:
@@ -142,7 +143,7 @@ class Scalar(Batch):
         return self.quantity.values(x)
 
     def hold_all(self, listing: Any) -> None:
-        """Act on these."""
+        """Act on these particles, given as the user gives them."""
         self.hold(self.quantity_of(listing))
 
     def can_regroup(self, change: Regrouping) -> bool:
@@ -169,11 +170,12 @@ class Scalar(Batch):
 
     @property
     def ramp(self) -> Ramp | None:
-        """The way to other rest values, while it is bound."""
+        """The ramp of rest values, while the batch is bound."""
         return vars(self.dev).get("ramp")
 
     def violation(self, position: np.ndarray) -> np.ndarray:
-        """C at the given positions, (m,), with the rest values of the state: those before a ramp that was not gone yet."""
+        """C at the given positions, (m,), with the rest values of the state: where a ramp is under way, those from which it
+        begins."""
         rest = self.ramp.now()[0] if self.ramp and self.ramp.under_way else self.goal
         return self.quantity.difference(self.rest_of(position), rest)
 
@@ -239,7 +241,7 @@ class Scalar(Batch):
 
     @property
     def _strictly(self) -> bytes | None:
-        """The compliances, where a world of higher order is made for these; its kernels are not."""
+        """The compliances in a world of higher order, which is built for these values, though its kernels are not; else None."""
         return self.compliance.tobytes() if self.scene and self.scene.order > 2 else None
 
     def acts_as_force(self, scene: Scene) -> np.ndarray:
@@ -247,31 +249,32 @@ class Scalar(Batch):
         return (self.compliance > 0) & (scene.order > 2)
 
     def relaxed_alone(self, scene: Scene) -> np.ndarray:
-        """Which constraints no system is to have, (m,): forces, those that end where gradients do, and clamped multipliers."""
+        """Which constraints no system takes, (m,): those that act as forces, rigid ones at a cusp, and drives with a limited
+        load."""
         if self.driven:
             return self.acts_as_force(scene) | np.isfinite(self.largest)
         return self.acts_as_force(scene) | (self.cusp & (self.goal == 0) & (self.compliance == 0))
 
     @property
     def outgrown(self) -> bool:
-        """Whether others than before are to be relaxed alone, too, or a world of higher order has other forces: a world is what
-        its knobs say, not how they came there."""
+        """Whether the world has to be built anew: others than before are to be relaxed alone, or compliances differ in a world of
+        higher order. A world is what its knobs say, not how they came there."""
         if not (self.scene and self.acts):
             return super().outgrown
         others = self.solvable_together and bool((self._alone != self.relaxed_alone(self.scene)).any())
         return super().outgrown or others or self._made_for != self._strictly
 
     def drive_of(self, scene: Scene) -> Drive:
-        """What moves the rest values, where the batch is driven."""
+        """What moves the rest values of a driven batch."""
         raise NotImplementedError
 
     def course(self) -> tuple[Any, Any]:
-        """Where the batch is driven: where rest values go to, and how fast, (m,) each."""
+        """Of a driven batch: where rest values go to, and how fast, (m,) each."""
         raise NotImplementedError
 
     @property
     def largest(self) -> Any:
-        """Where the batch is driven: the largest loads, (m,)."""
+        """Of a driven batch: the largest loads, (m,)."""
         raise NotImplementedError
 
     @property
@@ -280,11 +283,12 @@ class Scalar(Batch):
         return self.driven and bool(np.isfinite(self.largest).any()) or self._built("drive", "capped")
 
     def start_at(self, position: np.ndarray, first: int) -> None:
-        """Where the batch is driven: particles from number `first` on were placed where they are, (n, dim)."""
+        """Of a driven batch: particles from number `first` on were placed at `position`, (n, dim)."""
 
     @property
     def limited(self) -> bool:
-        """Whether steps of the batch have to be limited, or had to be when kernels were compiled: f is curved, and some rigid."""
+        """Whether steps have to be limited, see StepLimit, or had to be when kernels were compiled: f is curved, and any
+        constraint rigid."""
         return self.quantity.curved and bool((self.compliance == 0).any()) or self._built("limit", "acts")
 
     @property
@@ -294,7 +298,8 @@ class Scalar(Batch):
 
     @property
     def learns_loads(self) -> bool:
-        """Whether its constraints may know their loads: few corners, and straight; of these, those that are rigid do."""
+        """Whether rigid constraints of the batch can know their loads: few corners, an f that neither is curved nor collapses, no
+        drive."""
         return self.arity > 0 and not (self.driven or self.quantity.curved or self.quantity.collapses)
 
     def bind(self, scene: Scene) -> None:
@@ -363,13 +368,13 @@ class Scalar(Batch):
 
     @property
     def sagging(self) -> np.ndarray:
-        """The multipliers of the last substep that violations bear, (m,): all but the loads that are known."""
+        """The multipliers of the last substep without known loads, (m,): what violations bear."""
         known = self.dev.known
         lam = self.scene.memory.read(self.dev.lam)[: self.count].astype(np.float64)
         return lam - self.scene.memory.read(known.given)[: self.count] if known.learns else lam
 
     def forget_loads(self, some: np.ndarray) -> None:
-        """Of some, a mask (m,), no load is known: their particles were put elsewhere."""
+        """Forget the known loads of some constraints, a mask (m,): their particles were put elsewhere."""
         if self.dev.known.learns:
             self.dev.known.forget(some)
 
@@ -385,7 +390,7 @@ class Scalar(Batch):
 
     @ti.func
     def excess(self, c, f):
-        """f - rest."""
+        """f - rest, to all digits where f is `precise`."""
         C = f - self.dev.rest[c]
         if ti.static(self.dev.quantity.precise):
             C = self.dev.quantity.excess(self.member(c, 0), self.member(c, 1), f, self.dev.rest[c])
@@ -398,12 +403,12 @@ class Scalar(Batch):
 
     @ti.func
     def direction_reliable(self, f, f0):
-        """Whether the direction is clear enough at f and f0, now and at the start, for a turn of 41 degrees to mean something."""
+        """Whether directions at f (now) and f0 (at the start) are clear enough to tell a turn of 41 degrees."""
         return True
 
     @ti.func
     def start_substep(self, c, fresh):
-        """Before the first pass of a substep: what `measure` has to remember of its start."""
+        """Before the first pass of a substep: keep what measure() needs of its start."""
 
     @ti.func
     def corners(self, c, back):
@@ -442,7 +447,7 @@ class Scalar(Batch):
 
     @ti.func
     def bounded(self, value):
-        """`value` on the side on which the constraint acts, 0 on the other."""
+        """`value` where the constraint acts on its side, else 0."""
         if ti.static(self.side != 0):
             value = ti.max(self.side * value, 0) * self.side
         return value
@@ -497,18 +502,19 @@ class Scalar(Batch):
 
     @ti.func
     def clamped(self, c, lam):
-        """A multiplier, at most what the drive can do."""
+        """A multiplier, limited to the largest load of a drive."""
         if ti.static(self.driven):
             lam = self.dev.drive.clamp(c, lam)
         return lam
 
     @ti.func
     def postpone(self, c, f0, W, share, first):
-        """What of the violation is left for later substeps, see StepLimit. share: of the frame, that the substep is; 0: none."""
+        """What of the violation is left for later substeps, see StepLimit. share: of the frame, that the substep is; 0 where none
+        is."""
         out = ti.cast(0, self.dev.real)
         if first != 0:
             C = f0 - self.dev.rest[c]
-            if ti.static(self.driven):  # as fast as it is told to be, but what is assigned has no more than a share of its size
+            if ti.static(self.driven):  # the way that the drive goes in this substep is not postponed
                 C += self.dev.drive.step[c]
             if self.dev.spring.is_rigid(c):
                 out = self.dev.limit.postpone(c, self.bounded(C), W * ti.abs(self.dev.lam[c]), self.residual_scale(c), share)
@@ -531,7 +537,7 @@ class Scalar(Batch):
         f0, n = self.measure(c, start)
         f0 = self.unwrap(f0, self.dev.rest[c])
         f = self.unwrap(f, f0)
-        w = ti.cast(0, self.dev.real)  # sum of w |grad|^2, then mass-split: along both, current, start
+        w = ti.cast(0, self.dev.real)  # sum of w |grad|^2; then with split masses: of g . n, g . g, n . n
         both, here, there = ti.cast(0, self.dev.real), ti.cast(0, self.dev.real), ti.cast(0, self.dev.real)
         for k in ti.static(range(self.arity)):
             i = self.member(c, k)
@@ -572,7 +578,7 @@ class Scalar(Batch):
 
     @ti.func
     def has_cusp(self, c):
-        """Whether constraint c ends where gradients do: its directions mean nothing, from one substep or pass to the next."""
+        """Whether constraint c is rigid and at a cusp: its directions mean nothing from one pass to the next."""
         out = False
         if ti.static(self.dev.cusp):
             out = self.dev.rest[c] == 0 and self.dev.spring.is_rigid(c)
@@ -580,7 +586,7 @@ class Scalar(Batch):
 
     @ti.func
     def multiplier_of(self, c, violation, A, alpha, lam, W):
-        """The multiplier of a Jacobi pass."""
+        """The multiplier after a Jacobi pass."""
         new = lam
         if W > 0:
             new = lam - self.dev.slots.relaxation * violation / (A * W + alpha)
@@ -591,7 +597,7 @@ class Scalar(Batch):
 
     @ti.func
     def jacobi_update(self, c, violation, A, alpha, lam, W, turn):
-        """The same, of a pass that is made."""
+        """The same; where it changes, how far the constraint turned is noted."""
         new = self.multiplier_of(c, violation, A, alpha, lam, W)
         if new != lam:
             self.dev.slots.note_turn(turn)
@@ -608,10 +614,11 @@ class Scalar(Batch):
 
     @ti.func
     def motion(self, c, n, together):
-        """The motion u along n in this substep, its weight W, the largest move by a multiplier of 1, the largest move squared.
+        """Of constraint c along n: the motion u in this substep, the mass-split weight W, the largest move of a corner by a
+        multiplier of 1, and the largest motion of a corner, squared.
 
-        u is relative to the rest value, where that moves.
-        together: 1 where the mass is split between all constraints, though some are solved together.
+        Motions are relative to the first corner; u is relative to the rest value, where that moves.
+        together: 1 where masses are split among all constraints, though some are solved together.
         """
         u, W, longest, fastest = (
             ti.cast(0, self.dev.real),
@@ -635,7 +642,7 @@ class Scalar(Batch):
 
     @ti.func
     def limit_step(self, c, lam, new, n, share, together):
-        """The multiplier `new`, or where Newton's step means nothing, one that takes out motion; and whether it is that."""
+        """The multiplier `new`, or one that only takes out motion where StepLimit asks for it; and whether it is that."""
         far = False
         if self.dev.spring.is_rigid(c):
             u, W, longest, fastest = self.motion(c, n, together)
@@ -691,7 +698,7 @@ class Scalar(Batch):
             if W > 0:
                 new = self.multiplier_of(c, violation, A, alpha, lam, W)
                 new, far = self.limit_step(c, lam, new, n, share, 1)
-                if far:  # the others follow: a row without a weight goes back by its multiplier
+                if far:  # its step is fixed, and the others follow: a row without a weight has the step -start
                     start, weight = lam - new, 0 * W
         self.dev.slots.system.set_row(row, violation, A, alpha, start, weight, self.geometric_stiffness(c, weight))
         if ti.static(self.dev.slots.system.limits_steps):
@@ -712,7 +719,7 @@ class Scalar(Batch):
 
     @ti.func
     def relax_alone(self, c, violation, A, alpha, lam, W, n, turn, share, first):
-        """The step of the multiplier of constraint c, which belongs to no system; it is taken."""
+        """Take the step of the multiplier of constraint c, which belongs to no system. Returns the step."""
         new = self.jacobi_update(c, violation, A, alpha, lam, W, turn)
         if ti.static(self.dev.quantity.collapses > 0):
             move = ti.cast(0, self.dev.real)
@@ -725,9 +732,9 @@ class Scalar(Batch):
             last, wanted = self.dev.step[c], new
             if first != 0:
                 last = 0
-            if not self.has_cusp(c):  # there the last step went elsewhere
+            if not self.has_cusp(c):  # there the last step had another direction
                 wanted = lam + self.dev.slots.semi_iteration.step(last, step)
-            step = self.dev.slots.limited(wanted, self.geometric_stiffness(c, W / 2)) - lam  # split by two in a chain
+            step = self.dev.slots.limited(wanted, self.geometric_stiffness(c, W / 2)) - lam  # W has masses that are split by two
             new = lam + step
         if ti.static(self.dev.limit.acts):
             if W > 0:
@@ -744,7 +751,7 @@ class Scalar(Batch):
 
     @ti.func
     def known_violation(self, c, start, W, h, h2_effective):
-        """The violation that would ask for the load that constraint c knows; `start` is the one at the start of the substep."""
+        """The violation that would ask for the load that constraint c knows. start: the violation at the start of the substep."""
         out = 0 * start
         if W > 0 and self.dev.spring.is_rigid(c) and not self.has_cusp(c):
             missing = self.dev.slots.relaxation * start / W
@@ -755,7 +762,7 @@ class Scalar(Batch):
 
     @ti.func
     def weigh_load(self, c):
-        """As a window ends, see KnownLoad."""
+        """As a window ends: see KnownLoad.weigh()."""
         _, g = self.measure(c, self.corners(c, 0))
         _, _, most, _ = self.motion(c, g, 0)
         own = ti.cast(0, self.dev.real)
@@ -765,14 +772,15 @@ class Scalar(Batch):
 
     @ti.func
     def learn_load(self, c, h):
-        """Then, see KnownLoad."""
+        """After that: see KnownLoad.learn()."""
         _, g = self.measure(c, self.corners(c, 0))
         _, W, _, fastest = self.motion(c, g, 0)
         self.dev.known.learn(c, h * h * W, self.residual_scale(c), ti.sqrt(fastest))
 
     @ti.func
     def geometric_stiffness(self, c, W):
-        """(omega h)^2 of the fastest vibration across a tension, for a multiplier of 1: of a chain 4 w / l, where W = 2 w."""
+        """(omega h)^2 of the fastest transverse vibration under a multiplier of 1: 4 w / l in a chain of links l, where W = 2
+        w."""
         return 2 * W * self.dev.inverse_size[c]
 
     @ti.func
@@ -839,7 +847,7 @@ class Scalar(Batch):
 
     @ti.func
     def push_reaction(self, c, firm, soft):
-        """scale w_j lam grad_j C(x_n)."""
+        """Push scale w_j lam grad_j C, by the scale `firm` where c is rigid, and `soft` where not, see Batch."""
         pull = self.dev.lam[c] * ti.select(self.dev.spring.is_rigid(c), firm, soft)
         if ti.static(self.dev.known.learns):
             if self.dev.spring.is_rigid(c):
@@ -858,8 +866,8 @@ class Scalar(Batch):
 
     @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
-        """The violation that is left, relative to the rest value (to the batch's mean f where that is 0). What is worked out for
-        a pass along two directions is so along one: W has a part in it only where a load ends."""
+        """The violation that is left, relative to the rest value (to the batch's mean f where that is 0). W is made of the
+        current gradients alone: it cancels, unless the multiplier is bounded."""
         left = ti.cast(0, self.dev.real)
         if ti.static(self.arity == 0):
             left = self.dev.outline.violation_left(c, h, h2_effective, fresh)
