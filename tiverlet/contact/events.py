@@ -80,7 +80,7 @@ class EventLog:
 
     @ti.func
     def enter(self, row, i, e, began, last):
-        """Begin a row."""
+        """Begin a row for entry e of particle i. began, last: the substeps in which it began to touch, and touched last."""
         self.touched.field[e] = row + 1
         self.pair.field[row] = [i, self.list.neighbour[e]]
         self.when.field[row] = [began, last]
@@ -89,7 +89,7 @@ class EventLog:
 
     @ti.func
     def note(self, i, j, e, n, impulse, final):
-        """Note that entry e of particle i, with j, touches in this pass. Both sides of a pair come by, but for one that cannot
+        """Note that entry e of particle i, with j, touches in this pass. Both sides of a pair ask for it, but for one that cannot
         move; one of them writes."""
         if i < j or not self.state.w.positive(j):
             self.write(i, j, e, n, impulse, final)

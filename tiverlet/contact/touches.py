@@ -58,17 +58,17 @@ class ContactEvents:
 
     @property
     def begun(self) -> Touches:
-        """What did not touch before the frame."""
+        """Contacts that did not touch before the frame."""
         return self.touches[~np.isnan(self.touches.began)]
 
     @property
     def ended(self) -> Touches:
-        """What does not touch after it."""
+        """Contacts that do not touch after it."""
         return self.touches[~np.isnan(self.touches.ended)]
 
     @property
     def lasting(self) -> Touches:
-        """What touched before and after."""
+        """Contacts that touched before and after."""
         return self.touches[np.isnan(self.touches.began) & np.isnan(self.touches.ended)]
 
     def __len__(self) -> int:
@@ -94,13 +94,13 @@ class ContactEvents:
 
 
 def no_events(dim: int) -> ContactEvents:
-    """Nothing touched."""
+    """Events of a frame in which nothing touched."""
     pairs, vectors, numbers = np.zeros((0, 2), dtype=np.int64), np.zeros((0, dim)), np.zeros(0)
     return ContactEvents(Touches(pairs, vectors, vectors, numbers, numbers, numbers, numbers))
 
 
 def joined(parts: list[Touches]) -> Touches:
-    """All of them, in the order of their pairs."""
+    """All of these contacts, in the order of their pairs."""
     out = Touches(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Touches)))
     return out[np.lexsort(out.pairs.T[::-1])]
 

@@ -36,8 +36,8 @@ class Slots:
     The slots of one particle stand side by side, so that a particle adds them in an order that depends on nothing else. Corners
     that cannot move have no slot.
 
-    loads: whether constraints that are relaxed by themselves know their loads. bears: where they do, for each body how many
-    particles the constraint bears that bears most, as a window ends. split: the mass-split weight n w of each particle, for the n
+    loads: whether constraints that are relaxed by themselves know their loads. bears: where they do, the largest load in each
+    body, in weights of a particle, as a window ends. split: the mass-split weight n w of each particle, for the n
     blocks of constraints that it belongs to: a system that is solved as a whole is one, and each constraint that is relaxed by
     itself.
     """

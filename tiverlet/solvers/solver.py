@@ -30,7 +30,7 @@ class SemiIteration:
 
     @ti.func
     def step(self, last, correction):
-        """The step of a multiplier, from the last one (0 in the first pass) and the correction of Jacobi, which is times
+        """The step of a multiplier, from the last one (0 in the first pass) and the correction of a Jacobi pass, times
         relaxed_by()."""
         return correction
 
@@ -60,7 +60,7 @@ class Solver:
         """The System of what is solved together; None for nothing."""
 
     def semi_iteration(self, scene: Scene) -> SemiIteration | None:
-        """How passes follow one another; None for those of Jacobi. It asks for `converges`."""
+        """How passes follow one another; None for those of Jacobi. A solver with one sets `converges`."""
 
     def relaxed_by(self, scene: Scene, batches: list[Batch], split: np.ndarray) -> float:
         """The factor on each correction of what is relaxed by itself."""
@@ -76,5 +76,5 @@ class Solver:
         return "solver=tv.Direct()" if rows == sum(b.count for b in alone) else "solver=tv.ConjugateGradient()"
 
     def explain(self, batches: list[Batch], slots) -> str:
-        """What is solved how."""
+        """What is solved how, for World.explain()."""
         return f"{self!r}: {sum(b.count for b in batches)} constraints, each by itself"

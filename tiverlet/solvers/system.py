@@ -88,7 +88,7 @@ class System:
         return self._rows.get(id(batch), np.full(batch.count, -1))
 
     def left_out(self, batches: "list[Batch]") -> int:
-        """The number of constraints that are relaxed by themselves, of those with a particle that can move."""
+        """How many constraints are relaxed by themselves, of those with a particle that can move."""
         return sum(int((~b.idle(self.inv_mass) & (self.row(b) < 0)).sum()) for b in batches)
 
     def forget(self, off: "Sequence[tuple[Batch, np.ndarray]]" = ()) -> None:
@@ -122,11 +122,11 @@ class System:
 
     @ti.func
     def iterate(self, thread):
-        """One of them."""
+        """One of `steps` iterations."""
 
     @ti.func
     def end(self, thread):
-        """After the last."""
+        """After the last iteration."""
 
     @ti.func
     def total_of(self, i, begin, end):

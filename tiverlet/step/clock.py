@@ -43,7 +43,7 @@ class Clock:
     softened: bool = False
 
     def copy(self) -> "Clock":
-        """The same."""
+        """A clock with the same values."""
         return replace(self)
 
     def put_back(self, kept: "Clock") -> None:

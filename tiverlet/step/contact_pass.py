@@ -61,7 +61,7 @@ class ContactPass:
 
     @ti.func
     def struck(self):
-        """1 when a pair bounces in this substep."""
+        """1 where a pair bounces in this substep."""
         out = 0
         for c in ti.static(self.contacts):
             if ti.static(c.has_restitution):
@@ -119,7 +119,7 @@ class ContactPass:
 
     @ti.func
     def finish(self, now):
-        """Keep the slip of friction, and what was left of bounces."""
+        """Keep the slip of friction, and what bounces left over."""
         thread = now.thread
         for c in ti.static(self.contacts):
             if ti.static(c.has_friction or c.has_restitution):
@@ -136,7 +136,7 @@ class ContactPass:
 
     @ti.func
     def project_velocities(self, thread, k):
-        """Pass k of taking the sound out of loaded contacts."""
+        """Pass k of the projection that takes the sound out of loaded contacts."""
         for c in ti.static(self.contacts):
             for p in range(self.team.dealt_count(self.particles.pieces, 1, thread)):
                 begin, end = self.particles.piece(p, thread)

@@ -180,7 +180,7 @@ class Diagnostics:
 
     @ti.func
     def block_of(self, b, h64, t64, state_origin):
-        """One block, of the state as frames end, or as it came about otherwise."""
+        """Figures of one block, of the state at the end of a frame, or as it came about otherwise."""
         fresh, begin = ti.cast(state_origin == STARTED, ti.i32), ti.cast(state_origin == UNSTEPPED, ti.i32)
         h, t, fraction = ti.cast(h64, self.step.real), ti.cast(t64, self.step.real), self.step.integrator.frame_fraction(0, 1)
         return self.block(b, h, t, fraction, fresh, begin)
@@ -198,7 +198,7 @@ class Diagnostics:
 
     @ti.func
     def reduce_blocks(self, thread, h64, state_origin):
-        """The sums behind residuals."""
+        """Sum up what residuals of constraints on many particles need."""
         h, fresh = ti.cast(h64, self.step.real), ti.cast(state_origin == STARTED, ti.i32)
         self.step.constraints.reduce_blocks(thread, h, self.step.integrator.h2_effective(h, fresh), 0, fresh, False)
 
@@ -297,7 +297,7 @@ class Residuals:
 
     @ti.kernel
     def measure(self, h64: ti.f64, fresh: ti.i32, out: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
-        """Of every constraint."""
+        """The residual of every constraint."""
         if ti.static(self.step.team.size == 1):
             self.diagnostics.reduce_blocks(0, h64, fresh)
         elif ti.static(len(self.step.constraints.ragged) > 0):
@@ -321,7 +321,7 @@ class Reporter:
         self.figures = sheet[: 11 + step.dim]
 
     def regroup(self) -> None:
-        """Particles came or went."""
+        """Particles came or went: take their number, and how far out they may be."""
         search, self.n = self._step.search, self._step.n
         self.farthest = min(LARGEST, search.finest * FARTHEST) if search else LARGEST
 

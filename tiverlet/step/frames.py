@@ -56,12 +56,12 @@ def sheets(h, start, end, tick, since, fresh, origin, substeps: int, passes: int
 
 
 def waits(some: np.ndarray) -> np.ndarray:
-    """Which rows are of frames that stopped to have a list grown."""
+    """Which rows are of frames that stopped to have a list grown, or built."""
     return some[:, HALT] != 0
 
 
 def resume(row: np.ndarray, resumed: int, begin: int, half: int) -> None:
-    """Have a frame go on there."""
+    """Have a frame go on in the substep, and before the half of a pass, in which it stopped."""
     row[RESUMED], row[BEGIN], row[HALF] = resumed, begin, half
 
 
@@ -161,7 +161,7 @@ class Frames:
 
     @ti.func
     def keep(self, w, f, plan: ti.template(), figures: ti.template(), track: ti.template()):  # type: ignore[valid-type]
-        """What the frame came to, and where particles are after it."""
+        """Keep what the frame came to, and where particles are after it."""
         if plan[KEEPS] != 0:
             for k in range(FIGURES):
                 figures[(w * plan[FRAMES] + f) * FIGURES + k] = self.sheet[k]
@@ -177,7 +177,7 @@ class Frames:
 
     @ti.func
     def turn_over(self, plan: ti.template()):  # type: ignore[valid-type]
-        """The sheet for the next frame, as Clock.advance() and Runner.run() write it."""
+        """Write the sheet for the next frame, as Clock.advance() and Runner.run() do."""
         self.dates[2] += 1
         self.sheet[START] = self.sheet[END]
         self.sheet[END] = self.dates[0] + self.dates[1] * (self.dates[2] + 1)

@@ -32,7 +32,7 @@ class RigidRows:
         self.start, self.dev = batch.start, SimpleNamespace(spring=SimpleNamespace(soft=False))
 
     def idle(self, w: np.ndarray) -> np.ndarray:
-        """No row; those that nothing can move are left out."""
+        """No row: what nothing can move is left out already."""
         return np.zeros(self.count, dtype=bool)
 
     def violation(self, x: np.ndarray) -> np.ndarray:
@@ -89,7 +89,7 @@ class Cluster:
 
 
 def rigid_rows(batches: list, w: np.ndarray) -> list[RigidRows]:
-    """Those of the rigid clusters of a world that are in anything else, which passes leave undone; of those not too large."""
+    """Rows of the rigid clusters that share particles with anything, which passes leave violated; large clusters are left out."""
     rows = [RigidRows(b, w, some & ~_wide(b)) for b, some in _coupled(batches, w) if (some & ~_wide(b)).any()]
     return [some for some in rows if some.count]
 

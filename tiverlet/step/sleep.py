@@ -154,7 +154,7 @@ class Sleepers:
         self.review()
 
     def regroup(self) -> None:
-        """Particles came and went."""
+        """Particles came and went: take their number, and note who sleeps."""
         self.scene.memory.resize(self.blocks, blocks_of(self.scene.particles.count))
         self.review()
 

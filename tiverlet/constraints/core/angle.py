@@ -78,7 +78,7 @@ class DihedralAngle(Angle):
 
 
 def turned(C: np.ndarray) -> np.ndarray:
-    """A difference of angles, in (-pi, pi]."""
+    """Differences of angles, in (-pi, pi]."""
     return C - TURN * np.round(C / TURN)
 
 

@@ -89,7 +89,7 @@ class Quantity:
 
     @ti.func
     def exactly(self, i, j, rest):
-        """The same in f64."""
+        """f - rest in f64."""
         return ti.cast(0, ti.f64)
 
     @ti.func

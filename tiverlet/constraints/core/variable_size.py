@@ -85,7 +85,7 @@ class VariableSize:
         return VariableSize(self.kind, [number[self.row(k)] for k, stays in enumerate(some) if stays])
 
     def pairs(self) -> np.ndarray:
-        """None: corners of one constraint may be far from each other."""
+        """No pairs: corners of one constraint may be far from each other."""
         return np.zeros((0, 2), dtype=np.int32)
 
     def bind(self, batch, scene: Scene) -> None:
