@@ -84,7 +84,8 @@ def spin(S, X):
             out[1, 0] = gap[0] / size
             out[0, 1] = -out[1, 0]
         else:
-            x, _ = solved(diagonal(ti.static(1 + 2.0**-46) * size, S) - S, gap)  # about a line of particles anything will do
+            # About a line of particles anything will do. As a literal, 1 + 2^-46 would be 1 in f32.
+            x, _ = solved(diagonal(size + ti.static(2.0**-46) * size, S) - S, gap)
             out = ti.Matrix([[0 * size, -x[2], x[1]], [x[2], 0 * size, -x[0]], [-x[1], x[0], 0 * size]])
     return out
 
