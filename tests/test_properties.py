@@ -10,6 +10,7 @@ import pytest
 
 import tiverlet as tv
 from tiverlet import constraints
+from tiverlet.step import checkpoint
 
 from .bad_starts import BadStart
 from .conftest import order, rms, unprojected
@@ -268,3 +269,47 @@ def test_no_bad_start_flies(world, dim, solver):
             report = w.step(1 / 60)
             assert (bad.far(w.position) < 4).all() and ("moved" in report.flags) == (frame == 0)
         assert "unconverged" in report.flags  # some contradict each other
+
+
+@pytest.mark.parametrize("dim, solver", [(2, tv.ConjugateGradient(4)), (3, tv.Jacobi())], ids=["2D", "3D"])
+def test_what_was_no_number_leaves_nothing_behind(world, dim, solver):
+    """All constraints of a dimension in one world, rigid and soft. After a frame with NaN for every place, its state is put back
+    to what it was, and goes on to the bit; so a frame that is tried again with more substeps is what it would have been. And
+    places and velocities that are assigned are a new start."""
+    features, points = [tv.Gravity(np.zeros(dim)), tv.Contact(friction=0.3, restitution=0.5)], []
+
+    def corners(at):
+        """Two blocks of them, out of the way of others; one by itself stays where it is."""
+        first = sum(map(len, points))
+        for _ in range(2):
+            points.append(at + 10.0 * (len(points) + 1) * (len(at) > 1))
+        return first + np.arange(2 * len(at)).reshape(2, -1)
+
+    for row in (r for r in ROWS.values() if r.points.shape[1] == dim):
+        who = corners(row.points)
+        probe = row.make(np.arange(2 * len(row.points)).reshape(2, -1), np.zeros(2))
+        probe.prepare(tv.Particles(np.concatenate(points[-2:])), np.ones(2 * len(row.points)))
+        rest = probe.violation(np.concatenate(points[-2:])) - row.off / 10
+        features.append(row.make(who, rest, compliance=[0.0, 1e-2], damping=[0.0, 0.1]))
+    features += [make(corners(at)) for at, make, _ in OTHERS.values() if at.shape[1] == dim]
+    x = np.concatenate(points)
+    radius = np.concatenate([np.full(len(at), 0.02 * (len(at) > 1)) for at in points])
+    w = world(tv.Particles(x, radius=radius), features, solver=solver, substeps=2)
+    w.step(1e-3)
+    kept, waiting = checkpoint.keep(w), checkpoint.flags(w)
+    w.step(1e-3)
+    after, memory, state = w.hash(), w._runner.memory, w._runner.scene.state
+    for mend in (lambda: checkpoint.undo(w, kept, waiting), lambda: (setattr(w, "position", x), setattr(w, "velocity", 0 * x))):
+        for field in (state.x, state.d):
+            memory.write(field, np.full_like(memory.read(field), np.nan))
+        assert "non-finite" in w.step(1e-3).flags
+        mend()
+        report = w.step(1e-3)
+        if after:
+            assert w.hash() == after
+            after = None
+        assert (
+            np.isfinite(w.position).all()
+            and np.isfinite(w.velocity).all()
+            and np.isfinite([report.energy, report.residual]).all()
+        )

@@ -64,7 +64,7 @@ class Bend(Scalar):
         """Remember the normal, that of the end where the start is straight, and from which side it is seen."""
         if ti.static(self.dev.state.dim == 3):
             if fresh != 0:
-                self.dev.axis[c] = 0 * self.dev.axis[c]
+                self.dev.axis[c] = ti.Vector.zero(self.dev.real, 3)
             e = crossed(self.corners(c, 1))
             if e.norm() < 10 * self.dev.quantity.faint():
                 e = crossed(self.corners(c, 0))

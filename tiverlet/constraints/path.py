@@ -231,7 +231,7 @@ class Path(Anchored):
     def offsets(self, c, frame_fraction, first, fresh):
         """Across the curve, from where the plane across it meets it; at an end or a bend, from the nearest point."""
         i = self.member(c, 0)
-        x, t, C0 = self.dev.state.place(i), self.dev.tangent[c], 0 * self.dev.tangent[c]
+        x, t, C0 = self.dev.state.place(i), self.dev.tangent[c], self.nothing()
         k, r = self.dev.piece[c], self.dev.rest[c]
         if first != 0:
             start = x - self.dev.state.d[i]

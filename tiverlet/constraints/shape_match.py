@@ -198,6 +198,11 @@ class ShapeMatch(Batch):
         return np.maximum.reduceat(scale * np.linalg.norm(pull, axis=1), self.members.starts[:-1])
 
     @ti.func
+    def nothing(self) -> Any:
+        """A vector of zeros; what a field has may be no number."""
+        return ti.Vector.zero(ti.f64, self.dev.state.dim)
+
+    @ti.func
     def arm(self, e, i0, back):
         """Corner e relative to particle i0, at x - back d; in f64, so that places at the start and predicted ones differ by d."""
         i = self.dev.corners.members[e]
@@ -243,7 +248,7 @@ class ShapeMatch(Batch):
         begin, end, c = self.dev.corners.block[b]
         i0 = self.dev.corners.hub(c)
         rigid, soft, now, last, give = self.law(c, h, h2_effective, fresh)
-        total, p1, q1, s1 = ti.cast(0, ti.f64), 0 * self.dev.place[0], 0 * self.dev.place[0], 0 * self.dev.place[0]
+        total, p1, q1, s1 = ti.cast(0, ti.f64), self.nothing(), self.nothing(), self.nothing()
         K = p1.outer_product(p1)
         X, v1, U = 0 * K, 0 * p1, 0 * K
         for e in range(begin, end):
@@ -257,7 +262,7 @@ class ShapeMatch(Batch):
             K += (mu * q).outer_product(s)
             X += (mu * p).outer_product(s)
             if ti.static(self.dev.spring.soft):
-                v = mu * last * self.dev.spring.last[e]
+                v = mu * last * self.dev.spring.before(e, ti.cast(self.nothing(), self.dev.real), fresh)
                 if first == 0:
                     v = mu * (self.dev.spring.history[e] + give * self.dev.pull[e])
                 v1 += v
@@ -272,7 +277,7 @@ class ShapeMatch(Batch):
     @ti.func
     def moments(self, c):
         """Sum of mu, means of p, q and s, and the moments of q and p, about these means."""
-        total, p, q, s = ti.cast(0, ti.f64), 0 * self.dev.place[0], 0 * self.dev.place[0], 0 * self.dev.place[0]
+        total, p, q, s = ti.cast(0, ti.f64), self.nothing(), self.nothing(), self.nothing()
         K = p.outer_product(p)
         X = 0 * K
         for b in range(self.dev.corners.blocks[c], self.dev.corners.blocks[c + 1]):
@@ -341,7 +346,7 @@ class ShapeMatch(Batch):
         scale = firm
         if ti.static(self.dev.spring.soft):
             scale = ti.select(self.dev.spring.alpha[c] > 0, soft, firm)
-        total, mean, pull, held = ti.cast(0, ti.f64), 0 * self.dev.place[c], 0 * self.dev.place[c], False
+        total, mean, pull, held = ti.cast(0, ti.f64), self.nothing(), self.nothing(), False
         S = mean.outer_product(mean)
         X = 0 * S
         for e in range(begin, end):
@@ -371,9 +376,9 @@ class ShapeMatch(Batch):
         c, i = self.dev.corners.owner[e], self.dev.corners.members[e]
         w, relaxation = self.dev.w.of(i), self.dev.slots.relaxation
         if first > 0:
-            self.dev.pull[e] = 0 * self.dev.pull[e]
+            self.dev.pull[e] = ti.cast(self.nothing(), self.dev.real)
         if not self.dev.strength.holds(c):
-            self.dev.corners.give(e, 0 * self.dev.pull[e])
+            self.dev.corners.give(e, ti.cast(self.nothing(), self.dev.real))
         elif w > 0:
             C, n = self.off(e, c), self.dev.slots.split[i] / w
             if ti.static(not self.dev.spring.soft):
@@ -386,7 +391,7 @@ class ShapeMatch(Batch):
             else:
                 rigid, soft, now, last, give = self.law(c, h, h2_effective, fresh)
                 if first > 0:
-                    self.look_back(e, c, h, now, last)
+                    self.look_back(e, c, h, now, last, fresh)
                 C = self.wrong(e, c, C, rigid, soft, give)
                 move = ti.cast(-relaxation * C / ((rigid + soft) * n + give), self.dev.real)
                 self.dev.pull[e] = self.dev.pull[e] + move
@@ -399,11 +404,13 @@ class ShapeMatch(Batch):
         return rigid * C + soft * back + self.dev.spring.history[e] + give * self.dev.pull[e] - self.dev.mean[c]
 
     @ti.func
-    def look_back(self, e, c, h, now, last):
+    def look_back(self, e, c, h, now, last, fresh):
         """What C_n and C_(n-1) add to the violation; and flow, where the shape is plastic."""
         R = self.kept(self.dev.fit, c)
         C = self.arm(e, self.dev.corners.hub(c), 1) - self.dev.middle[c] - R @ self.dev.shape[e]
-        self.dev.spring.history[e] = now * C + last * (R @ self.dev.spring.last[e])
+        self.dev.spring.history[e] = now * C + last * (
+            R @ self.dev.spring.before(e, ti.cast(self.nothing(), self.dev.real), fresh)
+        )
         body = R.transpose() @ C
         if ti.static(self.dev.plastic):
             size = body.norm()
@@ -437,7 +444,7 @@ class ShapeMatch(Batch):
     @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
         """The largest violation that is left, by where the last pass turned the cluster, relative to its radius."""
-        worst, total, mean, holds = ti.cast(0, ti.f64), ti.cast(0, ti.f64), 0 * self.dev.place[c], self.dev.strength.holds(c)
+        worst, total, mean, holds = ti.cast(0, ti.f64), ti.cast(0, ti.f64), self.nothing(), self.dev.strength.holds(c)
         rigid, soft, now, last, give = self.law(c, h, h2_effective, fresh)
         for e in range(self.dev.corners.starts[c], self.dev.corners.starts[c + 1]):
             total += self.weight(e, c)
@@ -458,7 +465,7 @@ class ShapeMatch(Batch):
             alpha, mass, i0 = self.dev.spring.alpha[c], self.dev.mass[c], self.dev.corners.hub(c)
             if alpha > 0 and mass > 0 and self.dev.strength.holds(c):
                 total = ti.cast(0, ti.f64)
-                s, q = 0 * self.dev.place[c], 0 * self.dev.place[c]
+                s, q = self.nothing(), self.nothing()
                 K = s.outer_product(q)
                 for e in range(self.dev.corners.starts[c], self.dev.corners.starts[c + 1]):
                     mu = self.weight(e, c)

@@ -202,7 +202,7 @@ class CGSystem(System):
         """One step of conjugate gradients. One that needs a tension too large for the substep is taken back, and is the last."""
         for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
             if self.w.positive(i):
-                total = 0 * self.pulled[i]
+                total = ti.Vector.zero(self.real, self.dim)
                 for s in range(self.begin[i], self.begin[i + 1]):
                     r = self.row_of[s]
                     if r >= 0:

@@ -108,15 +108,19 @@ class Anchored(Batch):
         return scale * self.scene.memory.read(self.dev.lam)[: self.count].astype(np.float64)
 
     @ti.func
+    def nothing(self):
+        """A vector of zeros."""
+        return ti.Vector.zero(self.dev.real, self.dev.state.dim)
+
+    @ti.func
     def offsets(self, c, frame_fraction, first, fresh):
         """C at the end and at the start of the substep."""
-        zero = 0 * self.dev.state.d[0]
-        return zero, zero
+        return self.nothing(), self.nothing()
 
     @ti.func
     def offset_now(self, c, back):
         """C at x - back d."""
-        return 0 * self.dev.state.d[0]
+        return self.nothing()
 
     @ti.func
     def offset_change(self, c):
@@ -130,7 +134,7 @@ class Anchored(Batch):
         C, C0 = self.offsets(c, frame_fraction, first, fresh)
         lam, B = self.dev.lam[c], 0 * C
         if first != 0:
-            lam = 0 * lam
+            lam = self.nothing()
         new, size = lam, 0 * w
         if w > 0:
             alpha, A = 0 * w, 1 + 0 * w
@@ -138,7 +142,7 @@ class Anchored(Batch):
                 alpha = self.dev.spring.alpha[c] / h2_effective
                 A, now, last = self.dev.spring.law(c, h, w, fresh)
                 if first != 0:
-                    self.dev.spring.history[c] = now * C0 + last * self.dev.spring.last[c]
+                    self.dev.spring.history[c] = now * C0 + last * self.dev.spring.before(c, C0, fresh)
                     self.dev.spring.last[c] = C0
                 B = self.dev.spring.history[c]
             K = A * self.dev.slots.split[self.member(c, 0)] + alpha
@@ -156,7 +160,7 @@ class Anchored(Batch):
     @ti.func
     def push_spring_force(self, c, h):
         """As in Scalar, for each axis."""
-        move = 0 * self.dev.state.d[0]
+        move = self.nothing()
         if ti.static(self.dev.spring.soft):
             w, alpha = self.dev.w.of(self.member(c, 0)), self.dev.spring.alpha[c]
             if w > 0 and alpha > 0:

@@ -112,7 +112,9 @@ class Drive:
         lag = ti.cast(f, ti.f64) - start
         if (lag > stall and way < 0) or (ti.static(side == 0) and lag < -stall and way > 0):
             way = 0 * way
-        self.target[c] = self.near(start + way, 0 * start)
+        start = self.near(start + way, 0 * start)
+        if not ti.math.isnan(start):  # else it is where it was when f was a number
+            self.target[c] = start
         self.step[c] = ti.cast(way, self.real)
         return ti.cast(self.target[c], self.real)
 

@@ -60,7 +60,7 @@ class KnownLoad:
     @ti.func
     def let_go(self, c):
         """Forget the load of constraint c, which is slack or broken."""
-        self.load[c] = self.missing[c] = self.earlier[c] = self.given[c] = 0 * self.load[c]
+        self.load[c] = self.missing[c] = self.earlier[c] = self.given[c] = ti.cast(0, self.load.dtype)
 
     @ti.func
     def weigh(self, c, most, own):

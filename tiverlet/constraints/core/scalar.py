@@ -471,7 +471,7 @@ class Scalar(Batch):
                 A, now, last = self.dev.spring.law(c, h, w, fresh)
                 alpha = self.dev.spring.alpha[c] / h2_effective
                 if first != 0:
-                    f_last = self.unwrap(self.dev.spring.last[c], f0)
+                    f_last = self.unwrap(self.dev.spring.before(c, f0, fresh), f0)
                     B = now * self.bounded(self.violation_then(c, f0, 1)) + last * self.bounded(self.violation_then(c, f_last, 2))
                     self.dev.spring.history[c] = B
                     self.dev.spring.last[c] = f0

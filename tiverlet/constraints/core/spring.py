@@ -105,6 +105,11 @@ class Spring:
         return stored + theta * (borne - stored)
 
     @ti.func
+    def before(self, c, present, fresh):
+        """What is remembered of the substep before; at a start, the present, for what was before may be no number."""
+        return ti.select(fresh != 0, present, self.last[c])
+
+    @ti.func
     def law(self, c, h, w, fresh):
         """See law(), of constraint c."""
         return law(self.alpha[c], self.dashpot(c), h, w, fresh)
