@@ -195,3 +195,12 @@ def test_a_small_recording_takes_little_beside_its_positions(world, tmp_path):
         w.run(5.0, recorder=recording)
     assert (tmp_path / "rope.rrd").stat().st_size <= 2.5 * 300 * 320
     assert tv.replay(tmp_path / "rope.rrd").verify().frames == 301
+
+
+def test_what_is_too_far_away_for_a_picture_is_recorded(world, tmp_path, read_here):
+    # 1e40 m is none of the numbers of f32, in which pictures are: NumPy warns of nothing, and frames come out as they were.
+    w = world(tv.Particles([(0.0, 0.0), (1.0, 0.0)], velocity=[(1e42, 0.0), (0.0, 0.0)]), precision="f64")
+    with tv.Recorder(str(tmp_path / "far.rrd"), w) as recorder:
+        assert "out-of-range" in w.step(1 / 60).flags
+        recorder.log()
+    assert tv.replay(str(tmp_path / "far.rrd")).verify()

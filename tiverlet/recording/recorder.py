@@ -259,6 +259,7 @@ class Recorder:
         self._due = SHARE * size
         self._drawn, self._last_state = self._picture.drawing.bytes, self._calls
 
+    @np.errstate(over="ignore")  # what has exploded is too far away for f32
     def _frame(self, number: int) -> None:
         world, journal, picture = self.world, self._journal, self._picture
         journal.frame = number

@@ -152,6 +152,7 @@ class Replay:
             raise
 
     @_clear
+    @np.errstate(over="ignore")  # as Recorder
     def verify(self) -> Verdict:
         """Compute and draw everything again from the first frame on, and compare hashes, states and every row of the picture.
 
