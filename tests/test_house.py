@@ -1,7 +1,17 @@
-"""The layout: how much lies at the root of the package, how classes inherit, and that imports go one way, not deep."""
+"""The layout: how much lies at the root of the package, how classes inherit, that imports go one way, not deep, and through how
+many files a frame goes."""
 
 import ast
+import sys
 from pathlib import Path
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+from tiverlet.device.patches import patched
+
+from .conftest import ARCH
 
 ROOT = Path(__file__).parents[1] / "tiverlet"
 DEPTH = 16  # modules, one importing the next
@@ -120,3 +130,21 @@ def test_classes_are_abstract_or_final():
 def test_the_root_of_the_package_can_be_taken_in_at_a_glance():
     entries = [p.name for p in ROOT.iterdir() if p.name != "__pycache__"]
     assert len(entries) <= 25, sorted(entries)
+
+
+@pytest.mark.skipif(ARCH != "cpu" or not patched, reason="launches go through other files there")
+def test_a_frame_goes_through_few_files(world):
+    # Of the host, where links hang and discs lie: who looks for what a frame does has these to open, and the kernel's.
+    rope = tv.shapes.rope((0, 2), (1, 2), points=8)
+    discs = np.stack([0.1 * np.arange(8), np.full(8, 0.05)], axis=1)
+    w = world(
+        tv.Particles(np.concatenate([rope.position, discs]), radius=0.05, pinned=[0]),
+        [tv.Gravity(), tv.Distance(rope.links), tv.Contact(), tv.HalfSpace((0, 1), 0.0)], substeps=4,
+    )  # fmt: skip
+    w.run(0.1)
+    files = set()
+    sys.setprofile(lambda frame, event, _: files.add(frame.f_code.co_filename) if event == "call" else None)
+    w.step(1 / 60)
+    sys.setprofile(None)
+    ours = sorted(str(path.relative_to(ROOT)) for path in map(Path, files) if path.is_relative_to(ROOT))
+    assert "step/runner.py" in ours and len(ours) <= 15, ours
