@@ -8,13 +8,12 @@ from numpy.typing import ArrayLike
 from .. import checks
 from ..device import ti
 from ..features.feature import Knob, Scene
-from ..features.members import FixedSize
 from ..geometry.intervals import cross
 from ..particles import Particles
+from .core.members import FixedSize, VariableSize, rows
 from .core.outline import PRESSURE
 from .core.quantity import Quantity
 from .core.scalar import Scalar
-from .core.variable_size import VariableSize, rows
 
 
 class Area(Scalar):

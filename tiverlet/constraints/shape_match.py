@@ -10,9 +10,9 @@ from ..device import ti
 from ..features.feature import Batch, Knob, Scene
 from ..particles import Particles
 from .core import rotation
+from .core.members import VariableSize, rows
 from .core.spring import Spring, stiff
 from .core.strength import Strength, strength_of
-from .core.variable_size import VariableSize, rows
 
 HEAVY = 1024  # masses of the cluster: what a particle that cannot move weighs in it
 LEAST = 2.0**-46  # relative changes of a rotation that are rounding

@@ -8,11 +8,11 @@ asks of them:
     Batch          relax(c, ...) of one constraint: reads its particles, writes the moves it wants into slots
     Scalar         (constraints/core/scalar.py) a Batch whose constraint is one number: name a Quantity with f and its gradients,
                    and C = f - rest gets compliance, damping, mass splitting, residual and load from there
-    Anchored         (constraints/core/anchored.py) a Batch of particles, each drawn to a place of its own: give the vector to it
-    Collider           (colliders/collider.py) confine(i, ...) of one particle, with the last word
+    Anchored       (constraints/core/anchored.py) a Batch of particles, each drawn to a place of its own: give the vector to it
+    Collider       (colliders/collider.py) confine(i, ...) of one particle, with the last word
 
-Which particles a Batch acts on is an object that it holds, `members`: FixedSize (members.py), or VariableSize
-(constraints/core/variable_size.py) for constraints on any number of particles each.
+Which particles a Batch acts on is an object that it holds, `members`: FixedSize, or VariableSize for constraints
+on any number of particles each (constraints/core/members.py).
 
 A new constraint on k particles is one file with one Scalar subclass, which names its Quantity (constraints/core/quantity.py) and
 has an __init__ that checks its arrays. See constraints/distance.py. Arrays of its own with a row for each

@@ -7,8 +7,8 @@ import numpy as np
 from ... import checks
 from ...device import ti
 from ...features.feature import Batch, Feature, Knob, Scene
-from ...features.members import FixedSize
 from ...features.regrouping import Regrouping
+from .members import FixedSize
 from .spring import Spring, stiff
 
 if TYPE_CHECKING:

@@ -9,11 +9,11 @@ import numpy as np
 from ... import checks
 from ...device import ti
 from ...features.feature import FAR, Batch, Knob, Scene
-from ...features.members import FixedSize
 from ...features.regrouping import Regrouping
 from ...geometry.ordered import distinct
 from .drive import Drive
 from .known_load import KnownLoad
+from .members import FixedSize
 from .outline import Outline
 from .quantity import Quantity
 from .ramp import Ramp
