@@ -62,20 +62,16 @@ def _hashed(world: "World", values: dict[str, np.ndarray]) -> dict[str, np.ndarr
     """The state without what is for reports alone, without rest values that knobs tell as well, and without fields that were made
     when they were needed and are 0. A pair that has just bounced may be on the list or not, by the skin: pairs that remember
     nothing but what is for reports are left out."""
+    late, pieces = _late(world), _pieces(world)
     told = {e.name for memory in world._runner.memories for e in memory.entries if e.told}
-    late = _late(world)
-    values = {n: v for n, v in values.items() if not (n in told or n.startswith(RESTS) or (n in late and not v.any()))}
-    if PAIRS not in values:
-        return values
-    pieces = _pieces(world)
-    some = np.zeros(len(values[PAIRS]), dtype=bool)
-    for name in pieces:
-        if not pieces[name].told:
-            some |= values[name].any(axis=tuple(range(1, values[name].ndim)))
-    return {
-        name: v[some] if name == PAIRS or name in pieces else v for name, v in values.items()
-        if name not in pieces or not pieces[name].told
-    }  # fmt: skip
+    told |= {name for name, piece in pieces.items() if piece.told}
+    out = {n: v for n, v in values.items() if not (n in told or n.startswith(RESTS) or (n in late and not v.any()))}
+    if PAIRS in out:
+        carried, some = [name for name in pieces if name in out], np.zeros(len(out[PAIRS]), dtype=bool)
+        for name in carried:
+            some |= out[name].any(axis=tuple(range(1, out[name].ndim)))
+        out |= {name: out[name][some] for name in (PAIRS, *carried)}
+    return out
 
 
 def _late(world: "World") -> set[str]:
