@@ -57,7 +57,7 @@ class Slots:
         self.converges, self.loads = solver.converges, solver.loads
         if self.converges:
             self.tension = memory.field("slots.tension", None, kind=ti.f64)
-        self.turned = memory.field("slots.turned", None, kind=ti.i32)  # the worst turn since the last survey
+        self.turned = memory.field("slots.turned", None, kind=ti.i32)  # the worst turn since the last diagnostics
         if any(b.breaks for b in batches):
             self.broken = memory.field("slots.broken", None, kind=ti.i32)
         self.system: Any = solver.system(scene, batches, self)
