@@ -6,10 +6,11 @@ from .patches import assignments, lean, patched
 if lean:
     assignments.apply()
 if patched:
-    from .patches import sharing, source_cache, syntax_cache, timing
+    from .patches import sharing, source_cache, statements, syntax_cache, timing
 
     source_cache.apply()  # before what comes next, which is imported in half the time
     syntax_cache.apply()
+    statements.apply()
     sharing.apply(timing.compiled)
     timing.apply()
 from . import copies

@@ -10,11 +10,11 @@ Everything here knows the inside of Taichi 1.7.4; with another one, statements a
 
 import ast
 import operator
-from functools import cache, lru_cache, wraps
+from functools import cache, lru_cache
 from typing import Any
 
 from taichi._lib import core
-from taichi.lang import expr, impl, matrix_ops
+from taichi.lang import impl
 from taichi.lang.any_array import AnyArray
 from taichi.lang.ast import ast_transformer
 from taichi.lang.ast.ast_transformer import ASTTransformer
@@ -23,7 +23,7 @@ from taichi.lang.expr import Expr
 from taichi.lang.field import ScalarField
 from taichi.lang.matrix import MatrixField
 
-from ..language import active, at, ti
+from ..language import active, ti
 
 PLACES = 1000  # lines of code that are kept as what Taichi tells its compiler about where things are
 INT = range(-(2**31), 2**31)  # what a literal may be without a type of its own
@@ -153,23 +153,12 @@ def _target(value: Any) -> Any:
     return value.ptr if kind in (MatrixField, AnyArray) or kind is Expr and value.is_tensor() else None
 
 
-def _product(x: Any, y: Any) -> Any:
-    """The dot product of two vectors: the same sum in the same order, without the functions inside functions that Taichi makes
-    of it, which copy their arguments."""
-    vectors = isinstance(x, expr.Expr) and isinstance(y, expr.Expr) and x.is_tensor() and x.get_shape() == y.get_shape()
-    if not active or not impl.inside_kernel() or not vectors or len(x.get_shape()) > 1:
-        return _dot(x, y)
-    parts = impl.expr_init(x * y)
-    return sum((at(parts, k) for k in range(1, x.get_shape()[0])), at(parts, 0))
-
-
 def apply() -> None:
     """Put these in the place of what Taichi calls."""
     core.DebugInfo = lru_cache(PLACES)(core.DebugInfo)
     Expr.__init__, impl.expr_init, impl.subscript = _express, _variable, _subscript
     ASTTransformer.__call__, ASTTransformer.get_decorator = _visited, staticmethod(_decorated)
     ASTTransformer.build_call_if_is_builtin, ast_transformer.build_stmts = staticmethod(_builtin), _statements
-    matrix_ops.dot = wraps(_dot)(_product)
 
 
 _visit: Any = ASTTransformer.__call__
@@ -180,4 +169,3 @@ _build_all: Any = ast_transformer.build_stmts
 _init: Any = Expr.__init__
 _declare: Any = impl.expr_init
 _at: Any = impl.subscript
-_dot: Any = matrix_ops.dot
