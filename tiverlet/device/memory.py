@@ -49,7 +49,7 @@ class Memory:
         self._named: Counter[str] = Counter()
         self._later: list[tuple[Entry, np.ndarray]] = []
         self._declared: list[Declared] = []
-        self._numbers: dict[Any, tuple[Any, list[Number]]] = {}  # by kind: the field, and what it holds
+        self.numbers: dict[Any, tuple[Any, list[Number]]] = {}  # by kind: the field, and what it holds
         self._apart = not aligned()
         self._layout: Layout | None = None
         self._which: list[int] = []  # of its fields
@@ -102,9 +102,9 @@ class Memory:
     def number(self, value: float, kind=None) -> Number:
         """A number that kernels find in a field, so that others share them: an integer, unless `kind` says so."""
         kind = ti.i32 if kind is None else kind
-        if kind not in self._numbers:
-            self._numbers[kind] = layout.field(kind, 0), []
-        field, known = self._numbers[kind]
+        if kind not in self.numbers:
+            self.numbers[kind] = layout.field(kind, 0), []
+        field, known = self.numbers[kind]
         known.append(Number(self, field, len(known), value))
         return known[-1]
 
@@ -119,7 +119,7 @@ class Memory:
                 self.write(number.field, values)
 
     def _declare_numbers(self) -> None:
-        for kind, (field, known) in self._numbers.items():
+        for kind, (field, known) in self.numbers.items():
             self._declare(f"numbers.{np.dtype(_NUMPY[kind]).name}", field, len(known), 0, kind, False)
             self._later.append((self.entries[-1], np.array([number._value for number in known], dtype=np.float64)))
 

@@ -1,8 +1,14 @@
-"""Numbers that kernels read from fields, so that what is compiled does not depend on them."""
+"""Numbers that kernels read from fields, so that what is compiled does not depend on them.
+
+None changes while a kernel runs. The kernel of a frame reads all of them first: each time that an element of a field is looked up
+takes as much code as twenty operations.
+"""
 
 from typing import Any
 
-from .language import at, inside_kernel
+from .language import at, current, impl, inline, inside_kernel
+
+_read: tuple[Any, dict[int, Any]] = (None, {})  # a kernel, and its variables, by what they are
 
 
 class Number:
@@ -15,12 +21,23 @@ class Number:
     @property
     def now(self) -> Any:
         """What it is."""
-        return at(self.field, self.place) if inside_kernel() else self._value
+        if not inside_kernel():
+            return self._value
+        kernel, known = _read
+        return known[id(self)] if kernel is current().compiling_callable else at(self.field, self.place)
 
     def set(self, value: float) -> None:
         """Make it another one."""
         self._value = value
         self._memory.set_number(self)
+
+
+@inline
+def read_all(numbers):
+    """In a kernel: from here on they are variables. numbers: of a Memory."""
+    global _read
+    known = [number for _, some in numbers.values() for number in some]
+    _read = current().compiling_callable, {id(k): impl.expr_init(at(k.field, k.place)) for k in known}
 
 
 class OnDevice:

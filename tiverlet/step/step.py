@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..contact.velocity_projection import EVERY, PASSES
 from ..device import runtime, ti
-from ..device.number import OnDevice
+from ..device.number import OnDevice, read_all
 from ..device.thread_team import LEAST, Team
 from ..features.feature import Batch, Scene
 from ..neighbours.strays import Strays
@@ -86,7 +86,7 @@ class Step:
         walls: "list[Collider]", team: Team,
     ):  # fmt: skip
         self.scene, self.state, self.slots, self.team = scene, scene.state, scene.slots, team
-        self.n, self.dim, self.real = scene.count, scene.particles.dim, scene.real
+        self.n, self.dim, self.real, self.numbers = scene.count, scene.particles.dim, scene.real, scene.memory.numbers
         self.integrator, self.search, self.walls, self.drivers, self.batches = integrator, search, walls, drivers, batches
         self.posed = [w for w in walls if w.poses]
         self.wall_logs: list[Any] = [w.dev.log for w in walls if w.dev.log]
@@ -131,6 +131,7 @@ class Step:
     def run(self, thread, sheet: ti.template()):  # type: ignore[valid-type]
         """What a thread does of a frame. All threads of a team take the same branches, for what they depend on is written only
         where the others wait."""
+        read_all(self.numbers)
         frame(self, span_on(sheet, thread))
         if thread == 0:
             self.tell_halt(sheet)
