@@ -211,12 +211,12 @@ def test_memory_that_stays_for_what_went_is_shown_and_given_back():
     w.close()
 
 
-@pytest.mark.parametrize("precision", ["f32", "f64"])
-def test_a_pin_takes_a_disc_in_place(precision):
+@pytest.mark.parametrize(("precision", "spin"), [("f32", 2.0), ("f64", None)])
+def test_a_pin_takes_a_disc_in_place(precision, spin):
     # As the Pin that would be made for it, to the bit; among others that are held, whose pairs the list leaves out.
     def scene():
         pin = tv.Pin([10], (0.5, 0.9))
-        particles = tv.Particles(places(30), radius=RADIUS, pinned=[0, 1])
+        particles = tv.Particles(places(30), radius=RADIUS, pinned=[0, 1], spin=spin)
         w = tv.World(particles, [tv.Gravity(), tv.Box((0, 0), (2, 4)), tv.Contact(friction=0.3), pin], precision=precision)
         w.run(0.1)
         return w, pin
@@ -233,6 +233,7 @@ def test_a_pin_takes_a_disc_in_place(precision):
             assert w.step(1 / 60).energy == other.step(1 / 60).energy
         np.testing.assert_array_equal(w.position, other.position)
         np.testing.assert_array_equal(w.velocity, other.velocity)
+        np.testing.assert_array_equal(w.spin, other.spin)
     assert w._runner is runner and w._runner.scene.inv_mass[[0, 10, 20]].tolist() == [0, 1, 0]
     pin.indices = [0]
     with pytest.raises(ValueError, match="holds particle 0, which is pinned"):
@@ -260,7 +261,7 @@ def test_springs_of_a_pin_take_others_in_place(precision, monkeypatch, tmp_path)
     with tv.Recorder(tmp_path / "held.rrd", w) as recorder:
         for k in ([11, 3], [21, 12], [7, 6], [28, 13]):
             seen = []
-            for one, hand, planned in ((w, pin, grabbing), (other, twin, lambda *_: None)):
+            for one, hand, planned in ((w, pin, grabbing), (other, twin, lambda _: None)):
                 monkeypatch.setattr(edit_in_place, "grabbing", planned)
                 hand.indices, hand.target, hand.damping = k, [(0.6, 0.01 * k[0]), (1.0, 1.0)], 0.1 * k[1]
                 for _ in range(3):

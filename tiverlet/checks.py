@@ -88,9 +88,9 @@ def vector(who: str, name: str, value, dim: int, *, infinite=False) -> np.ndarra
 
 def finite(who: str, name: str, array: np.ndarray) -> None:
     """Raise for the first element that is NaN or infinite."""
-    bad = ~np.isfinite(array)
-    if bad.any():
-        at = np.unravel_index(int(np.argmax(bad)), array.shape)
+    sound = np.isfinite(array)
+    if not sound.all():
+        at = np.unravel_index(int(np.argmin(sound)), array.shape)
         place = ", ".join(str(int(k)) for k in at)
         raise ValueError(f"{who}: {name}[{place}] = {array[at]}, but it must be finite.")
 
@@ -105,10 +105,9 @@ def indices(who: str, name: str, value, count: int, *, arity: int | None = None,
     shape = f"(m, {arity})" if arity else "(m,)"
     if array.ndim != (2 if arity else 1) or (arity and array.shape[1] != arity):
         raise ValueError(f"{who}: {name} has shape {array.shape}, but {shape} is needed.")
-    bad = (array < 0) | (array >= count)
-    rows = bad.any(axis=1) if arity else bad
-    if rows.any():
-        i = int(np.argmax(rows))
+    if array.astype(np.uint64).max() >= count:  # which those below 0 are then, too
+        bad = (array < 0) | (array >= count)
+        i = int(np.argmax(bad.any(axis=1) if arity else bad))
         least = int(array[i].min())
         why = f"there are {count} {things} (0 ... {count - 1})" if count < ANY else f"{things} are numbered from 0"
         end = f"; count from the start, not {least} from the end" if least < 0 else ""

@@ -169,14 +169,11 @@ class World:
     def _upload_parameters(self) -> None:
         """Bring the knobs to the device; where a force has changed, start anew while the device still has what it was."""
         waiting = [f for f in self._features if f.changed or f.moving]
-        if any(not (isinstance(f, Batch) and f.drives) for f in waiting):
-            self._runner.wake()
-        for feature in waiting:
-            if feature.changed or feature.moving:
-                self._adapt()
-                with self._runner.memory.compiler():
-                    self._upload()
-                return
+        if waiting:
+            if self._runner.sleep and not all(isinstance(f, Batch) and f.drives for f in waiting):
+                self._runner.wake()
+            self._adapt()
+            self._upload()
 
     @property
     def _force_waits(self) -> bool:

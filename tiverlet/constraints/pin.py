@@ -8,15 +8,14 @@ from numpy.typing import ArrayLike
 from .. import checks
 from ..device import ti
 from ..features.feature import Knob, Scene
-from ..features.regrouping import Regrouping
 from ..particles import Particles, in_range
 from .core.anchored import Anchored, one_each
 
 
 def _targets(pin: "Pin", target):
-    target = np.asarray(target)
+    target = checks.plain("Pin", "target", target)
     if target.ndim == 1:  # one point for all
-        target = np.broadcast_to(target, (pin.count, len(target)))
+        target = target[None].repeat(pin.count, axis=0)
     target = checks.points("Pin", "target", target, dim=pin.dim, count=pin.count)
     in_range("Pin", "target", target)
     return target
@@ -29,7 +28,9 @@ def _indices(pin: "Pin", indices) -> np.ndarray:
     members = one_each("Pin", rows, pin.start.count if pin.start else checks.ANY)
     if members.count != pin.count:
         raise ValueError(f"Pin: indices has {members.count} particles, but this Pin holds {pin.count}. Make another one.")
-    pin._grabs |= pin.scene is not None and not np.array_equal(members.indices, pin.members.indices)
+    if pin.scene is not None and not pin._grabs:
+        pin._held = pin.members.rows[:, 0]
+        pin._grabs = members.rows.tobytes() != pin.members.rows.tobytes()
     pin._keep(members=members)
     return members.indices
 
@@ -52,7 +53,8 @@ class Pin(Anchored):
     dim = 0
     exclusive = True
     indices: Any = Knob(_indices, "The particles that are held, (m, 1).")
-    _grabs = False  # other particles than in the frame before
+    _grabs = False  # other particles than in the frame before, which were:
+    _held = np.zeros(0, dtype=np.int32)
     target = Knob(_targets, "Where the particles are held, (m, dim) [m].")
 
     def __init__(self, indices, target=None, *, compliance: ArrayLike = 0.0, damping: ArrayLike = 0.0):
@@ -89,18 +91,20 @@ class Pin(Anchored):
         """Whether it holds others."""
         return self._grabs
 
-    def can_grab(self, change: Regrouping) -> bool:
-        """Whether the others that are to be held now can be, while it stays bound, and while no other thing but their masses
-        changes."""
-        return self._grabs and self.acts and self._world_for == self.built_for()
+    @property
+    def held(self) -> np.ndarray:
+        """Where it holds others: those that it held before, (m,)."""
+        return self._held
 
-    def grab(self, change: Regrouping) -> None:
-        """Hold them as a new Pin would."""
-        memory = self.scene.memory
+    def grab(self, scene: Scene) -> None:
+        """Hold them as a new Pin would. Where it drives them, it takes nothing else from where particles are as it begins."""
+        memory, here = scene.memory, self.target
         self.note_arguments()
-        self.start, self._grabs, self.changed, self.moving, self.new_force = change.now, False, self.drives, False, False
-        here = self._anchors
-        if self.soft:
+        self._grabs, self.changed, self.moving, self.new_force = False, self.drives, False, False
+        if self.drives:
+            here = scene.state.get_some(memory, self.members.rows[:, 0])
+        else:
+            self.start = scene.particles
             memory.write(self.dev.lam, np.zeros_like(here))
             self.dev.spring.begin(self.compliance, self.damping)
             self.dev.size.set(self.start.size)

@@ -299,11 +299,14 @@ class Memory:
             self._load(entries, parts)
         self.choose(None)
 
-    def read(self, field) -> np.ndarray:
-        """A copy of a whole field, in its own type; with one more axis, the first, of all copies where none is chosen."""
+    def read(self, field, kind: Any = None) -> np.ndarray:
+        """A copy of a whole field, in its own type unless `kind` says so; with one more axis, the first, of all copies where none
+        is chosen."""
         self.check()
-        entry = self._find(field)
-        return self._dump([entry])[0]
+        entry, views = self._find(field), self._seen()
+        if views:
+            return np.array(self._one(entry, views[id(entry)]), dtype=kind)
+        return self._dump([entry])[0].astype(kind or entry.kind, copy=False)
 
     def seen(self, field) -> np.ndarray:
         """The field itself as an array, where the host sees it; else a copy."""

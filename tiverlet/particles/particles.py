@@ -148,8 +148,8 @@ def _fixed(name: str, array: np.ndarray) -> np.ndarray:
 
 def in_range(who: str, name: str, position: np.ndarray) -> None:
     """Refuse coordinates whose squares would overflow in f32."""
-    far = np.abs(position) > LARGEST
-    if far.any():
+    if np.abs(position).max(initial=0.0) > LARGEST:
+        far = np.abs(position) > LARGEST
         i, k = np.unravel_index(int(np.argmax(far)), far.shape)
         raise ValueError(
             f"{who}: {name}[{i}, {k}] = {position[i, k]:g} m is out of range (at most {LARGEST:g} m). "
@@ -316,10 +316,25 @@ class State:
         if self.spins:
             self.spin.regroup(memory, change)
 
+    def can_weigh(self, particles: Particles, inv_mass: np.ndarray) -> bool:
+        """Whether the same particles can have other inverse masses where it is."""
+        return self.w.can_be(inv_mass) and (not self.spins or self.spin.can_weigh(particles, inv_mass))
+
+    def weigh(self, memory: "Memory", particles: Particles, inv_mass: np.ndarray) -> None:
+        """They have these."""
+        self.w.become(memory, inv_mass)
+        if self.spins:
+            self.spin.weigh(memory, particles, inv_mass)
+
     def get(self, memory: "Memory") -> np.ndarray:
         """A copy of the positions, low words added in f64."""
-        out = memory.read(self.x).astype(np.float64, copy=False)
+        out = memory.read(self.x, np.float64)
         return (out + memory.read(self.low) if self.sums else out)[..., : self.count, :]
+
+    def get_some(self, memory: "Memory", some: np.ndarray) -> np.ndarray:
+        """The same of some particles, by their numbers; of a world alone."""
+        out = memory.seen(self.x)[some].astype(np.float64)
+        return out + memory.seen(self.low)[some] if self.sums else out
 
     def put(self, memory: "Memory", position: np.ndarray) -> None:
         """Overwrite the positions."""

@@ -53,6 +53,14 @@ class Spin:
             self.inverse_radius.become(memory, inverse(now.radius))
             memory.write_from(self.orientation, first, np.asarray(now.orientation).reshape(now.count, -1)[first:])
 
+    def can_weigh(self, particles: Particles, inv_mass: np.ndarray) -> bool:
+        """Whether the same particles can have other inverse masses where it is."""
+        return self.share.can_be(shares(particles, inv_mass))
+
+    def weigh(self, memory: Memory, particles: Particles, inv_mass: np.ndarray) -> None:
+        """They have these."""
+        self.share.become(memory, shares(particles, inv_mass))
+
     def from_rates(self, rates: Any) -> np.ndarray:
         """r omega [m/s] of angular velocities [rad/s], (n, axes)."""
         return self.radius[:, None] * np.asarray(rates).reshape(-1, self.axes)

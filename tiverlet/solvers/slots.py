@@ -92,19 +92,19 @@ class Slots:
         memory.resize(self.begin, n + 1)
         memory.write_from(self.begin, first, np.full(n + 1 - first, self.total))
 
-    def can_grab(self, change: Regrouping, batches: list[Batch]) -> bool:
+    def can_grab(self, inv_mass: np.ndarray, batches: list[Batch]) -> bool:
         """Whether constraints can act on other particles than before, with the same kernels: each is relaxed by itself, and they
         need as many slots and are as exact as before."""
         if self.system or self.semi_iteration or not all(b.arity for b in batches):
             return False
-        degree = arranged(batches, change.inv_mass)[1]
+        degree = arranged(batches, inv_mass)[1]
         return int(degree.sum()) == self.total and self.exact == (self._scalars and bool(degree.max(initial=0) <= 1))
 
-    def grab(self, memory: Memory, change: Regrouping, batches: list[Batch]) -> None:
+    def grab(self, memory: Memory, inv_mass: np.ndarray, batches: list[Batch]) -> None:
         """Have constraints act on other particles than before."""
-        self._places, degree = arranged(batches, change.inv_mass)
+        self._places, degree = arranged(batches, inv_mass)
         memory.write(self.begin, np.concatenate([[0], np.cumsum(degree)]))
-        memory.write(self.split, degree * change.inv_mass)
+        memory.write(self.split, degree * inv_mass)
         for b in batches:
             memory.write(b.dev.places, self.places(b))
 

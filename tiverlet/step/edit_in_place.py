@@ -6,11 +6,13 @@ sizes, pieces for threads, where slots begin. Pairs in contact keep what they re
 that would change (features, what kernels are made of, particles that a constraint holds), the world is built anew.
 """
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ..constraints.core.anchored import refuse_held_twice
+from ..constraints.pin import Pin
 from ..features.feature import Batch
 from ..features.regrouping import Regrouping
 from ..particles import Particles
@@ -77,46 +79,60 @@ def regroup(world: Any, change: Regrouping, added: Particles | None) -> None:
     runner.carry_loads()
 
 
-def grabbing(world: Any, some: np.ndarray) -> Regrouping | None:
-    """What is to happen where knobs ask for nothing but that pins hold other particles: none of all, `some`, comes or goes, but
-    masses change, as contacts see them, and slots. None where the world has to be built anew for it, as where constraints act on
-    what is driven now or was before."""
-    runner, pins = world._runner, [f for f in world.features if f.afresh]
-    scene, memory = runner.scene, runner.memory
-    if not pins or pins != [f for f in world.features if f.changed and f.outgrown]:
-        return None
-    if runner.sleep or runner.launched or scene.order > 2 or not all(one.elastic for one in runner.memories):
-        return None
-    now, inv_mass = world._particles.placed(scene.state.get(memory)), world._particles.inv_mass.copy()
-    for f in runner.step.drivers:
-        inv_mass[f.indices] = 0.0
-    change, touched = Regrouping(some, np.arange(len(some)), scene.particles, now, inv_mass), inv_mass != scene.inv_mass
-    free = not any(touched[b.indices].any() for b in runner.batches)
-    free = free and (all(f.drives for f in pins) or scene.slots.can_grab(change, runner.batches))
-    static = not runner.search or runner.search.has_static == bool((inv_mass == 0).any())
-    if not (free and static and scene.state.can_regroup(change) and all(f.can_grab(change) for f in pins)):
-        return None
-    refuse_held_twice(now, world.features)
-    return change
+@dataclass(frozen=True)
+class Grab:
+    """These pins are to hold other particles. inv_mass: of all, after pins, once they do."""
+
+    pins: list[Pin]
+    inv_mass: np.ndarray
 
 
-def grab(world: Any, change: Regrouping) -> None:
-    """Do what was asked for."""
+def grabbing(world: Any) -> Grab | None:
+    """What is to happen where knobs ask for nothing but that pins hold other particles: none comes or goes, but masses change, as
+    contacts see them, and slots. None where the world has to be built anew for it, as where constraints act on what is driven now
+    or was before."""
     runner = world._runner
-    scene = runner.scene
-    alone = min(np.count_nonzero(inv_mass) for inv_mass in (scene.inv_mass, change.inv_mass)) >= len(change.inv_mass) - 1
-    scene.particles, scene.inv_mass = change.now, change.inv_mass
-    scene.state.w.become(runner.memory, change.inv_mass)
-    pins = [f for f in world.features if f.afresh]
+    scene, asked = runner.scene, [f for f in world.features if f.changed and f.outgrown]
+    if runner.sleep or runner.launched or scene.order > 2 or not runner.memory.elastic:
+        return None
+    if not all(f.afresh and f.acts for f in asked):
+        return None
+    pins: list[Pin] = asked
+    driving, inv_mass = [f for f in pins if f.drives], scene.inv_mass
+    if driving:
+        inv_mass = inv_mass.copy()
+        for f in driving:
+            inv_mass[f.held] = world._particles.inv_mass[f.held]
+        for f in driving:
+            inv_mass[f.members.rows] = 0.0
+        if not scene.state.can_weigh(world._particles, inv_mass) or (runner.search and not runner.search.has_static):
+            return None
+        if any((inv_mass[b.indices] != scene.inv_mass[b.indices]).any() for b in runner.batches):
+            return None
+    if len(driving) < len(pins) and not scene.slots.can_grab(inv_mass, runner.batches):
+        return None
+    refuse_held_twice(world._particles, world.features, pins)
+    return Grab(pins, inv_mass)
+
+
+def grab(world: Any, change: Grab) -> None:
+    """Do what was asked for."""
+    runner, pins = world._runner, change.pins
+    scene, memory, particles = runner.scene, runner.memory, world._particles
+    if change.inv_mass is not scene.inv_mass:
+        free = min(np.count_nonzero(inv_mass) for inv_mass in (scene.inv_mass, change.inv_mass))
+        scene.inv_mass = change.inv_mass
+        scene.state.weigh(memory, particles, change.inv_mass)
+        if free < len(change.inv_mass) - 1:  # lists leave out pairs of which none can move
+            runner.invalidate()
     if any(f.soft for f in pins):
-        scene.slots.grab(runner.memory, change, runner.batches)
+        scene.particles = particles.placed(scene.state.get(memory))
+        scene.slots.grab(memory, change.inv_mass, runner.batches)
     for f in pins:
-        f.grab(change)
+        f.grab(scene)
     for log in runner.logs:
         log.forget()
     runner.carry_loads()
-    if not alone:  # lists leave out pairs of which none can move
-        runner.invalidate()
 
 
 def _pairs(near: Any, change: Regrouping) -> tuple[np.ndarray, dict[str, np.ndarray]]:

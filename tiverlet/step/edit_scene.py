@@ -146,13 +146,12 @@ def change(
 
 def renew(world: Any) -> None:
     """Give a world what its knobs ask for: to pins other particles to hold, in place where that can be; or other kernels."""
-    some = np.ones(len(world.particles), dtype=bool)
-    grabbing = edit_in_place.grabbing(world, some)
+    grabbing = edit_in_place.grabbing(world)
     if grabbing is None:
-        rebuild(world, some, None, world.features)
+        rebuild(world, np.ones(len(world.particles), dtype=bool), None, world.features)
         return
-    told = world._all_events()
-    if world._force_waits or any(f.afresh and f.soft for f in world.features):
+    told = world._all_events() if world._runner.logs else world._events
+    if world._force_waits or any(f.soft for f in grabbing.pins):
         with world._runner.memory.compiler():
             world._runner.restart(world.iterations)
     world._clock.parted = world._clock.energy = None

@@ -93,25 +93,26 @@ class Runner:
         """Begin a frame with substeps of this length [s]. Where it differs from the last one, displacements stand for other
         velocities: they are turned into velocities first, and the frame is a start."""
         if self.prepare(substep, iterations):
-            with self.memory.compiler():
-                if self.clock.energy is None:
-                    self.look()
-                    if self.sleep:
+            if self.clock.energy is None:
+                self.look()
+                if self.sleep:
+                    with self.memory.compiler():
                         self.sleep.compile(self.clock)
-                    if self.asks_velocities:  # so that nobody waits later for its kernel to compile
-                        self._velocities()
-                        self.asks_velocities = False
-                    report = self.report()
-                    self.looked(report.energy, report.overlap)
-                self.placed()
+                if self.asks_velocities:  # so that nobody waits later for its kernel to compile
+                    self._velocities()
+                    self.asks_velocities = False
+                report = self.report()
+                self.looked(report.energy, report.overlap)
+            self.placed()
 
     def prepare(self, substep: float, iterations: int) -> bool:
         """The first half of begin(). Returns whether there is a second: the state was changed, and has to be diagnosed."""
         h, clock, self.released, self.jumped = substep * self.integrator.first, self.clock, 0.0, False
         drag = decay(sum(f.rate for f in self.drags), h) if self.drags else None
-        known = clock.energy is not None and clock.first_moved is None
-        if h == clock.h and drag == clock.drag and not clock.d_is_velocity and known:
-            return False
+        if h == clock.h and drag == clock.drag and not clock.d_is_velocity and clock.first_moved is None:
+            if clock.energy is None:
+                self.wake()
+            return clock.energy is None
         self.wake()
         with self.memory.compiler():
             self._jump()
@@ -151,7 +152,8 @@ class Runner:
         """The second half of begin(), with the energy [J] and the overlap of the state that the frame starts from."""
         self.clock.energy = energy
         if overlap > 0 and self.clock.first_moved is not None:
-            self.ease(self.clock.first_moved)
+            with self.memory.compiler():
+                self.ease(self.clock.first_moved)
 
     def placed(self) -> None:
         """The end of begin(): nothing is left to be done about particles that were placed anew."""

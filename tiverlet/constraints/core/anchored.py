@@ -1,5 +1,6 @@
 """Particles drawn to a place, each by itself: what pins, paths and grids share."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -200,10 +201,13 @@ class Anchored(Batch):
         return out
 
 
-def refuse_held_twice(particles: "Particles", features: tuple[Feature, ...]) -> None:
-    """A particle has one place: refuse pins and driven paths on one that is pinned, or that another one holds."""
-    holder = np.full(len(particles), -1)
+def refuse_held_twice(particles: "Particles", features: tuple[Feature, ...], some: Sequence[Feature] | None = None) -> None:
+    """A particle has one place: refuse pins and driven paths on one that is pinned, or that another one holds. some: those that
+    hold others than before; None for all."""
     tethers = [(k, f) for k, f in enumerate(features) if isinstance(f, Anchored) and f.exclusive]
+    if some is not None and len(tethers) == 1 and not particles.pinned[tethers[0][1].members.rows].any():
+        return
+    holder = np.full(len(particles), -1)
     for k, f in sorted(tethers, key=lambda item: not item[1].drives):  # springs are lost on what is driven
         rows = f.indices[:, 0]
         wrong = particles.pinned[rows] | (holder[rows] >= 0)

@@ -22,13 +22,14 @@ class FixedSize:
 
     def __init__(self, kind: str, indices: np.ndarray):
         self.kind = kind
-        self.indices = handed_out(np.asarray(indices, dtype=np.int32), structure(kind, "indices"))
-        self.arity = self.indices.shape[1]
+        self.rows = np.asarray(indices, dtype=np.int32)
+        self.indices = handed_out(self.rows, structure(kind, "indices"))  # the same, which says what it is
+        self.arity = self.rows.shape[1]
 
     @property
     def count(self) -> int:
         """The number of constraints."""
-        return len(self.indices)
+        return len(self.rows)
 
     @property
     def owner(self) -> np.ndarray:
