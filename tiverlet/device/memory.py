@@ -9,12 +9,13 @@ import contextlib
 import mmap
 import weakref
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from . import language, layout, runtime
+from .again import Again
 from .copies import Copies
 from .host_copy import Entry, Transfer
 from .language import ti
@@ -47,6 +48,9 @@ class Memory:
         self.entries: list[Entry] = []
         self._at: dict[int, int] = {}  # by the ids of fields: which entry they are
         self._named: Counter[str] = Counter()
+        self._in_order: list[Number] = []
+        self._owned: dict[Any, tuple[range, list[Number]]] = {}  # by owner: fields and numbers
+        self._again: Again | None = None  # while they are declared a second time
         self._later: list[tuple[Entry, np.ndarray]] = []
         self._declared: list[Declared] = []
         self.numbers: dict[Any, tuple[Any, list[Number]]] = {}  # by kind: the field, and what it holds
@@ -75,6 +79,8 @@ class Memory:
         """Declare a field of `length` elements (None: a single one, of 0 dimensions) and give it its first values. A Number: one
         for each of what it counts, see regroup(). shared: it is one for all copies. state, told, below: see Entry."""
         kind, rows = self.real if kind is None else kind, None
+        if self._again:
+            return self._again.field(length, width, np.dtype(_NUMPY[kind]), values)
         if isinstance(length, Number):
             rows, length = length, int(length.now)
         length = 0 if length is None else max(1, length)  # a field of 0 elements poisons the runtime
@@ -105,8 +111,36 @@ class Memory:
         if kind not in self.numbers:
             self.numbers[kind] = layout.field(kind, 0), []
         field, known = self.numbers[kind]
+        if self._again:
+            return self._again.number(value, field)
         known.append(Number(self, field, len(known), value))
+        self._in_order.append(known[-1])
         return known[-1]
+
+    @contextlib.contextmanager
+    def owned(self, owner: Any) -> Iterator[None]:
+        """What is declared meanwhile is the owner's, who may declare it again()."""
+        if self._again:
+            with self._again.owned(*self._owned[owner]):
+                yield
+            return
+        fields, numbers = len(self.entries), len(self._in_order)
+        yield
+        self._owned[owner] = range(fields, len(self.entries)), self._in_order[numbers:]
+
+    @contextlib.contextmanager
+    def again(self, counts: dict[Number, int]) -> "Iterator[Again]":
+        """Meanwhile owners declare what they have a second time, see Again."""
+        self._again = Again(self, counts)
+        try:
+            yield self._again
+        finally:
+            self._again = None
+
+    def fill(self, k: int, length: int, values: Any) -> None:
+        """Give a field of an elastic memory, by its number, so many elements, and each of them a value."""
+        view = self._resized(k, length) if length else self._seen()[id(self.entries[k])]
+        view[...] = values
 
     def set_number(self, number: Number) -> None:
         """Write it, where it is on the device already; in all copies, for kernels are made for all."""

@@ -28,6 +28,12 @@ if TYPE_CHECKING:
 COUNT, FILL = range(2)  # what a scan of the cells around a particle does with the neighbours that it finds
 
 
+def _both(linked: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of n particles in both orders, each once, and where those of each particle begin."""
+    both = distinct(np.concatenate([linked, linked[:, ::-1]]))[0]
+    return both, np.searchsorted(both[:, 0], np.arange(n + 1))
+
+
 class NeighbourSearch:
     """What fills `list`, the list of near pairs, from `cells`, a hash of cells.
 
@@ -79,10 +85,8 @@ class NeighbourSearch:
         self.has_static = bool((scene.inv_mass == 0).any())  # whether there are pairs that cannot move
         self.linked = len(linked) > 0
         if self.linked:
-            both = np.concatenate([linked, linked[:, ::-1]])
-            both = distinct(both)[0]
-            begin = np.searchsorted(both[:, 0], np.arange(n + 1))
-            self.excluded = add("grid.linked", len(both), kind=ti.i32, values=both[:, 1])
+            self._both, begin = _both(linked, n)
+            self.excluded = add("grid.linked", len(self._both), kind=ti.i32, values=self._both[:, 1])
             self.excluded_begin = add("grid.linked_begin", n + 1, kind=ti.i32, values=begin)
 
     def __repr__(self) -> str:
@@ -133,6 +137,26 @@ class NeighbourSearch:
         if came:
             self.memory.write_from(self.origin, change.kept, np.full((came, self.dim), np.nan))
         self.memory.write(self.list.stale, (MOVED if came else stale) if stays else 1)
+
+    def can_exclude(self, linked: np.ndarray) -> bool:
+        """Whether it can leave out other pairs than it did."""
+        return self.linked == (len(linked) > 0)
+
+    def others(self, linked: np.ndarray, change: Regrouping) -> bool:
+        """Whether these pairs that are left out are others than before, of particles that stay."""
+        if not self.linked:
+            return False
+        before, now = change.number[self._both], _both(linked, change.now.count)[0]
+        stay = before[(before >= 0).all(axis=1)]
+        return not np.array_equal(stay, now[(now < change.kept).all(axis=1)])
+
+    def exclude(self, linked: np.ndarray) -> None:
+        """Leave out these pairs, which can_exclude() allows; its particles are those that there are now."""
+        if self.linked:
+            self._both, begin = _both(linked, len(self.memory.seen(self.excluded_begin)) - 1)
+            self.memory.resize(self.excluded, len(self._both))
+            self.memory.write(self.excluded, self._both[:, 1])
+            self.memory.write(self.excluded_begin, begin)
 
     @property
     def finest(self) -> float:

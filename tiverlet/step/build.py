@@ -152,7 +152,8 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     if (batches and solver.loads) or (contact and contact.has_loads):
         scene.own_weight = OwnWeight(scene)
     if batches:
-        scene.slots = Slots(scene, batches, solver)
+        with memory.owned("slots"):
+            scene.slots = Slots(scene, batches, solver)
         if not state.double and (state.compensated or (scene.slots.exact and sums_exactly())):
             state.carry(memory, particles)
         if scene.order > 2:
@@ -166,7 +167,8 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     for feature in of(Batch):
         feature.scene = scene  # also of those that do nothing, because all of their particles are held
     for feature in [*accelerations, *drivers, *batches, *walls]:
-        feature.bind(scene)
+        with memory.owned(feature):
+            feature.bind(scene)
     searches = [(f.join(scene, team), f.room) for f in accelerations if f.pairwise]
     for feature in features:
         feature.new_force = False  # it was given when it was made

@@ -321,8 +321,8 @@ class Reporter:
         self.figures = sheet[: 11 + step.dim]
 
     def regroup(self) -> None:
-        """Particles came or went: take their number, and how far out they may be."""
-        search, self.n = self._step.search, self._step.n
+        """Particles or constraints came or went: take their number, and how far out they may be."""
+        search, self.n, self.remedy = self._step.search, self._step.n, None
         self.farthest = min(LARGEST, search.finest * FARTHEST) if search else LARGEST
 
     def __call__(

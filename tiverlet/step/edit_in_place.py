@@ -6,6 +6,7 @@ sizes, pieces for threads, where slots begin. Pairs in contact keep what they re
 that would change (features, what kernels are made of, particles that a constraint holds), the world is built anew.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,19 +14,37 @@ import numpy as np
 
 from ..constraints.core.anchored import refuse_held_twice
 from ..constraints.pin import Pin
-from ..features.feature import Batch
+from ..features.feature import Batch, Feature
 from ..features.regrouping import Regrouping
 from ..particles import Particles
+from .bind_again import Bound, bind, bound_again
 from .scale import Scale
 
 
-def planned(world: Any, some: np.ndarray, number: np.ndarray, added: Particles | None) -> Regrouping | None:
-    """What is to happen to the particles of a world if those in the mask `some` stay and others are added; None where the world
-    has to be built anew for it. Raises ValueError as building it does, and changes nothing."""
+@dataclass(frozen=True)
+class Edit:
+    """What is to happen to a world. change: to its particles; starts: those that features began with, by their ids, as they will
+    be. bound: its constraints, where they are to be bound again."""
+
+    change: Regrouping
+    starts: dict[int, Particles]
+    bound: Bound | None
+
+    @property
+    def more(self) -> tuple[Any, ...]:
+        """What features are extended by."""
+        return (*self.bound.more.values(),) if self.bound else ()
+
+
+def planned(
+    world: Any, some: np.ndarray, number: np.ndarray, added: Particles | None, extend: Mapping[Feature, Feature]
+) -> Edit | None:
+    """What is to happen to a world if particles in the mask `some` stay, others are added, and features take more constraints;
+    None where the world has to be built anew for it. Raises ValueError as building it does, and changes nothing."""
     runner = world._runner
     scene, count = runner.scene, int(np.count_nonzero(some)) + (0 if added is None else len(added))
-    work = count + sum(f.count for f in world.features if isinstance(f, Batch))
-    if not (count and len(some) and scene.order == 2 and world._scale.holds(Scale(count, work))):
+    batches = [f for f in world.features if isinstance(f, Batch)]
+    if not (count and len(some) and scene.order == 2):
         return None
     if runner.launched or not all(memory.elastic and memory.holds(count + 1) for memory in runner.memories):
         return None
@@ -35,20 +54,39 @@ def planned(world: Any, some: np.ndarray, number: np.ndarray, added: Particles |
     now = world._particles.regrouped(some, added, scene.state.get(runner.memory).take(stay, axis=0))
     inv_mass = scene.inv_mass[stay] if added is None else np.concatenate([scene.inv_mass[stay], added.inv_mass])
     change = Regrouping(some, number, scene.particles, now, inv_mass)
+    came = None if added is None else added.position
+    known = {id(start): start for start in (world._particles, *(f.start for f in world.features))}
+    starts = {one: now.placed(change.joined(start.position, came)) for one, start in known.items()}
+    bound, tied = None, [f for f in batches if not f.can_regroup(change)]
+    if extend or tied:
+        if any(not f.acts for f in tied):
+            return None
+        bound = bound_again(world, number, now, starts, extend)
+        if not bound:
+            return None
+        change = Regrouping(some, number, scene.particles, now, bound.inv_mass)
+    work = count + sum(f.count for f in batches)
+    if bound:
+        work = count + sum(int(bound.kept[f][0].sum()) if f in bound.kept else f.count for f in batches)
+        work += sum(more.count for more in bound.more.values())
+    if not world._scale.holds(Scale(count, work)):
+        return None
     if not (scene.state.can_regroup(change) and (scene.radius is None or scene.radius.can_be(now.radius))):
         return None
-    if not all(f.can_regroup(change) for f in world.features):
+    if not all(f.can_regroup(change) for f in world.features if not (bound and f in bound.kept)):
         return None
     for f in world.features:
         f.check_added(now, change.kept)
-    return change
+    return Edit(change, starts, bound)
 
 
-def regroup(world: Any, change: Regrouping, added: Particles | None) -> None:
+def regroup(world: Any, edit: Edit, added: Particles | None) -> None:
     """Do what was planned."""
-    runner, count = world._runner, change.now.count
-    scene, step, memory = runner.scene, runner.step, runner.memory
-    pairs = _pairs(runner.search.list, change) if runner.search and runner.search.list.saved and change.goes else None
+    runner, change, bound = world._runner, edit.change, edit.bound
+    scene, step, memory, count = runner.scene, runner.step, runner.memory, change.now.count
+    search = runner.search
+    apart = search and ((search.list.saved and change.goes) or (bound and search.others(bound.linked, change)))
+    pairs = _pairs(search.list, change) if apart else None
     rows = scene.count
     for one in runner.memories:
         one.regroup(rows, change.first, change.stay[change.first :], count)
@@ -57,25 +95,25 @@ def regroup(world: Any, change: Regrouping, added: Particles | None) -> None:
     scene.state.regroup(memory, change)
     if scene.radius:
         scene.radius.become(memory, change.now.radius)
-    if scene.slots:
+    if scene.slots and not bound:
         scene.slots.regroup(memory, change)
     runner.team.regroup(count)
     step.particles.regroup(count)
-    came = None if added is None else added.position
-    known = {id(start): start for start in (world._particles, *(f.start for f in world.features))}
-    starts = {one: change.now.placed(change.joined(start.position, came)) for one, start in known.items()}
-    world._particles = starts[id(world._particles)]
+    world._particles = edit.starts[id(world._particles)]
     for f in world.features:
-        waits = f.changed, f.moving, f.new_force
-        f.start = starts[id(f.start)]
-        f.regroup(change)
-        f.changed, f.moving, f.new_force = waits
+        if not (bound and f in bound.kept):
+            waits = f.changed, f.moving, f.new_force
+            f.start = edit.starts[id(f.start)]
+            f.regroup(change)
+            f.changed, f.moving, f.new_force = waits
+    if bound:
+        bind(world, change, bound)
     runner.regroup()
     for log in runner.logs:
         log.forget()
     if pairs:
-        memory.write(runner.search.list.number, 0)
-        runner.search.list.restore(*pairs)
+        memory.write(search.list.number, 0)
+        search.list.restore(*pairs)
     runner.carry_loads()
 
 

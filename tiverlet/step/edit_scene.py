@@ -16,6 +16,7 @@ from ..features.feature import Acceleration, Batch, Feature
 from ..neighbours.periodic import Periodic
 from ..particles import Particles
 from . import checkpoint, edit_in_place, initial_violation
+from .bind_again import extended
 from .build import assemble, check_settings, checked_features, listed
 from .integrator import decay
 from .sleep import Sleep
@@ -129,19 +130,21 @@ def change(
     and others whose constraints they take."""
     number = np.where(some, np.cumsum(some) - 1, -1)
     planned = None
-    if features == world.features and not extend:
-        planned = edit_in_place.planned(world, some, number, added)
+    if features == world.features:
+        planned = edit_in_place.planned(world, some, number, added, extend)
     if planned is None:
         rebuild(world, some, added, features, extend)
         return
     with world._runner.memory.compiler():
         told, seen = world._all_events(), _seen(world, number, features)
-        if world._force_waits or world._runner.step.has_pair_forces:  # of others than before
+        others = (added is not None or not some.all()) and world._runner.step.has_pair_forces
+        if world._force_waits or others or any(more.soft for more in planned.more):
             world._runner.restart(world.iterations)
         world._clock.parted = None
         edit_in_place.regroup(world, planned, added)
         world._runner.wake()
-        _edited(world, some, added, told, seen, np.arange(len(features)), False)
+        tied = initial_violation.first_off([*planned.more], world.position) if planned.more else None
+        _edited(world, some, added, told, seen, np.arange(len(features)), bool(extend), tied)
 
 
 def renew(world: Any) -> None:
@@ -195,7 +198,7 @@ def rebuild(
         box = next((f for f in features if isinstance(f, Periodic)), None)
         for k, f in enumerate(features):
             if f in more:
-                starts[k] = _extended(f, more[f], starts[k], now, box)
+                starts[k] = extended(f, more[f], starts[k], now, box)
         parts = assemble(now, features, starts, n, *world._build_options)
         state = _carried(world, parts.memory, old, attributes, masks, some)
     except BaseException:
@@ -270,20 +273,6 @@ def _edited(
         clock.parted = seen[some] if added is None else np.concatenate([seen[some], added.velocity])
     for watcher in world._watchers:
         watcher.regrouped()
-
-
-def _extended(feature: Any, more: Feature, start: Particles, now: Particles, box: Periodic | None) -> Particles:
-    """Give a feature that is not bound more constraints, which start now. Returns where it started: for what it had, when that
-    came; for other particles, now."""
-    more.periodic, more.start = box, now
-    inv_mass = now.inv_mass.copy()
-    more.prepare(now, inv_mass)
-    more.review(now, inv_mass)
-    position = np.array(now.position)
-    mine = feature.indices.ravel()
-    position[mine] = start.position[mine]
-    feature.extend(more)
-    return start.placed(position)
 
 
 def _drives(feature: Feature, number: np.ndarray) -> bool:

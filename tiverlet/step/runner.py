@@ -43,6 +43,7 @@ class Runner:
         self.released = 0.0  # the violation that its shorter substep turns into energy, as a share of its size
         self.ramping: list[Any] = []  # batches whose rest values go to others in the coming frame
         self.ramps: list[Any] = []  # the memories of what ramps need
+        self.structure: Any = None  # of constraints, in short, once it was asked for
         self.interruptible = False  # what handlers of signals raise in the middle of a frame is followed by an undo
         # Asked in every frame, and Taichi looks at each attribute of what has kernels.
         step = self.step

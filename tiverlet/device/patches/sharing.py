@@ -44,11 +44,11 @@ class Same:
 
 
 class Writing:
-    """All that hangs on an object, in order."""
+    """All that hangs on an object, in order. known: objects that are not looked into."""
 
-    def __init__(self, value: Any):
+    def __init__(self, value: Any, known: tuple[Any, ...] = ()):
         self.out: list[Any] = []
-        self._numbers: dict[int, int] = {}
+        self._numbers: dict[int, int] = {id(one): k for k, one in enumerate(known)}
         self._alive: list[Any] = []  # whose ids must not go to others
         self._ours = True  # whether it hangs on an object of ours, and not on one of the user's
         self.write(value)

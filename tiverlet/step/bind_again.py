@@ -1,0 +1,161 @@
+"""Constraints that come and go in place: they are bound again, to the fields that they have, which get other lengths.
+
+What a constraint has on the device follows from all of them: slots stand by particles, and systems are eliminated in an order of
+their own. So the same code that binds them when a world is built runs once more, and fields that it declares are those that are
+there, see device/again.py. Where it declares others, or kernels could read anything else than before, nothing was changed, and
+the world is built anew.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..constraints.core.anchored import refuse_held_twice
+from ..device.again import Again, Differs
+from ..features.feature import Batch, Feature
+from ..features.regrouping import Regrouping
+from ..neighbours.periodic import Periodic
+from ..particles import Particles
+
+
+@dataclass(frozen=True)
+class Bound:
+    """Constraints as they are going to be. inv_mass: of all particles, after pins. linked: pairs that contacts leave out.
+    attributes: objects, each with what it has before and then. kept: masks of what stays of each feature's rows. more: what
+    features are extended by."""
+
+    again: Again
+    inv_mass: np.ndarray
+    linked: np.ndarray
+    attributes: list[tuple[Any, dict[str, Any], dict[str, Any]]]
+    kept: dict[Feature, tuple[np.ndarray, ...]]
+    more: dict[Feature, Any]
+
+
+def bound_again(
+    world: Any, number: np.ndarray, now: Particles, starts: dict[int, Particles], extend: Mapping[Feature, Feature]
+) -> Bound | None:
+    """Constraints of a world whose particles get other numbers, -1 for those that go, and are `now`, while features take others
+    behind their own; None where it has to be built anew. starts: by the ids of those that there are, the same of those that there
+    will be. Raises ValueError as building it does, and changes nothing."""
+    runner, scene, memory = world._runner, world._runner.scene, world._runner.memory
+    drivers, batches = runner.step.drivers, runner.batches
+    bound = [*drivers, *batches]
+    if runner.sleep or not (set(extend) <= set(bound)) or any(vars(f.dev).get("ramps") or f.ramping or f.afresh for f in bound):
+        return None
+    if not batches or any(f.changed and f not in drivers for f in bound):
+        return None
+    structure = runner.structure = runner.structure or _structure(scene, bound)
+    objects = [scene, scene.slots, *bound]
+    before, exact = [dict(vars(one)) for one in objects], scene.slots.exact
+    kept = {f: f.kept_mask(number) for f in bound}
+    more, inv_mass = {f: other.copy() for f, other in extend.items()}, now.inv_mass.copy()
+    try:
+        for f in world.features:
+            if f in kept:
+                start = starts[id(f.start)]
+                f.release()
+                f.remap_indices(number, now.count)
+                f.periodic = scene.periodic
+                f.start = extended(f, more[f], start, now, scene.periodic) if f in more else start
+                f.prepare(f.start, inv_mass)
+        _check(world, now, int(np.count_nonzero(number >= 0)), drivers, batches, inv_mass)
+        scene.particles, scene.inv_mass = now, inv_mass
+        with memory.again({scene.count: now.count}) as again:
+            system = scene.slots.system
+            with memory.owned("slots"):
+                scene.slots.__init__(scene, batches, world._solver)
+            if scene.slots.system and system:
+                scene.slots.system.team, scene.slots.system.stride = system.team, system.stride
+            for f in bound:
+                with memory.owned(f):
+                    f.bind(scene)
+                f._world_for = f.built_for()
+        if not (memory.holds(again.longest) and scene.slots.exact == exact and _structure(scene, bound) == structure):
+            return None
+        linked = np.concatenate([b.excluded_pairs(b.start) for b in batches])
+        if runner.search and not runner.search.can_exclude(linked):
+            return None
+        attributes = [(one, old, dict(vars(one))) for one, old in zip(objects, before, strict=True)]
+        return Bound(again, inv_mass, linked, attributes, kept, more)
+    except Differs:
+        return None
+    finally:
+        for one, values in zip(objects, before, strict=True):
+            vars(one).clear()
+            vars(one).update(values)
+
+
+def _check(world: Any, now: Particles, first: int, drivers: list[Batch], batches: list[Batch], inv_mass: np.ndarray) -> None:
+    """Raise Differs where other batches would act than before, and ValueError for what building refuses. first: the number of the
+    first particle that comes."""
+    there = [f for f in world.features if isinstance(f, Batch) and f.count]
+    acting = [f for f in there if not f.drives and (inv_mass[f.indices] > 0).any()]
+    if acting != batches or [f for f in there if f.drives] != drivers:
+        raise Differs
+    refuse_held_twice(now, world.features)
+    if box := world._runner.scene.periodic:
+        from .misfits import refuse_misfits  # noqa: PLC0415  (it knows of features that there may not be)
+
+        refuse_misfits(box, now, world.features)
+    for f in (*drivers, *batches):
+        f.check_added(now, first)
+
+
+def bind(world: Any, change: Regrouping, now: Bound) -> None:
+    """Do it, once particles and contacts are what they are going to be."""
+    runner = world._runner
+    memory, rows = runner.memory, runner.scene.count
+    names = {id(e.field): k for k, e in enumerate(memory.entries)}
+    held = {k: memory.seen(memory.entries[k].field).copy() for k in now.again.state}
+    now.again.write()
+    for k, values in held.items():
+        if memory.entries[k].rows is rows:
+            memory.seen(memory.entries[k].field)[...] = values
+    for f, before, after in now.attributes:
+        vars(f).clear()
+        vars(f).update(after)
+        if not isinstance(f, Batch):
+            continue
+        masks, old, new = now.kept[f], _state(before["dev"], names), _state(after["dev"], names)
+        for key in [key for key in old.keys() & new.keys() if old[key] in held]:
+            values = held[old[key]]
+            choices = (change.some,) if getattr(vars(f.dev)[key[0]], "per_particle", False) else masks
+            some = next((mask for mask in choices if len(mask) == len(values)), None)
+            values = values if some is None else values[some]
+            memory.seen(memory.entries[new[key]].field)[: len(values)] = values
+    constraints = runner.step.constraints
+    constraints.systems[:] = [runner.scene.slots.system] if constraints.systems else []
+    constraints.semi_iterations[:] = [runner.scene.slots.semi_iteration] if constraints.semi_iterations else []
+    if runner.search:
+        runner.search.exclude(now.linked)
+
+
+def _structure(scene: Any, bound: list[Batch]) -> Any:
+    """All that kernels could read of constraints, in short."""
+    from ..device.patches.sharing import Writing  # noqa: PLC0415  (it knows Taichi's inside, and is not there for others)
+
+    return Writing((scene.slots, *bound), known=(scene.memory, scene.state)).key
+
+
+def _state(dev: Any, names: dict[int, int]) -> dict[tuple[str, str], int]:
+    """The fields of the state that a feature has, or a part of it that lists them as `in_state`; by their numbers."""
+    parts = {key: getattr(value, "in_state", {"": value}) for key, value in vars(dev).items()}
+    fields = {(key, part): id(field) for key, held in parts.items() for part, field in held.items()}
+    return {key: names[field] for key, field in fields.items() if field in names}
+
+
+def extended(feature: Any, more: Feature, start: Particles, now: Particles, box: Periodic | None) -> Particles:
+    """Give a feature that is not bound more constraints, which start now. Returns where it started: for what it had, when that
+    came; for other particles, now."""
+    more.periodic, more.start = box, now
+    inv_mass = now.inv_mass.copy()
+    more.prepare(now, inv_mass)
+    more.review(now, inv_mass)
+    position = np.array(now.position)
+    mine = feature.indices.ravel()
+    position[mine] = start.position[mine]
+    feature.extend(more)
+    return start.placed(position)
