@@ -217,6 +217,37 @@ def bodies(solver=None):
     return w, [lambda: add(0), lambda: w.remove([3]), lambda: add(1), lambda: w.remove([20]), lambda: w.remove(np.arange(30, 36))]
 
 
+def outlines():
+    """Squares and triangles between discs, with friction, restitution, and links of a soft one. More: bodies, and discs."""
+    angle = np.arange(5) * 2 * np.pi / 5
+    square, five = np.array([[0.0, 0.0], [0.3, 0.0], [0.3, 0.3], [0.0, 0.3]]), 0.2 * np.stack([np.cos(angle), np.sin(angle)], 1)
+    position = np.concatenate([square + (0.1, 0.05), square + (0.15, 0.4), five + (0.9, 0.3), [[1.4, 0.1], [1.7, 0.1]]])
+    loops = [np.arange(4), np.arange(4, 8), np.arange(8, 13)]
+    rigid, outline = tv.ShapeMatch(loops[:2]), tv.Polygons(loops, friction=0.3, restitution=0.2)
+    ring = np.stack([np.arange(5), (np.arange(5) + 1) % 5], axis=1)
+    links, area = tv.Distance(ring + 8, compliance=1e-4), tv.Area(loops[2:])
+    features = [tv.Gravity(), tv.HalfSpace((0, 1), 0.0), outline, rigid, links, area]
+    w, came = tv.World(tv.Particles(position, radius=[0.01] * 13 + [0.1] * 2), features, substeps=5), []
+
+    def add(k: int):
+        """A square and a soft pentagon, the latter larger."""
+        n = len(w.particles)
+        more = np.concatenate([square + (0.5, 0.9 + k), 1.1 * five + (1.2, 0.9 + k)])
+        new = [np.arange(n, n + 4), np.arange(n + 4, n + 9)]
+        both = {links: tv.Distance(ring + n + 4, compliance=1e-4), area: tv.Area(new[1:])}
+        both |= {rigid: tv.ShapeMatch(new[:1]), outline: tv.Polygons(new, 0.3, 0.2)}
+        came.append(w.add(tv.Particles(more, radius=0.01), extend=both))
+
+    def disc():
+        """A disc, where a square was at the start."""
+        w.add(tv.Particles([[0.25, 0.25 + 3.0]], radius=0.1))
+
+    return w, [
+        lambda: add(0), disc, lambda: w.remove(np.arange(4, 8)), lambda: add(1), lambda: w.remove(came[0].indices[4:]),
+        lambda: w.remove([*range(4), 10]),
+    ]  # fmt: skip
+
+
 def grown(scene, anew: bool) -> list:
     """What is seen of a world whose constraints come and go. anew: it is built for them, else they do in place."""
     planned = edit_in_place.planned
@@ -244,7 +275,7 @@ def grown(scene, anew: bool) -> list:
 SOLVED = {
     "direct": lambda: ropes(tv.Direct(), "f64"), "loads": lambda: ropes(tv.Jacobi(loads=True)),
     "chebyshev": lambda: ropes(tv.Chebyshev()), "together": lambda: ropes(tv.ConjugateGradient(4), "f32-compensated"),
-    "bodies": bodies,
+    "bodies": bodies, "outlines": outlines,
 }  # fmt: skip
 
 

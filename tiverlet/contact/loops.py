@@ -47,11 +47,12 @@ def laid(loops: list[np.ndarray], x: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return ends, body, length
 
 
-def refuse_deep(loops: list[np.ndarray], body: np.ndarray, x: np.ndarray, first: int) -> None:
+def refuse_deep(loops: list[np.ndarray], x: np.ndarray, first: int) -> None:
     """Raise for particles, from number `first` on, that are deeper inside of a body than half of the edge that is nearest."""
     for k, loop in enumerate(loops):
         a = x[loop]
-        some = ((x >= a.min(axis=0)) & (x <= a.max(axis=0))).all(axis=1) & (body != k)
+        some = ((x >= a.min(axis=0)) & (x <= a.max(axis=0))).all(axis=1)
+        some[loop] = False
         for i in np.flatnonzero(some[first:]) + first:
             depth, edge = depth_of(x[i], a)
             if depth > edge / 2:

@@ -55,14 +55,15 @@ class PolygonGeometry:
     shrinks, store, late = True, None, ()  # its field is there from the start
 
     push_out: Any = OnDevice()
+    step: Any = OnDevice()  # how far a vertex may go in a substep and be seen to come in [m]
 
     def __init__(self, scene: Scene, outline: Outline, push_out: float):
-        n, add = scene.particles.count, scene.memory.field
+        n, add = scene.count, scene.memory.field
         self.scene, self.state, self.radius, self.w, self.real = scene, scene.state, scene.radius, scene.state.w, scene.real
         self.outline, self.push_out = outline, scene.memory.number(push_out, scene.real)
         self.loop = add("Polygons.loop", n, width=3, kind=ti.i32, values=np.c_[outline.ends, outline.body])
         self.longest = add("Polygons.longest_edge", n, values=outline.longest)
-        self.step = float(outline.length[outline.body >= 0].min(initial=np.inf)) / 4
+        self.step = scene.memory.number(self._stride(outline), scene.real)
         self.allowed = add("Polygons.allowed", n, state=True)  # overlap [m]
         self.in_state = {"allowed": self.allowed}
         self.h = add("Polygons.substep", None, state=bool(scene.state.sleepers))  # the first particle may sleep, and not tell
@@ -71,6 +72,17 @@ class PolygonGeometry:
         self.manifold, self.back = PairData("met", 4, False, kept=False), PairData("back", 2, False, kept=False)
         self.impulse = PairData("given", 0, lasting=True, told=True)  # pushes and impacts in the last substep [kg m]
         self.carried = [self.manifold, self.back, self.impulse]
+
+    @staticmethod
+    def _stride(outline: Outline) -> float:
+        """A quarter of the shortest edge [m]."""
+        return float(outline.length[outline.body >= 0].min(initial=np.inf)) / 4
+
+    def become(self, outline: Outline) -> None:
+        """Have other bodies, of the particles that there are now."""
+        self.outline, self.step, memory = outline, self._stride(outline), self.scene.memory
+        memory.write(self.loop, np.c_[outline.ends, outline.body])
+        memory.write(self.longest, outline.longest)
 
     def bind(self, search: NeighbourSearch) -> None:
         """Take the neighbour list, which asks for pairs by `Beside`."""

@@ -8,8 +8,10 @@ from numpy.typing import ArrayLike
 
 from ..device import ti
 from ..device.thread_team import Team
-from ..features.feature import Batch, Scene
+from ..features.extending import extended
+from ..features.feature import Batch, Feature, Scene
 from ..features.material import Table
+from ..features.regrouping import Regrouping
 from ..geometry.ordered import median
 from ..neighbours.neighbour_list import PairData
 from ..neighbours.neighbour_search import NeighbourSearch
@@ -47,6 +49,7 @@ class Polygons(PairContact):
     """
 
     detects = True
+    _after: Any = None  # the same bodies and others, as they are planned to be
     room = 64  # the particles of near bodies
 
     def __init__(
@@ -64,7 +67,6 @@ class Polygons(PairContact):
             raise ValueError("Polygons: it does not turn particles that spin. Leave out spin, or use tv.Contact for discs alone.")
         x = particles.position
         self.dev.outline = Outline(*laid(self.loops, x))
-        refuse_deep(self.loops, self.dev.outline.body, x, 0)
         sizes = np.where(self.dev.outline.body >= 0, SKIN * self.dev.outline.length, 0.75 * particles.radius)
         auto = median(sizes[sizes > 0]) if (sizes > 0).any() else 1.0
         self._listed = auto if self.skin == "auto" else float(self.skin)
@@ -74,16 +76,74 @@ class Polygons(PairContact):
         if self.matters:
             self.check_range(x)
 
+    def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
+        """Refuse particles deep inside of bodies, as they come."""
+        super().review(particles, inv_mass)
+        refuse_deep(self.loops, particles.position, 0)
+
     def check_added(self, particles: Particles, first: int) -> None:
         """Refuse positions too far out, or inside of bodies."""
-        super().check_added(particles, first)
-        refuse_deep(self.loops, self.dev.outline.body, particles.position, first)
+        bodies = self._after or self
+        PairContact.check_added(bodies, particles, first)
+        refuse_deep(bodies.loops, particles.position, first)
+
+    def release(self) -> None:
+        """Forget the world, and what was planned there."""
+        super().release()
+        self._after = None
+
+    @property
+    def indices(self) -> np.ndarray:
+        """The particles of all bodies, one after the other, (total,)."""
+        return np.concatenate([*self.loops, np.zeros(0, dtype=np.int32)])
 
     def remap_indices(self, number: np.ndarray, count: int) -> None:
         """Bodies stay as long as all of their particles do."""
-        whole = [loop for loop in self.loops if (number[loop] >= 0).all()]
-        self._keep(loops=[number[loop].astype(np.int32) for loop in whole])
-        self.arguments = {**self.arguments, "loops": self.loops}
+        self._hold([number[loop].astype(np.int32) for loop in self.loops if (number[loop] >= 0).all()])
+
+    def check_more(self, more: Feature) -> None:
+        """It takes other bodies, which are to be like its own."""
+        if not isinstance(more, Polygons):
+            raise TypeError(f"World.add: extend: {self!r} cannot take {more!r}, which is of another kind. Add it to features.")
+        for name, value in more.arguments.items():
+            if name != "loops" and value is not (own := self.arguments.get(name)) and not np.array_equal(value, own):
+                raise ValueError(f"World.add: extend: {more!r} has a {name} of its own, but all bodies have that of {self!r}.")
+
+    def extend(self, more: "Polygons") -> None:
+        """Bodies behind bodies."""
+        self._hold(checked([*self.loops, *more.loops]))
+
+    def _hold(self, loops: list[np.ndarray]) -> None:
+        """Have these bodies."""
+        self._keep(loops=loops)
+        self.arguments = {**self.arguments, "loops": loops}
+
+    def can_regroup(self, change: Regrouping) -> bool:
+        """Whether particles and bodies can come and go: not where bodies sleep as one, or lists are of another make."""
+        if not self.matters or self.scene.state.sleepers:
+            return False
+        came, now = change.now.position[change.kept :], change.now
+        after, start = self.copy(), now.placed(change.joined(self.start.position, came))
+        after.remap_indices(change.number, now.count)
+        if self in change.more:
+            start = extended(after, change.more[self], start, now, self.periodic)
+        after.start = start
+        after.prepare(start, change.inv_mass.copy())
+        self._after = after
+        reach = after.dev.outline.reach
+        alike = after.matters and self.table.can_be(change.before.group, now.group)
+        return alike and self.dev.search.can_regroup(change, now.radius, reach)
+
+    def regroup(self, change: Regrouping) -> None:
+        """They came and went, and the team knows."""
+        dev, after = self.dev, self._after
+        self.start, self._listed, self._finest, self._after = after.start, after._listed, after._finest, None
+        self._hold(after.loops)
+        dev.outline = after.dev.outline
+        dev.geometry.become(dev.outline)
+        dev.beside.skin = self._listed
+        self.table.regroup(self.scene, change.now.group)
+        dev.search.regroup(change, self._listed, change.now.radius, dev.outline.reach)
 
     def rods(self) -> tuple[np.ndarray, np.ndarray]:
         """Their edges, numbered from body to body."""
@@ -94,7 +154,7 @@ class Polygons(PairContact):
 
     def join(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
         """Declare the fields, among them the neighbour list's, which is returned."""
-        n, add, dev = scene.particles.count, scene.memory.field, self.dev
+        n, add, dev = scene.count, scene.memory.field, self.dev
         self.enter(scene)
         dev.forces = ForceShare(scene, sums=True, lasting=False)
         dev.geometry = PolygonGeometry(scene, dev.outline, self.push_out)
@@ -113,8 +173,8 @@ class Polygons(PairContact):
             *([dev.slip] if dev.has_friction else []),
             *([dev.restitution.aim] if dev.has_restitution else []),
         ]
-        beside: Any = Beside(dev.geometry, self.table, scene.memory.number(self._listed, scene.real))
-        dev.search = NeighbourSearch(scene, self._listed, linked, beside, pair_data, team, dev.move, dev.outline.reach)
+        dev.beside = Beside(dev.geometry, self.table, scene.memory.number(self._listed, scene.real))
+        dev.search = NeighbourSearch(scene, self._listed, linked, dev.beside, pair_data, team, dev.move, dev.outline.reach)
         dev.list = dev.search.list
         dev.geometry.bind(dev.search)
         return dev.search
@@ -269,7 +329,7 @@ class PolygonRestitution:
     """Contacts of vertices and edges leave with -e times the normal velocity that they had before the substep."""
 
     def __init__(self, scene: Scene, geometry: PolygonGeometry, table: Table):
-        n, add = scene.particles.count, scene.memory.field
+        n, add = scene.count, scene.memory.field
         self.geometry, self.table, self.state = geometry, table, scene.state
         self.split = add("Contact.struck", n)  # as it was in the first pass
         self.d_change = add("Contact.d_change", n, width=2)

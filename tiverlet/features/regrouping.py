@@ -1,8 +1,9 @@
 """Which particles come and go, for what stays where it is meanwhile: see step/edit_in_place.py."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,13 +15,14 @@ if TYPE_CHECKING:
 class Regrouping:
     """Particles in the mask `some`, (n,), stay, in order, and behind them come others. number: their new numbers, -1 for those
     that go. before, now: all particles, as they were when the world was built, and as and where they are. inv_mass: of those
-    that there are now, after pins."""
+    that there are now, after pins. more: features, and others whose bodies they take behind their own."""
 
     some: np.ndarray
     number: np.ndarray
     before: "Particles"
     now: "Particles"
     inv_mass: np.ndarray
+    more: Mapping[Any, Any] = field(default_factory=dict)
 
     @cached_property
     def first(self) -> int:

@@ -103,25 +103,28 @@ class NeighbourSearch:
         """Parts of the list of n particles."""
         return max(1, -(-n // self.team.piece)) if self.team.size > 1 and not self.counts else 1
 
-    def can_regroup(self, change: Regrouping, radius: np.ndarray) -> bool:
-        """Whether particles can come and go where it is; its reach is 0. radius: as many as there are now [m]."""
+    def can_regroup(self, change: Regrouping, radius: np.ndarray, reach: np.ndarray | None = None) -> bool:
+        """Whether particles can come and go where it is. radius, reach: as many as there are now [m]."""
+        reach = 0 * radius if reach is None else reach
         n, store = change.now.count, self.list.store
         room = store is not None and store.holds(self.list.room + (self.list.short + 1) * (n + 1))
         static = bool((change.inv_mass == 0).any()) == self.has_static
-        return room and static and not self.team.launched and self.cells.can_regroup(radius, 0 * radius)
+        lone = not self.several_levels and not self.state.images and not reach.any()
+        return room and static and not self.team.launched and lone == self.lone and self.cells.can_regroup(radius, reach)
 
-    def regroup(self, change: Regrouping, skin: float, radius: np.ndarray) -> None:
+    def regroup(self, change: Regrouping, skin: float, radius: np.ndarray, reach: np.ndarray | None = None) -> None:
         """They came and went, and the team knows. The list stays, but for pairs of what went, unless it is another one that
         would be built now; what came is on no list, as a stray is that has gone far. Where the old list is saved, what pairs
         remember is to be given to the next list by restore()."""
         n, stale = change.now.count, int(self.memory.seen(self.list.stale)[0])
+        reach = 0 * radius if reach is None else reach
         if change.goes and not self.list.saved:
             self.list.drop(change.number)
             self.cells.drop(change.number)
-        skin = self._skin(skin, radius, 0 * radius)
+        skin = self._skin(skin, radius, reach)
         stays = self.lone and not self.list.saved and stale != 1 and skin == self.skin
         self.skin, self.too_far = skin, (STALE * skin) ** 2
-        stays &= self.cells.regroup(radius, 0 * radius, skin, np.array(change.now.extent))
+        stays &= self.cells.regroup(radius, reach, skin, np.array(change.now.extent))
         if self.sheared:
             self.farthest = float(self.cells.sizes.max())
         self.sums.room = n

@@ -106,8 +106,9 @@ def _joined(found: list[tuple[Plan, int, int]], owners: np.ndarray, corners: np.
 
     def joined(name: str, shift: np.ndarray | list[int], skip: int = 0) -> np.ndarray:
         """What each part has of something, shifted."""
-        each = [getattr(one, name)[skip:] + by for one, by in zip(plans, shift, strict=False)]
-        return np.concatenate([*each, np.zeros(0, dtype=np.int64)])
+        each = [getattr(one, name)[skip:] for one in plans]
+        by = np.repeat(np.asarray(shift[: len(plans)], dtype=np.int64), [len(some) for some in each])
+        return np.concatenate([*each, np.zeros(0, dtype=np.int64)]) + by
 
     def shifted(address: np.ndarray, name: str) -> np.ndarray:
         """Addresses in the arrays of the parts, in that of all."""

@@ -14,9 +14,9 @@ import numpy as np
 
 from ..constraints.core.anchored import refuse_held_twice
 from ..device.again import Again, Differs
+from ..features.extending import extended
 from ..features.feature import Batch, Feature
 from ..features.regrouping import Regrouping
-from ..neighbours.periodic import Periodic
 from ..particles import Particles
 
 
@@ -145,17 +145,3 @@ def _state(dev: Any, names: dict[int, int]) -> dict[tuple[str, str], int]:
     parts = {key: getattr(value, "in_state", {"": value}) for key, value in vars(dev).items()}
     fields = {(key, part): id(field) for key, held in parts.items() for part, field in held.items()}
     return {key: names[field] for key, field in fields.items() if field in names}
-
-
-def extended(feature: Any, more: Feature, start: Particles, now: Particles, box: Periodic | None) -> Particles:
-    """Give a feature that is not bound more constraints, which start now. Returns where it started: for what it had, when that
-    came; for other particles, now."""
-    more.periodic, more.start = box, now
-    inv_mass = now.inv_mass.copy()
-    more.prepare(now, inv_mass)
-    more.review(now, inv_mass)
-    position = np.array(now.position)
-    mine = feature.indices.ravel()
-    position[mine] = start.position[mine]
-    feature.extend(more)
-    return start.placed(position)

@@ -53,18 +53,20 @@ def planned(
     stay = np.flatnonzero(some)
     now = world._particles.regrouped(some, added, scene.state.get(runner.memory).take(stay, axis=0))
     inv_mass = scene.inv_mass[stay] if added is None else np.concatenate([scene.inv_mass[stay], added.inv_mass])
-    change = Regrouping(some, number, scene.particles, now, inv_mass)
+    links = {f: more for f, more in extend.items() if isinstance(f, Batch)}
+    bodies = {f: more.copy() for f, more in extend.items() if f not in links}
+    change = Regrouping(some, number, scene.particles, now, inv_mass, bodies)
     came = None if added is None else added.position
     known = {id(start): start for start in (world._particles, *(f.start for f in world.features))}
     starts = {one: now.placed(change.joined(start.position, came)) for one, start in known.items()}
     bound, tied = None, [f for f in batches if not f.can_regroup(change)]
-    if extend or tied:
+    if links or tied:
         if any(not f.acts for f in tied):
             return None
-        bound = bound_again(world, number, now, starts, extend)
+        bound = bound_again(world, number, now, starts, links)
         if not bound:
             return None
-        change = Regrouping(some, number, scene.particles, now, bound.inv_mass)
+        change = Regrouping(some, number, scene.particles, now, bound.inv_mass, bodies)
     work = count + sum(f.count for f in batches)
     if bound:
         work = count + sum(int(bound.kept[f][0].sum()) if f in bound.kept else f.count for f in batches)

@@ -12,11 +12,11 @@ from ..colliders.collider import Collider
 from ..contact.pair_contact import PairContact
 from ..contact.touches import ContactEvents
 from ..device.memory import Memory
+from ..features.extending import extended
 from ..features.feature import Acceleration, Batch, Feature
 from ..neighbours.periodic import Periodic
 from ..particles import Particles
 from . import checkpoint, edit_in_place, initial_violation
-from .bind_again import extended
 from .build import assemble, check_settings, checked_features, listed
 from .integrator import decay
 from .sleep import Sleep
