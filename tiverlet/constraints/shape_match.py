@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 from .. import checks
 from ..device import ti
 from ..features.feature import Batch, Knob, Scene
+from ..geometry.ordered import distinct
 from ..particles import Particles
 from .core import rotation
 from .core.members import VariableSize, rows
@@ -143,8 +144,11 @@ class ShapeMatch(Batch):
 
     def excluded_pairs(self, particles: Particles) -> np.ndarray:
         """Particles of a cluster that are near each other may overlap; the rest cannot meet unless it is soft."""
-        near = [_near(self.members_of(c), particles) for c in range(self.count)]
-        return np.concatenate([*near, np.zeros((0, 2), dtype=np.int32)])
+        sizes, out = np.diff(self.members.starts), [np.zeros((0, 2), dtype=np.int32)]
+        for size in distinct(sizes)[0].tolist():
+            first = self.members.starts[:-1][sizes == size]
+            out.append(_near(np.asarray(self.indices)[first[:, None] + np.arange(size)], particles))
+        return np.concatenate(out)
 
     def bind(self, scene: Scene) -> None:
         """Shapes, rotations, sums; for soft clusters multipliers and the memory of the averaged constraint."""
@@ -492,11 +496,11 @@ class ShapeMatch(Batch):
 
 
 def _near(members: np.ndarray, particles: Particles) -> np.ndarray:
-    """Pairs of members less than 3 radii apart."""
+    """Pairs of members of the same cluster less than 3 radii apart. members: of clusters, (m, k)."""
     x, r = particles.position[members], particles.radius[members]
-    out = []
-    for k in range(len(members) - 1):
-        near = ((x[k + 1 :] - x[k]) ** 2).sum(axis=1) < (1.5 * (r[k + 1 :] + r[k])) ** 2
-        j = members[k + 1 :][near]
-        out.append(np.stack([np.full(len(j), members[k]), j], axis=1))
-    return np.concatenate([*out, np.zeros((0, 2))]).astype(np.int32)
+    out = [np.zeros((0, 2), dtype=np.int32)]
+    for k in range(members.shape[1] - 1):
+        near = ((x[:, k + 1 :] - x[:, k : k + 1]) ** 2).sum(axis=2) < (1.5 * (r[:, k + 1 :] + r[:, k : k + 1])) ** 2
+        c, j = np.nonzero(near)
+        out.append(np.stack([members[c, k], members[c, k + 1 + j]], axis=1))
+    return np.concatenate(out).astype(np.int32)

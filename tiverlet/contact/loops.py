@@ -29,32 +29,56 @@ def laid(loops: list[np.ndarray], x: np.ndarray) -> tuple[np.ndarray, np.ndarray
     loop (n,), or -1; and the length of the longer edge (n,) [m]. Refuses flat loops."""
     n = len(x)
     ends, body, length = np.full((n, 2), -1), np.full(n, -1), np.zeros(n)
-    for k, loop in enumerate(loops):
-        checks.indices("Polygons", f"loops[{k}]", loop, n)
-        area = area_of(x[loop])
-        extent = float(np.ptp(x[loop], axis=0).max())
-        if abs(area) <= 1e-9 * extent**2:
-            raise ValueError(f"Polygons: loops[{k}] encloses an area of {area:g} m^2; its particles are on a line.")
-        loop = loop if area > 0 else loop[::-1]
-        after = np.roll(loop, -1)
-        edge = np.linalg.norm(x[after] - x[loop], axis=1)
-        if (edge <= 1e-6 * extent).any():
-            m = int(np.argmin(edge))
-            raise ValueError(f"Polygons: particles {loop[m]} and {after[m]} of loops[{k}] are in the same place.")
-        ends[loop, 0], ends[after, 1], body[loop] = after, loop, k
-        length[loop] = np.maximum(length[loop], edge)
-        length[after] = np.maximum(length[after], edge)
+    if not loops:
+        return ends, body, length
+    corner, begin, owner = flat(loops)
+    if corner.max() >= n:
+        k = int(owner[np.argmax(corner >= n)])
+        checks.indices("Polygons", f"loops[{k}]", loops[k], n)
+    after, before = corner[turned(begin, 1)], corner[turned(begin, -1)]
+    v = x[corner] - (np.add.reduceat(x[corner], begin[:-1]) / np.diff(begin)[:, None])[owner]
+    w = v[turned(begin, 1)]
+    area = np.add.reduceat(v[:, 0] * w[:, 1] - v[:, 1] * w[:, 0], begin[:-1]) / 2
+    extent = (np.maximum.reduceat(x[corner], begin[:-1]) - np.minimum.reduceat(x[corner], begin[:-1])).max(axis=1)
+    edge = np.linalg.norm(x[after] - x[corner], axis=1)
+    thin, short = np.abs(area) <= 1e-9 * extent**2, edge <= 1e-6 * extent[owner]
+    if thin.any() or short.any():
+        k = int(np.argmax(thin | (np.bincount(owner, short) > 0)))
+        if thin[k]:
+            raise ValueError(f"Polygons: loops[{k}] encloses an area of {area[k]:g} m^2; its particles are on a line.")
+        m = int(begin[k] + np.argmin(edge[begin[k] : begin[k + 1]]))
+        raise ValueError(f"Polygons: particles {corner[m]} and {after[m]} of loops[{k}] are in the same place.")
+    left = area[owner] > 0
+    ends[corner, 0], ends[corner, 1], body[corner] = np.where(left, after, before), np.where(left, before, after), owner
+    length[corner] = np.maximum(edge, edge[turned(begin, -1)])
     return ends, body, length
+
+
+def flat(loops: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The corners of at least one loop, one loop after the other; where each begins, and all end; the loop of each corner."""
+    begin = np.concatenate([[0], np.cumsum([len(loop) for loop in loops])])
+    return np.concatenate(loops), begin, np.repeat(np.arange(len(loops)), np.diff(begin))
+
+
+def turned(begin: np.ndarray, by: int) -> np.ndarray:
+    """For each corner of loops that begin there the one that is so far, 1 or -1, around its loop."""
+    out = np.arange(begin[-1]) + by
+    first, last = (begin[:-1], begin[1:] - 1) if by > 0 else (begin[1:] - 1, begin[:-1])
+    out[last] = first
+    return out
 
 
 def refuse_deep(loops: list[np.ndarray], x: np.ndarray, first: int) -> None:
     """Raise for particles, from number `first` on, that are deeper inside of a body than half of the edge that is nearest."""
-    for k, loop in enumerate(loops):
-        a = x[loop]
-        some = ((x >= a.min(axis=0)) & (x <= a.max(axis=0))).all(axis=1)
-        some[loop] = False
-        for i in np.flatnonzero(some[first:]) + first:
-            depth, edge = depth_of(x[i], a)
+    if not loops or first >= len(x):
+        return
+    corner, begin, _ = flat(loops)
+    low, high = (of.reduceat(x[corner], begin[:-1]) for of in (np.minimum, np.maximum))
+    for k in np.flatnonzero(((low <= x[first:].max(axis=0)) & (high >= x[first:].min(axis=0))).all(axis=1)).tolist():
+        some = ((x >= low[k]) & (x <= high[k])).all(axis=1)
+        some[:first] = some[loops[k]] = False
+        for i in np.flatnonzero(some).tolist():
+            depth, edge = depth_of(x[i], x[loops[k]])
             if depth > edge / 2:
                 raise ValueError(
                     f"Polygons: particle {i} starts {depth:.3g} m inside of loops[{k}], deeper than half of the nearest edge "

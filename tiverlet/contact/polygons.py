@@ -17,7 +17,7 @@ from ..neighbours.neighbour_list import PairData
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
 from .force_share import ForceShare
-from .loops import checked, laid, refuse_deep
+from .loops import checked, flat, laid, refuse_deep
 from .pair_contact import PairContact
 from .polygon_narrow_phase import VERTEX, Beside, Outline, PolygonGeometry
 
@@ -99,7 +99,10 @@ class Polygons(PairContact):
 
     def remap_indices(self, number: np.ndarray, count: int) -> None:
         """Bodies stay as long as all of their particles do."""
-        self._hold([number[loop].astype(np.int32) for loop in self.loops if (number[loop] >= 0).all()])
+        if self.loops:
+            corner, begin, owner = flat(self.loops)
+            new, whole = number[corner].astype(np.int32), np.bincount(owner, number[corner] < 0) == 0
+            self._hold([new[begin[k] : begin[k + 1]] for k in np.flatnonzero(whole).tolist()])
 
     def check_more(self, more: Feature) -> None:
         """It takes other bodies, which are to be like its own."""
@@ -111,7 +114,8 @@ class Polygons(PairContact):
 
     def extend(self, more: "Polygons") -> None:
         """Bodies behind bodies."""
-        self._hold(checked([*self.loops, *more.loops]))
+        both = [*self.loops, *more.loops]
+        self._hold(checked(both) if np.isin(more.indices, self.indices).any() else both)
 
     def _hold(self, loops: list[np.ndarray]) -> None:
         """Have these bodies."""

@@ -4,6 +4,7 @@ What is here does not change: another choice of particles is another object.
 """
 
 from collections.abc import Sequence
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -143,7 +144,10 @@ class VariableSize:
 
     def remapped(self, some: np.ndarray, number: np.ndarray) -> "VariableSize":
         """Those in the mask `some`, by the new numbers of their particles."""
-        return VariableSize(self.kind, [number[self.row(k)] for k, stays in enumerate(some) if stays])
+        out, sizes = copy(self), np.diff(self.starts)[some]
+        out.starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int32)
+        out.indices = handed_out(number[self.indices[some[self.owner]]].astype(np.int32), structure(self.kind, "indices"))
+        return out
 
     def pairs(self) -> np.ndarray:
         """No pairs: corners of one constraint may be far from each other."""
