@@ -55,6 +55,14 @@ def test_edits_are_timed(report):
     assert {w.act for w in report.waits} == {*waits.FIRST, *waits.AIMS} and {w.particles for w in report.waits} == {400}
     assert all(w.cold >= 0 and w.warm >= 0 and w.aim == waits.AIMS.get(w.act) for w in report.waits)
     assert "take another in hand" in str(report)
+    (heads, rows) = next(table[1:] for table in report.tables() if table[0].startswith("Waits"))
+    assert heads[-2:] == ("pymunk", "newton") and all(row[-2:] == ("not there",) * 2 for row in rows)
+
+
+@pytest.mark.parametrize("engine", [waits.pymunks, waits.newtons])
+def test_edits_of_other_engines_are_timed(engine):
+    pytest.importorskip(engine.__name__.removesuffix("s"))
+    assert {*engine(100)} <= {*waits.FIRST, *waits.AIMS}
 
 
 def test_pile_in_c_does_the_same(report):

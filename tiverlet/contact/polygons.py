@@ -109,7 +109,7 @@ class Polygons(PairContact):
         if not isinstance(more, Polygons):
             raise TypeError(f"World.add: extend: {self!r} cannot take {more!r}, which is of another kind. Add it to features.")
         for name, value in more.arguments.items():
-            if name != "loops" and value is not (own := self.arguments.get(name)) and not np.array_equal(value, own):
+            if name != "loops" and repr(value) != repr(self.arguments.get(name)):
                 raise ValueError(f"World.add: extend: {more!r} has a {name} of its own, but all bodies have that of {self!r}.")
 
     def extend(self, more: "Polygons") -> None:
@@ -127,7 +127,8 @@ class Polygons(PairContact):
         if not self.matters or self.scene.state.sleepers:
             return False
         came, now = change.now.position[change.kept :], change.now
-        after, start = self.copy(), now.placed(change.joined(self.start.position, came))
+        after: Any = self.copy()
+        start = now.placed(change.joined(self.start.position, came))
         after.remap_indices(change.number, now.count)
         if self in change.more:
             start = extended(after, change.more[self], start, now, self.periodic)

@@ -53,7 +53,7 @@ def planned(
     stay = np.flatnonzero(some)
     now = world._particles.regrouped(some, added, scene.state.get(runner.memory).take(stay, axis=0))
     inv_mass = scene.inv_mass[stay] if added is None else np.concatenate([scene.inv_mass[stay], added.inv_mass])
-    links = {f: more for f, more in extend.items() if isinstance(f, Batch)}
+    links: dict[Feature, Feature] = {f: more for f, more in extend.items() if isinstance(f, Batch)}
     bodies = {f: more.copy() for f, more in extend.items() if f not in links}
     change = Regrouping(some, number, scene.particles, now, inv_mass, bodies)
     came = None if added is None else added.position

@@ -167,12 +167,13 @@ class SpeedReport(JupyterMixin):
 
     def tables(self) -> Iterator[tuple[str, tuple[str, ...], list[tuple[str, ...]]]]:
         """Title, heads and rows of each, without columns that are empty."""
+        present = {name for w in self.waits for name in w.peers}
         for title, heads, rows in (
             ("Speed", HEADS, [self._cells(r) for r in self.runs]),
             ("Starts, memory, quality", STARTS, [started(r) for r in self.runs]),
             ("Peers, at the same measured quality or better", PEERS, [beside(p) for p in self.peers]),
             ("Features that exist but are not in the scene", ABSENT, [without(a) for a in self.absent]),
-            ("Waits of who edits a pile, in ms", WAITS, [waited(w) for w in self.waits]),
+            ("Waits of who edits a pile, in ms", WAITS, [waited(w, present) for w in self.waits]),
         ):
             full = [k for k in range(len(heads)) if any(row[k] for row in rows)]
             if full:
@@ -244,7 +245,8 @@ STARTS = (
 )  # fmt: skip
 PEERS = ("peer", "scene", "particles", "threads", "setting", "ms", "ours", "ratio", "measure", "its", "ours", "as good")
 ABSENT = ("scene", "particles", "fields", "bytes", "launches", "ms", "ratio")
-WAITS = ("act", "particles", "aim", "cold", "warm", "pymunk", "newton")
+BESIDE = ("pymunk", "newton")
+WAITS = ("act", "particles", "aim", "cold", "warm", *BESIDE)
 TEXT = ("path", "flags", "setting", "measure")
 LEGEND = (
     "ms: of a frame of 1/60 s, median. Mps/s: millions of particle-substeps per second. launches: kernels of a frame, counted.",
@@ -298,7 +300,9 @@ def without(a: Absent) -> tuple[str, ...]:
     return (a.scene, f"{a.particles:,}", *pairs, times, f"{a.ratio:.3f}")
 
 
-def waited(w: Wait) -> tuple[str, ...]:
-    """A line about a wait."""
-    times = (w.aim, w.cold, w.warm, w.peers.get("pymunk"), w.peers.get("newton"))
-    return (w.act, f"{w.particles:,}", *("" if t is None else f"{1e3 * t:.3g}" for t in times))
+def waited(w: Wait, present: set[str]) -> tuple[str, ...]:
+    """A line about a wait. present: the peers that were measured."""
+    times = [w.aim, w.cold, w.warm, *(w.peers.get(name) for name in BESIDE)]
+    cells = ["" if t is None else f"{1e3 * t:.3g}" for t in times]
+    theirs = [cell if name in present else "not there" for name, cell in zip(BESIDE, cells[3:], strict=True)]
+    return (w.act, f"{w.particles:,}", *cells[:3], *theirs)

@@ -7,6 +7,7 @@ time of the host's thread, which other programs disturb less than the time on th
 
 import json
 from collections.abc import Callable
+from itertools import pairwise
 from statistics import median
 from time import perf_counter, thread_time
 from typing import Any
@@ -17,6 +18,7 @@ from .result import Wait
 
 TIMES = 30  # that an act is done; the median counts
 FEW, SOME = 1, 100  # that come and go
+POINTS, ROPES = 10, 5  # of a rope that does; ropes that are there
 START = """
 from time import perf_counter
 clock = perf_counter()
@@ -32,7 +34,7 @@ FIRST = ("import", "build, first step")
 AIMS = {
     "second world, first step": 0.02, "copy, first step": 0.01, f"add {FEW}": 0.002, f"add {SOME}": 0.002,
     f"remove {FEW}": 0.002, f"remove {SOME}": 0.002, "add as many again": 0.05, "pin another particle": 0.0002,
-    "take another in hand": 0.0002, "switch a wall": 0.002,
+    "take another in hand": 0.0002, "switch a wall": 0.002, "add a rope": 0.002, "remove a rope": 0.002,
 }  # fmt: skip
 
 
@@ -70,6 +72,12 @@ def pile(n: int):
         return Particles(place + [x[:, 0].min(), x[:, 1].max() + 3 * radius + turn * 10 * radius], radius=radius)
 
     return particles, features, more
+
+
+def hung(x: np.ndarray, radius: float, k: int) -> np.ndarray:
+    """The points of a rope that hangs in the air above particles at x, the k-th one."""
+    left, top = x[:, 0].min() + 3 * radius * k, x[:, 1].max() + 40 * radius
+    return np.stack([np.full(POINTS, left), top - 2.2 * radius * np.arange(POINTS)], axis=1)
 
 
 Act = Callable[[int], Any]
@@ -160,13 +168,43 @@ def ours(n: int) -> dict[str, float]:
         "pin another particle": (hold, None), "take another in hand": (take, None), "switch a wall": (switch, None),
         "add as many again": (added(n), removed(n)),
     }  # fmt: skip
-    return {FIRST[1]: first, "second world, first step": second, "copy, first step": copied, **timed(acts, frame)}
+    found = timed(acts, frame)
+    world.close()
+    return {FIRST[1]: first, "second world, first step": second, "copy, first step": copied, **found, **roped(n)}
+
+
+def roped(n: int) -> dict[str, float]:
+    """By tiverlet, in the pile with ropes."""
+    import tiverlet as tv
+
+    from .counting import DT
+
+    particles, features, _ = pile(n)
+    x, radius = particles.position, float(particles.radius[0])
+    pairs = np.stack([np.arange(POINTS - 1), np.arange(1, POINTS)], axis=1)
+    links = tv.Distance(np.concatenate([pairs + n + POINTS * k for k in range(ROPES)]))
+    ropes = np.concatenate([hung(x, radius, k) for k in range(ROPES)])
+    world = tv.World(tv.Particles(np.concatenate([x, ropes]), radius=radius), [*features, links], substeps=8)
+
+    def add(turn: int):
+        """One more."""
+        more = tv.Particles(hung(x, radius, ROPES), radius=radius)
+        world.add(more, extend={links: tv.Distance(pairs + len(world.particles))})
+
+    def remove(turn: int):
+        """The last one."""
+        world.remove(np.arange(len(world.particles) - POINTS, len(world.particles)))
+
+    acts: dict[str, tuple[Act, Act | None]] = {"add a rope": (add, remove), "remove a rope": (remove, add)}
+    world.step(DT)
+    add(0)
+    return timed(acts, lambda: world.step(DT))
 
 
 def pymunks(n: int) -> dict[str, float]:
     """By pymunk."""
     import pymunk  # pyright: ignore[reportMissingImports]
-    from pymunk.constraints import PivotJoint  # pyright: ignore[reportMissingImports]
+    from pymunk.constraints import PinJoint, PivotJoint  # pyright: ignore[reportMissingImports]
 
     from .peers import Pymunk
 
@@ -187,7 +225,7 @@ def pymunks(n: int) -> dict[str, float]:
     engine.space.copy()
     engine.frame()
     copied = perf_counter() - clock
-    space, come, grip = engine.space, [], []
+    space, come, grip, tied = engine.space, [], [], []
 
     def added(k: int):
         """Add k bodies."""
@@ -220,17 +258,35 @@ def pymunks(n: int) -> dict[str, float]:
         grip[:] = [PivotJoint(space.static_body, body, tuple(body.position))]
         space.add(*grip)
 
+    def tie(turn: int):
+        """Add bodies, and joints between them."""
+        rope = []
+        for place in hung(particles.position, float(particles.radius[0]), ROPES).tolist():
+            body = pymunk.Body(1.0, float("inf"))
+            body.position = tuple(place)
+            rope += [body, pymunk.Circle(body, float(particles.radius[0]))]
+        joints = [PinJoint(a, b) for a, b in pairwise(rope[::2])]
+        tied.append([*rope, *joints])
+        space.add(*tied[-1])
+
+    def untie(turn: int):
+        """Remove them."""
+        space.remove(*tied.pop())
+
     added(2 * SOME)(0)  # which can be removed
+    tie(0)
     acts = {
         f"add {FEW}": (added(FEW), removed(FEW)), f"add {SOME}": (added(SOME), removed(SOME)),
         f"remove {FEW}": (removed(FEW), added(FEW)), f"remove {SOME}": (removed(SOME), added(SOME)),
         "pin another particle": (hold, None), "add as many again": (added(n), removed(n)),
+        "add a rope": (tie, untie), "remove a rope": (untie, tie),
     }  # fmt: skip
     return {FIRST[1]: first, "second world, first step": second, "copy, first step": copied, **timed(acts, engine.frame)}
 
 
 def newtons(n: int) -> dict[str, float]:
-    """By newton, whose models are fixed: all acts are building one anew. Its discs are balls in a plane."""
+    """By newton, whose models are fixed but for what their arrays hold: particles that come or go, and springs, take another one.
+    What is pinned weighs nothing there. Its discs are balls in a plane."""
     from .peers import Newton
 
     particles, features, _ = pile(n)
@@ -250,5 +306,29 @@ def newtons(n: int) -> dict[str, float]:
     clock = perf_counter()
     built()
     again = perf_counter() - clock
+    clock = perf_counter()
+    other = engine.model.state()
+    other.assign(engine.now)
+    engine.now = other
+    engine.frame()
+    copied = perf_counter() - clock
+    inverse, held = engine.model.particle_inv_mass.numpy(), [0, 0.0]  # which is the array itself, on a CPU
+
+    def hold(k: int):
+        """Have another particle weigh infinitely much."""
+        inverse[held[0]] = held[1] or inverse[held[0]]
+        held[:] = n // 2 + k, float(inverse[n // 2 + k])
+        inverse[held[0]] = 0.0
+
+    pinned, times = [], []
+    for k in range(3):
+        clock = thread_time()
+        engine.frame()
+        times.append(thread_time() - clock)
+        clock = thread_time()
+        hold(k)
+        engine.frame()
+        pinned.append(thread_time() - clock)
     edits = {act: again - usual for act in AIMS if act.startswith(("add", "remove"))}
-    return {FIRST[1]: first, "second world, first step": again, **edits}
+    edits["pin another particle"] = max(0.0, median(pinned) - median(times))
+    return {FIRST[1]: first, "second world, first step": again, "copy, first step": copied, **edits}
