@@ -66,6 +66,8 @@ class Area(Scalar):
         self.check_indices(particles)
         if particles.dim == 2:
             self.hold(self.quantity.reversed(self.rest_of(particles.position) < 0))
+        if "rest" not in self.__dict__ and self._rest_given is None:  # what is straight is so to rounding, either way round
+            self.rest = np.maximum(self.rest_of(particles.position), 0.0)
         super().prepare(particles, inv_mass)
 
 

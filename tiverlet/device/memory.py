@@ -50,6 +50,7 @@ class Memory:
         self._named: Counter[str] = Counter()
         self._in_order: list[Number] = []
         self._owned: dict[Any, tuple[range, list[Number]]] = {}  # by owner: fields and numbers
+        self._valued: set[int] = set()  # fields that were given values
         self._again: Again | None = None  # while they are declared a second time
         self._later: list[tuple[Entry, np.ndarray]] = []
         self._declared: list[Declared] = []
@@ -87,6 +88,7 @@ class Memory:
         made = layout.field(kind, width)
         self._declare(name, made, length, width, kind, state, shared, rows, told, below)
         if values is not None and np.size(values):
+            self._valued.add(len(self.entries) - 1)
             self._later.append((self.entries[-1], np.asarray(values, dtype=np.float64)))
         return made
 
@@ -136,6 +138,25 @@ class Memory:
             yield self._again
         finally:
             self._again = None
+
+    def scratch(self, owner: Any) -> list[np.ndarray]:
+        """What an owner has noted while it worked, by which residuals go before the next step: copies of its fields that were given
+        no values and are no part of the state."""
+        return [self.read(field) for field in self._scratch(owner)]
+
+    def put_scratch(self, owner: Any, noted: list[np.ndarray], kept: tuple[np.ndarray, ...] = ()) -> None:
+        """Give it to an owner, where it has as many such fields. kept: masks of the rows that stay, for arrays of as many."""
+        fields = self._scratch(owner)
+        for field, values in zip(fields, noted, strict=True) if len(fields) == len(noted) else ():
+            some = next((mask for mask in kept if len(mask) == len(values)), None)
+            now, values = self.read(field), values if some is None else values[some]
+            if now.shape[1:] == values.shape[1:] and len(values) <= len(now):
+                now[: len(values)] = values
+                self.write(field, now)
+
+    def _scratch(self, owner: Any) -> list[Any]:
+        fields = self._owned[owner][0] if owner in self._owned else ()
+        return [self.entries[k].field for k in fields if k not in self._valued and not self.entries[k].state]
 
     def fill(self, k: int, length: int, values: Any) -> None:
         """Give a field of an elastic memory, by its number, so many elements, and each of them a value."""

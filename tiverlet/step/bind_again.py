@@ -107,12 +107,13 @@ def _check(world: Any, now: Particles, first: int, drivers: list[Batch], batches
 def bind(world: Any, change: Regrouping, now: Bound) -> None:
     """Do it, once particles and contacts are what they are going to be."""
     runner = world._runner
-    memory, rows = runner.memory, runner.scene.count
+    memory, particles = runner.memory, runner.scene.count
     names = {id(e.field): k for k, e in enumerate(memory.entries)}
+    noted = {f: memory.scratch(f) for f in now.kept}
     held = {k: memory.seen(memory.entries[k].field).copy() for k in now.again.state}
     now.again.write()
     for k, values in held.items():
-        if memory.entries[k].rows is rows:
+        if memory.entries[k].rows is particles:
             memory.seen(memory.entries[k].field)[...] = values
     for f, before, after in now.attributes:
         vars(f).clear()
@@ -126,6 +127,8 @@ def bind(world: Any, change: Regrouping, now: Bound) -> None:
             some = next((mask for mask in choices if len(mask) == len(values)), None)
             values = values if some is None else values[some]
             memory.seen(memory.entries[new[key]].field)[: len(values)] = values
+    for f, rows in noted.items():
+        memory.put_scratch(f, rows, now.kept[f])
     constraints = runner.step.constraints
     constraints.systems[:] = [runner.scene.slots.system] if constraints.systems else []
     constraints.semi_iterations[:] = [runner.scene.slots.semi_iteration] if constraints.semi_iterations else []

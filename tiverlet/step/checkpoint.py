@@ -161,6 +161,8 @@ def transfer(old: "World", new: "World") -> None:
     if new._precision == old._precision and new._order == old._order:
         install(new, kept, flags(old))
         new._runner.scene.h2_effective = old._runner.scene.h2_effective  # by which loads are known
+        for mine, other in zip(new.features, old.features, strict=True):
+            new._runner.memory.put_scratch(mine, old._runner.memory.scratch(other))
         return
     ours, theirs = new._clock, old._clock
     ours.time, ours.tick, ours.since, ours.frame = theirs.time, theirs.tick, theirs.since, theirs.frame

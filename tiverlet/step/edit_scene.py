@@ -180,6 +180,7 @@ def rebuild(
     known = {one: start.regrouped(some, added) for one, start in {id(f.start): f.start for f in before}.items()}
     starts: list[Any] = [None if f in came else known[id(f.start)] for f in features]
     parts, told, seen = None, world._all_events(), _seen(world, number, features)
+    noted = {f: world._runner.memory.scratch(f) for f in before if isinstance(f, Batch)}
     try:
         borne = any(isinstance(f, Collider) for f in went)
         pulled = (added is not None or not some.all()) and world._runner.step.has_pair_forces  # by others than before
@@ -219,6 +220,9 @@ def rebuild(
     world._install(particles, features, parts)
     world._runner.scene.h2_effective = h2_effective
     world._runner.memory.restore(state)
+    for f, rows in noted.items():
+        if f in features:
+            world._runner.memory.put_scratch(f, rows, masks[f])
     world._runner.wake()
     if contact and contact in world._runner.step.contacts:
         _give_contacts(world, contact, old, number, some)
