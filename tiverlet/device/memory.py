@@ -140,8 +140,8 @@ class Memory:
             self._again = None
 
     def scratch(self, owner: Any) -> list[np.ndarray]:
-        """What an owner has noted while it worked, by which residuals go before the next step: copies of its fields that were given
-        no values and are no part of the state."""
+        """What an owner has noted while it worked, by which residuals go before the next step: its fields that were given
+        no values and are no part of the state, copied."""
         return [self.read(field) for field in self._scratch(owner)]
 
     def put_scratch(self, owner: Any, noted: list[np.ndarray], kept: tuple[np.ndarray, ...] = ()) -> None:
