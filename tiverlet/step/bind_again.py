@@ -43,7 +43,7 @@ def bound_again(
     runner, scene, memory = world._runner, world._runner.scene, world._runner.memory
     drivers, batches = runner.step.drivers, runner.batches
     bound = [*drivers, *batches]
-    if runner.sleep or not (set(extend) <= set(bound)) or any(vars(f.dev).get("ramps") or f.ramping or f.afresh for f in bound):
+    if runner.sleep or not (set(extend) <= set(bound)) or any(f.afresh or (f.ramp and f.ramp.made) for f in bound):
         return None
     if not batches or any(f.changed and f not in drivers for f in bound):
         return None
