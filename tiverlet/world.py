@@ -557,17 +557,17 @@ class World:
         Rigid constraints that are not met there are met before the next frame, without velocity; it has the flag "moved".
         Particles that overlap others part gently, as at the start.
 
-        extend: features of the world, and others of their kind, whose constraints they take behind their own:
+        extend: features of the world, and others of their kind, whose constraints or bodies they take behind their own:
         world.add(tv.Particles(more.position), extend={ropes: tv.Distance(more.links + n)}). Each feature has kernels to compile,
         but no kernel knows how many constraints there are: the first rope that comes as a tv.Distance of its own takes seconds,
         and so does the next one; those that a Distance is extended by take milliseconds.
 
         What was there goes on to the bit: time, positions, velocities, multipliers, the history of springs, what pairs in contact
         remember. Where a force or a spring is added, displacements are first turned into velocities, as when a force changes.
-        On a CPU it takes two to four milliseconds where particles come alone, which happens in place, and ten else. Nothing is
-        compiled: the world keeps its kernels until there are four times as many of what they work on. Features, masses or radii
-        of a kind that it did not have, and the first particles that overlap others, cost the compiling that a new world costs,
-        once; all worlds share what was compiled.
+        On a CPU it takes two to four milliseconds where particles, constraints and bodies of kinds that are there come in place,
+        and ten else. Nothing is compiled: the world keeps its kernels until there are four times as many of what they work on.
+        Features, masses or radii of a kind that it did not have, and the first particles that overlap others, cost the compiling
+        that a new world costs, once; all worlds share what was compiled.
 
         Raises as World() does; the world is then as before.
         """

@@ -1,9 +1,11 @@
-"""Particles come and go in place: rows of fields move up, new ones are written behind them, and nothing is made anew.
+"""Particles and constraints come and go in place: rows of fields move up, new ones are written behind them, and nothing is made
+anew.
 
 Fields have room for many more elements than they have, see device/layout.py, and kernels find in a field how many there are. So
 what has a row for each particle keeps those that stay, and whatever else is known of all particles is worked out again: levels of
-sizes, pieces for threads, where slots begin. Pairs in contact keep what they remember, in the list or beside it. Where more than
-that would change (features, what kernels are made of, particles that a constraint holds), the world is built anew.
+sizes, pieces for threads, where slots begin. Constraints that lose some, take others or whose particles have other numbers are
+bound again to the fields that they have, see bind_again.py. Pairs in contact keep what they remember, in the list or beside it.
+Where more than that would change (features, what kernels are made of), the world is built anew.
 """
 
 from collections.abc import Mapping

@@ -1,5 +1,5 @@
-"""Adding to a world and removing from it. Particles that come and go by themselves do so in place, see edit_in_place.py; for what
-else there is the world is built anew around the same features, and what stays is carried over."""
+"""Adding to a world and removing from it. Particles and constraints come and go in place, see edit_in_place.py; for what else
+there is the world is built anew around the same features, and what stays is carried over."""
 
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
