@@ -142,21 +142,24 @@ class Memory:
     def scratch(self, owner: Any) -> list[np.ndarray]:
         """What an owner has noted while it worked, by which residuals go before the next step: its fields that were given
         no values and are no part of the state, copied."""
-        return [self.read(field) for field in self._scratch(owner)]
+        return self._dump(self._scratch(owner))
 
     def put_scratch(self, owner: Any, noted: list[np.ndarray], kept: tuple[np.ndarray, ...] = ()) -> None:
         """Give it to an owner, where it has as many such fields. kept: masks of the rows that stay, for arrays of as many."""
-        fields = self._scratch(owner)
-        for field, values in zip(fields, noted, strict=True) if len(fields) == len(noted) else ():
-            some = next((mask for mask in kept if len(mask) == len(values)), None)
-            now, values = self.read(field), values if some is None else values[some]
-            if now.shape[1:] == values.shape[1:] and len(values) <= len(now):
-                now[: len(values)] = values
-                self.write(field, now)
+        entries = self._scratch(owner)
+        if len(entries) != len(noted):
+            return
+        arrays = self._dump(entries)
+        for now, before in zip(arrays, noted, strict=True):
+            some = next((mask for mask in kept if len(mask) == len(before)), None)
+            rows = before if some is None else before[some]
+            if now.shape[1:] == rows.shape[1:] and len(rows) <= len(now):
+                now[: len(rows)] = rows
+        self._load(entries, arrays)
 
-    def _scratch(self, owner: Any) -> list[Any]:
+    def _scratch(self, owner: Any) -> list[Entry]:
         fields = self._owned[owner][0] if owner in self._owned else ()
-        return [self.entries[k].field for k in fields if k not in self._valued and not self.entries[k].state]
+        return [self.entries[k] for k in fields if k not in self._valued and not self.entries[k].state]
 
     def fill(self, k: int, length: int, values: Any) -> None:
         """Give a field of an elastic memory, by its number, so many elements, and each of them a value."""
