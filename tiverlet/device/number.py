@@ -24,7 +24,8 @@ class Number:
         if not inside_kernel():
             return self._value
         kernel, known = _read
-        return known[id(self)] if kernel is current().compiling_callable else at(self.field, self.place)
+        read = kernel is current().compiling_callable and id(self) in known
+        return known[id(self)] if read else at(self.field, self.place)
 
     def set(self, value: float) -> None:
         """Make it another one."""
