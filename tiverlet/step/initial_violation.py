@@ -194,9 +194,11 @@ def _newton(rows: "Rows", body: np.ndarray, going: np.ndarray) -> "Rows":
 
 
 def _relaxed(rows: "Rows", body: np.ndarray, going: np.ndarray) -> "Rows":
-    """The rows where passes leave those bodies whose constraints contradict each other."""
+    """The rows where passes leave those bodies whose constraints contradict each other. Where an f is curved, passes do not take
+    out what violations there are."""
     worst, size = _violation(rows, body, len(going))
-    going = going & (worst > SEEN)
+    curved = np.concatenate([np.full(some.sum(), b.quantity.curved or b.quantity.collapses > 0) for b, some in rows.active])
+    going = going & (worst > SEEN) & (np.bincount(_of(rows, body, len(going)), curved, minlength=len(going)) == 0)
     for _ in range(PASSES):
         if not going.any():
             break
