@@ -170,6 +170,39 @@ print(*sorted(name for name in os.listdir(os.environ["TI_OFFLINE_CACHE_FILE_PATH
     assert said[0].splitlines()[-2:] == said[1].splitlines()[-2:] and said[0].count(".tic") == 2, said
 
 
+TABLE = np.array([0.0, 2.0])  # what kernels compare while they compile, too
+
+
+def compared(x: ti.f32, out: ti.types.ndarray(ti.f64, 1)):
+    """Comparisons and choices of all kinds."""
+    i, v, u = ti.cast(x, ti.i32), ti.Vector([x, 2 * x]), ti.cast(ti.abs(ti.cast(x, ti.i32)), ti.u32)
+    for k in ti.static(range(2)):
+        if ti.static(TABLE[k] > 1.5):
+            out[k] = 1
+    if ti.static(np.int64(2) == 2) and TABLE[1] > 1.5:
+        out[2] = 1
+    larger, same = v > 1.0, v == v
+    out[3], out[4], out[5] = larger[0], larger.any(), same.all()
+    out[6], out[7], out[8], out[9] = x != x, 0 < x < 2, x >= 1, not x < 1
+    out[10], out[11] = (x > 1) + (x > 0.5), (x > 0) * 3.0 - (x > 1)
+    out[12], out[13], out[14] = ti.select(x > 1, 1.0, 2.0), ti.select(not x > 1, 1.0, 2.0), ti.select(i, 3.0, 4.0)
+    chosen = ti.select(v > 1.0, v, 0 * v)
+    out[15], out[16], out[17] = chosen[0], chosen[1], u > -1
+    out[18], out[19], out[20] = (x > 1) != (x > 2), (i > 1) << 3, (x > 1) == (x > 2)
+
+
+def test_comparisons_are_what_taichi_makes_of_them(world):
+    # Ours are one statement, see statements.py; Taichi's have branches. NaN is less than nothing, and NumPy's truths are truths.
+    w = world(tv.Particles(np.zeros((1, 2))))
+    ours, theirs = ti.kernel(compared), ti.kernel(compared)
+    for x in (0.7, 3.0, -1.5, np.nan):
+        out = np.zeros((2, 21))
+        with w._runner.memory.compiler():
+            ours(x, out[0])
+        theirs(x, out[1])
+        np.testing.assert_array_equal(*out)
+
+
 def test_functions_are_cut_out_of_their_files_as_python_does_it():
     modules = [module for name, module in sys.modules.items() if name.startswith("tiverlet")]
     owners = {o for m in modules for o in vars(m).values() if inspect.isclass(o) and o.__module__.startswith("tiverlet")}

@@ -261,6 +261,7 @@ def grown(scene, anew: bool) -> list:
             assert anew or w._runner is runner
             seen += [w.hash(), w.position.tobytes(), w.velocity.tobytes(), w.contacts.pairs.tobytes()]
             batches = [f for f in w.features if isinstance(f, Batch)]
+            seen += [f.residual.tobytes() for f in batches]  # of the substep before
             seen += [w.step(1 / 60).flags, *((f.broken.tobytes(), f.residual.tobytes()) for f in batches), *steps_of(w)]
             seen += [{name: size for name, size in w.fields.items() if not name.startswith("grid")}]
         seen.append(w.explain().split("Compiled")[0].split("launch")[0])

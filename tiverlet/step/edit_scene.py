@@ -139,7 +139,11 @@ def change(
         told, seen = world._all_events(), _seen(world, number, features)
         others = (added is not None or not some.all()) and world._runner.step.has_pair_forces
         if world._force_waits or others or any(more.soft for more in planned.more):
+            memory = world._runner.memory
+            noted = {f: memory.scratch(f) for f in features if isinstance(f, Batch)}
             world._runner.restart(world.iterations)
+            for f, rows in noted.items():
+                memory.put_scratch(f, rows)
         world._clock.parted = None
         edit_in_place.regroup(world, planned, added)
         world._runner.wake()

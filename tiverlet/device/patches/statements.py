@@ -8,6 +8,7 @@ import operator
 from functools import wraps
 from typing import Any
 
+import numpy as np
 from taichi._lib import core
 from taichi.lang import impl, matrix_ops, ops
 from taichi.lang.ast import ast_transformer
@@ -30,7 +31,7 @@ def _compared(ctx: Any, node: Any) -> Any:
     ast_transformer.build_stmt(ctx, node.left)
     ast_transformer.build_stmt(ctx, node.comparators[0])
     node.ptr = compare(node.left.ptr, node.comparators[0].ptr)
-    if node.ptr.is_tensor() if type(node.ptr) is Expr else type(node.ptr) is not bool:
+    if node.ptr.is_tensor() if type(node.ptr) is Expr else not isinstance(node.ptr, (bool, np.bool_)):
         node.ptr = ti.cast(node.ptr, ti.u1)
     return node.ptr
 
