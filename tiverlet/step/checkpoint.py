@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..features.feature import Batch
 from ..neighbours.periodic import Periodic
 from .clock import Clock
 
@@ -162,7 +163,8 @@ def transfer(old: "World", new: "World") -> None:
         install(new, kept, flags(old))
         new._runner.scene.h2_effective = old._runner.scene.h2_effective  # by which loads are known
         for mine, other in zip(new.features, old.features, strict=True):
-            new._runner.memory.put_scratch(mine, old._runner.memory.scratch(other))
+            if isinstance(mine, Batch):  # what it noted in the last substep; walls tell of frames, and a clone made none
+                new._runner.memory.put_scratch(mine, old._runner.memory.scratch(other))
         return
     ours, theirs = new._clock, old._clock
     ours.time, ours.tick, ours.since, ours.frame = theirs.time, theirs.tick, theirs.since, theirs.frame
