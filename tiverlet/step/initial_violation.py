@@ -349,11 +349,13 @@ class Rows:
 
     def newton(self) -> np.ndarray:
         """The least moves that take C to 0, as far as it is linear."""
-        scaled = Jacobian(len(self.C), self.row, self.who, self.w, self.J * self.scale[self.row, None])
-        return scaled.solve(-self.C * self.scale, enough=LEFT, steps=STEPS)
+        return self._scaled.solve(-self.C * self.scale, enough=LEFT, steps=STEPS)
 
     def relaxed(self) -> np.ndarray:
         """The moves of one pass, -w J^T C / W."""
-        push = -self.J * (self.scale**2 * self.C)[self.row, None]
-        sums = [np.bincount(self.who, column, minlength=len(self.w)) for column in push.T]
-        return self.w[:, None] * np.stack(sums, axis=1)
+        return self._scaled.moves(-self.C * self.scale)
+
+    @property
+    def _scaled(self) -> Jacobian:
+        """J, of C / sqrt(W)."""
+        return Jacobian(len(self.C), self.row, self.who, self.w, self.J * self.scale[self.row, None])
