@@ -178,7 +178,7 @@ class Contact(PairContact):
         dev.restitution = None
         if dev.has_restitution:
             noted = dev.events if dev.reports else None
-            dev.restitution = Restitution(scene, dev.geometry, self.table, struck, dev.slack, dev.impulse, noted)
+            dev.restitution = Restitution(scene, dev.geometry, self.table, struck, dev.slack, dev.impulse, noted, dev.has_loads)
             dev.hit = dev.restitution.hit
         if dev.spins:
             dev.spinning = Spinning(scene, self.table, dev.splitting.weight, dev.turn)
@@ -242,30 +242,31 @@ class Contact(PairContact):
                     overlap, each, n, reach = self.dev.geometry.impact(i, j, self.dev.geometry.contact_distance(i, j), shared)
                     each *= ti.static(RELAXATION)
                     paid, given, rests, alone = overlap, ti.zero(overlap), True, w + self.dev.w.of(j)
+                    push, known = ti.zero(overlap), ti.zero(overlap)  # known: what of its push was given before
+                    if first == 0:
+                        push = last
+                    keeps = ti.max(ti.min(1 - alone * each, ti.static(CARRY)), 0)
+                    if ti.static(self.dev.has_loads):
+                        if first != 0:
+                            known = self.dev.known.given(e, now)
+                            push = known
                     if ti.static(self.dev.has_restitution):
-                        given, slack, rests = self.dev.restitution.bounce(i, j, n, overlap, self.dev.slack.field[e], last, first)
+                        held = overlap
+                        if ti.static(self.dev.has_loads):  # what bounces asks its overlap whether it rests: that of its load, too
+                            held = ti.max(overlap, 0) + ti.max((1 - keeps) / each, alone) * self.dev.known.given(e, now)
+                        given, slack, rests = self.dev.restitution.bounce(i, j, n, held, self.dev.slack.field[e], last, first)
+                        slack = ti.min(slack, ti.max(overlap, 0))
                         if first != 0:
                             back = ti.static(UPTAKE) * ti.min(slack * each, slack / alone)
                             lift += w * back * n
                             self.dev.slack.field[e] = slack - alone * back
                         paid -= slack
-                    part, push = paid * each, ti.zero(overlap)
-                    if first == 0:
-                        push = last
-                    else:
-                        if ti.static(self.dev.has_loads):
-                            push = self.dev.known.given(e, now)
-                        if fresh == 0:
-                            part += ti.max(ti.min(1 - alone * each, ti.static(CARRY)), 0) * (last - push)
-                    known = ti.zero(overlap)  # what of its push was given before
+                    part = paid * each
+                    if first != 0 and fresh == 0:
+                        part += keeps * (last - push)
                     if ti.static(self.dev.has_loads):
-                        known = ti.select(first != 0, push, known)
                         part = ti.select(paid > 0, lesser(part, paid / alone), ti.max(part, paid / alone))
                         part = ti.max(part, -push)
-                        bounces = False  # what bounces finds out by overlaps whether it rests
-                        if ti.static(self.dev.has_restitution):
-                            bounces = self.table.of(i, j)[2] > 0
-                        carried += w * self.dev.known.remember(i, j, e, part, push + part, now, not bounces) * n
                     else:
                         part = lesser(part, paid / alone)  # without a branch: it would be taken at random
                     if ti.static(self.dev.has_restitution):
@@ -275,6 +276,9 @@ class Contact(PairContact):
                                 self.dev.hit[None] = 1
                         if not rests:
                             part = ti.zero(part)
+                            push -= known
+                    if ti.static(self.dev.has_loads):
+                        carried += w * self.dev.known.remember(i, j, e, part, push + part, now) * n
                     pressed = part + known
                     if ti.static(self.dev.has_restitution):
                         self.dev.impulse.field[e] = self.dev.impulse.field[e] + pressed

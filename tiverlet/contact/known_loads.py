@@ -44,7 +44,8 @@ class KnownLoads:
     0.1 N^2 substeps. So gain = WINDOW / (LAG + SLOW k^2), with k = F / (m g) the number of particles that a pair bears. An
     impact has a large k, and is not learnt.
 
-    A pair that gives nothing in the end, because its particles have parted, forgets at once. A wall takes back in the same
+    A pair that gives nothing in the end, because its particles have parted or bounced, forgets at once. Restitution asks the
+    overlap of a pair whether it rests; one that knows its load has that, too, which would hold it. A wall takes back in the same
     substep what is pushed into it; for contacts to know, particles are where walls leave them while contacts are solved (`lean`),
     and walls begin again with all that is pushed into them, which friction needs.
 
@@ -96,15 +97,14 @@ class KnownLoads:
         return self.load.field[e] * self.weights.integrator.h2_effective(now.h, now.fresh)
 
     @ti.func
-    def remember(self, i, j, e, part, push, now, learns):
-        """Entry e, the pair of i and j, got `part` in this pass, and `push` in all. Returns what it gives from now on [N]; 0 of
-        pairs that do not learn."""
+    def remember(self, i, j, e, part, push, now):
+        """Entry e, the pair of i and j, got `part` in this pass, and `push` in all. Returns what it gives from now on [N]."""
         load, borne = self.load.field[e], self.borne.field[e] + part
         if now.first != 0:
             if now.fresh != 0:
                 borne *= 0
             if (now.span.since + now.s) % WINDOW == 0:
-                load = self.learn(i, j, e, load, (borne - part) / (WINDOW * now.h * now.h), learns)
+                load = self.learn(i, j, e, load, (borne - part) / (WINDOW * now.h * now.h))
                 self.load.field[e] = load
                 borne = part
         if push <= 0:
@@ -114,9 +114,9 @@ class KnownLoads:
         return load
 
     @ti.func
-    def learn(self, i, j, e, load, mean, learns):
+    def learn(self, i, j, e, load, mean):
         """At the end of a window, in which entry e lacked `mean` of its load: what it knows from now on [N]."""
-        if learns and steady(mean, self.earlier.field[e]):
+        if steady(mean, self.earlier.field[e]):
             k = ti.abs(load + mean) * ti.max(self.state.w.of(i), self.state.w.of(j))
             own = ti.max(self.weights.field[i], self.weights.field[j])
             share = gain(own * own, SLOW * k * k, WINDOW)

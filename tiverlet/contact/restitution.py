@@ -8,22 +8,26 @@ from ..features.material import Table
 from ..neighbours.neighbour_list import PairData
 from .narrow_phase import DiscGeometry
 
+SLOW = 2.0  # substeps of forces that give a pair no more than the speed at which it rests, see Restitution
+
 
 class Restitution:
     """A pair leaves with -e times the normal velocity that it had before the substep, from the time of impact on, see Contact.
 
     struck: of its pairs, those that are struck in this substep. slack: of their overlap, what no push is for. impulse: pushes
-    and impacts of the last substep [kg m]. events: an EventLog, or None.
+    and impacts of the last substep [kg m]. events: an EventLog, or None. has_loads: pairs may know their loads. These are forces,
+    which press a pair between them together in each substep; so it rests, unless e is 1, at the speed that two substeps of them
+    give; else it would bounce on and on, for what an impact takes the next substep gives back.
     """
 
     def __init__(
         self, scene: Scene, geometry: DiscGeometry, table: Table, struck: PairData, slack: PairData, impulse: PairData,
-        events: Any,
+        events: Any, has_loads: bool,
     ):  # fmt: skip
         n, dim, add = scene.count, scene.particles.dim, scene.memory.field
         self.geometry, self.list, self.table, self.state = geometry, geometry.list, table, scene.state
         self.struck, self.slack, self.impulse, self.events = struck, slack, impulse, events
-        self.has_events = events is not None
+        self.has_events, self.has_loads = events is not None, has_loads
         self.weight = add("Contact.struck", n)  # the split mass of the first pass, 0 where nothing touched
         self.d_change = add("Contact.d_change", n, width=dim)
         self.lift = add("Contact.lift", n, width=dim)  # moves the position alone
@@ -43,13 +47,17 @@ class Restitution:
     @ti.func
     def bounce(self, i, j, n, overlap, slack, last, first):
         """The displacement that takes a pair that was struck in this substep from coming together to leaving, 0 for others; its
-        slack; and whether it rests, so that it is pushed apart, as it was in the last substep."""
+        slack; and whether it rests, so that it is pushed apart, as it was in the last substep. overlap: and what
+        would hold the load that it knows."""
         given, here, a = self.target(i, j, n)
         rests, e = True, self.table.of(i, j)[2]
         if e > 0:
             deep = ti.select(last > 0, overlap, ti.select(e < 1, slack, 0))  # nothing that is elastic rests where nothing pulls
             if last == 0:
                 slack = ti.max(slack, overlap - ti.max(here, 0))
+            if ti.static(self.has_loads):
+                if e < 1 and a <= ti.static(SLOW) * (here - a):
+                    deep = ti.max(deep, given)
             if a > 0:
                 rests = deep > 0 and (first == 0 or given <= deep)
             elif a < 0:
