@@ -70,8 +70,9 @@ class PolygonGeometry:
         # For each entry the contact of which its particle is the vertex: overlap, place on the edge (DISCS: there is none) and
         # normal; where in the list of the other one those are in which it is the start, and the end, of the edge (-1: nowhere).
         self.manifold, self.back = PairData("met", 4, False, kept=False), PairData("back", 2, False, kept=False)
+        self.most = PairData("most", 0, False, kept=False)  # how far the contact alone may be pushed out in this substep [m]
         self.impulse = PairData("given", 0, lasting=True, told=True)  # pushes and impacts in the last substep [kg m]
-        self.carried = [self.manifold, self.back, self.impulse]
+        self.carried = [self.manifold, self.back, self.most, self.impulse]
 
     @staticmethod
     def _stride(outline: Outline) -> float:
@@ -115,7 +116,8 @@ class PolygonGeometry:
 
     @ti.func
     def edge(self, v, a, front, moved: ti.template()):  # type: ignore[valid-type]
-        """How far v overlaps the edge from a to the next, negative where it does not, the normal, and where on the edge.
+        """How far v overlaps the edge from a to the next, negative where it does not, the normal, where on the edge, and how far it
+        may be pushed out in this substep.
 
         What was in front at the start of the substep came in over this edge if it crossed it between its ends. What was behind
         already goes out over the nearest one that faces its own body, at push_out. moved: as in detect().
@@ -123,7 +125,7 @@ class PolygonGeometry:
         b = self.after(a)
         r, u = self.state.apart(v, a), self.state.apart(b, a)
         uu, t = u.dot(u), 0 * r[0]
-        overlap, n = t - 1, 0 * r
+        overlap, n, most = t - 1, 0 * r, ti.cast(ti.math.inf, self.real)
         if uu > 0:
             length = ti.sqrt(uu)
             t, n = r.dot(u) / uu, ti.Vector([u[1], -u[0]]) / length
@@ -161,14 +163,15 @@ class PolygonGeometry:
                     came = came and back.dot(n) >= 0
                 if not came:
                     if ti.static(moved):
-                        out = ti.min(out, self.push_out * self.h[None] - self.relative(self.state.d, v, a, b, t).dot(n))
+                        most = self.push_out * self.h[None] - self.relative(self.state.d, v, a, b, t).dot(n)
+                        out = ti.select(most > 0, out, ti.min(out, most))
                     if tips == OVER_EDGE:
                         came = True
                     elif back.dot(n) >= 0 and self.inside(r + (ti.min(ti.max(t, SLACK), 1 - SLACK) - t) * u, a):
                         came = self.nearest(v, a, shared, height, back)
                 if came:
                     overlap = out
-        return overlap, n, t
+        return overlap, n, t, most
 
     @ti.func
     def tips_cross(self, v, c):
@@ -273,7 +276,7 @@ class PolygonGeometry:
                 overlap, n, t = 0 * self.w.of(i) - 1, 0 * self.state.x[i], 0 * self.w.of(i)
                 front = self.corner(i, j)
                 if self.after(j) >= 0:
-                    overlap, n, t = self.edge(i, j, front, moved)
+                    overlap, n, t, self.most.field[e] = self.edge(i, j, front, moved)
                     if overlap > 0:
                         if self.find(i, self.after(j)) < 0:
                             overlap = -overlap  # the edge is so long that its end knows nothing of i: momentum would be lost
@@ -375,6 +378,20 @@ class PolygonGeometry:
         p_ki m_i w_i).
         """
         return split[v] * self.w.of(v) + (1 - t) * split[a] * self.w.of(a) + t * split[b] * self.w.of(b)
+
+    @ti.func
+    def to_take_back(self, split: ti.template(), at, v, a, b, t):  # type: ignore[valid-type]
+        """The overlap of the contact at entry `at` that a pass takes back, where masses are split.
+
+        What goes out at push_out does so whatever else its particles bear: p <= most / (inverse mass), not / (split mass), or
+        what a vertex bears would hold it inside for good.
+        """
+        overlap = self.manifold.field[at][0]
+        if self.manifold.field[at][1] > DISCS:
+            most = self.most.field[at]
+            if most < overlap:
+                overlap = ti.min(overlap, most * self.split_mass(split, v, a, b, t) / self.inverse_mass(v, a, b, t))
+        return overlap
 
     @ti.func
     def too_long(self, i):

@@ -271,8 +271,9 @@ class Polygons(PairContact):
                 at, v, a, b, t, part = self.dev.geometry.participants(i, e, role)
                 if at >= 0:
                     found = self.dev.geometry.manifold.field[at]
-                    overlap, n = found[0], ti.Vector([found[2], found[3]])
-                    if overlap > 0:
+                    n = ti.Vector([found[2], found[3]])
+                    if found[0] > 0:
+                        overlap = self.dev.geometry.to_take_back(self.dev.split, at, v, a, b, t)
                         d = self.dev.geometry.relative(self.dev.state.d, v, a, b, t)
                         shared = self.dev.geometry.split_mass(self.dev.split, v, a, b, t)
                         share, missing = part * self.dev.w.of(i) / shared, 0 * overlap
@@ -326,7 +327,8 @@ class Polygons(PairContact):
                     found = self.dev.geometry.manifold.field[at]
                     if found[0] > 0:
                         n, d = ti.Vector([found[2], found[3]]), self.dev.geometry.relative(self.dev.state.d, v, a, b, t)
-                        slip = self.table.held(v, a, n, found[0], self.dev.slip.field[e] + d)
+                        overlap = self.dev.geometry.to_take_back(self.dev.split, at, v, a, b, t)
+                        slip = self.table.held(v, a, n, overlap, self.dev.slip.field[e] + d)
                 self.dev.slip.field[e] = slip
 
 
