@@ -241,11 +241,13 @@ def test_overlap_is_pushed_out_and_collapse_stays_finite(world):
     assert np.isfinite(w.position).all()
 
 
-def test_nothing_stays_inside_of_what_it_bears(world):
+def test_nothing_in_a_heap_stays_inside_of_what_it_bears_or_moves_on(world):
     # Boxes of 1 kg and 0.7 to 1 m, dropped at 4 substeps, so that corners are pressed into others as they land. They go out at
     # push_out under any load: of a corner with at most 4 contacts and w = 4 / kg, which bears up to 8 boxes, F h^2 (4 w + 4 w) is
-    # left. By a push that is shared out as the mass is, corners stayed 0.1 to 0.3 m deep for good.
-    rng = np.random.default_rng(2)
+    # left. By a push that is shared out as the mass is, corners stayed 0.1 to 0.3 m deep for good. And the heap comes to rest,
+    # though some corners hardly touch what is beside them: a mass that is split by the number of its contacts, not by how deep
+    # they are, kept some at 0.03 m/s.
+    rng = np.random.default_rng(0)
     shapes = []
     for k, row in np.ndindex(4, 8):
         half = rng.uniform(0.7, 1.0) / np.sqrt(2)
@@ -257,6 +259,9 @@ def test_nothing_stays_inside_of_what_it_bears(world):
     start = w.step(1 / 60).energy
     assert max(w.step(1 / 60).energy for _ in range(300)) < start * (1 + 1e-12)
     assert w.contacts.overlap.max() < 8 * 10.0 / 240**2 * 32 / 2
+    w.substeps = 8
+    w.run(4.0)
+    assert np.abs(w.velocity).max() < 0.01
 
 
 def test_edges_that_are_too_long_keep_momentum(world):

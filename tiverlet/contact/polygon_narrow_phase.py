@@ -116,8 +116,8 @@ class PolygonGeometry:
 
     @ti.func
     def edge(self, v, a, front, moved: ti.template()):  # type: ignore[valid-type]
-        """How far v overlaps the edge from a to the next, negative where it does not, the normal, where on the edge, and how far it
-        may be pushed out in this substep.
+        """How far v overlaps the edge from a to the next, negative where it does not, the normal, where on the edge, and how far
+        it may be pushed out in this substep.
 
         What was in front at the start of the substep came in over this edge if it crossed it between its ends. What was behind
         already goes out over the nearest one that faces its own body, at push_out. moved: as in detect().
@@ -257,20 +257,17 @@ class PolygonGeometry:
 
     @ti.func
     def detect(self, i, moved: ti.template()):  # type: ignore[valid-type]
-        """Find the contacts that particle i is the vertex of, or one of two discs: at most one with each near particle; returns
-        how many there are.
+        """Find the contacts that particle i is the vertex of, or one of two discs: at most one with each near particle.
 
         moved: in a substep, by how particles moved in it, and without the overlap that is allowed. Otherwise by where they are
         and the nearest edges: before the first substep after a start, d is the velocity.
         """
-        active = 0
         for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
             j = self.list.neighbour[e]
             if self.after(i) < 0 and self.after(j) < 0:
                 overlap, n = self.discs.overlap(i, j, self.radius.of(i) + self.radius.of(j))
                 if ti.static(moved):
                     overlap -= self.allowed[ti.min(i, j)]
-                active += ti.cast(overlap > 0, ti.i32)
                 self.manifold.field[e] = ti.Vector([overlap, ti.cast(DISCS, self.real), n[0], n[1]])
             else:
                 overlap, n, t = 0 * self.w.of(i) - 1, 0 * self.state.x[i], 0 * self.w.of(i)
@@ -291,11 +288,9 @@ class PolygonGeometry:
                         t = 0 * t + DISCS
                         if self.corner(j, i) <= 0:
                             overlap = -overlap
-                active += ti.cast(overlap > 0, ti.i32)
                 self.manifold.field[e] = ti.Vector([overlap, t, n[0], n[1]])
                 if self.after(i) >= 0:
                     self.back.field[e] = ti.cast(ti.Vector([self.find(j, i), self.find(j, self.before(i))]), self.real)
-        return active
 
     @ti.func
     def keeps(self, i, j):
@@ -372,26 +367,30 @@ class PolygonGeometry:
 
     @ti.func
     def split_mass(self, split: ti.template(), v, a, b, t):  # type: ignore[valid-type]
-        """The same where masses are split, each among the contacts of its particle by what part it has in them.
-
-        With parts p_ki of contact k and m_i = sum_k p_ki, (sum_k p_ki y_k)^2 <= m_i sum_k p_ki y_k^2: so J w J^T <= diag(sum_i
-        p_ki m_i w_i).
-        """
+        """The same where the masses of particles are split."""
         return split[v] * self.w.of(v) + (1 - t) * split[a] * self.w.of(a) + t * split[b] * self.w.of(b)
 
     @ti.func
-    def to_take_back(self, split: ti.template(), at, v, a, b, t):  # type: ignore[valid-type]
-        """The overlap of the contact at entry `at` that a pass takes back, where masses are split.
-
-        What goes out at push_out does so whatever else its particles bear: p <= most / (inverse mass), not / (split mass), or
-        what a vertex bears would hold it inside for good.
-        """
-        overlap = self.manifold.field[at][0]
+    def depth(self, at):
+        """How deep the contact at entry `at` is, or how far it may be pushed out in this substep, if that is less."""
+        depth = self.manifold.field[at][0]
         if self.manifold.field[at][1] > DISCS:
-            most = self.most.field[at]
-            if most < overlap:
-                overlap = ti.min(overlap, most * self.split_mass(split, v, a, b, t) / self.inverse_mass(v, a, b, t))
-        return overlap
+            depth = ti.min(depth, self.most.field[at])
+        return depth
+
+    @ti.func
+    def share(self, depths: ti.template(), at, v, a, b, t):  # type: ignore[valid-type]
+        """Of the contact at entry `at`: the overlap that a pass takes back, and the inverse mass by which that is split.
+
+        depths: S_i = sum_k p_ki C_k of the contacts k of particle i, of which it has the parts p_ki: 1, 1 - t or t. (sum_k p_ki
+        y_k)^2 <= S_i sum_k p_ki y_k^2 / C_k, so J w J^T <= diag(sum_i p_ki w_i S_i / C_k). What goes out at push_out does so
+        whatever else its particles bear, p <= most / (inverse mass alone): else a load could hold it inside for good.
+        """
+        overlap, shared = self.manifold.field[at][0], self.split_mass(depths, v, a, b, t) / self.depth(at)
+        if self.manifold.field[at][1] > DISCS:
+            if self.most.field[at] < overlap:
+                overlap = ti.min(overlap, self.most.field[at] * shared / self.inverse_mass(v, a, b, t))
+        return overlap, shared
 
     @ti.func
     def too_long(self, i):

@@ -34,10 +34,12 @@ class Polygons(PairContact):
     a body together is up to others (Distance, Area, ShapeMatch); it may bend, and stretch by a quarter. friction, restitution: as
     in Contact, and so are all particles that are in no loop. push_out: about the speed at which bodies that overlap part [m/s].
 
-    A Jacobi pass: each contact wants C back, split by mass, p = -C / (m_v w_v + (1 - t) m_a w_a + t m_b w_b), where m_i sums up
-    the parts, 1, 1 - t or t, that particle i has in its contacts. By Cauchy's inequality no eigenvalue of a pass exceeds 1, and m
-    changes no faster than contacts slide. That conserves momentum, and angular momentum but for the slip within a substep;
-    friction at a radius is a torque that nothing takes up. Corners that face each other touch as discs, by their radii. A vertex
+    A Jacobi pass: each contact wants C back, split by mass, p = -C / (m_v w_v + (1 - t) m_a w_a + t m_b w_b), with m_i = S_i / -C
+    and S_i the depths of all contacts of particle i, each times the part, 1, 1 - t or t, that i has in it. By Cauchy's inequality
+    no eigenvalue of a pass exceeds 1. A contact that is hardly deep takes hardly a part of the mass: by the number of contacts,
+    one that opens and closes would change how stiff those beside it are, and heaps would never rest. That conserves momentum, and
+    angular momentum but for the slip within a substep; friction at a radius is a torque that nothing takes up. Corners that face
+    each other touch as discs, by their radii. A vertex
     that is inside of another body goes out through the edge over which it came, or the nearest that faces its own body, if it is
     not deeper than half the length of that edge: in a substep nothing should get there, and the step flags "tunnelling-risk"
     where it might. Particles that start deeper are refused.
@@ -164,7 +166,7 @@ class Polygons(PairContact):
         dev.forces = ForceShare(scene, sums=True, lasting=False)
         dev.geometry = PolygonGeometry(scene, dev.outline, self.push_out)
         dev.move = add("Contact.move", n, width=2)
-        dev.split = add("Contact.split", n)  # how often the mass of each particle is split, see split_mass()
+        dev.depths = add("Contact.depths", n)  # of the contacts of each particle, see PolygonGeometry.share()
         dev.fast = add("Contact.fast", None, kind=ti.i32)
         self.table.bind(scene, asked=True)
         dev.slip = PairData("slip", 2, lasting=True)
@@ -201,11 +203,9 @@ class Polygons(PairContact):
                             self.dev.restitution.aim.field[e] = 0 * self.dev.restitution.aim.field[e]
             self.note_motion(0, self.dev.geometry.too_long(i))
         if ti.static(not self.dev.state.sleepers):
-            self.dev.split[i] = self.dev.geometry.detect(i, True)
+            self.dev.geometry.detect(i, True)
         elif self.dev.state.awake(i) or self.is_near(i):
-            contacts = self.dev.geometry.detect(i, True)
-            if self.dev.state.awake(i):
-                self.dev.split[i] = contacts
+            self.dev.geometry.detect(i, True)
         else:
             self.dev.geometry.forget(i)
 
@@ -248,17 +248,21 @@ class Polygons(PairContact):
 
     @ti.func
     def count(self, begin, end, now):
-        """How often the masses of some particles are split. What is in no loop knows it from detect()."""
+        """How deep the contacts of some particles are, all together; and how many, for those that bounce."""
         for i in range(begin, end):
-            if self.dev.geometry.after(i) >= 0 and self.dev.state.awake(i):
-                parts = 0 * self.dev.w.of(i)
+            if self.dev.state.awake(i):
+                depths, parts = 0 * self.dev.w.of(i), 0 * self.dev.w.of(i)
                 for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):
-                    for role in range(3):
+                    for role in range(self.dev.geometry.roles(i)):
                         at, _, _, _, _, part = self.dev.geometry.participants(i, e, role)
                         if at >= 0:
                             if self.dev.geometry.manifold.field[at][0] > 0:
+                                depths += abs(part) * self.dev.geometry.depth(at)
                                 parts += abs(part)
-                self.dev.split[i] = parts
+                self.dev.depths[i] = depths
+                if ti.static(self.dev.has_restitution):
+                    if now.first != 0:
+                        self.dev.restitution.split[i] = parts
 
     @ti.func
     def relax(self, i, now):
@@ -266,16 +270,15 @@ class Polygons(PairContact):
         first, final = now.first, now.final
         total, lifts, forced = 0 * self.dev.state.x[i], 0 * self.dev.state.x[i], 0 * self.dev.state.x[i]
         begin, roles = self.dev.list.first[i], self.dev.geometry.roles(i)
-        for e in range(begin, begin + ti.select(self.dev.split[i] > 0, self.dev.list.number[i], 0)):
+        for e in range(begin, begin + ti.select(self.dev.depths[i] > 0, self.dev.list.number[i], 0)):
             for role in range(roles):
                 at, v, a, b, t, part = self.dev.geometry.participants(i, e, role)
                 if at >= 0:
                     found = self.dev.geometry.manifold.field[at]
                     n = ti.Vector([found[2], found[3]])
                     if found[0] > 0:
-                        overlap = self.dev.geometry.to_take_back(self.dev.split, at, v, a, b, t)
+                        overlap, shared = self.dev.geometry.share(self.dev.depths, at, v, a, b, t)
                         d = self.dev.geometry.relative(self.dev.state.d, v, a, b, t)
-                        shared = self.dev.geometry.split_mass(self.dev.split, v, a, b, t)
                         share, missing = part * self.dev.w.of(i) / shared, 0 * overlap
                         back = overlap  # what is taken back of the position and of the displacement
                         if ti.static(self.dev.has_restitution):
@@ -304,13 +307,12 @@ class Polygons(PairContact):
         if ti.static(self.dev.has_restitution):
             if first != 0:
                 self.dev.restitution.lift[i] = lifts
-                self.dev.restitution.split[i] = self.dev.split[i]
 
     @ti.func
     def apply_corrections(self, i, first):
         """Move particle i as its contacts want; what bounced goes where it is at the end of the substep."""
         if self.dev.state.moves(i):
-            if self.dev.split[i] > 0:
+            if self.dev.depths[i] > 0:
                 self.dev.state.shift(i, self.dev.move[i])
             if ti.static(self.dev.has_restitution):
                 if first != 0:
@@ -327,7 +329,7 @@ class Polygons(PairContact):
                     found = self.dev.geometry.manifold.field[at]
                     if found[0] > 0:
                         n, d = ti.Vector([found[2], found[3]]), self.dev.geometry.relative(self.dev.state.d, v, a, b, t)
-                        overlap = self.dev.geometry.to_take_back(self.dev.split, at, v, a, b, t)
+                        overlap, _ = self.dev.geometry.share(self.dev.depths, at, v, a, b, t)
                         slip = self.table.held(v, a, n, overlap, self.dev.slip.field[e] + d)
                 self.dev.slip.field[e] = slip
 
@@ -338,7 +340,7 @@ class PolygonRestitution:
     def __init__(self, scene: Scene, geometry: PolygonGeometry, table: Table):
         n, add = scene.count, scene.memory.field
         self.geometry, self.table, self.state = geometry, table, scene.state
-        self.split = add("Contact.struck", n)  # as it was in the first pass
+        self.split = add("Contact.struck", n)  # how often the mass of each particle is split: its parts in all contacts
         self.d_change = add("Contact.d_change", n, width=2)
         self.lift = add("Contact.lift", n, width=2)  # moves the position alone
         self.hit = add("Contact.hit", None, kind=ti.i32)
