@@ -18,7 +18,7 @@ class Row:
     bilateral: holds on both sides, so that it is second order.
     largest: [m] what f32 holds.
     like: the row that shows for this one that batches can be divided and worlds be cloned, because the same code does it with
-    the same fields: those of Scalar for all that have a fixed number of corners, those of Outline for loops and surfaces.
+    the same fields: those of CornerPasses for a fixed number of corners, those of OutlinePasses for loops and surfaces.
     """
 
     make: Callable

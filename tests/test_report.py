@@ -200,7 +200,7 @@ def test_commands(capsys):
 PLANTS = {
     "the gradient at the predicted position": (
         "error_vs_time('D01', methods=['Jacobi'], precisions=('f64',), efforts=(20, 40, 80), baselines=False, runs=1)",
-        [("constraints/core/scalar.py", "f0, n = self.measure(c, start)", "f0, n = self.measure(c, now)")],
+        [("constraints/core/corner_passes.py", "n = self.quantity.measure(c, start)", "n = self.quantity.measure(c, now)")],
     ),
     "averaging by the count of constraints": (
         "error_vs_time('M01', precisions=('f64',), efforts=(20,), baselines=False, runs=1)",

@@ -10,9 +10,47 @@ from .. import checks
 from ..device import ti
 from ..features.feature import Knob, Scene
 from ..particles import Particles
-from .core.angle import TURN, PathAngle, turned, wrapped
+from .core.angle import TURN, Angle, faint, path_angle, path_angles, shorter_leg, turned, wrapped
 from .core.quantity import differences
 from .core.scalar import Scalar
+
+
+class AngleFromMiddle(Angle):
+    """On the device, how far the angle of a path is from the middle of its range; on the host the angle itself, since the middle
+    is a knob's."""
+
+    arity, centred = 3, True
+    exchangeable = ((0, 2),)
+    middle: Any
+
+    def values(self, x: np.ndarray) -> np.ndarray:
+        """The angles of paths."""
+        return path_angles(x[:, 0], x[:, 1], x[:, 2])
+
+    def bind(self, scene: Scene, batch: Any, equation: Any) -> "AngleFromMiddle":
+        """With the middle of each range."""
+        bound = super().bind(scene, batch, equation)
+        bound.middle = scene.memory.field("AngleLimit.middle", batch.count, values=batch.middle)
+        return bound
+
+    @ti.func
+    def reach(self, q):
+        """The shorter of the two legs."""
+        return shorter_leg(q)
+
+    @ti.func
+    def unwrap(self, f, other):
+        """A distance from the middle has one value."""
+        return f
+
+    @ti.func
+    def measure(self, c, q):
+        """|angle - middle|, and its gradients: those of the angle, with the sign of the side on which it is."""
+        f, g = path_angle(q, 0 * q[0, :], False, faint(self.state, self.real))
+        middle = self.middle[c]
+        f = wrapped(f, middle) - middle
+        side = ti.select(f < 0, ti.cast(-1, self.real), ti.cast(1, self.real))
+        return side * f, side * g
 
 
 class AngleLimit(Scalar):
@@ -31,8 +69,9 @@ class AngleLimit(Scalar):
     `load` is the moment at either stop [N m].
     """
 
-    measures = PathAngle
+    measures = AngleFromMiddle
     bulk = 3.0
+    uploads_all = False  # limits are checked against each other, of one
     index_name = "triples"
     each = ("lower", "upper", "compliance", "damping", "break_at")
     side = 1
@@ -80,35 +119,12 @@ class AngleLimit(Scalar):
 
     def tracks(self) -> list[tuple[Any, np.ndarray, Callable]]:
         """Half of the range, and its middle."""
-        return [(self.dev.rest, self.rest, np.subtract), (self.dev.middle, self.middle, self.quantity.difference)]
+        return [
+            (self.dev.equation.rest, self.rest, np.subtract),
+            (self.dev.quantity.middle, self.middle, self.quantity.difference),
+        ]
 
     def violation(self, position: np.ndarray) -> np.ndarray:
         """C at the given positions."""
         half, middle = self.ramp.now() if self.ramp and self.ramp.under_way else (self.rest, self.middle)
         return np.abs(turned(super().values(self.placed(position)) - middle)) - half
-
-    def bind(self, scene: Scene) -> None:
-        """The middle of each range."""
-        self.dev.middle = scene.memory.field("AngleLimit.middle", self.count, values=self.middle)
-        super().bind(scene)
-
-    uploads_all = False  # limits are checked against each other, of one
-
-    @ti.func
-    def step_of_rest(self, c):
-        """None: the angle is counted from the middle, which moves, too."""
-        return ti.cast(0, self.dev.real)
-
-    @ti.func
-    def unwrap(self, f, other):
-        """A distance from the middle has one value."""
-        return f
-
-    @ti.func
-    def measure(self, c, q):
-        """See the class."""
-        f, g = self.dev.quantity.measure(q)
-        middle = self.dev.middle[c]
-        f = wrapped(f, middle) - middle
-        side = ti.select(f < 0, ti.cast(-1, self.dev.real), ti.cast(1, self.dev.real))
-        return side * f, side * g

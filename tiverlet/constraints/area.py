@@ -11,7 +11,7 @@ from ..features.feature import Knob, Scene
 from ..geometry.intervals import cross
 from ..particles import Particles
 from .core.members import FixedSize, VariableSize, rows
-from .core.outline import PRESSURE
+from .core.outline_passes import PRESSURE
 from .core.quantity import Quantity
 from .core.scalar import Scalar
 
@@ -30,7 +30,7 @@ class Area(Scalar):
     compliance: number or (m,) [m^3/N], inverse of what pressure (N/m in 2D) each m^2 of missing area makes; 0 is rigid.
     damping: number or (m,) [N s/m^3], of a dashpot beside the spring. break_at: load at which it bursts, number or (m,) [N/m].
 
-    `load` is the tension that keeps the area [N/m]; -load is the pressure inside. Second order in h, see Scalar. Raises
+    `load` is the tension that keeps the area [N/m]; -load is the pressure inside. Second order in h, see Equation. Raises
     ValueError for loops of fewer than 3 or repeated particles, and for longer ones in 3D, where they enclose no area.
     """
 
@@ -96,7 +96,7 @@ class Triangles(Quantity):
         return q.norm()
 
     @ti.func
-    def measure(self, q):
+    def measure(self, c, q):
         """Area, and its gradients."""
         a, b = q[1, :], q[2, :]
         f = 0 * a[0]
@@ -161,9 +161,9 @@ class Loops(Quantity):
         indices = self.members.indices
         return np.stack([indices, indices[self.after]], axis=1)
 
-    def bind(self, scene: Scene, batch: Any) -> "Loops":
+    def bind(self, scene: Scene, batch: Any, equation: Any) -> "Loops":
         """Its gradients, on the device."""
-        bound, sides = super().bind(scene, batch), self.neighbours
+        bound, sides = super().bind(scene, batch, equation), self.neighbours
         bound.sides = scene.memory.field("Area.sides", len(sides), width=2, kind=ti.i32, values=sides)
         return bound
 

@@ -2,9 +2,8 @@
 
 from numpy.typing import ArrayLike
 
-from ..device import ti
-from ..features.feature import Scene
-from .core.angle import REST_ANGLE, PathAngle, path_angle
+from .core.angle import REST_ANGLE
+from .core.bend_angle import BendAngle
 from .core.scalar import Scalar
 
 
@@ -25,57 +24,9 @@ class Bend(Scalar):
     the compliance 30 h^2 / (m l^2), however rigid it was meant to be.
     """
 
-    measures = PathAngle
+    measures = BendAngle
     index_name = "triples"
     rest = REST_ANGLE
 
     def __init__(self, triples, rest=None, *, compliance: ArrayLike = 0.0, damping: ArrayLike = 0.0, break_at=None):
         self.setup(triples, rest, compliance, damping, break_at)
-
-    def bind(self, scene: Scene) -> None:
-        """In 3D, the normals as they were last."""
-        super().bind(scene)
-        if scene.state.dim == 3:
-            self.dev.axis = scene.memory.field(f"{self!r}.axis", self.count, width=3, state=True)
-
-    @ti.func
-    def measure(self, c, q):
-        """See path_angle(); in 3D, about the axis that is remembered."""
-        axis = 0 * q[0, :]
-        if ti.static(self.dev.state.dim == 3):
-            axis = self.dev.axis[c]
-        return path_angle(q, axis, self.mirrored(c), self.dev.quantity.faint())
-
-    @ti.func
-    def mirrored(self, c):
-        """Whether the angle is seen from the side of its axis: where straight is the rest shape."""
-        return self.dev.rest[c] == 0
-
-    @ti.func
-    def direction_reliable(self, f, f0):
-        """In 3D, the plane of a nearly straight path turns at the least motion."""
-        out = True
-        if ti.static(self.dev.state.dim == 3):
-            out = ti.max(ti.abs(f), ti.abs(f0)) > 0.1
-        return out
-
-    @ti.func
-    def start_substep(self, c, fresh):
-        """Remember the normal, that of the end where the start is straight, and from which side it is seen."""
-        if ti.static(self.dev.state.dim == 3):
-            if fresh != 0:
-                self.dev.axis[c] = ti.Vector.zero(self.dev.real, 3)
-            e = crossed(self.corners(c, 1))
-            if e.norm() < 10 * self.dev.quantity.faint():
-                e = crossed(self.corners(c, 0))
-            if e.norm() > 10 * self.dev.quantity.faint():
-                side = ti.cast(1, self.dev.real)
-                if self.mirrored(c) and self.dev.axis[c].dot(e) < 0:
-                    side = -side
-                self.dev.axis[c] = side * e / e.norm()
-
-
-@ti.func
-def crossed(q):
-    """u x v of a path in 3D."""
-    return (q[1, :] - q[0, :]).normalized(1e-30).cross((q[2, :] - q[1, :]).normalized(1e-30))

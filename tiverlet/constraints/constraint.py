@@ -20,11 +20,70 @@ WRONG = 1e-4  # relative difference between a gradient and differences of the fu
 
 
 class Function(Quantity):
-    """f that the user gives, of any corners, in the unit that is given: their Constraint measures it."""
+    """f that the user gives, in the unit that is given. derivative: it and its gradients. origin: what corners are relative to,
+    in two words, so that in f32 too it is where it was put; None for the first corner. size: of what it acts on [m]. All but the
+    unit are known once there are particles."""
 
-    def __init__(self, members: Any, unit: float | None):
+    size: Any  # on the device
+
+    def __init__(self, members: Any, unit: float | None, derivative: Any = None, origin: Any = None, size: float = 0.0):
         super().__init__(members)
-        self.unit = unit
+        self.unit, self.derivative, self.origin = unit, derivative, origin
+        self._size = size
+
+    def bind(self, scene: Scene, batch: Any, equation: Any) -> "Function":
+        """With the step of differences."""
+        bound = super().bind(scene, batch, equation)
+        bound.size = scene.memory.number(self._size, ti.f64)
+        return bound
+
+    def frame(self, corners: Any) -> "Frame":
+        """Corners relative to the origin, or to the first."""
+        return Frame(corners, self.origin)
+
+    @ti.func
+    def measure(self, c, q):
+        """The function and its gradient; nothing where they are not finite."""
+        f, g = self.derivative.both(c, ti.cast(q, ti.f64), self.size.now)
+        total = f
+        for k, a in ti.static(ti.ndrange(self.corners.arity, self.state.dim)):
+            total += g[k, a] * g[k, a]
+        good = not (ti.math.isnan(total) or ti.math.isinf(total))
+        n = ti.Matrix.zero(self.real, self.corners.arity, self.state.dim)
+        for k, a in ti.static(ti.ndrange(self.corners.arity, self.state.dim)):
+            n[k, a] = ti.select(good, ti.cast(g[k, a], self.real), 0)
+        return ti.select(good, ti.cast(f, self.real), 0), n
+
+
+class Frame:
+    """The corners of constraints relative to an origin, in two words, or to the first where that is None."""
+
+    def __init__(self, corners: Any, origin: Any):
+        self.corners, self.state, self.real, self.arity, self.origin = corners, corners.state, corners.real, corners.arity, origin
+
+    @ti.func
+    def apart(self, c, back):
+        """At x - back d."""
+        q = ti.Matrix.zero(self.real, self.arity, self.state.dim)
+        for k in ti.static(range(self.arity)):
+            i = self.corners.member(c, k)
+            r = -back * self.state.d[i]
+            if ti.static(bool(self.origin)):
+                for a in ti.static(range(self.state.dim)):
+                    r[a] += (self.state.x[i][a] - ti.static(self.origin[0][a])) - ti.static(self.origin[1][a])
+                if ti.static(self.state.compensated):
+                    r += self.state.low[i]
+            else:
+                j = self.corners.member(c, 0)
+                r += self.state.apart(i, j) + back * self.state.d[j]
+            for a in ti.static(range(self.state.dim)):
+                q[k, a] = r[a]
+        return q
+
+    @ti.func
+    def now_and_start(self, c):
+        """Now and at the start of the substep."""
+        return self.apart(c, 0), self.apart(c, 1)
 
 
 class Constraint(Scalar):
@@ -105,22 +164,23 @@ class Constraint(Scalar):
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the indices and the gradient, and settle the rest values."""
         checks.indices(repr(self), self.index_name, self.indices, particles.count, arity=self.arity)
+        words = None
         if self.origin is not None or self.arity == 1:
             origin = np.zeros(particles.dim) if self.origin is None else self.origin
             origin = checks.vector(repr(self), "origin", origin, particles.dim)
             self._keep(origin=origin)
-            high = origin.astype(np.float32).astype(np.float64)  # two words: in f32 too, the origin is where it was put
-            self.dev.origin = [high.tolist(), (origin - high).tolist()]
+            high = origin.astype(np.float32).astype(np.float64)
+            words = [high.tolist(), (origin - high).tolist()]
         mine = self.indices.ravel()  # others, wherever they are, change no bit
         extent = float(np.ptp(particles.position[mine], axis=0).max()) if len(mine) else 0.0
         self._keep(_size=extent or float(particles.radius[mine].max(initial=0.0)) or 1.0)
         self._keep(_known=(None, None, None))
-        self.dev.fixed = int(self.origin is None)
-        self.dev.gradient = NumericGradient(self.function, self.gradient, self.arity, particles.dim, self.dev.fixed)
+        self._derivative = NumericGradient(self.function, self.gradient, self.arity, particles.dim, int(self.origin is None))
+        self.hold(Function(self.members, self._unit, self._derivative, words, self._size))
         Scalar.prepare(self, particles, inv_mass)
         values, slopes = np.zeros(0), np.zeros((0, self.arity, particles.dim))
         if self.count:
-            values, slopes, _ = self.dev.gradient(self._corners(particles.position), self._size)
+            values, slopes, _ = self._derivative(self._corners(particles.position), self._size)
         self._keep(_known=(particles.position, values, slopes))
         if not np.isfinite(values).all():
             i = int(np.argmin(np.isfinite(values)))
@@ -128,18 +188,13 @@ class Constraint(Scalar):
         if self.gradient is not None and self.count:
             self._check_gradient(particles.position)
 
-    def bind(self, scene: Scene) -> None:
-        """The step of differences, too."""
-        super().bind(scene)
-        self.dev.size = scene.memory.number(self._size, ti.f64)
-
     def _check_gradient(self, position: np.ndarray) -> None:
         """Compare with differences at the initial positions and near by; two of four must agree, since there may be kinks."""
         wrong, found = np.zeros((self.count, self.arity, position.shape[1]), dtype=int), []
         for k in range(4):
             q = self._corners(position)
             q = q + k * 0.01 * self._size * (golden(np.arange(1, q.size + 1) + 1000 * k).reshape(q.shape) - 0.5)
-            _, given, differences = self.dev.gradient(q, self._size)
+            _, given, differences = self._derivative(q, self._size)
             size = np.abs(differences).max(axis=(1, 2), keepdims=True)
             off = ~(np.abs(given - differences) <= WRONG * size + 1e-9 * np.abs(given))
             wrong += off & np.isfinite(differences)
@@ -162,7 +217,7 @@ class Constraint(Scalar):
         known, values, _ = self._known
         if position is known:  # while the world's fields are being declared, Taichi cannot launch kernels
             return values
-        return self.dev.gradient(self._corners(position), self._size)[0] if self.count else np.zeros(0)
+        return self._derivative(self._corners(position), self._size)[0] if self.count else np.zeros(0)
 
     def gradients(self, position: np.ndarray) -> np.ndarray:
         """The gradients of function."""
@@ -171,41 +226,4 @@ class Constraint(Scalar):
             return slopes
         if not self.count:
             return np.zeros((0, self.arity, position.shape[1]))
-        return self.dev.gradient(self._corners(position), self._size)[1]
-
-    @ti.func
-    def corners(self, c, back):
-        """Corners at x - back d, relative to the origin or to the first."""
-        q = ti.Matrix.zero(self.dev.real, self.arity, self.dev.state.dim)
-        for k in ti.static(range(self.arity)):
-            i = self.member(c, k)
-            r = -back * self.dev.state.d[i]
-            if ti.static(self.dev.fixed == 0):
-                for a in ti.static(range(self.dev.state.dim)):
-                    r[a] += (self.dev.state.x[i][a] - ti.static(self.dev.origin[0][a])) - ti.static(self.dev.origin[1][a])
-                if ti.static(self.dev.state.compensated):
-                    r += self.dev.state.low[i]
-            else:
-                j = self.member(c, 0)
-                r += self.dev.state.apart(i, j) + back * self.dev.state.d[j]
-            for a in ti.static(range(self.dev.state.dim)):
-                q[k, a] = r[a]
-        return q
-
-    @ti.func
-    def corners_now_and_start(self, c):
-        """Corners now and at the start."""
-        return self.corners(c, 0), self.corners(c, 1)
-
-    @ti.func
-    def measure(self, c, q):
-        """The function and its gradient; nothing where they are not finite."""
-        f, g = self.dev.gradient.both(c, ti.cast(q, ti.f64), self.dev.size.now)
-        total = f
-        for k, a in ti.static(ti.ndrange(self.arity, self.dev.state.dim)):
-            total += g[k, a] * g[k, a]
-        good = not (ti.math.isnan(total) or ti.math.isinf(total))
-        n = ti.Matrix.zero(self.dev.real, self.arity, self.dev.state.dim)
-        for k, a in ti.static(ti.ndrange(self.arity, self.dev.state.dim)):
-            n[k, a] = ti.select(good, ti.cast(g[k, a], self.dev.real), 0)
-        return ti.select(good, ti.cast(f, self.dev.real), 0), n
+        return self._derivative(self._corners(position), self._size)[1]

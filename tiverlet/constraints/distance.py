@@ -18,7 +18,7 @@ class Distance(Scalar):
     break_at: load beyond which a link breaks, pulled or pushed, number or (m,) [N]; None for never. It acts no more from the next
     substep on; see world.broken and .broken.
 
-    Second order in h, without artificial damping, for every compliance (see Scalar). `load` is the tension of each link [N].
+    Second order in h, without artificial damping, for every compliance (see Equation). `load` is the tension of each link [N].
     """
 
     measures = Length

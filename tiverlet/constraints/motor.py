@@ -89,15 +89,10 @@ class Motor(Scalar):
             checks.per_item("Motor", "angle (of triples in 3D)", self.angle, self.count, least=0.0, most=np.pi)
         self._begin = self.rest_of(particles.position)
 
-    def bind(self, scene: Scene) -> None:
-        """Whether angles end at 0 and pi."""
-        self.dev.ends = scene.state.dim == 3 and self.arity == 3
-        super().bind(scene)
-
     def drive_of(self, scene: Scene) -> Drive:
         """Towards the angle, or on and on."""
-        largest = self.torque if self.capped else None
-        endless, period = not (self.serves or self.dev.ends), 0.0 if self.dev.ends else TURN
+        largest, ends = self.torque if self.capped else None, scene.state.dim == 3 and self.arity == 3  # at 0 and pi
+        endless, period = not (self.serves or ends), 0.0 if ends else TURN
         return Drive(scene, "Motor", self._begin, *self.course(), largest, endless, period, SETTLE * self.serves)
 
     def course(self) -> tuple[Any, Any]:

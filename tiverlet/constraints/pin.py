@@ -9,6 +9,7 @@ from .. import checks
 from ..device import ti
 from ..features.feature import Knob, Scene
 from ..particles import Particles, in_range
+from .core.anchor_passes import AnchorPasses, Place
 from .core.anchored import Anchored, one_each
 
 
@@ -33,6 +34,47 @@ def _indices(pin: "Pin", indices) -> np.ndarray:
         pin._grabs = members.rows.tobytes() != pin.members.rows.tobytes()
     pin._keep(members=members)
     return members.indices
+
+
+class Target(Place):
+    """A place for each particle, to which it goes in the course of a frame. here: where it is at first, (m, dim)."""
+
+    def __init__(self, scene: Scene, passes: AnchorPasses, here: np.ndarray):
+        add, (m, dim) = scene.memory.field, here.shape
+        self.name, self.state, self.corners = passes.name, scene.state, passes.corners
+        self.source = add("Pin.from", m, width=dim, values=here, state=True)
+        self.target = add("Pin.to", m, width=dim, values=here, state=True)
+        self.in_state = {"source": self.source, "target": self.target}
+
+    @ti.func
+    def aim(self, c, frame_fraction):
+        """The target at the fraction `when` of the frame."""
+        return self.source[c] * (1 - frame_fraction) + self.target[c] * frame_fraction
+
+    @ti.func
+    def drive(self, c, h, frame_fraction):
+        """Put the particle on the target."""
+        i = self.corners.member(c, 0)
+        d = self.aim(c, frame_fraction) - self.state.place(i)
+        self.state.d[i] = d
+        self.state.advance(i, d)
+
+    @ti.func
+    def offsets(self, c, frame_fraction, first, fresh):
+        """x - target."""
+        x = self.state.place(self.corners.member(c, 0))
+        return x - self.aim(c, frame_fraction[1]), x - self.state.d[self.corners.member(c, 0)] - self.aim(c, frame_fraction[0])
+
+    @ti.func
+    def offset_now(self, c, back):
+        """x - target at the end of the frame, where it is at rest."""
+        i = self.corners.member(c, 0)
+        return self.state.place(i) - back * self.state.d[i] - self.target[c]
+
+    @ti.func
+    def offset_change(self, c):
+        """The motion of the particle."""
+        return self.state.d[self.corners.member(c, 0)]
 
 
 class Pin(Anchored):
@@ -108,9 +150,9 @@ class Pin(Anchored):
             memory.write(self.dev.lam, np.zeros_like(here))
             self.dev.spring.begin(self.compliance, self.damping)
             self.dev.size.set(self.start.size)
-        memory.write(self.dev.members, self.indices)
-        memory.write(self.dev.source, here)
-        memory.write(self.dev.target, here)
+        memory.write(self.dev.corners.members, self.indices)
+        memory.write(self.dev.place.source, here)
+        memory.write(self.dev.place.target, here)
 
     def select(self, some: np.ndarray, number: np.ndarray) -> None:
         """Keep some, by their new numbers."""
@@ -131,13 +173,14 @@ class Pin(Anchored):
         if self.drives:
             inv_mass[rows] = 0.0
 
-    def bind(self, scene: Scene) -> None:
+    def place_of(self, scene: Scene, passes: AnchorPasses) -> "Target":
         """Targets at the start and the end of a frame."""
+        return Target(scene, passes, self._anchors)
+
+    def bind(self, scene: Scene) -> None:
+        """What it drives goes there from where it is."""
         super().bind(scene)
-        here = self._anchors
         self.changed = self.drives
-        self.dev.source = scene.memory.field("Pin.from", self.count, width=self.dim, values=here, state=True)
-        self.dev.target = scene.memory.field("Pin.to", self.count, width=self.dim, values=here, state=True)
 
     @property
     def _anchors(self) -> np.ndarray:
@@ -148,35 +191,10 @@ class Pin(Anchored):
         """Aim at the new target."""
         super().upload()
         if self.acts:
-            self.scene.memory.write(self.dev.target, self.target)
+            self.scene.memory.write(self.dev.place.target, self.target)
             self.moving = True
 
     def end_motion(self) -> None:
         """The next frame starts from the target."""
         if self.acts:
-            self.scene.memory.write(self.dev.source, self.scene.memory.read(self.dev.target))
-
-    @ti.func
-    def aim(self, c, frame_fraction):
-        """The target at the fraction `when` of the frame."""
-        return self.dev.source[c] * (1 - frame_fraction) + self.dev.target[c] * frame_fraction
-
-    @ti.func
-    def drive(self, c, h, frame_fraction):
-        """Put the particle on the target."""
-        i = self.member(c, 0)
-        d = self.aim(c, frame_fraction) - self.dev.state.place(i)
-        self.dev.state.d[i] = d
-        self.dev.state.advance(i, d)
-
-    @ti.func
-    def offsets(self, c, frame_fraction, first, fresh):
-        """x - target."""
-        x = self.dev.state.place(self.member(c, 0))
-        return x - self.aim(c, frame_fraction[1]), x - self.dev.state.d[self.member(c, 0)] - self.aim(c, frame_fraction[0])
-
-    @ti.func
-    def offset_now(self, c, back):
-        """x - target at the end of the frame, where it is at rest."""
-        i = self.member(c, 0)
-        return self.dev.state.place(i) - back * self.dev.state.d[i] - self.dev.target[c]
+            self.scene.memory.write(self.dev.place.source, self.scene.memory.read(self.dev.place.target))

@@ -7,7 +7,61 @@ from .. import checks
 from ..device import ti
 from ..features.feature import Scene
 from ..particles import Particles
+from .core.anchor_passes import AnchorPasses, Place
 from .core.anchored import Anchored
+
+
+class Nodes(Place):
+    """The node of a grid for each particle. grid: where one node is, and how far they are apart, 0 along axes that are free.
+    node: of each particle at first, (m, dim)."""
+
+    def __init__(self, scene: Scene, passes: AnchorPasses, grid: list[np.ndarray], node: np.ndarray):
+        add, (m, dim) = scene.memory.field, node.shape
+        self.name, self.state, self.corners, self.spring = passes.name, scene.state, passes.corners, passes.spring
+        self.grid = add("Snap.grid", 2, width=dim, values=grid)
+        self.node = add("Snap.node", m, width=dim, values=node, state=True)
+        self.in_state = {"node": self.node}
+
+    @ti.func
+    def nearest(self, x):
+        """The node nearest to x; x itself along axes that are free."""
+        node = x
+        for k in ti.static(range(self.state.dim)):
+            step, zero = self.grid[1][k], self.grid[0][k]
+            if step > 0:
+                node[k] = zero + ti.floor((x[k] - zero) / step + 0.5) * step
+        return node
+
+    @ti.func
+    def offsets(self, c, frame_fraction, first, fresh):
+        """x - node; what is remembered of the substep before is put in terms of the same node."""
+        i = self.corners.member(c, 0)
+        x, start = self.state.place(i), self.state.place(i) - self.state.d[i]
+        if first != 0:
+            node = self.nearest(start)
+            self.spring.last[c] = self.spring.last[c] + (self.node[c] - node)
+            for k in ti.static(range(self.state.dim)):
+                if self.grid[1][k] == 0:
+                    self.spring.last[c][k] = 0
+            self.node[c] = node
+        node = self.node[c]
+        C = x - node
+        for k in ti.static(range(self.state.dim)):
+            if self.grid[1][k] == 0:
+                C[k] = 0
+        return C, start - node
+
+    @ti.func
+    def offset_now(self, c, back):
+        """x - node."""
+        i = self.corners.member(c, 0)
+        x = self.state.place(i) - back * self.state.d[i]
+        return x - self.nearest(x)
+
+    @ti.func
+    def offset_change(self, c):
+        """The motion of the particle."""
+        return self.state.d[self.corners.member(c, 0)]
 
 
 class Snap(Anchored):
@@ -52,47 +106,13 @@ class Snap(Anchored):
         x = position[self.indices[:, 0]]
         return x - self.node(x)
 
-    def bind(self, scene: Scene) -> None:
+    def place_of(self, scene: Scene, passes: AnchorPasses) -> "Nodes":
         """The node of each particle."""
+        free = np.isinf(self._spacing)
+        x = self.start.position[self.indices[:, 0]]
+        return Nodes(scene, passes, [self._origin, np.where(free, 0.0, self._spacing)], self.node(x))
+
+    def bind(self, scene: Scene) -> None:
+        """Nothing of it changes."""
         super().bind(scene)
-        dim, free = scene.particles.dim, np.isinf(self._spacing)
-        add, x = scene.memory.field, self.start.position[self.indices[:, 0]]
-        self.dev.grid = add("Snap.grid", 2, width=dim, values=[self._origin, np.where(free, 0.0, self._spacing)])
-        self.dev.node = add("Snap.node", self.count, width=dim, values=self.node(x), state=True)
         self.changed = False
-
-    @ti.func
-    def nearest(self, x):
-        """The node nearest to x; x itself along axes that are free."""
-        node = x
-        for k in ti.static(range(self.dev.state.dim)):
-            step, zero = self.dev.grid[1][k], self.dev.grid[0][k]
-            if step > 0:
-                node[k] = zero + ti.floor((x[k] - zero) / step + 0.5) * step
-        return node
-
-    @ti.func
-    def offsets(self, c, frame_fraction, first, fresh):
-        """x - node; what is remembered of the substep before is put in terms of the same node."""
-        i = self.member(c, 0)
-        x, start = self.dev.state.place(i), self.dev.state.place(i) - self.dev.state.d[i]
-        if first != 0:
-            node = self.nearest(start)
-            self.dev.spring.last[c] = self.dev.spring.last[c] + (self.dev.node[c] - node)
-            for k in ti.static(range(self.dev.state.dim)):
-                if self.dev.grid[1][k] == 0:
-                    self.dev.spring.last[c][k] = 0
-            self.dev.node[c] = node
-        node = self.dev.node[c]
-        C = x - node
-        for k in ti.static(range(self.dev.state.dim)):
-            if self.dev.grid[1][k] == 0:
-                C[k] = 0
-        return C, start - node
-
-    @ti.func
-    def offset_now(self, c, back):
-        """x - node."""
-        i = self.member(c, 0)
-        x = self.dev.state.place(i) - back * self.dev.state.d[i]
-        return x - self.nearest(x)

@@ -11,7 +11,7 @@ from ..features.feature import Knob, Scene
 from ..geometry.intervals import cross
 from ..particles import Particles
 from .core.members import FixedSize, VariableSize
-from .core.outline import PRESSURE
+from .core.outline_passes import PRESSURE
 from .core.quantity import Quantity
 from .core.scalar import Scalar
 
@@ -31,7 +31,7 @@ class Volume(Scalar):
     compliance: number or (m,) [m^5/N], inverse of what pressure [Pa] each m^3 of missing volume makes; 0 is rigid.
     damping: number or (m,) [N s/m^5]. break_at: pressure at which it bursts, number or (m,) [Pa].
 
-    `load` is -p, with p the pressure inside [Pa]. Second order in h, see Scalar. Bodies of 1e9 m and more leave f32.
+    `load` is -p, with p the pressure inside [Pa]. Second order in h, see Equation. Bodies of 1e9 m and more leave f32.
 
     Raises ValueError in 2D, and for surfaces with an open edge, an edge of three faces, or only one side; the edge is named.
     """
@@ -112,7 +112,7 @@ class Tetrahedra(Quantity):
         return q.norm()
 
     @ti.func
-    def measure(self, q):
+    def measure(self, c, q):
         """Volume, and its gradients."""
         a, b, e = q[1, :], q[2, :], q[3, :]
         u, v, w = b.cross(e) / 6, e.cross(a) / 6, a.cross(b) / 6
@@ -180,14 +180,13 @@ class Surfaces(Quantity):
         """The ends of each edge."""
         return np.unique(np.sort(_edges(self.faces)[:, :2], axis=1), axis=0)
 
-    def bind(self, scene: Scene, batch: Any) -> "Surfaces":
+    def bind(self, scene: Scene, batch: Any, equation: Any) -> "Surfaces":
         """Its gradients, on the device: the faces around each corner, as the two other corners of each, in order."""
         members, corner = self.members, self._corner
         others = np.stack([self.faces[:, [1, 2, 0]].ravel(), self.faces[:, [2, 0, 1]].ravel()], axis=1)
         order = np.argsort(corner, kind="stable")
         starts = np.concatenate([[0], np.cumsum(np.bincount(corner, minlength=len(members.indices)))])
-        bound, add = super().bind(scene, batch), scene.memory.field
-        bound.corners = batch.dev.corners
+        bound, add = super().bind(scene, batch, equation), scene.memory.field
         bound.starts = add("Volume.rings", len(starts), kind=ti.i32, values=starts)
         bound.ring = add("Volume.ring", len(order), width=2, kind=ti.i32, values=others[order])
         return bound

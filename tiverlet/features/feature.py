@@ -5,10 +5,11 @@ absent from memory, from the kernels and from the clock when it is not in the sc
 asks of them:
 
     Acceleration   acceleration(i, x, v, t) of one particle, and/or a linear drag rate
-    Batch          relax(c, ...) of one constraint: reads its particles, writes the moves it wants into slots
+    Batch          relax(c, ...) of one constraint: reads its particles, writes the moves it wants into slots. That is done by its
+                   Passes (constraints/core/passes.py), which passes() makes
     Scalar         (constraints/core/scalar.py) a Batch whose constraint is one number: name a Quantity with f and its gradients,
                    and C = f - rest gets compliance, damping, mass splitting, residual and load from there
-    Anchored       (constraints/core/anchored.py) a Batch of particles, each drawn to a place of its own: give the vector to it
+    Anchored       (constraints/core/anchored.py) a Batch of particles, each drawn to a Place of its own
     Collider       (colliders/collider.py) confine(i, ...) of one particle, with the last word
 
 Which particles a Batch acts on is an object that it holds, `members`: FixedSize, or VariableSize for constraints
@@ -29,7 +30,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..device import at, inline, ti
+from ..device import ti
 from ..device.language import inside_kernel
 from ..device.number import Number
 from .arguments import Knob as Knob
@@ -249,8 +250,7 @@ class Acceleration(Feature):
 class Batch(Feature):
     """m constraints of the same kind on `arity` particles each.
 
-    relax() writes, for each of its particles, the move that it wants, already multiplied by the inverse mass. What the
-    particles of constraint c are: self.members(c, k); where their moves go: self.push(c, k, move).
+    What a substep does with each is said by its `dev`, see passes().
     """
 
     arity = 0  # 0: as many as each needs, see VariableSize
@@ -276,17 +276,7 @@ class Batch(Feature):
     @property
     def count(self) -> int:
         """The number of constraints, m."""
-        return self.dev.constraint_count.now if inside_kernel() else self.members.count
-
-    @property
-    def blocks(self) -> int:
-        """Of constraints of any size, how much there is for reduce_block() to do while it is bound; else 0."""
-        return self.dev.corners.blocks_in_all if "corners" in vars(self.dev) else 0
-
-    @property
-    def corner_count(self) -> int:
-        """Of constraints of any size, how much there is for scatter_corner() to do: corners; else 0."""
-        return self.dev.corners.count if "corners" in vars(self.dev) else 0
+        return self.dev.corners.count if inside_kernel() else self.members.count
 
     @property
     def residual(self) -> np.ndarray:
@@ -388,74 +378,11 @@ class Batch(Feature):
         """Pairs of particles that may overlap, (k, 2), because this batch says where they are to each other."""
         return self.members.pairs()
 
+    def passes(self, scene: Scene) -> Any:
+        """Declare its fields, and make its `dev`: Passes, which have what a substep does with each constraint."""
+        raise NotImplementedError
+
     def bind(self, scene: Scene) -> None:
-        """Declare the particles and slots of each constraint."""
+        """Have it on the device."""
         self.scene = scene
-        self.dev.state = scene.state
-        self.dev.slots = scene.slots
-        self.dev.w = scene.state.w
-        self.dev.real = scene.real
-        self.dev.constraint_count = scene.memory.number(self.members.count)
-        self.members.bind(self, scene)
-
-    @inline
-    def member(self, c, k):
-        """The particle at corner k of constraint c."""
-        return at(at(self.dev.members, c), k)
-
-    @inline
-    def awake(self, c):
-        """Whether constraint c has a particle that is awake, or one that cannot move alone."""
-        state = self.dev.state
-        if not state.sleepers or self.drives:
-            return ti.cast(1, ti.i32) > 0
-        if not self.arity:
-            return at(state.sleepers.asleep, at(self.dev.corners.mover, c)) == 0
-        asleep = at(state.sleepers.asleep, self.member(c, 0))
-        for k in range(1, self.arity):
-            asleep = ti.max(asleep, at(state.sleepers.asleep, self.member(c, k)))
-        return asleep == 0
-
-    @ti.func
-    def push(self, c, k: ti.template(), move):  # type: ignore[valid-type]
-        """Write the move of corner k into its slot; a particle that cannot move has none."""
-        place = self.dev.places[c][k]
-        if place >= 0:
-            self.dev.slots.move[place] = move
-
-    @ti.func
-    def relax(self, c, h, h2_effective, frame_fraction, first, fresh):
-        """One Jacobi correction of constraint c in a substep of h [s]: pushes one move for each corner.
-
-        h2_effective: what a constant acceleration adds to the displacement, per m/s^2: h^2, half of it at a start, less with
-        drag [s^2]. frame_fraction: where in the frame the substep starts and ends, for targets that move.
-        first: 1 in the first iteration of a substep. fresh: 1 in the first substep after a start.
-        """
-
-    @ti.func
-    def push_spring_force(self, c, h):
-        """Push what the constraint's spring, if it has one, adds to h^2 a at the present positions; for starts."""
-
-    @ti.func
-    def push_reaction(self, c, firm, soft):
-        """Push what the constraint added to h^2 a in the last substep, along its directions at the present positions, about which
-        it has no moment. firm, soft: h^2 over what its multiplier stands for, where it is rigid and where not."""
-
-    @ti.func
-    def reduce_block(self, b, h, h2_effective, first, fresh):
-        """Before relax() and push_spring_force(): sum over block b of a ragged batch. first: -1 before the latter."""
-
-    @ti.func
-    def scatter_corner(self, e, h, h2_effective, first, fresh):
-        """After relax() and push_spring_force(): push the move of corner e of a ragged batch."""
-
-    @ti.func
-    def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
-        """How far constraint c is from fulfilled, relative to its size."""
-        return 0.0
-
-    @ti.func
-    def energy(self, c, back, h2_effective, residual):
-        """Elastic energy [J] of constraint c at x - back d. residual: what residual_of() returns. h2_effective: as in
-        relax(), 0 where there was no substep yet."""
-        return 0.0
+        self._keep(dev=self.passes(scene))

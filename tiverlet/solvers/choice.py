@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..constraints.core.scalar import LOST
+from ..constraints.core.corner_passes import LOST
 from .conjugate import ConjugateGradient
 from .direct import Direct
 from .elimination import plan_of

@@ -131,7 +131,7 @@ class Elimination(System):
 
     @ti.func
     def set_row(self, r, violation, A, alpha, lam, W, geometric_stiffness):
-        """What constraint r is about in this pass, but for what its corners tell. geometric_stiffness: see Scalar."""
+        """What constraint r is about in this pass, but for what its corners tell. geometric_stiffness: see CornerPasses."""
         System.set_row(self, r, violation, A, alpha, lam, W, geometric_stiffness)
         if W > 0:
             self.inverse_size[r] = geometric_stiffness / (2 * W)
@@ -343,7 +343,7 @@ class Elimination(System):
         for r in range(begin, end):
             for k, b in ti.static(self.precise):
                 if self.batch[r] == k and self.alpha[r] == 0 and self.scale[r] != 0:
-                    self.violation[r] = b.exactly(self.number[r])
+                    self.violation[r] = b.dev.quantity.exactly(self.number[r])
 
     @ti.func
     def limit_tensions(self, begin, end):

@@ -106,7 +106,7 @@ class Slots:
         memory.write(self.begin, np.concatenate([[0], np.cumsum(degree)]))
         memory.write(self.split, degree * inv_mass)
         for b in batches:
-            memory.write(b.dev.places, self.places(b))
+            memory.write(b.dev.corners.places, self.places(b))
 
     def places(self, batch: Batch) -> np.ndarray:
         """The slot of each corner of a batch, -1 where it cannot move."""

@@ -97,7 +97,7 @@ class System:
 
     @ti.func
     def set_row(self, r, violation, A, alpha, lam, W, geometric_stiffness):
-        """What constraint r is about in this pass, but for what its corners tell. geometric_stiffness: see Scalar."""
+        """What constraint r is about in this pass, but for what its corners tell. geometric_stiffness: see CornerPasses."""
         self.violation[r], self.alpha[r], self.lam[r], self.geometric_stiffness[r] = violation, alpha, lam, geometric_stiffness
         self.scale[r] = ti.select(W > 0, A, 0 * A)
 

@@ -19,7 +19,7 @@ class ConstraintPass:
             system.team, system.stride = team, stride
         self.semi_iterations = [scene.slots.semi_iteration] if scene.slots and scene.slots.semi_iteration else []
         self.in_systems = [b for b in batches if b.solvable_together and b.dev.in_system]
-        self.ragged = [b for b in batches if b.blocks]
+        self.ragged = [b for b in batches if not b.arity]
         self.learners = [b for b in batches if b.solvable_together and b.dev.known.learns]
         self.springs = any(b.soft for b in batches) or bool(self.learners)
 
@@ -27,21 +27,23 @@ class ConstraintPass:
     def reduce_blocks(self, thread, h, h2_effective, first, fresh, some: ti.template()):  # type: ignore[valid-type]
         """The sums of constraints on many particles, by blocks. some: for which; those of the residual, or all."""
         for f in ti.static([f for f in self.ragged if f.reweighs or some]):
-            for b in range(self.team.chunk_begin(f.blocks, thread), self.team.chunk_end(f.blocks, thread)):
-                if ti.static(bool(f.dev.state.sleepers) and some):
-                    if f.awake(f.dev.corners.block[b][2]):
-                        f.reduce_block(b, h, h2_effective, first, fresh)
+            n = f.dev.corners.block_count
+            for b in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
+                if ti.static(bool(self.slots.state.sleepers) and some):
+                    if f.dev.corners.awake(f.dev.corners.block[b][2]):
+                        f.dev.reduce_block(b, h, h2_effective, first, fresh)
                 else:
-                    f.reduce_block(b, h, h2_effective, first, fresh)
+                    f.dev.reduce_block(b, h, h2_effective, first, fresh)
             self.team.wait()
 
     @ti.func
     def scatter_blocks(self, thread, h, h2_effective, first, fresh):
         """The moves of constraints on many particles."""
         for f in ti.static(self.ragged):
-            for e in range(self.team.chunk_begin(f.corner_count, thread), self.team.chunk_end(f.corner_count, thread)):
-                if f.awake(f.dev.corners.owner[e]):
-                    f.scatter_corner(e, h, h2_effective, first, fresh)
+            n = f.dev.corners.total
+            for e in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
+                if f.dev.corners.awake(f.dev.corners.owner[e]):
+                    f.dev.scatter_corner(e, h, h2_effective, first, fresh)
             self.team.wait()
 
     @ti.func
@@ -50,7 +52,7 @@ class ConstraintPass:
         self.reduce_blocks(thread, h, h * h, -1, 0, True)
         for f in ti.static(self.batches):
             for c in range(self.team.chunk_begin(f.count, thread), self.team.chunk_end(f.count, thread)):
-                f.push_spring_force(c, h)
+                f.dev.push_spring_force(c, h)
         self.team.wait()
         self.scatter_blocks(thread, h, h * h, -1, 0)
 
@@ -67,8 +69,8 @@ class ConstraintPass:
             self.team.wait()
         for f in ti.static(self.batches):
             for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
-                if f.awake(c):
-                    f.relax(c, now.h, h2_effective, now.frame_fraction, now.first, fresh)
+                if f.dev.corners.awake(c):
+                    f.dev.relax(c, now.h, h2_effective, now.frame_fraction, now.first, fresh)
         if ti.static(len(self.batches) > 0):
             self.team.wait()
         self.scatter_blocks(now.thread, now.h, h2_effective, now.first, fresh)
@@ -85,14 +87,14 @@ class ConstraintPass:
             for f in ti.static(self.learners):
                 n = ends * f.count
                 for c in range(self.team.chunk_begin(n, now.thread), self.team.chunk_end(n, now.thread)):
-                    if f.awake(c):
-                        f.weigh_load(c)
+                    if f.dev.corners.awake(c):
+                        f.dev.weigh_load(c)
             self.team.wait()
             for f in ti.static(self.learners):
                 n = ends * f.count
                 for c in range(self.team.chunk_begin(n, now.thread), self.team.chunk_end(n, now.thread)):
-                    if f.awake(c):
-                        f.learn_load(c, now.h)
+                    if f.dev.corners.awake(c):
+                        f.dev.learn_load(c, now.h)
 
     @ti.func
     def solve_systems(self, thread):
@@ -127,14 +129,14 @@ class ConstraintPass:
                 system.end(now.thread)
         for f in ti.static(self.in_systems):
             for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
-                if f.awake(c):
-                    f.update_multiplier(c, now.first)
+                if f.dev.corners.awake(c):
+                    f.dev.update_multiplier(c, now.first)
         if ti.static(len(self.in_systems) > 0):
             self.team.wait()
 
     @ti.func
     def reactions(self, firm, soft):
-        """Write what constraints added to h^2 a in the last substep to the slots, see Batch.push_reaction."""
+        """Write what constraints added to h^2 a in the last substep to the slots, see Passes."""
         for f in ti.static(self.batches):
             for c in range(f.count):
-                f.push_reaction(c, firm, soft)
+                f.dev.push_reaction(c, firm, soft)

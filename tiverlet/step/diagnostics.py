@@ -173,9 +173,9 @@ class Diagnostics:
                 h2_effective, residual = 0 * h, 0 * h
                 if begin == 0:
                     h2_effective = self.step.integrator.h2_effective(h, fresh)
-                    residual = f.residual_of(c, h, h2_effective, frame_fraction, fresh)
+                    residual = f.dev.residual_of(c, h, h2_effective, frame_fraction, fresh)
                     figures[1] = ti.max(figures[1], ti.cast(residual, ti.f64))
-                figures[0] += f.energy(c, back, h2_effective, residual)
+                figures[0] += f.dev.energy(c, back, h2_effective, residual)
         return figures, low, high
 
     @ti.func
@@ -307,7 +307,7 @@ class Residuals:
         for c in range(self.batch.count):
             h = ti.cast(h64, self.step.real)
             fraction = self.step.integrator.frame_fraction(0, 1)
-            out[c] = self.batch.residual_of(c, h, self.step.integrator.h2_effective(h, fresh), fraction, fresh)
+            out[c] = self.batch.dev.residual_of(c, h, self.step.integrator.h2_effective(h, fresh), fraction, fresh)
 
 
 class Reporter:

@@ -46,12 +46,12 @@ THIN = 1e-3  # of the longest: an axis along which a body does not extend
 def forget(scene: Scene, batches: list[Batch], x: np.ndarray) -> None:
     """Before particles are put to x, (n, dim): of constraints that this changes no load is known."""
     for b in _rigid(batches):
-        lam = scene.memory.read(b.dev.lam)
+        lam = scene.memory.read(b.dev.equation.lam)
         if lam.any():
             old = scene.state.get(scene.memory)
             off = np.abs(b.violation(x) - b.violation(old)) * b.inverse_size(b.start.position) > SEEN
             lam[: b.count][off] = 0.0
-            scene.memory.write(b.dev.lam, lam)
+            scene.memory.write(b.dev.equation.lam, lam)
             b.forget_loads(off)
 
 
@@ -105,7 +105,7 @@ def remove(
     body, bodies = _bodies(rigid, w)
     far, _ = _violation(rows, body, bodies)
     going = far > ENOUGH
-    if any(memory.read(b.dev.lam).any() for b in rigid):
+    if any(memory.read(b.dev.equation.lam).any() for b in rigid):
         rows = rows.towards(_borne(scene, rigid, x, going[body], min(1.0, ratio**2)))
     going = (np.bincount(body[placed:], minlength=bodies) > 0) & _open(rows, body, bodies)
     if not going.any():
@@ -124,10 +124,10 @@ def remove(
         if not moving.any():
             break
     for b in rigid:
-        lam = memory.read(b.dev.lam)[: b.count]
+        lam = memory.read(b.dev.equation.lam)[: b.count]
         others = (going & (far > ENOUGH))[body[b.indices.ravel()]]
         here = np.logical_or.reduceat(others, np.searchsorted(b.owner, np.arange(b.count)))
-        memory.write(b.dev.lam, np.where(here, 0.0, lam))  # they bear nothing there yet
+        memory.write(b.dev.equation.lam, np.where(here, 0.0, lam))  # they bear nothing there yet
         b.forget_loads(here)
     return np.linalg.norm(new - x, axis=1), float(far[going].max())
 

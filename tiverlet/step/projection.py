@@ -243,7 +243,8 @@ class Rows:
             read(s.last)[: b.count] - b.goal if s.soft else np.zeros(b.count) for b, s in zip(self.batches, springs, strict=True)
         ]
         borne = [
-            b.compliance * read(b.dev.lam)[: b.count] / h2_effective if b.compliance.any() else b.compliance for b in self.batches
+            b.compliance * read(b.dev.equation.lam)[: b.count] / h2_effective if b.compliance.any() else b.compliance
+            for b in self.batches
         ]
         return self._bounded(gamma * self.C + (1 - gamma) * self._bounded(self._each(before)) + self._each(borne))
 

@@ -94,7 +94,7 @@ class Solids:
 
 def _state(batch: Any, w: np.ndarray, h: float, h2_effective: float) -> tuple[np.ndarray, ...]:
     """By corners: the shape at rest, the deformation before and what moved each, (corners, dim), the share of the present
-    deformation in what passes see, and what a multiplier gives. See ShapeMatch and Scalar for the letters."""
+    deformation in what passes see, and what a multiplier gives. See ShapeMatch and Equation for the letters."""
     read, spring, owner = batch.scene.memory.read, batch.dev.spring, batch.owner
     mass = np.divide(1, w[batch.indices], out=np.zeros(len(owner)), where=w[batch.indices] > 0)
     alpha, total = batch.compliance, np.bincount(owner, mass)

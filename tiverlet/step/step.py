@@ -292,11 +292,11 @@ class Step:
         """Driven particles go to where they are to be."""
         for f in ti.static(self.drivers):
             for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
-                f.drive(c, now.h, now.frame_fraction[1])
+                f.dev.place.drive(c, now.h, now.frame_fraction[1])
                 if ti.static(self.state.befores):  # at the velocity with which it is driven, others meet it
-                    self.state.before[f.member(c, 0)] = self.state.d[f.member(c, 0)]
+                    self.state.before[f.dev.corners.member(c, 0)] = self.state.d[f.dev.corners.member(c, 0)]
                 for k in ti.static(self.contacts):
-                    k.note_motion(self.search.moved_too_far(f.member(c, 0)), k.overshoots(f.member(c, 0)))
+                    k.note_motion(self.search.moved_too_far(f.dev.corners.member(c, 0)), k.overshoots(f.dev.corners.member(c, 0)))
             self.team.wait()
 
     @ti.func
@@ -406,7 +406,7 @@ class Step:
         """
         for f in ti.static(self.breakers):
             for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
-                f.break_overloaded(c, self.integrator.h2_effective(now.h, 0), now.tick)
+                f.dev.break_overloaded(c, self.integrator.h2_effective(now.h, 0), now.tick)
         self.constraints.learn(now)
         self.contact_pass.finish(now)
         if ti.static(self.orients):

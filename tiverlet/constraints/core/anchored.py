@@ -6,11 +6,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ... import checks
-from ...device import ti
 from ...features.feature import Batch, Feature, Knob, Scene
 from ...features.regrouping import Regrouping
+from .anchor_passes import AnchorPasses, Place
 from .members import FixedSize
-from .spring import Spring, stiff
 
 if TYPE_CHECKING:
     from ...particles import Particles
@@ -26,11 +25,8 @@ def one_each(who: str, indices, count: int = checks.ANY) -> FixedSize:
 
 
 class Anchored(Batch):
-    """Constraints C(x) = x - place on one particle each, a vector, from soft to rigid: the formula of Scalar for each axis alike,
-    with unit vectors for gradients.
-
-    Subclasses give, on the device, offsets(): C at the end and at the start of a substep, and offset_now(): C at present; where
-    they drive their particles instead (`drives`), drive(c, h, frame_fraction) puts particle c in its place.
+    """Constraints C(x) = x - place on one particle each, a vector, from soft to rigid: the law of Equation for each axis alike,
+    with unit vectors for gradients. What the place is on the device, says place_of() of each kind.
     """
 
     arity = 1
@@ -85,14 +81,13 @@ class Anchored(Batch):
         """C at the start, (m, dim)."""
         return np.zeros((self.count, position.shape[1]))
 
-    def bind(self, scene: Scene) -> None:
-        """Declare multipliers where particles are not driven, and the memory of springs."""
-        super().bind(scene)
-        self.dev.size = scene.memory.number(self.start.size, scene.real)
-        if not self.drives:
-            self.dev.lam = scene.memory.field(f"{self!r}.multiplier", self.count, width=scene.particles.dim, state=True)
-            compliance, damping = (self.compliance, self.damping) if self.soft else (None, None)
-            self.dev.spring = Spring(scene, repr(self), compliance, damping, self.start_offset(self.start.position))
+    def place_of(self, scene: Scene, passes: AnchorPasses) -> Place:
+        """Where its particles are drawn to, on the device."""
+        raise NotImplementedError
+
+    def passes(self, scene: Scene) -> AnchorPasses:
+        """To their places."""
+        return AnchorPasses(scene, self, self.start_offset(self.start.position))
 
     @property
     def load(self) -> np.ndarray:
@@ -107,98 +102,6 @@ class Anchored(Batch):
             return np.zeros((self.count, self.scene.particles.dim))
         scale = 1 / self.scene.h2_effective if self.scene.h2_effective else 0.0
         return scale * self.scene.memory.read(self.dev.lam)[: self.count].astype(np.float64)
-
-    @ti.func
-    def nothing(self):
-        """A vector of zeros."""
-        return ti.Vector.zero(self.dev.real, self.dev.state.dim)
-
-    @ti.func
-    def offsets(self, c, frame_fraction, first, fresh):
-        """C at the end and at the start of the substep."""
-        return self.nothing(), self.nothing()
-
-    @ti.func
-    def offset_now(self, c, back):
-        """C at x - back d."""
-        return self.nothing()
-
-    @ti.func
-    def offset_change(self, c):
-        """How far C changed in the last substep by the motion of the particle."""
-        return self.dev.state.d[self.member(c, 0)]
-
-    @ti.func
-    def solve(self, c, h, h2_effective, frame_fraction, first, fresh):
-        """Multiplier before and after, and the size of the violation that this removes."""
-        w = self.dev.w.of(self.member(c, 0))
-        C, C0 = self.offsets(c, frame_fraction, first, fresh)
-        lam, B = self.dev.lam[c], 0 * C
-        if first != 0:
-            lam = self.nothing()
-        new, size = lam, 0 * w
-        if w > 0:
-            alpha, A = 0 * w, 1 + 0 * w
-            if ti.static(self.dev.spring.soft):
-                alpha = self.dev.spring.alpha[c] / h2_effective
-                A, now, last = self.dev.spring.law(c, h, w, fresh)
-                if first != 0:
-                    self.dev.spring.history[c] = now * C0 + last * self.dev.spring.before(c, C0, fresh)
-                    self.dev.spring.last[c] = C0
-                B = self.dev.spring.history[c]
-            K = A * self.dev.slots.split[self.member(c, 0)] + alpha
-            new = lam - self.dev.slots.relaxation * (A * C + B + alpha * lam) / K
-            size = (new - lam).norm() * K / self.dev.slots.relaxation
-        return lam, new, size
-
-    @ti.func
-    def relax(self, c, h, h2_effective, frame_fraction, first, fresh):
-        """Draw the particle to its place."""
-        lam, new, size = self.solve(c, h, h2_effective, frame_fraction, first, fresh)
-        self.dev.lam[c] = new
-        self.push(c, 0, self.dev.w.of(self.member(c, 0)) * (new - lam))
-
-    @ti.func
-    def push_spring_force(self, c, h):
-        """As in Scalar, for each axis."""
-        move = self.nothing()
-        if ti.static(self.dev.spring.soft):
-            w, alpha = self.dev.w.of(self.member(c, 0)), self.dev.spring.alpha[c]
-            if w > 0 and alpha > 0:
-                C = self.offset_now(c, 0)
-                rate = self.offset_change(c) / h
-                move = -h * h * w * (1 - stiff(alpha, h, w)) * (C / alpha + self.dev.spring.damping[c] * rate)
-        self.push(c, 0, move)
-
-    @ti.func
-    def push_reaction(self, c, firm, soft):
-        """As in Scalar, for each axis."""
-        scale = firm
-        if ti.static(self.dev.spring.soft):
-            scale = ti.select(self.dev.spring.alpha[c] > 0, soft, firm)
-        self.push(c, 0, scale * self.dev.w.of(self.member(c, 0)) * self.dev.lam[c])
-
-    @ti.func
-    def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
-        """The violation that is left, relative to the size of the scene."""
-        _, _, size = self.solve(c, h, h2_effective, frame_fraction, 0, fresh)
-        return size / self.dev.size.now
-
-    @ti.func
-    def energy(self, c, back, h2_effective, residual):
-        """|C|^2 / (2 alpha), of what bears a load: F C / 2, see Scalar."""
-        out = ti.cast(0, ti.f64)
-        if ti.static(self.dev.spring.soft):
-            alpha = self.dev.spring.alpha[c]
-            if alpha > 0:
-                C = self.offset_now(c, back)
-                out = ti.cast(C.dot(C) / (2 * alpha), ti.f64)
-                out *= self.dev.spring.solved(self.dev.lam[c].norm() * alpha, h2_effective, residual * self.dev.size.now)
-                force, w = ti.cast(self.dev.lam[c].norm(), ti.f64), self.dev.w.of(self.member(c, 0))
-                if h2_effective > 0:
-                    force /= h2_effective
-                out = self.dev.spring.energy(c, w, h2_effective, out, force * force * alpha / 2)
-        return out
 
 
 def refuse_held_twice(particles: "Particles", features: tuple[Feature, ...], some: Sequence[Feature] | None = None) -> None:

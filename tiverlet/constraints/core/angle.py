@@ -3,7 +3,7 @@
 import numpy as np
 
 from ... import checks
-from ...device import ti
+from ...device import inline, ti
 from ...features.feature import Knob
 from ...geometry.intervals import cross
 from .quantity import Quantity
@@ -43,17 +43,12 @@ class PathAngle(Angle):
     @ti.func
     def reach(self, q):
         """The shorter of the two legs."""
-        return ti.min((q[1, :] - q[0, :]).norm(), (q[2, :] - q[1, :]).norm())
+        return shorter_leg(q)
 
     @ti.func
-    def faint(self):
-        """|u x v| of unit vectors below which their normal is lost in rounding."""
-        return ti.cast(ti.static(1e-13 if self.state.double else 1e-6), self.real)
-
-    @ti.func
-    def measure(self, q):
+    def measure(self, c, q):
         """See path_angle(); nothing is remembered of the plane."""
-        return path_angle(q, 0 * q[0, :], False, self.faint())
+        return path_angle(q, 0 * q[0, :], False, faint(self.state, self.real))
 
 
 class DihedralAngle(Angle):
@@ -72,7 +67,7 @@ class DihedralAngle(Angle):
         return ti.min(q[1, :].norm(), ti.min(q[2, :].norm(), q[3, :].norm()))
 
     @ti.func
-    def measure(self, q):
+    def measure(self, c, q):
         """See dihedral_angle()."""
         return dihedral_angle(q)
 
@@ -86,6 +81,18 @@ def turned(C: np.ndarray) -> np.ndarray:
 def wrapped(f, other):
     """f plus whole turns, within half a turn of `other`."""
     return f - ti.static(TURN) * ti.round((f - other) * ti.static(1 / TURN))
+
+
+@ti.func
+def shorter_leg(q):
+    """The shorter of the two links of a path."""
+    return ti.min((q[1, :] - q[0, :]).norm(), (q[2, :] - q[1, :]).norm())
+
+
+@inline
+def faint(state, real):
+    """|u x v| of unit vectors below which their normal is lost in rounding."""
+    return ti.cast(1e-13 if state.double else 1e-6, real)
 
 
 def path_angles(i: np.ndarray, j: np.ndarray, k: np.ndarray) -> np.ndarray:

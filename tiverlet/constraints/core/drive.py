@@ -84,7 +84,7 @@ class Drive:
     def advance(self, c, f, side: ti.template(), W, alpha, lam, h, h2_effective, size, fresh):  # type: ignore[valid-type]
         """The rest value at the end of a substep that starts at f.
 
-        side, W: see Scalar. alpha: compliance. lam: the multiplier of the last substep. size: of the constraint.
+        side, W: see Equation. alpha: compliance. lam: the multiplier of the last substep. size: of the constraint.
         """
         old, pace = self.target[c], self.pace[c]
         lag = ti.cast(f, ti.f64) - old

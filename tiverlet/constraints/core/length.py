@@ -46,18 +46,19 @@ class Length(Quantity):
         return np.stack([n, -n], axis=1)
 
     @ti.func
-    def excess(self, i, j, f, rest):
+    def excess(self, c, f):
         """|r| - rest = (r^2 - rest^2) / (|r| + rest): to all digits of the low words, where there are any."""
+        rest = self.rest[c]
         C = f - rest
         if ti.static(self.state.carries):
             if f + rest > 0:
-                r = self.state.between(i, j)
+                r = self.state.between(self.corners.member(c, 0), self.corners.member(c, 1))
                 goal = ti.cast(rest, ti.f64)
                 C = ti.cast(r.dot(r) - goal * goal, self.real) / (f + rest)
         return C
 
     @ti.func
-    def measure(self, q):
+    def measure(self, c, q):
         """|r| and +- r / |r|, with r = x_0 - x_1."""
         r = q[0, :] - q[1, :]
         length = ti.sqrt(r.dot(r))
@@ -68,10 +69,10 @@ class Length(Quantity):
         return length, ti.Matrix.rows([n, -n])
 
     @ti.func
-    def exactly(self, i, j, rest):
+    def exactly(self, c):
         """f - rest in f64, which the difference of two lengths in f32 is not."""
-        r = self.state.between(i, j)
-        return ti.sqrt(r.dot(r)) - ti.cast(rest, ti.f64)
+        r = self.state.between(self.corners.member(c, 0), self.corners.member(c, 1))
+        return ti.sqrt(r.dot(r)) - ti.cast(self.rest[c], ti.f64)
 
 
 def is_link(feature: Any) -> "TypeGuard[Scalar]":

@@ -1,21 +1,20 @@
-"""Which particles the constraints of a batch act on: each on as many, or on any number, whose corners are summed by blocks.
+"""Which particles the constraints of a batch act on: each on as many, or on any number. On the device: corners.py.
 
 What is here does not change: another choice of particles is another object.
 """
 
 from collections.abc import Sequence
 from copy import copy
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ... import checks
-from ...device import ti
-from ...device.number import OnDevice
-from ...features.feature import Scene
 from ...features.read_only import handed_out, structure
+from .corners import FixedCorners, VariableCorners
 
-BLOCK = 32  # corners that one thread sums up: the order of all sums is fixed by it, not by the threads
+if TYPE_CHECKING:
+    from ...features.feature import Scene
 
 
 class FixedSize:
@@ -67,13 +66,9 @@ class FixedSize:
         pairs = [self.indices[:, [a, b]] for a in range(self.arity) for b in range(a)]
         return np.concatenate([*pairs, np.zeros((0, 2), dtype=np.int32)])
 
-    def bind(self, batch, scene) -> None:
-        """Declare the particles of each constraint in batch.dev, and their slots unless they are driven."""
-        name, add = repr(batch), scene.memory.field
-        batch.dev.members = add(f"{name}.members", self.count, width=self.arity, kind=ti.i32, values=self.indices)
-        if not batch.drives:
-            places = scene.slots.places(batch)
-            batch.dev.places = add(f"{name}.slots", self.count, width=self.arity, kind=ti.i32, values=places)
+    def bind(self, scene: "Scene", batch: Any) -> FixedCorners:
+        """The same on the device, for a batch; with slots, unless it drives its particles."""
+        return FixedCorners(scene, repr(batch), self.indices, None if batch.drives else scene.slots.places(batch))
 
 
 def rows(who: str, name: str, value: Any, least: int) -> list[np.ndarray]:
@@ -153,62 +148,6 @@ class VariableSize:
         """No pairs: corners of one constraint may be far from each other."""
         return np.zeros((0, 2), dtype=np.int32)
 
-    def bind(self, batch, scene: Scene) -> None:
-        """Declare the corners, batch.dev.corners."""
-        batch.dev.corners = Corners(scene, repr(batch), self, scene.slots.places(batch))
-
-
-class Corners:
-    """The corners of constraints of any size on the device.
-
-    A pass has three loops, so that one constraint on a hundred thousand particles is as parallel as many small ones:
-
-        reduce_block(b)   sums over at most BLOCK corners of one constraint: block[b] = first corner, last + 1, constraint
-        relax(c)   adds up its blocks, blocks[c] to blocks[c + 1], in order, and solves
-        scatter_corner(e)  gives corner e its move, with give(e, move)
-
-    The same loops run before push_spring_force(), and reduce_block() before residual_of() where the batch `reweighs`.
-    members, owner: the particle and the constraint of each corner. starts: the first corner of each constraint.
-    """
-
-    count: Any = OnDevice()
-    blocks_in_all: Any = OnDevice()
-
-    def __init__(self, scene: Scene, name: str, members: VariableSize, places: np.ndarray):
-        self.state, self.slots = scene.state, scene.slots
-        count, starts, size = members.count, members.starts, len(members.indices)
-        parts = -(-np.diff(starts) // BLOCK)
-        first = np.concatenate([[0], np.cumsum(parts)])
-        blocks, number = int(first[-1]), scene.memory.number
-        self.count, self.blocks_in_all = number(size), number(blocks)
-        owner = np.repeat(np.arange(count), parts)
-        begin = starts[owner] + BLOCK * (np.arange(blocks) - first[owner])
-        end = np.minimum(begin + BLOCK, starts[owner + 1])
-        add = scene.memory.field
-        self.members = add(f"{name}.members", size, kind=ti.i32, values=members.indices)
-        self.owner = add(f"{name}.owner", size, kind=ti.i32, values=members.owner)
-        self.starts = add(f"{name}.starts", count + 1, kind=ti.i32, values=starts)
-        self.block = add(f"{name}.block", blocks, width=3, kind=ti.i32, values=np.stack([begin, end, owner], axis=1))
-        self.blocks = add(f"{name}.blocks", count + 1, kind=ti.i32, values=first)
-        self.places = add(f"{name}.slots", size, kind=ti.i32, values=places)
-        if scene.state.sleepers:  # of each constraint a particle that can move, or else its first one: all sleep or none does
-            first = np.lexsort((scene.inv_mass[members.indices] == 0, members.owner))[starts[:-1]]
-            self.mover = add(f"{name}.mover", count, kind=ti.i32, values=members.indices[first])
-
-    @ti.func
-    def give(self, e, move):
-        """Write the move of corner e into its slot; a particle that cannot move has none."""
-        place = self.places[e]
-        if place >= 0:
-            self.slots.move[place] = move
-
-    @ti.func
-    def hub(self, c):
-        """The particle relative to which corners of constraint c are given, so that nothing is lost in f32."""
-        return self.members[self.starts[c]]
-
-    @ti.func
-    def arm(self, e, i0, back):
-        """Corner e relative to particle i0, at x - back d."""
-        i = self.members[e]
-        return self.state.apart(i, i0) - back * (self.state.d[i] - self.state.d[i0])
+    def bind(self, scene: "Scene", batch: Any) -> VariableCorners:
+        """The same on the device, for a batch."""
+        return VariableCorners(scene, repr(batch), self.starts, self.indices, self.owner, scene.slots.places(batch))

@@ -2,12 +2,14 @@
 
 from collections.abc import Callable
 from copy import copy
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ...device import ti
-from ...features.feature import Scene
+
+if TYPE_CHECKING:
+    from ...features.feature import Scene
 
 
 class Quantity:
@@ -15,7 +17,7 @@ class Quantity:
 
     A new one says values() and measure(), and how it differs from a plain number: unwrap() and difference() where some values
     mean the same, `curved` and reach() where its gradient is right only near by. Kernels call what bind() returns. Of outlines
-    (arity 0) f is a polynomial of degree dim in the corners, and they give slope() in place of measure(), see Outline.
+    (arity 0) f is a polynomial of degree dim in the corners, and they give slope() in place of measure(), see OutlinePasses.
 
     members: FixedSize or VariableSize, the particles of each constraint.
     """
@@ -28,8 +30,11 @@ class Quantity:
     curved = False  # whether f is so curved that Newton's step from afar means nothing
     collapses = 0  # the power of a length that f is, where gradients vanish with the size of the body; else 0
     transcends = False  # takes angles, cube roots or exponentials, which SPIR-V has for f32 only
-    state: Any  # on the device
+    centred = False  # whether f is counted from something that moves with the rest value
+    state: Any  # on the device, as what follows
     real: Any
+    corners: Any
+    rest: Any
 
     def __init__(self, members: Any):
         self.members = members
@@ -61,15 +66,20 @@ class Quantity:
         """How far f is from a goal, (m,)."""
         return f - goal
 
-    def bind(self, scene: Scene, batch: Any) -> Any:
-        """The same for the kernels of a batch, whose members are bound."""
+    def bind(self, scene: "Scene", batch: Any, equation: Any) -> Any:
+        """The same for the kernels of a batch, whose corners and rest values its equation has."""
         bound = copy(self)
         bound.state, bound.real = scene.state, scene.real
+        bound.corners, bound.rest = equation.corners, equation.rest
         return bound
 
+    def frame(self, corners: Any) -> Any:
+        """What gives measure() its corners: relative to the first of each constraint, unless f says otherwise."""
+        return corners
+
     @ti.func
-    def measure(self, q):
-        """f and its (arity, dim) gradients at corners q (arity, dim), which are relative to corner 0."""
+    def measure(self, c, q):
+        """f of constraint c and its (arity, dim) gradients at corners q (arity, dim), which are relative to corner 0."""
         return 0.0, q
 
     @ti.func
@@ -83,19 +93,28 @@ class Quantity:
         return f
 
     @ti.func
-    def excess(self, i, j, f, rest):
-        """Where it is `precise`: f - rest to all digits, with first corners i and j."""
-        return f - rest
+    def excess(self, c, f):
+        """Where it is `precise`: f - rest of constraint c to all digits."""
+        return f - self.rest[c]
 
     @ti.func
-    def exactly(self, i, j, rest):
-        """f - rest in f64."""
+    def exactly(self, c):
+        """f - rest of constraint c in f64."""
         return ti.cast(0, ti.f64)
 
     @ti.func
     def reach(self, q):
         """How far a corner may move before f is no longer what its gradient says, with corners q: about the size of the body."""
         return ti.cast(1, self.real)
+
+    @ti.func
+    def start_substep(self, c, now, start, fresh):
+        """Before the first pass of a substep: keep what measure() needs of its start, from corners now and at the start."""
+
+    @ti.func
+    def direction_reliable(self, f, f0):
+        """Whether directions at f (now) and f0 (at the start) are clear enough to tell a turn of 41 degrees."""
+        return True
 
 
 def differences(values: Callable, x: np.ndarray) -> np.ndarray:

@@ -1,11 +1,13 @@
 """Rest values on their way from what they were to what they were assigned, in the course of a frame."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ...device import ti
-from ...device.memory import Memory
+
+if TYPE_CHECKING:
+    from ...device.memory import Memory
 
 
 class Ramp:
@@ -24,7 +26,7 @@ class Ramp:
 
     host_only = ("memory", "under_way")
 
-    def __init__(self, memory: Memory, batch: Any):
+    def __init__(self, memory: "Memory", batch: Any):
         self._memory, self._batch, self.memory = memory, batch, memory
         self.made = self.under_way = False
 

@@ -1,4 +1,4 @@
-"""Springs of constraints: one law from soft to rigid, for every constraint that has a spring. See Scalar for the letters."""
+"""Springs of constraints: one law from soft to rigid, for every constraint that has a spring. See Equation for the letters."""
 
 from typing import TYPE_CHECKING
 

@@ -64,7 +64,7 @@ class StepLimit:
     @ti.func
     def limit(self, c, lam, new, u, W, longest, fastest, reach, size, share):
         """The multiplier `new` of constraint c, or where Newton's step means nothing, one that takes out motion; and whether it
-        is that. u, W, longest, fastest: see Scalar.motion. reach: see Quantity. size, share: see postpone()."""
+        is that. u, W, longest, fastest: see CornerPasses.motion. reach: see Quantity. size, share: see postpone()."""
         far = False
         if W > 0 and (self.postponed[c] != 0 or ti.abs(new - lam) * longest > TRUST * reach):
             pace = APPROACH * share * ti.min(size, W * ti.min(reach, self.span[c]) / longest)

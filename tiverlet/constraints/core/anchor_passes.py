@@ -1,0 +1,130 @@
+"""The passes over particles that are drawn to places, each by itself."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...device import ti
+from .passes import Passes
+from .spring import Spring, stiff
+
+if TYPE_CHECKING:
+    from ...features.feature import Scene
+
+
+class Place:
+    """The contract of where particles are drawn to, on the device: C = x - place. name: as it is told apart by. in_state: what it
+    has in the exact state, by name."""
+
+    told_apart = True
+    name: str
+    in_state: dict[str, Any]
+
+    def __repr__(self) -> str:
+        return self.name
+
+    @ti.func
+    def offsets(self, c, frame_fraction, first, fresh):
+        """C at the end and at the start of the substep."""
+        return 0.0, 0.0
+
+    @ti.func
+    def offset_now(self, c, back):
+        """C at x - back d."""
+        return 0.0
+
+    @ti.func
+    def offset_change(self, c):
+        """How far C changed in the last substep by the motion of the particle."""
+        return 0.0
+
+    @ti.func
+    def drive(self, c, h, frame_fraction):
+        """Where particles are driven: put particle c in its place."""
+
+
+class AnchorPasses(Passes):
+    """The passes of an Anchored. What it drives has no multipliers and springs. start: C at the start, (m, dim)."""
+
+    def __init__(self, scene: "Scene", batch: Any, start: np.ndarray):
+        self.name = name = repr(batch)
+        self.state, self.slots, self.w, self.real = scene.state, scene.slots, scene.state.w, scene.real
+        self.corners = batch.members.bind(scene, batch)
+        self.size = scene.memory.number(batch.start.size, scene.real)
+        if not batch.drives:
+            self.lam = scene.memory.field(f"{name}.multiplier", batch.count, width=scene.particles.dim, state=True)
+            compliance, damping = (batch.compliance, batch.damping) if batch.soft else (None, None)
+            self.spring = Spring(scene, name, compliance, damping, start)
+        self.place = batch.place_of(scene, self)
+
+    @ti.func
+    def solve(self, c, h, h2_effective, frame_fraction, first, fresh):
+        """Multiplier before and after, and the size of the violation that this removes."""
+        w = self.w.of(self.corners.member(c, 0))
+        C, C0 = self.place.offsets(c, frame_fraction, first, fresh)
+        lam, B = self.lam[c], 0 * C
+        if first != 0:
+            lam = ti.Vector.zero(self.real, self.state.dim)
+        new, size = lam, 0 * w
+        if w > 0:
+            alpha, A = 0 * w, 1 + 0 * w
+            if ti.static(self.spring.soft):
+                alpha = self.spring.alpha[c] / h2_effective
+                A, now, last = self.spring.law(c, h, w, fresh)
+                if first != 0:
+                    self.spring.history[c] = now * C0 + last * self.spring.before(c, C0, fresh)
+                    self.spring.last[c] = C0
+                B = self.spring.history[c]
+            K = A * self.slots.split[self.corners.member(c, 0)] + alpha
+            new = lam - self.slots.relaxation * (A * C + B + alpha * lam) / K
+            size = (new - lam).norm() * K / self.slots.relaxation
+        return lam, new, size
+
+    @ti.func
+    def relax(self, c, h, h2_effective, frame_fraction, first, fresh):
+        """Draw the particle to its place."""
+        lam, new, size = self.solve(c, h, h2_effective, frame_fraction, first, fresh)
+        self.lam[c] = new
+        self.corners.push(c, 0, self.w.of(self.corners.member(c, 0)) * (new - lam))
+
+    @ti.func
+    def push_spring_force(self, c, h):
+        """As in CornerPasses, for each axis."""
+        move = ti.Vector.zero(self.real, self.state.dim)
+        if ti.static(self.spring.soft):
+            w, alpha = self.w.of(self.corners.member(c, 0)), self.spring.alpha[c]
+            if w > 0 and alpha > 0:
+                C = self.place.offset_now(c, 0)
+                rate = self.place.offset_change(c) / h
+                move = -h * h * w * (1 - stiff(alpha, h, w)) * (C / alpha + self.spring.damping[c] * rate)
+        self.corners.push(c, 0, move)
+
+    @ti.func
+    def push_reaction(self, c, firm, soft):
+        """As in CornerPasses, for each axis."""
+        scale = firm
+        if ti.static(self.spring.soft):
+            scale = ti.select(self.spring.alpha[c] > 0, soft, firm)
+        self.corners.push(c, 0, scale * self.w.of(self.corners.member(c, 0)) * self.lam[c])
+
+    @ti.func
+    def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
+        """The violation that is left, relative to the size of the scene."""
+        _, _, size = self.solve(c, h, h2_effective, frame_fraction, 0, fresh)
+        return size / self.size.now
+
+    @ti.func
+    def energy(self, c, back, h2_effective, residual):
+        """|C|^2 / (2 alpha), of what bears a load: F C / 2, see Equation."""
+        out = ti.cast(0, ti.f64)
+        if ti.static(self.spring.soft):
+            alpha = self.spring.alpha[c]
+            if alpha > 0:
+                C = self.place.offset_now(c, back)
+                out = ti.cast(C.dot(C) / (2 * alpha), ti.f64)
+                out *= self.spring.solved(self.lam[c].norm() * alpha, h2_effective, residual * self.size.now)
+                force, w = ti.cast(self.lam[c].norm(), ti.f64), self.w.of(self.corners.member(c, 0))
+                if h2_effective > 0:
+                    force /= h2_effective
+                out = self.spring.energy(c, w, h2_effective, out, force * force * alpha / 2)
+        return out

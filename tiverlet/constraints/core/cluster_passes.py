@@ -1,0 +1,355 @@
+"""The passes over clusters of particles that keep their shape."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...device import ti
+from . import rotation
+from .passes import Passes
+from .spring import Spring, stiff
+from .strength import Strength
+
+if TYPE_CHECKING:
+    from ...features.feature import Scene
+
+HEAVY = 1024  # masses of the cluster: what a particle that cannot move weighs in it
+LEAST = 2.0**-46  # relative changes of a rotation that are rounding
+
+
+class ClusterPasses(Passes):
+    """The passes of a ShapeMatch, which says what c, R and q are, in the loops of VariableCorners: blocks sum up moments, from
+    which each cluster finds where it goes, and corners move towards their places there.
+
+    turn, place: R, as few numbers, and c. pose: R as a matrix. fit, middle: R and c at the start of the substep. mean: of what
+    else pulls, which shifts nothing. pull: what a substep moved each corner by.
+    shape: at rest, about the center of each cluster, (total, dim). radius: of each cluster, (m,).
+    """
+
+    def __init__(self, scene: "Scene", batch: Any, shape: np.ndarray, radius: np.ndarray):
+        self.name = name = repr(batch)
+        dim, m, add = scene.state.dim, batch.count, scene.memory.field
+        self.state, self.slots, self.w, self.real = scene.state, scene.slots, scene.state.w, scene.real
+        self.corners = batch.members.bind(scene, batch)
+        self.plastic = batch.transcends
+        w, owner, total = scene.inv_mass[batch.indices], batch.owner, len(shape)
+        mass = np.bincount(owner, weights=np.divide(1, w, where=w > 0, out=np.zeros_like(w)), minlength=m)
+        self.mass = add(f"{name}.mass", m, values=mass)
+        self.size = add(f"{name}.radius", m, values=np.maximum(radius, 1e-6 * batch.start.size))
+        self.shape = add(f"{name}.shape", total, width=dim, values=shape, state=self.plastic)
+        turn = rotation.identity(dim)
+        self.pull: Any = add(f"{name}.multiplier", total, width=dim, state=True)
+        self.strength = Strength(scene, name, batch)
+        self.turn = add(f"{name}.turn", m, width=len(turn), kind=ti.f64, values=[turn] * m, state=True)
+        told = bool(scene.state.sleepers)  # what the report of a cluster that sleeps goes by, in a clone too
+        self.pose = add(f"{name}.pose", m, width=dim * dim, kind=ti.f64, state=told)
+        self.place = add(f"{name}.place", m, width=dim, kind=ti.f64, state=told)
+
+        def moment(what, width):
+            """A field with a row for each block, to be summed up."""
+            return add(f"{name}.{what}", self.corners.block_count, width=width, kind=ti.f64)
+
+        self.total = moment("total", 0)
+        self.p, self.q, self.s = moment("p", dim), moment("q", dim), moment("s", dim)
+        self.K, self.X = moment("K", dim * dim), moment("X", dim * dim)
+        compliance, damping = (batch.compliance, batch.damping) if batch.soft else (None, None)
+        self.spring: Any = Spring(scene, name, compliance, damping, np.zeros((total, dim)))
+        if self.spring.soft:
+            self.v, self.U = moment("v", dim), moment("U", dim * dim)
+            self.fit = add(f"{name}.fit", m, width=dim * dim, kind=ti.f64, state=told)
+            self.middle = add(f"{name}.middle", m, width=dim, kind=ti.f64)
+            self.mean = add(f"{name}.mean", m, width=dim, kind=ti.f64, state=told)
+        if self.plastic:
+            self.creep = add(f"{name}.creep", m, values=batch.creep)
+            self.yield_size = add(f"{name}.yield", m, values=batch.yield_strain * radius)
+
+    @ti.func
+    def nothing(self) -> Any:
+        """A vector of zeros; what a field has may be no number."""
+        return ti.Vector.zero(ti.f64, self.state.dim)
+
+    @ti.func
+    def arm(self, e, i0, back):
+        """Corner e relative to particle i0, at x - back d; in f64, so that places at the start and predicted ones differ by d."""
+        i = self.corners.members[e]
+        move = ti.cast(self.state.d[i], ti.f64) - ti.cast(self.state.d[i0], ti.f64)
+        return ti.cast(self.state.apart(i, i0), ti.f64) - back * move
+
+    @ti.func
+    def law(self, c, h, h2_effective, fresh):
+        """The coefficients of C_(n+1) (the rigid part and the rest), C_n and C_(n-1), and alpha M / h^2: alpha' of a move."""
+        rigid, soft = ti.cast(1, self.real), ti.cast(0, self.real)
+        now, last, give = 0 * soft, 0 * soft, 0 * soft
+        if ti.static(self.spring.soft):
+            alpha, mass = self.spring.alpha[c], self.mass[c]
+            if alpha > 0 and mass > 0:
+                soft, now, last = self.spring.law(c, h, 1 / mass, fresh)
+                if soft < 1 / 64:  # a start asks for nothing at the end where it is soft: c and R need something to go by
+                    soft, now = ti.cast(1 / 64, self.real), now + soft - 1 / 64
+                rigid = ti.min(stiff(alpha, h, 1 / mass), soft)
+                soft -= rigid
+                give = alpha * mass / h2_effective
+        return rigid, soft, now, last, give
+
+    @ti.func
+    def share(self, e, A, give):
+        """mu of corner e in a pass: its mass, times what a violation of 1 moves it."""
+        i = self.corners.members[e]
+        w, mu = self.w.of(i), ti.cast(HEAVY * self.mass[self.corners.owner[e]], ti.f64)
+        if w > 0:
+            mu = 1 / ti.cast(A * self.slots.split[i] + give * w, ti.f64)
+        return mu
+
+    @ti.func
+    def weight(self, e, c):
+        """The mass of corner e in a fit."""
+        w, mu = self.w.of(self.corners.members[e]), ti.cast(HEAVY * self.mass[c], ti.f64)
+        if w > 0:
+            mu = ti.cast(1, ti.f64) / w
+        return mu
+
+    @ti.func
+    def reduce_block(self, b, h, h2_effective, first, fresh):
+        """The moments of a block about the places s at the start: of shapes q, predicted places p, and of what else pulls."""
+        begin, end, c = self.corners.block[b]
+        i0 = self.corners.hub(c)
+        rigid, soft, now, last, give = self.law(c, h, h2_effective, fresh)
+        total, p1, q1, s1 = ti.cast(0, ti.f64), self.nothing(), self.nothing(), self.nothing()
+        K = p1.outer_product(p1)
+        X, v1, U = 0 * K, 0 * p1, 0 * K
+        for e in range(begin, end):
+            mu, p, q, s = self.share(e, rigid + soft, give), self.arm(e, i0, 0), self.shape[e], self.arm(e, i0, 1)
+            if first < 0:
+                mu, s = self.weight(e, c), p
+            total += mu
+            p1 += mu * p
+            q1 += mu * q
+            s1 += mu * s
+            K += (mu * q).outer_product(s)
+            X += (mu * p).outer_product(s)
+            if ti.static(self.spring.soft):
+                v = mu * last * self.spring.before(e, ti.cast(self.nothing(), self.real), fresh)
+                if first == 0:
+                    v = mu * (self.spring.history[e] + give * self.pull[e])
+                v1 += v
+                U += v.outer_product(s)
+        self.total[b], self.p[b], self.q[b], self.s[b] = total, p1, q1, s1
+        self.keep(self.K, b, K)
+        self.keep(self.X, b, X)
+        if ti.static(self.spring.soft):
+            self.v[b] = v1
+            self.keep(self.U, b, U)
+
+    @ti.func
+    def moments(self, c):
+        """Sum of mu, means of p, q and s, and the moments of q and p, about these means."""
+        total, p, q, s = ti.cast(0, ti.f64), self.nothing(), self.nothing(), self.nothing()
+        K = p.outer_product(p)
+        X = 0 * K
+        for b in range(self.corners.blocks[c], self.corners.blocks[c + 1]):
+            total += self.total[b]
+            p += self.p[b]
+            q += self.q[b]
+            s += self.s[b]
+            K += self.kept(self.K, b)
+            X += self.kept(self.X, b)
+        p, q, s = p / total, q / total, s / total
+        return total, p, q, s, K - total * q.outer_product(s), X - total * p.outer_product(s)
+
+    @ti.func
+    def keep(self, field: ti.template(), c, R):
+        """Write a matrix."""
+        for j in ti.static(range(self.state.dim)):
+            for k in ti.static(range(self.state.dim)):
+                field[c][self.state.dim * j + k] = R[j, k]
+
+    @ti.func
+    def kept(self, field: ti.template(), c):
+        """Read a matrix."""
+        dim = ti.static(self.state.dim)
+        return ti.Matrix([[field[c][dim * j + k] for k in ti.static(range(dim))] for j in ti.static(range(dim))])
+
+    @ti.func
+    def relax(self, c, h, h2_effective, frame_fraction, first, fresh):
+        """Find where the cluster goes."""
+        if self.mass[c] > 0:
+            total, p, q, s, K, X = self.moments(c)
+            rigid, soft, now, last, give = self.law(c, h, h2_effective, fresh)
+            mean, U = 0 * p, 0 * K
+            if ti.static(self.spring.soft):
+                for b in range(self.corners.blocks[c], self.corners.blocks[c + 1]):
+                    mean += self.v[b] / total
+                    U += self.kept(self.U, b)
+                U -= total * mean.outer_product(s)
+            start, end, cosine = rotation.turn(K, X, U, first > 0, rigid, soft, self.turn[c], LEAST, self.spring.soft)
+            pose = rotation.matrix(end)
+            self.turn[c], self.place[c] = end, p - pose @ q
+            self.keep(self.pose, c, pose)
+            self.slots.note_turn(self.slots.turn(cosine, 1.0))
+            if ti.static(self.spring.soft):
+                R = rotation.matrix(start)
+                if first > 0:  # in the frame of the body
+                    mean = R @ mean
+                self.middle[c], self.mean[c] = s - R @ q, mean
+                self.keep(self.fit, c, R)
+
+    @ti.func
+    def push_spring_force(self, c, h):
+        """Find where the cluster is; scatter_corner() then adds h^2 times what its springs do now."""
+        if self.mass[c] > 0:
+            total, p, q, s, K, X = self.moments(c)
+            R = rotation.matrix(rotation.fit(K, self.turn[c], LEAST))
+            self.place[c] = s - R @ q
+            self.keep(self.pose, c, R)
+
+    @ti.func
+    def push_reaction(self, c, firm, soft):
+        """What moved each corner, less its moment about the present places: as what turns the cluster, of least sum m move^2.
+
+        Moves have no moment about the places at the start. Where something cannot move, forces from outside have one.
+        """
+        begin, end, i0 = self.corners.starts[c], self.corners.starts[c + 1], self.corners.hub(c)
+        scale = firm
+        if ti.static(self.spring.soft):
+            scale = ti.select(self.spring.alpha[c] > 0, soft, firm)
+        total, mean, pull, held = ti.cast(0, ti.f64), self.nothing(), self.nothing(), False
+        S = mean.outer_product(mean)
+        X = 0 * S
+        for e in range(begin, end):
+            held = held or self.w.of(self.corners.members[e]) == 0
+            m, r = self.weight(e, c), self.arm(e, i0, 0)
+            total += m
+            mean += m * r
+            pull += m * self.pull[e]
+            S += m * r.outer_product(r)
+            X += m * r.outer_product(ti.cast(self.pull[e], ti.f64))
+        mean, pull = mean / total, pull / total
+        spin = rotation.spin(S - total * mean.outer_product(mean), X - total * mean.outer_product(pull))
+        for e in range(begin, end):
+            move = ti.cast(self.pull[e], ti.f64)
+            if not held:
+                move -= spin @ (self.arm(e, i0, 0) - mean)
+            self.corners.give(e, ti.cast(scale * move, self.real))
+
+    @ti.func
+    def off(self, e, c):
+        """C_i at the present places."""
+        return self.arm(e, self.corners.hub(c), 0) - self.place[c] - self.kept(self.pose, c) @ self.shape[e]
+
+    @ti.func
+    def scatter_corner(self, e, h, h2_effective, first, fresh):
+        """Move corner e towards its place."""
+        c, i = self.corners.owner[e], self.corners.members[e]
+        w, relaxation = self.w.of(i), self.slots.relaxation
+        if first > 0:
+            self.pull[e] = ti.cast(self.nothing(), self.real)
+        if not self.strength.holds(c):
+            self.corners.give(e, ti.cast(self.nothing(), self.real))
+        elif w > 0:
+            C, n = self.off(e, c), self.slots.split[i] / w
+            if ti.static(not self.spring.soft):
+                move = ti.cast(-relaxation * C / n, self.real)
+                if first >= 0:
+                    self.pull[e] = self.pull[e] + move
+                self.corners.give(e, move)
+            elif first < 0:
+                self.corners.give(e, ti.cast(self.spring_move(e, c, C, h), self.real))
+            else:
+                rigid, soft, now, last, give = self.law(c, h, h2_effective, fresh)
+                if first > 0:
+                    self.look_back(e, c, h, now, last, fresh)
+                C = self.wrong(e, c, C, rigid, soft, give)
+                move = ti.cast(-relaxation * C / ((rigid + soft) * n + give), self.real)
+                self.pull[e] = self.pull[e] + move
+                self.corners.give(e, move)
+
+    @ti.func
+    def wrong(self, e, c, C, rigid, soft, give):
+        """C* + alpha' lam of a soft cluster, with the soft part of C_(n+1) = C in the frame at the start."""
+        back = self.kept(self.fit, c) @ (self.kept(self.pose, c).transpose() @ C)
+        return rigid * C + soft * back + self.spring.history[e] + give * self.pull[e] - self.mean[c]
+
+    @ti.func
+    def look_back(self, e, c, h, now, last, fresh):
+        """What C_n and C_(n-1) add to the violation; and flow, where the shape is plastic."""
+        R = self.kept(self.fit, c)
+        C = self.arm(e, self.corners.hub(c), 1) - self.middle[c] - R @ self.shape[e]
+        self.spring.history[e] = now * C + last * (R @ self.spring.before(e, ti.cast(self.nothing(), self.real), fresh))
+        body = R.transpose() @ C
+        if ti.static(self.plastic):
+            size = body.norm()
+            if size > self.yield_size[c]:
+                flow = (1 - ti.exp(-self.creep[c] * h)) * (1 - self.yield_size[c] / size) * body
+                self.shape[e] = self.shape[e] + flow
+                body -= flow
+        self.spring.last[e] = body
+
+    @ti.func
+    def spring_move(self, e, c, C, h):
+        """h^2 times the acceleration by the spring and the dashpot of corner e, as far as the step resolves them."""
+        alpha, mass = self.spring.alpha[c], self.mass[c]
+        out = 0 * C
+        if alpha > 0:
+            rate = (C - self.kept(self.pose, c) @ self.spring.last[e]) / h
+            out = -h * h * (1 - stiff(alpha, h, 1 / mass)) * (C / alpha + self.spring.damping[c] * rate) / mass
+        return out
+
+    @ti.func
+    def break_overloaded(self, c, h2_effective, tick):
+        """Let cluster c fall apart if the force on one of its particles was too large."""
+        if self.strength.holds(c):
+            most = ti.cast(0, self.real)
+            for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
+                w = self.w.of(self.corners.members[e])
+                if w > 0:
+                    most = ti.max(most, self.pull[e].norm() / w)
+            self.strength.test(c, most, h2_effective, tick)
+
+    @ti.func
+    def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
+        """The largest violation that is left, by where the last pass turned the cluster, relative to its radius."""
+        worst, total, mean, holds = ti.cast(0, ti.f64), ti.cast(0, ti.f64), self.nothing(), self.strength.holds(c)
+        rigid, soft, now, last, give = self.law(c, h, h2_effective, fresh)
+        for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
+            total += self.weight(e, c)
+            mean += self.weight(e, c) * self.off(e, c)
+        for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
+            if self.w.of(self.corners.members[e]) > 0 and holds:
+                C = self.off(e, c) - mean / total  # places are relative to a particle that has moved since
+                if ti.static(self.spring.soft):
+                    C = self.wrong(e, c, C, rigid, soft, give)
+                worst = ti.max(worst, C.norm())
+        return ti.cast(worst / self.size[c], self.real)
+
+    @ti.func
+    def energy(self, c, back, h2_effective, residual):
+        """Sum of m |C|^2 / (2 alpha M) at x - back d, about the best fit there, of what bears loads: see Spring.solved()."""
+        out = ti.cast(0, ti.f64)
+        if ti.static(self.spring.soft):
+            alpha, mass, i0 = self.spring.alpha[c], self.mass[c], self.corners.hub(c)
+            if alpha > 0 and mass > 0 and self.strength.holds(c):
+                total = ti.cast(0, ti.f64)
+                s, q = self.nothing(), self.nothing()
+                K = s.outer_product(q)
+                for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
+                    mu = self.weight(e, c)
+                    x = self.arm(e, i0, back)
+                    total += mu
+                    s += mu * x
+                    q += mu * self.shape[e]
+                    K += mu * self.shape[e].outer_product(x)
+                s, q = s / total, q / total
+                R = rotation.matrix(rotation.fit(K - total * q.outer_product(s), self.turn[c], LEAST))
+                most, borne = ti.cast(0, self.real), ti.cast(0, ti.f64)
+                for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
+                    C = self.arm(e, i0, back) - s - R @ (self.shape[e] - q)
+                    if self.w.of(self.corners.members[e]) > 0:
+                        out += C.dot(C) / (2 * alpha * mass * self.w.of(self.corners.members[e]))
+                        most = ti.max(most, self.pull[e].norm())
+                        pull = ti.cast(self.pull[e].norm(), ti.f64)
+                        if h2_effective > 0:
+                            pull /= h2_effective
+                        borne += pull * pull * alpha * mass / (2 * self.w.of(self.corners.members[e]))
+                out *= self.spring.solved(most * alpha * mass, h2_effective, residual * self.size[c])
+                out = self.spring.energy(c, 1 / mass, h2_effective, out, borne)
+        return out

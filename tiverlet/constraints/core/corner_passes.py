@@ -1,0 +1,338 @@
+"""The passes over constraints that are one number, of a few corners each."""
+
+from typing import Any
+
+import numpy as np
+
+from ...device import ti
+from ...features.feature import FAR, Scene
+from .equation import Equation
+from .known_load import KnownLoad
+from .passes import Passes
+from .step_limit import TRUST
+
+RESOLVED = 4.0  # alpha' / W: from where on the substep resolves a spring
+LOST = 0.015  # violation at the start of a substep, relative to the size, from where on its direction would bring in energy
+
+
+class CornerPasses(Passes):
+    """The passes of a Scalar whose constraints have a few corners; see Equation for the law.
+
+    The direction is that at the start of the step, x_n (SHAKE, Ryckaert 1977): second order and no loss of energy. When a
+    constraint turns by more than 41 degrees in a step, or has no direction at x_n, the current direction takes its place; but
+    springs that the step resolves, alpha' >= RESOLVED W, keep that of x_n, and are Verlet's kick. With the current one, a spring
+    that goes through length 0 would get the push of the other side a step too early, each time, and gain energy.
+
+    Where a solver takes constraints together, row says which row of its system each is, -1 for none. Others are relaxed alone.
+    """
+
+    def __init__(self, scene: Scene, batch: Any, start: np.ndarray):
+        self.name = name = repr(batch)
+        m, add = batch.count, scene.memory.field
+        self.state, self.slots, self.w, self.real, self.arity = scene.state, scene.slots, scene.state.w, scene.real, batch.arity
+        self.corners = batch.members.bind(scene, batch)
+        self.equation = Equation(scene, batch, self.corners, start)
+        self.spring, self.strength, self.limit = self.equation.spring, self.equation.strength, self.equation.limit
+        self.quantity, self.drive, self.side = self.equation.quantity, self.equation.drive, batch.side
+        self.seen = self.quantity.frame(self.corners)
+        rows = scene.slots.rows(batch)
+        self.in_system, self.outside = bool((rows >= 0).any()), bool((rows < 0).any())
+        if self.in_system:
+            self.row = add(f"{name}.row", m, kind=ti.i32, values=rows)
+        self.converges = batch.solvable_together and (self.in_system or bool(scene.slots.semi_iteration))
+        if self.converges:
+            self.inverse_size = add(f"{name}.close", m, values=batch.inverse_size(batch.start.position))
+        alone = self.converges and scene.slots.semi_iteration and self.outside
+        self.steps = bool(alone and not (self.side or batch.driven))
+        if self.steps:
+            self.step = add(f"{name}.step", m)
+        self.known = KnownLoad(scene, name, batch)
+
+    @ti.func
+    def relax(self, c, h, h2_effective, frame_fraction, first, fresh):
+        """Move each corner by w_j dlam grad_j C. Where c belongs to a system, dlam comes from there: c tells it what it is about,
+        and leaves w_j grad_j C."""
+        if ti.static(self.equation.ramp.made):
+            if first != 0:
+                self.equation.ramp.follow(c, frame_fraction)
+        share = frame_fraction[1] - frame_fraction[0]
+        violation, A, alpha, lam, W, n, g, turn, moved = self.linearise(c, h, h2_effective, share, first, fresh)
+        step = ti.cast(1, self.real)
+        if ti.static(self.in_system):
+            if self.row[c] >= 0:
+                self.tell_system(c, violation, A, alpha, lam, W, n, g, turn, moved, share)
+        if ti.static(self.outside):
+            if self.outside_systems(c):
+                if ti.static(self.known.learns):
+                    if first != 0:
+                        violation += self.known_violation(c, violation - moved, W, h, h2_effective)
+                step = self.relax_alone(c, violation, A, alpha, lam, W, n, turn, share, first)
+        for k in ti.static(range(self.arity)):
+            self.corners.push(c, k, self.w.of(self.corners.member(c, k)) * step * n[k, :])
+
+    @ti.func
+    def linearise(self, c, h, h2_effective, share, first, fresh):
+        """What every solver knows of constraint c in a pass; of the state it writes nothing but the memory of soft constraints.
+
+        Returns the violation A C + B + alpha' lam, A, alpha', lam, the mass-split weight W (0: no corner can move), directions n
+        and gradients g, both (arity, dim), how far it turned, see Slots.note_turn (n is g where too far), and C_(n+1) - C_n.
+        """
+        now, start = self.seen.now_and_start(c)
+        if first != 0:
+            self.quantity.start_substep(c, now, start, fresh)
+        f, g = self.quantity.measure(c, now)
+        f0, n = self.quantity.measure(c, start)
+        f0 = self.quantity.unwrap(f0, self.equation.rest[c])
+        f = self.quantity.unwrap(f, f0)
+        w = ti.cast(0, self.real)  # sum of w |grad|^2; then with split masses: of g . n, g . g, n . n
+        both, here, there = ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real)
+        for k in ti.static(range(self.arity)):
+            i = self.corners.member(c, k)
+            gg, split = g[k, :].dot(g[k, :]), self.slots.split[i]
+            w += self.w.of(i) * gg
+            both += split * g[k, :].dot(n[k, :])
+            here += split * gg
+            there += split * n[k, :].dot(n[k, :])
+        turn = self.slots.turn(both, ti.sqrt(here * there))
+        lost = turn == FAR
+        if self.equation.has_cusp(c):
+            lost, turn = True, 0
+        if ti.static(self.converges):
+            if self.spring.is_rigid(c):
+                lost = lost or ti.abs(self.equation.bounded(f0 - self.equation.rest[c])) * self.inverse_size[c] > LOST
+        if lost:
+            resolved = False
+            if ti.static(self.spring.soft):
+                resolved = self.spring.alpha[c] >= RESOLVED * here * h2_effective
+            if resolved:
+                both = ti.max(both, here / RESOLVED)  # positive, and small beside alpha'
+            else:
+                n, both = g, here
+        if ti.static(self.equation.driven):
+            if first != 0:
+                alpha = ti.cast(0, self.real)
+                if ti.static(self.spring.soft):
+                    alpha = self.spring.alpha[c]
+                self.equation.rest[c] = self.drive.advance(
+                    c, f0, self.side, ti.max(here, both), alpha, self.equation.lam[c], h, h2_effective,
+                    self.equation.residual_scale(c), fresh,
+                )  # fmt: skip
+            f0 = self.quantity.unwrap(f0, self.equation.rest[c])
+            f = self.quantity.unwrap(f, f0)
+        violation, A, alpha, lam, W = self.equation.terms(c, f, f0, w, both, h, h2_effective, first, fresh)
+        if ti.static(self.limit.acts):
+            violation -= A * self.equation.postpone(c, f0, W, share, first)
+        return violation, A, alpha, lam, W, n, g, turn * ti.cast(self.quantity.direction_reliable(f, f0), ti.i32), f - f0
+
+    @ti.func
+    def motion(self, c, n, together):
+        """Of constraint c along n: the motion u in this substep, the mass-split weight W, the largest move of a corner by a
+        multiplier of 1, and the largest motion of a corner, squared.
+
+        Motions are relative to the first corner; u is relative to the rest value, where that moves.
+        together: 1 where masses are split among all constraints, though some are solved together.
+        """
+        u, W, longest, fastest = ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real)
+        for k in ti.static(range(self.arity)):
+            i = self.corners.member(c, k)
+            j, split = self.corners.member(c, 0), self.slots.split[i]
+            move = self.state.slid(self.state.d[i] - self.state.d[j], i, j)
+            if together != 0:
+                split = self.w.of(i) * (self.slots.begin[i + 1] - self.slots.begin[i])
+            u += n[k, :].dot(move)
+            W += split * n[k, :].dot(n[k, :])
+            longest = ti.max(longest, self.w.of(i) * n[k, :].norm())
+            fastest = ti.max(fastest, move.norm_sqr())
+        if ti.static(self.equation.driven):
+            u -= self.drive.step[c]
+        return u, W, longest, fastest
+
+    @ti.func
+    def limit_step(self, c, lam, new, n, share, together):
+        """The multiplier `new`, or one that only takes out motion where StepLimit asks for it; and whether it is that."""
+        far = False
+        if self.spring.is_rigid(c):
+            u, W, longest, fastest = self.motion(c, n, together)
+            reach, size = self.quantity.reach(self.seen.apart(c, 0)), self.equation.residual_scale(c)
+            new, far = self.limit.limit(c, lam, new, u, W, longest, fastest, reach, size, share)
+        return new, far
+
+    @ti.func
+    def tell_system(self, c, violation, A, alpha, lam, W, n, g, turn, moved, share):
+        """Fill in the row of constraint c, from what linearise() returns. share: of the frame, that the substep is."""
+        row, start, weight, new = self.row[c], lam, W, lam
+        if ti.static(self.limit.acts):
+            if W > 0:
+                new = self.equation.multiplier_of(c, violation, A, alpha, lam, W)
+                new, far = self.limit_step(c, lam, new, n, share, 1)
+                if far:  # its step is fixed, and the others follow: a row without a weight has the step -start
+                    start, weight = lam - new, 0 * W
+        self.slots.system.set_row(row, violation, A, alpha, start, weight, self.geometric_stiffness(c, weight))
+        if ti.static(self.slots.system.limits_steps):
+            u, split, longest, _ = self.motion(c, n, 0)
+            spare, most = ti.math.inf + 0 * u, ti.math.inf + 0 * u
+            if split > 0 and self.spring.is_rigid(c):
+                spare = 2 * (violation - moved) ** 2 / split
+                if ti.static(self.limit.acts):
+                    most = TRUST * self.quantity.reach(self.seen.apart(c, 0)) / longest
+            self.slots.system.limit_row(row, u, spare, most, lam - new)
+        for k in ti.static(range(self.arity)):
+            self.slots.system.set_gradient(self.corners.places[c][k], self.corners.member(c, k), g[k, :])
+        acts = violation != 0
+        if ti.static(self.side != 0):  # one that is slack has a direction, but does nothing along it
+            acts = self.side * violation > 0 or lam != 0
+        if acts:
+            self.slots.note_turn(turn)
+
+    @ti.func
+    def relax_alone(self, c, violation, A, alpha, lam, W, n, turn, share, first):
+        """Take the step of the multiplier of constraint c, which belongs to no system. Returns the step."""
+        new = self.equation.jacobi_update(c, violation, A, alpha, lam, W, turn)
+        if ti.static(self.quantity.collapses > 0):
+            move = ti.cast(0, self.real)
+            for k in ti.static(range(self.arity)):
+                w = self.w.of(self.corners.member(c, k))
+                move += w * w * n[k, :].dot(n[k, :])
+            new = self.limit.limit_collapse(lam, new, self.equation.rest[c], self.seen.apart(c, 0).norm_sqr(), move)
+        step = new - lam
+        if ti.static(self.steps):
+            last, wanted = self.step[c], new
+            if first != 0:
+                last = 0
+            if not self.equation.has_cusp(c):  # there the last step had another direction
+                wanted = lam + self.slots.semi_iteration.step(last, step)
+            step = self.slots.limited(wanted, self.geometric_stiffness(c, W / 2)) - lam  # W has masses that are split by two
+            new = lam + step
+        if ti.static(self.limit.acts):
+            if W > 0:
+                new, _ = self.limit_step(c, lam, new, n, share, 0)
+                if ti.static(self.equation.driven):
+                    new = self.drive.clamp(c, new)
+                step = new - lam
+        if ti.static(self.steps):
+            self.step[c] = step
+        self.equation.lam[c] = new
+        if ti.static(self.known.learns):
+            if new == 0 and (W == 0 or ti.static(self.side != 0)):
+                self.known.let_go(c)
+        return step
+
+    @ti.func
+    def known_violation(self, c, start, W, h, h2_effective):
+        """The violation that would ask for the load that constraint c knows. start: the violation at the start of the substep."""
+        out = 0 * start
+        if W > 0 and self.spring.is_rigid(c) and not self.equation.has_cusp(c):
+            missing = self.slots.relaxation * start / W
+            if ti.static(self.side != 0):
+                missing = ti.select(self.side * (missing + h2_effective * self.known.load[c]) > 0, missing, 0 * missing)
+            out = -self.known.give(c, missing, h, h2_effective) * W / self.slots.relaxation
+        return out
+
+    @ti.func
+    def weigh_load(self, c):
+        """As a window ends: see KnownLoad.weigh()."""
+        _, g = self.quantity.measure(c, self.seen.apart(c, 0))
+        _, _, most, _ = self.motion(c, g, 0)
+        own = ti.cast(0, self.real)
+        for k in ti.static(range(self.arity)):
+            own = ti.max(own, self.known.weights.field[self.corners.member(c, k)])
+        self.known.weigh(c, most, own)
+
+    @ti.func
+    def learn_load(self, c, h):
+        """After that: see KnownLoad.learn()."""
+        _, g = self.quantity.measure(c, self.seen.apart(c, 0))
+        _, W, _, fastest = self.motion(c, g, 0)
+        self.known.learn(c, h * h * W, self.equation.residual_scale(c), ti.sqrt(fastest))
+
+    @ti.func
+    def geometric_stiffness(self, c, W):
+        """(omega h)^2 of the fastest transverse vibration under a multiplier of 1: 4 w / l in a chain of links l, where W = 2
+        w."""
+        return 2 * W * self.inverse_size[c]
+
+    @ti.func
+    def outside_systems(self, c):
+        """Whether constraint c belongs to no system."""
+        out = True
+        if ti.static(self.in_system):
+            out = self.row[c] < 0
+        return out
+
+    @ti.func
+    def update_multiplier(self, c, first):
+        """Add what the system has found to the multiplier."""
+        if ti.static(self.in_system):
+            row = self.row[c]
+            if row >= 0:
+                step = ti.cast(self.slots.system.step[row], self.real)
+                if first != 0:
+                    self.equation.lam[c] = step
+                else:
+                    self.equation.lam[c] = self.equation.lam[c] + step
+
+    @ti.func
+    def push_spring_force(self, c, h):
+        """h^2 w_j F grad_j C, with F of Equation.spring_force(). Rigid links find their force in the next substep, but for the
+        load that they know."""
+        f, g = self.quantity.measure(c, self.seen.apart(c, 0))
+        f = self.quantity.unwrap(f, self.equation.rest[c])
+        f0, w = f, ti.cast(0, self.real)
+        if ti.static(self.spring.damped):
+            f0, _ = self.quantity.measure(c, self.seen.apart(c, 1))
+        for k in ti.static(range(self.arity)):
+            w += self.w.of(self.corners.member(c, k)) * g[k, :].dot(g[k, :])
+        force = self.equation.spring_force(c, f, self.quantity.unwrap(f0, f), w, h)
+        if ti.static(self.known.learns):
+            if self.spring.is_rigid(c):
+                force = -self.known.load[c]
+        for k in ti.static(range(self.arity)):
+            self.corners.push(c, k, h * h * self.w.of(self.corners.member(c, k)) * force * g[k, :])
+
+    @ti.func
+    def push_reaction(self, c, firm, soft):
+        """Push scale w_j lam grad_j C, by the scale `firm` where c is rigid, and `soft` where not."""
+        pull = self.equation.lam[c] * ti.select(self.spring.is_rigid(c), firm, soft)
+        if ti.static(self.known.learns):
+            if self.spring.is_rigid(c):
+                pull += (soft - firm) * self.known.given[c]
+        _, g = self.quantity.measure(c, self.seen.apart(c, 0))
+        for k in ti.static(range(self.arity)):
+            self.corners.push(c, k, self.w.of(self.corners.member(c, k)) * pull * g[k, :])
+
+    @ti.func
+    def break_overloaded(self, c, h2_effective, tick):
+        """By its multiplier."""
+        self.strength.test(c, ti.abs(self.equation.lam[c]), h2_effective, tick)
+
+    @ti.func
+    def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
+        """The violation that is left, relative to the rest value (to the batch's mean f where that is 0). W is made of the
+        current gradients alone: it cancels, unless the multiplier is bounded."""
+        f, g = self.quantity.measure(c, self.seen.apart(c, 0))
+        f = self.quantity.unwrap(f, self.equation.rest[c])
+        w, W = ti.cast(0, self.real), ti.cast(0, self.real)
+        for k in ti.static(range(self.arity)):
+            i, gg = self.corners.member(c, k), g[k, :].dot(g[k, :])
+            w += self.w.of(i) * gg
+            W += self.slots.split[i] * gg
+        violation, A, alpha, lam, W = self.equation.terms(c, f, f, w, W, h, h2_effective, 0, fresh)
+        left = self.equation.removed(c, violation, A, alpha, lam, W)
+        if ti.static(self.quantity.collapses > 0):
+            if g.norm_sqr() == 0 and self.strength.holds(c):
+                left = ti.abs(self.equation.bounded(f - self.equation.rest[c]))
+        return left / self.equation.residual_scale(c)
+
+    @ti.func
+    def energy(self, c, back, h2_effective, residual):
+        """That of its spring."""
+        out = ti.cast(0, ti.f64)
+        if ti.static(self.spring.soft):
+            if self.equation.stores(c):
+                f, _ = self.quantity.measure(c, self.seen.apart(c, back))
+                _, g = self.quantity.measure(c, self.seen.apart(c, 0))
+                w = ti.cast(0, self.real)
+                for k in ti.static(range(self.arity)):
+                    w += self.w.of(self.corners.member(c, k)) * g[k, :].dot(g[k, :])
+                out = self.equation.energy(c, f, w, h2_effective, residual)
+        return out

@@ -1,0 +1,140 @@
+"""The corners of constraints on the device: their particles, where these are, and the slots to which their moves go."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...device import at, inline, ti
+from ...device.number import OnDevice
+
+if TYPE_CHECKING:
+    from ...features.feature import Scene
+
+BLOCK = 32  # corners that one thread sums up: the order of all sums is fixed by it, not by the threads
+
+
+class FixedCorners:
+    """Of constraints on `arity` particles each. count: of constraints. places: their slots, None where they have none."""
+
+    count: Any = OnDevice()
+
+    def __init__(self, scene: "Scene", name: str, members: np.ndarray, places: np.ndarray | None):
+        add, (m, arity) = scene.memory.field, members.shape
+        self.state, self.slots, self.real, self.arity = scene.state, scene.slots, scene.real, arity
+        self.count = scene.memory.number(m)
+        self.members = add(f"{name}.members", m, width=arity, kind=ti.i32, values=members)
+        if places is not None:
+            self.places = add(f"{name}.slots", m, width=arity, kind=ti.i32, values=places)
+
+    @inline
+    def member(self, c, k):
+        """The particle at corner k of constraint c."""
+        return at(at(self.members, c), k)
+
+    @inline
+    def awake(self, c):
+        """Whether constraint c has a particle that is awake, or one that cannot move alone."""
+        sleepers = self.state.sleepers
+        if not sleepers:
+            return ti.cast(1, ti.i32) > 0
+        asleep = at(sleepers.asleep, self.member(c, 0))
+        for k in range(1, self.arity):
+            asleep = ti.max(asleep, at(sleepers.asleep, self.member(c, k)))
+        return asleep == 0
+
+    @ti.func
+    def push(self, c, k: ti.template(), move):  # type: ignore[valid-type]
+        """Write the move of corner k into its slot; a particle that cannot move has none."""
+        place = self.places[c][k]
+        if place >= 0:
+            self.slots.move[place] = move
+
+    @ti.func
+    def apart(self, c, back):
+        """Corners of constraint c relative to the first, at x - back d: near the origin, so nothing is lost in f32."""
+        i = self.member(c, 0)
+        q = ti.Matrix.zero(self.real, self.arity, self.state.dim)
+        for k in ti.static(range(1, self.arity)):
+            j = self.member(c, k)
+            r = self.state.apart(j, i) - back * self.state.slid(self.state.d[j] - self.state.d[i], j, i)
+            for a in ti.static(range(self.state.dim)):
+                q[k, a] = r[a]
+        return q
+
+    @ti.func
+    def now_and_start(self, c):
+        """The same, now and at the start of the substep."""
+        i = self.member(c, 0)
+        now = ti.Matrix.zero(self.real, self.arity, self.state.dim)
+        start = now
+        for k in ti.static(range(1, self.arity)):
+            j = self.member(c, k)
+            r, moved = self.state.apart(j, i), self.state.slid(self.state.d[j] - self.state.d[i], j, i)
+            for a in ti.static(range(self.state.dim)):
+                now[k, a], start[k, a] = r[a] - 0 * moved[a], r[a] - moved[a]
+        return now, start
+
+
+class VariableCorners:
+    """Of constraints of any size. A pass has three loops, so that one constraint on a hundred thousand particles is as parallel
+    as many small ones:
+
+        reduce_block(b)   sums over at most BLOCK corners of one constraint: block[b] = first corner, last + 1, constraint
+        relax(c)   adds up its blocks, blocks[c] to blocks[c + 1], in order, and solves
+        scatter_corner(e)  gives corner e its move, with give(e, move)
+
+    The same loops run before push_spring_force(), and reduce_block() before residual_of() where the batch `reweighs`.
+    count, total, block_count: of constraints, corners, blocks. members, owner: the particle and the constraint of each corner.
+    starts: the first corner of each constraint.
+    """
+
+    count: Any = OnDevice()
+    total: Any = OnDevice()
+    block_count: Any = OnDevice()
+
+    def __init__(
+        self, scene: "Scene", name: str, starts: np.ndarray, members: np.ndarray, owner: np.ndarray, places: np.ndarray
+    ):  # fmt: skip
+        self.state, self.slots = scene.state, scene.slots
+        count, size, number = len(starts) - 1, len(members), scene.memory.number
+        parts = -(-np.diff(starts) // BLOCK)
+        first = np.concatenate([[0], np.cumsum(parts)])
+        blocks = int(first[-1])
+        self.count, self.total, self.block_count = number(count), number(size), number(blocks)
+        whose = np.repeat(np.arange(count), parts)
+        begin = starts[whose] + BLOCK * (np.arange(blocks) - first[whose])
+        end = np.minimum(begin + BLOCK, starts[whose + 1])
+        add = scene.memory.field
+        self.members = add(f"{name}.members", size, kind=ti.i32, values=members)
+        self.owner = add(f"{name}.owner", size, kind=ti.i32, values=owner)
+        self.starts = add(f"{name}.starts", count + 1, kind=ti.i32, values=starts)
+        self.block = add(f"{name}.block", blocks, width=3, kind=ti.i32, values=np.stack([begin, end, whose], axis=1))
+        self.blocks = add(f"{name}.blocks", count + 1, kind=ti.i32, values=first)
+        self.places = add(f"{name}.slots", size, kind=ti.i32, values=places)
+        if scene.state.sleepers:  # of each constraint a particle that can move, or else its first one: all sleep or none does
+            first = np.lexsort((scene.inv_mass[members] == 0, owner))[starts[:-1]]
+            self.mover = add(f"{name}.mover", count, kind=ti.i32, values=members[first])
+
+    @inline
+    def awake(self, c):
+        """Whether constraint c is awake."""
+        sleepers = self.state.sleepers
+        return at(sleepers.asleep, at(self.mover, c)) == 0 if sleepers else ti.cast(1, ti.i32) > 0
+
+    @ti.func
+    def give(self, e, move):
+        """Write the move of corner e into its slot; a particle that cannot move has none."""
+        place = self.places[e]
+        if place >= 0:
+            self.slots.move[place] = move
+
+    @ti.func
+    def hub(self, c):
+        """The particle relative to which corners of constraint c are given, so that nothing is lost in f32."""
+        return self.members[self.starts[c]]
+
+    @ti.func
+    def arm(self, e, i0, back):
+        """Corner e relative to particle i0, at x - back d."""
+        i = self.members[e]
+        return self.state.apart(i, i0) - back * (self.state.d[i] - self.state.d[i0])

@@ -1,0 +1,206 @@
+"""The equation of constraints that are one number, C = f - rest: one law from soft to rigid."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...device import ti
+from .ramp import Ramp
+from .spring import Spring, stiff
+from .step_limit import StepLimit
+from .strength import Strength
+
+if TYPE_CHECKING:
+    from ...features.feature import Scene
+
+
+class Equation:
+    """What the multiplier lam of each constraint C(x) = f(x) - rest = 0, >= 0 or <= 0 has to fulfil, on the device:
+
+        theta = s^4 / (1 + s^4), s^2 = (omega h)^2 = w h^2 / alpha     0: resolved by the step, 1: rigid
+        C*    = (1 - theta) (C_(n+1) + 2 C_n + C_(n-1)) / 4 + theta C_(n+1)
+        dlam  = -(A C + B + alpha' lam) / (A W + alpha'),  A = (1 - theta)/4 + theta,  alpha' = alpha / h^2
+        dx_j  = w_j dlam grad_j C(x_n)
+
+    W = sum_j n_j w_j grad_j C(x_(n+1)) . grad_j C(x_n) is the mass-split weight: particle j belongs to n_j constraints, and
+    gives each an n_j-th of its mass (Tonge 2012), which keeps the sum of all corrections stable and conserves momentum.
+    In the first substep after a start (`fresh`) the force acts for half a kick, alpha' = alpha / (h^2 / 2), and C* is made of
+    C_(n+1) and C_n. With drag, alpha' = alpha / (phi h^2) with the factor phi that the exact solution gives every other
+    acceleration.
+
+    What f and its gradients are, say the passes that ask: CornerPasses, OutlinePasses.
+    batch: the Scalar. start: f at the start, (m,). side: 0: C = 0; 1: C <= 0; -1: C >= 0. scale: what residuals are relative to
+    where the rest value is 0. scene_sized: whether that is the size of the scene. in_state: what it has in the exact state, by
+    name.
+    """
+
+    host_only = ("scene_sized",)
+
+    def __init__(self, scene: "Scene", batch: Any, corners: Any, start: np.ndarray):
+        name, m, add, unit = repr(batch), batch.count, scene.memory.field, batch.quantity.unit
+        self.slots, self.real, self.side, self.corners = scene.slots, scene.real, batch.side, corners
+        self.forces = bool(batch.acts_as_force(scene).any())
+        self.scene_sized = not unit and not np.any(start)
+        scale = unit or (batch.start.size if self.scene_sized else float(np.abs(start).mean()))
+        self.scale = scene.memory.number(scale, scene.real)
+        self.rest = add(f"{name}.rest", m, values=batch.goal, state=batch.driven)
+        self.driven = batch.driven
+        self.drive: Any = batch.drive_of(scene) if batch.driven else None
+        self.lam = add(f"{name}.multiplier", m, state=True)
+        compliance, damping = batch.compliance if batch.soft else None, batch.damping if batch.damped else None
+        self.spring = Spring(scene, name, compliance, damping, start)
+        self.strength = Strength(scene, name, batch)
+        self.limit = StepLimit(scene, name, batch)
+        self.cusp, self.ramp = batch.cusp, Ramp(scene.memory, batch)
+        self.quantity = batch.quantity.bind(scene, batch, self)
+        self.in_state = {"lam": self.lam} | ({"rest": self.rest} if batch.driven else {})
+
+    @ti.func
+    def bounded(self, value):
+        """`value` where the constraint acts on its side, else 0."""
+        if ti.static(self.side != 0):
+            value = ti.max(self.side * value, 0) * self.side
+        return value
+
+    @ti.func
+    def has_cusp(self, c):
+        """Whether constraint c is rigid and at a cusp: its directions mean nothing from one pass to the next."""
+        out = False
+        if ti.static(self.cusp):
+            out = self.rest[c] == 0 and self.spring.is_rigid(c)
+        return out
+
+    @ti.func
+    def terms(self, c, f, f0, w, W, h, h2_effective, first, fresh):
+        """A C + B + alpha' lam, A, alpha', lam and W (0 where it is broken), from f at the end and at the start, and w."""
+        if ti.static(self.strength.breaks):
+            if not self.strength.holds(c):
+                W = 0
+        if ti.static(self.forces):
+            if not self.spring.is_rigid(c):
+                W = 0
+        C, A = self.quantity.excess(c, f), ti.cast(1, self.real)
+        B, alpha = ti.cast(0, self.real), ti.cast(0, self.real)
+        lam = self.lam[c]
+        if first != 0:
+            lam = 0
+        if ti.static(self.spring.soft):
+            if W > 0:
+                A, now, last = self.spring.law(c, h, w, fresh)
+                alpha = self.spring.alpha[c] / h2_effective
+                if first != 0:
+                    f_last = self.quantity.unwrap(self.spring.before(c, f0, fresh), f0)
+                    B = now * self.bounded(self.violation_then(c, f0, 1)) + last * self.bounded(self.violation_then(c, f_last, 2))
+                    self.spring.history[c] = B
+                    self.spring.last[c] = f0
+                else:
+                    B = self.spring.history[c]
+            elif first != 0:  # it has no direction now, and may get one in a later pass
+                self.spring.history[c] = 0
+                self.spring.last[c] = f0
+        return A * C + B + alpha * lam, A, alpha, lam, W
+
+    @ti.func
+    def violation_then(self, c, f, ago: ti.template()):  # type: ignore[valid-type]
+        """f - rest with the rest value of `ago` substeps ago."""
+        C = f - self.rest[c]
+        if ti.static(self.driven):
+            C += ago * self.drive.step[c]
+        elif ti.static(self.ramp.made and not self.quantity.centred):
+            C += ago * self.ramp.step[c]
+        return C
+
+    @ti.func
+    def postpone(self, c, f0, W, share, first):
+        """What of the violation is left for later substeps, see StepLimit. share: of the frame, that the substep is; 0 where none
+        is."""
+        out = ti.cast(0, self.real)
+        if first != 0:
+            C = f0 - self.rest[c]
+            if ti.static(self.driven):  # the way that the drive goes in this substep is not postponed
+                C += self.drive.step[c]
+            if self.spring.is_rigid(c):
+                out = self.limit.postpone(c, self.bounded(C), W * ti.abs(self.lam[c]), self.residual_scale(c), share)
+            self.limit.postponed[c] = out
+        elif share > 0:
+            out = self.limit.postponed[c]
+        return out
+
+    @ti.func
+    def multiplier_of(self, c, violation, A, alpha, lam, W):
+        """The multiplier after a Jacobi pass."""
+        new = lam
+        if W > 0:
+            new = lam - self.slots.relaxation * violation / (A * W + alpha)
+            if ti.static(self.side != 0):
+                new = -self.bounded(-new)
+            if ti.static(self.driven):
+                new = self.drive.clamp(c, new)
+        return new
+
+    @ti.func
+    def jacobi_update(self, c, violation, A, alpha, lam, W, turn):
+        """The same; where it changes, how far the constraint turned is noted."""
+        new = self.multiplier_of(c, violation, A, alpha, lam, W)
+        if new != lam:
+            self.slots.note_turn(turn)
+        return new
+
+    @ti.func
+    def removed(self, c, violation, A, alpha, lam, W):
+        """The size of the violation that a Jacobi pass would remove."""
+        size = ti.cast(0, self.real)
+        if W > 0:
+            new = self.multiplier_of(c, violation, A, alpha, lam, W)
+            size = ti.abs(new - lam) * (A * W + alpha) / self.slots.relaxation
+        return size
+
+    @ti.func
+    def spring_force(self, c, f, f0, w, h):
+        """F = -(1 - theta) (C / alpha + damping dC/dt), from f now and a substep ago, for starts."""
+        force = ti.cast(0, self.real)
+        if ti.static(self.spring.soft):
+            alpha = self.spring.alpha[c]
+            if w > 0 and alpha > 0 and self.strength.holds(c):
+                resolved = ti.cast(1, self.real)
+                if ti.static(not self.forces):
+                    resolved -= stiff(alpha, h, w)
+                C = self.bounded(f - self.rest[c])
+                force = -resolved * C / alpha
+                if ti.static(self.spring.damped):
+                    if ti.static(self.side == 0) or C != 0:
+                        force -= resolved * self.spring.damping[c] * (f - f0) / h
+                if ti.static(self.driven):
+                    force = self.drive.clamp_force(c, force)
+        return force
+
+    @ti.func
+    def stores(self, c):
+        """Whether constraint c is a spring, which can store energy."""
+        return self.spring.alpha[c] > 0 and self.strength.holds(c)
+
+    @ti.func
+    def energy(self, c, f, w, h2_effective, residual):
+        """Elastic energy [J] of a spring at f: F C / 2, which is C^2 / (2 alpha) once solved.
+
+        See Spring.solved() and Spring.energy(). h2_effective: F = -lam / h2_effective; 0 where there was no substep yet.
+        """
+        alpha = self.spring.alpha[c]
+        C = self.bounded(self.quantity.unwrap(f, self.rest[c]) - self.rest[c])
+        out = ti.cast(C, ti.f64) * C / (2 * alpha)
+        if ti.static(not self.forces):
+            out *= self.spring.solved(ti.abs(self.lam[c]) * alpha, h2_effective, residual * self.residual_scale(c))
+            force = ti.cast(self.lam[c], ti.f64)
+            if h2_effective > 0:
+                force /= h2_effective
+            out = self.spring.energy(c, w, h2_effective, out, force * force * alpha / 2)
+        return out
+
+    @ti.func
+    def residual_scale(self, c):
+        """What the residual of constraint c is relative to."""
+        size = self.scale.now
+        if ti.static(not self.quantity.unit):
+            if self.rest[c] != 0:
+                size = ti.abs(self.rest[c])
+        return size

@@ -1,0 +1,133 @@
+"""The passes over constraints that are one number, of any number of corners each: what a line or a surface encloses."""
+
+from typing import Any
+
+import numpy as np
+
+from ... import checks
+from ...device import ti
+from ...features.feature import FAR, Knob, Scene
+from .equation import Equation
+from .passes import Passes
+
+PRESSURE = Knob(lambda f, v: checks.per_item(repr(f), "pressure", v, f.count, least=0.0), "Factor on the rest value.")
+
+
+class OutlinePasses(Passes):
+    """The passes of a Scalar on closed outlines of any size, in the loops of VariableCorners; see Equation for the law.
+
+    f is a polynomial of degree dim in the corners and the same after a translation. So dim f = sum_e (x_e - x_0) . grad_e f
+    (Euler), and outlines need no more than their gradients, which are slope(e, back) of their Quantity.
+    """
+
+    def __init__(self, scene: Scene, batch: Any, start: np.ndarray):
+        self.name = name = repr(batch)
+        m, add = batch.count, scene.memory.field
+        self.slots, self.w, self.real, self.dim = scene.slots, scene.state.w, scene.real, scene.state.dim
+        self.corners = batch.members.bind(scene, batch)
+        self.equation = Equation(scene, batch, self.corners, start)
+        self.spring, self.strength, self.limit = self.equation.spring, self.equation.strength, self.equation.limit
+        self.quantity, self.drive = self.equation.quantity, self.equation.drive
+        self.sums = add(f"{name}.sums", self.corners.block_count, width=8)
+        self.start = add(f"{name}.gradient", self.corners.total, width=self.dim)
+        self.change = add(f"{name}.change", m)
+        self.astray = add(f"{name}.turned", m, kind=ti.i32)
+
+    @ti.func
+    def reduce_block(self, b, h, h2_effective, first, fresh):
+        """Of a block: f and f0, w |grad|^2; mass-split along both, current, start; its squared size, and of what it moves."""
+        begin, end, c = self.corners.block[b]
+        i0 = self.corners.hub(c)
+        sums = ti.Vector.zero(self.real, 8)
+        for e in range(begin, end):
+            i = self.corners.members[e]
+            g, n = self.quantity.slope(e, 0), self.quantity.slope(e, 1)
+            sums[0] += self.corners.arm(e, i0, 0).dot(g)
+            sums[1] += self.corners.arm(e, i0, 1).dot(n)
+            sums[2] += self.w.of(i) * g.dot(g)
+            sums[3] += self.slots.split[i] * g.dot(n)
+            sums[4] += self.slots.split[i] * g.dot(g)
+            sums[5] += self.slots.split[i] * n.dot(n)
+            sums[6] += self.corners.arm(e, i0, 0).norm_sqr()
+            sums[7] += self.w.of(i) * self.w.of(i) * ti.max(g.dot(g), n.dot(n))
+            self.start[e] = n
+        self.sums[b] = sums
+
+    @ti.func
+    def total(self, c):
+        """f, f0, the sum of w |grad|^2, the mass-split weight, how far it turned, and the last two sums."""
+        sums = ti.Vector.zero(self.real, 8)
+        for b in range(self.corners.blocks[c], self.corners.blocks[c + 1]):
+            sums += self.sums[b]
+        turn = self.slots.turn(sums[3], ti.sqrt(sums[4] * sums[5]))
+        W = sums[3]
+        if turn == FAR:
+            W = sums[4]
+        return sums[0] / self.dim, sums[1] / self.dim, sums[2], W, turn, sums[6], sums[7]
+
+    @ti.func
+    def relax(self, c, h, h2_effective, frame_fraction, first, fresh):
+        """Find dlam; scatter_corner() moves the corners."""
+        if ti.static(self.equation.ramp.made):
+            if first != 0:
+                self.equation.ramp.follow(c, frame_fraction)
+        f, f0, w, W, turn, extent, move = self.total(c)
+        violation, A, alpha, lam, W = self.equation.terms(c, f, f0, w, W, h, h2_effective, first, fresh)
+        if ti.static(self.limit.acts):
+            violation -= A * self.equation.postpone(c, f0, W, frame_fraction[1] - frame_fraction[0], first)
+        new = self.equation.jacobi_update(c, violation, A, alpha, lam, W, turn)
+        new = self.limit.limit_collapse(lam, new, self.equation.rest[c], extent, move)
+        self.equation.lam[c], self.change[c], self.astray[c] = new, new - lam, turn == FAR
+
+    @ti.func
+    def scatter_corner(self, e, h, h2_effective, first, fresh):
+        """Move each corner by w_j dlam grad_j C."""
+        c = self.corners.owner[e]
+        n = self.start[e]
+        if self.astray[c] != 0:
+            n = self.quantity.slope(e, 0)
+        self.corners.give(e, self.w.of(self.corners.members[e]) * self.change[c] * n)
+
+    @ti.func
+    def push_spring_force(self, c, h):
+        """As in CornerPasses; scatter_corner() pushes what is found here."""
+        f, f0, w, W, turn, extent, move = self.total(c)
+        self.change[c], self.astray[c] = h * h * self.equation.spring_force(c, f, f0, w, h), 1
+
+    @ti.func
+    def push_reaction(self, c, firm, soft):
+        """As in CornerPasses."""
+        pull = self.equation.lam[c] * ti.select(self.spring.is_rigid(c), firm, soft)
+        for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
+            self.corners.give(e, self.w.of(self.corners.members[e]) * pull * self.quantity.slope(e, 0))
+
+    @ti.func
+    def break_overloaded(self, c, h2_effective, tick):
+        """By its multiplier."""
+        self.strength.test(c, ti.abs(self.equation.lam[c]), h2_effective, tick)
+
+    @ti.func
+    def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
+        """The violation that is left, as in CornerPasses."""
+        f, f0, w, W, turn, extent, move = self.total(c)
+        violation, A, alpha, lam, W = self.equation.terms(c, f, f0, w, W, h, h2_effective, 0, fresh)
+        left = self.equation.removed(c, violation, A, alpha, lam, W)
+        if w == 0:  # collapsed, or static
+            for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
+                if self.w.of(self.corners.members[e]) > 0 and self.strength.holds(c):
+                    left = ti.abs(f - self.equation.rest[c])
+        return left / self.equation.residual_scale(c)
+
+    @ti.func
+    def energy(self, c, back, h2_effective, residual):
+        """That of its spring, at f by Euler's theorem."""
+        out = ti.cast(0, ti.f64)
+        if ti.static(self.spring.soft):
+            if self.equation.stores(c):
+                f, w, i0 = ti.cast(0, self.real), ti.cast(0, self.real), self.corners.hub(c)
+                for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
+                    f += self.corners.arm(e, i0, back).dot(self.quantity.slope(e, back))
+                for b in range(self.corners.blocks[c], self.corners.blocks[c + 1]):
+                    w += self.sums[b][2]
+                out = self.equation.energy(c, f / self.dim, w, h2_effective, residual)
+        return out
