@@ -16,7 +16,13 @@ from .conftest import ARCH
 ROOT = Path(__file__).parents[1] / "tiverlet"
 DEPTH = 16  # modules, one importing the next
 # What a step asks of each kind of object, says its contract: its methods do nothing, or what most do.
-CONTRACTS = ("Acceleration", "Batch", "Collider", "PairContact", "Quantity", "SemiIteration", "Solver", "System")
+CONTRACTS = (
+    "Acceleration", "Batch", "Collider", "PairContact", "Passes", "Place", "Quantity", "SemiIteration", "Shape", "Solver",
+    "System",
+)  # fmt: skip
+# Whose functions of kernels others inherit; elsewhere they hold an object that has them.
+SHARED = ("Baseline", "Moving", "PairContact", "System")
+INHERITED = 200  # lines that a constraint like Rope has from the classes above it
 CHAIN = 4  # classes, each below the next: what acts on particles, how many of them, of which kind, and which
 
 
@@ -125,6 +131,35 @@ def test_classes_are_abstract_or_final():
     made = {kind for m, some in calls.items() for node in some if (kind := kind_of(m, node.func))}
     assert abstract & made == set()
     assert ("tiverlet.features.feature", "Batch") in abstract and ("tiverlet.neighbours.neighbour_list", "NeighbourList") in made
+
+
+def lines(function: ast.FunctionDef) -> int:
+    """Of code in it, without its docstring."""
+    body = [node for node in function.body if not (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant))]
+    return (body[-1].end_lineno or 0) - body[0].lineno + 1 if body else 0
+
+
+def functions(kind: tuple[str, str], in_kernels: bool | None = None) -> list[ast.FunctionDef]:
+    """Those of a class: all, those for kernels, or those for the host."""
+    some = [node for node in KINDS[kind].body if isinstance(node, ast.FunctionDef)]
+    marks = {id(f): bool({ast.unparse(d) for d in f.decorator_list} & {"ti.func", "ti.kernel", "inline"}) for f in some}
+    return [f for f in some if in_kernels is None or marks[id(f)] == in_kernels]
+
+
+def above(kind: tuple[str, str]) -> list[tuple[str, str]]:
+    """The classes of ours that one inherits from."""
+    return [a for b in BASES[kind] for a in (b, *above(b))]
+
+
+def test_kernels_inherit_nothing_that_does_something():
+    # Of a contract they have functions of one line, which give what most would; and a constraint has few lines of the host's.
+    by = {kind[1]: kind for kind in KINDS}
+    abstract = {b for bases in BASES.values() for b in bases}
+    long = {kind[1] for kind in abstract if any(lines(f) > 1 for f in functions(kind, in_kernels=True))}
+    assert long == set(SHARED)
+    assert lines(functions(by["CornerPasses"], in_kernels=True)[0]) > 10  # and functions are seen
+    inherited = sum(lines(f) for kind in above(by["Rope"]) for f in functions(kind))
+    assert 100 < inherited <= INHERITED
 
 
 def test_the_root_of_the_package_can_be_taken_in_at_a_glance():
