@@ -1,8 +1,7 @@
 """Many worlds of one structure, stepped together, none of which knows of the others."""
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from itertools import zip_longest
+from collections.abc import Callable, Iterable, Iterator
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -13,10 +12,9 @@ from ..constraints.core.scalar import Scalar
 from ..device import runtime
 from ..device.copies import Copies
 from ..device.interrupts import whole
-from ..device.language import COMPILER
 from ..device.patches.compiler import CachedLaunch
 from ..features.arguments import knobs_of, meant
-from ..features.feature import Batch, Feature
+from ..features.feature import Feature
 from ..features.read_only import assign_whole, read_only
 from ..particles import in_range
 from ..step import checkpoint
@@ -25,7 +23,9 @@ from ..step.diagnostics import STARTED, STEPPED, TURNS, UNSTEPPED, risks
 from ..step.integrator import FREE
 from ..world import World
 from .clocks import NONE, Clocks
+from .knobs import Knobs
 from .report import WorldsReport
+from .structure import alike, check_structure
 
 WORK = 30_000_000  # particles and constraints, times passes, in a launch: it takes about a second
 LOGGED = 1 << 22  # figures of frames that are kept at a time
@@ -65,17 +65,16 @@ class Worlds:
             count = len(sources)
         with whole:
             self._originals = first.features  # by which the user may know those of the copies
-            sources = _alike(sources)
+            sources = alike(sources)
             self._copies = Copies(count)
             self._world = World._of(
                 first.particles, tuple(f.copy() for f in first.features), [f.start for f in first.features],
                 copies=self._copies, **(first.settings | {"path": "fused"}),
             )  # fmt: skip
             self._runner = self._world._runner
-            _check_structure(sources)
+            check_structure(sources)
             self._fastest = np.array([world._runner.step.integrator.fastest for world in sources])
             self._sources = [_Source(world) for world in sources] if len(sources) > 1 else []
-            self._given = _other_knobs(sources)  # by feature and knob: what each world has of it
             self._clocks = Clocks([world._clock for world in sources])
             for k, world in enumerate(sources):
                 self._take(k, world)
@@ -84,14 +83,9 @@ class Worlds:
                     memory.choose(0)
                     memory.spread()
                 self._clocks = Clocks([self._clocks.of(0)] * count)
+            self._knobs = Knobs(self._world.features, sources, count)
             self._rest()
-            self._waiting = [[_flags(f) for f in world.features] for world in sources]  # of each, for the first frame
-            for f, *each in zip(self._world.features, *self._waiting, strict=True):
-                changed, moving, new_force = (any(flags) for flags in zip(*each, strict=True))
-                _set_flags(f, (changed, moving, new_force))
         self._copies.closed = True
-        self._set: dict[int, np.ndarray] = {}  # by feature, the worlds in which set() gave it other knobs
-        self._forced: set[Feature] = set()  # of these, whose forces changed
         self._last: WorldsReport | None = None
         self._start: _Start | None = None  # what reset() returns to; from the first step on
 
@@ -113,9 +107,7 @@ class Worlds:
         """Meanwhile fields are those of all worlds, and signals wait."""
         with whole, self._copies.all():
             self._runner.memory.check()
-            for i, name in [*self._given]:
-                if vars(self._world.features[i])[name] is not self._given[i, name]:
-                    del self._given[i, name]  # assigned for all since then
+            self._knobs.forget_assigned()
             yield
 
     @property
@@ -127,12 +119,7 @@ class Worlds:
     def _rest(self) -> None:
         """No world is chosen."""
         self._runner.memory.choose(None)
-        self._show_knobs(None)
-
-    def _show_knobs(self, k: int | None) -> None:
-        """Features have the knobs of the k-th; None: of all, as they are to be seen."""
-        for (i, name), values in self._given.items():
-            self._world.features[i].__dict__[name] = values if k is None else values[k]
+        self._knobs.show(None)
 
     @contextlib.contextmanager
     def _at(self, k: Any) -> Iterator[World]:
@@ -144,7 +131,7 @@ class Worlds:
         runner.scene.h2_effective = clock.h**2 * runner.integrator.h2_factor * share
         if self._sources:
             self._sources[k].put_on(world)
-        self._show_knobs(k)
+        self._knobs.show(k)
         try:
             yield world
         finally:
@@ -238,26 +225,6 @@ class Worlds:
         self._start = self._start or _Start(self)
         return moved, released
 
-    def _upload_to_all(self) -> bool:
-        """Write knobs of all worlds in one go, where features can. False where each world has to be asked by itself."""
-        features = self._world.features
-        changed = [f for i, f in enumerate(features) if f.changed or i in self._set]
-        able = all(f.uploads_all and not f.new_force and f not in self._forced for f in changed)
-        able = able and all(f.uploads_all for f in features if f.moving) and len(self._waiting) <= 1
-        stacked = [values for (i, _), values in self._given.items() if features[i] in changed]
-        if not able or any(not isinstance(values, np.ndarray) or values.dtype == object for values in stacked):
-            return False
-        self._set, self._waiting = {}, []
-        for f in features:
-            if f.moving:
-                f.moving = False
-                f.end_motion()
-        for f in changed:
-            f.changed = False
-            f.upload()
-        self._runner.find_ramps()
-        return True
-
     def _look(self, some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Energies [J] and overlaps of some, in the state in which they are."""
         clocks = self._clocks
@@ -271,47 +238,22 @@ class Worlds:
         self._go(plan, some, sheets, np.zeros((len(self), kernel.DATES)), figures, np.zeros(1))
         return figures[some, 0, 0], figures[some, 0, 2]
 
-    def _check_kernels(self) -> None:
-        """Refuse what was assigned for all and asks for other kernels; of one of them."""
-        for f in self._world.features:
-            if f.changed and f.outgrown:
-                _refuse_outgrown(f)
-
     def _upload(self) -> None:
         """Bring knobs to the device: those that were assigned for all, and those that were set for some."""
-        world, features = self._world, self._world.features
-        if not self._set and not any(f.changed or f.moving for f in features):
-            self._waiting = []  # nor in any of the worlds that these were made of
+        world, features, knobs = self._world, self._world.features, self._knobs
+        if knobs.idle():
             return
         with self._at(0):
-            self._check_kernels()
-        if self._upload_to_all():
+            knobs.check_kernels()
+        if knobs.upload_to_all():
+            self._runner.find_ramps()
             return
-        all_of_them = len(self._waiting) > 1 or any(f.changed or f.moving for f in features)
         still = np.zeros(len(features), dtype=bool)
-        for k in range(len(self)) if all_of_them else np.flatnonzero(np.any([*self._set.values()], axis=0)):
-            with self._at(k), self._flagged(k):
+        for k in knobs.waiting:
+            with self._at(k), knobs.flagged(k):
                 world._upload_parameters()
                 still |= [f.moving for f in features]
-        self._set, self._waiting = {}, []
-        self._forced.clear()
-        for f, moving in zip(features, still.tolist(), strict=True):
-            _set_flags(f, (False, moving, False))
-
-    @contextlib.contextmanager
-    def _flagged(self, k: Any) -> Iterator[None]:
-        """Meanwhile features say what waits in them to be uploaded for the k-th, and not for all."""
-        features = self._world.features
-        common = [_flags(f) for f in features]
-        own = self._waiting[k] if len(self._waiting) > 1 else common
-        for i, (f, (changed, moving, new_force)) in enumerate(zip(features, own, strict=True)):
-            changed = changed or (i in self._set and bool(self._set[i][k]))
-            _set_flags(f, (changed, moving, new_force or (changed and f in self._forced)))
-        try:
-            yield
-        finally:
-            for f, flags in zip(features, common, strict=True):
-                _set_flags(f, flags)
+        knobs.note_uploaded(still.tolist())
 
     def _launch(
         self, dt: float, frames: int, moved: np.ndarray, released: np.ndarray, every: int = 0, track: np.ndarray | None = None,
@@ -358,11 +300,11 @@ class Worlds:
         while len(some):
             plan[kernel.COUNT], plan[kernel.GRAIN] = len(some), self._kernels.grain(len(some))
             which[: len(some)] = some
-            self._show_knobs(0)  # kernels are compiled for whether there is friction, which is the same in all
+            self._knobs.show(0)  # kernels are compiled for whether there is friction, which is the same in all
             try:
                 CachedLaunch(self._kernels, "run", memory.compiler, plan, which, figures.reshape(-1), track)()
             finally:
-                self._show_knobs(None)
+                self._knobs.show(None)
             if not runner.step.searches:
                 return
             sheets = memory.read(self._kernels.sheet)
@@ -417,36 +359,9 @@ class Worlds:
 
         Raises ValueError or TypeError as an assignment to the knob does, and names the world.
         """
-        i, f = self._feature(feature)
+        i = self._feature(feature)
         chosen = self._chosen("Worlds.set", some)
-        for name, values in knobs.items():
-            if name not in knobs_of(type(f)):
-                live = ", ".join(knobs_of(type(f))) or "nothing"
-                raise AttributeError(f"Worlds.set: {name} is no knob of {f!r}{meant(name, knobs_of(type(f)))}. Live are {live}.")
-            if np.ndim(values) == 0 or len(values) != len(chosen):
-                has = "one value" if np.ndim(values) == 0 else f"{len(values)} values"
-                raise ValueError(f"Worlds.set: {name} has {has}, but there are {len(chosen)} worlds. Give each its own.")
-            knob, before = getattr(type(f), name), vars(f)[name]
-            every = list(before) if (i, name) in self._given and before is self._given[i, name] else [before] * len(self)
-            k = -1
-            try:
-                for k, value in zip(chosen, values, strict=True):
-                    every[k] = knob.check(f, value)
-                    if not f.uploads_all:
-                        _check_fits(f, name, every[k], before)
-                together = _stacked(every)
-                if f.uploads_all:
-                    k = -1
-                    _check_fits(f, name, together, before)
-            except (ValueError, TypeError) as error:
-                if k >= 0:
-                    error.add_note(f"That is what Worlds.set was given for world {k}.")
-                raise
-            vars(f)[name] = self._given[i, name] = together
-            mask = self._set.setdefault(i, np.zeros(len(self), dtype=bool))
-            mask[chosen] = True
-            if knob.force:
-                self._forced.add(f)
+        self._knobs.set(i, chosen, knobs)
 
     def reset(self, some: Any = None, position: Any = None, velocity: Any = None) -> None:
         """Return to where they were before their first step: time, positions, velocities, all that the future depends on. Knobs
@@ -467,10 +382,11 @@ class Worlds:
                 v = self._per_particle("velocity", velocity, len(chosen))
                 self._start_from(v, chosen)
 
-    def _feature(self, feature: Feature) -> tuple[int, Feature]:
+    def _feature(self, feature: Feature) -> int:
+        """Its number."""
         for i, (ours, theirs) in enumerate(zip(self._world.features, self._originals, strict=True)):
             if feature is ours or feature is theirs:
-                return i, ours
+                return i
         raise ValueError(
             f"Worlds.set: {feature!r} is none of these worlds. They have {', '.join(map(repr, self._world.features))}."
         )
@@ -499,8 +415,8 @@ class Worlds:
     def __getitem__(self, k: int) -> World:
         """The k-th as a World of its own, in its present state: what is done to it shows in no other."""
         k = range(len(self))[k]
-        with self._open(), self._at(k) as world, self._flagged(k):
-            self._check_kernels()
+        with self._open(), self._at(k) as world, self._knobs.flagged(k):
+            self._knobs.check_kernels()
             return world.clone(path="auto")
 
     def each(self, ask: Callable[[World], Any], some: Any = None) -> list[Any]:
@@ -771,126 +687,6 @@ def _checked(worlds: Any, count: int | None) -> list[World]:
         if world._controller.auto:
             raise ValueError(f'Worlds: worlds[{k}] has substeps = "auto", but all go through the same substeps. Give a number.')
     return several
-
-
-def _alike(worlds: list[World]) -> list[World]:
-    """The worlds, or clones of those that are only compiled in another way: for a team of threads, for knobs that they no longer
-    have, or without what lets particles part that overlap, where others have them."""
-    shrinks = [any(contact.shrinks for contact in world._runner.step.contacts) for world in worlds]
-    out = []
-    for world, has in zip(worlds, shrinks, strict=True):
-        lacks = any(shrinks) and not has
-        outgrown = any(f.changed and f.outgrown for f in world.features)  # knobs ask for other kernels, which clones get
-        if lacks or outgrown or world.path != "fused":
-            world = world.clone(path="fused")
-        if lacks:
-            world._runner.step.contacts[0].enable_shrink()
-            world._runner.renew()
-        out.append(world)
-    return out
-
-
-def _check_fits(feature: Feature, name: str, value: Any, before: Any) -> None:
-    """Refuse what asks for other kernels."""
-    vars(feature)[name] = value
-    try:
-        if feature.outgrown:
-            _refuse_outgrown(feature)
-    finally:
-        vars(feature)[name] = before
-
-
-def _refuse_outgrown(feature: Feature) -> None:
-    raise ValueError(
-        f"Worlds: a knob of {feature!r} asks for what these kernels do not have, such as friction where there was none. Give the "
-        "World that Worlds is made of a value other than 0 first."
-    )
-
-
-def _flags(feature: Feature) -> tuple[bool, bool, bool]:
-    """What waits in it to be uploaded."""
-    return feature.changed, feature.moving, feature.new_force
-
-
-def _set_flags(feature: Feature, flags: tuple[bool, bool, bool]) -> None:
-    feature.changed, feature.moving, feature.new_force = flags
-
-
-def _other_knobs(worlds: list[World]) -> dict[tuple[int, str], Any]:
-    """The knobs that are not the same in all of them: by the number of the feature and the name, the values."""
-    out: dict[tuple[int, str], Any] = {}
-    for i, alike in enumerate(zip(*(world.features for world in worlds), strict=True)):
-        for name in knobs_of(type(alike[0])):
-            values = [vars(f)[name] for f in alike if name in vars(f)]
-            if len(values) == len(worlds) and any(not np.array_equal(v, values[0]) for v in values):
-                out[i, name] = _stacked(values)
-    return out
-
-
-def _stacked(values: list[Any]) -> Any:
-    """An array of what each world has; a list of what makes none."""
-    try:
-        return np.array(values)
-    except ValueError:
-        return values
-
-
-def _check_structure(worlds: Sequence[World]) -> None:
-    """Raise ValueError for a world that kernels of the first do not fit."""
-    rule = "They may differ in numbers only, not in how many particles and constraints there are, in what acts, or on what."
-    first = _structure(worlds[0])
-    for k, world in enumerate(worlds[1:], 1):
-        now = _structure(world)
-        for what in ("settings", "features", "fields"):
-            if now[what] != first[what]:
-                ours, theirs = _difference(first[what], now[what])
-                raise ValueError(f"Worlds: worlds[{k}] has {theirs}, where worlds[0] has {ours}. {rule}")
-        if now["indices"] != first["indices"]:
-            raise ValueError(f"Worlds: constraints of worlds[{k}] act on other particles than those of worlds[0]. {rule}")
-        if now["kernels"] != first["kernels"]:
-            raise ValueError(
-                f"Worlds: kernels of worlds[{k}] have other constants than those of worlds[0], as Jacobi(relaxation='auto') "
-                f"finds them for a scene, or functions of yours that know other values. {rule}"
-            )
-
-
-def _difference(ours: list[Any], theirs: list[Any]) -> tuple[str, str]:
-    """The first items that are not the same."""
-    missing = object()
-    for a, b in zip_longest(ours, theirs, fillvalue=missing):
-        if a != b:
-            return tuple("nothing" if v is missing else " ".join(map(str, v)) for v in (a, b))  # type: ignore[return-value]
-    raise AssertionError("they are equal")
-
-
-def _structure(world: World) -> dict[str, Any]:
-    """What all of them must have in common."""
-    built = [(type(f).__name__, *(f._world_for or {}).items()) for f in world.features]
-    out: dict[str, Any] = {
-        "settings": [(name, "=", repr(value)) for name, value in world.settings.items()],
-        "features": built,
-        "fields": [("a field", e.name, "of shape", e.shape) for e in world._runner.memory.entries],
-        "indices": [f.indices.tobytes() for f in world.features if isinstance(f, Batch)],
-        "kernels": None,
-    }
-    if COMPILER == "taichi":  # whose inside is known
-        out["kernels"] = _written(world)
-    return out
-
-
-def _written(world: World) -> Any:
-    """What kernels of a world are compiled from, where fields go by their numbers."""
-    from ..device.patches.sharing import Writing  # noqa: PLC0415
-
-    fields = [vars(e.field) for memory in world._runner.memories for e in memory.entries]
-    before = [known.get("place_name") for known in fields]
-    for k, known in enumerate(fields):
-        known["place_name"] = "field", k
-    try:
-        return Writing(world._runner.step).key
-    finally:
-        for known, name in zip(fields, before, strict=True):
-            known["place_name"] = name
 
 
 def _frame_count(who: str, seconds: float, dt: float) -> int:

@@ -1,0 +1,178 @@
+"""Knobs that differ from world to world."""
+
+import contextlib
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..features.arguments import knobs_of, meant
+from ..features.feature import Feature
+
+if TYPE_CHECKING:
+    from ..world import World
+
+
+class Knobs:
+    """Of the features of one World that stands for `count`: knobs that differ from world to world, what each has of them, and
+    what waits to be uploaded for the next frame.
+
+    worlds: those that they were made of.
+    """
+
+    def __init__(self, features: tuple[Feature, ...], worlds: "list[World]", count: int):
+        self.features, self.count = features, count
+        self._given = _other_knobs(worlds)  # by feature and knob: what each world has of it
+        self._waiting = [[_flags(f) for f in world.features] for world in worlds]  # of each, for the first frame
+        self._set: dict[int, np.ndarray] = {}  # by feature, the worlds in which set() gave it other knobs
+        self._forced: set[Feature] = set()  # of these, whose forces changed
+        for f, *each in zip(features, *self._waiting, strict=True):
+            changed, moving, new_force = (any(flags) for flags in zip(*each, strict=True))
+            _set_flags(f, (changed, moving, new_force))
+
+    def forget_assigned(self) -> None:
+        """What was assigned for all, since it was set for some, differs no more."""
+        for i, name in [*self._given]:
+            if vars(self.features[i])[name] is not self._given[i, name]:
+                del self._given[i, name]
+
+    def show(self, k: int | None) -> None:
+        """Features have the knobs of the k-th; None: of all, as they are to be seen."""
+        for (i, name), values in self._given.items():
+            self.features[i].__dict__[name] = values if k is None else values[k]
+
+    def set(self, i: int, chosen: np.ndarray, knobs: dict[str, Any]) -> None:
+        """Give knobs of the i-th feature other values in the chosen worlds, see Worlds.set()."""
+        f = self.features[i]
+        for name, values in knobs.items():
+            if name not in knobs_of(type(f)):
+                live = ", ".join(knobs_of(type(f))) or "nothing"
+                raise AttributeError(f"Worlds.set: {name} is no knob of {f!r}{meant(name, knobs_of(type(f)))}. Live are {live}.")
+            if np.ndim(values) == 0 or len(values) != len(chosen):
+                has = "one value" if np.ndim(values) == 0 else f"{len(values)} values"
+                raise ValueError(f"Worlds.set: {name} has {has}, but there are {len(chosen)} worlds. Give each its own.")
+            knob, before = getattr(type(f), name), vars(f)[name]
+            every = list(before) if (i, name) in self._given and before is self._given[i, name] else [before] * self.count
+            k = -1
+            try:
+                for k, value in zip(chosen, values, strict=True):
+                    every[k] = knob.check(f, value)
+                    if not f.uploads_all:
+                        _check_fits(f, name, every[k], before)
+                together = _stacked(every)
+                if f.uploads_all:
+                    k = -1
+                    _check_fits(f, name, together, before)
+            except (ValueError, TypeError) as error:
+                if k >= 0:
+                    error.add_note(f"That is what Worlds.set was given for world {k}.")
+                raise
+            vars(f)[name] = self._given[i, name] = together
+            mask = self._set.setdefault(i, np.zeros(self.count, dtype=bool))
+            mask[chosen] = True
+            if knob.force:
+                self._forced.add(f)
+
+    def check_kernels(self) -> None:
+        """Refuse what was assigned for all and asks for other kernels; of the one that is shown."""
+        for f in self.features:
+            if f.changed and f.outgrown:
+                _refuse_outgrown(f)
+
+    def idle(self) -> bool:
+        """Whether nothing waits to be uploaded."""
+        if self._set or any(f.changed or f.moving for f in self.features):
+            return False
+        self._waiting = []  # nor in any of the worlds that these were made of
+        return True
+
+    def upload_to_all(self) -> bool:
+        """Write those of all worlds in one go, where features can. False where each world has to be asked by itself."""
+        changed = [f for i, f in enumerate(self.features) if f.changed or i in self._set]
+        able = all(f.uploads_all and not f.new_force and f not in self._forced for f in changed)
+        able = able and all(f.uploads_all for f in self.features if f.moving) and len(self._waiting) <= 1
+        stacked = [values for (i, _), values in self._given.items() if self.features[i] in changed]
+        if not able or any(not isinstance(values, np.ndarray) or values.dtype == object for values in stacked):
+            return False
+        self._set, self._waiting = {}, []
+        for f in self.features:
+            if f.moving:
+                f.moving = False
+                f.end_motion()
+        for f in changed:
+            f.changed = False
+            f.upload()
+        return True
+
+    @property
+    def waiting(self) -> np.ndarray:
+        """The worlds in which something waits."""
+        if len(self._waiting) > 1 or any(f.changed or f.moving for f in self.features):
+            return np.arange(self.count)
+        return np.flatnonzero(np.any([*self._set.values()], axis=0))
+
+    def note_uploaded(self, moving: list[bool]) -> None:
+        """All were asked by themselves. moving: of each feature, whether a target is under way in any world."""
+        self._set, self._waiting = {}, []
+        self._forced.clear()
+        for f, still in zip(self.features, moving, strict=True):
+            _set_flags(f, (False, still, False))
+
+    @contextlib.contextmanager
+    def flagged(self, k: Any) -> Iterator[None]:
+        """Meanwhile features say what waits in them to be uploaded for the k-th, and not for all."""
+        common = [_flags(f) for f in self.features]
+        own = self._waiting[k] if len(self._waiting) > 1 else common
+        for i, (f, (changed, moving, new_force)) in enumerate(zip(self.features, own, strict=True)):
+            changed = changed or (i in self._set and bool(self._set[i][k]))
+            _set_flags(f, (changed, moving, new_force or (changed and f in self._forced)))
+        try:
+            yield
+        finally:
+            for f, flags in zip(self.features, common, strict=True):
+                _set_flags(f, flags)
+
+
+def _check_fits(feature: Feature, name: str, value: Any, before: Any) -> None:
+    """Refuse what asks for other kernels."""
+    vars(feature)[name] = value
+    try:
+        if feature.outgrown:
+            _refuse_outgrown(feature)
+    finally:
+        vars(feature)[name] = before
+
+
+def _refuse_outgrown(feature: Feature) -> None:
+    raise ValueError(
+        f"Worlds: a knob of {feature!r} asks for what these kernels do not have, such as friction where there was none. Give the "
+        "World that Worlds is made of a value other than 0 first."
+    )
+
+
+def _flags(feature: Feature) -> tuple[bool, bool, bool]:
+    """What waits in it to be uploaded."""
+    return feature.changed, feature.moving, feature.new_force
+
+
+def _set_flags(feature: Feature, flags: tuple[bool, bool, bool]) -> None:
+    feature.changed, feature.moving, feature.new_force = flags
+
+
+def _other_knobs(worlds: "list[World]") -> dict[tuple[int, str], Any]:
+    """The knobs that are not the same in all of them: by the number of the feature and the name, the values."""
+    out: dict[tuple[int, str], Any] = {}
+    for i, alike in enumerate(zip(*(world.features for world in worlds), strict=True)):
+        for name in knobs_of(type(alike[0])):
+            values = [vars(f)[name] for f in alike if name in vars(f)]
+            if len(values) == len(worlds) and any(not np.array_equal(v, values[0]) for v in values):
+                out[i, name] = _stacked(values)
+    return out
+
+
+def _stacked(values: list[Any]) -> Any:
+    """An array of what each world has; a list of what makes none."""
+    try:
+        return np.array(values)
+    except ValueError:
+        return values

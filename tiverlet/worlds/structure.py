@@ -1,0 +1,86 @@
+"""Which worlds can be stepped together: those whose kernels are the same."""
+
+from collections.abc import Sequence
+from itertools import zip_longest
+from typing import TYPE_CHECKING, Any
+
+from ..device.language import COMPILER
+from ..features.feature import Batch
+
+if TYPE_CHECKING:
+    from ..world import World
+
+
+def alike(worlds: "list[World]") -> "list[World]":
+    """The worlds, or clones of those that are only compiled in another way: for a team of threads, for knobs that they no longer
+    have, or without what lets particles part that overlap, where others have them."""
+    shrinks = [any(contact.shrinks for contact in world._runner.step.contacts) for world in worlds]
+    out = []
+    for world, has in zip(worlds, shrinks, strict=True):
+        lacks = any(shrinks) and not has
+        outgrown = any(f.changed and f.outgrown for f in world.features)  # knobs ask for other kernels, which clones get
+        if lacks or outgrown or world.path != "fused":
+            world = world.clone(path="fused")
+        if lacks:
+            world._runner.step.contacts[0].enable_shrink()
+            world._runner.renew()
+        out.append(world)
+    return out
+
+
+def check_structure(worlds: "Sequence[World]") -> None:
+    """Raise ValueError for a world that kernels of the first do not fit."""
+    rule = "They may differ in numbers only, not in how many particles and constraints there are, in what acts, or on what."
+    first = _structure(worlds[0])
+    for k, world in enumerate(worlds[1:], 1):
+        now = _structure(world)
+        for what in ("settings", "features", "fields"):
+            if now[what] != first[what]:
+                ours, theirs = _difference(first[what], now[what])
+                raise ValueError(f"Worlds: worlds[{k}] has {theirs}, where worlds[0] has {ours}. {rule}")
+        if now["indices"] != first["indices"]:
+            raise ValueError(f"Worlds: constraints of worlds[{k}] act on other particles than those of worlds[0]. {rule}")
+        if now["kernels"] != first["kernels"]:
+            raise ValueError(
+                f"Worlds: kernels of worlds[{k}] have other constants than those of worlds[0], as Jacobi(relaxation='auto') "
+                f"finds them for a scene, or functions of yours that know other values. {rule}"
+            )
+
+
+def _difference(ours: list[Any], theirs: list[Any]) -> tuple[str, str]:
+    """The first items that are not the same."""
+    missing = object()
+    for a, b in zip_longest(ours, theirs, fillvalue=missing):
+        if a != b:
+            return tuple("nothing" if v is missing else " ".join(map(str, v)) for v in (a, b))  # type: ignore[return-value]
+    raise AssertionError("they are equal")
+
+
+def _structure(world: "World") -> dict[str, Any]:
+    """What all of them must have in common."""
+    built = [(type(f).__name__, *(f._world_for or {}).items()) for f in world.features]
+    out: dict[str, Any] = {
+        "settings": [(name, "=", repr(value)) for name, value in world.settings.items()],
+        "features": built,
+        "fields": [("a field", e.name, "of shape", e.shape) for e in world._runner.memory.entries],
+        "indices": [f.indices.tobytes() for f in world.features if isinstance(f, Batch)],
+        "kernels": None,
+    }
+    if COMPILER == "taichi":  # whose inside is known
+        out["kernels"] = _written(world)
+    return out
+
+
+def _written(world: "World") -> Any:
+    """What kernels of a world are compiled from, where fields go by their numbers."""
+    from ..device.patches.sharing import Writing  # noqa: PLC0415
+
+    fields = [vars(e.field) for memory in world._runner.memories for e in memory.entries]
+    before = [known.get("place_name") for known in fields]
+    for k, known in enumerate(fields):
+        known["place_name"] = "field", k
+    try:
+        return Writing(world._runner.step).key
+    finally:
+        for known, name in zip(fields, before, strict=True):
+            known["place_name"] = name
