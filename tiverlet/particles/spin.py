@@ -8,7 +8,8 @@ from ..device import ti
 from ..device.memory import Memory
 from ..device.number import Number
 from ..features.regrouping import Regrouping
-from .particles import Particles, Shared, at_rest
+from .particles import Particles, at_rest
+from .per_particle import PerParticle
 
 
 class Spin:
@@ -28,13 +29,13 @@ class Spin:
         n, self.dim, self.real = particles.count, particles.dim, memory.real
         self.axes, self.radius = particles.axes, particles.radius
         self.s = memory.field("spin", number, width=self.axes, values=self.from_rates(particles.spin), state=True)
-        self.share = Shared(memory, "spin_share", shares(particles, inv_mass), number)
+        self.share = PerParticle(memory, "spin_share", shares(particles, inv_mass), number)
         self.orients = particles.orientation is not None
         if self.orients:
             width = 1 if self.dim == 2 else 4
             turned = np.asarray(particles.orientation).reshape(n, width)
             self.orientation = memory.field("orientation", number, width=width, kind=ti.f64, values=turned, state=True)
-            self.inverse_radius = Shared(memory, "inverse_radius", inverse(particles.radius), number)
+            self.inverse_radius = PerParticle(memory, "inverse_radius", inverse(particles.radius), number)
 
     def can_regroup(self, change: Regrouping) -> bool:
         """Whether particles can come and go where it is."""

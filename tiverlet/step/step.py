@@ -2,7 +2,7 @@
 
 frame() and substep() are the order of the phases, for every path. Taichi compiles them into one kernel, where `do` is a Step:
 a whole frame in one launch, by one CPU thread or a team of them ("fused" and "parallel"). Where each phase is launched by itself,
-as on a GPU, Python runs the same lines, and `do` is a Launcher (runner.py). Higher orders differ in the integrator alone.
+as on a GPU, Python runs the same lines, and `do` is a Launcher (launcher.py). Higher orders differ in the integrator alone.
 """
 
 from typing import TYPE_CHECKING, Any
