@@ -48,7 +48,7 @@ class Target(Place):
 
     @ti.func
     def aim(self, c, frame_fraction):
-        """The target at the fraction `when` of the frame."""
+        """The target at this fraction of the frame."""
         return self.source[c] * (1 - frame_fraction) + self.target[c] * frame_fraction
 
     @ti.func

@@ -1,0 +1,166 @@
+"""Places on a curve, on the device."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ...device import ti
+from ...features.feature import FAR
+from .anchor_passes import AnchorPasses, Place
+
+if TYPE_CHECKING:
+    from ...features.feature import Scene
+    from .curve import Curve
+
+WALK = 64  # steps along the pieces of a path, at most, that a search takes
+
+
+class OnCurve(Place):
+    """Where particles are on a curve: the piece, and how far along it. start: their arc lengths at first, (m,). extent: of the
+    curve [m]. Those that are driven have a pace: speeds where it `moves`, or else arc lengths; None where they slide."""
+
+    def __init__(
+        self, scene: "Scene", passes: AnchorPasses, curve: "Curve", start: np.ndarray, pace: np.ndarray | None, moves: bool,
+        extent: float,
+    ):  # fmt: skip
+        dim, add, m = scene.particles.dim, scene.memory.field, len(start)
+        self.name, self.corners = passes.name, passes.corners
+        self.state, self.slots, self.real = scene.state, scene.slots, scene.real
+        self.pieces, self.closed = len(curve.lengths), curve.closed
+        self.a, self.b, self.c, self.d = (
+            add(f"Path.{name}", self.pieces, width=dim, values=v)
+            for name, v in (("points", curve.a), ("tangents", curve.b), ("second", curve.c), ("third", curve.d))
+        )
+        self.lengths = add("Path.lengths", self.pieces, values=curve.lengths)
+        piece, rest = curve.split(start)
+        self.piece = add("Path.piece", m, kind=ti.i32, values=piece, state=True, below=self.pieces)
+        self.rest = add("Path.rest", m, values=rest, state=True)
+        self.in_state = {"piece": self.piece, "rest": self.rest}
+        self.least = extent * (2.0**-22 if scene.real == ti.f32 else 2.0**-44)
+        if pace is None:
+            self.tangent = add("Path.tangent", m, width=dim)
+        else:
+            self.moves = moves
+            self.begin = add("Path.begin", self.pieces + 1, kind=ti.f64, values=curve.starts)
+            self.source = add("Path.from", m, kind=ti.f64, values=start, state=True)
+            self.target = add("Path.to", m, kind=ti.f64, values=pace, state=True)
+            self.in_state |= {"source": self.source, "target": self.target}
+
+    @ti.func
+    def point(self, k, r):
+        """P and dP/dr on piece k."""
+        b, c, d = self.b[k], self.c[k], self.d[k]
+        return self.a[k] + r * (b + r * (c + r * d)), b + r * (2 * c + 3 * r * d)
+
+    @ti.func
+    def drive(self, c, h, frame_fraction):
+        """Put the particle where it is to be."""
+        s, length = self.source[c], self.begin[self.pieces]
+        if ti.static(self.moves):
+            s += self.target[c] * h
+            self.source[c] = s
+        else:
+            s = s * (1 - frame_fraction) + self.target[c] * frame_fraction
+        if ti.static(self.closed):
+            s -= ti.floor(s / length) * length
+        else:
+            s = ti.min(ti.max(s, 0), length)
+        low, high = 0, self.pieces
+        while high - low > 1:
+            middle = (low + high) // 2
+            if self.begin[middle] <= s:
+                low = middle
+            else:
+                high = middle
+        P, T = self.point(low, ti.cast(s - self.begin[low], self.real))
+        i = self.corners.member(c, 0)
+        d = P - self.state.place(i)
+        self.state.d[i] = d
+        self.state.advance(i, d)
+
+    @ti.func
+    def search(self, x):
+        """The piece nearest to x, and how far along it, as if it were straight."""
+        best, piece, rest = ti.cast(ti.math.inf, self.real), 0, 0 * x[0]
+        for k in range(self.pieces):
+            a, end = self.a[k], self.point(k, self.lengths[k])[0]
+            along = end - a
+            u = ti.min(ti.max((x - a).dot(along) / along.dot(along), 0), 1)
+            far = (x - a - u * along).norm_sqr()
+            if far < best:
+                best, piece, rest = far, k, u * self.lengths[k]
+        return piece, rest
+
+    @ti.func
+    def foot(self, k, r, x, t, across):
+        """Where, from rest r on piece k on, the plane through x across t meets the curve; or else the point nearest to x.
+
+        Also says whether the curve turned away from t by more than 41 degrees, or the way was too long.
+        """
+        going, bent, came = True, False, -1
+        for _ in range(WALK):
+            if going:
+                P, T = self.point(k, r)
+                n, length = T, self.lengths[k]
+                if across:
+                    n = t
+                    bent = T.dot(t) < 0.75 * T.norm()
+                step = (x - P).dot(n) / T.dot(n)
+                if bent:
+                    going = False
+                elif r + step > length:
+                    ahead = k + 1 if k + 1 < self.pieces else 0
+                    if ahead == came or (ti.static(not self.closed) and ahead == 0):
+                        r, going = length, False
+                    else:
+                        came, k, r = k, ahead, 0 * r
+                elif r + step < 0:
+                    ahead = k - 1 if k > 0 else self.pieces - 1
+                    if ahead == came or (ti.static(not self.closed) and k == 0):
+                        r, going = 0 * r, False
+                    else:
+                        came, k, r = k, ahead, self.lengths[ahead]
+                else:
+                    r, came, going = r + step, -1, ti.abs(step) > self.least
+        return k, r, bent or going
+
+    @ti.func
+    def offsets(self, c, frame_fraction, first, fresh):
+        """Across the curve, from where the plane across it meets it; at an end or a bend, from the nearest point."""
+        i = self.corners.member(c, 0)
+        x, t, C0 = self.state.place(i), self.tangent[c], ti.Vector.zero(self.real, self.state.dim)
+        k, r = self.piece[c], self.rest[c]
+        if first != 0:
+            start = x - self.state.d[i]
+            if fresh != 0:
+                k, r = self.search(start)
+            k, r, lost = self.foot(k, r, start, t, False)
+            self.piece[c], self.rest[c] = k, r
+            P, T = self.point(k, r)
+            t, C0 = T / T.norm(), start - P
+            self.tangent[c] = t
+        k, r, bent = self.foot(k, r, x, t, True)
+        if bent:
+            k, r, lost = self.foot(self.piece[c], self.rest[c], x, t, False)
+            self.slots.note_turn(FAR)
+        P, T = self.point(k, r)
+        C = x - P
+        ends = ti.static(not self.closed) and ((k == 0 and r <= 0) or (k == self.pieces - 1 and r >= self.lengths[k]))
+        if not (bent or ends):
+            C -= C.dot(t) * t
+        return C, C0
+
+    @ti.func
+    def offset_now(self, c, back):
+        """From the nearest point."""
+        i = self.corners.member(c, 0)
+        x = self.state.place(i) - back * self.state.d[i]
+        k, r, lost = self.foot(self.piece[c], self.rest[c], x, x, False)
+        P, T = self.point(k, r)
+        return x - P
+
+    @ti.func
+    def offset_change(self, c):
+        """What of the motion is across the curve."""
+        d, t = self.state.d[self.corners.member(c, 0)], self.tangent[c]
+        return d - d.dot(t) * t
