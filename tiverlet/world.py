@@ -158,7 +158,7 @@ class World:
         return report
 
     def _broken_off(self) -> None:
-        """A step ended with an exception: undo it, or tell recorders that the state is none that steps lead to."""
+        """A step ended with an exception: undo it, or tell recorders that no step leads to this state."""
         undo, self._undo, self._events = self._undo, None, (none := no_events(self._particles.dim), none)
         if undo:
             checkpoint.undo(self, *undo)
@@ -167,7 +167,7 @@ class World:
             watcher.broken_off()
 
     def _upload_parameters(self) -> None:
-        """Bring the knobs to the device; where a force has changed, start anew while the device still has what it was."""
+        """Bring the knobs to the device. Where a force has changed, displacements become velocities first, by the old force."""
         waiting = [f for f in self._features if f.changed or f.moving]
         if waiting:
             if self._runner.sleep and not all(isinstance(f, Batch) and f.drives for f in waiting):
@@ -177,11 +177,12 @@ class World:
 
     @property
     def _force_waits(self) -> bool:
-        """Whether a force has changed and the device still has what it was."""
+        """Whether a force has changed and the device still has the old one."""
         return any(f.changed and (f.new_force or isinstance(f, Acceleration)) for f in self._features)
 
     def _settle_forces(self) -> None:
-        """Where a force has changed, take velocities by what it was: before that is overwritten, or left behind by a copy."""
+        """Where a force has changed, turn displacements into velocities by the old one, before it is overwritten, or left behind
+        by a copy."""
         if any(f.changed and f.lets_go for f in self._features):
             self._let_go()
         elif self._force_waits:
@@ -189,7 +190,7 @@ class World:
                 self._runner.restart(self._iterations)
 
     def _let_go(self) -> None:
-        """Start from velocities, with the part in them of what is about to go."""
+        """Start from the velocities of now, to which what is about to go has given its part."""
         if not self._clock.d_is_velocity:
             self._start_from(self.velocity)
 

@@ -53,7 +53,7 @@ class Particles:
         self._fix()
 
     def _fix(self) -> None:
-        """All that was set is structure from now on."""
+        """From now on nothing can be set."""
         for name, array in vars(self).items():
             if isinstance(array, np.ndarray):
                 vars(self)[name] = _fixed(name, array)
@@ -66,7 +66,7 @@ class Particles:
 
     @property
     def extent(self) -> list[float]:
-        """Of the box around them [m]. Axis by axis, which takes NumPy a tenth of what all at once do."""
+        """Of the box around them [m]. Axis by axis: NumPy is ten times as fast as with all at once."""
         columns = np.ascontiguousarray(np.asarray(self.position).T)
         return [float(x.max() - x.min()) if self.count else 0.0 for x in columns]
 

@@ -21,7 +21,7 @@ from .span import ACTIVE_THREADS, BEFORE, END, GIVE, HALT, ORIGIN, H, Span
 from .step import frame
 from .step_report import StepReport
 
-KEPT = 100_000  # particles up to which the array for velocities is kept: with more, making one takes next to nothing beside them
+KEPT = 100_000  # particles: up to so many, the array for velocities is kept; for more, making one costs next to nothing
 LONG = 10_000_000  # particles and constraints, times passes, in a launch: it takes about a second
 
 
@@ -39,12 +39,12 @@ class Runner:
         self.moved = 0.0  # how far the coming frame has had to move a particle to where its constraints are met [m]
         self.jumped = False  # whether that was further than a particle is large
         self.sleepers, self.sleep = parts.scene.state.sleepers, parts.step.sleep
-        self.released = 0.0  # the violation that its shorter substep turns into energy, as a share of its size
+        self.released = 0.0  # the violation that a shorter substep turns into energy, as a share of the constraint's size
         self.ramping: list[Any] = []  # batches whose rest values go to others in the coming frame
         self.ramps: list[Any] = []  # the memories of what ramps need
-        self.structure: Any = None  # of constraints, in short, once it was asked for
-        self.interruptible = False  # what handlers of signals raise in the middle of a frame is followed by an undo
-        # Asked in every frame, and Taichi looks at each attribute of what has kernels.
+        self.structure: Any = None  # a digest of what kernels could read of constraints, once it was asked for
+        self.interruptible = False  # whether a frame is undone when a handler of a signal raises in the middle of it
+        # Every frame reads these, and Taichi checks each attribute that is read of an object with kernels.
         step = self.step
         self.n, self.launched, self.team, self.integrator = step.n, step.launched, step.team, step.integrator
         self.driven = [b for b in self.batches if b.driven]
@@ -98,7 +98,7 @@ class Runner:
                 if self.sleep:
                     with self.memory.compiler():
                         self.sleep.compile(self.clock)
-                if self.asks_velocities:  # so that nobody waits later for its kernel to compile
+                if self.asks_velocities:  # compile its kernel now, so that nobody waits for it later
                     self._velocities()
                     self.asks_velocities = False
                 report = self.report()
@@ -185,7 +185,7 @@ class Runner:
         self.ramping = [b for b in self.batches if b.ramp and b.ramp.under_way]
 
     def _jump(self) -> None:
-        """In bodies of which any particle was placed anew, rest values jump to what was assigned."""
+        """Have rest values jump to what was assigned, in bodies of which a particle was placed anew."""
         if self.ramping and self.clock.first_moved is not None:
             tied = initial_violation.tied(self.scene, self.batches, self.clock.first_moved)
             for b in self.ramping:
@@ -375,13 +375,13 @@ class Runner:
                 )
 
     def stopped(self) -> tuple[int, int, int]:
-        """Where the frame stopped, for Span, when what it waits for is about to be done."""
+        """Where the frame stopped, as Span has it; and let it go on, for the host is about to do what it waits for."""
         self.memory.write(self.step.halt, 0)
         resumed, begin, half = (int(v) for v in self._data[HALT:ACTIVE_THREADS])
         return (0, begin, 0) if half == BEFORE else (resumed, begin, half)
 
     def _launch(self, span: Span) -> None:
-        """Phase by phase. Whether the frame waits for a list is all that the host asks, when all is launched."""
+        """Phase by phase. Once all is launched, the host asks one thing: whether the frame waits for a list."""
         try:
             frame(self.launcher, span)
             while self.step.searches and self._data[HALT]:

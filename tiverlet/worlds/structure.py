@@ -12,8 +12,8 @@ if TYPE_CHECKING:
 
 
 def alike(worlds: "list[World]") -> "list[World]":
-    """The worlds, or clones of those that are only compiled in another way: for a team of threads, for knobs that they no longer
-    have, or without what lets particles part that overlap, where others have them."""
+    """The worlds, with clones in place of those that differ in nothing but how they were compiled: for a team of threads, for
+    knobs that have other values now, or without shrinking contacts where others have them."""
     shrinks = [any(contact.shrinks for contact in world._runner.step.contacts) for world in worlds]
     out = []
     for world, has in zip(worlds, shrinks, strict=True):
@@ -48,7 +48,7 @@ def check_structure(worlds: "Sequence[World]") -> None:
 
 
 def _difference(ours: list[Any], theirs: list[Any]) -> tuple[str, str]:
-    """The first items that are not the same."""
+    """The first items in which they differ, in words."""
     missing = object()
     for a, b in zip_longest(ours, theirs, fillvalue=missing):
         if a != b:
@@ -72,7 +72,7 @@ def _structure(world: "World") -> dict[str, Any]:
 
 
 def _written(world: "World") -> Any:
-    """What kernels of a world are compiled from, where fields go by their numbers."""
+    """What kernels of a world are compiled from, with numbers in place of its fields."""
     from ..device.patches.sharing import Writing  # noqa: PLC0415
 
     fields = [vars(e.field) for memory in world._runner.memories for e in memory.entries]

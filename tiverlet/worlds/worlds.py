@@ -112,7 +112,7 @@ class Worlds:
 
     @property
     def _kernels(self) -> kernel.Frames:
-        """Those that go through many; other ones after a list has grown."""
+        """The kernels that go through many worlds; after a list has grown, others than before."""
         assert self._runner.frames
         return self._runner.frames
 
@@ -195,8 +195,8 @@ class Worlds:
         return worst
 
     def _begin(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
-        """Have all of them ready for substeps of this length, see Runner.begin(). Returns what that found of each: how far
-        particles were moved, and what a shorter substep released."""
+        """Make all ready for substeps of this length, see Runner.begin(). Returns of each how far particles were moved, and what
+        a shorter substep released."""
         world, runner, clocks = self._world, self._runner, self._clocks
         drags = any(f.changed for f in runner.drags)  # what the clocks have of them is of other rates
         self._upload()
@@ -259,7 +259,7 @@ class Worlds:
         self, dt: float, frames: int, moved: np.ndarray, released: np.ndarray, every: int = 0, track: np.ndarray | None = None,
         before: int = 0,
     ) -> WorldsReport:  # fmt: skip
-        """Frames in one launch, and as many more as lists have to grow. before: frames that are on the track already."""
+        """Frames in one launch, and one more each time that a list has to grow. before: frames that are on the track already."""
         world, runner, clocks = self._world, self._runner, self._clocks
         runner.set_out()
         substeps, iterations, stages = world.substeps, world.iterations, runner.integrator.stages
@@ -292,7 +292,7 @@ class Worlds:
     def _go(
         self, plan: np.ndarray, some: np.ndarray, sheets: np.ndarray, dates: np.ndarray, figures: np.ndarray, track: np.ndarray
     ) -> None:
-        """Launch frames of some, and again those that had to wait for a longer list."""
+        """Launch frames of some worlds, and go on with those that had to wait for a longer list."""
         runner, memory = self._runner, self._runner.memory
         which = some.astype(np.int32)
         memory.write(self._kernels.sheet, sheets)
@@ -646,7 +646,7 @@ class _Start:
 
 
 class _Source:
-    """What Python knows of one of several worlds that are not copies of each other, but for the knobs."""
+    """What the host knows of one of several different worlds, without its knobs."""
 
     def __init__(self, world: World):
         self.particles, self.inv_mass = world.particles, world._runner.scene.inv_mass
