@@ -210,8 +210,9 @@ def test_redundant_links(world):
     t, k = np.linspace(0, 1, n + 1), np.arange(n)
     rope = np.stack([6 * t, -4 * (1 - np.abs(2 * t - 1))], axis=1)
     pairs = np.stack([k, k + 1], axis=1)
-    with pytest.warns(UserWarning, match="duplicates"):
+    with pytest.warns(UserWarning, match="duplicates") as said:
         links = tv.Distance(np.concatenate([pairs, pairs + n + 1, pairs + n + 1]), 10 / n)
+    assert said[0].filename == __file__  # and at whose line
     start = tv.Particles(np.concatenate([rope, rope]), mass=0.1, pinned=[0, n, n + 1, 2 * n + 1])
     w = world(start, [tv.Gravity(9.81), links, tv.Drag(4.0)], iterations=16, precision="f64", solver=tv.Jacobi())
     for seconds in (0.5, 7.5):

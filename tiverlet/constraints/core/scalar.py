@@ -48,14 +48,10 @@ class Scalar(Batch):
 
     def setup(self, indices, rest, compliance, damping, break_at=None) -> None:
         """Keep the arguments of __init__; what depends on the particles is checked in prepare()."""
-        self.keep_indices(indices)
+        self.hold_all(indices)
+        self._warn_duplicates()
         self._rest_given = rest
         self.break_at, self.compliance, self.damping = break_at, compliance, damping
-
-    def keep_indices(self, indices) -> None:
-        """Keep the particles of each constraint."""
-        self.hold(self.quantity_of(indices))
-        self._warn_duplicates()
 
     def quantity_of(self, indices) -> Quantity:
         """f of these particles, given as the user gives them."""
@@ -74,6 +70,7 @@ class Scalar(Batch):
         self.members.check(repr(self), self.index_name, particles.count)
 
     def _warn_duplicates(self) -> None:
+        """Warn of constraints that are given twice, at the line that made them."""
         if not self.arity:
             return
         ordered = self.indices.copy()
