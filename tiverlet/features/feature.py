@@ -75,9 +75,11 @@ class Scene:
 
 
 class Feature:
-    """Base of all. `arguments` are those that it was made with; `changed` says that a knob waits to be uploaded, `new_force`
-    that it changes a force, `lets_go` that it no longer bears what it bore, `afresh` that it begins anew where the world is built
-    anew, `moving` that a target is under way."""
+    """Base of all.
+
+    arguments: those that it was made with. changed: a knob waits to be uploaded. new_force: it changes a force. lets_go: it no
+    longer bears what it bore. afresh: it begins anew where the world is built anew. moving: a target is under way.
+    """
 
     arguments: Mapping[str, Any] = MappingProxyType({})
     # Attributes that a world sets.
@@ -95,7 +97,7 @@ class Feature:
     periodic: Any = None  # the Periodic of its world, from before prepare() on
     _world_for: dict[str, Any] | None = None  # what the world was built for, of built_for(); None where the feature does nothing
     ramp: Any = None  # the Ramp of its rest values, where it has one, while it is bound
-    start: Any = None  # Particles, as they were when it came: what it takes from them is what it took then, when bound again too
+    start: Any = None  # Particles as they were when it came: it goes by these when it is bound again, too
 
     __setattr__, __delattr__, _keep = set_attribute, refuse_deletion, keep
 
@@ -248,10 +250,7 @@ class Acceleration(Feature):
 
 
 class Batch(Feature):
-    """m constraints of the same kind on `arity` particles each.
-
-    What a substep does with each is said by its `dev`, see passes().
-    """
+    """m constraints of the same kind on `arity` particles each. What a substep does with them, says its `dev`, see passes()."""
 
     arity = 0  # 0: as many as each needs, see VariableSize
     reweighs = False  # residual_of() needs reduce_block()
