@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
-from tiverlet.colliders.angle import cos_sin
+from tiverlet.colliders.cos_sin import cos_sin
 from tiverlet.device import ti
 from tiverlet.geometry.ordered import distinct, median
 

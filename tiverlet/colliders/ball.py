@@ -10,7 +10,7 @@ from ..geometry.intervals import ball, entry, exit_of, rounding
 from ..geometry.nearest import away
 from ..particles import Particles
 from .collider import Collider
-from .round import rounded
+from .round_mesh import rounded
 from .surface import TOUCH
 from .track import Track
 

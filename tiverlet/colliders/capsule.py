@@ -10,7 +10,7 @@ from ..geometry.intervals import capsule, entry, rounding
 from ..geometry.nearest import away, on_segment
 from ..particles import Particles
 from .collider import Collider
-from .round import rounded
+from .round_mesh import rounded
 from .surface import TOUCH
 from .track import Track
 

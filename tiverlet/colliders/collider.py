@@ -60,7 +60,7 @@ class Collider(Feature):
     repeats = False  # one confine() may leave a particle that rubs or bounces where it has to be confined again
     dim = 0  # 2 or 3; 0 while it is not known
     inside = False  # particles are kept inside of it
-    poses = False  # has a pose(when) to be worked out once for each substep, before any confine()
+    poses = False  # has a pose(frame_fraction) to be worked out once for each substep, before any confine()
 
     def surface(
         self, friction: Any, restitution: Any, push_out: float, active: bool | None, events: bool = False, one_way: Any = None,

@@ -4,7 +4,7 @@ import numpy as np
 
 from ..device import ti
 from ..features.feature import Scene
-from .angle import cos_sin
+from .cos_sin import cos_sin
 from .track import Track
 
 

@@ -32,7 +32,7 @@ class Track:
 
     @ti.func
     def at(self, frame_fraction):
-        """Where it is at the fraction `when` of the frame; what stands is where it stands, to the bit."""
+        """Where it is at this fraction of the frame; what stands is where it stands, to the bit."""
         a, b = self.ends[0], self.ends[1]
         return ti.select(a == b, a, a * (1 - frame_fraction) + b * frame_fraction)
 

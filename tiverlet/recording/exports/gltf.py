@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...colliders.round import rounded
+from ...colliders.round_mesh import rounded
 from ...shapes import Shape
 from .extras import needed
 from .geometry import Geometry
