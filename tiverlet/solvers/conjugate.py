@@ -104,8 +104,11 @@ class CGSystem(System):
         self.partial, self.worst = self.reals("partial_sums", BLOCKS), self.reals("worst", BLOCKS)
         if self.limits_steps:
             self.gain, self.over = self.reals("gain", BLOCKS), self.reals("over", BLOCKS)
-        # r . z; by how much the last direction counts in the next; how far a step is taken back; r . z at the start
-        self.sums = scene.memory.field("system.sums", None, width=4, kind=ti.f64)
+        # r . z; by how much the last direction counts in the next; how far a step is taken back; r . z at the start, and of rounding
+        self.sums = scene.memory.field("system.sums", None, width=5, kind=ti.f64)
+        self.state, self.rounding = scene.state, float(np.finfo(np.float32 if scene.real == ti.f32 else np.float64).eps)
+        if scene.state.compensated:
+            self.rounding *= self.rounding
         least = 1.2 * largest(scene, scalars, self.blocks * scene.inv_mass, POWER) / steps**2
         self.least = self.memory.number(least, scene.real)
         _, part, _ = distinct(components(len(rows), row[free], who[free]))
@@ -166,18 +169,27 @@ class CGSystem(System):
 
     @ti.func
     def start(self, thread):
-        """r . z of the first residual."""
+        """r . z of the first residual, and of what rounding leaves of violations: eps |x| of each, whose W is w |grad C|^2."""
         for k in range(self.team.chunk_begin(BLOCKS * self.stride, thread), self.team.chunk_end(BLOCKS * self.stride, thread)):
             if k % self.stride == 0:
-                b, total = k // self.stride, ti.cast(0, ti.f64)
+                b, total, noise = k // self.stride, ti.cast(0, ti.f64), ti.cast(0, ti.f64)
                 for r in range(self.begin_of(b), ti.min(self.begin_of(b + 1), self.rows)):
+                    if ti.static(bool(self.state.sleepers)):
+                        if not self.state.awake(self.lead[r]):  # nobody has set it
+                            self.residual[r], self.direction[r], self.step[r] = 0, 0, 0
                     total += ti.cast(self.residual[r], ti.f64) * self.direction[r]
-                self.partial[b] = total
+                    x = self.state.x[self.lead[r]]
+                    noise += ti.cast(x.dot(x) / self.w.of(self.lead[r]), ti.f64)
+                self.partial[b], self.worst[b] = total, noise
         self.team.wait()
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread)):
-            now = self.summed()
-            self.sums[None] = ti.Vector([now, 0, 0, now], ti.f64)
+            now, noise = self.summed(), ti.cast(0, ti.f64)
+            for b in range(BLOCKS):
+                noise += self.worst[b]
+            noise *= ti.static(self.rounding**2)
+            now = ti.select(now > noise, now, 0 * now)
+            self.sums[None] = ti.Vector([now, 0, 0, now, noise], ti.f64)
         self.team.wait()
 
     @ti.func
@@ -268,8 +280,9 @@ class CGSystem(System):
             back = ti.select(worst > TENSEST, self.sums[None][1], 0 * now)
             if worst > TENSEST:
                 now = 0
-            first = self.sums[None][3]
-            self.sums[None] = ti.Vector([now, ti.select(before > 0, now / before, 0 * now), back, first], ti.f64)
+            first, noise = self.sums[None][3], self.sums[None][4]
+            now = ti.select(now > noise, now, 0 * now)
+            self.sums[None] = ti.Vector([now, ti.select(before > 0, now / before, 0 * now), back, first, noise], ti.f64)
         self.team.wait()
         for r in range(self.team.chunk_begin(self.rows, thread), self.team.chunk_end(self.rows, thread)):
             if self.sums[None][2] != 0:

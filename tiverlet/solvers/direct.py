@@ -116,6 +116,14 @@ class Elimination(System):
         who = np.zeros(slots.total, dtype=np.int64)
         who[slot] = item
         self.particle_of, self.w, self.inverse_size = ints("who", who), scene.state.w, reals("close")
+        self.state, self.sleeps = scene.state, bool(scene.state.sleepers)
+        if self.sleeps:
+            lead = np.zeros(len(found.rows), dtype=np.int64)
+            for b in scalars:
+                row = np.broadcast_to(self.row(b)[:, None], b.indices.shape)
+                free = (slots.places(b) >= 0) & (row >= 0)
+                lead[row[free]] = b.indices[free]
+            self.lead = ints("lead", lead[found.part_begin[:-1]])  # one particle of each system: all of them sleep, or none
         self.epsilon = float(np.finfo(np.float32 if scene.real == ti.f32 else np.float64).eps)
         parts = [scene.inv_mass[b.indices] * (b.gradients(b.start.position) ** 2).sum(axis=2) for b in scalars]
         least = np.concatenate([np.where(p > 0, p, np.inf).min(axis=1, initial=np.inf) for p in parts])[found.rows]
@@ -363,6 +371,9 @@ class Elimination(System):
         that, to give way now would be to take most of it back, along other directions: the system stays where it is.
         """
         begin, end = self.part_begin[b], self.part_begin[b + 1]
+        if ti.static(self.sleeps):
+            if not self.state.awake(self.lead[b]):
+                end = begin
         zero = ti.cast(0, ti.f64)
         softness, least, inverse, tension_at_start, total_at_start = zero, zero, zero, zero, zero
         stage, k, bound = FORWARD, 0, True
