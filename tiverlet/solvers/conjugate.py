@@ -46,6 +46,8 @@ class ConjugateGradient(Solver):
     Each part, of what hangs together, has its own, which is raised where a row has more than its share, of all rows, of the r . z
     that is left. Where rigid constraints contradict each other as particles are placed, the right side is partly in the null
     space of A, to which steps give any multiplier: sigma = 1 from the first substep on bounds it by what a Jacobi pass gives.
+    So is what rounding leaves of violations where links are more than are needed (braced bodies): steps end where r . z is no more
+    than that.
 
     steps: of conjugate gradients in an iteration. Ropes, spacers and what is not one number are relaxed as by Jacobi beside it.
     """
@@ -104,7 +106,8 @@ class CGSystem(System):
         self.partial, self.worst = self.reals("partial_sums", BLOCKS), self.reals("worst", BLOCKS)
         if self.limits_steps:
             self.gain, self.over = self.reals("gain", BLOCKS), self.reals("over", BLOCKS)
-        # r . z; by how much the last direction counts in the next; how far a step is taken back; r . z at the start, and of rounding
+        # r . z; by how much the last direction counts in the next; how far a step is taken back; r . z at the start; and that of
+        # rounding
         self.sums = scene.memory.field("system.sums", None, width=5, kind=ti.f64)
         self.state, self.rounding = scene.state, float(np.finfo(np.float32 if scene.real == ti.f32 else np.float64).eps)
         if scene.state.compensated:
