@@ -46,8 +46,8 @@ class ConjugateGradient(Solver):
     Each part, of what hangs together, has its own, which is raised where a row has more than its share, of all rows, of the r . z
     that is left. Where rigid constraints contradict each other as particles are placed, the right side is partly in the null
     space of A, to which steps give any multiplier: sigma = 1 from the first substep on bounds it by what a Jacobi pass gives.
-    So is what rounding leaves of violations where links are more than are needed (braced bodies): steps end where r . z is no more
-    than that.
+    So is what rounding leaves of violations where links are more than are needed (braced bodies): steps end where r . z is no
+    more than that.
 
     steps: of conjugate gradients in an iteration. Ropes, spacers and what is not one number are relaxed as by Jacobi beside it.
     """
