@@ -178,7 +178,7 @@ class Polygons(PairContact):
         pair_data = [
             *dev.geometry.carried,
             *([dev.slip] if dev.has_friction else []),
-            *([dev.restitution.aim] if dev.has_restitution else []),
+            *([dev.restitution.aim, dev.restitution.last] if dev.has_restitution else []),
         ]
         dev.beside = Beside(dev.geometry, self.table, scene.memory.number(self._listed, scene.real))
         dev.search = NeighbourSearch(scene, self._listed, linked, dev.beside, pair_data, team, dev.move, dev.outline.reach)
@@ -283,7 +283,7 @@ class Polygons(PairContact):
                         back = overlap  # what is taken back of the position and of the displacement
                         if ti.static(self.dev.has_restitution):
                             if first != 0:
-                                aim, missing, lift = self.dev.restitution.target(v, a, b, t, n, overlap, d.dot(n))
+                                aim, missing, lift = self.dev.restitution.target(at, v, a, b, t, n, overlap, d.dot(n))
                                 if missing > 0:
                                     lifts += share * (overlap + lift) * n
                                     back = 0 * overlap
@@ -332,6 +332,10 @@ class Polygons(PairContact):
                         overlap, _ = self.dev.geometry.share(self.dev.depths, at, v, a, b, t)
                         slip = self.table.held(v, a, n, overlap, self.dev.slip.field[e] + d)
                 self.dev.slip.field[e] = slip
+        if ti.static(self.dev.has_restitution):
+            for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):
+                aim, pushed = self.dev.restitution.aim.field[e], self.dev.geometry.impulse.field[e]
+                self.dev.restitution.last.field[e] = ti.select(aim.dot(aim) > 0, 0 * pushed, pushed)
 
 
 class PolygonRestitution:
@@ -345,14 +349,20 @@ class PolygonRestitution:
         self.lift = add("Contact.lift", n, width=2)  # moves the position alone
         self.hit = add("Contact.hit", None, kind=ti.i32)
         self.aim = PairData("aim", 2, lasting=False)  # with which displacement each contact is to leave, along its normal
+        self.last = PairData("pushed", 0, lasting=True)  # of the last substep, without impacts [kg m]
 
     @ti.func
-    def target(self, v, a, b, t, n, overlap, leaving):
-        """The displacement with which a contact is to leave; what it lacks of it; and how far it gets until the substep ends."""
+    def target(self, at, v, a, b, t, n, overlap, leaving):
+        """The displacement with which a contact is to leave; what it lacks of it; and how far it gets until the substep ends.
+
+        A contact rests, unless e is 1, that is to leave by no more than it overlapped before the substep and what it was pushed
+        in the last one: what is pushed as far in each substep came no faster than its load brings it.
+        """
         before = self.state.before[v] - (1 - t) * self.state.before[a] - t * self.state.before[b]
         approach, restitution = -before.dot(n), self.table.of(v, a)[2]
         aim, missing, lift = restitution * ti.max(approach, 0), 0 * overlap, 0 * overlap
-        if approach > 0:
+        held = self.last.field[at] * self.geometry.inverse_mass(v, a, b, t)
+        if approach > 0 and (restitution >= 1 or held == 0 or aim > overlap + leaving + held):
             missing = ti.max(aim - (overlap + leaving), 0)
             if overlap <= -leaving:
                 lift = restitution * overlap
