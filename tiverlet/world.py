@@ -183,9 +183,10 @@ class World:
     def _settle_forces(self) -> None:
         """Where a force has changed, turn displacements into velocities by the old one, before it is overwritten, or left behind
         by a copy."""
-        if any(f.changed and f.lets_go for f in self._features):
+        changed = [f for f in self._features if f.changed]
+        if any(f.lets_go for f in changed):
             self._let_go()
-        elif self._force_waits:
+        elif any(f.new_force or isinstance(f, Acceleration) for f in changed):
             with self._runner.memory.compiler():
                 self._runner.restart(self._iterations)
 
@@ -205,8 +206,7 @@ class World:
     def _adapt(self) -> None:
         """Settle forces; where knobs ask for what the kernels do not have, build the world anew."""
         self._settle_forces()
-        if any(f.changed and f.outgrown for f in self._features):
-            check_settings(self._precision, self._requested[1], self._order, self._features)
+        if any(f.outgrown for f in self._features if f.changed):
             edit_scene.renew(self)
 
     def _upload(self) -> None:

@@ -26,13 +26,13 @@ def _indices(pin: "Pin", indices) -> np.ndarray:
     """Those in hand: also the members, which are made of them."""
     rows = np.asarray(indices)
     rows = rows[:, 0] if rows.ndim == 2 and rows.shape[1] == 1 else rows  # as they are read
-    members = one_each("Pin", rows, pin.start.count if pin.start else checks.ANY)
-    if members.count != pin.count:
+    members, own = one_each("Pin", rows, checks.ANY if pin.start is None else pin.start.count), vars(pin)
+    before = pin.members.rows
+    if members.count != len(before):
         raise ValueError(f"Pin: indices has {members.count} particles, but this Pin holds {pin.count}. Make another one.")
     if pin.scene is not None and not pin._grabs:
-        pin._held = pin.members.rows[:, 0]
-        pin._grabs = members.rows.tobytes() != pin.members.rows.tobytes()
-    pin._keep(members=members)
+        own.update(_held=before[:, 0], _grabs=members.rows.tobytes() != before.tobytes())
+    own["members"] = members
     return members.indices
 
 
@@ -140,19 +140,16 @@ class Pin(Anchored):
 
     def grab(self, scene: Scene) -> None:
         """Hold them as a new Pin would. Where it drives them, it takes nothing else from where particles are as it begins."""
-        memory, here = scene.memory, self.target
+        memory, dev, own, drives, rows = scene.memory, self.dev, vars(self), self.drives, self.members.rows
         self.note_arguments()
-        self._grabs, self.changed, self.moving, self.new_force = False, self.drives, False, False
-        if self.drives:
-            here = scene.state.get_some(memory, self.members.rows[:, 0])
-        else:
+        own.update(_grabs=False, changed=drives, moving=False, new_force=False)
+        here = scene.state.get_some(memory, rows[:, 0]) if drives else own["target"]
+        if not drives:
             self.start = scene.particles
-            memory.write(self.dev.lam, np.zeros_like(here))
-            self.dev.spring.begin(self.compliance, self.damping)
-            self.dev.size.set(self.start.size)
-        memory.write(self.dev.corners.members, self.indices)
-        memory.write(self.dev.place.source, here)
-        memory.write(self.dev.place.target, here)
+            memory.write(dev.lam, np.zeros_like(here))
+            dev.spring.begin(self.compliance, self.damping)
+            dev.size.set(self.start.size)
+        memory.write_each((dev.corners.members, rows), (dev.place.source, here), (dev.place.target, here))
 
     def select(self, some: np.ndarray, number: np.ndarray) -> None:
         """Keep some, by their new numbers."""

@@ -323,6 +323,11 @@ class Memory:
         if np.size(values):
             self._load([self._find(field)], [np.asarray(values, dtype=np.float64)])
 
+    def write_each(self, *values: tuple[Any, np.ndarray]) -> None:
+        """Overwrite fields, each with an array that is not empty."""
+        self.check()
+        self._load([self._find(field) for field, _ in values], [array for _, array in values])
+
     def write_from(self, field, first: int, values) -> None:
         """Overwrite some elements of a field, from one on; of a world alone."""
         self.check()

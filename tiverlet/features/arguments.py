@@ -48,11 +48,11 @@ class Knob:
         return feature.__dict__[self.name]
 
     def __set__(self, feature, value) -> None:
-        value = self.check(feature, value)
-        feature.__dict__[self.name] = handed_out(value, assign_whole(type(feature).__name__, self.name))
-        feature.changed = True
+        value, own = self.check(feature, value), feature.__dict__
+        own[self.name] = handed_out(value, assign_whole(type(feature).__name__, self.name))
+        own["changed"] = True
         if self.force:
-            feature.new_force = True
+            own["new_force"] = True
 
 
 def record_arguments(kind: Any) -> None:

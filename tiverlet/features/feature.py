@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from ..particles import Particles, State
     from .regrouping import Regrouping
 
+ONE = (float, int, type(None))  # for all constraints
 BENT, FAR = 1, 2  # how far a constraint turned in a substep: by more than 26 degrees, by more than 41
 
 
@@ -333,7 +334,7 @@ class Batch(Feature):
     def note_arguments(self) -> None:
         """Keep what it would be made with now: other particles, and rows."""
         now = {self.index_name: self.listing} | {name: self.__dict__[name] for name in self.each if name in self.__dict__}
-        self.arguments = {k: v if v is None or np.isscalar(v) else now.get(k, v) for k, v in self.arguments.items()}
+        self.arguments = {k: v if type(v) in ONE or np.isscalar(v) else now.get(k, v) for k, v in self.arguments.items()}
 
     @property
     def listing(self) -> Any:

@@ -1,6 +1,7 @@
 """Arrays and mappings that are handed out: they can be read like any other, and say what to do when they are written to."""
 
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -57,7 +58,7 @@ def read_only(array: np.ndarray, advice: str) -> ReadOnly:
     """The same numbers, which nobody can write to. advice: what to do instead, for the error."""
     out = array.view(ReadOnly)
     out.advice = advice
-    out.flags.writeable = False
+    out.setflags(write=False)
     return out
 
 
@@ -92,6 +93,7 @@ def handed_out(value: Any, advice: str) -> Any:
     return value
 
 
+@cache
 def assign_whole(owner: str, name: str) -> str:
     """Advice for an array that is live as a whole."""
     return (
@@ -100,6 +102,7 @@ def assign_whole(owner: str, name: str) -> str:
     )
 
 
+@cache
 def structure(owner: str, name: str) -> str:
     """Advice for an array that is not live."""
     return f"{owner}.{name} is read-only: it is structure, fixed when {owner} is made."

@@ -36,6 +36,17 @@ class PerParticle:
         else:
             memory.write(self.field, values)
 
+    def can_change(self, values: np.ndarray, some: np.ndarray) -> bool:
+        """The same as can_be(), where others than `some` are what they are; where these differ, nobody looks at all."""
+        return (not self.uniform and len({*values[some].tolist()}) > 1) or self.can_be(values)
+
+    def change(self, memory: "Memory", values: np.ndarray, some: np.ndarray) -> None:
+        """The same as become(), for an elastic memory."""
+        if self.uniform:
+            self.become(memory, values)
+        else:
+            memory.seen(self.field)[some] = values[some]
+
     @inline
     def of(self, i):
         """That of particle i."""

@@ -70,13 +70,13 @@ class State:
         if self.spins:
             self.spin.regroup(memory, change)
 
-    def can_weigh(self, particles: "Particles", inv_mass: np.ndarray) -> bool:
-        """Whether the same particles can have other inverse masses where it is."""
-        return self.w.can_be(inv_mass) and (not self.spins or self.spin.can_weigh(particles, inv_mass))
+    def can_weigh(self, particles: "Particles", inv_mass: np.ndarray, some: np.ndarray) -> bool:
+        """Whether the same particles can have other inverse masses where it is. some: those of which they may differ."""
+        return self.w.can_change(inv_mass, some) and (not self.spins or self.spin.can_weigh(particles, inv_mass))
 
-    def weigh(self, memory: "Memory", particles: "Particles", inv_mass: np.ndarray) -> None:
+    def weigh(self, memory: "Memory", particles: "Particles", inv_mass: np.ndarray, some: np.ndarray) -> None:
         """They have these."""
-        self.w.become(memory, inv_mass)
+        self.w.change(memory, inv_mass, some)
         if self.spins:
             self.spin.weigh(memory, particles, inv_mass)
 

@@ -24,6 +24,7 @@ TURNS = (0, 26, 41)  # degrees, for nothing, BENT and FAR
 STIFF = 4.0  # (omega h)^2 beyond which Verlet diverges
 
 STEPPED, STARTED, UNSTEPPED = range(3)  # how a state came about: by a substep, by the first one after a start, by none yet
+BARE = 3  # added to one of these: nothing but energy is asked for
 
 
 @ti.data_oriented
@@ -137,9 +138,10 @@ class Diagnostics:
         return figures, zero + ti.math.inf, zero - ti.math.inf
 
     @ti.func
-    def block(self, b, h, t, frame_fraction, fresh, begin):
-        """One block of particles and constraints. Returns energy, residual, overlap, stiffness, contacts, bad, and where there
-        are pair forces the two sums of pair_stiffness(); low, high."""
+    def block(self, b, h, t, frame_fraction, fresh, begin, bare):
+        """One block of particles and constraints; where it is to be bare, figures 2 and 3 and the box are not there. Returns
+        energy, residual, overlap, stiffness, contacts, bad, and where there are pair forces the two sums of pair_stiffness();
+        low, high."""
         figures, low, high = self.nothing()
         scale, back = ti.cast(1, ti.f64), ti.cast(0, self.step.real)
         if begin == 0:
@@ -153,10 +155,11 @@ class Diagnostics:
             if not sound:
                 figures[5] = ti.min(figures[5], ti.cast(i, ti.f64))
             else:
-                low, high = ti.min(low, ti.cast(x, ti.f64)), ti.max(high, ti.cast(x, ti.f64))
+                if bare == 0:
+                    low, high = ti.min(low, ti.cast(x, ti.f64)), ti.max(high, ti.cast(x, ti.f64))
                 figures[0] += self.energy(i, x, scale, back)
                 if ti.static(len(self.probes) > 0):
-                    if begin == 0:
+                    if begin == 0 and bare == 0:
                         figures[3] = ti.max(figures[3], self.stiffness(i, x, h, t))
                 if ti.static(len(self.pair_forces) > 0):
                     if begin == 0:
@@ -164,9 +167,10 @@ class Diagnostics:
                         figures[6] += change
                         figures[7] += moved
                 for c in ti.static(self.contacts):
-                    touching, worst = c.worst_overlap(i)
-                    figures[2] = ti.max(figures[2], worst)
-                    figures[4] += touching
+                    if bare == 0:
+                        touching, worst = c.worst_overlap(i)
+                        figures[2] = ti.max(figures[2], worst)
+                        figures[4] += touching
         for f in ti.static(self.batches):
             part = (f.count + self.blocks - 1) // self.blocks
             for c in range(b * part, ti.min((b + 1) * part, f.count)):
@@ -181,9 +185,9 @@ class Diagnostics:
     @ti.func
     def block_of(self, b, h64, t64, state_origin):
         """Figures of one block, of the state at the end of a frame, or as it came about otherwise."""
-        fresh, begin = ti.cast(state_origin == STARTED, ti.i32), ti.cast(state_origin == UNSTEPPED, ti.i32)
+        fresh, begin = ti.cast(state_origin % BARE == STARTED, ti.i32), ti.cast(state_origin % BARE == UNSTEPPED, ti.i32)
         h, t, fraction = ti.cast(h64, self.step.real), ti.cast(t64, self.step.real), self.step.integrator.frame_fraction(0, 1)
-        return self.block(b, h, t, fraction, fresh, begin)
+        return self.block(b, h, t, fraction, fresh, begin, ti.cast(state_origin >= BARE, ti.i32))
 
     @ti.func
     def filled(self):
@@ -199,7 +203,7 @@ class Diagnostics:
     @ti.func
     def reduce_blocks(self, thread, h64, state_origin):
         """Sum up what residuals of constraints on many particles need."""
-        h, fresh = ti.cast(h64, self.step.real), ti.cast(state_origin == STARTED, ti.i32)
+        h, fresh = ti.cast(h64, self.step.real), ti.cast(state_origin % BARE == STARTED, ti.i32)
         self.step.constraints.reduce_blocks(thread, h, self.step.integrator.h2_effective(h, fresh), 0, fresh, False)
 
     @ti.kernel

@@ -22,6 +22,8 @@ from ..particles import Particles
 from .bind_again import Bound, bind, bound_again
 from .scale import Scale
 
+NOBODY = np.zeros(0, dtype=np.int32)
+
 
 @dataclass(frozen=True)
 class Edit:
@@ -123,10 +125,13 @@ def regroup(world: Any, edit: Edit, added: Particles | None) -> None:
 
 @dataclass(frozen=True)
 class Grab:
-    """These pins are to hold other particles. inv_mass: of all, after pins, once they do."""
+    """These pins are to hold other particles. soft: whether any of them by a spring. inv_mass: of all, after pins, once they do;
+    some: those of which it may differ."""
 
     pins: list[Pin]
+    soft: bool
     inv_mass: np.ndarray
+    some: np.ndarray
 
 
 def grabbing(world: Any) -> Grab | None:
@@ -134,40 +139,40 @@ def grabbing(world: Any) -> Grab | None:
     contacts see them, and slots. None where the world has to be built anew for it, as where constraints act on what is driven now
     or was before."""
     runner = world._runner
-    scene, asked = runner.scene, [f for f in world.features if f.changed and f.outgrown]
+    scene, pins = runner.scene, [f for f in world._features if f.changed and f.outgrown]
     if runner.sleep or runner.launched or scene.order > 2 or not runner.memory.elastic:
         return None
-    if not all(f.afresh and f.acts for f in asked):
-        return None
-    pins: list[Pin] = asked
-    driving, inv_mass = [f for f in pins if f.drives], scene.inv_mass
+    for f in pins:
+        if not (f.afresh and f.acts):
+            return None
+    driving, inv_mass, some = [f for f in pins if f.drives], scene.inv_mass, NOBODY
     if driving:
-        inv_mass = inv_mass.copy()
-        for f in driving:
-            inv_mass[f.held] = world._particles.inv_mass[f.held]
-        for f in driving:
-            inv_mass[f.members.rows] = 0.0
-        if not scene.state.can_weigh(world._particles, inv_mass) or (runner.search and not runner.search.has_static):
+        before, after = _joined([f.held for f in driving]), _joined([f.members.rows[:, 0] for f in driving])
+        inv_mass, some = inv_mass.copy(), _joined([before, after])
+        inv_mass[before] = world._particles.inv_mass[before]
+        inv_mass[after] = 0.0
+        if not scene.state.can_weigh(world._particles, inv_mass, some) or (runner.search and not runner.search.has_static):
             return None
         if any((inv_mass[b.indices] != scene.inv_mass[b.indices]).any() for b in runner.batches):
             return None
-    if len(driving) < len(pins) and not scene.slots.can_grab(inv_mass, runner.batches):
+    soft = len(driving) < len(pins)
+    if soft and not scene.slots.can_grab(inv_mass, runner.batches):
         return None
-    refuse_held_twice(world._particles, world.features, pins)
-    return Grab(pins, inv_mass)
+    refuse_held_twice(world._particles, world._features, pins)
+    return Grab(pins, soft, inv_mass, some)
 
 
 def grab(world: Any, change: Grab) -> None:
     """Do what was asked for."""
     runner, pins = world._runner, change.pins
     scene, memory, particles = runner.scene, runner.memory, world._particles
-    if change.inv_mass is not scene.inv_mass:
+    if len(change.some):
         free = min(np.count_nonzero(inv_mass) for inv_mass in (scene.inv_mass, change.inv_mass))
         scene.inv_mass = change.inv_mass
-        scene.state.weigh(memory, particles, change.inv_mass)
+        scene.state.weigh(memory, particles, change.inv_mass, change.some)
         if free < len(change.inv_mass) - 1:  # lists leave out pairs of which none can move
             runner.invalidate()
-    if any(f.soft for f in pins):
+    if change.soft:
         scene.particles = particles.placed(scene.state.get(memory))
         scene.slots.grab(memory, change.inv_mass, runner.batches)
     for f in pins:
@@ -175,6 +180,11 @@ def grab(world: Any, change: Grab) -> None:
     for log in runner.logs:
         log.forget()
     runner.carry_loads()
+
+
+def _joined(some: list[np.ndarray]) -> np.ndarray:
+    """One array behind the other."""
+    return some[0] if len(some) == 1 else np.concatenate(some)
 
 
 def _pairs(near: Any, change: Regrouping) -> tuple[np.ndarray, dict[str, np.ndarray]]:

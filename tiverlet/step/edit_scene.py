@@ -153,15 +153,16 @@ def change(
 
 def renew(world: Any) -> None:
     """Give a world what its knobs ask for: to pins other particles to hold, in place where that can be; or other kernels."""
-    grabbing = edit_in_place.grabbing(world)
+    grabbing, runner, clock = edit_in_place.grabbing(world), world._runner, world._clock
     if grabbing is None:
+        check_settings(world._precision, world._requested[1], world._order, world.features)
         rebuild(world, np.ones(len(world.particles), dtype=bool), None, world.features)
         return
-    told = world._all_events() if world._runner.logs else world._events
-    if world._force_waits or any(f.soft for f in grabbing.pins):
-        with world._runner.memory.compiler():
-            world._runner.restart(world.iterations)
-    world._clock.parted = world._clock.energy = None
+    told = world._all_events() if runner.logs else world._events
+    if grabbing.soft:
+        with runner.memory.compiler():
+            runner.restart(world.iterations)
+    clock.parted = clock.energy = None
     edit_in_place.grab(world, grabbing)
     world._events = told
     for watcher in world._watchers:
