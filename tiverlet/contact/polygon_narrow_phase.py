@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..device import ti
+from ..device import called, ti
 from ..device.number import Number, OnDevice
 from ..features.feature import Scene
 from ..features.material import Table
@@ -115,7 +115,7 @@ class PolygonGeometry:
         return out
 
     @ti.func
-    def edge(self, v, a, front, moved: ti.template()):  # type: ignore[valid-type]
+    def edge(self, v, a, front, moved):
         """How far v overlaps the edge from a to the next, negative where it does not, the normal, where on the edge, and how far
         it may be pushed out in this substep.
 
@@ -132,7 +132,7 @@ class PolygonGeometry:
             height, cross, came, shared, passed = r.dot(n), t, True, a, False
             if height < 0:
                 came = height >= -SLACK * length
-                if ti.static(moved):
+                if moved != 0:
                     d = self.state.d[a]
                     r0, u0 = r - (self.state.d[v] - d), u - (self.state.d[b] - d)
                     height0, t0 = r0.dot(ti.Vector([u0[1], -u0[0]])) / length, r0.dot(u0) / ti.max(u0.dot(u0), uu * SLACK)
@@ -156,13 +156,13 @@ class PolygonGeometry:
             contact_distance = self.radius.of(v) + (1 - t) * self.radius.of(a) + t * self.radius.of(b)
             if beside and height < contact_distance and height >= -length / 2:
                 out, back = contact_distance - height, 0 * r
-                if ti.static(moved):
+                if moved != 0:
                     out -= self.allowed[v]
                 if height < 0 and tips != OVER_EDGE:
                     back = self.inward(v)
                     came = came and back.dot(n) >= 0
                 if not came:
-                    if ti.static(moved):
+                    if moved != 0:
                         most = self.push_out * self.h[None] - self.relative(self.state.d, v, a, b, t).dot(n)
                         out = ti.select(most > 0, out, ti.min(out, most))
                     if tips == OVER_EDGE:
@@ -173,8 +173,9 @@ class PolygonGeometry:
                     overlap = out
         return overlap, n, t, most
 
+    @called
     @ti.func
-    def tips_cross(self, v, c):
+    def tips_cross(self, v: ti.i32, c: ti.i32) -> ti.i32:
         """Whether the bodies of two corners v and c cross there although neither corner is inside of the other body.
 
         Each corner has then passed between the edges of the other: it is behind one of them and in front of the next, and the
@@ -255,8 +256,9 @@ class PolygonGeometry:
                     out = False
         return out
 
+    @called
     @ti.func
-    def detect(self, i, moved: ti.template()):  # type: ignore[valid-type]
+    def detect(self, i: ti.i32, moved: ti.i32):
         """Find the contacts that particle i is the vertex of, or one of two discs: at most one with each near particle.
 
         moved: in a substep, by how particles moved in it, and without the overlap that is allowed. Otherwise by where they are
@@ -266,7 +268,7 @@ class PolygonGeometry:
             j = self.list.neighbour[e]
             if self.after(i) < 0 and self.after(j) < 0:
                 overlap, n = self.discs.overlap(i, j, self.radius.of(i) + self.radius.of(j))
-                if ti.static(moved):
+                if moved != 0:
                     overlap -= self.allowed[ti.min(i, j)]
                 self.manifold.field[e] = ti.Vector([overlap, ti.cast(DISCS, self.real), n[0], n[1]])
             else:
@@ -282,7 +284,7 @@ class PolygonGeometry:
                     if overlap > 0:
                         if self.tips_cross(i, j) != 0:
                             overlap = -overlap
-                    if ti.static(moved):
+                    if moved != 0:
                         overlap -= self.allowed[i]
                     if overlap > 0:
                         t = 0 * t + DISCS
@@ -416,7 +418,7 @@ class PolygonGeometry:
     @ti.func
     def shrink(self, i, first):
         """Allow particle i the overlap that it has as a vertex, as far as particles from number `first` on have to do with it."""
-        self.detect(i, False)
+        self.detect(i, 0)
         allowed = ti.select(first > 0, self.allowed[i], 0 * self.w.of(i))
         for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
             j, found = self.list.neighbour[e], self.manifold.field[e]
@@ -465,7 +467,7 @@ class PolygonGeometry:
         It is relative to half of the edge, or to the radius of the smaller disc.
         """
         touching, worst = 0, ti.cast(0, ti.f64)
-        self.detect(i, False)
+        self.detect(i, 0)
         for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
             j, found = self.list.neighbour[e], self.manifold.field[e]
             if found[0] > 0 and (found[1] > DISCS or self.keeps(i, j)):

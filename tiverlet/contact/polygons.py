@@ -203,9 +203,9 @@ class Polygons(PairContact):
                             self.dev.restitution.aim.field[e] = 0 * self.dev.restitution.aim.field[e]
             self.note_motion(0, self.dev.geometry.too_long(i))
         if ti.static(not self.dev.state.sleepers):
-            self.dev.geometry.detect(i, True)
+            self.dev.geometry.detect(i, 1)
         elif self.dev.state.awake(i) or self.is_near(i):
-            self.dev.geometry.detect(i, True)
+            self.dev.geometry.detect(i, 1)
         else:
             self.dev.geometry.forget(i)
 

@@ -1,20 +1,25 @@
 """The door to Taichi: starting it, memory, threads. All other modules import Taichi from here."""
 
-from .language import at, inline, record, ti
+from typing import Any
+
+from .language import at, copied, inline, record, ti
 from .patches import assignments, lean, patched
 
 if lean:
     assignments.apply()
 if patched:
-    from .patches import sharing, source_cache, statements, syntax_cache, timing
+    from .patches import calls, sharing, source_cache, statements, syntax_cache, timing
 
     source_cache.apply()  # before what comes next, which is imported in half the time
     syntax_cache.apply()
     statements.apply()
     sharing.apply(timing.compiled)
     timing.apply()
+    called: Any = calls.called
+else:
+    called = copied
 from . import copies
 
 copies.apply()  # last, and whatever is patched: it is what subscripts mean
 
-__all__ = ["at", "inline", "record", "ti"]
+__all__ = ["at", "called", "inline", "record", "ti"]

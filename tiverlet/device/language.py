@@ -139,6 +139,11 @@ def inline(function: Any) -> Any:
     return callable_in_kernels(function)
 
 
+def copied(function: Any) -> Any:
+    """A ti.func as it is: each place that calls it gets a copy of it."""
+    return function
+
+
 def record(kind: Any) -> Any:
     """A class of several values under names, for kernels: what they call makes one, passes it on whole and reads it."""
     kind._data_oriented = True  # by this Taichi knows objects of ours, which it leaves as they are

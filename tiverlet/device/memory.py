@@ -44,7 +44,7 @@ class Memory:
         if not patched:  # whose fields need a place once they are made
             layout.check_trees()
         self.real, self.copies = real, copies
-        self.compiler = compiler or Compiler(real, few, passes)
+        self.compiler = compiler or Compiler(real, few, passes, copies is not None)
         self.entries: list[Entry] = []
         self._at: dict[int, int] = {}  # by the ids of fields: which entry they are
         self._named: Counter[str] = Counter()

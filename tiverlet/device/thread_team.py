@@ -10,7 +10,7 @@ import contextlib
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from . import runtime
+from . import called, runtime
 from .language import at, current, impl, inline, ti
 from .number import OnDevice
 
@@ -82,6 +82,7 @@ class Team:
     patience: Any = OnDevice()
 
     def __init__(self, memory: "Memory", size: int, particles: int, launched: bool, pieces: int):
+        memory.compiler.launches = launched
         self.size, self.launched, self.patience = size, launched, memory.number(PATIENCE + particles)
         self._pieces = pieces
         self.piece = memory.number(self.piece_of(particles))
@@ -218,8 +219,9 @@ class Team:
     def _wait(self):
         return self.wait_for(self.active())
 
+    @called
     @ti.func
-    def wait_for(self, active):
+    def wait_for(self, active: ti.i32):
         """Wait for so many. The last one says so in another place than where all arrive, whom those who look would hold up."""
         if active > 1:
             before = ti.atomic_add(self.arrived[0], 1)

@@ -8,7 +8,7 @@ as on a GPU, Python runs the same lines, and `do` is a Launcher (launcher.py). H
 from typing import TYPE_CHECKING, Any
 
 from ..contact.velocity_projection import EVERY, PASSES
-from ..device import runtime, ti
+from ..device import called, runtime, ti
 from ..device.number import OnDevice, read_all
 from ..device.thread_team import LEAST, Team
 from ..features.feature import Batch, Scene
@@ -307,7 +307,7 @@ class Step:
                 if ti.static(bool(self.strays)):
                     self.strays.keep_list(now.thread)
                 if self.is_stale() != 0:
-                    self.search.build(now.thread)
+                    self.list_particles(now.thread)
                     if self.search.list.need[None] > self.search.list.capacity:
                         self.halt[None] = [1, now.s, half]  # all write the same
         if ti.static(self.looks):
@@ -315,6 +315,12 @@ class Step:
                 self.look_for_sleepers(self.turn(now, half))
                 if self.sleepers.calls[None] != 0:
                     self.halt[None] = [1, now.s, half]
+
+    @called
+    @ti.func
+    def list_particles(self, thread: ti.i32):
+        """Build it."""
+        self.search.build(thread)
 
     @ti.func
     def look_for_sleepers(self, now):
@@ -422,7 +428,13 @@ class Step:
     @ti.func
     def project_contact_velocities(self, now):
         """Every 32 substeps: take the sound out of loaded contacts."""
-        self.contact_pass.project_velocities(now.thread, now.it)
+        self.damp_sound(now.thread, now.it)
+
+    @called
+    @ti.func
+    def damp_sound(self, thread: ti.i32, it: ti.i32):
+        """One pass of it."""
+        self.contact_pass.project_velocities(thread, it)
 
     @ti.func
     def diagnose(self, now):

@@ -54,13 +54,15 @@ class Compiler:
 
     real: the type of their literals. Taichi rounds the literal 0.1 to its default type even next to f64 operands; a world of
     precision "f64" (and the user's own functions in it) must not lose half of the digits that way. few: whether they are
-    for fewer than FEW particles. passes: settings of Taichi's, LEAN, UNSEARCHED or BRIEF. Kernels compile at their first launch.
+    for fewer than FEW particles. passes: settings of Taichi's, LEAN, UNSEARCHED or BRIEF. many: whether there are many copies of
+    the world. Kernels compile at their first launch.
     """
 
-    kernels_read = ("real", "few", "passes", "thorough")
+    kernels_read = ("real", "few", "passes", "many", "thorough")
 
-    def __init__(self, real, few: bool = False, passes: Mapping[str, Any] = LEAN):
-        self.real, self.few, self.passes = real, few, passes
+    def __init__(self, real, few: bool = False, passes: Mapping[str, Any] = LEAN, many: bool = False):
+        self.real, self.few, self.passes, self.many = real, few, passes, many
+        self.launches = False  # whether loops at the top of kernels are spread over threads, or those of a GPU
         self.thorough = not lean  # once and for all, since what Taichi fails to compile may be tried again
         self.config: Any = None  # of Taichi, while kernels compile
         self._host: bool | None = None  # whether they are for the host, once that is asked: Taichi takes 6 us to say so
@@ -69,6 +71,12 @@ class Compiler:
         self.refused: Exception | None = None  # what is wrong with a function that is being compiled, see refuse()
         self.times = Times({}, {})
         self.places: list[tuple[Any, int]] = []  # where the world's fields are: layouts and addresses
+
+    @property
+    def calls(self) -> bool:
+        """Whether kernels call functions that are long, see calls.py. These do not know which copy of a world it is, and have no
+        loops that are spread."""
+        return bool(self._host) and self.passes is BRIEF and not (self.many or self.launches or self.thorough)
 
     def point(self) -> None:
         """Have kernels find the fields of this world."""
