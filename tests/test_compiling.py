@@ -268,3 +268,20 @@ def test_who_waits_is_told_what_for(world, monkeypatch):
     other = w.clone()
     other.step(1 / 60)
     assert "Nothing was compiled for it" in other.explain()
+
+
+def test_functions_that_kernels_call_change_no_bit(monkeypatch):
+    # Two squares fall on each other and on the floor: by kernels that call what is long, and by others that have it copied.
+    square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    particles = tv.Particles(np.concatenate([square, square + [0.5, 1.1]]), velocity=(0, -2), radius=0.02)
+    loops, sides = np.arange(8).reshape(2, 4), np.stack(np.triu_indices(4, 1), axis=1)
+    made = []
+    for passes in (BRIEF, LEAN):
+        monkeypatch.setattr(build, "_passes", lambda *scene, chosen=passes: chosen)
+        rough = [tv.Polygons(loops, friction=0.5), tv.HalfSpace((0, 1), -0.1, friction=0.5)]
+        features = [tv.Gravity(), tv.Distance(np.concatenate([sides, sides + 4])), *rough]
+        with tv.World(particles, features, substeps=8) as w:
+            made.append(([w.step(1 / 60) for _ in range(60)], w.hash(), w._runner.memory.compiler.calls))
+    (reports, digest, calls), (others, other, copies) = made
+    assert reports == others and digest == other and sum(r.contacts for r in reports) > 5
+    assert calls == (patched and ARCH == "cpu") and not copies

@@ -427,3 +427,26 @@ def test_worlds_one_after_the_other_take_no_more_memory():
     for k in range(200):
         live(k)
     assert runtime.trees == trees and peak() - before < 4 << 10  # KiB; a world of its own would take 100
+
+
+def test_residuals_stay_those_of_the_last_substep_until_the_next_one():
+    # What other forces make of the state tells nothing of how that substep went: displacements are velocities then, 600 times
+    # what they were, and clusters have summed up their springs alone.
+    square = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
+    clusters = tv.ShapeMatch([[0, 1, 2, 3]], compliance=1e-3), tv.ShapeMatch([[1, 2, 4, 5]])
+    bodies = tv.Area([[0, 1, 2, 3]], compliance=1e-3), *clusters
+    pin = tv.Pin([7])
+    x = np.concatenate([square, square + 2])
+    with tv.World(tv.Particles(x, velocity=x**2), [tv.Gravity(), *bodies, pin], substeps=10) as w:
+        for _ in range(3):
+            w.step(1 / 60)
+        before = [f.residual for f in bodies]
+        w.add(features=[tv.Gravity(1.0)])
+        with w.clone() as other:
+            for f, one, kept in zip(bodies, other.features[1:], before, strict=False):
+                assert f.residual.tobytes() == one.residual.tobytes() == kept.tobytes()
+        w.step(1 / 60)
+        before = bodies[2].residual
+        pin.indices, bodies[0].compliance = [6], 2e-3
+        w.clone().close()
+        assert bodies[2].residual.tobytes() == before.tobytes() and (before > 0).all()

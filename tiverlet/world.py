@@ -172,7 +172,7 @@ class World:
         if waiting:
             if self._runner.sleep and not all(isinstance(f, Batch) and f.drives for f in waiting):
                 self._runner.wake()
-            self._adapt()
+            self._adapt(steps=True)
             self._upload()
 
     @property
@@ -180,15 +180,17 @@ class World:
         """Whether a force has changed and the device still has the old one."""
         return any(f.changed and (f.new_force or isinstance(f, Acceleration)) for f in self._features)
 
-    def _settle_forces(self) -> None:
+    def _settle_forces(self, steps: bool) -> None:
         """Where a force has changed, turn displacements into velocities by the old one, before it is overwritten, or left behind
-        by a copy."""
+        by a copy. steps: see _adapt()."""
         changed = [f for f in self._features if f.changed]
         if any(f.lets_go for f in changed):
+            if not steps:
+                self._runner.note_displacements()
             self._let_go()
         elif any(f.new_force or isinstance(f, Acceleration) for f in changed):
             with self._runner.memory.compiler():
-                self._runner.restart(self._iterations)
+                (self._runner.restart if steps else self._runner.restart_between)(self._iterations)
 
     def _let_go(self) -> None:
         """Start from the velocities of now, to which what is about to go has given its part."""
@@ -203,9 +205,10 @@ class World:
         state.start(self._runner.memory, velocity)
         clock.d_is_velocity, clock.energy, clock.owed, clock.parted = True, None, 0.0, None
 
-    def _adapt(self) -> None:
-        """Settle forces; where knobs ask for what the kernels do not have, build the world anew."""
-        self._settle_forces()
+    def _adapt(self, steps: bool = False) -> None:
+        """Settle forces; where knobs ask for what the kernels do not have, build the world anew. steps: a frame comes next,
+        before which nobody asks for residuals of the last one."""
+        self._settle_forces(steps)
         if any(f.outgrown for f in self._features if f.changed):
             edit_scene.renew(self)
 
@@ -614,6 +617,7 @@ class World:
         copies = tuple(f.copy() for f in self._features)
         new = World._of(self._particles, copies, [f.start for f in self._features], **{**settings, **changes})
         checkpoint.transfer(self, new)
+        new._runner.pass_on(self._runner.left, np.ones(len(self._particles), dtype=bool))
         return new
 
     def report(self, seconds: float, tolerance: float | None = None, **options):

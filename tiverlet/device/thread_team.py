@@ -190,9 +190,9 @@ class Team:
             if thread == 0 and self.late[None] >= LONG and self.active_threads[None] > 1:
                 self.ends[None] = 1
 
-    @ti.func
+    @inline
     def _share(self, n, k):
-        return ti.min(k * quotient(n + self.active() - 1, self.active()), n)
+        return ti.min(k * quotient(n + (self.active() - 1), self.active()), n)
 
     @ti.func
     def _dealt_count(self, n, unit, thread):
@@ -205,9 +205,9 @@ class Team:
             out -= units * unit - n
         return out
 
-    @ti.func
+    @inline
     def _dealt_index(self, k, unit, thread):
-        before = quotient(k, unit)
+        before = impl.expr_init(quotient(k, unit))
         return k + (before * (self.active() - 1) + self._place(before, thread)) * unit
 
     @inline

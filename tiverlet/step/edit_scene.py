@@ -139,13 +139,10 @@ def change(
         told, seen = world._all_events(), _seen(world, number, features)
         others = (added is not None or not some.all()) and world._runner.step.has_pair_forces
         if world._force_waits or others or any(more.soft for more in planned.more):
-            memory = world._runner.memory
-            noted = {f: memory.scratch(f) for f in features if isinstance(f, Batch)}
-            world._runner.restart(world.iterations)
-            for f, rows in noted.items():
-                memory.put_scratch(f, rows)
+            world._runner.restart_between(world.iterations)
         world._clock.parted = None
         edit_in_place.regroup(world, planned, added)
+        world._runner.pass_on(world._runner.left, some)
         world._runner.wake()
         tied = initial_violation.first_off([*planned.more], world.position) if planned.more else None
         _edited(world, some, added, told, seen, np.arange(len(features)), bool(extend), tied)
@@ -161,7 +158,7 @@ def renew(world: Any) -> None:
     told = world._all_events() if runner.logs else world._events
     if grabbing.soft:
         with runner.memory.compiler():
-            runner.restart(world.iterations)
+            runner.restart_between(world.iterations)
     clock.parted = clock.energy = None
     edit_in_place.grab(world, grabbing)
     world._events = told
@@ -187,6 +184,7 @@ def rebuild(
     parts, told, seen = None, world._all_events(), _seen(world, number, features)
     noted = {f: world._runner.memory.scratch(f) for f in before if isinstance(f, Batch)}
     try:
+        world._runner.note_displacements()
         borne = any(isinstance(f, Collider) for f in went)
         pulled = (added is not None or not some.all()) and world._runner.step.has_pair_forces  # by others than before
         turned = borne or pulled or world._force_waits or any(_drives(f, number) for f in (*came, *went, *more.values()))
@@ -221,8 +219,9 @@ def rebuild(
         next((c for c in world._runner.step.contacts if c in features), None),
         world._runner.scene.h2_effective,
     )
-    world._clock.parted = None
+    world._clock.parted, left = None, world._runner.left
     world._install(particles, features, parts)
+    world._runner.pass_on(left, some)
     world._runner.scene.h2_effective = h2_effective
     world._runner.memory.restore(state)
     for f, rows in noted.items():

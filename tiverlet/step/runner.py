@@ -36,6 +36,7 @@ class Runner:
         self.step, self.diagnostics, self.path, self.solver = parts.step, parts.diagnostics, parts.path, parts.solver
         self.frames: Frames | None = parts.frames
         self.clock = clock
+        self.left: np.ndarray | None = None  # displacements of the last substep, where they have become velocities between frames
         self.moved = 0.0  # how far the coming frame has had to move a particle to where its constraints are met [m]
         self.jumped = False  # whether that was further than a particle is large
         self.sleepers, self.sleep = parts.scene.state.sleepers, parts.step.sleep
@@ -179,6 +180,7 @@ class Runner:
         if not (self.sleep and self.sleep.rests):
             self.run(substeps if self.n else 0, iterations, span[0] + span[1] * span[2], STARTED if started else STEPPED)
         clock.advance(substeps, span, started)
+        self.left = None
         if self.sleep:
             self.settle(dt)
         self.scene.h2_effective = clock.h**2 * self.integrator.h2_factor * (clock.drag or FREE)[2 if started else 1]
@@ -264,6 +266,25 @@ class Runner:
                 self.step.to_velocity(clock.h, clock.time)
                 clock.owed = (clock.drag or FREE)[3] * clock.h
             clock.d_is_velocity, clock.parted = True, None
+
+    def restart_between(self, iterations: int) -> None:
+        """The same between frames: what residuals of the last substep go by stays known."""
+        noted = {b: self.memory.scratch(b) for b in self.batches}
+        self.note_displacements()
+        self.restart(iterations)
+        for b, rows in noted.items():
+            self.memory.put_scratch(b, rows)
+
+    def note_displacements(self) -> None:
+        """Keep displacements that are about to become velocities."""
+        if self.batches and not self.clock.d_is_velocity:
+            self.left = self.memory.read(self.scene.state.d)[: self.n]
+
+    def pass_on(self, left: np.ndarray | None, some: np.ndarray) -> None:
+        """Take over what was left of particles in the mask `some`, which are the first ones now."""
+        if left is not None:
+            self.left = np.zeros((self.n, left.shape[1]), dtype=left.dtype)
+            self.left[: np.count_nonzero(some)] = left[some]
 
     def stop_at_walls(self, before: np.ndarray) -> None:
         """Let walls stop particles that the host has moved from `before`, (n, dim); with memory.compiler()."""
@@ -463,12 +484,19 @@ class Runner:
         return report
 
     def residuals(self, batch) -> np.ndarray:
-        """What the last substep left of each violation in a batch."""
+        """What the last substep left of each violation in a batch, by the displacements that particles had in it."""
         self.memory.check()
         if not self.clock.h:
             raise RuntimeError(f"{batch!r}.residual: there is none before the world has been stepped.")
+        d, left = self.scene.state.d, self.left if self.clock.d_is_velocity else None
         with self.memory.compiler():
-            return self.diagnostics.residuals(batch, self.clock.h, self.clock.started)
+            now = None if left is None else self.memory.read(d)
+            if left is not None:
+                self.memory.write(d, left)
+            out = self.diagnostics.residuals(batch, self.clock.h, self.clock.started)
+            if now is not None:
+                self.memory.write(d, now)
+            return out
 
     @property
     def memories(self) -> list[Any]:
