@@ -43,14 +43,14 @@ def bound_again(
     runner, scene, memory = world._runner, world._runner.scene, world._runner.memory
     drivers, batches = runner.step.drivers, runner.batches
     bound = [*drivers, *batches]
-    if runner.sleep or not (set(extend) <= set(bound)) or any(f.afresh or (f.ramp and f.ramp.made) for f in bound):
+    if not (set(extend) <= set(bound)) or any(f.afresh for f in bound):
         return None
     if not batches or any(f.changed and f not in drivers for f in bound):
         return None
     structure = runner.structure = runner.structure or _structure(scene, bound)
     objects = [scene, scene.slots, *bound]
     before, exact = [dict(vars(one)) for one in objects], scene.slots.exact
-    kept = {f: f.kept_mask(number) for f in bound}
+    kept, ramps = {f: f.kept_mask(number) for f in bound}, {f: f.ramp for f in bound if f.ramp and f.ramp.made}
     more, inv_mass = {f: other.copy() for f, other in extend.items()}, now.inv_mass.copy()
     try:
         for f in world.features:
@@ -72,6 +72,8 @@ def bound_again(
             for f in bound:
                 with memory.owned(f):
                     f.bind(scene)
+                if f in ramps:
+                    f.ramp.adopt(ramps[f])
                 f._world_for = f.built_for()
         if not (memory.holds(again.longest) and scene.slots.exact == exact and _structure(scene, bound) == structure):
             return None
@@ -129,6 +131,8 @@ def bind(world: Any, change: Regrouping, now: Bound) -> None:
             memory.seen(memory.entries[new[key]].field)[: len(values)] = values
     for f, rows in noted.items():
         memory.put_scratch(f, rows, now.kept[f])
+        if f.ramp and f.ramp.made:
+            f.ramp.fit()
     constraints = runner.step.constraints
     constraints.systems[:] = [runner.scene.slots.system] if constraints.systems else []
     constraints.semi_iterations[:] = [runner.scene.slots.semi_iteration] if constraints.semi_iterations else []

@@ -114,6 +114,8 @@ def regroup(world: Any, edit: Edit, added: Particles | None) -> None:
             f.changed, f.moving, f.new_force = waits
     if bound:
         bind(world, change, bound)
+    if runner.sleep:
+        runner.sleep.bind_again(step.drivers, runner.batches)
     runner.regroup()
     for log in runner.logs:
         log.forget()

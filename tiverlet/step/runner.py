@@ -205,7 +205,7 @@ class Runner:
             new = [b.ramp.memory for b in self.ramping if b.ramp.set_out()]
             self.ramping = [b for b in self.ramping if b.ramp.under_way]
             if new:
-                self.ramps = [*self.ramps, *new]
+                self.ramps, self.structure = [*self.ramps, *new], None
                 self.renew()
 
     def arrive(self) -> None:

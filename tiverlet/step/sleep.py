@@ -204,6 +204,15 @@ class SleepPass:
         turns = self.step.orients and bool((self.step.scene.inv_mass == 0).any())
         self.goes_on = turns or bool(self.step.drivers)
 
+    def bind_again(self, drivers: list[Batch], batches: list[Batch]) -> None:
+        """Constraints came or went: who is linked now, and who never sleeps."""
+        memory = self.step.scene.memory
+        kept, pairs = linked(self.step.scene.inv_mass, drivers, batches, self.contacts)
+        memory.write(self.kept_awake, kept)
+        memory.resize(self.pairs, len(pairs))
+        memory.write(self.pairs, pairs)
+        self.links = len(pairs)
+
     def compile(self, clock: "Clock") -> None:
         """Now, so that nobody waits for it later: nothing is ready to sleep yet, and none is called."""
         self.fall_asleep(clock.time)

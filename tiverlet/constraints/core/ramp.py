@@ -95,6 +95,17 @@ class Ramp:
         self.memory.place()
         self.made = True
 
+    def adopt(self, before: "Ramp") -> None:
+        """Take what was made for the same batch when it had other constraints."""
+        self.fields, self.memory, self.made = before.fields, before.memory, True
+        self.begin, self.goal, self.step = before.begin, before.goal, before.step
+
+    def fit(self) -> None:
+        """Have a row for each constraint that there is now. Nothing is on its way."""
+        for field in (*self.begin, *self.goal, self.step):
+            self.memory.resize(field, self._batch.count)
+        self.arrive()
+
     def _aim(self, begin: list[np.ndarray], goal: list[np.ndarray]) -> None:
         """Go from here to there in the coming frame."""
         for field, values in zip([*self.begin, *self.goal], [*begin, *goal], strict=True):

@@ -46,7 +46,7 @@ class Spring:
             self.alpha = add(f"{name}.compliance", len(compliance), values=compliance)
             self.last = add(f"{name}.last", len(start), width=width, values=start, state=True)
             self.history = add(f"{name}.history", len(start), width=width, state=bool(scene.state.sleepers))
-            self.in_state = {"last": self.last}
+            self.in_state = {"last": self.last} | ({"history": self.history} if scene.state.sleepers else {})
         if damping is not None:
             self.damping = add(f"{name}.damping", len(damping), values=damping)
 
