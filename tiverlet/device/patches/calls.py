@@ -69,7 +69,8 @@ def _address(made: tuple[Any, Any]) -> int:
 def _compile(real: Any, key: Any, function: Any, args: tuple[Any, ...]) -> None:
     """Give a function a body."""
     runtime: Any = impl.get_runtime()
-    tree, ctx = kernel_impl._get_tree_and_ctx(real, is_kernel=False, args=args, is_real_function=True)
+    read: Any = kernel_impl._get_tree_and_ctx
+    tree, ctx = read(real, is_kernel=False, args=args, is_real_function=True)
     names = [one.name for one in real.arguments[1:]]
     tree.body[0].body.insert(0, ast.parse(NEVER.format(names[0], real.func.__name__, ", ".join(names))).body[0])
     real.taichi_functions[key.instance_id] = function

@@ -92,7 +92,8 @@ def _read(self: Any, *more: Any, is_kernel: bool = True, is_real_function: bool 
     """The tree of a function, and what it is compiled in: a tree that was read before and is not in use, see _transformed(). What
     calls it may be a function itself, see calls.py; Taichi thinks of kernels alone."""
     if options.get("ast_builder") is not None:
-        options["ast_builder"] = impl.get_runtime().compiling_callable.ast_builder()
+        runtime: Any = impl.get_runtime()
+        options["ast_builder"] = runtime.compiling_callable.ast_builder()
     spare = _trees.get(self.func) if active and not (is_kernel or is_real_function or more) else None
     if not spare:
         return _parse(self, *more, is_kernel=is_kernel, is_real_function=is_real_function, **options)
