@@ -8,6 +8,8 @@ import pytest
 import tiverlet as tv
 from tiverlet.device import ti
 
+from .test_events import equal
+
 R = 0.5
 
 
@@ -18,17 +20,16 @@ def heap(columns, rows, apart=2.05, x0=0.0):
     return x + rng.uniform(0, 0.02 * R, x.shape) + [x0, 0.0]
 
 
+WIDE = (8 * 2.05 * R + 0.02, 999)  # [m] where the walls around a heap are
 NEVER = 1e9  # [s] to be slow for: asleep never, in the kernels of those that do
 
 
-def pile(world, height=10.0, time=0.5, contact=None, spin=None, **settings):
+def pile(world, height=10.0, time=0.5):
     """A heap between walls, and a disc that falls on it, where it has a height, when the heap sleeps."""
     x = heap(8, 4)
     x = np.vstack([x, [4.0, height]]) if height else x
-    contact = contact or {"friction": 0.3}
-    box = tv.Box((0, 0), (8 * 2.05 * R + 0.02, 999), friction=contact["friction"])
-    features = [tv.Gravity(), box, tv.Contact(**contact), tv.Sleep(time=time)]
-    return world(tv.Particles(x, radius=R, spin=spin), features, substeps=10, **settings)
+    features = [tv.Gravity(), tv.Box((0, 0), WIDE, friction=0.3), tv.Contact(friction=0.3), tv.Sleep(time=time)]
+    return world(tv.Particles(x, radius=R), features, substeps=10)
 
 
 def until(w, asleep, seconds=12.0):
@@ -100,15 +101,23 @@ def test_against_a_world_that_never_rested(world):
 
 
 def test_bits_of_all_paths(world):
-    """Who sleeps, and when who wakes, is the same on one thread, on a team, and phase by phase. Smooth: see bodies of loops."""
-    rough = dict(friction=(0.5, 0.4, 0.05), restitution=0.2, events=True)
-    worlds = [pile(world, path=path, contact=rough, spin=0.0) for path in ("fused", "parallel", "launched")]
-    seen = []
+    """Who sleeps, when who wakes, spins and all events are the same on one thread, on a team, and phase by phase. Without spins,
+    friction and events: see bodies of loops."""
+    x = np.vstack([heap(8, 4), [4.0, 10.0], [4.0, 6.0]])  # what falls on the heap passes a sensor
+    start = tv.Particles(x, radius=R, spin=0.0, group=np.arange(34) // 33, pinned=[33])
+    rough: dict = dict(friction=(0.5, 0.4, 0.05), restitution=0.2, events=True)
+    worlds, seen, met = [], [], 0
+    for path in ("fused", "parallel", "launched"):
+        contact, box = tv.Contact(sensors=[(0, 1)], **rough), tv.Box((0, 0), WIDE, **rough)
+        worlds.append(world(start, [tv.Gravity(), box, contact, tv.Sleep()], substeps=10, path=path))
     for k in range(75):
         seen.append({w.step(1 / 60).asleep for w in worlds})
+        for w in worlds[1:]:
+            met += equal(worlds[0].events(), w.events()) + equal(worlds[0].wall_events(), w.wall_events())
         if k % 10 == 0 or seen[-1] != seen[k - 1]:
             assert len({w.hash() for w in worlds}) == 1
     assert all(len(s) == 1 for s in seen) and {32} in seen and seen[-1] != {32}  # fell asleep, and was hit
+    assert met > 500
 
 
 def test_clones_and_replays_sleep_alike(world, tmp_path, read_here):
