@@ -63,8 +63,8 @@ def results(path):
 
 
 def test_every_solver_has_the_same_bits_on_1_and_8_threads():
-    # Sums over all constraints, as conjugate gradients take them, and systems that several threads solve, both beside contacts:
-    # cloth and ropes that fall on a ball, with hail on them. On one thread phase by phase, as on a GPU.
+    # Sums over all constraints, as conjugate gradients take them beside contacts, and systems that several threads solve: cloth
+    # that falls on a ball, with hail on it, and ropes. On one thread phase by phase, as on a GPU.
     code = """
 import numpy as np
 import pytest
@@ -82,8 +82,8 @@ start = tv.Particles(
 def results(path):
     touching = [tv.Ball((0.5, 0.69, 0.5), 0.3, friction=0.3), tv.Contact(friction=0.3)]
     for solver, pairs, more in (
-        (tv.Direct(), ropes, touching), (tv.Jacobi("auto"), net, []), (tv.Chebyshev(), net, []),
-        (tv.ConjugateGradient(steps=4), net, [f.copy() for f in touching]),
+        (tv.Direct(), ropes, []), (tv.Jacobi("auto"), net, []), (tv.Chebyshev(), net, []),
+        (tv.ConjugateGradient(steps=4), net, touching),
     ):
         features = [tv.Gravity(9.81), tv.Distance(pairs), *more]
         with tv.World(start, features, solver=solver, path=path, substeps=5, iterations=4) as world:
@@ -114,27 +114,29 @@ def test_a_large_pile_has_the_same_bits_on_all_paths_and_where_a_team_breaks_up(
 
 
 def test_all_paths_have_the_same_bits(world):
-    # In three dimensions see the next but one, and the fuzzer.
+    # In three dimensions see the next but one, and the fuzzer; for spins, events, sleep and bodies of loops see test_sleep.py. A
+    # column on the first disc learns its loads.
     n = 300
     x = tv.golden(np.arange(n), dim=2) * [4, 3]
-    pairs = np.stack([np.arange(0, n - 1, 2), np.arange(1, n, 2)], axis=1)
+    x[:4] = [1.0, 7.0] + np.outer(np.arange(4), [0.0, 0.16])
+    pairs = np.stack([np.arange(8, n - 1, 2), np.arange(9, n, 2)], axis=1)
     made = []
     for path in ("fused", "parallel", "launched"):
         features = [
             tv.Gravity(9.81), tv.Drag(0.1),
-            tv.Distance(pairs, compliance=np.where(np.arange(n // 2) % 2, 1e-4, 0.0), damping=1.0),
-            tv.Rope(pairs[:20] + 100, 0.5), tv.Contact(), tv.Box((0, 0), (4, 9)), tv.HalfSpace((0.2, 1), 0.1),
-            tv.Pin([0], (1, 1), compliance=1e-3), tv.Pin([5], (1, 2)),
+            tv.Distance(pairs, compliance=np.where(np.arange(len(pairs)) % 2, 1e-4, 0.0), damping=1.0),
+            tv.Rope(pairs[:20] + 100, 0.5), tv.Contact(loads=True), tv.Box((0, 0), (4, 9)), tv.HalfSpace((0.2, 1), 0.1),
+            tv.Pin([0]), tv.Pin([4], (1, 1), compliance=1e-3), tv.Pin([5], (1, 2)),
         ]  # fmt: skip
         w = world(
             tv.Particles(x, radius=0.08, mass=1 + np.arange(n) % 5), features, path=path,
             precision="f32-compensated", substeps=7, iterations=2,
         )  # fmt: skip
-        w.run(0.1)
+        w.run(0.6)
         w.substeps = 9
-        w.run(0.1)
+        w.run(0.5)
         made.append((w.hash(), w.last.energy, w.last.residual, w.last.overlap))
-        assert w.last.contacts > 60
+        assert w.last.contacts > 60 and (w._runner.search.list.lasting_data()[1]["load"] > 0).any()
     assert made[0] == made[1] == made[2]
 
 
@@ -207,7 +209,7 @@ def test_unused_files_change_no_bit(tmp_path):
 
     package = pathlib.Path(tv.__file__).parent
     bare = tmp_path / "bare" / "tiverlet"
-    shutil.copytree(package, bare, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(package, bare)
     gone = {"forces": ["attractor", "drag", "pair_force", "force", "wind"], "constraints": ["rope", "spacer"]}
     for folder, files in gone.items():
         init = bare / folder / "__init__.py"

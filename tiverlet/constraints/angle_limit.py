@@ -110,8 +110,8 @@ class AngleLimit(Scalar):
                 checks.per_item("AngleLimit", f"{name} (in 3D)", value, self.count, least=0.0, most=np.pi)
 
     def values(self, x: np.ndarray) -> np.ndarray:
-        """How far the angles are from the middle."""
-        return np.abs(turned(super().values(x) - self.middle))
+        """How far the angles are from the middle; of all corners once, or several times."""
+        return np.abs(turned(super().values(x) - np.tile(self.middle, len(x) // max(1, self.count))))
 
     def gradients(self, position: np.ndarray) -> np.ndarray:
         """Of that, by each corner."""

@@ -11,6 +11,8 @@ from ...device import ti
 if TYPE_CHECKING:
     from ...features.feature import Scene
 
+TOGETHER = 10_000  # rows whose values are found at a time
+
 
 class Quantity:
     """The contract of f in C(x) = f(x) - rest: a length, an angle, an area; and what most of them do.
@@ -118,13 +120,16 @@ class Quantity:
 
 
 def differences(values: Callable, x: np.ndarray) -> np.ndarray:
-    """Gradients of values(x) by each corner of x (m, arity, dim), central differences."""
-    step = 1e-6 * (float(np.ptp(x, axis=1).max(initial=0.0)) or 1.0)
-    out = np.zeros_like(x)
-    for k in range(x.shape[1]):
-        for a in range(x.shape[2]):
-            ends = np.stack([x, x])
-            ends[:, :, k, a] += [[step], [-step]]
-            up, down = (values(end) for end in ends)
-            out[:, k, a] = (up - down) / (2 * step)
-    return out
+    """Gradients of values(x) by each corner of x (m, arity, dim), central differences. values: takes all of x several times, one
+    behind the other; few rows take as long as one."""
+    step, m = 1e-6 * (float(np.ptp(x, axis=1).max(initial=0.0)) or 1.0), len(x)
+    flat = x.reshape(m, x.shape[1] * x.shape[2])
+    out, each = np.zeros_like(flat), max(1, TOGETHER // max(1, 2 * m))
+    for first in range(0, flat.shape[1] if m else 0, each):
+        some = np.arange(first, min(first + each, flat.shape[1]))
+        ends, k = np.tile(flat, (2, len(some), 1, 1)), np.arange(len(some))
+        ends[0, k, :, some] += step
+        ends[1, k, :, some] -= step
+        up, down = values(ends.reshape(-1, *x.shape[1:])).reshape(2, len(some), m)
+        out[:, some] = ((up - down) / (2 * step)).T
+    return out.reshape(x.shape)
