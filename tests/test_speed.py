@@ -62,7 +62,7 @@ def test_edits_are_timed(report):
 @pytest.mark.parametrize("engine", [waits.pymunks, waits.newtons])
 def test_edits_of_other_engines_are_timed(engine):
     pytest.importorskip(engine.__name__.removesuffix("s"))
-    assert {*engine(100)} <= {*waits.FIRST, *waits.AIMS}
+    assert {*engine(100, 3)} <= {*waits.FIRST, *waits.AIMS}
 
 
 def test_pile_in_c_does_the_same(report):

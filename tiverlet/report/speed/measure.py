@@ -196,7 +196,8 @@ class Session:
         """What edits of a pile take, here and by the peers that there are."""
         names = [peer.name for peer in others.PEERS.values() if peers and not peer.missing()]
         with self.noting("waits"):
-            return edits.waits(EDITED if self.rounds == ROUNDS else EDITED // 10, self.cache(), names)
+            few = self.rounds != ROUNDS
+            return edits.waits(EDITED // 10 if few else EDITED, edits.QUICK if few else edits.TIMES, self.cache(), names)
         return []
 
     def without(self, name: str, n: int) -> Absent:

@@ -16,7 +16,7 @@ import numpy as np
 
 from .result import Wait
 
-TIMES = 30  # that an act is done; the median counts
+TIMES, QUICK = 30, 5  # that an act is done, and in a quick report; the median counts
 FEW, SOME = 1, 100  # that come and go
 POINTS, ROPES = 10, 5  # of a rope that does; ropes that are there
 START = """
@@ -38,13 +38,13 @@ AIMS = {
 }  # fmt: skip
 
 
-def waits(n: int, cache: str, peers: list[str]) -> list[Wait]:
-    """Of a pile of n discs. cache: an empty folder. peers: those that are installed."""
+def waits(n: int, times: int, cache: str, peers: list[str]) -> list[Wait]:
+    """Of a pile of n discs. times: that an act is done. cache: an empty folder. peers: those that are installed."""
     from .processes import started
 
     def of(engine: str) -> dict[str, float]:
         """Seconds of each act in one engine, in a process of its own."""
-        with started(START, {"engine": engine, "n": n}, cache) as talker:
+        with started(START, {"engine": engine, "n": n, "times": times}, cache) as talker:
             return talker.ask()
 
     cold, warm, theirs = of("tiverlet"), of("tiverlet"), {name: of(name) for name in peers}
@@ -54,7 +54,7 @@ def waits(n: int, cache: str, peers: list[str]) -> list[Wait]:
 
 def main(job: dict[str, Any], imported: float) -> None:
     """The process of an engine: seconds, by act."""
-    out = {FIRST[0]: imported, **{"tiverlet": ours, "pymunk": pymunks, "newton": newtons}[job["engine"]](job["n"])}
+    out = {FIRST[0]: imported, **{"tiverlet": ours, "pymunk": pymunks, "newton": newtons}[job["engine"]](job["n"], job["times"])}
     print(json.dumps(out), flush=True)
 
 
@@ -83,7 +83,7 @@ def hung(x: np.ndarray, radius: float, k: int) -> np.ndarray:
 Act = Callable[[int], Any]
 
 
-def timed(acts: dict[str, tuple[Act, Act | None]], frame: Callable[[], Any]) -> dict[str, float]:
+def timed(acts: dict[str, tuple[Act, Act | None]], frame: Callable[[], Any], times: int) -> dict[str, float]:
     """Seconds that acts take, and what they put off for the next frame. By name: the act, and what takes it back, or None.
 
     From one act to the next there is an odd number of frames: ours take out sound in every fourth, of 8 substeps.
@@ -91,7 +91,7 @@ def timed(acts: dict[str, tuple[Act, Act | None]], frame: Callable[[], Any]) -> 
     out = {}
     for name, (act, back) in acts.items():
         spent, usual = [], []
-        for k in range(TIMES):
+        for k in range(times):
             for _ in range(3 if back else 2):
                 clock = thread_time()
                 frame()
@@ -107,7 +107,7 @@ def timed(acts: dict[str, tuple[Act, Act | None]], frame: Callable[[], Any]) -> 
     return out
 
 
-def ours(n: int) -> dict[str, float]:
+def ours(n: int, times: int) -> dict[str, float]:
     """By tiverlet, with a pin, a hand and a wall that can be switched in the scene."""
     import tiverlet as tv
 
@@ -168,12 +168,12 @@ def ours(n: int) -> dict[str, float]:
         "pin another particle": (hold, None), "take another in hand": (take, None), "switch a wall": (switch, None),
         "add as many again": (added(n), removed(n)),
     }  # fmt: skip
-    found = timed(acts, frame)
+    found = timed(acts, frame, times)
     world.close()
-    return {FIRST[1]: first, "second world, first step": second, "copy, first step": copied, **found, **roped(n)}
+    return {FIRST[1]: first, "second world, first step": second, "copy, first step": copied, **found, **roped(n, times)}
 
 
-def roped(n: int) -> dict[str, float]:
+def roped(n: int, times: int) -> dict[str, float]:
     """By tiverlet, in the pile with ropes."""
     import tiverlet as tv
 
@@ -198,10 +198,10 @@ def roped(n: int) -> dict[str, float]:
     acts: dict[str, tuple[Act, Act | None]] = {"add a rope": (add, remove), "remove a rope": (remove, add)}
     world.step(DT)
     add(0)
-    return timed(acts, lambda: world.step(DT))
+    return timed(acts, lambda: world.step(DT), times)
 
 
-def pymunks(n: int) -> dict[str, float]:
+def pymunks(n: int, times: int) -> dict[str, float]:
     """By pymunk."""
     import pymunk  # pyright: ignore[reportMissingImports]
     from pymunk.constraints import PinJoint, PivotJoint  # pyright: ignore[reportMissingImports]
@@ -281,10 +281,10 @@ def pymunks(n: int) -> dict[str, float]:
         "pin another particle": (hold, None), "add as many again": (added(n), removed(n)),
         "add a rope": (tie, untie), "remove a rope": (untie, tie),
     }  # fmt: skip
-    return {FIRST[1]: first, "second world, first step": second, "copy, first step": copied, **timed(acts, engine.frame)}
+    return {FIRST[1]: first, "second world, first step": second, "copy, first step": copied, **timed(acts, engine.frame, times)}
 
 
-def newtons(n: int) -> dict[str, float]:
+def newtons(n: int, times: int) -> dict[str, float]:
     """By newton, whose models are fixed but for what their arrays hold: particles that come or go, and springs, take another one.
     What is pinned weighs nothing there. Its discs are balls in a plane."""
     from .peers import Newton
