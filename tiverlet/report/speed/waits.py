@@ -83,7 +83,7 @@ def hung(x: np.ndarray, radius: float, k: int) -> np.ndarray:
 Act = Callable[[int], Any]
 
 
-def timed(acts: dict[str, tuple[Act, Act | None]], frame: Callable[[], Any], times: int) -> dict[str, float]:
+def timed(acts: dict[str, tuple[Act, Act | None]], frame: Callable[[], Any], rounds: int) -> dict[str, float]:
     """Seconds that acts take, and what they put off for the next frame. By name: the act, and what takes it back, or None.
 
     From one act to the next there is an odd number of frames: ours take out sound in every fourth, of 8 substeps.
@@ -91,7 +91,7 @@ def timed(acts: dict[str, tuple[Act, Act | None]], frame: Callable[[], Any], tim
     out = {}
     for name, (act, back) in acts.items():
         spent, usual = [], []
-        for k in range(times):
+        for k in range(rounds):
             for _ in range(3 if back else 2):
                 clock = thread_time()
                 frame()
@@ -107,7 +107,7 @@ def timed(acts: dict[str, tuple[Act, Act | None]], frame: Callable[[], Any], tim
     return out
 
 
-def ours(n: int, times: int) -> dict[str, float]:
+def ours(n: int, rounds: int) -> dict[str, float]:
     """By tiverlet, with a pin, a hand and a wall that can be switched in the scene."""
     import tiverlet as tv
 
@@ -168,12 +168,12 @@ def ours(n: int, times: int) -> dict[str, float]:
         "pin another particle": (hold, None), "take another in hand": (take, None), "switch a wall": (switch, None),
         "add as many again": (added(n), removed(n)),
     }  # fmt: skip
-    found = timed(acts, frame, times)
+    found = timed(acts, frame, rounds)
     world.close()
-    return {FIRST[1]: first, "second world, first step": second, "copy, first step": copied, **found, **roped(n, times)}
+    return {FIRST[1]: first, "second world, first step": second, "copy, first step": copied, **found, **roped(n, rounds)}
 
 
-def roped(n: int, times: int) -> dict[str, float]:
+def roped(n: int, rounds: int) -> dict[str, float]:
     """By tiverlet, in the pile with ropes."""
     import tiverlet as tv
 
@@ -198,10 +198,10 @@ def roped(n: int, times: int) -> dict[str, float]:
     acts: dict[str, tuple[Act, Act | None]] = {"add a rope": (add, remove), "remove a rope": (remove, add)}
     world.step(DT)
     add(0)
-    return timed(acts, lambda: world.step(DT), times)
+    return timed(acts, lambda: world.step(DT), rounds)
 
 
-def pymunks(n: int, times: int) -> dict[str, float]:
+def pymunks(n: int, rounds: int) -> dict[str, float]:
     """By pymunk."""
     import pymunk  # pyright: ignore[reportMissingImports]
     from pymunk.constraints import PinJoint, PivotJoint  # pyright: ignore[reportMissingImports]
@@ -281,10 +281,10 @@ def pymunks(n: int, times: int) -> dict[str, float]:
         "pin another particle": (hold, None), "add as many again": (added(n), removed(n)),
         "add a rope": (tie, untie), "remove a rope": (untie, tie),
     }  # fmt: skip
-    return {FIRST[1]: first, "second world, first step": second, "copy, first step": copied, **timed(acts, engine.frame, times)}
+    return {FIRST[1]: first, "second world, first step": second, "copy, first step": copied, **timed(acts, engine.frame, rounds)}
 
 
-def newtons(n: int, times: int) -> dict[str, float]:
+def newtons(n: int, rounds: int) -> dict[str, float]:
     """By newton, whose models are fixed but for what their arrays hold: particles that come or go, and springs, take another one.
     What is pinned weighs nothing there. Its discs are balls in a plane."""
     from .peers import Newton
