@@ -112,8 +112,8 @@ def test_momentum_is_kept_whatever_the_function(radius):
 
 
 def test_energy_stays_and_lists_grow():
-    """A crowd that keeps its energy to order h^2, and finds all of its pairs when it is drawn together to many times as many; by a
-    team of threads."""
+    """A crowd that keeps its energy to order h^2, and finds all of its pairs when it is drawn together to many times as many; by
+    a team of threads."""
     world = crowd(n=400, substeps=20, path="parallel")
     start = world.step(0.0 + 1e-4).energy
     for _ in range(60):
