@@ -38,7 +38,8 @@ collect_ignore = [] if patched else ["test_compiling.py", "test_sharing.py"]  # 
 # Files that take longest, which come first: else one worker would go on with one of them when the others are done.
 LONG = (
     "demos", "worlds", "properties", "determinism", "sleep", "speed", "periodic", "recordings", "sweep", "edit_in_place",
-    "polygons", "knobs", "spin", "contact", "loads", "pairs", "overlap_release", "sharing", "solvers", "impacts", "walls", "docs", "fuzz",
+    "polygons", "knobs", "spin", "contact", "loads", "pairs", "overlap_release", "sharing", "solvers", "impacts", "walls",
+    "docs", "fuzz",
 )  # fmt: skip
 ARCH = os.environ.get("TIVERLET_ARCH", "cpu")
 SOURCES = str(pathlib.Path(tv.__file__).parent)
