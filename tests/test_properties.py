@@ -169,6 +169,23 @@ def test_a_constraint_does_what_all_constraints_do(world, name):
     assert f.load[c] == pytest.approx(row.off / 10 / scene.compliance[c], rel=1e-5)
 
 
+@pytest.mark.parametrize("name", ["Bend 2D", "Bend 3D", "AngleLimit 3D", "Dihedral 3D", "Area 3D", "Volume 3D"])
+def test_gradients_of_many_are_those_of_each(name):
+    # The host takes differences of as many coordinates at once as there is room for: here of all, and of few. Sum grad = 0, and a
+    # move of 1e-4 changes C by grad C dx to second order.
+    points, make = ROWS[name].points, ROWS[name].make
+    found, move = [], 1e-4 * np.random.default_rng(0).normal(size=points.shape)
+    for count in (1, 2000):
+        x = np.tile(points, (count, 1))
+        feature = make(np.arange(len(x)).reshape(count, -1), np.zeros(count))
+        feature.prepare(tv.Particles(x), np.ones(len(x)))
+        found.append(feature.gradients(x))
+        change = feature.violation(x + np.tile(move, (count, 1))) - feature.violation(x)
+        np.testing.assert_allclose(change, (found[-1] * move).sum(axis=(1, 2)), atol=3e-7)
+    np.testing.assert_array_equal(found[1], np.repeat(found[0], 2000, axis=0))
+    assert np.abs(found[0].sum(axis=1)).max() < 1e-8 < 0.1 < np.abs(found[0]).max()
+
+
 def test_the_tables_hold_every_constraint():
     named = {name.split()[0].rstrip(",") for name in (*ROWS, *OTHERS)}
     assert named == set(constraints.__all__) and all(reason for *_, reason in OTHERS.values())
