@@ -45,7 +45,7 @@ def test_pay_finds_that_features_only_add(printed):
         ("cradle", {}, "formula"),
         ("net", {"settings": [("CELLS", 10), ("STRENGTH", 20.0)]}, "times its weight"),
         ("hourglass", {"built": {"grains": 300}}, "through the neck"),
-        ("polygons", {"seconds": 3.0}, "36 bodies"),
+        ("polygons", {"seconds": 1.5}, "36 bodies"),
         ("cloth", {"built": {"points": 17}}, "cloth.rrd"),
         ("wrecking", {"seconds": 2.5}, "before they were hit"),
         ("jelly", {"settings": [("CELLS", 4)]}, "of its height"),
@@ -57,7 +57,8 @@ def test_pay_finds_that_features_only_add(printed):
         ("silo", {"settings": [("GRAINS", 250), ("SETTLED", 2.0)], "seconds": 4.0}, "of the weight"),
         ("drum", {"settings": [("GRAINS", 250), ("RADIUS", 0.04)], "seconds": 3.0}, "the heap leans"),
         ("billiards", {}, "all at rest"),
-        *((name, {}, f"{name}.rrd") for name in ("soft", "bead", "tidy", "ragdoll", "machine", "buggy")),
+        ("soft", {"seconds": 2.0}, "soft.rrd"),
+        *((name, {}, f"{name}.rrd") for name in ("bead", "tidy", "ragdoll", "machine", "buggy")),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
