@@ -28,6 +28,13 @@ def places(n: int, dim: int = 2) -> np.ndarray:
     return 0.205 * lattice + 0.15 + 0.003 * np.sin(np.arange(n * dim)).reshape(n, dim)
 
 
+def overlapping(n: int, dim: int = 2) -> np.ndarray:
+    """The same, of which two overlap, as some do where a world is built anew: both worlds have the same kernels then."""
+    x = places(n, dim)
+    x[-1] = x[-2] + 0.15 * np.eye(dim)[0]
+    return x
+
+
 def drops(k: int, turn: int, dim: int = 2, radius: Any = RADIUS, **more) -> tv.Particles:
     """Particles that come from above, each turn further up: none overlaps another."""
     x = np.concatenate([0.3 + 0.25 * np.arange(k)[:, None], np.full((k, dim - 1), 1.9 + 0.3 * turn)], axis=1)
@@ -37,7 +44,7 @@ def drops(k: int, turn: int, dim: int = 2, radius: Any = RADIUS, **more) -> tv.P
 def discs():
     """Groups, sensors, events, spins, a wall, a hand, a spring that holds one."""
     n = 40
-    particles = tv.Particles(places(n), radius=RADIUS, group=np.arange(n) % 3, spin=0.5, orientation=0.0)
+    particles = tv.Particles(overlapping(n), radius=RADIUS, group=np.arange(n) % 3, spin=0.5, orientation=0.0)
     contact = tv.Contact(friction={(0, 1): 0.5}, groups=[(0, 1), (1, 1), (0, 0)], sensors=[(0, 2)], events=True)
     features = [
         tv.Gravity(), tv.Drag(0.1), tv.Hand((1.0, 0.2), particle=30), contact, tv.HalfSpace((0, 1), 0.0, events=True),
@@ -59,7 +66,7 @@ def grains():
 def beside_a_rope():
     """Spheres beside a rope between a pinned particle and a driven one, in two words of f32."""
     rope = tv.shapes.rope((0.1, 2.5, 0.2), (1.9, 2.5, 0.2), points=10)
-    particles = tv.Particles(np.concatenate([rope.position, places(30, 3)]), radius=0.09, pinned=[0])
+    particles = tv.Particles(np.concatenate([rope.position, overlapping(30, 3)]), radius=0.09, pinned=[0])
     features = [tv.Gravity(), tv.Distance(rope.links), tv.Pin([9]), tv.HalfSpace((0, 1, 0), 0.0), tv.Contact()]
     w = tv.World(particles, features, substeps=5, precision="f32-compensated")
     return w, lambda k, turn: drops(k, turn, 3, 0.09)
@@ -68,7 +75,7 @@ def beside_a_rope():
 def beside_a_net():
     """Discs beside a net, whose system knows what hangs together by the numbers of particles."""
     net = tv.shapes.cloth((0.1, 2.5), (1.8, 0), (0, 0.4), points=(7, 3))
-    particles = tv.Particles(np.concatenate([net.position, places(30)]), radius=0.09, pinned=[0, 6])
+    particles = tv.Particles(np.concatenate([net.position, overlapping(30)]), radius=0.09, pinned=[0, 6])
     features = [tv.Gravity(), tv.Distance(net.links), tv.HalfSpace((0, 1), 0.0), tv.Contact()]
     w = tv.World(particles, features, substeps=5, solver=tv.ConjugateGradient(4))
     return w, lambda k, turn: drops(k, turn, radius=0.09)
@@ -171,7 +178,7 @@ def test_in_place_is_to_the_bit_as_built_anew(scene):
 def ropes(solver=None, precision="f32", **more):
     """Three ropes, the last of which breaks, between discs, with pins of both kinds. More: a rope, and a link of two discs."""
     hung = [tv.shapes.rope((0.1 + 0.6 * k, 2.4), (0.5 + 0.6 * k, 2.4), points=5) for k in range(3)]
-    position = np.concatenate([places(20), *(rope.position for rope in hung)])
+    position = np.concatenate([overlapping(20), *(rope.position for rope in hung)])
     pairs = np.concatenate([rope.links + 20 + 5 * k for k, rope in enumerate(hung)])
     link = tv.Distance(pairs, compliance=np.where(pairs.min(axis=1) < 30, 1e-5, 0.0), break_at=20.0, **more)
     bend = tv.Bend(np.stack([pairs[:-1, 0], pairs[:-1, 1], pairs[1:, 1]], axis=1)[[0, 1, 2, 4, 5, 6]], compliance=1e-2)
