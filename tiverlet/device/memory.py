@@ -55,7 +55,6 @@ class Memory:
         self._later: list[tuple[Entry, np.ndarray]] = []
         self._declared: list[Declared] = []
         self.numbers: dict[Any, tuple[Any, list[Number]]] = {}  # by kind: the field, and what it holds
-        self._read: tuple[Any, dict[int, Any]] = None, {}  # the kernel that has read them, and its variables, see read_all()
         self._apart = not aligned()
         self._layout: Layout | None = None
         self._which: list[int] = []  # of its fields

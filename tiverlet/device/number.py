@@ -8,6 +8,9 @@ from typing import Any
 
 from .language import at, current, impl, inline, inside_kernel
 
+# The kernel that is being translated, and its variables, by what they are. Not an attribute: kernels share what they do not read.
+_read: tuple[Any, dict[int, Any]] = (None, {})
+
 
 class Number:
     """One number, at a place of a field. Where kernels are translated `now` is that place, elsewhere the number."""
@@ -21,7 +24,7 @@ class Number:
         """What it is."""
         if not inside_kernel():
             return self._value
-        kernel, known = self._memory._read
+        kernel, known = _read
         read = kernel is current().compiling_callable and id(self) in known
         return known[id(self)] if read else at(self.field, self.place)
 
@@ -33,10 +36,10 @@ class Number:
 
 @inline
 def read_all(numbers):
-    """In a kernel: from here on to its end they are variables. numbers: of one Memory, which knows which kernel has them."""
+    """In a kernel: from here on they are variables. numbers: of a Memory."""
+    global _read
     known = [number for _, some in numbers.values() for number in some]
-    variables = {id(k): impl.expr_init(at(k.field, k.place)) for k in known}
-    known[0]._memory._read = current().compiling_callable, variables
+    _read = current().compiling_callable, {id(k): impl.expr_init(at(k.field, k.place)) for k in known}
 
 
 class OnDevice:
