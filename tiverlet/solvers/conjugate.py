@@ -46,8 +46,8 @@ class ConjugateGradient(Solver):
     Each part, of what hangs together, has its own, which is raised where a row has more than its share, of all rows, of the r . z
     that is left. Where rigid constraints contradict each other as particles are placed, the right side is partly in the null
     space of A, to which steps give any multiplier: sigma = 1 from the first substep on bounds it by what a Jacobi pass gives.
-    So is what rounding leaves of violations where links are more than are needed (braced bodies): steps end where r . z is no
-    more than that.
+    So is what rounding leaves of violations where links are more than are needed (braced bodies): steps end where no row is left
+    with more than that. A sum over rows would not do: beside what rounding leaves of heavy particles, light ones would not count.
 
     steps: of conjugate gradients in an iteration. Ropes, spacers and what is not one number are relaxed as by Jacobi beside it.
     """
@@ -106,9 +106,9 @@ class CGSystem(System):
         self.partial, self.worst = self.reals("partial_sums", BLOCKS), self.reals("worst", BLOCKS)
         if self.limits_steps:
             self.gain, self.over = self.reals("gain", BLOCKS), self.reals("over", BLOCKS)
-        # r . z; by how much the last direction counts in the next; how far a step is taken back; r . z at the start; and that of
-        # rounding
-        self.sums = scene.memory.field("system.sums", None, width=5, kind=ti.f64)
+        # r . z; by how much the last direction counts in the next; how far a step is taken back; r . z at the start
+        self.sums = scene.memory.field("system.sums", None, width=4, kind=ti.f64)
+        self.noise, self.loud = self.reals("noise"), self.reals("loud", BLOCKS)  # r z of rounding; 1 where a row has more
         self.state, self.rounding = scene.state, float(np.finfo(np.float32 if scene.real == ti.f32 else np.float64).eps)
         if scene.state.compensated:
             self.rounding *= self.rounding
@@ -172,28 +172,39 @@ class CGSystem(System):
 
     @ti.func
     def start(self, thread):
-        """r . z of the first residual, and of what rounding leaves of violations: eps |x| of each, whose W is w |grad C|^2."""
+        """r . z of the first residual, and for each row that of what rounding leaves of its violation, 2 eps |x| |grad C|."""
         for k in range(self.team.chunk_begin(BLOCKS * self.stride, thread), self.team.chunk_end(BLOCKS * self.stride, thread)):
             if k % self.stride == 0:
-                b, total, noise = k // self.stride, ti.cast(0, ti.f64), ti.cast(0, ti.f64)
+                b, total, loud = k // self.stride, ti.cast(0, ti.f64), ti.cast(0, ti.f64)
                 for r in range(self.begin_of(b), ti.min(self.begin_of(b + 1), self.rows)):
                     if ti.static(bool(self.state.sleepers)):
                         if not self.state.awake(self.lead[r]):  # nobody has set it
                             self.residual[r], self.direction[r], self.step[r] = 0, 0, 0
-                    total += ti.cast(self.residual[r], ti.f64) * self.direction[r]
-                    x = self.state.x[self.lead[r]]
-                    noise += ti.cast(x.dot(x) / self.w.of(self.lead[r]), ti.f64)
-                self.partial[b], self.worst[b] = total, noise
+                    far, squares = ti.cast(0, ti.f64), ti.cast(0, ti.f64)
+                    for c in range(self.corner_begin[r], self.corner_begin[r + 1]):
+                        at = self.corner[c]
+                        far = ti.max(far, self.state.x[at[1]].norm_sqr())
+                        squares += self.gradient[at[0]].norm_sqr()
+                    self.noise[r] = ti.static((2 * self.rounding) ** 2) * far * squares * self.inverse_diagonal[r]
+                    here = ti.cast(self.residual[r], ti.f64) * self.direction[r]
+                    total += here
+                    if here > self.noise[r]:
+                        loud = 1.0
+                self.partial[b], self.loud[b] = total, loud
         self.team.wait()
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread)):
-            now, noise = self.summed(), ti.cast(0, ti.f64)
-            for b in range(BLOCKS):
-                noise += self.worst[b]
-            noise *= ti.static(self.rounding**2)
-            now = ti.select(now > noise, now, 0 * now)
-            self.sums[None] = ti.Vector([now, 0, 0, now, noise], ti.f64)
+            now = self.heard()
+            self.sums[None] = ti.Vector([now, 0, 0, now], ti.f64)
         self.team.wait()
+
+    @ti.func
+    def heard(self):
+        """r . z, or 0 where no row has more than rounding leaves."""
+        loud, total = self.loud[0], self.summed()
+        for b in range(1, BLOCKS):
+            loud = ti.max(loud, self.loud[b])
+        return ti.select(loud > 0, total, 0 * total)
 
     @ti.func
     def end(self, thread):
@@ -247,11 +258,15 @@ class CGSystem(System):
             if k % self.stride == 0:
                 b, total, worst = k // self.stride, ti.cast(0, ti.f64), ti.cast(0, ti.f64)
                 far, gain, over = self.sums[None][1], ti.cast(0, ti.f64), ti.cast(0, ti.f64)
+                loud = ti.cast(0, ti.f64)
                 for r in range(self.begin_of(b), ti.min(self.begin_of(b + 1), self.rows)):
                     self.step[r] = self.step[r] + far * self.direction[r]
                     left = self.residual[r] - ti.cast(far, self.real) * self.applied[r]
                     self.residual[r] = left
-                    total += ti.cast(self.inverse_diagonal[r] * left, ti.f64) * left
+                    here = ti.cast(self.inverse_diagonal[r] * left, ti.f64) * left
+                    total += here
+                    if here > self.noise[r]:
+                        loud = 1.0
                     tension = self.geometric_stiffness[r] * ti.abs(self.lam[r] + self.step[r])
                     worst = ti.max(worst, tension)
                     if tension > TENSEST / 2:
@@ -263,13 +278,13 @@ class CGSystem(System):
                             gain -= SLACK * ti.abs(self.step[r] * self.violation[r])
                             if ti.abs(self.step[r]) > self.trusted_step[r]:
                                 over = 1.0
-                self.partial[b], self.worst[b] = total, worst
+                self.partial[b], self.worst[b], self.loud[b] = total, worst, loud
                 if ti.static(self.limits_steps):
                     self.gain[b], self.over[b] = gain, over
         self.team.wait()
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread)):
-            now, before, worst = self.summed(), self.sums[None][0], self.worst[0]
+            now, before, worst = self.heard(), self.sums[None][0], self.worst[0]
             for b in range(1, BLOCKS):
                 worst = ti.max(worst, self.worst[b])
             ti.atomic_max(self.tension[None], worst)
@@ -283,9 +298,8 @@ class CGSystem(System):
             back = ti.select(worst > TENSEST, self.sums[None][1], 0 * now)
             if worst > TENSEST:
                 now = 0
-            first, noise = self.sums[None][3], self.sums[None][4]
-            now = ti.select(now > noise, now, 0 * now)
-            self.sums[None] = ti.Vector([now, ti.select(before > 0, now / before, 0 * now), back, first, noise], ti.f64)
+            first = self.sums[None][3]
+            self.sums[None] = ti.Vector([now, ti.select(before > 0, now / before, 0 * now), back, first], ti.f64)
         self.team.wait()
         for r in range(self.team.chunk_begin(self.rows, thread), self.team.chunk_end(self.rows, thread)):
             if self.sums[None][2] != 0:
