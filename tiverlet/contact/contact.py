@@ -145,7 +145,7 @@ class Contact(PairContact):
         dev.slip = PairData("slip", dim, lasting=True)
         dev.spins, dev.axes = scene.state.spins and dev.has_friction, scene.particles.axes
         dev.turn = PairData("turn", dev.axes, lasting=True) if dev.turns else None
-        dev.slack = PairData("slack", 0, lasting=True)  # of the overlap, what no push is for
+        dev.slack = PairData("slack", 0, lasting=True, marked=True)  # of the overlap, what no push is for
         dev.impulse = PairData("given", 0, lasting=True, told=True)  # pushes and impacts in the last substep [kg m]
         dev.has_loads = self.has_loads
         dev.known = KnownLoads(scene) if dev.has_loads else None

@@ -280,8 +280,8 @@ class NeighbourList:
 
     @ti.func
     def transfer_pair_data(self, i):
-        """Give each pair of particle i its data from the old list; both are sorted. Returns bits for those that got some, among
-        the first entries."""
+        """Give each pair of particle i its data from the old list; both are sorted. Returns bits for those that got any that is
+        marked, among the first entries."""
         first, number = self.first[i], self.number[i]
         for piece in ti.static(self.pair_data):
             for e in range(first, first + number):
@@ -296,9 +296,12 @@ class NeighbourList:
                 at += 1
             if at < number:
                 if self.neighbour[first + at] == self.old_neighbour[old]:
+                    some = 0
                     for piece in ti.static(self.transferred):
                         piece.field[first + at] = piece.old[old]
-                    if at < WORD:
+                        if ti.static(piece.marked):
+                            some |= ti.cast(piece.old[old] != 0, ti.i32)
+                    if some != 0 and at < WORD:
                         bits |= ti.u32(1) << ti.cast(at, ti.u32)
         return bits
 
