@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 POWER = 30  # rounds of power iteration for lambda_max
 GROWTH, HIGHEST = 1.1, 1.0  # of the floor: the factor by which it grows, and its limit, where a link gives way as by itself
 CONVERGED = 1e-2  # of r . z at the start of an iteration: what may be left at its end
+REDUNDANT, NULL = 1e-12, 8  # of d . W d: with d . A d below, or below so many roundings, a direction d is in the null space of A
 BLOCKS = 64  # partial sums: their number is fixed, so the total has the same bits on any number of threads
 
 
@@ -47,7 +48,7 @@ class ConjugateGradient(Solver):
     that is left. Where rigid constraints contradict each other as particles are placed, the right side is partly in the null
     space of A, to which steps give any multiplier: sigma = 1 from the first substep on bounds it by what a Jacobi pass gives.
     So is what rounding leaves of violations where links are more than are needed (braced bodies): steps end where no row is left
-    with more than that. A sum over rows would not do: beside what rounding leaves of heavy particles, light ones would not count.
+    with more than that and the next direction is in the null space, too.
 
     steps: of conjugate gradients in an iteration. Ropes, spacers and what is not one number are relaxed as by Jacobi beside it.
     """
@@ -110,6 +111,7 @@ class CGSystem(System):
         self.sums = scene.memory.field("system.sums", None, width=4, kind=ti.f64)
         self.noise, self.loud = self.reals("noise"), self.reals("loud", BLOCKS)  # r z of rounding; 1 where a row has more
         self.state, self.rounding = scene.state, float(np.finfo(np.float32 if scene.real == ti.f32 else np.float64).eps)
+        self.null = max(REDUNDANT, NULL * self.rounding)
         if scene.state.compensated:
             self.rounding *= self.rounding
         least = 1.2 * largest(scene, scalars, self.blocks * scene.inv_mass, POWER) / steps**2
@@ -194,17 +196,9 @@ class CGSystem(System):
         self.team.wait()
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread)):
-            now = self.heard()
+            now = self.summed()
             self.sums[None] = ti.Vector([now, 0, 0, now], ti.f64)
         self.team.wait()
-
-    @ti.func
-    def heard(self):
-        """r . z, or 0 where no row has more than rounding leaves."""
-        loud, total = self.loud[0], self.summed()
-        for b in range(1, BLOCKS):
-            loud = ti.max(loud, self.loud[b])
-        return ti.select(loud > 0, total, 0 * total)
 
     @ti.func
     def end(self, thread):
@@ -239,19 +233,26 @@ class CGSystem(System):
         self.team.wait()
         for k in range(self.team.chunk_begin(BLOCKS * self.stride, thread), self.team.chunk_end(BLOCKS * self.stride, thread)):
             if k % self.stride == 0:
-                b, total = k // self.stride, ti.cast(0, ti.f64)
+                b, total, size = k // self.stride, ti.cast(0, ti.f64), ti.cast(0, ti.f64)
                 for r in range(self.begin_of(b), ti.min(self.begin_of(b + 1), self.rows)):
                     value = self.shift[r] * self.direction[r]
+                    if self.inverse_diagonal[r] > 0:
+                        size += ti.cast(self.direction[r], ti.f64) * self.direction[r] / self.inverse_diagonal[r]
                     for c in range(self.corner_begin[r], self.corner_begin[r + 1]):
                         at = self.corner[c]
                         value += self.gradient[at[0]].dot(self.pulled[at[1]])
                     self.applied[r] = value
                     total += ti.cast(value, ti.f64) * self.direction[r]
-                self.partial[b] = total
+                self.partial[b], self.worst[b] = total, size
         self.team.wait()
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread)):
-            curve = self.summed()
+            curve, size, loud = self.summed(), ti.cast(0, ti.f64), ti.cast(0, ti.f64)
+            for b in range(BLOCKS):
+                size += self.worst[b]
+                loud = ti.max(loud, self.loud[b])
+            if loud == 0 and curve <= ti.static(self.null) * size:
+                self.sums[None][0] = 0
             self.sums[None][1] = ti.select(curve > 0, self.sums[None][0] / curve, ti.cast(0, ti.f64))
         self.team.wait()
         for k in range(self.team.chunk_begin(BLOCKS * self.stride, thread), self.team.chunk_end(BLOCKS * self.stride, thread)):
@@ -284,7 +285,8 @@ class CGSystem(System):
         self.team.wait()
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread)):
-            now, before, worst = self.heard(), self.sums[None][0], self.worst[0]
+            before, worst = self.sums[None][0], self.worst[0]
+            now = ti.select(before > 0, self.summed(), 0 * before)
             for b in range(1, BLOCKS):
                 worst = ti.max(worst, self.worst[b])
             ti.atomic_max(self.tension[None], worst)
