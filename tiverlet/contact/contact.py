@@ -178,7 +178,7 @@ class Contact(PairContact):
         dev.restitution = None
         if dev.has_restitution:
             noted = dev.events if dev.reports else None
-            dev.restitution = Restitution(scene, dev.geometry, self.table, struck, dev.slack, dev.impulse, noted, dev.has_loads)
+            dev.restitution = Restitution(scene, dev.geometry, self.table, struck, dev.slack, dev.impulse, noted)
             dev.hit = dev.restitution.hit
         if dev.spins:
             dev.spinning = Spinning(scene, self.table, dev.splitting.weight, dev.turn)

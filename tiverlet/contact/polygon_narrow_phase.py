@@ -388,10 +388,10 @@ class PolygonGeometry:
         y_k)^2 <= S_i sum_k p_ki y_k^2 / C_k, so J w J^T <= diag(sum_i p_ki w_i S_i / C_k). What goes out at push_out does so
         whatever else its particles bear, p <= most / (inverse mass alone): else a load could hold it inside for good.
         """
-        overlap, shared = self.manifold.field[at][0], self.split_mass(depths, v, a, b, t) / self.depth(at)
-        if self.manifold.field[at][1] > DISCS:
-            if self.most.field[at] < overlap:
-                overlap = ti.min(overlap, self.most.field[at] * shared / self.inverse_mass(v, a, b, t))
+        overlap, depth = self.manifold.field[at][0], self.depth(at)
+        shared = self.split_mass(depths, v, a, b, t) / depth
+        if depth < overlap:
+            overlap = ti.min(overlap, depth * shared / self.inverse_mass(v, a, b, t))
         return overlap, shared
 
     @ti.func

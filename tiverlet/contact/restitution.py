@@ -15,19 +15,20 @@ class Restitution:
     """A pair leaves with -e times the normal velocity that it had before the substep, from the time of impact on, see Contact.
 
     struck: of its pairs, those that are struck in this substep. slack: of their overlap, what no push is for. impulse: pushes
-    and impacts of the last substep [kg m]. events: an EventLog, or None. has_loads: pairs may know their loads. These are forces,
-    which press a pair between them together in each substep; so it rests, unless e is 1, at the speed that two substeps of them
-    give; else it would bounce on and on, for what an impact takes the next substep gives back.
+    and impacts of the last substep [kg m]. events: an EventLog, or None.
+
+    Loads that pairs know are forces, which press a pair between them together in each substep. So it rests there, unless e is 1,
+    at the speed that two substeps of them give; else it would bounce on and on, for what an impact takes the next one gives back.
     """
 
     def __init__(
         self, scene: Scene, geometry: DiscGeometry, table: Table, struck: PairData, slack: PairData, impulse: PairData,
-        events: Any, has_loads: bool,
+        events: Any,
     ):  # fmt: skip
         n, dim, add = scene.count, scene.particles.dim, scene.memory.field
         self.geometry, self.list, self.table, self.state = geometry, geometry.list, table, scene.state
         self.struck, self.slack, self.impulse, self.events = struck, slack, impulse, events
-        self.has_events, self.has_loads = events is not None, has_loads
+        self.has_events = events is not None
         self.weight = add("Contact.struck", n)  # the split mass of the first pass, 0 where nothing touched
         self.d_change = add("Contact.d_change", n, width=dim)
         self.lift = add("Contact.lift", n, width=dim)  # moves the position alone
@@ -55,7 +56,7 @@ class Restitution:
             deep = ti.select(last > 0, overlap, ti.select(e < 1, slack, 0))  # nothing that is elastic rests where nothing pulls
             if last == 0:
                 slack = ti.max(slack, overlap - ti.max(here, 0))
-            if ti.static(self.has_loads):
+            if ti.static(self.geometry.has_loads):
                 if e < 1 and a <= ti.static(SLOW) * (here - a):
                     deep = ti.max(deep, given)
             if a > 0:
