@@ -14,7 +14,7 @@ from .corners import components
 from .slots import TENSEST, Slots
 from .solver import Solver
 from .spectrum import largest
-from .system import SLACK, System, solvable
+from .system import REDUNDANT, SLACK, System, solvable
 
 if TYPE_CHECKING:
     from ..constraints.core.scalar import Scalar
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 POWER = 30  # rounds of power iteration for lambda_max
 GROWTH, HIGHEST = 1.1, 1.0  # of the floor: the factor by which it grows, and its limit, where a link gives way as by itself
 CONVERGED = 1e-2  # of r . z at the start of an iteration: what may be left at its end
-REDUNDANT, NULL = 1e-12, 8  # of d . W d: with d . A d below, or below so many roundings, a direction d is in the null space of A
+NULL = 8  # roundings, of d . W d: with d . A d below so many, or below REDUNDANT, a direction d is in the null space of A
 BLOCKS = 64  # partial sums: their number is fixed, so the total has the same bits on any number of threads
 
 
@@ -110,16 +110,14 @@ class CGSystem(System):
         # r . z; by how much the last direction counts in the next; how far a step is taken back; r . z at the start
         self.sums = scene.memory.field("system.sums", None, width=4, kind=ti.f64)
         self.noise, self.loud = self.reals("noise"), self.reals("loud", BLOCKS)  # r z of rounding; 1 where a row has more
-        self.state, self.rounding = scene.state, float(np.finfo(np.float32 if scene.real == ti.f32 else np.float64).eps)
-        self.null = max(REDUNDANT, NULL * self.rounding)
-        if scene.state.compensated:
-            self.rounding *= self.rounding
+        self.null = max(REDUNDANT, NULL * self.epsilon)
+        self.rounding = self.epsilon ** (2 if scene.state.compensated else 1)  # of places
         least = 1.2 * largest(scene, scalars, self.blocks * scene.inv_mass, POWER) / steps**2
         self.least = self.memory.number(least, scene.real)
         _, part, _ = distinct(components(len(rows), row[free], who[free]))
         self._part_of = np.zeros(scene.particles.count, dtype=np.int32)  # the part of each particle, from 1 on; 0 for none
         self._part_of[who[free]] = part[row[free]] + 1
-        self.part, self.lead = self.ints("part", part + 1), self.ints("lead", who[free][order][ends[:-1]])
+        self.part, self.lead = self.ints("part", part + 1), self.ints("lead", self.leads(scalars, slots))
         self.part_of = scene.memory.field("system.part_of", scene.count, kind=ti.i32, values=self._part_of)
         count = int(part.max(initial=0)) + 2
         self.groups = self.memory.number(count)

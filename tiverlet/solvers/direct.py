@@ -12,12 +12,11 @@ from .corners import corners_of
 from .elimination import Plan, plan
 from .slots import TENSEST, Slots
 from .solver import WIDTH, Solver
-from .system import SLACK, System, solvable
+from .system import REDUNDANT, SLACK, System, solvable
 
 if TYPE_CHECKING:
     from ..constraints.core.scalar import Scalar
 
-REDUNDANT = 1e-12  # of its diagonal: a pivot this small belongs to a constraint that others imply
 CONTRADICTION = 1e-6  # of its violation: what others leave of such a constraint without contradicting it
 SMALL_PIVOT = 2e-3  # of what the heaviest of its particles adds to it: with a pivot below, a load is hardly borne to first order
 AGREEMENT = 0.25  # of the tension: how far the two ends of a substep may differ about it there
@@ -116,15 +115,9 @@ class Elimination(System):
         who = np.zeros(slots.total, dtype=np.int64)
         who[slot] = item
         self.particle_of, self.w, self.inverse_size = ints("who", who), scene.state.w, reals("close")
-        self.state, self.sleeps = scene.state, bool(scene.state.sleepers)
-        if self.sleeps:
-            lead = np.zeros(len(found.rows), dtype=np.int64)
-            for b in scalars:
-                row = np.broadcast_to(self.row(b)[:, None], b.indices.shape)
-                free = (slots.places(b) >= 0) & (row >= 0)
-                lead[row[free]] = b.indices[free]
-            self.lead = ints("lead", lead[found.part_begin[:-1]])  # one particle of each system: all of them sleep, or none
-        self.epsilon = float(np.finfo(np.float32 if scene.real == ti.f32 else np.float64).eps)
+        self.sleeps = bool(scene.state.sleepers)
+        if self.sleeps:  # all of a system, or nothing
+            self.lead = ints("lead", self.leads(scalars, slots)[found.part_begin[:-1]])
         parts = [scene.inv_mass[b.indices] * (b.gradients(b.start.position) ** 2).sum(axis=2) for b in scalars]
         least = np.concatenate([np.where(p > 0, p, np.inf).min(axis=1, initial=np.inf) for p in parts])[found.rows]
         small = np.where(np.isfinite(least), SMALL_PIVOT * least, 0.0)

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from ..features.feature import Batch, Scene
     from .slots import Slots
 
+REDUNDANT = 1e-12  # of its diagonal: what is left of a constraint that others imply
 SLACK = 0.1  # of |step violation|: how much energy steps may bring in by their own curvature
 
 
@@ -37,7 +38,9 @@ class System:
     stride: int  # iterations of such a loop for each block of rows
 
     def __init__(self, scene: "Scene", batches: "list[Batch]", slots: "Slots", scalars: "list[Scalar]", rows: np.ndarray):
-        self.real, self.dim, self.move, self.tension = scene.real, scene.state.dim, slots.move, slots.tension
+        self.state, self.real, self.dim = scene.state, scene.real, scene.state.dim
+        self.move, self.tension = slots.move, slots.tension
+        self.epsilon = float(np.finfo(np.float32 if scene.real == ti.f32 else np.float64).eps)
         self.memory, self.inv_mass, self.rows = scene.memory, scene.inv_mass, scene.memory.number(len(rows))
         counts = [b.count for b in scalars]
         row = np.full(sum(counts), -1)
@@ -86,6 +89,15 @@ class System:
     def row(self, batch: "Batch") -> np.ndarray:
         """The row of each constraint of a batch, -1 where it is relaxed by itself."""
         return self._rows.get(id(batch), np.full(batch.count, -1))
+
+    def leads(self, scalars: "list[Scalar]", slots: "Slots") -> np.ndarray:
+        """One particle of each row that can move."""
+        out = np.zeros(self.rows, dtype=np.int64)
+        for b in scalars:
+            row = np.broadcast_to(self.row(b)[:, None], b.indices.shape)
+            free = (slots.places(b) >= 0) & (row >= 0)
+            out[row[free]] = b.indices[free]
+        return out
 
     def left_out(self, batches: "list[Batch]") -> int:
         """How many constraints are relaxed by themselves, of those with a particle that can move."""
