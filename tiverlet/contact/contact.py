@@ -229,8 +229,11 @@ class Contact(PairContact):
         if ti.static(self.dev.has_restitution):
             if first != 0:
                 self.dev.restitution.clear(i, self.dev.splitting.weight[i])
-        idle = 0
-        if self.dev.splitting.weight[i] > 0:
+        # 1 or 0, for a branch in the loop takes longer: whether pairs go on from their push in this substep, or the last one.
+        again = ti.cast(ti.select(first == 0, 1, 0), self.scene.real)
+        carries = ti.cast(ti.select(first != 0 and fresh == 0, 1, 0), self.scene.real)
+        own, least = self.dev.splitting.weight[i], ti.cast(1, self.scene.real)  # least: of all pushes
+        if own > 0:
             for word in range(self.dev.list.words(i)):
                 bits = self.dev.splitting.touching(i, word)
                 while bits != 0:
@@ -238,14 +241,12 @@ class Contact(PairContact):
                     bits &= bits - ti.u32(1)
                     j = self.dev.list.neighbour[e]
                     last = self.dev.push.field[e]
-                    shared = self.dev.splitting.weight[i] + self.dev.splitting.weight[j]
+                    shared = own + self.dev.splitting.weight[j]
                     overlap, each, n, reach = self.dev.geometry.impact(i, j, self.dev.geometry.contact_distance(i, j), shared)
                     each *= ti.static(RELAXATION)
                     paid, given, rests, alone = overlap, ti.zero(overlap), True, w + self.dev.w.of(j)
-                    push, known = ti.zero(overlap), ti.zero(overlap)  # known: what of its push was given before
-                    if first == 0:
-                        push = last
-                    keeps = ti.max(ti.min(1 - alone * each, ti.static(CARRY)), 0)
+                    push, known = again * last, ti.zero(overlap)  # known: what of its push was given before
+                    keeps = ti.max(lesser(1 - alone * each, ti.static(CARRY)), 0)
                     if ti.static(self.dev.has_loads):
                         if first != 0:
                             known = self.dev.known.given(e, now)
@@ -261,9 +262,7 @@ class Contact(PairContact):
                             lift += w * back * n
                             self.dev.slack.field[e] = slack - alone * back
                         paid -= slack
-                    part = paid * each
-                    if first != 0 and fresh == 0:
-                        part += keeps * (last - push)
+                    part = paid * each + keeps * (carries * (last - push))
                     if ti.static(self.dev.has_loads):
                         part = ti.select(paid > 0, lesser(part, paid / alone), ti.max(part, paid / alone))
                         part = ti.max(part, -push)
@@ -285,7 +284,7 @@ class Contact(PairContact):
                     if ti.static(self.dev.reports):
                         self.dev.events.note(i, j, e, n, pressed, final)
                     push += part
-                    idle |= ti.cast(push == 0, ti.i32)
+                    least = lesser(push, least)
                     want = part * n
                     if ti.static(self.dev.spins):
                         tangential, turned = self.grip(i, j, e, n, reach, pressed + given / shared, given > 0)
@@ -308,7 +307,7 @@ class Contact(PairContact):
                             approach = -self.dev.state.slid(self.dev.forces.before[i] - self.dev.forces.before[j], i, j).dot(n)
                             forced += self.dev.forces.share(approach, pressed * alone) * w * (want - part * n)
                     self.dev.push.field[e] = push
-            if idle != 0:
+            if least == 0:
                 self.dev.splitting.doubt(i)
         self.dev.move[i] = total
         if ti.static(self.dev.has_loads):

@@ -203,22 +203,21 @@ class DiscGeometry:
     @ti.func
     def worst_overlap(self, i):
         """For the report: contacts of particle i with later ones, and the worst overlap in radii of the smaller."""
-        touching, worst = 0, ti.cast(0, ti.f64)
+        touching, worst = 0, ti.cast(0, self.real)
         number = self.list.number[i]
         last = self.list.first[i] + number - 1
         for k in range(number):
             j = self.list.neighbour[last - k]
             if j < i:  # and so are the rest
                 break
-            a, b = self.radius.of(i), self.radius.of(j)
-            overlap = self.depth(i, j, (a + b) * self.pushes(i, j))
-            if overlap > 0:
-                small = ti.min(a, b)
-                if small == 0:
-                    small = ti.max(a, b)
-                worst = ti.max(worst, overlap / small)
-                touching += 1
-        return touching, worst
+            a, b, r = self.radius.of(i), self.radius.of(j), self.state.apart(i, j)
+            rr, contact_distance = r.dot(r), (a + b) * self.pushes(i, j)
+            small = ti.select(ti.min(a, b) > 0, ti.min(a, b), ti.max(a, b))
+            # No branch: half of what is listed is apart.
+            touching += ti.cast(rr < contact_distance * contact_distance, ti.i32)
+            overlap = (contact_distance - ti.sqrt(rr)) / small
+            worst = ti.select(overlap > worst, overlap, worst)
+        return touching, ti.cast(worst, ti.f64)
 
     def candidates(self, x: np.ndarray) -> DiscCandidates:
         """What may touch around positions x (n, dim) [m], for the host: the listed pairs."""
