@@ -170,7 +170,8 @@ class Contact(PairContact):
             dev.events.bind(dev.list, dev.geometry)
         skips = not scene.memory.compiler.few and not dev.has_restitution  # in relax() what bounces forgets the last impact
         ended = [dev.push, *loads, *bouncing]
-        dev.splitting = MassSplitting(scene, dev.geometry, dev.has_friction, skips, dev.push, ended, team, dev.known)
+        slid = [*([dev.slip] if dev.has_friction else []), *([dev.turn] if dev.turn else [])]
+        dev.splitting = MassSplitting(scene, dev.geometry, slid, skips, dev.push, ended, team, dev.known)
         if dev.known:
             dev.known.bind(dev.list)
         dev.forces = ForceShare(scene, sums=dev.has_friction, lasting=True)
@@ -379,32 +380,36 @@ class Contact(PairContact):
                 self.dev.state.advance(i, self.dev.restitution.lift[i])
 
     @ti.func
-    def finish_substep(self, i):
+    def finish_substep(self, i, now):
         """At the end of a substep: add to each pair's slip what it has moved, as far as friction can hold it; a pair that parted
         has no slack. What came to overlap after pairs were pushed, which a list with a narrow skin may not know yet, waits."""
         if ti.static(self.dev.has_friction):
-            for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):
-                j = self.dev.list.neighbour[e]
-                overlap, n = self.dev.geometry.overlap(i, j, self.dev.geometry.contact_distance(i, j))
-                slip, turn = 0 * self.dev.state.x[i], ti.Vector.zero(self.scene.real, self.dev.axes)
-                if ti.static(self.dev.has_loads):
-                    if overlap <= 0 and self.dev.push.field[e] > 0:
-                        overlap, n = self.dev.geometry.gap(i, j)
-                if (overlap > 0 or ti.static(self.dev.has_loads)) and self.dev.push.field[e] > 0:
-                    shared = self.dev.splitting.weight[i] + self.dev.splitting.weight[j]
-                    pressed = self.dev.push.field[e] * shared
-                    if ti.static(self.dev.spins):
-                        pressed = ti.max(overlap, pressed) / shared
-                        reach = pressed * self.dev.spinning.split_mass(i, j)
-                        slip = self.dev.slip.field[e] + self.dev.spinning.slip(i, j, self.dev.spinning.arm(i, j, n))
-                        slip = self.table.held(i, j, n, reach, slip)
-                        if ti.static(self.dev.turns):
-                            turn = self.dev.spinning.left(i, j, e, n, pressed)
-                    else:
-                        slip = self.held(i, j, n, ti.max(overlap, pressed), self.dev.slip.field[e])
-                self.dev.slip.field[e] = slip
-                if ti.static(self.dev.turns):
-                    self.dev.turn.field[e] = turn
+            for word in range(self.dev.list.words(i)):
+                bits = self.dev.splitting.sliding(i, word, now)
+                while bits != 0:
+                    e = self.dev.list.entry(i, word, bits)
+                    bits &= bits - ti.u32(1)
+                    j = self.dev.list.neighbour[e]
+                    overlap, n = self.dev.geometry.overlap(i, j, self.dev.geometry.contact_distance(i, j))
+                    slip, turn = 0 * self.dev.state.x[i], ti.Vector.zero(self.scene.real, self.dev.axes)
+                    if ti.static(self.dev.has_loads):
+                        if overlap <= 0 and self.dev.push.field[e] > 0:
+                            overlap, n = self.dev.geometry.gap(i, j)
+                    if (overlap > 0 or ti.static(self.dev.has_loads)) and self.dev.push.field[e] > 0:
+                        shared = self.dev.splitting.weight[i] + self.dev.splitting.weight[j]
+                        pressed = self.dev.push.field[e] * shared
+                        if ti.static(self.dev.spins):
+                            pressed = ti.max(overlap, pressed) / shared
+                            reach = pressed * self.dev.spinning.split_mass(i, j)
+                            slip = self.dev.slip.field[e] + self.dev.spinning.slip(i, j, self.dev.spinning.arm(i, j, n))
+                            slip = self.table.held(i, j, n, reach, slip)
+                            if ti.static(self.dev.turns):
+                                turn = self.dev.spinning.left(i, j, e, n, pressed)
+                        else:
+                            slip = self.held(i, j, n, ti.max(overlap, pressed), self.dev.slip.field[e])
+                    self.dev.slip.field[e] = slip
+                    if ti.static(self.dev.turns):
+                        self.dev.turn.field[e] = turn
         if ti.static(self.dev.has_restitution):
             if self.dev.splitting.weight[i] > 0:
                 for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):

@@ -19,21 +19,22 @@ FADE = 31 / 32  # of how much more often than needed a mass was split, what is l
 class MassSplitting:
     """A disc or sphere i has its mass split m_i times, see Contact; `weight` is m_i w_i, 0 where it touches nothing.
 
-    has_friction: whether pairs have it. skips: whether blocks of particles without contact are skipped. ended: what pairs
-    carry only while they touch. known: the KnownLoads of pairs, or None. in_state: its fields that are part of the state.
+    ended: what pairs carry only while they touch. slid: what those with friction carry only while they touch as a substep ends.
+    skips: whether blocks of particles without contact are skipped. known: the KnownLoads of pairs, or None. in_state: its fields
+    that are part of the state.
     """
 
     def __init__(
-        self, scene: Scene, geometry: DiscGeometry, has_friction: bool, skips: bool, push: PairData, ended: list[PairData],
+        self, scene: Scene, geometry: DiscGeometry, slid: list[PairData], skips: bool, push: PairData, ended: list[PairData],
         team: Team, known: Any,
     ):  # fmt: skip
         self.known, self.has_loads = known, known is not None
         self.geometry, self.list, self.push, self.ended = geometry, geometry.list, push, ended
-        self.has_friction, self.skips = has_friction, skips
+        self.slid, self.has_friction, self.skips = slid, bool(slid), skips
         self.state, self.real, self.few = scene.state, scene.real, scene.memory.compiler.few
         self.weight = scene.memory.field("Contact.split_mass", scene.count, state=True)
         self.in_state = {"weight": self.weight}
-        if not has_friction:
+        if not slid:
             self.bound = scene.memory.field("Contact.bound", scene.count, state=True)
             self.in_state["bound"] = self.bound
         self.block = min(BLOCK, team.piece) if skips else BLOCK
@@ -132,14 +133,14 @@ class MassSplitting:
         """Which pairs of particle i touch, and how often its mass is split. What does not touch has no push to keep."""
         bits = self.touches(i, 0)
         pairs, others = ti.math.popcnt(bits), self.list.touching[i] != bits
-        self.clear(i, 0, self.list.touching[i] & ~bits)
+        self.clear(i, 0, self.list.touching[i] & ~bits, now)
         self.list.touching[i] = bits
         for word in range(1, self.list.words(i)):
             bits = self.touches(i, word)
             pairs += ti.math.popcnt(bits)
             if ti.static(not self.has_friction):
                 others = others or self.changes(i, word, bits)
-            self.clear(i, word, self.list.all_bits(i, word) & ~bits)
+            self.clear(i, word, self.list.all_bits(i, word) & ~bits, now)
         split = ti.cast(pairs, self.real)
         if ti.static(not self.has_friction):
             if pairs > 2:
@@ -211,13 +212,25 @@ class MassSplitting:
         return tensor
 
     @ti.func
-    def clear(self, i, word, gone):
+    def clear(self, i, word, gone, now):
         """Take from pairs that do not touch any more what they carry only while they touch."""
         while gone != 0:
             e = self.list.entry(i, word, gone)
             for piece in ti.static(self.ended):
                 piece.field[e] = 0
+            if now.span.iterations == 1:
+                for piece in ti.static(self.slid):
+                    piece.field[e] = 0
             gone &= gone - ti.u32(1)
+
+    @ti.func
+    def sliding(self, i, word, now):
+        """Bits for the entries of particle i that may have slid, as a substep ends: those that touch. Where there are several
+        passes a pair may touch in some and not in others, so it keeps what it carries to the end."""
+        out = self.list.all_bits(i, word)
+        if word == 0 and now.span.iterations == 1:
+            out = self.list.touching[i]
+        return out
 
 
 @ti.func

@@ -65,8 +65,8 @@ class PairContact(Feature):
     A subclass gives prepare() and join(), which makes `dev.geometry` and `dev.forces`, and for a pass of a substep, in this
     order: detect(i, first), where it `detects`; count(begin, end) and busy(begin), by blocks of particles; relax(i, now);
     choose(i) and apply(i) of its `dev.restitution`, in rounds while `dev.hit` is set, where any pair has restitution;
-    apply_corrections(i, first); and at the end of a substep finish_substep(i). For what sleeps: presses(i, e), whether there is a
-    contact at entry e of the list of particle i, with held_by(j) of the other one; and reached(i, e, margin), whom of those
+    apply_corrections(i, first); and at the end of a substep finish_substep(i, now). For what sleeps: presses(i, e), whether there
+    is a contact at entry e of the list of particle i, with held_by(j) of the other one; and reached(i, e, margin), whom of those
     that sleep particle i, which is awake, touches there, or nearly, -1 for none.
     """
 

@@ -319,7 +319,7 @@ class Polygons(PairContact):
                     self.dev.state.advance(i, self.dev.restitution.lift[i])
 
     @ti.func
-    def finish_substep(self, i):
+    def finish_substep(self, i, now):
         """At the end of a substep: add to the slip of each contact what it has moved, as far as friction can hold it."""
         if ti.static(self.dev.has_friction):
             for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):

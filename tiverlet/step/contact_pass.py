@@ -125,7 +125,7 @@ class ContactPass:
             if ti.static(c.has_friction or c.has_restitution):
                 for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
                     if c.dev.state.awake(i):
-                        c.finish_substep(i)
+                        c.finish_substep(i, now)
             if ti.static(c.dev.has_events):
                 self.finish_events(now)
             self.team.wait()
