@@ -57,6 +57,14 @@ class ConstraintPass:
         self.scatter_blocks(thread, h, h * h, -1, 0)
 
     @ti.func
+    def note_turns(self, thread):
+        """Note how far springs that are forces turned."""
+        for f in ti.static(self.batches):
+            if ti.static(f.soft):
+                for c in range(self.team.chunk_begin(f.count, thread), self.team.chunk_end(f.count, thread)):
+                    f.dev.note_spring_turn(c)
+
+    @ti.func
     def solve(self, now):
         """Every constraint leaves the moves that it wants in its slots, or tells its system what it is about."""
         fresh = now.fresh if ti.static(self.integrator.half_kick) else 0

@@ -105,7 +105,7 @@ class Composition:
         self.forces, self.state, self.slots = forces, scene.state, scene.slots
         self.real, self.dim = scene.real, scene.particles.dim
         g = stages(scene.order)
-        self.stages, self.first = len(g), float(g[0])
+        self.stages, self.first, self.longest = len(g), float(g[0]), int(np.argmax(np.abs(g)))
         self.h2_factor = float(1 + g[-2] / g[-1]) / 2
         self.springs_pull = any(b.soft for b in batches)
         self.solved = PASSES[scene.order] if scene.slots and scene.slots.system else 0

@@ -267,6 +267,8 @@ class Step:
         """Particles move on their own. Walls go to where they are in this substep."""
         if ti.static(self.integrator.springs_pull):
             self.constraints.spring_forces(now.thread, now.h)
+            if now.s % self.integrator.stages == self.integrator.longest + 1:
+                self.constraints.note_turns(now.thread)
         for w in ti.static(self.posed):
             ti.loop_config(serialize=True)
             for _ in range(self.team.one(1, now.thread)):

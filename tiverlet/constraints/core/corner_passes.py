@@ -290,6 +290,20 @@ class CornerPasses(Passes):
             self.corners.push(c, k, h * h * self.w.of(self.corners.member(c, k)) * force * g[k, :])
 
     @ti.func
+    def note_spring_turn(self, c):
+        """Of springs alone; one without length goes through its other end."""
+        if not self.spring.is_rigid(c) and (ti.static(not self.equation.cusp) or self.equation.rest[c] != 0):
+            f, g = self.quantity.measure(c, self.seen.apart(c, 0))
+            f0, n = self.quantity.measure(c, self.seen.apart(c, 1))
+            both, here, there = ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real)
+            for k in ti.static(range(self.arity)):
+                both += g[k, :].dot(n[k, :])
+                here += g[k, :].dot(g[k, :])
+                there += n[k, :].dot(n[k, :])
+            if self.quantity.direction_reliable(f, f0):
+                self.slots.note_turn(self.slots.turn(both, ti.sqrt(here * there)))
+
+    @ti.func
     def push_reaction(self, c, firm, soft):
         """Push scale w_j lam grad_j C, by the scale `firm` where c is rigid, and `soft` where not."""
         pull = self.equation.lam[c] * ti.select(self.spring.is_rigid(c), firm, soft)

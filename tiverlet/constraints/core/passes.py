@@ -33,6 +33,10 @@ class Passes:
         """Push what the constraint's spring, if it has one, adds to h^2 a at the present positions; for starts."""
 
     @ti.func
+    def note_spring_turn(self, c):
+        """Where springs are forces (orders from 4 on): note how far this one turned in the last stage, see Slots.note_turn."""
+
+    @ti.func
     def push_reaction(self, c, firm, soft):
         """Push what the constraint added to h^2 a in the last substep, along its directions at the present positions, about which
         it has no moment. firm, soft: h^2 over what its multiplier stands for, where it is rigid and where not."""
