@@ -20,6 +20,7 @@ from .force_share import ForceShare
 from .loops import checked, flat, laid, refuse_deep
 from .pair_contact import PairContact
 from .polygon_narrow_phase import VERTEX, Beside, Outline, PolygonGeometry
+from .restitution import SLOW
 
 SKIN = 0.15  # of the longer edge of a vertex
 
@@ -356,13 +357,15 @@ class PolygonRestitution:
         """The displacement with which a contact is to leave; what it lacks of it; and how far it gets until the substep ends.
 
         A contact rests, unless e is 1, that is to leave by no more than it overlapped before the substep and what it was pushed
-        in the last one: what is pushed as far in each substep came no faster than its load brings it.
+        in the last one: what is pushed as far in each substep came no faster than its load brings it. It rests, too, where SLOW
+        substeps of forces brought it, or heaps would hop on and on: what one bounce takes, the next corner gives back.
         """
         before = self.state.before[v] - (1 - t) * self.state.before[a] - t * self.state.before[b]
         approach, restitution = -before.dot(n), self.table.of(v, a)[2]
         aim, missing, lift = restitution * ti.max(approach, 0), 0 * overlap, 0 * overlap
         held = self.last.field[at] * self.geometry.inverse_mass(v, a, b, t)
-        if approach > 0 and (restitution >= 1 or held == 0 or aim > overlap + leaving + held):
+        fast = approach > ti.static(SLOW) * (-leaving - approach)
+        if approach > 0 and (restitution >= 1 or (fast and (held == 0 or aim > overlap + leaving + held))):
             missing = ti.max(aim - (overlap + leaving), 0)
             if overlap <= -leaving:
                 lift = restitution * overlap
