@@ -21,6 +21,8 @@ REACH = 1.35  # of an edge, from one end to where a contact may be: (1 + BEYOND,
 CLOSE = 1e-4  # edges whose distances differ by less are equally near: the first of them counts
 TILT = 1 / 16  # the sine of an angle by which edges that lie on each other may lean, as bodies give way
 TINY = 1e-30
+
+RATE = 0.4  # at which the usual depth of a contact follows its depth, see PolygonGeometry.share()
 DISCS = -1  # as a place on an edge: there is no edge, two discs touch
 OVER_EDGE = 1  # what tips_cross() returns where the way out is over the edge of the second corner
 VERTEX, START, END = range(3)  # what a particle is in a contact with one that it is listed with
@@ -72,7 +74,8 @@ class PolygonGeometry:
         self.manifold, self.back = PairData("met", 4, False, kept=False), PairData("back", 2, False, kept=False)
         self.most = PairData("most", 0, False, kept=False)  # how far the contact alone may be pushed out in this substep [m]
         self.impulse = PairData("given", 0, lasting=True, told=True)  # pushes and impacts in the last substep [kg m]
-        self.carried = [self.manifold, self.back, self.most, self.impulse]
+        self.usual = PairData("usual", 0, lasting=True)  # how deep it has been, with the last substeps counting most [m]
+        self.carried = [self.manifold, self.back, self.most, self.impulse, self.usual]
 
     @staticmethod
     def _stride(outline: Outline) -> float:
@@ -262,7 +265,7 @@ class PolygonGeometry:
         """Find the contacts that particle i is the vertex of, or one of two discs: at most one with each near particle.
 
         moved: in a substep, by how particles moved in it, and without the overlap that is allowed. Otherwise by where they are
-        and the nearest edges: before the first substep after a start, d is the velocity.
+        and the nearest edges: before the first substep after a start, d is the velocity. 2 in passes but the first.
         """
         for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
             j = self.list.neighbour[e]
@@ -271,6 +274,7 @@ class PolygonGeometry:
                 if moved != 0:
                     overlap -= self.allowed[ti.min(i, j)]
                 self.manifold.field[e] = ti.Vector([overlap, ti.cast(DISCS, self.real), n[0], n[1]])
+                self.remember(i, j, e, moved)
             else:
                 overlap, n, t = 0 * self.w.of(i) - 1, 0 * self.state.x[i], 0 * self.w.of(i)
                 front = self.corner(i, j)
@@ -291,8 +295,22 @@ class PolygonGeometry:
                         if self.corner(j, i) <= 0:
                             overlap = -overlap
                 self.manifold.field[e] = ti.Vector([overlap, t, n[0], n[1]])
+                self.remember(i, j, e, moved)
                 if self.after(i) >= 0:
                     self.back.field[e] = ti.cast(ti.Vector([self.find(j, i), self.find(j, self.before(i))]), self.real)
+
+    @ti.func
+    def remember(self, i, j, e, moved):
+        """Keep how deep the contact of vertex i with j, at entry e, usually is; what sleeps keeps what it knows."""
+        if moved != 0 and (self.state.awake(i) or self.state.awake(self.held_by(j))):
+            depth, usual = self.depth(e), self.usual.field[e]
+            if depth <= 0:
+                usual *= 0
+            elif usual == 0:
+                usual = depth
+            elif moved == 1:
+                usual += ti.static(RATE) * (depth - usual)
+            self.usual.field[e] = usual
 
     @ti.func
     def keeps(self, i, j):
@@ -384,12 +402,15 @@ class PolygonGeometry:
     def share(self, depths: ti.template(), at, v, a, b, t):  # type: ignore[valid-type]
         """Of the contact at entry `at`: the overlap that a pass takes back, and the inverse mass by which that is split.
 
-        depths: S_i = sum_k p_ki C_k of the contacts k of particle i, of which it has the parts p_ki: 1, 1 - t or t. (sum_k p_ki
-        y_k)^2 <= S_i sum_k p_ki y_k^2 / C_k, so J w J^T <= diag(sum_i p_ki w_i S_i / C_k). What goes out at push_out does so
-        whatever else its particles bear, p <= most / (inverse mass alone): else a load could hold it inside for good.
+        depths: S_i = sum_k p_ki a_k of the contacts k of particle i, of which it has the parts p_ki: 1, 1 - t or t, with their
+        usual depths a_k. (sum_k p_ki y_k)^2 <= S_i sum_k p_ki y_k^2 / a_k, so J w J^T <= diag(sum_i p_ki w_i S_i / a_k). By
+        their depths C_k in this substep pushes would go as C_k^2 / S_i: what is squeezed from both sides, with the eigenvalue 1,
+        would have 2, and go to and fro for good. With a_k += RATE (C_k - a_k) it has z^2 + (3 RATE - 1) z = RATE, which is stable
+        below 1/2; slower ones take damping from what is slow. What goes out at push_out does so whatever else its particles bear,
+        p <= most / (inverse mass alone): else a load could hold it inside for good.
         """
         overlap, depth = self.manifold.field[at][0], self.depth(at)
-        shared = self.split_mass(depths, v, a, b, t) / depth
+        shared = self.split_mass(depths, v, a, b, t) / self.usual.field[at]
         if depth < overlap:
             overlap = ti.min(overlap, depth * shared / self.inverse_mass(v, a, b, t))
         return overlap, shared

@@ -35,15 +35,15 @@ class Polygons(PairContact):
     a body together is up to others (Distance, Area, ShapeMatch); it may bend, and stretch by a quarter. friction, restitution: as
     in Contact, and so are all particles that are in no loop. push_out: about the speed at which bodies that overlap part [m/s].
 
-    A Jacobi pass: each contact wants C back, split by mass, p = -C / (m_v w_v + (1 - t) m_a w_a + t m_b w_b), with m_i = S_i / -C
-    and S_i the depths of all contacts of particle i, each times the part, 1, 1 - t or t, that i has in it. By Cauchy's inequality
-    no eigenvalue of a pass exceeds 1. A contact that is hardly deep takes hardly a part of the mass: by the number of contacts,
-    one that opens and closes would change how stiff those beside it are, and heaps would never rest. That conserves momentum, and
-    angular momentum but for the slip within a substep; friction at a radius is a torque that nothing takes up. Corners that face
-    each other touch as discs, by their radii. A vertex
-    that is inside of another body goes out through the edge over which it came, or the nearest that faces its own body, if it is
-    not deeper than half the length of that edge: in a substep nothing should get there, and the step flags "tunnelling-risk"
-    where it might. Particles that start deeper are refused.
+    A Jacobi pass: each contact wants C back, split by mass, p = -C / (m_v w_v + (1 - t) m_a w_a + t m_b w_b), with m_i = S_i / a,
+    where a is how deep the contact has been in the last few substeps, and S_i the same of all contacts of particle i, each times
+    the part, 1, 1 - t or t, that i has in it. By Cauchy's inequality no eigenvalue of a pass exceeds 1. A contact that is hardly
+    deep takes hardly a part of the mass: by the number of contacts, one that opens and closes would change how stiff those beside
+    it are, and heaps would never rest. That conserves momentum, and angular momentum but for the slip within a substep; friction
+    at a radius is a torque that nothing takes up. Corners that face each other touch as discs, by their radii. A vertex that is
+    inside of another body goes out through the edge over which it came, or the nearest that faces its own body, if it is not
+    deeper than half the length of that edge: in a substep nothing should get there, and the step flags "tunnelling-risk" where it
+    might. Particles that start deeper are refused.
 
     Two sharp corners may pass each other, so that neither is inside of the other body but their edges cross. They part over that
     of their edges which is nearer, C as above with t beyond the end of the edge. Other bodies that cross each other without a
@@ -204,9 +204,9 @@ class Polygons(PairContact):
                             self.dev.restitution.aim.field[e] = 0 * self.dev.restitution.aim.field[e]
             self.note_motion(0, self.dev.geometry.too_long(i))
         if ti.static(not self.dev.state.sleepers):
-            self.dev.geometry.detect(i, 1)
+            self.dev.geometry.detect(i, 2 - first)
         elif self.dev.state.awake(i) or self.is_near(i):
-            self.dev.geometry.detect(i, 1)
+            self.dev.geometry.detect(i, 2 - first)
         else:
             self.dev.geometry.forget(i)
 
@@ -258,7 +258,7 @@ class Polygons(PairContact):
                         at, _, _, _, _, part = self.dev.geometry.participants(i, e, role)
                         if at >= 0:
                             if self.dev.geometry.manifold.field[at][0] > 0:
-                                depths += abs(part) * self.dev.geometry.depth(at)
+                                depths += abs(part) * self.dev.geometry.usual.field[at]
                                 parts += abs(part)
                 self.dev.depths[i] = depths
                 if ti.static(self.dev.has_restitution):

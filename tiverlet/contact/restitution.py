@@ -17,8 +17,8 @@ class Restitution:
     struck: of its pairs, those that are struck in this substep. slack: of their overlap, what no push is for. impulse: pushes
     and impacts of the last substep [kg m]. events: an EventLog, or None.
 
-    Loads that pairs know are forces, which press a pair between them together in each substep. So it rests there, unless e is 1,
-    at the speed that two substeps of them give; else it would bounce on and on, for what an impact takes the next one gives back.
+    A pair rests, unless e is 1, at the speed that two substeps of forces give it. Else what is pressed in between others would
+    bounce on and on, by loads that pairs know or as a corner of a body: what an impact takes the next one gives back.
     """
 
     def __init__(
@@ -56,9 +56,8 @@ class Restitution:
             deep = ti.select(last > 0, overlap, ti.select(e < 1, slack, 0))  # nothing that is elastic rests where nothing pulls
             if last == 0:
                 slack = ti.max(slack, overlap - ti.max(here, 0))
-            if ti.static(self.geometry.has_loads):
-                if e < 1 and a <= ti.static(SLOW) * (here - a):
-                    deep = ti.max(deep, given)
+            if e < 1 and a <= ti.static(SLOW) * (here - a):
+                deep = ti.max(deep, given)
             if a > 0:
                 rests = deep > 0 and (first == 0 or given <= deep)
             elif a < 0:
