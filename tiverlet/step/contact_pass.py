@@ -36,13 +36,13 @@ class ContactPass:
                 self.team.wait()
             if ti.static(c.dev.has_events):
                 self.start_events(now)
-            for k in range(self.team.dealt_count(self.particles.pieces, 1, now.thread)):
+            for k in range(self.particles.piece_count(now.thread)):
                 begin, end = self.particles.piece(k, now.thread)
                 for b in range(blocks(begin, end)):
                     low, high = block(b, begin, end)
                     c.count(low, high, now)
             self.team.wait()
-            for k in range(self.team.dealt_count(self.particles.pieces, 1, now.thread)):
+            for k in range(self.particles.piece_count(now.thread)):
                 begin, end = self.particles.piece(k, now.thread)
                 for b in range(blocks(begin, end)):
                     low, high = block(b, begin, end)
@@ -138,7 +138,7 @@ class ContactPass:
     def project_velocities(self, thread, k):
         """Pass k of the projection that takes the sound out of loaded contacts."""
         for c in ti.static(self.contacts):
-            for p in range(self.team.dealt_count(self.particles.pieces, 1, thread)):
+            for p in range(self.particles.piece_count(thread)):
                 begin, end = self.particles.piece(p, thread)
                 piece = self.team.dealt_index(p, 1, thread)
                 if k == 0:
@@ -146,7 +146,7 @@ class ContactPass:
                 for m in range(begin, begin + c.dev.projection.count[piece]):
                     c.dev.projection.relax(c.dev.projection.loaded[m], k)
             self.team.wait()
-            for p in range(self.team.dealt_count(self.particles.pieces, 1, thread)):
+            for p in range(self.particles.piece_count(thread)):
                 begin, end = self.particles.piece(p, thread)
                 for m in range(begin, begin + c.dev.projection.count[self.team.dealt_index(p, 1, thread)]):
                     c.dev.projection.apply(c.dev.projection.loaded[m])

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..colliders.surface import AGAIN, AHEAD, FIRST, GENTLY
 from ..contact.force_share import accumulate
-from ..device import ti
+from ..device import inline, ti
 from ..device.number import OnDevice
 from ..device.thread_team import Team, block, blocks
 from ..features.feature import Batch, Scene
@@ -35,6 +35,8 @@ class ParticlePass:
         number = scene.memory.number
         self.pieces, self.tile, self.each = map(number, self._parts(scene.particles.count, team))
         self.few = scene.memory.compiler.few
+        self.whole = team.size == 1 and not team.launched  # all particles are one piece,
+        self.undivided = self.whole and self.few  # and one tile: no loop over them is compiled
         self.slots, self.search, self.walls, self.radius = scene.slots, search, walls, scene.radius
         self.gathers = bool(batches) and not contact  # else the moves of constraints are applied before contacts are solved
         self.held = bool(batches)
@@ -59,15 +61,35 @@ class ParticlePass:
         """There are n particles now, and the team knows."""
         self.pieces, self.tile, self.each = self._parts(n, self.team)
 
+    @inline
+    def piece_count(self, thread):
+        """How many pieces fall to a thread."""
+        return 1 if self.whole else self.team.dealt_count(self.pieces, 1, thread)
+
     @ti.func
     def piece(self, k, thread):
         """The particles of the k-th piece of a thread: the first, and where they end."""
-        first = self.team.dealt_index(k, 1, thread) * self.team.piece
-        return first, ti.min(first + self.team.piece, self.n)
+        first, end = self.team.chunk_begin(self.n, thread), self.n
+        if ti.static(not self.whole):
+            first = self.team.dealt_index(k, 1, thread) * self.team.piece
+            end = ti.min(first + self.team.piece, self.n)
+        return first, end
+
+    @inline
+    def tile_count(self, thread):
+        """How many tiles fall to a thread."""
+        return 1 if self.undivided else self.team.dealt_count(self.pieces * self.each, self.each, thread)
 
     @ti.func
     def tile_of(self, k, thread):
         """The particles of the k-th tile of a thread."""
+        first, end = self.team.chunk_begin(self.n, thread), self.n
+        if ti.static(not self.undivided):
+            first, end = self._tile_of(k, thread)
+        return first, end
+
+    @ti.func
+    def _tile_of(self, k, thread):
         first, end = k * self.tile, self.n  # of the one piece that there is, without a division
         if ti.static(self.team.size > 1):
             tile = self.team.dealt_index(k, self.each, thread)
@@ -78,7 +100,7 @@ class ParticlePass:
     @ti.func
     def integrate(self, now):
         """All particles."""
-        for k in range(self.team.dealt_count(self.pieces * self.each, self.each, now.thread)):
+        for k in range(self.tile_count(now.thread)):
             first, end = self.tile_of(k, now.thread)
             if self.state.stirs(first, end) != 0:
                 self.advance(first, end, now)
@@ -176,7 +198,7 @@ class ParticlePass:
     def apply_corrections(self, now):
         """Move particles as constraints or contacts want, and walls after that."""
         if ti.static(self.acts):
-            for k in range(self.team.dealt_count(self.pieces * self.each, self.each, now.thread)):
+            for k in range(self.tile_count(now.thread)):
                 begin, end = self.tile_of(k, now.thread)
                 if self.state.stirs(begin, end) != 0:
                     self.move(begin, end, now)
