@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from .language import at, copied, inline, record, ti
+from .language import at, copied, copied_with, inline, record, ti
 from .patches import assignments, lean, patched
 
 if lean:
@@ -16,10 +16,11 @@ if patched:
     sharing.apply(timing.compiled)
     timing.apply()
     called: Any = calls.called
+    called_with: Any = calls.called_with
 else:
-    called = copied
+    called, called_with = copied, copied_with
 from . import copies
 
 copies.apply()  # last, and whatever is patched: it is what subscripts mean
 
-__all__ = ["at", "called", "inline", "record", "ti"]
+__all__ = ["at", "called", "called_with", "inline", "record", "ti"]

@@ -144,6 +144,11 @@ def copied(function: Any) -> Any:
     return function
 
 
+def copied_with(types: Any) -> Any:
+    """The same, where it would be called with other types than integers."""
+    return copied
+
+
 def record(kind: Any) -> Any:
     """A class of several values under names, for kernels: what they call makes one, passes it on whole and reads it."""
     kind._data_oriented = True  # by this Taichi knows objects of ours, which it leaves as they are

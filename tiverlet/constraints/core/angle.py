@@ -6,7 +6,7 @@ from ... import checks
 from ...device import inline, ti
 from ...features.feature import Knob
 from ...geometry.intervals import cross
-from .quantity import Quantity
+from .quantity import Quantity, measured
 
 TURN = 2 * np.pi
 SHORT = 1e-24  # [m^2] squared length below which a link has no direction, in f32 and far below any in use
@@ -45,10 +45,12 @@ class PathAngle(Angle):
         """The shorter of the two legs."""
         return shorter_leg(q)
 
+    @measured
     @ti.func
     def measure(self, c, q):
         """See path_angle(); nothing is remembered of the plane."""
-        return path_angle(q, 0 * q[0, :], False, faint(self.state, self.real))
+        f, g = path_angle(q, 0 * q[0, :], False, faint(self.state, self.real))
+        return f, g
 
 
 class DihedralAngle(Angle):
@@ -66,10 +68,12 @@ class DihedralAngle(Angle):
         """The shortest way from an end of the edge to another corner."""
         return ti.min(q[1, :].norm(), ti.min(q[2, :].norm(), q[3, :].norm()))
 
+    @measured
     @ti.func
     def measure(self, c, q):
         """See dihedral_angle()."""
-        return dihedral_angle(q)
+        f, g = dihedral_angle(q)
+        return f, g
 
 
 def turned(C: np.ndarray) -> np.ndarray:

@@ -2,11 +2,12 @@
 
 from collections.abc import Callable
 from copy import copy
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...device import ti
+from ...device import called_with, ti
 
 if TYPE_CHECKING:
     from ...features.feature import Scene
@@ -117,6 +118,20 @@ class Quantity:
     def direction_reliable(self, f, f0):
         """Whether directions at f (now) and f0 (at the start) are clear enough to tell a turn of 41 degrees."""
         return True
+
+
+def gradients_of(quantity: Quantity) -> Any:
+    """The type of gradients, and of corners."""
+    return _matrix(quantity.arity, quantity.state.dim, quantity.real)
+
+
+@cache
+def _matrix(rows: int, columns: int, real: Any) -> Any:
+    return ti.types.matrix(rows, columns, real)
+
+
+# For measure() of what is long: kernels need it up to five times.
+measured = called_with(lambda self: ((ti.i32, gradients_of(self)), (self.real, gradients_of(self))))
 
 
 def differences(values: Callable, x: np.ndarray) -> np.ndarray:

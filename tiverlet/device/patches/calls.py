@@ -9,14 +9,17 @@ Everything here knows the inside of Taichi 1.7.4; with another one, all is copie
 
 import ast
 import ctypes
+import inspect
+from collections.abc import Callable
 from functools import wraps
 from itertools import count
+from types import FunctionType
 from typing import Any
 
 from taichi._lib import core
 from taichi.lang import impl, kernel_impl
 
-from ..language import active, inline
+from ..language import active, inline, ti
 
 NEVER = "if {0} < -2147483647: self.{1}({2})"  # what a function begins with: LLVM copies none that calls itself
 MOST = 8  # functions of a kernel
@@ -29,13 +32,50 @@ _spare: list[tuple[Any, Any]] = []  # and those that have none: keys and functio
 def called(function: Any) -> Any:
     """A ti.func for kernels to call: a method whose other arguments, and what it returns, are integers that its annotations name.
     What else it finds out, it writes to fields."""
-    real: Any = kernel_impl.Func(function.func.func, _classfunc=True, is_real_function=True)
+    real = _real(function.func.func)
+    return _calling(function, lambda self: real)
+
+
+def called_with(types: Callable[[Any], tuple[tuple[Any, ...], tuple[Any, ...]]]) -> Any:
+    """The same for a method that takes and returns other types, see below; the first is an integer's. types: of arguments and of
+    results, by the object."""
+
+    def decorated(function: Any) -> Any:
+        """A ti.func whose types depend on the object."""
+        reals: dict[Any, Any] = {}
+
+        def real_for(self: Any) -> Any:
+            """The function for the types of this object."""
+            given, returned = key = types(self)
+            if key not in reals:
+                of: Any = function.func.func
+                new = FunctionType(of.__code__, of.__globals__, of.__name__, of.__defaults__, of.__closure__)
+                new.__annotations__ = dict(zip(inspect.signature(of).parameters, (ti.template(), *given), strict=True))
+                new.__annotations__["return"] = returned
+                reals[key] = _real(new)
+            return reals[key]
+
+        return _calling(function, real_for)
+
+    return decorated
+
+
+def _real(function: Any) -> Any:
+    """A function that is called, of one that would be copied."""
+    return kernel_impl.Func(function, _classfunc=True, is_real_function=True)
+
+
+def _calling(function: Any, real_for: Callable[[Any], Any]) -> Any:
+    """A method that kernels call where they may. real_for: what they call of an object."""
 
     @inline
     @wraps(function)
     def call(self, *args):
         """Call it, or have it copied."""
-        key = _key(real, (self, *args)) if active and active[-1].calls else None
+        if not (active and active[-1].calls):
+            return function(self, *args)
+        real = real_for(self)
+        key = _key(real, (self, *args))
         return real.func_call_rvalue(key=key, args=(self, *args)) if key else function(self, *args)
 
     return call
@@ -72,6 +112,7 @@ def _compile(real: Any, key: Any, function: Any, args: tuple[Any, ...]) -> None:
     read: Any = kernel_impl._get_tree_and_ctx
     tree, ctx = read(real, is_kernel=False, args=args, is_real_function=True)
     names = [one.name for one in real.arguments[1:]]
+    tree.body[0].returns = real.return_type and ast.Constant(0)  # else Taichi takes it for one that returns nothing
     tree.body[0].body.insert(0, ast.parse(NEVER.format(names[0], real.func.__name__, ", ".join(names))).body[0])
     real.taichi_functions[key.instance_id] = function
 
