@@ -362,7 +362,14 @@ class Step:
     @ti.func
     def solve_systems(self, now):
         """Chains and cloth are solved together."""
-        self.constraints.solve_systems(now.thread)
+        if ti.static(len(self.constraints.systems) > 0):
+            self.solve_each(now.thread)
+
+    @called
+    @ti.func
+    def solve_each(self, thread: ti.i32):
+        """Each system."""
+        self.constraints.solve_systems(thread)
 
     @ti.func
     def start_systems(self, now):
