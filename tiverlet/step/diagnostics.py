@@ -45,7 +45,8 @@ class Diagnostics:
         self.n, self.dim, self.state = step.scene.count, step.dim, step.state
         self.batches = step.batches
         self.contacts = step.contacts
-        self.single = step.real == ti.f32
+        self.bits: Any = ti.u32 if step.real == ti.f32 else ti.u64
+        self.exponent = 0x7F800000 if step.real == ti.f32 else 0x7FF0000000000000  # of what is not finite
         self.probes = [f for f in step.integrator.forces.all if not f.uniform]
         self.pair_forces = step.pair_forces
         self.measured = [f for f in self.pair_forces if f.potential_arity]
@@ -80,16 +81,10 @@ class Diagnostics:
     @ti.func
     def finite(self, x):
         """Whether x is finite, by the bits of its exponent: Taichi's comparisons with NaN are not reliable."""
-        out = 1
+        exponent, largest = self.bits(self.exponent), self.bits(0)
         for k in ti.static(range(x.n)):
-            if ti.static(self.single):
-                if ti.bit_cast(x[k], ti.u32) & ti.u32(0x7F800000) == ti.u32(0x7F800000):
-                    out = 0
-            else:
-                mask = ti.u64(0x7FF0000000000000)
-                if ti.bit_cast(x[k], ti.u64) & mask == mask:
-                    out = 0
-        return out
+            largest = ti.max(largest, ti.bit_cast(x[k], self.bits) & exponent)
+        return ti.cast(largest != exponent, ti.i32)
 
     @ti.func
     def energy(self, i, x, scale, back):
@@ -149,10 +144,10 @@ class Diagnostics:
         size = (self.n + self.blocks - 1) // self.blocks
         for i in range(b * size, ti.min((b + 1) * size, self.n)):
             x = self.state.place(i)
-            sound = self.finite(x) != 0 and self.finite(self.state.d[i]) != 0
+            sound = self.finite(x) & self.finite(self.state.d[i])
             if ti.static(self.state.spins):
-                sound = sound and self.finite(self.state.spin.s[i]) != 0
-            if not sound:
+                sound &= self.finite(self.state.spin.s[i])
+            if sound == 0:
                 figures[5] = ti.min(figures[5], ti.cast(i, ti.f64))
             else:
                 if bare == 0:
@@ -171,12 +166,12 @@ class Diagnostics:
                         touching, worst = c.worst_overlap(i)
                         figures[2] = ti.max(figures[2], worst)
                         figures[4] += touching
+        h2_effective = ti.select(begin == 0, self.step.integrator.h2_effective(h, fresh), 0 * h)
         for f in ti.static(self.batches):
             part = (f.count + self.blocks - 1) // self.blocks
             for c in range(b * part, ti.min((b + 1) * part, f.count)):
-                h2_effective, residual = 0 * h, 0 * h
+                residual = 0 * h
                 if begin == 0:
-                    h2_effective = self.step.integrator.h2_effective(h, fresh)
                     residual = f.dev.residual_of(c, h, h2_effective, frame_fraction, fresh)
                     figures[1] = ti.max(figures[1], ti.cast(residual, ti.f64))
                 figures[0] += f.dev.energy(c, back, h2_effective, residual)

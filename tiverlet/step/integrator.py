@@ -165,9 +165,9 @@ class Verlet:
         """What a constant acceleration adds to the displacement in a substep, per m/s^2: h^2, half of it at a start."""
         h2_effective = h * h
         if ti.static(self.decays):
-            h2_effective *= self.decay[None][2] if fresh != 0 else self.decay[None][1]
-        elif fresh != 0:
-            h2_effective /= 2
+            h2_effective *= ti.select(fresh != 0, self.decay[None][2], self.decay[None][1])
+        else:
+            h2_effective = ti.select(fresh != 0, h2_effective / 2, h2_effective)
         return h2_effective
 
     @ti.func
