@@ -270,18 +270,35 @@ def test_who_waits_is_told_what_for(world, monkeypatch):
     assert "Nothing was compiled for it" in other.explain()
 
 
-def test_functions_that_kernels_call_change_no_bit(monkeypatch):
-    # Two squares fall on each other and on the floor: by kernels that call what is long, and by others that have it copied.
+def squares():
+    """Two squares that fall on each other and on the floor."""
     square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
     particles = tv.Particles(np.concatenate([square, square + [0.5, 1.1]]), velocity=(0, -2), radius=0.02)
     loops, sides = np.arange(8).reshape(2, 4), np.stack(np.triu_indices(4, 1), axis=1)
+    rough = [tv.Polygons(loops, friction=0.5), tv.HalfSpace((0, 1), -0.1, friction=0.5)]
+    return particles, [tv.Gravity(), tv.Distance(np.concatenate([sides, sides + 4])), *rough]
+
+
+def arm():
+    """A path in space with an angle of each kind at its corners."""
+    particles = tv.Particles([[0, 0, 0], [1, 0, 0], [2, 1, 0], [2, 1, 1], [3, 0, 1]], pinned=[0])
+    angles = [
+        tv.Bend([[0, 1, 2]], compliance=1e-3),
+        tv.AngleLimit([[1, 2, 3]], 0, 1),
+        tv.Dihedral([[1, 2, 3, 4]], compliance=1e-2),
+    ]
+    return particles, [tv.Gravity(), tv.Distance([[0, 1], [1, 2], [2, 3], [3, 4]]), *angles]
+
+
+@pytest.mark.parametrize("scene, precision", [(squares, "f32"), (arm, "f64")])
+def test_functions_that_kernels_call_change_no_bit(monkeypatch, scene, precision):
+    # By kernels that call what is long, and by others that have it copied.
     made = []
     for passes in (BRIEF, LEAN):
         monkeypatch.setattr(build, "_passes", lambda *scene, chosen=passes: chosen)
-        rough = [tv.Polygons(loops, friction=0.5), tv.HalfSpace((0, 1), -0.1, friction=0.5)]
-        features = [tv.Gravity(), tv.Distance(np.concatenate([sides, sides + 4])), *rough]
-        with tv.World(particles, features, substeps=8) as w:
+        with tv.World(*scene(), substeps=8, precision=precision) as w:
             made.append(([w.step(1 / 60) for _ in range(60)], w.hash(), w._runner.memory.compiler.calls))
     (reports, digest, calls), (others, other, copies) = made
-    assert reports == others and digest == other and sum(r.contacts for r in reports) > 5
+    assert reports == others and digest == other and reports[0].energy != reports[-1].energy
+    assert scene is not squares or sum(r.contacts for r in reports) > 5
     assert calls == (patched and ARCH == "cpu") and not copies
