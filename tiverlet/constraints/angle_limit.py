@@ -11,7 +11,7 @@ from ..device import ti
 from ..features.feature import Knob, Scene
 from ..particles import Particles
 from .core.angle import TURN, Angle, faint, path_angle, path_angles, shorter_leg, turned, wrapped
-from .core.quantity import differences, measured
+from .core.quantity import differences
 from .core.scalar import Scalar
 
 
@@ -43,7 +43,6 @@ class AngleFromMiddle(Angle):
         """A distance from the middle has one value."""
         return f
 
-    @measured
     @ti.func
     def measure(self, c, q):
         """|angle - middle|, and its gradients: those of the angle, with the sign of the side on which it is."""

@@ -1,18 +1,31 @@
 """Angles: that of a path, and that between two triangles."""
 
+from functools import cache
+from typing import Any
+
 import numpy as np
 
 from ... import checks
-from ...device import inline, ti
+from ...device import called_with, inline, ti
 from ...features.feature import Knob
 from ...geometry.intervals import cross
-from .quantity import Quantity, measured
+from .quantity import Quantity
 
 TURN = 2 * np.pi
 SHORT = 1e-24  # [m^2] squared length below which a link has no direction, in f32 and far below any in use
 
 
 REST_ANGLE = Knob(lambda f, v: checks.per_item(repr(f), f.rest_name, v, f.count, least=-TURN, most=TURN), "Rest angle [rad].")
+
+
+@cache
+def _matrix(rows: int, columns: int, real: Any) -> Any:
+    return ti.types.matrix(rows, columns, real)
+
+
+def corners_of(angle: Any) -> Any:
+    """The type of its corners, and of its gradients."""
+    return _matrix(angle.arity, angle.state.dim, angle.real)
 
 
 class Angle(Quantity):
@@ -28,6 +41,12 @@ class Angle(Quantity):
     def unwrap(self, f, other):
         """f plus whole turns, within half a turn of `other`."""
         return wrapped(f, other)
+
+    @called_with(lambda self: ((ti.i32, corners_of(self)), (self.real, corners_of(self))))
+    @ti.func
+    def remeasure(self, c, q):
+        """As one function, for it is long and stands in up to three places."""
+        return self.measure(c, q)
 
 
 class PathAngle(Angle):
@@ -45,12 +64,10 @@ class PathAngle(Angle):
         """The shorter of the two legs."""
         return shorter_leg(q)
 
-    @measured
     @ti.func
     def measure(self, c, q):
         """See path_angle(); nothing is remembered of the plane."""
-        f, g = path_angle(q, 0 * q[0, :], False, faint(self.state, self.real))
-        return f, g
+        return path_angle(q, 0 * q[0, :], False, faint(self.state, self.real))
 
 
 class DihedralAngle(Angle):
@@ -68,12 +85,10 @@ class DihedralAngle(Angle):
         """The shortest way from an end of the edge to another corner."""
         return ti.min(q[1, :].norm(), ti.min(q[2, :].norm(), q[3, :].norm()))
 
-    @measured
     @ti.func
     def measure(self, c, q):
         """See dihedral_angle()."""
-        f, g = dihedral_angle(q)
-        return f, g
+        return dihedral_angle(q)
 
 
 def turned(C: np.ndarray) -> np.ndarray:

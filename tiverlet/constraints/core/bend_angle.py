@@ -6,7 +6,6 @@ import numpy as np
 
 from ...device import ti
 from .angle import Angle, faint, path_angle, path_angles, shorter_leg
-from .quantity import measured
 
 if TYPE_CHECKING:
     from ...features.feature import Scene
@@ -39,15 +38,13 @@ class BendAngle(Angle):
         """The shorter of the two legs."""
         return shorter_leg(q)
 
-    @measured
     @ti.func
     def measure(self, c, q):
         """See path_angle(); in 3D, about the axis that is remembered."""
         axis = 0 * q[0, :]
         if ti.static(self.state.dim == 3):
             axis = self.axis[c]
-        f, g = path_angle(q, axis, self.mirrored(c), faint(self.state, self.real))
-        return f, g
+        return path_angle(q, axis, self.mirrored(c), faint(self.state, self.real))
 
     @ti.func
     def mirrored(self, c):

@@ -231,7 +231,7 @@ class CornerPasses(Passes):
     @ti.func
     def weigh_load(self, c):
         """As a window ends: see KnownLoad.weigh()."""
-        _, g = self.quantity.measure(c, self.seen.apart(c, 0))
+        _, g = self.quantity.remeasure(c, self.seen.apart(c, 0))
         _, _, most, _ = self.motion(c, g, 0)
         own = ti.cast(0, self.real)
         for k in ti.static(range(self.arity)):
@@ -241,7 +241,7 @@ class CornerPasses(Passes):
     @ti.func
     def learn_load(self, c, h):
         """After that: see KnownLoad.learn()."""
-        _, g = self.quantity.measure(c, self.seen.apart(c, 0))
+        _, g = self.quantity.remeasure(c, self.seen.apart(c, 0))
         _, W, _, fastest = self.motion(c, g, 0)
         self.known.learn(c, h * h * W, self.equation.residual_scale(c), ti.sqrt(fastest))
 
@@ -275,11 +275,11 @@ class CornerPasses(Passes):
     def push_spring_force(self, c, h):
         """h^2 w_j F grad_j C, with F of Equation.spring_force(). Rigid links find their force in the next substep, but for the
         load that they know."""
-        f, g = self.quantity.measure(c, self.seen.apart(c, 0))
+        f, g = self.quantity.remeasure(c, self.seen.apart(c, 0))
         f = self.quantity.unwrap(f, self.equation.rest[c])
         f0, w = f, ti.cast(0, self.real)
         if ti.static(self.spring.damped):
-            f0, _ = self.quantity.measure(c, self.seen.apart(c, 1))
+            f0, _ = self.quantity.remeasure(c, self.seen.apart(c, 1))
         for k in ti.static(range(self.arity)):
             w += self.w.of(self.corners.member(c, k)) * g[k, :].dot(g[k, :])
         force = self.equation.spring_force(c, f, self.quantity.unwrap(f0, f), w, h)
@@ -293,8 +293,8 @@ class CornerPasses(Passes):
     def note_spring_turn(self, c):
         """Of springs alone; one without length goes through its other end."""
         if not self.spring.is_rigid(c) and (ti.static(not self.equation.cusp) or self.equation.rest[c] != 0):
-            f, g = self.quantity.measure(c, self.seen.apart(c, 0))
-            f0, n = self.quantity.measure(c, self.seen.apart(c, 1))
+            f, g = self.quantity.remeasure(c, self.seen.apart(c, 0))
+            f0, n = self.quantity.remeasure(c, self.seen.apart(c, 1))
             both, here, there = ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real)
             for k in ti.static(range(self.arity)):
                 both += g[k, :].dot(n[k, :])
@@ -310,7 +310,7 @@ class CornerPasses(Passes):
         if ti.static(self.known.learns):
             if self.spring.is_rigid(c):
                 pull += (soft - firm) * self.known.given[c]
-        _, g = self.quantity.measure(c, self.seen.apart(c, 0))
+        _, g = self.quantity.remeasure(c, self.seen.apart(c, 0))
         for k in ti.static(range(self.arity)):
             self.corners.push(c, k, self.w.of(self.corners.member(c, k)) * pull * g[k, :])
 
@@ -323,7 +323,7 @@ class CornerPasses(Passes):
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
         """The violation that is left, relative to the rest value (to the batch's mean f where that is 0). W is made of the
         current gradients alone: it cancels, unless the multiplier is bounded."""
-        f, g = self.quantity.measure(c, self.seen.apart(c, 0))
+        f, g = self.quantity.remeasure(c, self.seen.apart(c, 0))
         f = self.quantity.unwrap(f, self.equation.rest[c])
         w, W = ti.cast(0, self.real), ti.cast(0, self.real)
         for k in ti.static(range(self.arity)):
@@ -343,8 +343,8 @@ class CornerPasses(Passes):
         out = ti.cast(0, ti.f64)
         if ti.static(self.spring.soft):
             if self.equation.stores(c):
-                f, _ = self.quantity.measure(c, self.seen.apart(c, back))
-                _, g = self.quantity.measure(c, self.seen.apart(c, 0))
+                f, _ = self.quantity.remeasure(c, self.seen.apart(c, back))
+                _, g = self.quantity.remeasure(c, self.seen.apart(c, 0))
                 w = ti.cast(0, self.real)
                 for k in ti.static(range(self.arity)):
                     w += self.w.of(self.corners.member(c, k)) * g[k, :].dot(g[k, :])

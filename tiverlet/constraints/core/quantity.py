@@ -2,12 +2,11 @@
 
 from collections.abc import Callable
 from copy import copy
-from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...device import called_with, ti
+from ...device import ti
 
 if TYPE_CHECKING:
     from ...features.feature import Scene
@@ -86,6 +85,11 @@ class Quantity:
         return 0.0, q
 
     @ti.func
+    def remeasure(self, c, q):
+        """The same where it is not for a pass, which solvers take most of their time for."""
+        return self.measure(c, q)
+
+    @ti.func
     def slope(self, e, back):
         """Of outlines: the gradient by corner e, at x - back d."""
         return ti.Vector.zero(self.real, 1)
@@ -118,20 +122,6 @@ class Quantity:
     def direction_reliable(self, f, f0):
         """Whether directions at f (now) and f0 (at the start) are clear enough to tell a turn of 41 degrees."""
         return True
-
-
-def gradients_of(quantity: Quantity) -> Any:
-    """The type of gradients, and of corners."""
-    return _matrix(quantity.arity, quantity.state.dim, quantity.real)
-
-
-@cache
-def _matrix(rows: int, columns: int, real: Any) -> Any:
-    return ti.types.matrix(rows, columns, real)
-
-
-# For measure() of what is long: kernels need it up to five times.
-measured = called_with(lambda self: ((ti.i32, gradients_of(self)), (self.real, gradients_of(self))))
 
 
 def differences(values: Callable, x: np.ndarray) -> np.ndarray:
