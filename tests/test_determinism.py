@@ -64,7 +64,7 @@ def results(path):
 
 def test_every_solver_has_the_same_bits_on_1_and_8_threads():
     # Sums over all constraints, as conjugate gradients take them beside contacts, and systems that several threads solve: cloth
-    # that falls on a ball, with hail on it, and ropes. On one thread phase by phase, as on a GPU.
+    # that falls on a ball, with hail on it, and ropes. On one thread phase by phase, as on a GPU. For Jacobi see all paths below.
     code = """
 import numpy as np
 import pytest
@@ -82,8 +82,7 @@ start = tv.Particles(
 def results(path):
     touching = [tv.Ball((0.5, 0.69, 0.5), 0.3, friction=0.3), tv.Contact(friction=0.3)]
     for solver, pairs, more in (
-        (tv.Direct(), ropes, []), (tv.Jacobi("auto"), net, []), (tv.Chebyshev(), net, []),
-        (tv.ConjugateGradient(steps=4), net, touching),
+        (tv.Direct(), ropes, []), (tv.Chebyshev(), net, []), (tv.ConjugateGradient(steps=4), net, touching),
     ):
         features = [tv.Gravity(9.81), tv.Distance(pairs), *more]
         with tv.World(start, features, solver=solver, path=path, substeps=5, iterations=4) as world:
@@ -92,7 +91,7 @@ def results(path):
             yield world.hash()
 """
     made = hashes(code, '((1, "parallel"), (8, "parallel"))')
-    assert len(made) == 8 and len(set(made[:4])) == 4 and made[:4] == made[4:]
+    assert len(made) == 6 and len(set(made[:3])) == 3 and made[:3] == made[3:]
 
 
 def test_a_large_pile_has_the_same_bits_on_all_paths_and_where_a_team_breaks_up(world):
@@ -174,7 +173,6 @@ def test_what_is_absent_has_no_field_and_no_kernel(world):
 def test_launches_count_what_the_scene_needs(world):
     # Kernel launches of a frame, counted at Taichi's door: one for all of it on a CPU; else one for each pass of a substep.
     for features, path, expected in (
-        ([tv.Gravity(1.0)], "launched", {"integrate": 5, "measure": 1}),
         ([tv.Gravity(1.0), tv.Distance([[0, 1]])], "launched", {f"integrate {PASS}": 5, PASS: 5, "measure": 1}),
         (
             [tv.Gravity(1.0), tv.Distance([[0, 1]]), tv.Contact(friction=0.1, restitution=0.5)],

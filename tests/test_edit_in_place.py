@@ -29,9 +29,9 @@ def places(n: int, dim: int = 2) -> np.ndarray:
 
 
 def overlapping(n: int, dim: int = 2) -> np.ndarray:
-    """The same, of which two overlap, as some do where a world is built anew: both worlds have the same kernels then."""
+    """The same, of which two that stay overlap, as some do where a world is built anew: both have the same kernels then."""
     x = places(n, dim)
-    x[-1] = x[-2] + 0.15 * np.eye(dim)[0]
+    x[9] = x[8] + 0.15 * np.eye(dim)[0]
     return x
 
 
@@ -175,24 +175,25 @@ def test_in_place_is_to_the_bit_as_built_anew(scene):
         assert a == b, k
 
 
-def ropes(solver=None, precision="f32", **more):
-    """Three ropes, the last of which breaks, between discs, with pins of both kinds. More: a rope, and a link of two discs."""
+def ropes(solver, precision="f32", only=False):
+    """Three ropes, the last of which breaks, between discs, with pins of both kinds. More: a rope, and a link of two discs.
+    only: links alone, between discs that pass through each other."""
     hung = [tv.shapes.rope((0.1 + 0.6 * k, 2.4), (0.5 + 0.6 * k, 2.4), points=5) for k in range(3)]
     position = np.concatenate([overlapping(20), *(rope.position for rope in hung)])
     pairs = np.concatenate([rope.links + 20 + 5 * k for k, rope in enumerate(hung)])
-    link = tv.Distance(pairs, compliance=np.where(pairs.min(axis=1) < 30, 1e-5, 0.0), break_at=20.0, **more)
+    link = tv.Distance(pairs, compliance=np.where(pairs.min(axis=1) < 30, 1e-5, 0.0), break_at=20.0)
     bend = tv.Bend(np.stack([pairs[:-1, 0], pairs[:-1, 1], pairs[1:, 1]], axis=1)[[0, 1, 2, 4, 5, 6]], compliance=1e-2)
-    features = [
-        tv.Gravity(), tv.HalfSpace((0, 1), 0.0), tv.Contact(0.2), link, tv.Pin([20]), tv.Pin([34, 29], compliance=1e-4), bend
-    ]  # fmt: skip
-    w = tv.World(tv.Particles(position, radius=0.09), features, substeps=5, solver=solver, precision=precision)
+    beside = [tv.HalfSpace((0, 1), 0.0), tv.Contact(0.2), tv.Pin([20]), tv.Pin([34, 29], compliance=1e-4), bend]
+    features = [tv.Gravity(), link, *(beside if not only else [])]
+    particles = tv.Particles(position, radius=0.09, pinned=[20] if only else ())
+    w = tv.World(particles, features, substeps=5, solver=solver, precision=precision)
 
     def rope(k: int):
         """One more, k points long."""
         new = tv.shapes.rope((0.2, 3.0), (1.4, 3.0), points=k)
         first = len(w.particles)
         both = {link: tv.Distance(new.links + first), bend: tv.Bend([[first, first + 1, first + 2]], compliance=1e-2)}
-        w.add(tv.Particles(new.position, radius=0.09), extend=both)
+        w.add(tv.Particles(new.position, radius=0.09), extend={f: more for f, more in both.items() if f in features})
 
     return w, [
         lambda: rope(6), lambda: w.remove([len(w.particles) - 1]), lambda: w.remove([27]), lambda: rope(4),
@@ -284,8 +285,9 @@ def grown(scene, anew: bool) -> list:
 
 
 SOLVED = {
-    "direct": lambda: ropes(tv.Direct(), "f64"), "loads": lambda: ropes(tv.Jacobi(loads=True)),
-    "chebyshev": lambda: ropes(tv.Chebyshev()), "together": lambda: ropes(tv.ConjugateGradient(4), "f32-compensated"),
+    "direct": lambda: ropes(tv.Direct(), "f64"), "loads": lambda: ropes(tv.Jacobi(loads=True), only=True),
+    "chebyshev": lambda: ropes(tv.Chebyshev(), only=True),
+    "together": lambda: ropes(tv.ConjugateGradient(4), "f32-compensated", only=True),
     "bodies": bodies, "outlines": outlines, "asleep": lambda: bodies(tv.Sleep(10.0, 0.05)),
 }  # fmt: skip
 
@@ -379,15 +381,14 @@ def test_a_pin_takes_a_disc_in_place(precision, spin):
     other.close()
 
 
-@pytest.mark.parametrize("precision", ["f32", "f64"])
-def test_springs_of_a_pin_take_others_in_place(precision, monkeypatch, tmp_path):
+def test_springs_of_a_pin_take_others_in_place(monkeypatch, tmp_path):
     # As in a world that is built anew for it, to the bit; beside links, whose slots stand among theirs, and with knobs of both.
     def scene():
         pin = tv.Pin([10, 3], (0.5, 0.9), compliance=1e-3, damping=0.5)
         link = tv.Distance([[20, 21], [21, 22], [5, 6]], compliance=1e-5)
         particles = tv.Particles(places(30), radius=RADIUS, pinned=[0, 1])
         features = [tv.Gravity(), tv.HalfSpace((0, 1), 0.0), tv.Contact(friction=0.3), pin, link]
-        w = tv.World(particles, features, precision=precision, substeps=5, solver=tv.Jacobi())
+        w = tv.World(particles, features, substeps=5, solver=tv.Jacobi())
         w.run(0.1)
         return w, pin
 
@@ -421,7 +422,7 @@ def test_worlds_one_after_the_other_take_no_more_memory():
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
     def live(k: int) -> None:
-        with tv.World(tv.Particles(places(20 + k % 7), radius=RADIUS), [tv.Gravity(), tv.Contact()], substeps=2) as w:
+        with tv.World(tv.Particles(1.1 * places(20 + k % 7), radius=RADIUS), [tv.Gravity(), tv.Contact()], substeps=2) as w:
             w.step(1 / 60)
             w.add(drops(1 + k % 3, 0))
             w.step(1 / 60)
@@ -465,8 +466,8 @@ def test_constraints_come_and_go_in_place_where_rest_values_were_assigned():
         planned = edit_in_place.planned
         edit_in_place.planned = (lambda *_: None) if anew else planned
         try:
-            w, edits = ropes()
-            link: Any = w.features[3]
+            w, edits = ropes(tv.Direct(), "f64")
+            link: Any = w.features[1]
             seen = [steps_of(w)]
             link.rest = link.rest * np.where(np.arange(link.count) == 1, 1.2, 1.0)
             seen.append(steps_of(w))

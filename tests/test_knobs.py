@@ -224,7 +224,7 @@ class Scene:
         """Let targets be reached, and what pairs remember be forgotten; then run from the start."""
         apart = self.x.copy()
         for name in ("Contact", "Polygons"):
-            apart[self.indices.get(name, []), 1] += np.arange(len(self.indices.get(name, []))) / 2
+            apart[self.indices.get(name, []), 1] += np.arange(len(self.indices.get(name, [])))
         self.world.velocity, self.world.position = 0 * self.v, apart
         self.world.step(DT)
         self.world.velocity, self.world.position = self.v, self.x

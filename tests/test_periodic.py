@@ -150,11 +150,10 @@ def test_where_the_box_begins_and_which_image_is_followed_changes_nothing(world,
     assert np.abs(d).max() > 0.1
 
 
-@pytest.mark.parametrize("shear", [0.0, 0.8])
-def test_a_collision_across_the_boundary_is_that_with_the_image(world, shear):
+def test_a_collision_across_the_boundary_is_that_with_the_image(world):
     # Two discs, one at the top and one at the bottom; the other world has the upper one's partner where its image is, a box
     # higher, faster by shear times the height and further by the strain so far, and no box. They meet after about 0.25 s.
-    length = np.array([5.0, 4.0])
+    length, shear = np.array([5.0, 4.0]), 0.8
     x, v = np.array([[1.0, 3.7], [1.3 - 1.28 * shear, 0.4]]), np.array([[0.2, 0.5], [-0.1, -0.4]])
     contact = {"friction": 0.4, "restitution": 0.6}
     w = world(
@@ -324,7 +323,7 @@ def test_a_floor_under_a_periodic_pile(world):
     )  # fmt: skip
     w.run(2.0)
     np.testing.assert_allclose(w.position[:, 1], 0.2, atol=1e-3)
-    np.testing.assert_allclose(w.velocity[:, 0], 3.0, atol=1e-5)
+    np.testing.assert_allclose(w.position[:, 0] - x[:, 0], 3.0 * w.time, atol=2e-5)
     assert (w.position[:, 0] > 4).any()
 
 
@@ -407,13 +406,13 @@ def test_f32_with_low_words_is_as_good_a_hundred_boxes_away(world):
 
 
 def test_soft_bodies_pass_the_boundary_as_if_there_were_none(world):
-    # Given whole, members of a body are always nearest to each other as they are.
+    # Given whole, members of a body are always nearest to each other as they are. In the larger box they never come to the end.
     square = np.array([[0.0, 0], [0.6, 0], [0.6, 0.6], [0, 0.6]])
-    boxes = [[tv.Periodic((0, 0), (2, 2))], []]
     found = []
-    for more in boxes:
+    for size in (2, 200):
         features = [tv.Area(LOOP, pressure=1.2, compliance=1e-4), tv.Distance([[0, 1], [1, 2], [2, 3], [3, 0]], compliance=1e-4)]
-        w = world(tv.Particles(square + 1.2, velocity=(2.0, 1.0)), [*more, *features], precision="f64")
+        box = tv.Periodic((0, 0), (size, size))
+        w = world(tv.Particles(square + 1.2, velocity=(2.0, 1.0)), [box, *features], precision="f64")
         w.run(0.8)
         found.append(w.position)
     np.testing.assert_allclose(*found, atol=1e-10)

@@ -18,6 +18,7 @@ from .rows import OTHERS, ROWS, Row
 
 BLOCKS = ("met", "off", "turned", "held", "stuck", "soft", "free", "swing", "loaded", "weak")
 MASS = np.array([1.0, 2.5, 0.7, 4.0])
+OWN = ("Bend 3D", "AngleLimit 3D", "Area of loops 2D")  # that have fields of their own; others have those of Distance, or fewer
 IN_BATCHES = ("Bend 3D", "Volume of surfaces")  # what is tried in two batches of one world, see Row.like
 
 
@@ -190,6 +191,14 @@ def test_the_tables_hold_every_constraint():
     named = {name.split()[0].rstrip(",") for name in (*ROWS, *OTHERS)}
     assert named == set(constraints.__all__) and all(reason for *_, reason in OTHERS.values())
 
+    def fields(row):
+        one = row.make(np.arange(len(row.points))[None], np.zeros(1), compliance=[1e-2], damping=[1.0], break_at=1e9)
+        with tv.World(tv.Particles(row.points), [one]) as w:
+            return {field.partition(".")[2] for field in w.fields if not field.startswith("numbers.")}
+
+    plain = fields(ROWS["Distance 3D"])
+    assert {name for name, row in ROWS.items() if not fields(row) <= plain} == {*OWN}
+
 
 @pytest.mark.parametrize("name", ["Bend 3D", *OTHERS])
 def test_a_batch_is_its_constraints_and_a_clone_is_its_world(world, name):
@@ -290,9 +299,9 @@ def test_no_bad_start_flies(world, dim, solver):
 
 @pytest.mark.parametrize("dim, solver", [(2, tv.ConjugateGradient(4)), (3, tv.Jacobi())], ids=["2D", "3D"])
 def test_what_was_no_number_leaves_nothing_behind(world, dim, solver):
-    """All constraints of a dimension in one world, rigid and soft. After a frame with NaN for every place, its state is put back
-    to what it was, and goes on to the bit; so a frame that is tried again with more substeps is what it would have been. And
-    places and velocities that are assigned are a new start."""
+    """A link and all constraints of a dimension that have fields of their own in one world, rigid and soft. After a frame with
+    NaN for every place, its state is put back to what it was, and goes on to the bit; so a frame that is tried again with more
+    substeps is what it would have been. And places and velocities that are assigned are a new start."""
     features, points = [tv.Gravity(np.zeros(dim)), tv.Contact(friction=0.3, restitution=0.5)], []
 
     def corners(at):
@@ -302,7 +311,7 @@ def test_what_was_no_number_leaves_nothing_behind(world, dim, solver):
             points.append(at + 10.0 * (len(points) + 1) * (len(at) > 1))
         return first + np.arange(2 * len(at)).reshape(2, -1)
 
-    for row in (r for r in ROWS.values() if r.points.shape[1] == dim):
+    for row in (ROWS[name] for name in (*OWN, "Rope 2D", "Distance 3D") if ROWS[name].points.shape[1] == dim):
         who = corners(row.points)
         probe = row.make(np.arange(2 * len(row.points)).reshape(2, -1), np.zeros(2))
         probe.prepare(tv.Particles(np.concatenate(points[-2:])), np.ones(2 * len(row.points)))
@@ -325,8 +334,5 @@ def test_what_was_no_number_leaves_nothing_behind(world, dim, solver):
         if after:
             assert w.hash() == after
             after = None
-        assert (
-            np.isfinite(w.position).all()
-            and np.isfinite(w.velocity).all()
-            and np.isfinite([report.energy, report.residual]).all()
-        )
+        assert all(np.isfinite(values).all() for values in memory.state().values())
+        assert np.isfinite([report.energy, report.residual]).all()

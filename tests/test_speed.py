@@ -1,7 +1,6 @@
 """The report on speed: its figures belong together. Nothing here is about how fast anything is."""
 
 import contextlib
-import itertools
 import json
 import pathlib
 import types
@@ -25,11 +24,11 @@ def kept(taichi):
 
 @pytest.fixture(scope="module")
 def report(kept):
-    """Two scenes of one size each, quickly, one of them by a copy of the package that lacks what it does not use."""
-    number = itertools.count()
+    """Two scenes of one size each, quickly, one of them by a copy of the package that lacks what it does not use. What is cold is
+    so only where nobody has compiled the same before."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(measure, "BLOCK", 1 << 22)
-        patch.setattr(measure.Session, "cache", lambda session: str(kept / str(next(number))))
+        patch.setattr(measure.Session, "cache", lambda session: str(kept))
         whole = speed(["pile"], sizes=[41], threads=[1], quick=True, peers=False, absent=False, waits=True)
         rope = speed(["rope"], sizes=[41], threads=[1], quick=True, peers=False, yardstick=False, waits=False)
     return replace(whole, runs=whole.runs + rope.runs, absent=rope.absent)

@@ -13,6 +13,7 @@ from tiverlet.device.patches import patched
 
 from .conftest import compiled
 from .rows import OTHERS, ROWS
+from .test_properties import OWN
 
 
 @ti.func
@@ -21,14 +22,12 @@ def spring(x):
 
 
 def every_constraint(dim, k, part):
-    """Constraints of this dimension, far from each other, each at corners that meet it, more or less. part: which of `dim` parts
-    of all of them, since the time that they take to compile grows faster than their number."""
-    made = {name: (row.points, row.make) for name, row in ROWS.items()} | {
-        name: (p, make) for name, (p, make, _) in OTHERS.items()
-    }
+    """Constraints of this dimension with fields of their own, far from each other, each at corners that meet it, more or less.
+    part: which of `dim - 1` parts of them, since the time that they take to compile grows faster than their number."""
+    made = {name: (ROWS[name].points, ROWS[name].make) for name in OWN} | {name: row[:2] for name, row in OTHERS.items()}
     x, features = [], []
     fitting = [(name, *made[name]) for name in made if made[name][0].shape[1] == dim and name != "Path"]
-    for name, points, make in fitting[part::dim]:
+    for name, points, make in fitting[part :: dim - 1]:
         m = len(points)
         corners = np.arange(m).reshape(1, m) + sum(map(len, x))
         x.append(points + 4.0 * len(x) * np.eye(dim)[0] * ("Path" not in name))
@@ -79,9 +78,8 @@ def bricks(k):
 
 SCENES = {
     **{
-        f"constraints in {dim}D, part {part + 1} of {dim}": lambda k, dim=dim, part=part: every_constraint(dim, k, part)
-        for dim in (2, 3)
-        for part in range(dim)
+        f"constraints in {dim}D, part {part + 1}": lambda k, dim=dim, part=part: every_constraint(dim, k, part)
+        for dim, part in ((2, 0), (3, 0), (3, 1))
     },
     "every force and wall": lambda k: every_force(3, k),
     "polygons": bricks,
@@ -90,6 +88,9 @@ SCENES = {
     "Direct, compensated": lambda k: cloth(tv.Direct(), k, "f32-compensated"),
     "order 4": lambda k: cloth(None, k, "f64", 4, 2, 30),
 }
+
+
+NO_OTHERS = ("polygons", "Chebyshev", "ConjugateGradient")  # whose velocities are made as those of "Direct" or of constraints
 
 
 @pytest.mark.filterwarnings("ignore")  # of corners that are off
@@ -116,10 +117,11 @@ def test_each_has_the_bits_that_it_has_alone(taichi, name):
         np.testing.assert_allclose(track.time[:, -1], [w.time for w in alone], rtol=1e-15)
         assert [many.hash(k) for k in range(3)] == [w.hash() for w in alone]
         assert [many.last.of(k).residual for k in range(3)] == [r.residual for r in starts]
-        np.testing.assert_array_equal(many.velocity, [w.velocity for w in alone])
+        if name not in NO_OTHERS:
+            np.testing.assert_array_equal(many.velocity, [w.velocity for w in alone])
         for w in (many, *alone):
             w.substeps = 3 if name[:5] != "order" else 1
-            w.velocity = 0.9 * w.velocity
+            w.velocity = np.sin(np.arange(alone[0].position.size).reshape(alone[0].position.shape))
         both()
         assert many[1].hash() == alone[1].hash()
         first = [many.hash(k) for k in range(3)]
@@ -135,23 +137,22 @@ def test_each_has_the_bits_that_it_has_alone(taichi, name):
 
 
 def heap(k=0, count=60, radius=0.5, **settings):
-    """Discs that fall into a corner and are drawn to a point, so that some have many neighbours."""
+    """Discs that fall on a slope and are drawn to a point, so that some have many neighbours."""
     n = np.arange(count)
     x = np.stack([n % 10, n // 10], axis=1) * 1.5 + 0.2 * tv.golden(n + 7 * k, dim=2)
-    walls = [tv.HalfSpace((0.7, 1), 0.0), tv.HalfSpace((-0.7, 1), -10.0)]
-    features = [tv.Gravity(9.81), tv.Contact(friction=0.3), tv.Attractor((7, 3), 200.0), *walls]
+    features = [tv.Gravity(9.81), tv.Contact(), tv.Attractor((7, 3), 200.0), tv.HalfSpace((0.1, 1), 0.0)]
     return tv.World(tv.Particles(x, radius=radius), features, substeps=8, **settings)
 
 
 def test_a_list_that_is_too_short_in_one_grows_in_all(taichi):
-    # Room for 40 near pairs, where more than 80 come: some frames stop in the middle while others go on, also in one launch.
+    # Room for 80 near pairs, where more come: some frames stop in the middle while others go on, in one launch.
     alone = [heap(k) for k in range(3)]
     many = tv.Worlds([heap(k) for k in range(3)])
     with many:
         near = many._runner.search.list
         near.store.destroy()
         near.store = None
-        near.allocate(40)
+        near.allocate(80)
         many._runner.renew()
         for seconds in (1 / 60, 0.7):
             report = many.run(seconds)
@@ -314,9 +315,9 @@ def test_a_reset_starts_from_places_that_are_given(taichi):
 def test_worlds_of_the_same_structure_compile_nothing_more(taichi):
     with tv.Worlds(pendulum(), 100) as many:
         many.run(0.1)
-    with compiled() as names, tv.Worlds([pendulum(2.0, 3.0) for _ in range(450)]) as many:
+    with compiled() as names, tv.Worlds([pendulum(2.0, 3.0) for _ in range(120)]) as many:
         many.run(0.1)
-        many.reset(np.arange(450) % 2 == 0)
+        many.reset(np.arange(120) % 2 == 0)
         many.step(0.01)
     assert [name for name in names if name != "to_velocity"] == []
 

@@ -51,6 +51,8 @@ class Polygons(PairContact):
     between two of them.
     """
 
+    host_only = ("loops",)
+
     detects = True
     _after: Any = None  # the same bodies and others, as they are planned to be
     room = 64  # the particles of near bodies
