@@ -279,18 +279,20 @@ def test_nothing_explodes_where_a_constraint_has_no_direction(world, name):
 
 @pytest.mark.parametrize(
     ("dim", "solver"),
-    [(2, tv.Jacobi()), (2, tv.Chebyshev()), (2, tv.ConjugateGradient()), (3, tv.Direct())],
+    [(2, tv.Chebyshev()), (2, tv.ConjugateGradient()), (3, tv.Direct())],
     ids=str,
 )
 def test_no_bad_start_flies(world, dim, solver):
     # Rigid constraints that nothing in the scene pulled apart have no energy to give, at no number of substeps: what they do not
     # give up before the first one they give up at a third of their size in a frame: 2 sizes in 6 frames, after the 2 that it
-    # takes to where they are met. Passes as such would move bodies by their size in a substep: 600 sizes at 100.
+    # takes to where they are met. Passes as such would move bodies by their size in a substep: 600 sizes at 100. A single pass of
+    # Chebyshev is one of Jacobi.
     bad = BadStart(dim)
     start = tv.Particles(bad.position, pinned=bad.pinned, mass=0.1)
-    w = world(start, bad.features, precision="f64", solver=solver, iterations=8 if isinstance(solver, tv.Chebyshev) else 1)
-    for substeps in (1, 20, 100):
+    w = world(start, bad.features, precision="f64", solver=solver)
+    for substeps, passes in ((1, 1), (20, 8), (100, 1)):
         w.velocity, w.position, w.substeps = np.zeros_like(bad.position), bad.position, substeps
+        w.iterations = passes if isinstance(solver, tv.Chebyshev) else 1
         for frame in range(6):
             report = w.step(1 / 60)
             assert (bad.far(w.position) < 4).all() and ("moved" in report.flags) == (frame == 0)
