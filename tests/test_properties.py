@@ -290,9 +290,8 @@ def test_no_bad_start_flies(world, dim, solver):
     bad = BadStart(dim)
     start = tv.Particles(bad.position, pinned=bad.pinned, mass=0.1)
     w = world(start, bad.features, precision="f64", solver=solver)
-    for substeps, passes in ((1, 1), (20, 8), (100, 1)):
-        w.velocity, w.position, w.substeps = np.zeros_like(bad.position), bad.position, substeps
-        w.iterations = passes if isinstance(solver, tv.Chebyshev) else 1
+    for substeps, passes in ((1, 1), *([(20, 8)] if isinstance(solver, tv.Chebyshev) else []), (100, 1)):
+        w.velocity, w.position, w.substeps, w.iterations = np.zeros_like(bad.position), bad.position, substeps, passes
         for frame in range(6):
             report = w.step(1 / 60)
             assert (bad.far(w.position) < 4).all() and ("moved" in report.flags) == (frame == 0)
@@ -304,7 +303,7 @@ def test_what_was_no_number_leaves_nothing_behind(world, dim, solver):
     """A link and all constraints of a dimension that have fields of their own in one world, rigid and soft. After a frame with
     NaN for every place, its state is put back to what it was, and goes on to the bit; so a frame that is tried again with more
     substeps is what it would have been. And places and velocities that are assigned are a new start."""
-    features, points = [tv.Gravity(np.zeros(dim)), tv.Contact(friction=0.3, restitution=0.5)], []
+    features, points = [tv.Gravity(np.zeros(dim)), *([tv.Contact(friction=0.3, restitution=0.5)] if dim == 2 else [])], []
 
     def corners(at):
         """Two blocks of them, out of the way of others; one by itself stays where it is."""

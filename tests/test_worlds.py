@@ -90,7 +90,7 @@ SCENES = {
 }
 
 
-NO_OTHERS = ("polygons", "Chebyshev", "ConjugateGradient")  # whose velocities are made as those of "Direct" or of constraints
+NO_OTHERS = ("Chebyshev", "ConjugateGradient")  # whose velocities are made as those of "Direct"
 
 
 @pytest.mark.filterwarnings("ignore")  # of corners that are off
