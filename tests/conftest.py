@@ -37,9 +37,9 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as it is in the backgro
 collect_ignore = [] if patched else ["test_compiling.py", "test_sharing.py"]  # which are about what is not there then
 # Files that take longest, which come first: else one worker would go on with one of them when the others are done.
 LONG = (
-    "demos", "worlds", "properties", "determinism", "sleep", "speed", "periodic", "recordings", "sweep", "edit_in_place",
-    "polygons", "knobs", "spin", "contact", "loads", "pairs", "overlap_release", "sharing", "solvers", "impacts", "walls",
-    "docs", "fuzz",
+    "demos", "edit_in_place", "properties", "worlds", "determinism", "speed", "sleep", "events", "spin", "polygons", "periodic",
+    "loads", "pairs", "contact", "walls", "impacts", "solvers", "motors", "knobs", "docs", "recordings", "sweep", "extremes",
+    "report", "compiling", "solids", "overlap_release", "conservation", "regroup", "fuzz", "sharing", "granular", "direct",
 )  # fmt: skip
 ARCH = os.environ.get("TIVERLET_ARCH", "cpu")
 SOURCES = str(pathlib.Path(tv.__file__).parent)

@@ -294,7 +294,7 @@ def arm():
 def test_functions_that_kernels_call_change_no_bit(monkeypatch, scene, precision):
     # By kernels that call what is long, and by others that have it copied.
     made = []
-    for passes in (BRIEF, dict(BRIEF)):  # calls are for BRIEF itself
+    for passes in (BRIEF, LEAN):
         monkeypatch.setattr(build, "_passes", lambda *scene, chosen=passes: chosen)
         with tv.World(*scene(), substeps=8, precision=precision) as w:
             made.append(([w.step(1 / 60) for _ in range(60)], w.hash(), w._runner.memory.compiler.calls))

@@ -173,6 +173,7 @@ def test_what_is_absent_has_no_field_and_no_kernel(world):
 def test_launches_count_what_the_scene_needs(world):
     # Kernel launches of a frame, counted at Taichi's door: one for all of it on a CPU; else one for each pass of a substep.
     for features, path, expected in (
+        ([tv.Gravity(1.0)], "launched", {"integrate": 5, "measure": 1}),
         ([tv.Gravity(1.0), tv.Distance([[0, 1]])], "launched", {f"integrate {PASS}": 5, PASS: 5, "measure": 1}),
         (
             [tv.Gravity(1.0), tv.Distance([[0, 1]]), tv.Contact(friction=0.1, restitution=0.5)],

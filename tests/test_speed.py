@@ -28,6 +28,7 @@ def report(kept):
     so only where nobody has compiled the same before."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(measure, "BLOCK", 1 << 22)
+        patch.setattr(waits, "QUICK", 2)
         patch.setattr(measure.Session, "cache", lambda session: str(kept))
         whole = speed(["pile"], sizes=[41], threads=[1], quick=True, peers=False, absent=False, waits=True)
         rope = speed(["rope"], sizes=[41], threads=[1], quick=True, peers=False, yardstick=False, waits=False)
