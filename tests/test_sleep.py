@@ -29,7 +29,7 @@ def rough(world, x, time: float | None = 0.5, wide=WIDE, substeps=10, v=0.0, kno
     """Discs that spin, rub, bounce and tell of it, between walls, the last of them a sensor that is held far away if it has no
     other place: one structure for all heaps. time: None for a world without Sleep."""
     k = np.arange(len(x))
-    start = tv.Particles(x, velocity=v, radius=R, spin=0.0, group=k // (len(x) - 1), pinned=[len(x) - 1])
+    start = tv.Particles(x, velocity=v, radius=R, spin=0.0, orientation=0, group=k // (len(x) - 1), pinned=[len(x) - 1])
     features = [tv.Gravity(g), tv.Box((0, 0), wide, **ROUGH), tv.Contact(sensors=[(0, 1)], **ROUGH)]
     w = world(start, [*features, *([] if time is None else [tv.Sleep(time=time)])], substeps=substeps, path=path)
     for name, value in knobs.items():
