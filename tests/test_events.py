@@ -20,11 +20,25 @@ def rows(pairs):
     return {tuple(map(int, pair)) for pair in pairs}
 
 
-def bouncing(world, x, v=0.0, m=1.0, e=1.0, g=0.0, **settings):
-    """Balls in space, of which the first cannot move, and a floor."""
-    mass = np.where(np.arange(len(x)), m, np.inf)
-    features = [tv.Gravity(g), tv.Contact(restitution=e, events=True), tv.HalfSpace((0, 1, 0), 0.0, restitution=e, events=True)]
-    return world(tv.Particles(x, velocity=v, radius=0.05, mass=mass), features, precision="f64", **settings)
+def flat(world, start, g=9.81, wide=99.0, more=(), **settings):
+    """In the plane, in a box that tells of what touches it: one structure."""
+    features = [tv.Gravity(g), tv.Contact(events=True), tv.Box([-wide] * 2, [wide] * 2, events=True), *more]
+    return world(start, features, precision="f64", **settings)
+
+
+def bouncing(world, start, e=1.0, g=0.0, floor=0.0, **settings):
+    """In space, above a floor."""
+    walls = [tv.HalfSpace((0, 1, 0), floor, restitution=1.0, events=True)]
+    w = world(start, [tv.Gravity(g), tv.Contact(restitution=1.0, events=True), *walls], precision="f64", **settings)
+    w.features[1].restitution = w.features[2].restitution = e
+    return w
+
+
+def balls(x, v=0.0, m=1.0):
+    """The first of them cannot move."""
+    return tv.Particles(
+        x, velocity=v, radius=np.r_[0.05 + 1e-12, np.full(len(x) - 1, 0.05)], mass=np.r_[np.inf, np.full(len(x) - 1, m)]
+    )
 
 
 def test_a_bouncing_ball(world):
@@ -34,7 +48,7 @@ def test_a_bouncing_ball(world):
     # up to e g h in each bounce.
     H, e, g, m, r, frame, substeps = 0.5, 0.8, 9.81, 2.0, 0.05, 1 / 60, 20
     h = frame / substeps
-    w = bouncing(world, [[0.0, 0, 0], [0, 2 * r + H, 0], [1, r + H, 0]], m=m, e=e, g=g, substeps=substeps)
+    w = bouncing(world, balls([[0.0, 0, 0], [0, 2 * r + H, 0], [1, r + H, 0]], m=m), e, g, substeps=substeps)
     seen, t0, v0 = [[], []], np.sqrt(2 * H / g), np.sqrt(2 * g * H)
     for _ in range(120):
         w.step(frame)
@@ -57,7 +71,7 @@ def test_a_cradle(world):
     m, v, x = 1.5, 2.0, [[0.0, 9, 0], [-0.3, 3, 0], *([0.1 * k, 3, 0] for k in range(4))]
     moving = np.zeros((6, 3))
     moving[1, 0] = v
-    w, seen = bouncing(world, x, moving, m), {}
+    w, seen = bouncing(world, balls(x, moving, m)), {}
     for _ in range(12):
         w.step(1 / 60)
         for touch in (w.events().touches[k : k + 1] for k in range(len(w.events()))):
@@ -105,8 +119,8 @@ def test_what_brute_force_finds(world, dim):
     # same in frames of 6 substeps, before velocities are first projected (after 32). Impulses are sums, speeds the highest.
     particles, h, gravity = cloud(dim, 60, dim), 1 / 200, np.zeros(dim)
     gravity[1] = -9.81
-    made = [(tv.Gravity(9.81), tv.Contact(events=True)) for _ in range(2)]
-    single, whole = (world(particles, some, substeps=k, precision="f64") for some, k in zip(made, (1, 6), strict=True))
+    build = flat if dim == 2 else lambda *given, **more: bouncing(*given, 0.0, 9.81, -99.0, **more)
+    single, whole = (build(world, particles, substeps=k) for k in (1, 6))
     old, before, counts = None, set(), np.zeros(4, dtype=int)
     for _ in range(5):
         start, impulses, speeds, first, last, met = before, {}, {}, {}, {}, {}
@@ -170,11 +184,15 @@ def stage(world, sensing=True, events=True, **settings):
     k = np.arange(len(x))
     group = np.where(k % 10 == 9, 3, 0)
     more = {"events": events, **({"sensors": [(0, 3)]} if sensing else {"groups": [(0, 0), (3, 3)]})}
-    return world(
-        tv.Particles(x, radius=np.where(group == 3, 0.1, 0.05), group=group, pinned=np.flatnonzero(k % 20 == 19)),
-        [tv.Gravity(5.0), tv.Box((-1, -1), (1, 1), restitution=0.3, events=events), tv.Contact(0.3, 0.4, **more)],
-        **({"substeps": 5, "precision": "f32-compensated"} | settings),
-    )
+    start = tv.Particles(x, radius=np.where(group == 3, 0.1, 0.05), group=group, pinned=np.flatnonzero(k % 20 == 19))
+    return staged(world, start, events, **more, **settings)
+
+
+def staged(world, start, walls, g=5.0, wide=1.0, events=False, sensors=(), groups=None, **settings):
+    """Discs that rub and bounce in a box."""
+    features = [tv.Gravity(g), tv.Box([-wide] * 2, [wide] * 2, restitution=0.3, events=walls)]
+    features.append(tv.Contact(0.3, 0.4, events=events, sensors=sensors, groups=groups))
+    return world(start, features, **({"substeps": 5, "precision": "f32-compensated"} | settings))
 
 
 def test_sensors_note_what_overlaps_and_touch_nothing(world):
@@ -216,13 +234,11 @@ def test_what_begins_and_ends_is_what_touches(world):
 
 
 def test_a_heap_leans_on_what_is_below(world):
-    # At rest: what all that is above a place weighs goes through the contacts and walls below it. In a second a disc on a static
-    # one on the floor gets m g t, and so does the floor from it: with both, twice that.
+    # At rest: what all that is above a place weighs goes through the contacts and walls below it. In a second a disc of mass m on
+    # one of 2 m on the floor gets m g t, and the floor 3 m g t.
     m, g = 3.0, 9.81
-    x = [[0.0, 0.1], [0.0, 0.29999]]
-    w = world(
-        tv.Particles(x, radius=0.1, mass=m), [tv.Gravity(g), tv.Contact(events=True), tv.Box([-0.1, 0], [0.1, 1], events=True)]
-    )
+    x = [[0.0, -98.9], [0.0, -98.6999], [9.0, 9.0]]
+    w = flat(world, tv.Particles(x, radius=[0.1, 0.1, 0.11], mass=[2 * m, m, np.inf]))
     w.run(0.5)
     total = np.zeros(2)
     for _ in range(30):
@@ -230,9 +246,9 @@ def test_a_heap_leans_on_what_is_below(world):
         assert len(w.events().lasting) == len(w.events()) == 1 and w.events().touches.speed[0] == 0
         walls = w.wall_events().lasting
         assert rows(walls.pairs) == {(0, 2)} and len(w.wall_events()) == 1
-        np.testing.assert_allclose(walls.point, [[0, 0]], atol=1e-4)
+        np.testing.assert_allclose(walls.point, [[0, -99]], atol=1e-4)
         total += w.events().touches.impulse[0], walls.impulse[0]
-    np.testing.assert_allclose(total, [m * g / 2, m * g], rtol=1e-3)
+    np.testing.assert_allclose(total, [m * g / 2, 3 * m * g / 2], rtol=1e-3)
 
 
 def test_recorded_cloned_edited(world, tmp_path):
@@ -275,11 +291,9 @@ def test_recorded_cloned_edited(world, tmp_path):
 
 def test_what_is_held_and_let_go(world):
     # Of a pair only the particle that moves writes; when the other one is let go, it goes on as one contact.
-    pin = tv.Pin([0], (0.0, 0.0))
-    w = world(
-        tv.Particles([[0.0, 0.0], [0.0, 0.19999]], radius=0.1),
-        [tv.Gravity(9.81), tv.Contact(events=True), pin, tv.Box((-1, -0.1), (1, 1), events=True)],
-    )
+    pin = tv.Pin([0], (0.0, -98.9))
+    start = tv.Particles([[0.0, -98.9], [0.0, -98.6999], [9.0, 9.0]], radius=[0.1, 0.1, 0.11], mass=[2.0, 1.0, np.inf])
+    w = flat(world, start, more=[pin])
     w.run(0.1)
     assert rows(w.events().lasting.pairs) == {(0, 1)}
     np.testing.assert_allclose(w.events().touches.normal, [[0, -1]], atol=1e-6)
@@ -296,11 +310,8 @@ def test_nothing_is_lost_where_lists_grow(world):
     x = np.concatenate([0.01 * tv.golden(k, dim=2), [[-3.0, 0.0], [3.5, 0.25]]])
     v = np.concatenate([np.zeros((60, 2)), [[120.0, 0.0], [-120.0, 0.0]]])
     group = np.where(np.arange(62) < 60, 1, 0)
-    w = world(
-        tv.Particles(x, radius=np.where(group, 0.5, 0.1), velocity=v, group=group),
-        [tv.Contact(sensors=[(0, 1), (1, 1)])],
-        substeps=100,
-    )
+    start = tv.Particles(x, radius=np.where(group, 0.5, 0.1), velocity=v, group=group, pinned=[59])
+    w = staged(world, start, False, 0.0, 99.0, sensors=[(0, 1), (1, 1)], substeps=100)
     room = w._runner.search.list.room
     w.step(1 / 20)
     assert w._runner.search.list.room > room
