@@ -279,8 +279,9 @@ def slope(world, friction, dim):
     x = np.zeros((n, dim))
     x[:, 1] = 0.1 + 0.1 * k
     x[:, [0, 2][: dim - 1]] = tv.golden(k, dim - 1).reshape(n, -1) - 0.5
-    features = [tv.Gravity(9.81), tv.Contact(friction=friction), tv.HalfSpace(np.eye(dim)[1], friction=friction)]
+    features = [tv.Gravity(9.81), tv.Contact(friction=0.5), tv.HalfSpace(np.eye(dim)[1], friction=0.5)]
     w = world(tv.Particles(x, radius=0.1), features, substeps=20)
+    features[1].friction = features[2].friction = friction
     w.run(4.0)
     assert np.isfinite(w.position).all() and w.last.overlap < 0.1
     # Of a triangle of height H and half width B the mean height is H / 3, the median distance from the middle B (1 - sqrt(1/2)).
@@ -297,18 +298,20 @@ def test_heaps_are_steeper_with_friction_and_flat_without(world, dim):
     assert 0.02 < slopes[0] < 0.5 * slopes[1], slopes
 
 
+def crowded(world, start, low, high, skin, g=9.81, **settings):
+    """Discs that rub and bounce in a box."""
+    contact = tv.Contact(friction=(0.6, 0.4), restitution=0.3, skin=skin)
+    return world(start, [tv.Gravity(g), contact, tv.Box(low, high, friction=0.5, restitution=0.3)], **settings)
+
+
 def test_what_takes_over_a_state_goes_on_to_the_bit(world):
     # With other lists, too. For paths see test_sleep.py.
     rng = np.random.default_rng(3)
     k = np.arange(200)
     x = np.stack([k % 14 * 0.21, 0.2 + k // 14 * 0.21], axis=1) + rng.uniform(0, 0.005, (200, 2))
-    worlds = []
+    start, worlds = tv.Particles(x, radius=0.08 + 0.02 * tv.golden(k)), []
     for skin in ("auto", 0.05):
-        features = [
-            tv.Gravity(9.81), tv.Contact(friction=(0.6, 0.4), restitution=0.3, skin=skin),
-            tv.Box((-0.2, 0), (3.2, 9), friction=0.5, restitution=0.3),
-        ]  # fmt: skip
-        worlds.append(world(tv.Particles(x, radius=0.08 + 0.02 * tv.golden(k)), features, substeps=10))
+        worlds.append(crowded(world, start, (-0.2, 0), (3.2, 9), skin, substeps=10))
         worlds[-1].run(0.5)
     before = worlds[0].hash()
     assert before == worlds[1].hash()
@@ -327,8 +330,10 @@ def test_bounces_survive_a_new_list_between_two_passes(world):
     x = np.stack([k % 15 * 0.215 + 0.15, k // 15 * 0.215 + 0.15], axis=1)
     v = np.random.default_rng(4).normal(size=(150, 2)) * 2
     hashes = set()
-    contact, box = tv.Contact(restitution=0.9), tv.Box((0, 0), (3.4, 2.4), restitution=0.9)
-    w = world(tv.Particles(x, velocity=v, radius=0.1), [contact, box], substeps=5, iterations=3)
+    start = tv.Particles(x, velocity=v, radius=0.1 - 0.02 * tv.golden(k))
+    w = crowded(world, start, (0, 0), (3.4, 2.4), 0.5, 0.0, substeps=5, iterations=3)
+    contact, box = w.features[1:]
+    contact.restitution = box.restitution = 0.9
     begin = checkpoint.keep(w)
     for contact.skin in (0.5, 0.002):
         checkpoint.put_back(w, begin)
