@@ -67,16 +67,20 @@ def test_volumes_of_solids(world):
     solid = tv.Volume([[20, 21, 23, 22]])
     pairs = np.array([(i, j) for i in range(24) for j in range(i) if np.linalg.norm(x[i] - x[j]) < 1.5])
     springs = tv.Distance(pairs, compliance=1e-3)
-    w = world(tv.Particles(x), [tv.Gravity(9.81), springs, shells, solid, tv.HalfSpace((0, 1, 0), -1.5)], precision="f64")
+    features = [tv.Gravity(9.81), springs, shells, solid, tv.HalfSpace((0, 1, 0), -1.5)]
+    w = world(tv.Particles(x), features, precision="f64")
     values = case("R25b_volume")["values"]
     np.testing.assert_allclose(shells.rest, [values["cube_edge1"], values["icosahedron_edge1"]], rtol=1e-14)
     np.testing.assert_allclose(solid.rest, values["regular_tet_edge1"], rtol=1e-14)
     rerun(w, 1.0, iterations=40)
     for f in (shells, solid):
         assert np.abs(f.rest_of(w.position) / f.rest - 1).max() <= 1e-6
-    shells.pressure = 1.3
-    w.run(0.5)
-    np.testing.assert_allclose(shells.rest_of(w.position), 1.3 * shells.rest, rtol=1e-5)
+    # Inflated from the start; what comes later, by a ramp, is shown by areas.
+    features = [f.copy() for f in features]
+    features[2] = tv.Volume(np.concatenate([cube, np.array(faces) + 8]), pressure=1.3)
+    w = world(tv.Particles(x), features, precision="f64", iterations=40)
+    w.run(1.5)
+    np.testing.assert_allclose(features[2].rest_of(w.position), 1.3 * shells.rest, rtol=1e-5)
 
 
 def test_a_soft_ring_breathes(world):
@@ -180,21 +184,17 @@ def test_meshes_and_loops_that_are_refused():
 def test_bodies_have_the_same_bits_on_both_paths(world):
     # And clones go on alike, with the memory of soft constraints and of shapes that flow.
     rng = np.random.default_rng(1)
-    flat = np.concatenate([ring(40), rng.normal(size=(70, 2)) + [3, 0]])
-    shape = tv.ShapeMatch([np.arange(40, 110), np.arange(10)], compliance=[1e-3, 0.0], damping=0.1, creep=[1.0, 0.0])
-    cube = np.concatenate([CORNERS, CORNERS + [2, 0, 0]])
-    scenes = [
-        (flat, [tv.Gravity(9.81), tv.Area([np.arange(40)], compliance=1e-3, pressure=1.1), shape, tv.Pin([0])]),
-        (cube, [tv.Volume(np.concatenate([CUBE, CUBE + 8]), pressure=1.1), tv.ShapeMatch([np.arange(4, 12)])]),
+    x = np.concatenate([CORNERS, CORNERS + [2, 0, 0], rng.normal(size=(70, 3)) + [9, 0, 0]])
+    shape = tv.ShapeMatch([np.arange(4, 12), np.arange(16, 86)], compliance=[0.0, 1e-3], damping=0.1, creep=[0.0, 1.0])
+    volume = tv.Volume(np.concatenate([CUBE, CUBE + 8]), compliance=[1e-3, 0.0], pressure=1.1)
+    pair = [
+        world(tv.Particles(x), [tv.Gravity(9.81), volume.copy(), shape.copy(), tv.Pin([0])], path=path)
+        for path in ("fused", "parallel")
     ]
-    fused = []
-    for x, features in scenes:
-        pair = [world(tv.Particles(x), [f.copy() for f in features], path=path) for path in ("fused", "parallel")]
-        for w in pair:
-            w.run(0.4)
-        assert pair[0].hash() == pair[1].hash()
-        fused.append(pair[0])
-    w = fused[0]
+    for w in pair:
+        w.run(0.4)
+    assert pair[0].hash() == pair[1].hash()
+    w = pair[0]
     twin = w.clone()
     assert twin.hash() == w.hash()
     twin.run(0.2)

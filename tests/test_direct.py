@@ -87,7 +87,7 @@ def test_many_passes_agree_with_relaxation(world):
         substeps=5, iterations=5, precision="f64", solver=tv.Direct(),
     )  # fmt: skip
     unprojected(w)
-    for _ in range(5):
+    for _ in range(3):
         w.step(1 / 60)
         for _ in range(5):
             plain.substep(1 / 300, 4000)
@@ -171,7 +171,8 @@ def test_redundant_links_are_left_to_the_others(world):
     rods = [(i, j) for i in range(4) for j in range(i)]
     for precision in ("f64", "f32"):
         v = np.array([[0.0, -1], [1, 0], [0, 1], [-1, 0]]) @ [[1, 0.2], [-0.2, 1]] + [3.0, 0]
-        w = world(tv.Particles(square, velocity=v), [tv.Distance(rods)], precision=precision, solver=tv.Direct())
+        start = tv.Particles(np.vstack([square, [[9.0, 9.0]]]), velocity=np.vstack([v, [[0.0, 0.0]]]), pinned=[4])
+        w = world(start, [tv.Gravity(0.0), tv.Distance(rods)], precision=precision, solver=tv.Direct())
         spin = tv.measure.angular_momentum(w)
         report = w.run(2.0)
         assert report.clean and report.residual < 1e-5

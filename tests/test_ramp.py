@@ -11,7 +11,7 @@ DT, L, M = 1 / 60, 0.5, 0.2
 
 def pendulum(world, *features, **options):
     """One particle of mass M at a distance L from one that is pinned, without gravity."""
-    return world(tv.Particles([[0.0, 0], [L, 0]], mass=M, pinned=[0]), features, **options)
+    return world(tv.Particles([[0.0, 0], [L, 0]], mass=M, pinned=[0]), [tv.Gravity(0.0), *features], **options)
 
 
 @pytest.mark.parametrize("solver", [tv.Jacobi(), tv.Direct()], ids=str)
@@ -85,11 +85,11 @@ def test_a_muscle_does_the_work_of_its_load(world):
 def crowd():
     """Of what has rest values some, apart from each other: particles, features, and a function that turns all knobs."""
     x = [
-        (0.0, 0), (0.5, 0), (1, 0), (1.5, 0.2),  # links, stop, rope
+        (-5.0, 0), (0, 0), (0.5, 0), (1, 0), (1.5, 0.2),  # one by itself; links, stop, rope
         (9, 0), (10, 0), (10, 1), (9, 1),  # loop
     ]  # fmt: skip
     features = [
-        tv.Distance([[0, 1], [1, 2]]), tv.AngleLimit([[0, 1, 2]], -0.2, 0.3), tv.Area([[4, 5, 6, 7]]), tv.Rope([[2, 3]])
+        tv.Distance([[1, 2], [2, 3]]), tv.AngleLimit([[1, 2, 3]], -0.2, 0.3), tv.Area([[5, 6, 7, 8]]), tv.Rope([[3, 4]])
     ]  # fmt: skip
 
     def turn(features, by):
@@ -144,7 +144,7 @@ def test_copies_edits_and_recordings_know_where_a_ramp_begins(world, tmp_path):
         for k in range(3):
             turn(features, 1.0 - 0.05 * k)
             if k == 1:
-                w.remove([3])
+                w.remove([0])
             w.step(DT)
             recorder.log()
     assert tv.replay(tmp_path / "a.rrd").verify().kind == "intact"

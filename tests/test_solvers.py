@@ -203,10 +203,10 @@ def test_64_chebyshev_refuses_what_is_unstable(world):
 
 
 @pytest.mark.parametrize("make", [tv.Chebyshev, tv.ConjugateGradient])
-def test_a_solver_has_the_same_bits_phase_by_phase(world, make):
-    # With a team of threads too, see test_every_solver_has_the_same_bits_on_1_and_8_threads.
+def test_a_solver_has_the_same_bits_in_one_kernel_and_for_a_team(world, make):
+    # Which has those of phase by phase, see test_every_solver_has_the_same_bits_on_1_and_8_threads.
     hashes = []
-    for path in ("fused", "launched"):
+    for path in ("fused", "parallel"):
         x, pairs = cloth(8)
         features = [tv.Gravity(9.81), tv.Distance(pairs), tv.Rope([[0, 9], [63, 54]])]
         w = world(tv.Particles(x, pinned=np.arange(8)), features, solver=make(), path=path, iterations=4, substeps=3)
