@@ -249,7 +249,7 @@ def test_constraints_that_are_not_met_are_flagged_with_what_helps(world, solver,
 @pytest.mark.parametrize(
     "solver, precision, pins",
     [
-        (tv.ConjugateGradient(8), "f32", [0, 132]),
+        (tv.ConjugateGradient(6), "f32", [0, 132]),
         (tv.ConjugateGradient(), "f64", [0, 11, 132, 143]),
         (tv.Chebyshev(), "f32", [0, 132]),
     ],
