@@ -54,7 +54,8 @@ FEW = [(-0.5, 0.2), (0.0, 0.1), (0.5, 0.3), (0.1, 0.4), (2.017036, -0.207938), (
 
 
 def test_nothing_gets_out_of_a_function(world):
-    keeps(world, [tv.Sdf(round_room, friction=0.3, restitution=0.8)], lambda x, w: 1 - np.linalg.norm(x, axis=1), lambda s: {})
+    room = [tv.Sdf(round_room, friction=0.3, restitution=0.8)]
+    keeps(world, room, lambda x, w: 1 - np.linalg.norm(x, axis=1), lambda s: {}, room)
 
 
 MU, BOUNCE = 0.4, 0.5
