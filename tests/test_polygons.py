@@ -365,7 +365,7 @@ def test_corners_that_cross_part_over_the_nearer_edge(world):
     # Two wedges part soonest over one of their edges (separating axes). That is what contacts have to say, and what they do
     # conserves momentum, and angular momentum but for an impulse of 0.2 kg m/s times the slip in a substep, 0.2 m/s h.
     rng, shapes = np.random.default_rng(5), []
-    while len(shapes) < 60:
+    while len(shapes) < 30:
         tips = []
         for side in (-1.0, 1.0):
             half, lean, length = rng.uniform(0.15, 0.6), rng.uniform(-0.5, 0.5), rng.uniform(0.5, 1.0)

@@ -40,11 +40,10 @@ def scenes(dim):
     }
 
 
-def one_of(world, dim, name, start, before=(), **more):
-    """Walls of all shapes, of which only this one is switched on: one structure for all, but for friction and restitution."""
-    options = {key: more.pop(key) for key in ("friction", "restitution") if key in more}
-    walls = {key: make(active=key == name, **options) for key, (make, _) in scenes(dim).items()}
-    w = world(start, [*before, *walls.values()], **more)
+def one_of(world, dim, name, start, before, **settings):
+    """Walls of all shapes, of which only this one is switched on: one structure for all."""
+    walls = {key: make(active=key == name) for key, (make, _) in scenes(dim).items()}
+    w = world(start, [*before, *walls.values()], **settings)
     return w, walls[name], scenes(dim)[name][1]
 
 
@@ -269,23 +268,18 @@ def test_moving_balls_and_rods_carry_what_they_meet(world):
 
 
 def test_friction_on_every_wall_holds_and_slides(world):
-    # On top of a rod, where it is level, and on planes: a horizontal velocity v is used up after v^2 / (2 mu g).
-    for k in range(3):
-        w, _ = lying(world, k, (2.0, 0.0))
+    # On a plane, on top of a rod, and in a box, of which one is switched on: a horizontal velocity v is used up after
+    # v^2 / (2 mu g).
+    for on in range(3):
+        walls = [
+            tv.HalfSpace((0, 1), 0.0, friction=0.5, active=on == 0),
+            tv.Capsule((-9, -1), (9, -1), 1.0, friction=0.5, active=on == 1),
+            tv.Box((-9, 0), (9, 9), friction=0.5, active=on == 2),
+        ]
+        w = world(tv.Particles([[0.0, 0.1]], velocity=(2.0, 0.0), radius=0.1), [tv.Gravity(9.81), *walls], precision="f64")
         w.run(1.0)
         assert w.position[0, 0] == pytest.approx(4 / (2 * 0.5 * 9.81), rel=1e-3)
         np.testing.assert_allclose(w.velocity, 0.0, atol=1e-9)
-
-
-def lying(world, k, v=(0.0, 0.0), friction=0.5):
-    """A disc on the k-th of three walls, the others switched off."""
-    walls = [
-        tv.HalfSpace((0, 1), 0.0, friction=friction, active=k == 0),
-        tv.Capsule((-50, -1), (50, -1), 1.0, friction=friction, active=k == 1),
-        tv.Box((-50, 0), (50, 9), friction=friction, active=k == 2),
-    ]
-    start = tv.Particles([[0.0, 0.1]], velocity=v, radius=0.1)
-    return world(start, [tv.Gravity(9.81), *walls], precision="f64"), walls[k]
 
 
 def test_bad_walls_are_named():
@@ -302,7 +296,8 @@ def test_bad_walls_are_named():
 
 def test_a_conveyor_takes_along_what_lies_on_it(world):
     # Row 70: a long rod runs along its own axis at 1 m/s. Friction brings a disc up to its speed after v / (mu g), then holds.
-    w, belt = lying(world, 1, friction=0.4)
+    belt = tv.Capsule((-50.0, -1.0), (50.0, -1.0), 1.0, friction=0.4)
+    w = world(tv.Particles([[0.0, 0.1]], radius=0.1), [tv.Gravity(9.81), belt], precision="f64")
     for k in range(90):
         shift = (k + 1) / 60
         belt.a, belt.b = (-50.0 + shift, -1.0), (50.0 + shift, -1.0)
