@@ -64,8 +64,8 @@ class Contact(PairContact):
 
     Friction wants back the slip s of a pair, up to friction times the overlap: what a pair has moved across its normal since it
     touched, kept as long as it touches (Cundall and Strack 1979). Restitution gives the pair the normal velocity -e times the one
-    that it had before the substep, from the moment on when it met. Neither depends on h, but where forces draw the two together: an
-    acceleration g takes g h of the speed in a bounce at e = 1, on average, which walls do not.
+    that it had before the substep, from the moment on when it met. Neither depends on h, but where forces draw the two together:
+    an acceleration g takes g h of the speed in a bounce at e = 1, on average, which walls do not.
 
     Particles that spin (see Particles) slide past each other by what the points that touch do, and turn as friction acts there.
     friction = (static, dynamic, rolling, twisting) also resists rolling, by a moment of up to rolling * r times the normal force,
