@@ -162,6 +162,7 @@ def test_what_does_nothing_is_said(world):
         world(start, [tv.Contact()])
     with pytest.warns(UserWarning, match=r"particle 2 starts 1.5 m outside along axis 0 \(1 such in all\); push_out = 1 m/s"):
         world(start, [tv.Box((-2, -2), (2, 2))])
+    world(start, [tv.Box((-2, -2), (2, 2), active=False)])  # which has no inside
 
 
 @ti.func

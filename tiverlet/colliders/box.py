@@ -64,7 +64,9 @@ class Box(Collider):
         self.lower, self.upper = self.lower, self.upper
 
     def review(self, particles: Particles, inv_mass: np.ndarray) -> None:
-        """Warn of particles whose centers start outside."""
+        """Warn of particles whose centers start outside; not of a box that is switched off, which has no inside."""
+        if not self.active:
+            return
         x = particles.position
         out = np.maximum(self.lower - x, x - self.upper)
         out[inv_mass == 0] = 0
