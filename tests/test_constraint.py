@@ -47,6 +47,19 @@ def test_a_length_of_ones_own_is_a_distance(world):
         np.testing.assert_allclose(load, made[0][1], atol=1e-5)
 
 
+def test_what_has_no_direction_says_how_far_it_is_off(world):
+    # Central differences of |a - b| at a = b are 0: a rigid link of L m cannot open there, and misses all of L. A spring pulls
+    # nowhere, as F = -C grad C / alpha says, and lacks nothing. Nothing is held to what does not move.
+    pairs, links = [[0, 1], [2, 3], [4, 5]], []
+    for rest in (2.0, 1.0):
+        links.append(tv.Constraint(length, pairs, rest, compliance=[0.0, 1e-3, 0.0]))
+    apart = tv.Constraint(length, [[0, 1]], 0.5, side=1)
+    with pytest.warns(UserWarning, match="cannot move"):
+        w = world(tv.Particles(np.zeros((6, 2)), pinned=[4, 5]), [*links, apart], precision="f64")
+    assert w.step(1 / 60).residual == 1 and (w.position == 0).all()
+    assert all(np.array_equal(link.residual, [1, 0, 0]) for link in links) and apart.residual[0] == 0
+
+
 def test_a_bead_on_a_wire(world):
     # On a circle it is the pendulum R06b. Down y = (c + 1) x^2 / 2 from rest, energy is kept and the wire never left.
     v = case("R06b_pendulum_state")["values"]["90deg_t5"]

@@ -112,7 +112,8 @@ class Constraint(Scalar):
     (measured: 0.19 instead of 0.11 us per distance, 2.0 instead of 0.23 us per dihedral angle). Dual numbers would need operators
     that Taichi's structs do not have, and what Taichi differentiates itself is kernels, not functions inside of them.
     A gradient that is given is compared with differences when the world is built: ValueError names the corner and the axis.
-    Where function or gradient are not finite, as between coincident corners, the constraint does not act.
+    Where function or gradient are not finite, as between coincident corners, the constraint does not act, and where the gradient
+    is 0 it cannot; if it is rigid its residual tells what it misses, by a function of 0 where that is not finite.
     """
 
     index_name = "indices"

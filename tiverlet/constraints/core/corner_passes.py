@@ -322,18 +322,20 @@ class CornerPasses(Passes):
     @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
         """The violation that is left, relative to the rest value (to the batch's mean f where that is 0). W is made of the
-        current gradients alone: it cancels, unless the multiplier is bounded."""
+        current gradients alone: it cancels, unless the multiplier is bounded. Without gradients there is no way back, so all of
+        it is left; a spring pulls nowhere there, as it should."""
         f, g = self.quantity.remeasure(c, self.seen.apart(c, 0))
         f = self.quantity.unwrap(f, self.equation.rest[c])
-        w, W = ti.cast(0, self.real), ti.cast(0, self.real)
+        w, W, free = ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real)
         for k in ti.static(range(self.arity)):
             i, gg = self.corners.member(c, k), g[k, :].dot(g[k, :])
             w += self.w.of(i) * gg
             W += self.slots.split[i] * gg
+            free += self.w.of(i)
         violation, A, alpha, lam, W = self.equation.terms(c, f, f, w, W, h, h2_effective, 0, fresh)
         left = self.equation.removed(c, violation, A, alpha, lam, W)
-        if ti.static(self.quantity.collapses > 0):
-            if g.norm_sqr() == 0 and self.strength.holds(c):
+        if g.norm_sqr() == 0 and free > 0 and self.strength.holds(c):
+            if ti.static(self.quantity.collapses > 0) or self.spring.is_rigid(c):
                 left = ti.abs(self.equation.bounded(f - self.equation.rest[c]))
         return left / self.equation.residual_scale(c)
 
