@@ -188,10 +188,10 @@ def built_once(monkeypatch):
     worlds = {}
     made = scene.rebuild
 
-    def rebuild(data, arrays, given, turned):
-        key = json.dumps([data["particles"], data["features"], data["settings"]])
+    def rebuild(data, arrays, given, turned, once):
+        key = json.dumps([data["particles"], data["features"], data["settings"], once])
         if key not in worlds:
-            worlds[key] = made(data, arrays, given, turned)
+            worlds[key] = made(data, arrays, given, turned, once)
             worlds[key].__dict__["close"] = lambda: None
         for feature, told in zip(worlds[key].features, data["features"], strict=True):
             scene.turn(feature, {name: scene.decode(value, arrays) for name, value in told["knobs"].items()})

@@ -320,6 +320,7 @@ FORGERIES = {
     "flags": _told("frame", lambda d: d.update(flags=["stiff-force"], notes=["stiff-force: none"])),
     "what was compiled": _told("scene", lambda d: d.update(explained="nothing")),
     "knobs": _told("turned", lambda d: d["features"].get("0", {}).update(g=3.0)),
+    "kernels that there are not": _told("state", lambda d: d.update(once=[["levity"], *d["once"][1:]])),
     "nothing turned": _gone("turned"),
     "no end": _gone("end"),
     "a feature that there is not": _told("scene", lambda d: d["features"][0].update({"class": "Levity"})),

@@ -494,12 +494,30 @@ def test_what_is_removed_from_a_pile_that_moves_is_recorded(world, tmp_path):
 
 
 def test_a_recording_begins_while_a_knob_asks_for_other_kernels(world, tmp_path):
-    start = tv.Particles([(0, 0.1), (0.3, 0.1)], radius=0.1, velocity=(1.0, 0.0))
-    contact = tv.Contact()
-    w = world(start, [tv.Gravity(), tv.Box((-1, 0), (1, 2)), contact])
+    start = tv.Particles([(0, 0.1), (0.19, 0.1), (0.5, 0.1)], radius=0.1, velocity=(1.0, 0.0), spin=0.0)
+    contact, box, link = tv.Contact(), tv.Box((-1, 0), (1, 2)), tv.Distance([[1, 2]])
+    w = world(start, [tv.Gravity(), box, contact, link])
     w.step(1 / 60)
-    contact.friction = 0.3
+    contact.friction = box.friction = (0.3, 0.3, 0.1, 0.0)
+    contact.restitution, link.compliance = (0.2, 0.5), 1e-3
     with tv.Recorder(tmp_path / "knob.rrd", w) as recorder:
         w.step(1 / 60)
         recorder.log()
-    assert tv.replay(tmp_path / "knob.rrd").verify()
+        contact.friction = contact.restitution = box.friction = link.compliance = 0.0
+        w.step(1 / 60)
+        recorder.log()
+    # Kernels keep what knobs no longer ask for, which shows in bits and in what the state consists of: of a world that goes on
+    # from a recording, of one that begins only then, and of a clone.
+    clone, again = w.clone(), tv.replay(tmp_path / "knob.rrd")
+    assert again.verify() and again.world(2).hash() == w.hash()
+    with tv.Recorder(tmp_path / "off.rrd", w) as recorder:
+        w.run(0.1, recorder=recorder)
+    again, end = tv.replay(tmp_path / "off.rrd"), w.hash()
+    assert again.verify() and again.world(int(again.frames[-1])).hash() == end
+    clone.run(0.1)
+    assert clone.hash() == end
+    # The same features in a new world are what their knobs say.
+    w.close()
+    fresh = world(start, w.features)
+    assert not (contact.has_friction or contact.has_restitution or contact.turns or box.has_friction or link.soft)
+    fresh.step(1 / 60)

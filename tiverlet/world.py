@@ -614,7 +614,7 @@ class World:
             raise TypeError(f"World.clone: {sorted(unknown)[0]} cannot be changed; one of {', '.join(settings)} can.")
         self._runner.memory.check()
         self._adapt()
-        copies = tuple(f.copy() for f in self._features)
+        copies = tuple(f.twin() for f in self._features)
         new = World._of(self._particles, copies, [f.start for f in self._features], **{**settings, **changes})
         checkpoint.transfer(self, new)
         new._runner.pass_on(self._runner.left, np.ones(len(self._particles), dtype=bool))
@@ -636,7 +636,7 @@ class World:
         for memory in self._runner.memories:
             memory.destroy()
         for feature in self._features:
-            feature.scene = None
+            feature.scene, feature.once = None, frozenset()
 
     def __enter__(self) -> "World":
         return self

@@ -83,20 +83,18 @@ class Collider(Feature):
     @property
     def has_friction(self) -> bool:
         """Whether there is friction, or was when kernels were compiled."""
-        return (
-            self.turns or friction_of(repr(self), "friction", self.friction).static > 0 or self._built("surface", "has_friction")
-        )
+        return self.turns or friction_of(repr(self), "friction", self.friction).static > 0 or "has_friction" in self.once
 
     @property
     def has_restitution(self) -> bool:
         """Whether there is restitution, or was when kernels were compiled."""
-        return self._bounce.normal > 0 or self._built("surface", "has_restitution")
+        return self._bounce.normal > 0 or "has_restitution" in self.once
 
     @property
     def turns(self) -> bool:
         """Whether it resists rolling, or bounces across the normal, or did when kernels were compiled."""
         rub = friction_of(repr(self), "friction", self.friction)
-        return max(rub.rolling, rub.twisting, self._bounce.tangential) > 0 or self._built("surface", "turns")
+        return max(rub.rolling, rub.twisting, self._bounce.tangential) > 0 or "turns" in self.once
 
     @property
     def _bounce(self) -> Bounce:
@@ -115,7 +113,7 @@ class Collider(Feature):
     @property
     def has_switch(self) -> bool:
         """Whether it can be switched off, by the kernels as they are or are to be."""
-        return self._switch or not self.active or self._built("surface", "has_switch")
+        return self._switch or not self.active or "has_switch" in self.once
 
     def bind(self, scene: Scene) -> None:
         """Keep the state at hand, and make the surface."""

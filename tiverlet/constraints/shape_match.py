@@ -89,17 +89,17 @@ class ShapeMatch(Batch):
     @property
     def soft(self) -> bool:
         """Whether any cluster has compliance."""
-        return bool((self.compliance > 0).any()) or self._built("spring", "soft")
+        return bool((self.compliance > 0).any()) or "soft" in self.once
 
     @property
     def breaks(self) -> bool:
         """Whether a load can break clusters, or could when kernels were compiled."""
-        return self.break_at is not None or self._built("strength", "breaks")
+        return self.break_at is not None or "breaks" in self.once
 
     @property
     def transcends(self) -> bool:
         """Whether any cluster flows, at an exponential rate."""
-        return bool((self.creep > 0).any()) or vars(self.dev).get("plastic", False)
+        return bool((self.creep > 0).any()) or "transcends" in self.once
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Settle the shapes at rest, each about its center."""

@@ -122,17 +122,17 @@ class PairContact(Feature):
     @property
     def has_friction(self) -> bool:
         """Whether any pair has friction, or had when kernels were compiled."""
-        return self._pairs.has_friction or vars(self.dev).get("has_friction", False)
+        return self._pairs.has_friction or "has_friction" in self.once
 
     @property
     def has_restitution(self) -> bool:
         """Whether any pair has restitution, or had when kernels were compiled."""
-        return self._pairs.has_restitution or vars(self.dev).get("has_restitution", False)
+        return self._pairs.has_restitution or "has_restitution" in self.once
 
     @property
     def turns(self) -> bool:
         """Whether any pair resists rolling, or bounces across the normal, or did when kernels were compiled."""
-        return self._pairs.turns or vars(self.dev).get("turns", False)
+        return self._pairs.turns or "turns" in self.once
 
     @property
     def has_events(self) -> bool:
@@ -173,6 +173,7 @@ class PairContact(Feature):
         dev = self.dev
         self.scene, dev.state, dev.w = scene, scene.state, scene.state.w
         dev.has_friction, dev.has_restitution, dev.turns = self.has_friction, self.has_restitution, self.turns
+        self.table.make_room(dev.has_friction, dev.has_restitution, dev.turns)
         # `reports`: pairs that push each other are noted, not only what sensors overlap. `events`: an EventLog, or None.
         dev.has_events, dev.reports, dev.events = self.has_events, bool(vars(self).get("events")), None
 

@@ -79,14 +79,15 @@ class Feature:
     """Base of all.
 
     arguments: those that it was made with. changed: a knob waits to be uploaded. new_force: it changes a force. lets_go: it no
-    longer bears what it bore. afresh: it begins anew where the world is built anew. moving: a target is under way.
+    longer bears what it bore. afresh: it begins anew where the world is built anew. moving: a target is under way. once: names of
+    compiled_for that its kernels have had in this world; they go on having them, however the world is built anew.
     """
 
     arguments: Mapping[str, Any] = MappingProxyType({})
     # Attributes that a world sets.
-    kept_by_world: tuple[str, ...] = ("scene", "start", "periodic", "changed", "moving", "new_force", "arguments")
+    kept_by_world: tuple[str, ...] = ("scene", "start", "periodic", "changed", "moving", "new_force", "arguments", "once")
     # What kernels do not read of it.
-    host_only: tuple[str, ...] = ("start", "periodic", "changed", "moving", "new_force", "arguments")
+    host_only: tuple[str, ...] = ("start", "periodic", "changed", "moving", "new_force", "arguments", "once")
     uploads_all = False  # upload() and end_motion() do as well for many worlds, where knobs have one more axis, the first
     compiled_for: tuple[str, ...] = ()  # properties that decide what its kernels consist of
     told_apart = True  # its share of the time that kernels take to compile is known by its name
@@ -94,6 +95,7 @@ class Feature:
     bulk = 0.3  # of its code in the kernels, next to that of a Distance; see build.LONG
     changed = True
     moving = new_force = lets_go = afresh = False
+    once: frozenset[str] = frozenset()
     scene: Any = None  # Scene, from bind() on
     periodic: Any = None  # the Periodic of its world, from before prepare() on
     _world_for: dict[str, Any] | None = None  # what the world was built for, of built_for(); None where the feature does nothing
@@ -143,11 +145,18 @@ class Feature:
         """Whether kernels were compiled for a part of it that is, say, soft."""
         return part in vars(self.dev) and getattr(vars(self.dev)[part], what)
 
+    def built(self) -> None:
+        """A world was built with it: note what for. One in which it does nothing has no kernels for it."""
+        acts = not isinstance(self, Batch) or self.acts
+        self._world_for = self.built_for() if acts else None
+        self.once |= {name for name in self.compiled_for if acts and getattr(self, name)}
+
     @property
     def outgrown(self) -> bool:
         """Whether knobs ask for what its kernels do not have, so that the world has to be built anew around it.
 
-        What once was compiled stays when a knob no longer needs it: friction of 0 where there was some costs no compiling.
+        What once was compiled stays when a knob no longer needs it, see `once`: friction of 0 where there was some costs no
+        compiling. It shows in bits, so it also stays where the world is built anew, cloned or replayed.
         """
         return self._world_for is not None and self._world_for != self.built_for()
 
@@ -156,10 +165,17 @@ class Feature:
         new = object.__new__(type(self))
         new.__dict__.update(vars(self))
         new.release()
+        new.once = frozenset()
+        return new
+
+    def twin(self) -> "Feature":
+        """A copy for a world of the same state, whose kernels have what these have."""
+        new = self.copy()
+        new.once = self.once
         return new
 
     def release(self) -> None:
-        """Forget the world that it acted in."""
+        """Forget the world that it acted in, but for what its kernels had there, for it may be built anew."""
         for name in ("scene", "start", "periodic", "changed", "moving", "new_force", "dev", "_world_for"):
             self.__dict__.pop(name, None)
 

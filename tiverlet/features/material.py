@@ -151,6 +151,10 @@ class Table:
                     table[at[a], at[b], columns] = table[at[b], at[a], columns] = row
         return rank, table.reshape(m * m, 7)
 
+    def make_room(self, has_friction: bool, has_restitution: bool, turns: bool) -> None:
+        """Have columns for what kernels ask for, though all of it may be 0."""
+        self.has_friction, self.has_restitution, self.turns = has_friction, has_restitution, turns
+
     def bind(self, scene: "Scene", asked: bool = False) -> None:
         """Declare the table and the groups, where they differ. asked: of() is asked even where all rows are 0."""
         rank, rows = self.rows(scene.particles.group)

@@ -79,7 +79,7 @@ class Periodic(Feature):
     @property
     def sheared(self) -> bool:
         """Whether there is a shear, or was when kernels were compiled."""
-        return self.shear != 0 or self._built("images", "sheared")
+        return self.shear != 0 or "sheared" in self.once
 
     @property
     def lengths(self) -> np.ndarray:

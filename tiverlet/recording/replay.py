@@ -259,7 +259,8 @@ class Replay:
         state, base = self._entries[start], max(k for k in range(start) if self._entries[k].kind == "scene")
         source = self._entries[base]
         before = [turned for e in self._entries[base:start] if e.kind == "turned" for turned in self._turned(e)]
-        world = scene.rebuild(source.data, source.arrays, self._given, before)
+        once = state.data.get("once", [[] for _ in source.data["features"]])
+        world = scene.rebuild(source.data, source.arrays, self._given, before, once)
         _settle(world, [e.data["now"] for e in self._entries[: start + 1] if "now" in e.data][-1])
         checkpoint.install(world, _kept(state, world), state.data["flags"])
         world._runner.scene.h2_effective = state.data["reach"]

@@ -235,8 +235,12 @@ def _particles(scene: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> Parti
     return Particles(p.pop("position"), **p)
 
 
-def rebuild(scene: dict[str, Any], arrays: Mapping[str, np.ndarray], given: Mapping[str, Any], turned: list[Turned]) -> "World":
-    """A world of the scene, with what was turned since."""
+def rebuild(
+    scene: dict[str, Any], arrays: Mapping[str, np.ndarray], given: Mapping[str, Any], turned: list[Turned],
+    once: list[list[str]],
+) -> "World":  # fmt: skip
+    """A world of the scene, with what was turned since. once: of each feature, what its kernels had, though knobs may no longer
+    ask for it."""
     from ..world import World
 
     missing = sorted(set(scene["needs"]) - set(given))
@@ -261,6 +265,10 @@ def rebuild(scene: dict[str, Any], arrays: Mapping[str, np.ndarray], given: Mapp
         features.append(feature)
     for k, values in turned:
         turn(features[k], values)
+    for feature, names in zip(features, once, strict=True):
+        if not {*names} <= {*feature.compiled_for}:
+            raise ValueError(f"replay: kernels of {feature!r} cannot have {names}.")
+        feature.once = frozenset(names)
     settings = dict(scene["settings"])
     settings["solver"] = _made(settings["solver"], Solver, arrays, given)
     return World._of(particles, tuple(features), starts, **settings)

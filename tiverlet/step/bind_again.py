@@ -74,7 +74,7 @@ def bound_again(
                     f.bind(scene)
                 if f in ramps:
                     f.ramp.adopt(ramps[f])
-                f._world_for = f.built_for()
+                f.built()
         if not (memory.holds(again.longest) and scene.slots.exact == exact and _structure(scene, bound) == structure):
             return None
         linked = np.concatenate([b.excluded_pairs(b.start) for b in batches])

@@ -172,7 +172,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     searches = [(f.join(scene, team), f.room) for f in accelerations if f.pairwise]
     for feature in features:
         feature.new_force = False  # it was given when it was made
-        feature._world_for = feature.built_for() if not isinstance(feature, Batch) or feature.acts else None
+        feature.built()
     known = contact.known if contact else None
     forces = Forces(scene, [*accelerations, known.carried] if known else accelerations)
     integrator = Verlet(scene, forces) if scene.order == 2 else high_order.Composition(scene, forces, batches)

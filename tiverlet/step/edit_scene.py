@@ -199,6 +199,8 @@ def rebuild(
         for f in before:
             f.release()
             f.remap_indices(number, n + m)
+        for f in went:
+            f.once = frozenset()
         box = next((f for f in features if isinstance(f, Periodic)), None)
         for k, f in enumerate(features):
             if f in more:

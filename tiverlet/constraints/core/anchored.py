@@ -57,7 +57,7 @@ class Anchored(Batch):
         rows = self.compliance
         if rows is not self._asked[0]:  # it is asked ten times when a pin takes others
             self._asked = rows, bool((rows > 0).any())
-        return self._asked[1] or self._built("spring", "soft")
+        return self._asked[1] or "soft" in self.once
 
     def upload(self) -> None:
         """Write new stiffnesses."""

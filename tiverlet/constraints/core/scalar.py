@@ -94,7 +94,7 @@ class Scalar(Batch):
     def cusp(self) -> bool:
         """Whether any rest value is an f at which gradients end (f = 0), or was when kernels were compiled: directions mean
         nothing there."""
-        return self.quantity.ends and bool((self.goal == 0).any()) or self._built("equation", "cusp")
+        return self.quantity.ends and bool((self.goal == 0).any()) or "cusp" in self.once
 
     @property
     def reweighs(self) -> bool:
@@ -203,17 +203,17 @@ class Scalar(Batch):
     @property
     def soft(self) -> bool:
         """Whether any constraint of the batch has compliance, or had when kernels were compiled."""
-        return bool((self.compliance > 0).any()) or self._built("spring", "soft")
+        return bool((self.compliance > 0).any()) or "soft" in self.once
 
     @property
     def damped(self) -> bool:
         """Whether any has a dashpot."""
-        return self.soft and bool((self.damping > 0).any()) or self._built("spring", "damped")
+        return self.soft and bool((self.damping > 0).any()) or "damped" in self.once
 
     @property
     def breaks(self) -> bool:
         """Whether a load can break constraints of the batch."""
-        return self.break_at is not None or self._built("strength", "breaks")
+        return self.break_at is not None or "breaks" in self.once
 
     @property
     def _strictly(self) -> bytes | None:
@@ -256,7 +256,7 @@ class Scalar(Batch):
     @property
     def capped(self) -> bool:
         """Whether any load of a drive is limited, or was when kernels were compiled."""
-        return self.driven and (bool(np.isfinite(self.largest).any()) or self._built("drive", "capped"))
+        return self.driven and (bool(np.isfinite(self.largest).any()) or "capped" in self.once)
 
     def start_at(self, position: np.ndarray, first: int) -> None:
         """Of a driven batch: particles from number `first` on were placed at `position`, (n, dim)."""
@@ -265,7 +265,7 @@ class Scalar(Batch):
     def limited(self) -> bool:
         """Whether steps have to be limited, see StepLimit, or had to be when kernels were compiled: f is curved, and any
         constraint rigid."""
-        return self.quantity.curved and bool((self.compliance == 0).any()) or self._built("limit", "acts")
+        return self.quantity.curved and bool((self.compliance == 0).any()) or "limited" in self.once
 
     @property
     def solvable_together(self) -> bool:
