@@ -151,7 +151,7 @@ def test_every_feature_is_built_again_from_its_description():
             seen |= {f["class"] for f in [*data["features"], data["settings"]["solver"]]}
             text, blob = journal.Entry("scene", 0, data, arrays).pack(0)
             entry = journal.Entry.unpack(text, blob)
-            with scene.rebuild(entry.data, entry.arrays, {f.__name__: f for f in USERS}, []) as again:
+            with scene.rebuild(entry.data, entry.arrays, {f.__name__: f for f in USERS}, [], [[]] * len(world.features)) as again:
                 assert repr(again) == repr(world)
                 assert repr(again.settings["solver"]) == repr(world.settings["solver"])
                 assert [type(f) for f in again.features] == [type(f) for f in world.features]
