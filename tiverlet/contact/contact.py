@@ -81,7 +81,7 @@ class Contact(PairContact):
     spring was there when the pair was thrown together. It is removed from positions only, an eighth per substep. Other overlap of
     pairs that bounce is pushed out: what came to be while pushes acted, or in the substep in which the pair comes to rest. A pair
     with slack rests unless it is thrown together by more than that in a substep, or e is 1; otherwise it bounces again, or is let
-    go on its way out. So does any pair that comes together no faster than two substeps of forces make it.
+    go on its way out. Unless e is 1, a pair rests, too, that comes together no faster than two substeps of forces make it.
     """
 
     def __init__(

@@ -211,11 +211,10 @@ class DiscGeometry:
             if j < i:  # and so are the rest
                 break
             a, b, r = self.radius.of(i), self.radius.of(j), self.state.apart(i, j)
-            rr, contact_distance = r.dot(r), (a + b) * self.pushes(i, j)
             small = ti.select(ti.min(a, b) > 0, ti.min(a, b), ti.max(a, b))
+            overlap = ((a + b) * self.pushes(i, j) - ti.sqrt(r.dot(r))) / small
             # No branch: half of what is listed is apart.
-            touching += ti.cast(rr < contact_distance * contact_distance, ti.i32)
-            overlap = (contact_distance - ti.sqrt(rr)) / small
+            touching += ti.cast(overlap > 0, ti.i32)
             worst = ti.select(overlap > worst, overlap, worst)
         return touching, ti.cast(worst, ti.f64)
 

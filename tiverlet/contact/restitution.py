@@ -56,7 +56,8 @@ class Restitution:
             deep = ti.select(last > 0, overlap, ti.select(e < 1, slack, 0))  # nothing that is elastic rests where nothing pulls
             if last == 0:
                 slack = ti.max(slack, overlap - ti.max(here, 0))
-            if e < 1 and a <= ti.static(SLOW) * (here - a):
+            # Later passes have what others pushed in it, too.
+            if first != 0 and e < 1 and a <= ti.static(SLOW) * (here - a):
                 deep = ti.max(deep, given)
             if a > 0:
                 rests = deep > 0 and (first == 0 or given <= deep)
