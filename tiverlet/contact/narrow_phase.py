@@ -44,7 +44,7 @@ class DiscGeometry:
         """The distance at which particles i and j touch."""
         contact_distance = self.radius.of(i) + self.radius.of(j)
         if ti.static(self.shrinks):
-            contact_distance -= self.shrunk[i] + self.shrunk[j]
+            contact_distance = ti.max(contact_distance - (self.shrunk[i] + self.shrunk[j]), 0)  # no less, by rounding
         return contact_distance
 
     @ti.func
