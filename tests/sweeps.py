@@ -21,11 +21,15 @@ def pendulum(angle: float, length: float) -> tv.World:
     return tv.World(tv.Particles(x, pinned=[0]), [tv.Gravity(G), tv.Distance([(0, 1), (1, 2)])], substeps=4)
 
 
+def here(worlds) -> dict[str, Any]:
+    """Which process computes it, and on how many threads."""
+    return {"process": [os.getpid()] * len(worlds), "threads": [runtime.threads()] * len(worlds)}
+
+
 def ends(worlds) -> dict[str, Any]:
-    """Where and how fast they are in the end; which process has computed it, and on how many threads."""
+    """Where and how fast they are in the end."""
     worlds.run(SECONDS)
-    here = {"process": [os.getpid()] * len(worlds), "threads": [runtime.threads()] * len(worlds)}
-    return {"end": worlds.position, "speed": worlds.velocity} | here
+    return {"end": worlds.position, "speed": worlds.velocity} | here(worlds)
 
 
 def ball(speed: float, marker: str = "", always: bool = False) -> tv.World:
@@ -41,7 +45,7 @@ def ball(speed: float, marker: str = "", always: bool = False) -> tv.World:
 def height(worlds) -> dict[str, Any]:
     """After a while."""
     worlds.run(0.5)
-    return {"y": worlds.position[:, 0, 1]}
+    return {"y": worlds.position[:, 0, 1]} | here(worlds)
 
 
 class Unsendable(Exception):
