@@ -8,7 +8,6 @@ import resource
 import signal
 import struct
 import subprocess
-import sys
 import tempfile
 
 import numpy as np
@@ -123,7 +122,7 @@ def test_damage_is_named(falling, tmp_path, read_here):
     assert not wrong.complete and "a length is wrong" in wrong.text and wrong.verify().kind == "incomplete"
 
 
-def test_tampering_is_found(falling, tmp_path):
+def test_tampering_is_found(falling, tmp_path, read_here):
     def turn(text):
         entry = json.loads(text)
         if entry["kind"] == "turned" and entry["data"]["features"]["0"]:
@@ -171,7 +170,7 @@ def test_tampering_is_found(falling, tmp_path):
     assert (verdict.kind, verdict.frame, verdict.particle) == ("changed", 8, 1) and "picture" in str(verdict)
 
 
-def test_a_killed_process_leaves_what_was_flushed(tmp_path):
+def test_a_killed_process_leaves_what_was_flushed(tmp_path, read_here):
     code = f"""
 import os, signal, sys
 import numpy as np
@@ -197,7 +196,7 @@ os.kill(os.getpid(), signal.SIGKILL)
     assert (verdict.kind, bool(verdict)) == ("incomplete", False) and verdict.frames >= 26
 
 
-def test_a_full_disk_is_an_error_and_loses_nothing_that_was_written(world, tmp_path):
+def test_a_full_disk_is_an_error_and_loses_nothing_that_was_written(world, tmp_path, read_here):
     w = world(tv.Particles(np.random.default_rng(0).uniform(0, 1, (2000, 3))), [tv.Gravity()], substeps=1)
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, hard))  # bytes in a file, as if the disk were full
@@ -227,7 +226,7 @@ def test_a_full_disk_is_an_error_and_loses_nothing_that_was_written(world, tmp_p
         tv.Recorder(tmp_path, w)
 
 
-def test_nothing_is_overwritten_unasked(falling, world, tmp_path):
+def test_nothing_is_overwritten_unasked(falling, world, tmp_path, read_here):
     w = world(tv.Particles(np.eye(2)), [tv.Gravity(1.0)])
     path, other = tmp_path / "a.rrd", tmp_path / "thesis.txt"
     path.write_bytes(falling.read_bytes())
@@ -311,7 +310,7 @@ recorder.close()
     assert list(tv.replay(tmp_path / "f.rrd").frames) == [0, 1]
 
 
-def test_a_budget_is_kept_and_said(world, tmp_path):
+def test_a_budget_is_kept_and_said(world, tmp_path, read_here):
     w = world(tv.Particles(np.random.default_rng(0).uniform(0, 1, (500, 2))), [tv.Gravity()], substeps=1)
     with pytest.raises(ValueError, match="Give at least"):
         tv.Recorder(tmp_path / "a.rrd", w, budget=1000)
@@ -362,14 +361,13 @@ def test_frames_are_taken_out_so_that_the_rest_shows_the_same(stride):
         assert len(rest) <= 40 // stride + 3 or len(frames) < 10
 
 
-def test_command_line(falling, tmp_path, monkeypatch, capsys):
+def test_command_line(falling, tmp_path, monkeypatch, capsys, read_here):
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "a.rrd"
     path.write_bytes(falling.read_bytes())
     assert main(["replay", str(path), "--verify"]) == 0 and "all 11 frames come out" in capsys.readouterr().out
-    anew = "import sys; from tiverlet.__main__ import main; sys.exit(main(sys.argv[1:]))"  # where Taichi does not run yet
-    words = [sys.executable, "-c", anew, "replay", str(path), "--verify"]
-    assert "all 11 frames come out" in subprocess.run(words, capture_output=True, text=True, check=True).stdout
+    anew = f"from tiverlet.__main__ import main\nraise SystemExit(main(['replay', {str(path)!r}, '--verify']))"
+    assert "all 11 frames come out" in python(anew).stdout  # where Taichi does not run yet
     wrong = rewrite(falling, tmp_path / "b.rrd", lambda text: text.replace('"g": 5.0', '"g": 5.5'))
     assert main(["replay", str(wrong), "--verify"]) == 1 and "first particle 0" in capsys.readouterr().out
     assert main(["replay", str(path), "--export", "csv"]) == 0 and (tmp_path / "a.csv").exists()
@@ -480,7 +478,7 @@ def test_a_picture_without_a_window(falling, tmp_path, monkeypatch):
     assert (np.abs(first - last).max(axis=2) < 20).mean() > 0.5
 
 
-def test_what_is_removed_from_a_pile_that_moves_is_recorded(world, tmp_path):
+def test_what_is_removed_from_a_pile_that_moves_is_recorded(world, tmp_path, read_here):
     # Contacts that go leave their part in the velocities of what stays, an array of the clock's, until the next step.
     start = tv.Particles([(0, 0.1), (0.3, 0.1), (0.25, 0.3)], radius=0.1)
     w = world(start, [tv.Gravity(), tv.Box((-1, 0), (1, 2)), tv.Contact(friction=0.5)])
@@ -493,7 +491,7 @@ def test_what_is_removed_from_a_pile_that_moves_is_recorded(world, tmp_path):
     assert tv.replay(tmp_path / "removed.rrd").verify()
 
 
-def test_a_recording_begins_while_a_knob_asks_for_other_kernels(world, tmp_path):
+def test_a_recording_begins_while_a_knob_asks_for_other_kernels(world, tmp_path, read_here):
     start = tv.Particles([(0, 0.1), (0.19, 0.1), (0.5, 0.1)], radius=0.1, velocity=(1.0, 0.0), spin=0.0)
     contact, box, link = tv.Contact(), tv.Box((-1, 0), (1, 2)), tv.Distance([[1, 2]])
     w = world(start, [tv.Gravity(), box, contact, link])
