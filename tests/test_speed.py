@@ -1,6 +1,7 @@
 """The report on speed: its figures belong together. Nothing here is about how fast anything is."""
 
 import contextlib
+import io
 import json
 import pathlib
 import types
@@ -13,7 +14,22 @@ import tiverlet as tv
 from tiverlet.__main__ import main
 from tiverlet.device import ti
 from tiverlet.report import speed
-from tiverlet.report.speed import SCENES, SpeedReport, c_baseline, counting, measure, peers, scenes, stripped, waits, worlds
+from tiverlet.report.speed import (
+    SCENES,
+    SpeedReport,
+    c_baseline,
+    child,
+    counting,
+    measure,
+    peers,
+    processes,
+    scenes,
+    stripped,
+    waits,
+    worlds,
+)
+
+from .conftest import python
 
 
 @pytest.fixture(scope="module")
@@ -22,33 +38,70 @@ def kept(taichi):
     return pathlib.Path(ti.cfg.offline_cache_file_path, "speed")
 
 
+class Forked:
+    """What is asked once and answers once, by a process that has imported tiverlet before."""
+
+    def __init__(self, code, job, cache):
+        keeps = {"TI_OFFLINE_CACHE": "1", "TI_OFFLINE_CACHE_FILE_PATH": cache}
+        before = f"import os, sys, warnings\nwarnings.simplefilter('default')\nos.environ.update({keeps})"
+        self.code = f"{before}\nsys.argv[1:] = [{json.dumps(job)!r}]\n{code}"
+
+    def ask(self):
+        return json.loads(python(self.code).stdout)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exc):
+        pass
+
+
 @pytest.fixture(scope="module")
-def report(kept):
-    """Two scenes of one size each, quickly, one of them by a copy of the package that lacks what it does not use. What is cold is
-    so only where nobody has compiled the same before."""
+def forked(process):
+    """Only the scene, which is asked again and again, has interpreters of its own: each imports for a second of CPU time."""
+    with pytest.MonkeyPatch.context() as patch:
+        made = processes.started
+        patch.setattr(processes, "started", lambda code, *job: (made if code == child.START else Forked)(code, *job))
+        yield
+
+
+@pytest.fixture(scope="module")
+def report(kept, forked):
+    """A scene of one size, quickly, and another by a copy of the package that lacks what it does not use. What is cold is so only
+    where nobody has compiled the same before."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(measure, "BLOCK", 1 << 22)
         patch.setattr(waits, "QUICK", 2)
         patch.setattr(measure.Session, "cache", lambda session: str(kept))
         whole = speed(["pile"], sizes=[41], threads=[1], quick=True, peers=False, absent=False, waits=True)
+        patch.setattr(measure.Session, "point", lambda session, name, n: [])
         rope = speed(["rope"], sizes=[41], threads=[1], quick=True, peers=False, yardstick=False, waits=False)
-    return replace(whole, runs=whole.runs + rope.runs, absent=rope.absent)
+    return replace(whole, absent=rope.absent)
 
 
 def test_figures_are_positive_and_belong_together(report):
-    assert [(r.scene, r.particles, r.threads) for r in report.runs] == [("pile", 41, 1), ("rope", 41, 1)]
-    for r in report.runs:
-        assert r.substeps == SCENES[r.scene].substeps and r.path == "fused" and not r.flags
-        assert r.launches == 1
-        assert r.rate * r.seconds == pytest.approx(41 * r.substeps, rel=1e-12)
-        assert set(r.traffic) == set(r.times) and r.bytes == sum(r.traffic.values()) and min(r.times.values()) > 0
-        assert min(r.seconds, r.rounds, r.bytes, r.memory, r.imported, r.cold, r.warm) > 0
-        assert report.share(r) == pytest.approx(r.rate * r.bytes / report.copy[1])
-        assert report.scaling(r) is None and report.growth(r.scene, 1) is None
-    pile, rope = report.runs
-    assert 0 < pile.overlap < 0.05 and pile.residual == 0
-    assert 0 < rope.residual < 1e-4 and rope.overlap == 0 and rope.yardstick is None
+    (r,) = report.runs
+    assert (r.scene, r.particles, r.threads) == ("pile", 41, 1)
+    assert r.substeps == SCENES[r.scene].substeps and r.path == "fused" and not r.flags
+    assert r.launches == 1
+    assert r.rate * r.seconds == pytest.approx(41 * r.substeps, rel=1e-12)
+    assert set(r.traffic) == set(r.times) and r.bytes == sum(r.traffic.values()) and min(r.times.values()) > 0
+    assert min(r.seconds, r.rounds, r.bytes, r.memory, r.imported, r.cold, r.warm) > 0
+    assert report.share(r) == pytest.approx(r.rate * r.bytes / report.copy[1])
+    assert report.scaling(r) is None and report.growth(r.scene, 1) is None
+    assert 0 < r.overlap < 0.05 and r.residual == 0
     assert not report.missing
+
+
+def test_a_scene_of_links_has_a_residual(monkeypatch, capsys):
+    # What the process of a scene answers, line by line, in this one.
+    monkeypatch.setattr(tv, "init", lambda arch, threads: None)
+    monkeypatch.setattr("sys.stdin", io.StringIO("restart\nrun 12\nquality\nlook\n"))
+    child.main({"scene": "rope", "n": 41, "arch": "cpu", "threads": 1}, 0.5)
+    start, restart, seconds, quality, look = map(json.loads, capsys.readouterr().out.splitlines())
+    assert start["import"] == 0.5 and start["particles"] == 41 and min(start["first"], seconds) > 0 == restart
+    assert 0 < quality["residual"] < 1e-4 and quality["overlap"] == 0
+    assert look["launches"] == 1 and look["path"] == "fused" and not look["flags"]
 
 
 def test_edits_are_timed(report):
@@ -220,7 +273,7 @@ def test_command(capsys):
 
 
 @pytest.fixture(scope="module")
-def batch(kept):
+def batch(kept, forked):
     """Many worlds, few of them."""
     with pytest.MonkeyPatch.context() as patch:
         folder = contextlib.nullcontext(str(kept / "worlds"))
