@@ -275,18 +275,14 @@ def squares():
     square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
     particles = tv.Particles(np.concatenate([square, square + [0.5, 1.1]]), velocity=(0, -2), radius=0.02)
     loops, sides = np.arange(8).reshape(2, 4), np.stack(np.triu_indices(4, 1), axis=1)
-    rough = [tv.Polygons(loops, friction=0.5), tv.HalfSpace((0, 1), -0.1, friction=0.5)]
+    rough = [tv.Polygons(loops, friction=0.5), tv.HalfSpace((0, 1), -0.1)]
     return particles, [tv.Gravity(), tv.Distance(np.concatenate([sides, sides + 4])), *rough]
 
 
 def arm():
-    """A path in space with an angle of each kind at its corners."""
+    """A path in space with angles at its corners and along it."""
     particles = tv.Particles([[0, 0, 0], [1, 0, 0], [2, 1, 0], [2, 1, 1], [3, 0, 1]], pinned=[0])
-    angles = [
-        tv.Bend([[0, 1, 2]], compliance=1e-3),
-        tv.AngleLimit([[1, 2, 3]], 0, 1),
-        tv.Dihedral([[1, 2, 3, 4]], compliance=1e-2),
-    ]
+    angles = [tv.AngleLimit([[0, 1, 2], [1, 2, 3]], 0, 1), tv.Dihedral([[1, 2, 3, 4]], compliance=1e-2)]
     return particles, [tv.Gravity(), tv.Distance([[0, 1], [1, 2], [2, 3], [3, 4]]), *angles]
 
 
