@@ -44,7 +44,8 @@ class Forked:
     def __init__(self, code, job, cache):
         keeps = {"TI_OFFLINE_CACHE": "1", "TI_OFFLINE_CACHE_FILE_PATH": cache}
         before = f"import os, sys, warnings\nwarnings.simplefilter('default')\nos.environ.update({keeps})"
-        self.code = f"{before}\nsys.argv[1:] = [{json.dumps(job)!r}]\n{code}"
+        after = "from tiverlet.device import ti\nti.reset()"  # which keeps what was compiled; what was forked does not at its end
+        self.code = f"{before}\nsys.argv[1:] = [{json.dumps(job)!r}]\n{code}\n{after}\n"
 
     def ask(self):
         return json.loads(python(self.code).stdout)
