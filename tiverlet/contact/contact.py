@@ -352,7 +352,7 @@ class Contact(PairContact):
         total, w = 0 * self.dev.state.d[i], self.dev.w.of(i)
         if self.dev.splitting.weight[i] > 0:
             for word in range(self.dev.list.words(i)):
-                bits = ti.select(word == 0, self.dev.list.touching[i], self.dev.list.all_bits(i, word))
+                bits = self.dev.list.touched(i, word)
                 while bits != 0:
                     e = self.dev.list.entry(i, word, bits)
                     bits &= bits - ti.u32(1)

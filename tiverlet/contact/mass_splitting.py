@@ -227,10 +227,7 @@ class MassSplitting:
     def sliding(self, i, word, now):
         """Bits for the entries of particle i that may have slid, as a substep ends: those that touch. Where there are several
         passes a pair may touch in some and not in others, so it keeps what it carries to the end."""
-        out = self.list.all_bits(i, word)
-        if word == 0 and now.span.iterations == 1:
-            out = self.list.touching[i]
-        return out
+        return ti.select(now.span.iterations == 1, self.list.touched(i, word), self.list.all_bits(i, word))
 
 
 @ti.func

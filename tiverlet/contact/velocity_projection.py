@@ -68,7 +68,7 @@ class VelocityProjection:
         if self.weight[i] > 0 and self.state.awake(i):
             for word in range(self.list.words(i)):
                 # Not touches(): the pair may have parted in this pass, and both of it have to agree.
-                bits = ti.select(word == 0, self.list.touching[i], self.list.all_bits(i, word))
+                bits = self.list.touched(i, word)
                 while bits != 0:
                     e = first + word * WORD + lowest_bit(bits)
                     bits &= bits - ti.u32(1)

@@ -141,10 +141,6 @@ class Feature:
         knobs = [name for name in knobs_of(type(self)) if getattr(type(self), name).built]
         return self.compiled() | {name: getattr(self, name) for name in knobs}
 
-    def _built(self, part: str, what: str) -> bool:
-        """Whether kernels were compiled for a part of it that is, say, soft."""
-        return part in vars(self.dev) and getattr(vars(self.dev)[part], what)
-
     def built(self) -> None:
         """A world was built with it: note what for. One in which it does nothing has no kernels for it."""
         acts = not isinstance(self, Batch) or self.acts

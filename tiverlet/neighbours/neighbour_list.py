@@ -258,10 +258,7 @@ class NeighbourList:
         first = self.first[i]
         at = first
         for word in range(self.words(i)):
-            bits = self.all_bits(i, word)
-            if ti.static(self.marked):
-                if word == 0:
-                    bits = self.touching[i]
+            bits = self.touched(i, word) if ti.static(self.marked) else self.all_bits(i, word)
             while bits != 0:
                 e = first + word * WORD + lowest_bit(bits)
                 bits &= bits - ti.u32(1)
@@ -320,6 +317,11 @@ class NeighbourList:
         """Bits of all entries that the word is for."""
         left = self.number[i] - word * WORD
         return ti.select(left < WORD, (ti.u32(1) << ti.cast(left & (WORD - 1), ti.u32)) - ti.u32(1), ti.u32(FULL))
+
+    @ti.func
+    def touched(self, i, word):
+        """Bits of those entries that touched when last looked at; beyond the first word, where that is not kept, of all."""
+        return ti.select(word == 0, self.touching[i], self.all_bits(i, word))
 
 
 @ti.func

@@ -295,13 +295,8 @@ class CornerPasses(Passes):
         if not self.spring.is_rigid(c) and (ti.static(not self.equation.cusp) or self.equation.rest[c] != 0):
             f, g = self.quantity.remeasure(c, self.seen.apart(c, 0))
             f0, n = self.quantity.remeasure(c, self.seen.apart(c, 1))
-            both, here, there = ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real)
-            for k in ti.static(range(self.arity)):
-                both += g[k, :].dot(n[k, :])
-                here += g[k, :].dot(g[k, :])
-                there += n[k, :].dot(n[k, :])
             if self.quantity.direction_reliable(f, f0):
-                self.slots.note_turn(self.slots.turn(both, ti.sqrt(here * there)))
+                self.slots.note_turn(self.slots.turn((g * n).sum(), g.norm() * n.norm()))
 
     @ti.func
     def push_reaction(self, c, firm, soft):

@@ -317,12 +317,17 @@ class Scalar(Batch):
         return -scale * self.scene.memory.read(self.dev.equation.lam)[: self.count].astype(np.float64)
 
     @property
+    def _learns(self) -> bool:
+        """Whether its loads are learnt, in the kernels as they are."""
+        return "known" in vars(self.dev) and self.dev.known.learns
+
+    @property
     def sagging(self) -> np.ndarray:
         """The multipliers of the last substep without known loads, (m,): what violations bear."""
         lam = self.scene.memory.read(self.dev.equation.lam)[: self.count].astype(np.float64)
-        return lam - self.scene.memory.read(self.dev.known.given)[: self.count] if self._built("known", "learns") else lam
+        return lam - self.scene.memory.read(self.dev.known.given)[: self.count] if self._learns else lam
 
     def forget_loads(self, some: np.ndarray) -> None:
         """Forget the known loads of some constraints, a mask (m,): their particles were put elsewhere."""
-        if self._built("known", "learns"):
+        if self._learns:
             self.dev.known.forget(some)
