@@ -125,6 +125,8 @@ def _recording(init):
 
 def _frozen(value: Any) -> Any:
     """The same value, safe from what its owner does with it later; what can be read only once is read."""
+    if type(value) in (int, float, str):  # most of what long lists hold
+        return value
     if isinstance(value, np.ndarray):
         if value.flags.writeable or value.base is not None:
             value = value.copy()

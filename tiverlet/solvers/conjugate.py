@@ -24,6 +24,9 @@ GROWTH, HIGHEST = 1.1, 1.0  # of the floor: the factor by which it grows, and it
 CONVERGED = 1e-2  # of r . z at the start of an iteration: what may be left at its end
 NULL = 8  # roundings, of d . W d: with d . A d below so many, or below REDUNDANT, a direction d is in the null space of A
 BLOCKS = 64  # partial sums: their number is fixed, so the total has the same bits on any number of threads
+# Of the sums: r . z; how far to go, and then by how much the direction counts in the next; how far a step is taken back; r . z at
+# the start.
+LEFT, FACTOR, BACK, FIRST = range(4)
 
 
 class ConjugateGradient(Solver):
@@ -107,7 +110,6 @@ class CGSystem(System):
         self.partial, self.worst = self.reals("partial_sums", BLOCKS), self.reals("worst", BLOCKS)
         if self.limits_steps:
             self.gain, self.over = self.reals("gain", BLOCKS), self.reals("over", BLOCKS)
-        # r . z; by how much the last direction counts in the next; how far a step is taken back; r . z at the start
         self.sums = scene.memory.field("system.sums", None, width=4, kind=ti.f64)
         self.noise, self.loud = self.reals("noise"), self.reals("loud", BLOCKS)  # r z of rounding; 1 where a row has more
         self.null = max(REDUNDANT, NULL * self.epsilon)
@@ -202,8 +204,8 @@ class CGSystem(System):
     def end(self, thread):
         """Raise the floors of parts where the steps have not converged, or have come to a tension that is hard to stand."""
         for r in range(self.team.chunk_begin(self.rows, thread), self.team.chunk_end(self.rows, thread)):
-            share = CONVERGED * self.sums[None][3]
-            if self.sums[None][0] > share:
+            share = CONVERGED * self.sums[None][FIRST]
+            if self.sums[None][LEFT] > share:
                 if self.rows * ti.cast(self.inverse_diagonal[r] * self.residual[r], ti.f64) * self.residual[r] > share:
                     self.strained[self.part[r]] = 1  # all write the same
         self.team.wait()
@@ -218,6 +220,14 @@ class CGSystem(System):
     @ti.func
     def iterate(self, thread):
         """One step of conjugate gradients. One that needs a tension too large for the substep is taken back, and is the last."""
+        self.pull(thread)
+        self.curve(thread)
+        self.advance(thread)
+        self.turn(thread)
+
+    @ti.func
+    def pull(self, thread):
+        """w G^T d: how the direction moves each particle."""
         for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
             if self.w.positive(i):
                 total = ti.Vector.zero(self.real, self.dim)
@@ -229,6 +239,10 @@ class CGSystem(System):
                     total *= self.share[i]
                 self.pulled[i] = total
         self.team.wait()
+
+    @ti.func
+    def curve(self, thread):
+        """A d, and how far to go, r . z / d . A d; nowhere, where only rounding is left and d is in the null space."""
         for k in range(self.team.chunk_begin(BLOCKS * self.stride, thread), self.team.chunk_end(BLOCKS * self.stride, thread)):
             if k % self.stride == 0:
                 b, total, size = k // self.stride, ti.cast(0, ti.f64), ti.cast(0, ti.f64)
@@ -250,13 +264,17 @@ class CGSystem(System):
                 size += self.worst[b]
                 loud = ti.max(loud, self.loud[b])
             if loud == 0 and curve <= ti.static(self.null) * size:
-                self.sums[None][0] = 0
-            self.sums[None][1] = ti.select(curve > 0, self.sums[None][0] / curve, ti.cast(0, ti.f64))
+                self.sums[None][LEFT] = 0
+            self.sums[None][FACTOR] = ti.select(curve > 0, self.sums[None][LEFT] / curve, ti.cast(0, ti.f64))
         self.team.wait()
+
+    @ti.func
+    def advance(self, thread):
+        """Go so far, and work out what is left, and whether that was too far."""
         for k in range(self.team.chunk_begin(BLOCKS * self.stride, thread), self.team.chunk_end(BLOCKS * self.stride, thread)):
             if k % self.stride == 0:
                 b, total, worst = k // self.stride, ti.cast(0, ti.f64), ti.cast(0, ti.f64)
-                far, gain, over = self.sums[None][1], ti.cast(0, ti.f64), ti.cast(0, ti.f64)
+                far, gain, over = self.sums[None][FACTOR], ti.cast(0, ti.f64), ti.cast(0, ti.f64)
                 loud = ti.cast(0, ti.f64)
                 for r in range(self.begin_of(b), ti.min(self.begin_of(b + 1), self.rows)):
                     self.step[r] = self.step[r] + far * self.direction[r]
@@ -283,7 +301,7 @@ class CGSystem(System):
         self.team.wait()
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread)):
-            before, worst = self.sums[None][0], self.worst[0]
+            before, worst = self.sums[None][LEFT], self.worst[0]
             now = ti.select(before > 0, self.summed(), 0 * before)
             for b in range(1, BLOCKS):
                 worst = ti.max(worst, self.worst[b])
@@ -295,17 +313,21 @@ class CGSystem(System):
                     over += self.over[b]
                 if gain > 0 and over > 0:  # as in Elimination.limit_steps; such a step is taken back, too
                     worst = 2 * TENSEST
-            back = ti.select(worst > TENSEST, self.sums[None][1], 0 * now)
+            back = ti.select(worst > TENSEST, self.sums[None][FACTOR], 0 * now)
             if worst > TENSEST:
                 now = 0
-            first = self.sums[None][3]
+            first = self.sums[None][FIRST]
             self.sums[None] = ti.Vector([now, ti.select(before > 0, now / before, 0 * now), back, first], ti.f64)
         self.team.wait()
+
+    @ti.func
+    def turn(self, thread):
+        """Take the step back if it was, and the next direction: z + (r . z / r . z before) d."""
         for r in range(self.team.chunk_begin(self.rows, thread), self.team.chunk_end(self.rows, thread)):
-            if self.sums[None][2] != 0:
-                self.step[r] = self.step[r] - self.sums[None][2] * self.direction[r]
+            if self.sums[None][BACK] != 0:
+                self.step[r] = self.step[r] - self.sums[None][BACK] * self.direction[r]
                 self.residual[r] = 0
             self.direction[r] = (
-                self.inverse_diagonal[r] * self.residual[r] + ti.cast(self.sums[None][1], self.real) * self.direction[r]
+                self.inverse_diagonal[r] * self.residual[r] + ti.cast(self.sums[None][FACTOR], self.real) * self.direction[r]
             )
         self.team.wait()
