@@ -27,6 +27,7 @@ from .solvers.solver import Solver
 from .step import checkpoint, edit_scene
 from .step.adaptive import StepController
 from .step.build import Assembly, assemble, check_settings, checked_features, checked_solver
+from .step.build_again import Rebuild
 from .step.clock import Clock
 from .step.edit_scene import Handle
 from .step.explain import compiling, explain
@@ -113,6 +114,14 @@ class World:
         self._runner, self._solver, self._scale = Runner(parts, self._clock), parts.solver, parts.scale
         self._search: PointSearch | None = None  # compiled when it is first asked
         parts.scene.residuals = self._runner.residuals
+
+    def _build_again(
+        self, some: np.ndarray, added: Particles | None, features: tuple[Feature, ...], extend: Mapping[Feature, Feature]
+    ) -> Rebuild:
+        """Have other particles and features. The Rebuild says which of these came and went."""
+        again = Rebuild(self, some, added, features, extend)
+        again.run()
+        return again
 
     # The step.
 

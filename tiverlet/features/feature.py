@@ -18,8 +18,8 @@ on any number of particles each (constraints/core/members.py).
 A new constraint on k particles is one file with one Scalar subclass, which names its Quantity (constraints/core/quantity.py) and
 has an __init__ that checks its arrays. See constraints/distance.py. Arrays of its own with a row for each
 constraint are named in `each`, and what depends on where particles were is taken from `self.start`, so that a world can be built
-anew around it (step/edit_scene.py). What a method other than __init__ finds out is set by self._keep(name=value), or under a name
-that begins with an underscore: from outside only Knobs can be set.
+anew around it (step/build_again.py). What a method other than __init__ finds out is set by self._keep(name=value), or under a
+name that begins with an underscore: from outside only Knobs can be set.
 """
 
 import functools

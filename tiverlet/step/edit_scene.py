@@ -8,16 +8,13 @@ from typing import Any
 import numpy as np
 
 from .. import checks
-from ..colliders.collider import Collider
 from ..contact.pair_contact import PairContact
 from ..contact.touches import ContactEvents
-from ..device.memory import Memory
-from ..features.extending import extended
-from ..features.feature import Acceleration, Batch, Feature
+from ..features.feature import Batch, Feature
 from ..neighbours.periodic import Periodic
 from ..particles import Particles
-from . import checkpoint, edit_in_place, initial_violation
-from .build import assemble, check_settings, checked_features, listed
+from . import edit_in_place, initial_violation
+from .build import check_settings, checked_features, listed
 from .integrator import decay
 from .sleep import Sleep
 
@@ -133,7 +130,7 @@ def change(
     if features == world.features:
         planned = edit_in_place.planned(world, some, number, added, extend)
     if planned is None:
-        rebuild(world, some, added, features, extend)
+        build_again(world, some, added, features, extend)
         return
     with world._runner.memory.compiler():
         told, seen = world._all_events(), _seen(world, number, features)
@@ -153,7 +150,7 @@ def renew(world: Any) -> None:
     grabbing, runner, clock = edit_in_place.grabbing(world), world._runner, world._clock
     if grabbing is None:
         check_settings(world._precision, world._requested[1], world._order, world.features)
-        rebuild(world, np.ones(len(world.particles), dtype=bool), None, world.features)
+        build_again(world, np.ones(len(world.particles), dtype=bool), None, world.features, NONE)
         return
     told = world._all_events() if runner.logs else world._events
     if grabbing.soft:
@@ -166,89 +163,18 @@ def renew(world: Any) -> None:
         watcher.regrouped()
 
 
-def rebuild(
-    world: Any, some: np.ndarray, added: Particles | None, features: tuple[Feature, ...],
-    extend: Mapping[Feature, Feature] = NONE,
-) -> None:  # fmt: skip
-    """Build the world anew, of its particles in the mask `some` and the added ones, under these features, see change()."""
+def build_again(
+    world: Any, some: np.ndarray, added: Particles | None, features: tuple[Feature, ...], extend: Mapping[Feature, Feature]
+) -> None:
+    """Make a change by building the world anew."""
     world._runner.memory.check()
-    n, m, before = int(some.sum()), 0 if added is None else len(added), world.features
-    number = np.where(some, np.cumsum(some) - 1, -1)
-    now = world._particles.regrouped(some, added, world.position[some])
-    kept, attributes = checkpoint.keep(world), {f: dict(vars(f)) for f in {*before, *features}}
-    came = [f for f in features if f not in before or f.afresh]
-    went = [f for f in before if f not in features or f.afresh]
-    more = {f: other.copy() for f, other in extend.items()}
-    known = {one: start.regrouped(some, added) for one, start in {id(f.start): f.start for f in before}.items()}
-    starts: list[Any] = [None if f in came else known[id(f.start)] for f in features]
-    parts, told, seen = None, world._all_events(), _seen(world, number, features)
-    noted = {f: world._runner.memory.scratch(f) for f in before if isinstance(f, Batch)}
-    try:
-        world._runner.note_displacements()
-        borne = any(isinstance(f, Collider) for f in went)
-        pulled = (added is not None or not some.all()) and world._runner.step.has_pair_forces  # by others than before
-        turned = borne or pulled or world._force_waits or any(_drives(f, number) for f in (*came, *went, *more.values()))
-        if borne:
-            world._let_go()
-        elif turned:
-            with world._runner.memory.compiler():
-                world._runner.restart(world.iterations)
-        old = checkpoint.state(world) if turned else kept.values
-        masks = {f: tuple(mask & (f not in came) for mask in f.kept_mask(number)) for f in before}
-        rests = {f: np.stack(f.ramp.now())[:, masks[f][0]] for f in features if f.ramp and f.ramp.waits}
-        for f in before:
-            f.release()
-            f.remap_indices(number, n + m)
-        for f in went:
-            f.once = frozenset()
-        box = next((f for f in features if isinstance(f, Periodic)), None)
-        for k, f in enumerate(features):
-            if f in more:
-                starts[k] = extended(f, more[f], starts[k], now, box)
-        parts = assemble(now, features, starts, n, *world._build_options)
-        state = _carried(world, parts.memory, old, attributes, masks, some)
-    except BaseException:
-        if parts:
-            parts.memory.destroy()
-        for f, values in attributes.items():
-            f.__dict__.clear()
-            f.__dict__.update(values)
-        if world._clock.d_is_velocity != kept.clock.d_is_velocity:
-            checkpoint.put_back(world, kept)
-        raise
-    memories, particles = world._runner.memories, world._particles.regrouped(some, added)
-    contact, h2_effective = (
-        next((c for c in world._runner.step.contacts if c in features), None),
-        world._runner.scene.h2_effective,
-    )
-    world._clock.parted, left = None, world._runner.left
-    world._install(particles, features, parts)
-    world._runner.pass_on(left, some)
-    world._runner.scene.h2_effective = h2_effective
-    world._runner.memory.restore(state)
-    for f, rows in noted.items():
-        if f in features:
-            world._runner.memory.put_scratch(f, rows, masks[f])
-    world._runner.wake()
-    if contact and contact in world._runner.step.contacts:
-        _give_contacts(world, contact, old, number, some)
-    drag, world._clock.drag = world._clock.drag, None
-    if world._runner.integrator.decays:
-        world._runner.set_substep(world._clock.h, drag)
-    for f in features:
-        if f not in came:
-            f.changed, f.moving = attributes[f].get("changed", True), attributes[f].get("moving", False)
-            f.new_force = attributes[f].get("new_force", False)
-    for f, values in rests.items():
-        if f.ramp:
-            f.ramp.put([*values])  # from where they go to those that were assigned
-    for memory in memories:
-        memory.destroy()
-    if any(isinstance(f, PairContact) for f in came):
-        world._clock.first_moved = 0
+    before, told = world.features, world._all_events()
+    seen = _seen(world, np.where(some, np.cumsum(some) - 1, -1), features)
+    again = world._build_again(some, added, features, extend)
     walls = np.array([features.index(f) if f in features else -1 for f in before], dtype=np.int64)
-    tied = initial_violation.first_off([*(f for f in came if f not in before), *more.values()], world.position)
-    _edited(world, some, added, told, seen, walls, bool(came or went or more), tied)
+    new = [*(f for f in again.came if f not in before), *again.extending.values()]
+    tied = initial_violation.first_off(new, world.position)
+    _edited(world, some, added, told, seen, walls, bool(again.came or again.went or new), tied)
 
 
 def _seen(world: Any, number: np.ndarray, features: tuple[Feature, ...]) -> np.ndarray | None:
@@ -285,65 +211,9 @@ def _edited(
         watcher.regrouped()
 
 
-def _drives(feature: Feature, number: np.ndarray) -> bool:
-    """Whether a feature that comes or goes changes the force on particles that stay."""
-    if isinstance(feature, Batch):
-        return feature.soft and bool(feature.kept_mask(number)[0].any()) if feature.scene else feature.soft
-    return isinstance(feature, Acceleration)
-
-
 def _loses(feature: Feature, number: np.ndarray, features: tuple[Feature, ...]) -> bool:
     """Whether constraints go, or what may touch."""
     return isinstance(feature, Batch | PairContact) and (feature not in features or not feature.kept_mask(number)[0].all())
-
-
-def _carried(
-    world: Any, memory: Memory, old: dict[str, np.ndarray], attributes: dict[Feature, dict], masks: dict, some: np.ndarray
-) -> dict[str, np.ndarray]:
-    """The state of a world that was built anew: the rows of what stayed are as they were."""
-    new = memory.state()
-    names = [{id(e.field): e.name for e in one.entries if e.state} for one in (world._runner.memory, memory)]
-    owned: list[set[str]] = [set(), set()]
-    moves: list[tuple[str, str, tuple[np.ndarray, ...]]] = []
-    for feature, before in attributes.items():
-        pair = [_fields(values, known) for values, known in zip((before, vars(feature)), names, strict=True)]
-        for known, found in zip(owned, pair, strict=True):
-            known.update(found.values())
-        for key in pair[0].keys() & pair[1].keys():
-            per_particle = getattr(vars(feature.dev)[key[0]], "per_particle", False)  # and not by how many rows there are
-            moves.append((pair[0][key], pair[1][key], (some,) if per_particle else masks[feature]))
-    moves += [(name, name, (some,)) for name in (set(names[0].values()) - owned[0]) & (set(names[1].values()) - owned[1])]
-    for before, after, choices in moves:
-        rows = old[before]
-        mask = next((choice for choice in choices if len(choice) == len(rows)), None)
-        rows = rows if mask is None else rows[mask]
-        new[after][: len(rows)] = rows
-    return new
-
-
-def _fields(attributes: dict[str, Any], names: dict[int, str]) -> dict[tuple[str, str], str]:
-    """The fields of the state that a feature holds, or a part of it that lists them as `in_state`; and their names."""
-    bound = vars(attributes["dev"]) if "dev" in attributes else {}
-    parts = {key: getattr(value, "in_state", {"": value}) for key, value in bound.items()}
-    fields = {(key, part): field for key, held in parts.items() for part, field in held.items()}
-    return {key: names[id(field)] for key, field in fields.items() if id(field) in names}
-
-
-def _give_contacts(world: Any, contact: PairContact, old: dict, number: np.ndarray, some: np.ndarray) -> None:
-    """What pairs in contact remember, and how much smaller particles are than they will be."""
-    if "Contact.shrunk" in old:
-        contact.enable_shrink()
-        less: Any = contact.store
-        values = less.state()
-        values["Contact.shrunk"][: some.sum()] = old["Contact.shrunk"][some]
-        less.restore(values)
-    search, pairs = world._runner.search, number[old["Contact.pairs"]]
-    assert search
-    both = (pairs >= 0).all(axis=1)
-    # Of what came just now pairs remember nothing.
-    nothing = {p.name: np.zeros((len(pairs), p.width) if p.width else len(pairs)) for p in search.list.lasting}
-    search.list.restore(pairs[both], {name: old.get(f"Contact.{name}", none)[both] for name, none in nothing.items()})
-    world._runner.carry_loads()
 
 
 def _launch(world: Any, first: int) -> None:

@@ -1,0 +1,184 @@
+"""A world that is built anew around the same features, and what stays of its particles and its state."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ..colliders.collider import Collider
+from ..contact.pair_contact import PairContact
+from ..device.memory import Memory
+from ..features.extending import extended
+from ..features.feature import Acceleration, Batch, Feature
+from ..neighbours.periodic import Periodic
+from ..particles import Particles
+from . import checkpoint
+from .build import assemble
+
+
+class Rebuild:
+    """Build a world anew, of its particles in the mask `some` and the added ones, under these features, see edit_scene.change().
+
+    came, went: features, those that begin afresh among both. extending: what features take more of. Where anything is refused,
+    the world is as it was.
+    """
+
+    def __init__(
+        self, world: Any, some: np.ndarray, added: Particles | None, features: tuple[Feature, ...],
+        extend: Mapping[Feature, Feature],
+    ):  # fmt: skip
+        self.world, self.some, self.added, self.features, self.before = world, some, added, features, world.features
+        self.came = [f for f in features if f not in self.before or f.afresh]
+        self.went = [f for f in self.before if f not in features or f.afresh]
+        self.extending = {f: other.copy() for f, other in extend.items()}
+        self.number = np.where(some, np.cumsum(some) - 1, -1)
+        self.particles = world._particles.regrouped(some, added, world.position[some])
+        known = {one: start.regrouped(some, added) for one, start in {id(f.start): f.start for f in self.before}.items()}
+        self.starts: list[Any] = [None if f in self.came else known[id(f.start)] for f in features]
+        # What there was, for what stays, and to go back to.
+        self.checkpoint = checkpoint.keep(world)
+        self.attributes = {f: dict(vars(f)) for f in {*self.before, *features}}
+        self.noted = {f: world._runner.memory.scratch(f) for f in self.before if isinstance(f, Batch)}
+        self.old: dict[str, np.ndarray] = {}  # state
+        self.masks: dict[Feature, tuple[np.ndarray, ...]] = {}  # of the rows of each feature that stay
+        self.rests: dict[Feature, np.ndarray] = {}  # rest values that were assigned and wait
+
+    def run(self) -> None:
+        """Do it."""
+        parts = None
+        try:
+            self._settle()
+            self._take_apart()
+            parts = self._assembled()
+            state = self._carried(parts.memory)
+        except BaseException:
+            if parts:
+                parts.memory.destroy()
+            self._undo()
+            raise
+        self._install(parts, state)
+
+    def _settle(self) -> None:
+        """Keep the state; where forces will be others, such as displacements are in between, without a part of them."""
+        runner = self.world._runner
+        runner.note_displacements()
+        pulled = (self.added is not None or not self.some.all()) and runner.step.has_pair_forces  # by others than before
+        if any(isinstance(f, Collider) for f in self.went):
+            self.world._let_go()
+        elif pulled or self.world._force_waits or any(map(self._drives, (*self.came, *self.went, *self.extending.values()))):
+            with runner.memory.compiler():
+                runner.restart(self.world.iterations)
+        else:
+            self.old = self.checkpoint.values
+            return
+        self.old = checkpoint.state(self.world)
+
+    def _drives(self, feature: Feature) -> bool:
+        """Whether a feature that comes or goes changes the force on particles that stay."""
+        if isinstance(feature, Batch):
+            return feature.soft and bool(feature.kept_mask(self.number)[0].any()) if feature.scene else feature.soft
+        return isinstance(feature, Acceleration)
+
+    def _take_apart(self) -> None:
+        """Release features, and give them the new numbers of their particles."""
+        self.masks = {f: tuple(mask & (f not in self.came) for mask in f.kept_mask(self.number)) for f in self.before}
+        self.rests = {f: np.stack(f.ramp.now())[:, self.masks[f][0]] for f in self.features if f.ramp and f.ramp.waits}
+        for f in self.before:
+            f.release()
+            f.remap_indices(self.number, len(self.particles))
+        for f in self.went:
+            f.once = frozenset()
+
+    def _assembled(self) -> Any:
+        """The parts of the new world, see assemble()."""
+        box = next((f for f in self.features if isinstance(f, Periodic)), None)
+        for k, f in enumerate(self.features):
+            if f in self.extending:
+                self.starts[k] = extended(f, self.extending[f], self.starts[k], self.particles, box)
+        return assemble(self.particles, self.features, self.starts, int(self.some.sum()), *self.world._build_options)
+
+    def _carried(self, memory: Memory) -> dict[str, np.ndarray]:
+        """The state of the new world: the rows of what stays are as they were."""
+        new = memory.state()
+        names = [{id(e.field): e.name for e in one.entries if e.state} for one in (self.world._runner.memory, memory)]
+        owned: list[set[str]] = [set(), set()]
+        moves: list[tuple[str, str, tuple[np.ndarray, ...]]] = []
+        for feature, before in self.attributes.items():
+            pair = [_fields(values, known) for values, known in zip((before, vars(feature)), names, strict=True)]
+            for known, found in zip(owned, pair, strict=True):
+                known.update(found.values())
+            for key in pair[0].keys() & pair[1].keys():
+                per_particle = getattr(vars(feature.dev)[key[0]], "per_particle", False)  # and not by how many rows there are
+                moves.append((pair[0][key], pair[1][key], (self.some,) if per_particle else self.masks[feature]))
+        shared = (set(names[0].values()) - owned[0]) & (set(names[1].values()) - owned[1])
+        moves += [(name, name, (self.some,)) for name in shared]
+        for before, after, choices in moves:
+            rows = self.old[before]
+            mask = next((choice for choice in choices if len(choice) == len(rows)), None)
+            rows = rows if mask is None else rows[mask]
+            new[after][: len(rows)] = rows
+        return new
+
+    def _undo(self) -> None:
+        """Have the world as it was."""
+        for f, values in self.attributes.items():
+            f.__dict__.clear()
+            f.__dict__.update(values)
+        if self.world._clock.d_is_velocity != self.checkpoint.clock.d_is_velocity:
+            checkpoint.put_back(self.world, self.checkpoint)
+
+    def _install(self, parts: Any, state: dict[str, np.ndarray]) -> None:
+        """Put the parts into the world, and into these what stays."""
+        world, last = self.world, self.world._runner
+        contact = next((c for c in last.step.contacts if c in self.features), None)
+        h2_effective, left, memories = last.scene.h2_effective, last.left, last.memories
+        world._clock.parted = None
+        world._install(world._particles.regrouped(self.some, self.added), self.features, parts)
+        runner = world._runner
+        runner.pass_on(left, self.some)
+        runner.scene.h2_effective = h2_effective
+        runner.memory.restore(state)
+        for f, rows in self.noted.items():
+            if f in self.features:
+                runner.memory.put_scratch(f, rows, self.masks[f])
+        runner.wake()
+        if contact and contact in runner.step.contacts:
+            self._give_contacts(contact)
+        drag, world._clock.drag = world._clock.drag, None
+        if runner.integrator.decays:
+            runner.set_substep(world._clock.h, drag)
+        for f in self.features:
+            if f not in self.came:
+                f.changed, f.moving = self.attributes[f].get("changed", True), self.attributes[f].get("moving", False)
+                f.new_force = self.attributes[f].get("new_force", False)
+        for f, values in self.rests.items():
+            if f.ramp:
+                f.ramp.put([*values])  # from where they go to those that were assigned
+        for memory in memories:
+            memory.destroy()
+        if any(isinstance(f, PairContact) for f in self.came):
+            world._clock.first_moved = 0
+
+    def _give_contacts(self, contact: PairContact) -> None:
+        """What pairs in contact remember, and how much smaller particles are than they will be."""
+        if "Contact.shrunk" in self.old:
+            contact.enable_shrink()
+            less: Any = contact.store
+            values = less.state()
+            values["Contact.shrunk"][: self.some.sum()] = self.old["Contact.shrunk"][self.some]
+            less.restore(values)
+        search, pairs = self.world._runner.search, self.number[self.old["Contact.pairs"]]
+        assert search
+        both = (pairs >= 0).all(axis=1)
+        # Of what came just now pairs remember nothing.
+        nothing = {p.name: np.zeros((len(pairs), p.width) if p.width else len(pairs)) for p in search.list.lasting}
+        search.list.restore(pairs[both], {name: self.old.get(f"Contact.{name}", none)[both] for name, none in nothing.items()})
+        self.world._runner.carry_loads()
+
+
+def _fields(attributes: dict[str, Any], names: dict[int, str]) -> dict[tuple[str, str], str]:
+    """The fields of the state that a feature holds, or a part of it that lists them as `in_state`; and their names."""
+    bound = vars(attributes["dev"]) if "dev" in attributes else {}
+    parts = {key: getattr(value, "in_state", {"": value}) for key, value in bound.items()}
+    fields = {(key, part): field for key, held in parts.items() for part, field in held.items()}
+    return {key: names[id(field)] for key, field in fields.items() if id(field) in names}
