@@ -118,6 +118,63 @@ def test_bouncing_ball(floor, e):
     np.testing.assert_allclose(ends, ends[0], rtol=1e-12)
 
 
+def in_rows(rows, dim=2):
+    """Particles (x, y, speed upwards, radius, pinned) in rows, a group each and 10 m apart; and where those are that are free."""
+    flat, group = np.concatenate(rows).astype(float), np.repeat(np.arange(len(rows)), [len(row) for row in rows])
+    x, v = np.zeros((len(flat), dim)), np.zeros((len(flat), dim))
+    x[:, 0], x[:, 1], v[:, 1] = flat[:, 0] + 10 * group, flat[:, 1], flat[:, 2]
+    start = tv.Particles(x, velocity=v, radius=flat[:, 3], pinned=np.flatnonzero(flat[:, 4]), group=group)
+    return start, [np.flatnonzero((group == k) & (flat[:, 4] == 0)) for k in range(len(rows))]
+
+
+@pytest.mark.parametrize("kind, limit", [("discs", 1e-12), ("polygons", 1e-12), ("spheres in f32", 1e-4)])
+def test_what_bounces_on_pinned_particles_keeps_its_energy(world, kind, limit):
+    # With gravity, E = v^2 / 2 + g y, for any substep: kept where e = 1, by what falls on one that is pinned, flies to and fro
+    # below another one, or hops between two; above the contact E e^(2 k) after k bounces, at t0 (1 + 2 (e + ... + e^(k - 1))).
+    # Two that fall together and collide have the relative velocity -e u, and their middle falls as before.
+    g, e, r = 9.81, 0.8, 0.5
+    loops, floor, roof = [], [(0, 0, 0, r, 1)], [(0, 2.3, 0, r, 1)]
+    if kind == "polygons":
+        floor, roof = ([(x, y + up, 0, 0, 1) for x, y in ((-1, -r), (1, -r), (1, r), (-1, r))] for up in (0, 2.3))
+        loops = [range(4), range(5, 9), range(9, 13), range(14, 18)]
+    rows = [[*floor, (0, 1.2, 0, r, 0)], [*floor, *roof, (0, 1.1, 5, r, 0)], [*floor, (0, 1.2, 0, r, 0)]]
+    rows += [[(-0.7, 0, 0, r, 1), (0.7, 0, 0, r, 1), (0.02, 1.5, 0, r, 0)], [(0, 0, 3, r, 0), (0, 1.3, 0, r, 0)]]
+    start, free = in_rows(rows, 3 if kind.startswith("spheres") else 2)
+    restitution = {(k, k): e if k in (2, 4) else 1.0 for k in range(5)}
+    contact = tv.Polygons(loops, restitution=restitution) if loops else tv.Contact(restitution=restitution)
+    w = world(start, [tv.Gravity(g), contact], precision="f32" if "f32" in kind else "f64")
+    t0 = np.sqrt(2 * 0.2 / g)
+    met = t0 * (1 + 2 * np.cumsum(np.r_[0, e ** np.arange(1, 8)]))
+    for substeps in (2, 7, 20):
+        w.position, w.velocity, w.substeps, begin = start.position, start.velocity, substeps, w.time
+        energy = (start.velocity**2).sum(axis=1) / 2 + g * start.position[:, 1]
+        for _ in range(75):
+            w.step(1 / 60)
+            now, t = (w.velocity**2).sum(axis=1) / 2 + g * w.position[:, 1], w.time - begin
+            kept = np.concatenate([free[0], free[1], free[3]])
+            np.testing.assert_allclose(now[kept], energy[kept], rtol=limit)
+            if np.abs(t - met).min() > 1e-3 and t < met[-1]:
+                np.testing.assert_allclose(now[free[2]] - g, g * 0.2 * e ** (2 * (met < t).sum()), rtol=10 * limit)
+        low, high = free[4]
+        t = w.time - begin
+        assert w.velocity[low, 1] - w.velocity[high, 1] == pytest.approx(-3 * e, rel=10 * limit)
+        assert w.position[[low, high], 1].mean() == pytest.approx(0.65 + 1.5 * t - g * t * t / 2, rel=10 * limit)
+
+
+def test_what_springs_draw_to_a_pinned_disc_keeps_its_energy_to_second_order(world):
+    # A ball on a spring of 5 N/m, at rest 1 m long, and on a disc below it, e = 1: E = v^2 / 2 + g y + k (l - 1)^2 / 2.
+    start = tv.Particles([(0.0, 0.0), (0.0, 1.3), (0.0, 2.5)], radius=[0.5, 0.5, 0.0], pinned=[0, 2])
+    spring = tv.Distance([[1, 2]], compliance=0.2, rest=1.0)
+    w = world(start, [tv.Gravity(), tv.Contact(restitution=1.0), spring], precision="f64")
+    off = []
+    for substeps in (5, 20):
+        rerun(w, 5.0, substeps=substeps)
+        length = 2.5 - w.position[1, 1]
+        energy = (w.velocity[1] ** 2).sum() / 2 + 9.81 * w.position[1, 1] + 2.5 * (length - 1) ** 2
+        off.append(abs(energy / (9.81 * 1.3 + 2.5 * 0.2**2) - 1))
+    assert off[0] < 1e-3 and off[1] < off[0] / 8
+
+
 def test_newtons_cradle(world):
     # R17: pair by pair, with a gap and touching; the last ball carries on with all of it. Three rows, a group for each e.
     p, want = case("R17_newton_cradle")["params"], case("R17_newton_cradle")["values"]

@@ -63,9 +63,9 @@ class Contact(PairContact):
     (Distance, Rope, Spacer) do not touch.
 
     Friction wants back the slip s of a pair, up to friction times the overlap: what a pair has moved across its normal since it
-    touched, kept as long as it touches (Cundall and Strack 1979). Restitution gives the pair the normal velocity -e times the one
-    that it had before the substep, from the moment on when it met. Neither depends on h, but where forces draw the two together:
-    an acceleration g takes g h of the speed in a bounce at e = 1, on average, which walls do not.
+    touched, kept as long as it touches (Cundall and Strack 1979). Restitution gives the pair, from the moment on when it meets,
+    the normal velocity -e times the one that it has then, with the force in that substep. Neither depends on h: a bounce keeps
+    e^2 of the energy along the normal, to rounding under forces that are the same everywhere, and to second order under others.
 
     Particles that spin (see Particles) slide past each other by what the points that touch do, and turn as friction acts there.
     friction = (static, dynamic, rolling, twisting) also resists rolling, by a moment of up to rolling * r times the normal force,
@@ -248,6 +248,7 @@ class Contact(PairContact):
                     each *= ti.static(RELAXATION)
                     paid, given, rests, alone = overlap, ti.zero(overlap), True, w + self.dev.w.of(j)
                     push, known = again * last, ti.zero(overlap)  # known: what of its push was given before
+                    left = ti.zero(overlap)  # of the substep, after an impact
                     keeps = ti.max(lesser(1 - alone * each, ti.static(CARRY)), 0)
                     if ti.static(self.dev.has_loads):
                         if first != 0:
@@ -288,12 +289,15 @@ class Contact(PairContact):
                     push += part
                     least = lesser(push, least)
                     want = part * n
+                    if ti.static(self.dev.has_restitution and self.dev.has_friction):
+                        if given > 0:
+                            given, left, _approach = self.dev.restitution.impact(i, j, n, overlap)
                     if ti.static(self.dev.spins):
                         tangential, turned = self.grip(i, j, e, n, reach, pressed + given / shared, given > 0)
                         want += tangential
                         if ti.static(self.dev.has_restitution):
                             if given > 0:  # it acts from the time of impact on
-                                lift -= w * self.dev.restitution.before_impact(i, j, n, overlap) * tangential
+                                lift -= (1 - left) * w * tangential
                         spin_change += w * turned
                         if final != 0:
                             before = self.dev.forces.before[i] - self.dev.forces.before[j]

@@ -20,7 +20,7 @@ from .force_share import ForceShare
 from .loops import checked, flat, laid, refuse_deep
 from .pair_contact import PairContact
 from .polygon_narrow_phase import VERTEX, Beside, Outline, PolygonGeometry
-from .restitution import SLOW
+from .restitution import SLOW, under_force
 
 SKIN = 0.15  # of the longer edge of a vertex
 
@@ -342,7 +342,7 @@ class Polygons(PairContact):
 
 
 class PolygonRestitution:
-    """Contacts of vertices and edges leave with -e times the normal velocity that they had before the substep."""
+    """Contacts of vertices and edges leave with -e times the normal velocity that they have as they meet, see under_force()."""
 
     def __init__(self, scene: Scene, geometry: PolygonGeometry, table: Table):
         n, add = scene.count, scene.memory.field
@@ -371,6 +371,9 @@ class PolygonRestitution:
             missing = ti.max(aim - (overlap + leaving), 0)
             if overlap <= -leaving:
                 lift = restitution * overlap
+            given, left = under_force(0 * overlap, 0 * overlap, -leaving, approach, overlap, restitution)
+            if given > 0:
+                aim, missing, lift = given + leaving, given, left * given - overlap
         return aim, missing, lift
 
     @ti.func

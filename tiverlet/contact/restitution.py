@@ -12,7 +12,7 @@ SLOW = 2.0  # substeps of forces that give a pair no more than the speed at whic
 
 
 class Restitution:
-    """A pair leaves with -e times the normal velocity that it had before the substep, from the time of impact on, see Contact.
+    """A pair leaves with -e times the normal velocity that it has at the time of impact, from then on, see under_force().
 
     struck: of its pairs, those that are struck in this substep. slack: of their overlap, what no push is for. impulse: pushes
     and impacts of the last substep [kg m]. events: an EventLog, or None.
@@ -71,16 +71,20 @@ class Restitution:
 
     @ti.func
     def target(self, i, j, n):
-        """What takes a pair from coming together to leaving; how far it comes together in this substep, and without forces."""
+        """What takes a pair from coming together to leaving at e times its velocity before the substep; how far it comes together
+        in this substep, and without forces."""
         a = -self.state.slid(self.state.before[i] - self.state.before[j], i, j).dot(n)
         here = -self.state.slid(self.state.d[i] - self.state.d[j], i, j).dot(n)
         return here + self.table.of(i, j)[2] * ti.max(a, 0), here, a
 
     @ti.func
-    def before_impact(self, i, j, n, overlap):
-        """The share of the substep that had passed when a pair met."""
-        here = -self.state.slid(self.state.d[i] - self.state.d[j], i, j).dot(n)
-        return ti.select(overlap < here, 1 - overlap / here, 0 * here)
+    def impact(self, i, j, n, overlap):
+        """What takes a pair that overlaps from coming together to leaving, with the force in the substep; the part of the substep
+        that is left after the impact; and how far the pair comes together without forces."""
+        given, here, a = self.target(i, j, n)
+        left = ti.select(overlap < here, overlap / here, 1)
+        given, left = under_force(given, left, here, a, overlap, self.table.of(i, j)[2])
+        return given, left, a
 
     @ti.func
     def choose(self, i):
@@ -91,9 +95,8 @@ class Restitution:
                 if self.struck.field[e] > 0:
                     j = self.list.neighbour[e]
                     overlap, _each, n, _reach = self.geometry.impact(i, j, self.geometry.contact_distance(i, j), self.weight[i])
-                    given, here, a = self.target(i, j, n)
+                    given, left, a = self.impact(i, j, n, overlap)
                     if overlap > 0 and a > 0 and given > 0:
-                        left = ti.select(overlap < here, overlap / here, 1)
                         if left > most or (left == most and earlier(i, j, partner)):
                             first, partner, most = e, j, left
                             self.d_change[i] = w / (w + self.state.w.of(j)) * given * n
@@ -118,6 +121,26 @@ class Restitution:
                 self.state.d[i] = self.state.d[i] + d_change
                 self.state.before[i] = self.state.before[i] + d_change
                 self.state.advance(i, self.left[i] * d_change)
+
+
+@ti.func
+def under_force(given, left, here, a, overlap, e):
+    """The impact of a pair in a substep in which a force acts: what takes it from coming together to leaving [m], and the part of
+    the substep that is left after it; `given` and `left` where no force acts, or where the pair does not get free of overlap.
+
+    In units of the substep, the pair comes together by `here`, of which f = here - a is what forces added. At s its way is
+    u s + f s^2 / 2, u = here - f / 2, and its velocity u + f s. It meets at s = 2 gap / (u + sqrt(u^2 + 2 f gap)), gap = here -
+    overlap, leaves at e times its velocity then, and falls back by f (1 - s)^2 / 2. So energy is kept at e = 1, whatever s is:
+    a change J of the velocity at s changes what d and x are worth at the end by J (J / 2 - u - f s).
+    """
+    f, gap = here - a, here - overlap
+    u = here - f / 2
+    if f != 0 and gap > 0 and u > 0:
+        s = ti.min(2 * gap / (u + ti.sqrt(ti.max(u * u + 2 * f * gap, 0))), 1)
+        met = here + (s - 0.5) * f
+        if e * met > ti.max((1 - s) * f / 2, 0):
+            given, left = (1 + e) * met, 1 - s
+    return given, left
 
 
 @ti.func
