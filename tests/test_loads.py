@@ -193,13 +193,17 @@ def test_pairs_that_bounce_learn_where_they_rest(world):
 
 
 def test_what_bounces_knows_no_load(world):
-    # To the bit: what flies about without a force, and a ball that falls on one that is held, for the 1.5 s until it rests; it
-    # leaves at e times its speed, so it rises to e^2 of its height.
+    # To the bit: what flies about without a force, or falls and bounces on walls in the substep in which pairs are struck, too,
+    # and a ball that falls on one that is held, for the 1.5 s until it rests; it leaves at e times its speed, so it rises to e^2
+    # of its height.
     rng = np.random.default_rng(0)
     gas = np.stack(np.meshgrid(1.5 * np.arange(6), 1.5 * np.arange(6)), axis=-1).reshape(-1, 2) + 1.0
     ball, speed = np.array([[5.0, 3.5]]), rng.normal(size=gas.shape)
-    for x, held, v, gravity, e in ((gas, None, speed, 0.0, 0.8), (ball, [5.0, 2.0], 0.0, G, 0.6)):
-        known, plain = (boxed(world, x, 9.5, 0.0, None, loads, e, 1.0, v, gravity, held, substeps=20) for loads in (True, False))
+    for x, held, v, gravity, e, substeps in (
+        (gas, None, speed, 0.0, 0.8, 20), (gas, None, speed, G, 1.0, 2), (ball, [5.0, 2.0], 0.0, G, 0.6, 20)
+    ):  # fmt: skip
+        settings = {"walls": 1.0, "v": v, "g": gravity, "held": held, "substeps": substeps}
+        known, plain = (boxed(world, x, 9.5, 0.0, None, loads, e, **settings) for loads in (True, False))
         heights = []
         for _ in range(90):
             known.step(1 / 60), plain.step(1 / 60)

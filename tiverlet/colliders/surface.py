@@ -125,8 +125,10 @@ class Surface:
             if ti.static(self.has_restitution):
                 # Where the last bounce has put it back on a straight way, that way began at a height of `gap`.
                 gap = -depth - leaving
-                if gap >= 0 and leaving < 0 and turn < GENTLY:
+                if gap >= 0 and leaving < 0 and turn != GENTLY:
                     rise, after, left = self.bounce(gap, leaving, (self.state.before[i] - moved).dot(n), after)
+                if turn == AHEAD and rise > 0:  # what bounces in this substep does not lean on the wall
+                    move, rise, after = 0 * depth, 0 * depth, leaving
             if ti.static(self.has_log):
                 if turn != AHEAD:
                     self.log.note(i, depth, n, after - leaving, -leaving)
