@@ -64,6 +64,8 @@ def test_a_pile_at_rest_hardly_overlaps(world, settings, most):
         without = pile(world, loads=False, **settings)
         without.run(15.0)
         assert most < 0.05 * overlap(without)
+        # What pushes there is a force in their velocities: else these would be half of what gravity gives in a substep.
+        assert np.abs(without.velocity).max() < 1e-9
     speed = np.linalg.norm(w.velocity, axis=1).max()
     assert speed < (1e-3 if w.precision == "f32" or "spin" in settings else 1e-4)
 
@@ -85,6 +87,28 @@ def test_a_column_bears_what_is_above(world):
     np.testing.assert_allclose(found.impulse / h, G * np.cumsum(mass[:0:-1])[::-1], rtol=1e-7)
     assert np.abs(found.overlap).max() < 1e-9
     assert np.abs(w.velocity).max() < 1e-8
+
+
+def test_a_load_is_learnt_where_it_is_steady_and_lost_where_it_is_let_go(world):
+    # A disc of 1 kg bears one of 99 kg. What is missing of the pair's load is learnt where it was the same in the window before,
+    # of 128 substeps: not in the first of them, before which nothing was missing. Then 1 - 128 / (64 + 0.3 k^2) of it is left by
+    # each window, k = 99, and the overlap of the pair is in proportion to it.
+    def known(w):
+        """Of the pair [N]."""
+        pairs, values = w._runner.search.list.lasting_data()
+        return values["load"][(pairs == (0, 1)).all(axis=1)].sum()
+
+    w = smooth(world, None, [1.0, 99.0], substeps=128)
+    knew = [known(w) for _ in range(3) if w.step(128 / 480)]
+    assert knew[:2] == [0.0, 0.0] and knew[2] > 0.0
+    w.run(12 * 128 / 480, dt=128 / 480)
+    left = [w.contacts.overlap[0] for _ in range(3) if w.step(128 / 480)]
+    np.testing.assert_allclose(np.array(left[1:]) / left[:-1], 1 - 128 / (64 + 0.3 * 99**2), rtol=1e-3)
+    # What leaves has no load from the substep on in which nothing pushes it, however near it still is.
+    assert known(w) > 0.0
+    w.velocity, w.substeps = [[0.0, 0.0], [0.0, 1.0], [0.0, 0.0]], 8
+    w.step(8 / 480)
+    assert known(w) == 0.0 and 1.0 < np.linalg.norm(w.position[1] - w.position[0]) < 1.02
 
 
 def test_what_is_known_holds_at_any_substep(world):

@@ -167,6 +167,7 @@ def test_a_constraint_does_what_all_constraints_do(world, name):
     scene.gravity.g = force / MASS[scene.arity - 1]
     w.run(0.5, dt=0.1)
     np.testing.assert_allclose(scene.block("loaded"), scene.block("loaded", x0), atol=2e-7)
+    np.testing.assert_allclose(scene.block("loaded", w.velocity), 0.0, atol=1e-8)  # the spring is a force in them, too
     assert f.load[c] == pytest.approx(row.off / 10 / scene.compliance[c], rel=1e-5)
 
 

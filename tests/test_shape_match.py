@@ -170,6 +170,8 @@ def test_clusters_fall_apart(world):
     w.run(0.1)
     assert shape.broken.tolist() == [True, False, True, False]
     assert shape.load[[0, 2]].tolist() == [0, 0] and shape.load[1] == pytest.approx(25, rel=1e-4)
+    # What turns has velocities across its radius, second order in h; without reactions they would be off by h m omega^2 r / 2.
+    assert abs(np.diff(w.velocity, axis=0)[2] @ np.diff(w.position, axis=0)[2]) < 1e-6
     away = w.position
     w.run(0.5)
     np.testing.assert_allclose(w.position[[0, 1, 4, 5]] - away[[0, 1, 4, 5]], 0.5 * w.velocity[[0, 1, 4, 5]], atol=1e-9)
