@@ -389,9 +389,9 @@ def test_a_link_whose_rest_length_becomes_zero(world):
 def test_what_was_turned_and_turned_back_leaves_no_trace(world):
     # Links of length 0 are relaxed alone. Longer again they are solved with the others again, to the bits of a new world.
     def hang(rest):
-        start = tv.Particles(np.array([[0.0, 0], [0.5, 0], [1, 0.2], [1.4, 0]]), pinned=[0], radius=0.05)
+        start = tv.Particles(np.array([[0.0, 0], [0.5, 0], [1, 0.2], [1.4, 0]]), pinned=[0])
         links = tv.Distance([[0, 1], [1, 2], [2, 3]], rest=rest)
-        return world(start, [links, tv.Gravity(9.81), tv.Contact()], substeps=7, solver=tv.Direct()), links
+        return world(start, [links, tv.Gravity(9.81)], substeps=7, solver=tv.Direct()), links
 
     w, links = hang([0.5, 0.5, 0.4])
     for rest in ([0.5, 0.0, 0.4], [0.6, 0.5, 0.4]):
