@@ -2,6 +2,7 @@
 many files a frame goes."""
 
 import ast
+import functools
 import sys
 from pathlib import Path
 
@@ -26,6 +27,8 @@ INHERITED = 200  # lines that a constraint like Rope has from the classes above 
 CHAIN = 4  # classes, each below the next: what acts on particles, how many of them, of which kind, and which
 
 
+# Nothing is read when this file is imported, which every worker does.
+@functools.cache
 def modules() -> dict[str, ast.Module]:
     """All modules of the package by their names."""
     out = {}
@@ -35,16 +38,13 @@ def modules() -> dict[str, ast.Module]:
     return out
 
 
-MODULES = modules()
-
-
 def named(module: str, node: ast.AST) -> dict[str, tuple[str, str]]:
     """What an import of ours names there: by each name the module, and what of it, "" for the module itself."""
     if not isinstance(node, ast.ImportFrom) or not node.level:
         return {}
     package = module if (ROOT.parent / module.replace(".", "/")).is_dir() else module.rpartition(".")[0]
     base = ".".join([*package.split(".")[: len(package.split(".")) + 1 - node.level], *filter(None, [node.module])])
-    return {a.asname or a.name: (m, "") if (m := f"{base}.{a.name}") in MODULES else (base, a.name) for a in node.names}
+    return {a.asname or a.name: (m, "") if (m := f"{base}.{a.name}") in modules() else (base, a.name) for a in node.names}
 
 
 def imported(name: str) -> list[str]:
@@ -58,7 +58,7 @@ def imported(name: str) -> list[str]:
             if isinstance(node, ast.If) and "TYPE_CHECKING" not in ast.unparse(node.test):
                 look(node.body + node.orelse)
 
-    look(MODULES[name].body)
+    look(modules()[name].body)
     return [m for m in dict.fromkeys(out) if m != name]
 
 
@@ -73,7 +73,7 @@ def test_imports_go_in_no_circle():
                 visit(below, (*path, name))
             done.add(name)
 
-    for name in MODULES:
+    for name in modules():
         visit(name, ())
 
 
@@ -87,47 +87,58 @@ def test_imports_are_shallow():
             chains[name] = (name, *max(map(chain, imported(name)), key=len, default=()))
         return chains[name]
 
-    longest = max(map(chain, MODULES), key=len)
+    longest = max(map(chain, modules()), key=len)
     assert len(longest) <= DEPTH, " -> ".join(longest)
     assert chain("tiverlet.world")[-1] == "tiverlet.device.language"  # and imports are seen
 
 
-KINDS = {(m, node.name): node for m, tree in MODULES.items() for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
-ORIGINS = {m: {k: v for node in ast.walk(tree) for k, v in named(m, node).items()} for m, tree in MODULES.items()}
+@functools.cache
+def kinds() -> dict[tuple[str, str], ast.ClassDef]:
+    """All classes of the package by their modules and names."""
+    return {(m, node.name): node for m, tree in modules().items() for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
+
+
+@functools.cache
+def origins() -> dict[str, dict[str, tuple[str, str]]]:
+    """Of each module what its imports name."""
+    return {m: {k: v for node in ast.walk(tree) for k, v in named(m, node).items()} for m, tree in modules().items()}
 
 
 def kind_of(module: str, said: ast.expr) -> tuple[str, str] | None:
     """The class of ours, by its module and its name, that an expression means there."""
     if isinstance(said, ast.Attribute) and isinstance(said.value, ast.Name):
-        module, name = ORIGINS[module].get(said.value.id, ("", ""))[0], said.attr
+        module, name = origins()[module].get(said.value.id, ("", ""))[0], said.attr
     else:
         name = said.id if isinstance(said, ast.Name) else ""
-    while module and (module, name) not in KINDS:
-        module, name = ORIGINS[module].get(name, ("", ""))
+    while module and (module, name) not in kinds():
+        module, name = origins()[module].get(name, ("", ""))
     return (module, name) if module else None
 
 
-BASES = {kind: [b for said in node.bases if (b := kind_of(kind[0], said))] for kind, node in KINDS.items()}
+@functools.cache
+def bases() -> dict[tuple[str, str], list[tuple[str, str]]]:
+    """Of each class those of ours that it inherits from at once."""
+    return {kind: [b for said in node.bases if (b := kind_of(kind[0], said))] for kind, node in kinds().items()}
 
 
 def depth(kind: tuple[str, str], ground: tuple[str, ...] = CONTRACTS) -> int:
     """How many classes of ours are below one, those of the ground and what is below these left out."""
-    return 0 if kind[1] in ground else max((1 + depth(b, ground) for b in BASES[kind]), default=0)
+    return 0 if kind[1] in ground else max((1 + depth(b, ground) for b in bases()[kind]), default=0)
 
 
 def test_classes_are_at_most_two_below_a_contract():
     # And no chain of them is longer than CHAIN, contracts and all.
-    by = {kind[1]: kind for kind in KINDS}
-    assert {kind: d for kind in KINDS if (d := depth(kind)) > 2} == {}
-    assert {kind: d for kind in KINDS if (d := depth(kind, ()) + 1) > CHAIN} == {}
+    by = {kind[1]: kind for kind in kinds()}
+    assert {kind: d for kind in kinds() if (d := depth(kind)) > 2} == {}
+    assert {kind: d for kind in kinds() if (d := depth(kind, ()) + 1) > CHAIN} == {}
     assert depth(by["Distance"]) == depth(by["Mesh"]) == 2 and depth(by["Gravity"]) == depth(by["Direct"]) == 1
     assert depth(by["Distance"], ()) + 1 == CHAIN and depth(by["Direct"], ()) + 1 == 2
 
 
 def test_classes_are_abstract_or_final():
     # What others inherit from is never made itself: who wants its code holds an object.
-    abstract = {b for bases in BASES.values() for b in bases}
-    calls = {m: [node for node in ast.walk(tree) if isinstance(node, ast.Call)] for m, tree in MODULES.items()}
+    abstract = {b for below in bases().values() for b in below}
+    calls = {m: [node for node in ast.walk(tree) if isinstance(node, ast.Call)] for m, tree in modules().items()}
     made = {kind for m, some in calls.items() for node in some if (kind := kind_of(m, node.func))}
     assert abstract & made == set()
     assert ("tiverlet.features.feature", "Batch") in abstract and ("tiverlet.neighbours.neighbour_list", "NeighbourList") in made
@@ -141,20 +152,20 @@ def lines(function: ast.FunctionDef) -> int:
 
 def functions(kind: tuple[str, str], in_kernels: bool | None = None) -> list[ast.FunctionDef]:
     """Those of a class: all, those for kernels, or those for the host."""
-    some = [node for node in KINDS[kind].body if isinstance(node, ast.FunctionDef)]
+    some = [node for node in kinds()[kind].body if isinstance(node, ast.FunctionDef)]
     marks = {id(f): bool({ast.unparse(d) for d in f.decorator_list} & {"ti.func", "ti.kernel", "inline"}) for f in some}
     return [f for f in some if in_kernels is None or marks[id(f)] == in_kernels]
 
 
 def above(kind: tuple[str, str]) -> list[tuple[str, str]]:
     """The classes of ours that one inherits from."""
-    return [a for b in BASES[kind] for a in (b, *above(b))]
+    return [a for b in bases()[kind] for a in (b, *above(b))]
 
 
 def test_kernels_inherit_nothing_that_does_something():
     # Of a contract they have functions of one line, which give what most would; and a constraint has few lines of the host's.
-    by = {kind[1]: kind for kind in KINDS}
-    abstract = {b for bases in BASES.values() for b in bases}
+    by = {kind[1]: kind for kind in kinds()}
+    abstract = {b for below in bases().values() for b in below}
     long = {kind[1] for kind in abstract if any(lines(f) > 1 for f in functions(kind, in_kernels=True))}
     assert long == set(SHARED)
     assert lines(functions(by["CornerPasses"], in_kernels=True)[0]) > 10  # and functions are seen
