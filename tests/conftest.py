@@ -27,6 +27,8 @@ from tiverlet.recording import reader, rrd, scene
 from tiverlet.report.accuracy.cases import entries, known
 from tiverlet.step import build
 
+# Until the first test begins: collecting tests leaves little garbage, and to look for it takes a third of the time.
+gc.disable()
 # Taichi keeps kernels that it has compiled, by their content. Part of that are the numbers of the trees of fields that were made
 # before, so every file of tests has a Taichi of its own: a second run finds them all and takes a third of the time, and after an
 # edit it compiles what the edit changes. All of them are larger than what Taichi keeps by default, 100 MB.
@@ -126,6 +128,7 @@ def process():
     # What has been imported is no garbage; to look through all of it again and again takes 4 % of a run that compiles nothing.
     gc.collect()
     gc.freeze()
+    gc.enable()
     with checked_assignments() if patched else contextlib.nullcontext():
         yield
     build.CROSSOVER = CROSSOVER
