@@ -102,11 +102,11 @@ class KnownLoads:
         load, borne = self.load.field[e], self.borne.field[e] + part
         if now.first != 0:
             if now.fresh != 0:
-                borne *= 0
+                borne = part  # a start: forces were others before it
             if (now.span.since + now.s) % WINDOW == 0:
                 load = self.learn(i, j, e, load, (borne - part) / (WINDOW * now.h * now.h))
                 self.load.field[e] = load
-                borne = part
+                borne = part  # a start: forces were others before it
         if push <= 0:
             load *= 0
             self.load.field[e] = load
