@@ -40,6 +40,7 @@ SLIGHT = 0.01  # of the kinetic energy: what violations may become where contact
 LEFT = 0.01  # of what violations store: what may be left of it in the shorter substep
 DONE = 1e-6  # of its size: a violation that is none
 TURNS = 16  # with walls, at most: a link that stands on one halves its violation in each
+HELD = 1e3  # of its mass: how firmly a wall holds a particle that it has stopped
 LARGEST = 300  # corners: outlines of more couple each with each
 
 
@@ -78,24 +79,29 @@ def project(runner: "Runner", h: float, longest: float) -> bool | None:
     still = (undone != 0) & (start.theta > FIRM)
     v[:n] += rows.jacobian.solve(-rows.jacobian.rates(v[:n]) * still, still)
     energy, overlap = seen_before(runner)
+    enough = LEFT * ratio**2 * start.stored
     for _ in range(TURNS):
-        state.put(memory, _newton(rows, LEFT * ratio**2 * start.stored, LEFT * ratio**2, converges))
+        state.put(memory, _newton(rows, enough, LEFT * ratio**2, converges))
         sent = state.get(memory)
         runner.stop_at_walls(before)
         x = state.get(memory)
         if (x == sent).all():
             break
-        rows = rows.at(x)  # what walls stop is lifted by the others
+        last, rows = rows, rows.at(x)  # what walls stop is lifted by the others
+        if rows.stored > last.stored or last.wall.any():  # what lies on them would be sent back there again and again
+            rows = rows.held(last.wall, x - sent)
+            if rows.stored <= enough:
+                break
     memory.write(state.d, v)
     more, deeper = seen(runner)
-    if deeper > overlap:
+    if deeper > overlap or rows.stored > start.stored:
         state.put(memory, before)
         memory.write(state.d, kept)
         stake = _over(start.weight * undone**2, start.diagonal).sum() / (2 * h * h)
         kinetic = (_over(np.ones_like(w), w)[:, None] * kept[:n].astype(np.float64) ** 2).sum() / 2
         return None if stake > SLIGHT * kinetic else True
     if more > energy:
-        v[:n] = paid(start.jacobian, v[:n], x - before, more - energy)
+        v[:n] = paid(start.jacobian, v[:n], x - before, more - energy, rows.wall.any(axis=1))
         memory.write(state.d, v)
     return True
 
@@ -177,6 +183,7 @@ class Rows:
         first = (np.cumsum(arity) - arity)[arity == 2]
         self.pairs = self.row[first], self.who[first], self.who[first + 1]
         self.arity = arity
+        self.wall = np.zeros_like(x)  # normals of the walls that hold particles; 0 where none does
         self._measure(x)
 
     def _each(self, values: list[np.ndarray]) -> np.ndarray:
@@ -213,6 +220,16 @@ class Rows:
         ])  # fmt: skip
         self.free = (ends >= 0).all(axis=0)
         self.matrix = BlockMatrix(len(self.inside), self.dim, *ends[:, self.free])
+
+    def held(self, wall: np.ndarray, back: np.ndarray) -> "Rows":
+        """The same rows where walls, of these normals, and of those along which particles were moved `back`, (n, dim), hold what
+        is not drawn off them."""
+        far = np.linalg.norm(back, axis=1)[:, None]
+        wall = np.where(far > 0, back * _over(np.ones_like(far), far), wall)
+        pull = -self.jacobian.gathered(self.J * (_over(self.weight, self.diagonal) * self.C)[self.row, None])
+        new = copy.copy(self)
+        new.wall = wall * ((pull * wall).sum(axis=1) <= 0)[:, None]
+        return new
 
     def at(self, x: np.ndarray) -> "Rows":
         """The same rows elsewhere."""
@@ -253,7 +270,8 @@ class Rows:
         return _over(reach * reach, reach * reach + alpha * alpha)
 
     def step(self, mu: float) -> np.ndarray:
-        """Moves p that minimize sum (C + J p)^2 / (2 D) + mu p^T M p / 2 + p^T K p / 2, with D the diagonal of J w J^T.
+        """Moves p that minimize sum (C + J p)^2 / (2 D) + p^T M (mu + HELD n n^T) p / 2 + p^T K p / 2, with D the diagonal of
+        J w J^T and n the normals of walls that hold particles: else these are sent into them again, and stopped again.
 
         K is what tensions C / D across links are: without it, those that are in one line have no direction to give way in, and
         what would draw a taut rope straight throws it into a zigzag.
@@ -266,7 +284,8 @@ class Rows:
         taut = _over(np.maximum(self.C[row], 0.0) * stiff[row], length)
         one, (a, b) = np.eye(self.dim), self.corners
         sides = taut[:, None, None] * (one - across[:, :, None] * across[:, None, :])
-        mass = mu / self.w[self.inside][:, None, None] * one
+        wall = self.wall[self.inside]
+        mass = (mu * one + HELD * wall[:, :, None] * wall[:, None, :]) / self.w[self.inside][:, None, None]
         along = (stiff[self.row[a], None] * self.J[a])[:, :, None] * self.J[b][:, None, :]
         right = self.jacobian.gathered(self.J * (stiff * self.C)[self.row, None])
         blocks = np.concatenate((along, sides, sides, -sides, -sides, mass))[self.free]
@@ -275,8 +294,9 @@ class Rows:
         return out
 
 
-def paid(jacobian: Jacobian, v: np.ndarray, moves: np.ndarray, energy: float) -> np.ndarray:
-    """Velocities without the energy [J] that moves added: of their part along them first, then of what is anchored.
+def paid(jacobian: Jacobian, v: np.ndarray, moves: np.ndarray, energy: float, walls: Any = False) -> np.ndarray:
+    """Velocities without the energy [J] that moves added: of their part along them first, then of what is anchored, or stands on
+    something. walls: whether one holds each particle.
 
     Each body, of what constraints tie together, pays by the mass that it has lifted, up to all it has.
     """
@@ -293,7 +313,7 @@ def paid(jacobian: Jacobian, v: np.ndarray, moves: np.ndarray, energy: float) ->
     part = _over(along, size)
     due, left = _settled(due, part * along / 2)
     v = v - ((1 - left) * part)[body][:, None] * moves
-    held = np.bincount(label[row[w[who] == 0]], minlength=rows + 1) > 0
+    held = np.bincount(label[row[(w[who] == 0) | np.broadcast_to(walls, len(w))[who]]], minlength=rows + 1) > 0
     _, left = _settled(np.where(held, due, 0.0), summed((v**2).sum(axis=1)) / 2)
     return v * left[body][:, None]
 
