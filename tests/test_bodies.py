@@ -43,7 +43,8 @@ def test_areas_of_polygons(world):
 
 
 def test_straight_outlines_enclose_nothing():
-    # Their area is 0 to rounding, which may be below 0 both ways round; what it takes for rest can be assigned.
+    # Their area is 0 to rounding, which may be below 0 both ways round; what it takes for rest can be assigned, and it goes the
+    # same way round however often it is asked.
     random = np.random.default_rng(1)
     for _ in range(200):
         along, at, m = random.normal(size=2), random.normal(size=2), int(random.integers(4, 14))
@@ -51,6 +52,9 @@ def test_straight_outlines_enclose_nothing():
         area.prepare(particles, particles.inv_mass.copy())
         area.rest = area.rest
         assert 0 <= area.rest[0] < 1e-15
+        order = area.indices.copy()
+        area.prepare(particles, particles.inv_mass.copy())  # as for a clone, which goes the same way round
+        assert (area.indices == order).all()
 
 
 def test_volumes_of_solids(world):

@@ -65,7 +65,8 @@ class Area(Scalar):
             raise ValueError("Area: loops of more than 3 particles enclose no definite area in 3D; use triangles, or Volume.")
         self.check_indices(particles)
         if particles.dim == 2:
-            self.hold(self.quantity.reversed(self.rest_of(particles.position) < 0))
+            for _ in range(2):  # back again where it is negative either way round, being flat: a clone asks anew
+                self.hold(self.quantity.reversed(self.rest_of(particles.position) < 0))
         if "rest" not in self.__dict__ and self._rest_given is None:  # what is straight is so to rounding, either way round
             self.rest = np.maximum(self.rest_of(particles.position), 0.0)
         super().prepare(particles, inv_mass)

@@ -77,7 +77,8 @@ class Volume(Scalar):
         if particles.dim != 3:
             raise ValueError("Volume: there are no volumes in a 2D world; use Area.")
         self.check_indices(particles)
-        self.hold(self.quantity.reversed(self.rest_of(particles.position) < 0))
+        for _ in range(2):  # back again where it is negative either way round, being flat: a clone asks anew
+            self.hold(self.quantity.reversed(self.rest_of(particles.position) < 0))
         super().prepare(particles, inv_mass)
         if (self.rest < 0).any():  # of a flat body, by rounding, either way round
             self.__dict__["rest"] = np.maximum(self.rest, 0.0)
