@@ -136,8 +136,8 @@ def by_recording(trial: Trial, events: list[Event]) -> None:
 def by_company(trial: Trial, events: list[Event]) -> None:
     """A particle that comes and goes far away changes nothing."""
     structure = trial.structure
-    if structure.periodic or any(f.name == "Sleep" for f in structure.features):  # nothing is far away; edits wake
-        return
+    if structure.periodic or any(f.name in ("Sleep", "PairForce") for f in structure.features):
+        return  # nothing is far away; edits wake what sleeps, and are a start where forces between particles make velocities
     other, n, radius = Trial(structure), len(structure.position), float(trial.world.particles.radius.max())
     try:
         steps = [e for e in events if isinstance(e, Step)][:3]
