@@ -224,6 +224,16 @@ def test_systems_of_particles_are_solved(monkeypatch):
     wide = block_matrix.BlockMatrix(26, 3, a, b)
     error = np.linalg.norm(wide.solve(blocks, right) - want) / np.linalg.norm(want)
     assert not wide.narrow and error <= 1e-2  # as far as it has to go
+    # Rows on many particles at once, as of volumes, are added without a block for each two.
+    k, row, who, J = np.array([2.0, 0.5]), np.repeat([0, 1], 20), np.r_[np.arange(20), np.arange(6, 26)], rng.normal(size=(40, 3))
+    rows = np.zeros((2, 26, 3))
+    rows[row, who] = J
+    both = dense.reshape(78, 78) + np.einsum("k,ki,kj->ij", k, rows.reshape(2, 78), rows.reshape(2, 78))
+    some = block_matrix.WideRows(26, row, who, J, k)
+    np.testing.assert_allclose(some.own()[7], both.reshape(26, 3, 26, 3)[7, :, 7] - dense[7, :, 7], atol=1e-12)
+    want = np.linalg.solve(both, right.ravel()).reshape(26, 3)
+    for system in (direct, wide):
+        assert np.linalg.norm(system.solve(blocks, right, some) - want) / np.linalg.norm(want) <= 1e-2
 
 
 def test_too_much_for_the_budget_is_said(world):

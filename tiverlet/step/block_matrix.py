@@ -15,6 +15,25 @@ STEPS = 200  # of conjugate gradients, at most
 ENOUGH = 1e-4  # of r . z at their start: what they leave
 
 
+class WideRows:
+    """The matrix J^T k J of rows on so many particles that no block for each two of them is kept.
+
+    Corner i belongs to row[i] and is particle who[i] of `count`, with the gradient J[i]. k: of each row.
+    """
+
+    def __init__(self, count: int, row: np.ndarray, who: np.ndarray, J: np.ndarray, k: np.ndarray):
+        self.count, self.row, self.who, self.J, self.k = count, row, who, J, k
+
+    def times(self, p: np.ndarray) -> np.ndarray:
+        """Its product with p, (count, dim)."""
+        along = self.k * np.bincount(self.row, (self.J * p[self.who]).sum(axis=1), minlength=len(self.k))
+        return summed(self.J * along[self.row, None], self.who, self.count)
+
+    def own(self) -> np.ndarray:
+        """The blocks of each particle with itself, (count, dim, dim)."""
+        return summed((self.k[self.row, None] * self.J)[:, :, None] * self.J[:, None, :], self.who, self.count)
+
+
 class BlockMatrix:
     """A matrix that is the sum of dim x dim blocks, block k between the particles a[k] and b[k] of `count`; positive definite."""
 
@@ -41,9 +60,9 @@ class BlockMatrix:
         i, j = dim * place[a][:, None] + axis, dim * place[b][:, None] + axis
         self.address = (begin[:, None, None] + i[:, :, None] * width[:, None, None] + j[:, None, :]).ravel()
 
-    def solve(self, blocks: np.ndarray, right: np.ndarray) -> np.ndarray:
-        """x with A x = right, (count, dim), for A the sum of blocks, (pairs, dim, dim)."""
-        return self._eliminate(blocks, right) if self.narrow else self._iterate(blocks, right)
+    def solve(self, blocks: np.ndarray, right: np.ndarray, wide: WideRows | None = None) -> np.ndarray:
+        """x with A x = right, (count, dim), for A the sum of blocks, (pairs, dim, dim), and of wide rows."""
+        return self._eliminate(blocks, right) if self.narrow and wide is None else self._iterate(blocks, right, wide)
 
     def _eliminate(self, blocks: np.ndarray, right: np.ndarray) -> np.ndarray:
         """Level by level."""
@@ -64,21 +83,23 @@ class BlockMatrix:
             out[self.rows[k]] = last
         return out.reshape(right.shape)
 
-    def _iterate(self, blocks: np.ndarray, right: np.ndarray) -> np.ndarray:
+    def _iterate(self, blocks: np.ndarray, right: np.ndarray, wide: WideRows | None) -> np.ndarray:
         """Conjugate gradients, with the blocks of particles for a preconditioner."""
         own = self.a == self.b
-        inverse = np.linalg.inv(self._summed(blocks[own], self.a[own]))
-        return conjugate_gradients(
-            lambda p: self._summed(np.einsum("kab,kb->ka", blocks, p[self.b]), self.a),
-            lambda r: np.einsum("iab,ib->ia", inverse, r),
-            right,
-            ENOUGH,
-        )
+        diagonal = summed(blocks[own], self.a[own], self.count)
 
-    def _summed(self, values: np.ndarray, who: np.ndarray) -> np.ndarray:
-        """The sums of values over the particles that they belong to."""
-        sums = [np.bincount(who, column, minlength=self.count) for column in values.reshape(len(values), -1).T]
-        return np.stack(sums, axis=1).reshape(self.count, *values.shape[1:])
+        def times(p: np.ndarray) -> np.ndarray:
+            out = summed(np.einsum("kab,kb->ka", blocks, p[self.b]), self.a, self.count)
+            return out if wide is None else out + wide.times(p)
+
+        inverse = np.linalg.inv(diagonal if wide is None else diagonal + wide.own())
+        return conjugate_gradients(times, lambda r: np.einsum("iab,ib->ia", inverse, r), right, ENOUGH)
+
+
+def summed(values: np.ndarray, who: np.ndarray, count: int) -> np.ndarray:
+    """The sums of values over the particles, of `count`, that they belong to."""
+    sums = [np.bincount(who, column, minlength=count) for column in values.reshape(len(values), -1).T]
+    return np.stack(sums, axis=1).reshape(count, *values.shape[1:])
 
 
 def conjugate_gradients(

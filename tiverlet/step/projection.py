@@ -23,7 +23,7 @@ import numpy as np
 from ..constraints.core.scalar import Scalar
 from ..neighbours.queries import between
 from ..solvers.corners import bodies_of
-from .block_matrix import BlockMatrix
+from .block_matrix import WIDEST, BlockMatrix, WideRows
 from .integrator import h2_effective_of
 from .jacobian import Jacobian
 from .rigid_rows import RigidRows, left_out, rigid_rows
@@ -205,14 +205,17 @@ class Rows:
     def _link(self) -> None:
         """The matrix of step(), for what its rows and their tensions couple."""
         last = np.cumsum(self.arity)
-        width = np.repeat(self.arity, self.arity)  # of the row of each corner
+        wide = (self.arity * self.dim > 2 * WIDEST)[self.row]  # no two levels hold such a row
+        width = np.where(wide, 0, np.repeat(self.arity, self.arity))  # of the row of each corner
         a = np.repeat(np.arange(len(self.who)), width)
         b = np.repeat((last - self.arity)[self.row], width) + np.arange(len(a)) - np.repeat(np.cumsum(width) - width, width)
         self.corners = a, b  # of each row, each with each
+        self.wide = np.flatnonzero(wide & (self.w[self.who] > 0))
         _, i, j = self.pairs
         self.inside = np.unique(self.who[self.w[self.who] > 0])
         number = np.full(self.n, -1)
         number[self.inside] = every = np.arange(len(self.inside))
+        self.number = number
         sides = [i, j, i, j], [i, j, j, i]  # of tensions across links
         ends = np.stack([
             np.concatenate([*(number[who] for who in (self.who[corner], *side)), every])
@@ -290,7 +293,9 @@ class Rows:
         right = self.jacobian.gathered(self.J * (stiff * self.C)[self.row, None])
         blocks = np.concatenate((along, sides, sides, -sides, -sides, mass))[self.free]
         out = np.zeros_like(right)
-        out[self.inside] = self.matrix.solve(blocks, -right[self.inside])
+        some = self.wide
+        wide = WideRows(len(self.inside), self.row[some], self.number[self.who[some]], self.J[some], stiff) if len(some) else None
+        out[self.inside] = self.matrix.solve(blocks, -right[self.inside], wide)
         return out
 
 
