@@ -89,6 +89,7 @@ class BlockMatrix:
         diagonal = summed(blocks[own], self.a[own], self.count)
 
         def times(p: np.ndarray) -> np.ndarray:
+            """The product of the matrix with p."""
             out = summed(np.einsum("kab,kb->ka", blocks, p[self.b]), self.a, self.count)
             return out if wide is None else out + wide.times(p)
 

@@ -20,7 +20,7 @@ import numpy as np
 from ..constraints.core.scalar import Scalar
 from ..contact.candidates import Candidates, DiscCandidates
 from .jacobian import Jacobian
-from .projection import LARGEST, Rows, matters, paid, seen, seen_before, sizes
+from .projection import Rows, matters, paid, seen, seen_before
 from .rigid_rows import rigid_rows
 from .solids import Solids
 
@@ -149,11 +149,11 @@ class Walls:
 
 
 def bound(runner: Any, x: np.ndarray, ratio: float) -> Rows | None:
-    """The constraints of the world that are not too large, and rigid clusters that share particles with others; C is measured
-    from what it is to be, as in projection.py."""
+    """The constraints of the world, and rigid clusters that share particles with others; C is measured from what it is to be, as
+    in projection.py."""
     w = runner.scene.inv_mass
     scalars = [b for b in runner.batches if isinstance(b, Scalar) and b.count]
-    some = [b for b in scalars if sizes(b).max() <= LARGEST and (~b.idle(w) & ~b.broken).any()]
+    some = [b for b in scalars if (~b.idle(w) & ~b.broken).any()]
     some += rigid_rows([b for b in runner.batches if b.clusters], w)
     if not some:
         return None

@@ -41,7 +41,6 @@ LEFT = 0.01  # of what violations store: what may be left of it in the shorter s
 DONE = 1e-6  # of its size: a violation that is none
 TURNS = 16  # with walls, at most: a link that stands on one halves its violation in each
 HELD = 1e3  # of its mass: how firmly a wall holds a particle that it has stopped
-LARGEST = 300  # corners: outlines of more couple each with each
 
 
 def project(runner: "Runner", h: float, longest: float) -> bool | None:
@@ -56,10 +55,8 @@ def project(runner: "Runner", h: float, longest: float) -> bool | None:
     x = before = state.get(memory)
     if not np.isfinite(x).all():
         return True
-    scalars: list[Any] = [b for b in runner.batches if isinstance(b, Scalar) and b.count]
-    batches = [b for b in scalars if sizes(b).max() <= LARGEST]
-    large = [b.violation(x) * b.inverse_size(b.start.position) * (b.compliance == 0) for b in scalars if b not in batches]
-    stays = max([left_out(runner.batches, w, x), *(float(np.abs(C).max()) for C in large)])
+    batches: list[Any] = [b for b in runner.batches if isinstance(b, Scalar) and b.count]
+    stays = left_out(runner.batches, w, x)
     if matters(stays, ratio):
         runner.released = stays
     if slots and slots.system and not slots.system.steps and not runner.clock.softened:  # it holds loads without a violation
