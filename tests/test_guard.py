@@ -220,6 +220,25 @@ def test_a_shorter_substep_makes_no_energy_of_a_large_outline(world):
         assert w.step(1 / 60).energy < before.energy
 
 
+def test_a_winch_at_its_limit_lifts_nothing_where_the_substep_gets_shorter(world):
+    # It pulls with 20 N at a sling of 1 kg, in which a load of 4 kg stays on the floor. The sling is stretched by h^2; what takes
+    # that out moves the sling, against a constant force, and not the load, which had nothing to pay for that with.
+    x = [[0, 3.0], [0, 1.0], [0, 0.5], [0.3, 0.3], [-0.3, 0.3]]
+    winch, sling = tv.Winch([[0, 1]], speed=-0.3, force=20.0), tv.Distance([[1, 2], [2, 3], [2, 4], [3, 4]])
+    floor = tv.HalfSpace((0, 1), 0.3)
+    w = world(
+        tv.Particles(x, mass=[1, 1, 1, 2, 2], pinned=[0]), [tv.Gravity(9.81), tv.Drag(1.0), winch, sling, floor], substeps=2,
+        solver=tv.Jacobi(), precision="f64",
+    )  # fmt: skip
+    before = w.run(10.0)
+    assert before.residual > 5e-3 and winch.load[0] == pytest.approx(20.0)
+    for substeps in (4, 8, 16, 64):
+        w.substeps = substeps
+        for _ in range(5):
+            w.step(1 / 60)
+            assert w.position[3:, 1].max() < 0.3 + 1e-6
+
+
 def test_systems_of_particles_are_solved(monkeypatch):
     # Against a dense solution: a sheet, two ropes and a lone particle, by levels of the graph, and where these are too wide.
     rng = np.random.default_rng(0)

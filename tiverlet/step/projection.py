@@ -171,6 +171,9 @@ class Rows:
         self.batches, self.w, self.n, self.dim = batches, w, *x.shape
         self.box = box  # the Periodic of the world
         self.some = [~b.idle(w) & ~b.broken if b.breaks else ~b.idle(w) for b in batches]
+        for b, some in zip(batches, self.some, strict=True):
+            if drive := getattr(b.dev, "drive", None):
+                some &= ~drive.slips(b.dev.equation.lam)[: b.count]
         self.side, arity = (self._each([of(b) for b in batches]) for of in (lambda b: np.full(b.count, b.side), sizes))
         self.m = len(self.side)
         self.corner = [some[b.owner] for b, some in zip(batches, self.some, strict=True)]

@@ -69,6 +69,11 @@ class Drive:
         """Where the rest values are now, (m,)."""
         return self._memory.read(self.target)
 
+    def slips(self, lam: ti.Field) -> np.ndarray:
+        """Which of the multipliers, a field, are the largest there may be, (m,): forces, which no longer hold anything."""
+        most = self._memory.read(self.most) if self.capped else np.inf
+        return np.abs(self._memory.read(lam)) >= most
+
     def put(self, values: np.ndarray) -> None:
         """Have them go on from elsewhere."""
         self._memory.write(self.target, values)
