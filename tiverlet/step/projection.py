@@ -40,6 +40,7 @@ SLIGHT = 0.01  # of the kinetic energy: what violations may become where contact
 LEFT = 0.01  # of what violations store: what may be left of it in the shorter substep
 DONE = 1e-6  # of its size: a violation that is none
 TURNS = 16  # with walls, at most: a link that stands on one halves its violation in each
+WORSE = 2.0  # times what violations stored before: what is left of it, at most, where it is taken at all
 HELD = 1e3  # of its mass: how firmly a wall holds a particle that it has stopped
 
 
@@ -82,16 +83,16 @@ def project(runner: "Runner", h: float, longest: float) -> bool | None:
         sent = state.get(memory)
         runner.stop_at_walls(before)
         x = state.get(memory)
+        last, rows = rows, rows.at(x)  # what walls stop is lifted by the others
         if (x == sent).all():
             break
-        last, rows = rows, rows.at(x)  # what walls stop is lifted by the others
         if rows.stored > last.stored or last.wall.any():  # what lies on them would be sent back there again and again
             rows = rows.held(last.wall, x - sent)
             if rows.stored <= enough:
                 break
     memory.write(state.d, v)
     more, deeper = seen(runner)
-    if deeper > overlap or rows.stored > start.stored:
+    if deeper > overlap or rows.stored > WORSE * start.stored:
         state.put(memory, before)
         memory.write(state.d, kept)
         stake = _over(start.weight * undone**2, start.diagonal).sum() / (2 * h * h)
