@@ -70,7 +70,8 @@ class World:
         starts = [None] * len(features)
         self._build(particles, features, starts, substeps, iterations, solver, precision, path, order)
         for contact in self._runner.step.contacts:
-            if not contact.shrinks and contact.table.uniform and overlapping(self._runner.scene, self._runner.batches):
+            scene, batches = self._runner.scene, self._runner.batches
+            if not contact.shrinks and contact.table.uniform and overlapping(scene, batches, particles.position):
                 contact.enable_shrink()  # before anything is compiled: later, the frame would be compiled again
 
     @staticmethod

@@ -12,14 +12,14 @@ MANY = 20_000  # particles for which it is not worth the time
 CROWD = 16  # in a cell, likewise
 
 
-def overlapping(scene: Scene, batches: list[Batch], first: int = 0) -> bool | None:
-    """Whether discs or spheres overlap, one of them free to move and one of them from number `first` on; what is linked never
-    touches. None where finding out would take long.
+def overlapping(scene: Scene, batches: list[Batch], x: np.ndarray, first: int = 0) -> bool | None:
+    """Whether discs or spheres at x, (n, dim) [m], overlap, one of them free to move and one of them from number `first` on; what
+    is linked never touches. None where finding out would take long.
 
     From 0 on all that the device will see counts, with what it rounds, for that is what a world is compiled for; else what f32
     rounds does not.
     """
-    x, radius, free = scene.particles.position, scene.particles.radius, scene.inv_mass > 0
+    radius, free = scene.particles.radius, scene.inv_mass > 0
     count, number = len(x), np.arange(len(x))
     if scene.periodic is not None:  # particles and their images side by side
         number, x = scene.periodic.ghosts(x, 2 * float(radius.max(initial=0.0)))
