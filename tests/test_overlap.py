@@ -20,8 +20,8 @@ def test_overlap_is_what_comparing_all_pairs_finds():
         pairs, _ = tv.measure.overlapping(x, radius)
         want = bool(free[pairs].any())
         state = Some(double=True, compensated=False)
-        scene: Any = Some(periodic=None, particles=Some(position=x, radius=radius), inv_mass=free * 2.0, state=state)
-        assert overlapping(scene, []) == want
+        scene: Any = Some(periodic=None, particles=Some(radius=radius), inv_mass=free * 2.0, state=state)
+        assert overlapping(scene, [], x) == want
         seen[want] += 1
     assert min(seen) > 30
 
