@@ -116,13 +116,11 @@ class World:
         self._search: PointSearch | None = None  # compiled when it is first asked
         parts.scene.residuals = self._runner.residuals
 
-    def _build_again(
+    def _rebuild(
         self, some: np.ndarray, added: Particles | None, features: tuple[Feature, ...], extend: Mapping[Feature, Feature]
     ) -> Rebuild:
-        """Have other particles and features. The Rebuild says which of these came and went."""
-        again = Rebuild(self, some, added, features, extend)
-        again.run()
-        return again
+        """How it is to be built anew, of other particles and features."""
+        return Rebuild(self, some, added, features, extend)
 
     # The step.
 

@@ -291,7 +291,7 @@ class Contact(PairContact):
                     want = part * n
                     if ti.static(self.dev.has_restitution and self.dev.has_friction):
                         if given > 0:
-                            given, left, _approach = self.dev.restitution.impact(i, j, n, overlap)
+                            given, left, _approach = self.dev.restitution.collision(i, j, n, overlap)
                     if ti.static(self.dev.spins):
                         tangential, turned = self.grip(i, j, e, n, reach, pressed + given / shared, given > 0)
                         want += tangential

@@ -78,7 +78,7 @@ class Restitution:
         return here + self.table.of(i, j)[2] * ti.max(a, 0), here, a
 
     @ti.func
-    def impact(self, i, j, n, overlap):
+    def collision(self, i, j, n, overlap):
         """What takes a pair that overlaps from coming together to leaving, with the force in the substep; the part of the substep
         that is left after the impact; and how far the pair comes together without forces."""
         given, here, a = self.target(i, j, n)
@@ -95,7 +95,7 @@ class Restitution:
                 if self.struck.field[e] > 0:
                     j = self.list.neighbour[e]
                     overlap, _each, n, _reach = self.geometry.impact(i, j, self.geometry.contact_distance(i, j), self.weight[i])
-                    given, left, a = self.impact(i, j, n, overlap)
+                    given, left, a = self.collision(i, j, n, overlap)
                     if overlap > 0 and a > 0 and given > 0:
                         if left > most or (left == most and earlier(i, j, partner)):
                             first, partner, most = e, j, left

@@ -98,7 +98,7 @@ class BlockMatrix:
 
 
 def summed(values: np.ndarray, who: np.ndarray, count: int) -> np.ndarray:
-    """The sums of values over the particles, of `count`, that they belong to."""
+    """The sums of values, numbers, vectors or matrices, over the particles or bodies, of `count`, that they belong to."""
     sums = [np.bincount(who, column, minlength=count) for column in values.reshape(len(values), -1).T]
     return np.stack(sums, axis=1).reshape(count, *values.shape[1:])
 

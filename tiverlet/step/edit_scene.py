@@ -168,9 +168,9 @@ def build_again(
 ) -> None:
     """Make a change by building the world anew."""
     world._runner.memory.check()
-    before, told = world.features, world._all_events()
-    seen = _seen(world, np.where(some, np.cumsum(some) - 1, -1), features)
-    again = world._build_again(some, added, features, extend)
+    again = world._rebuild(some, added, features, extend)
+    before, told, seen = world.features, world._all_events(), _seen(world, again.number, features)
+    again.run()
     walls = np.array([features.index(f) if f in features else -1 for f in before], dtype=np.int64)
     new = [*(f for f in again.came if f not in before), *again.extending.values()]
     tied = initial_violation.first_off(new, world.position)

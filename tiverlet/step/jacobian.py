@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .block_matrix import STEPS, conjugate_gradients
+from .block_matrix import STEPS, conjugate_gradients, summed
 
 SOFT = 1e-6  # of the diagonal: what has hardly a direction to move in stays
 DONE = 1e-12  # of r . z at the start of conjugate gradients: what is left
@@ -30,7 +30,7 @@ class Jacobian:
 
     def gathered(self, values: np.ndarray) -> np.ndarray:
         """The sums of values of corners over the particles that they belong to, (n, dim)."""
-        return np.stack([np.bincount(self.who, column, minlength=len(self.w)) for column in values.T], axis=1)
+        return summed(values, self.who, len(self.w))
 
     def moves(self, lam: np.ndarray) -> np.ndarray:
         """w J^T lam, of whole bodies."""

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from .block_matrix import summed
 from .integrator import h2_effective_of
 from .rigid_rows import HEAVY
 
@@ -57,8 +58,8 @@ class Solids:
 
     def _summed(self, values: np.ndarray) -> np.ndarray:
         """Sums over bodies of m times matrices or vectors of particles."""
-        columns = (self.m[:, None] * values.reshape(len(self.m), -1)).T
-        return np.stack([np.bincount(self.owner, column) for column in columns], axis=1).reshape(-1, *values.shape[1:])
+        weighted = self.m[:, None] * values.reshape(len(self.m), -1)
+        return summed(weighted.reshape(values.shape), self.owner, len(self.total))
 
     def fitted(self, x: np.ndarray) -> np.ndarray:
         """Positions x, with all bodies in shape."""
