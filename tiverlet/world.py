@@ -24,11 +24,12 @@ from .neighbours.queries import Contacts, PointSearch, near_by_all, nearest
 from .particles import Particles, at_rest, in_range, spin_of
 from .solvers.jacobi import Jacobi
 from .solvers.solver import Solver
-from .step import checkpoint, edit_scene
+from .step import checkpoint, edit_scene, energy_bound
 from .step.adaptive import StepController
 from .step.build import Assembly, assemble, check_settings, checked_features, checked_solver
 from .step.build_again import Rebuild
 from .step.clock import Clock
+from .step.diagnostics import KINETIC
 from .step.edit_scene import Handle
 from .step.explain import compiling, explain
 from .step.runner import Runner
@@ -159,6 +160,8 @@ class World:
                 self._broken_off()
                 raise
             self._runner.arrive()
+            if self._clock.exceeds(report.energy, self._runner.sheet.item(KINETIC), report.overlap):
+                report = energy_bound.checked(self, report)
             report.__dict__["seconds"] = perf_counter() - clock  # which is no part of what it says
             self._last, self._clock.energy, self._undo, self._events = report, report.energy, None, None
             for watcher in self._watchers:
@@ -178,6 +181,7 @@ class World:
         """Bring the knobs to the device. Where a force has changed, displacements become velocities first, by the old force."""
         waiting = [f for f in self._features if f.changed or f.moving]
         if waiting:
+            self._clock.bound = None
             if self._runner.sleep and not all(isinstance(f, Batch) and f.drives for f in waiting):
                 self._runner.wake()
             self._adapt(steps=True)

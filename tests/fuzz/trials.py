@@ -192,6 +192,8 @@ class Judge:
         flagged = bool(self.flags & RISKS)  # said to be wrong, but it should not fly
         share = 1.0 if flagged else 0.5 if t.soft else 1e-3
         room = max((1.0 if flagged else 1e-3) * fall, share * abs(self.energy)) + self.digits(fall)
+        if "energy-gain" in report.flags and report.energy <= self.energy + room:
+            raise Find("energy-gain", f"{self.energy:.6g} -> {report.energy:.6g} J; {set(self.flags)}, {report}")
         if report.energy > self.energy + room:
             kind = "energy, flagged" if flagged else "energy"
             raise Find(kind, f"{self.energy:.6g} -> {report.energy:.6g} J, allowed {room:.3g} more; {set(self.flags)}, {report}")

@@ -62,6 +62,11 @@ class Path(Anchored):
         """Whether the particles are driven."""
         return bool(self.driver)
 
+    @property
+    def does_work(self) -> bool:  # type: ignore[override]
+        """Whether the particles are driven."""
+        return self.drives
+
     def _drive(self, name: str, value) -> np.ndarray:
         if name != self.driver:
             how = f"driven by {self.driver}" if self.driver else "free to slide"

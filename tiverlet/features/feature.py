@@ -91,6 +91,7 @@ class Feature:
     uploads_all = False  # upload() and end_motion() do as well for many worlds, where knobs have one more axis, the first
     compiled_for: tuple[str, ...] = ()  # properties that decide what its kernels consist of
     told_apart = True  # its share of the time that kernels take to compile is known by its name
+    does_work = False  # it may bring in energy that no report knows; what only moves when it is told to says so by `changed`
     for_all = False  # nothing of it, on the device or beside, depends on which particles there are; see can_regroup()
     bulk = 0.3  # of its code in the kernels, next to that of a Distance; see build.LONG
     changed = True
@@ -230,6 +231,11 @@ class Acceleration(Feature):
     pairwise = False
     room = 0  # listed neighbours of a particle for which there is room at first
 
+    @property
+    def does_work(self) -> bool:  # type: ignore[override]
+        """Whether it accelerates, and its potential is not known."""
+        return self.accelerates and not self.conservative
+
     def settings(self) -> dict[str, Any]:
         """What its knobs come to for kernels: numbers and vectors, which are `dev.name[None]`."""
         return {}
@@ -279,6 +285,11 @@ class Batch(Feature):
     bulk = 1.0
     each: tuple[str, ...] = ()  # its arrays with one row for each constraint, beside the indices
     index_name = "indices"  # the argument of __init__ that they are, as `listing` gives them
+
+    @property
+    def does_work(self) -> bool:  # type: ignore[override]
+        """Whether rest values move by themselves."""
+        return self.driven
 
     @property
     def indices(self) -> np.ndarray:

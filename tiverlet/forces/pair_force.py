@@ -70,6 +70,11 @@ class PairForce(Acceleration):
             self.potential_arity = check_function("PairForce", "potential", potential, ("r", "i", "j"), (1, 3))
         self.listed = radius is not None
 
+    @property
+    def does_work(self) -> bool:  # type: ignore[override]
+        """Whether its potential is not known."""
+        return not self.potential_arity
+
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Nothing to check before the functions are compiled."""
 

@@ -77,6 +77,11 @@ class Periodic(Feature):
             raise ValueError(f"Periodic: shear = {self.shear:g} needs a box that is periodic along x and y, not {self.axes}.")
 
     @property
+    def does_work(self) -> bool:  # type: ignore[override]
+        """Whether images move."""
+        return self.shear != 0
+
+    @property
     def sheared(self) -> bool:
         """Whether there is a shear, or was when kernels were compiled."""
         return self.shear != 0 or "sheared" in self.once

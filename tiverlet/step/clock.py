@@ -9,8 +9,17 @@ import numpy as np
 NAMES = {
     "_time": "time", "_tick": "tick", "_since": "since", "_h": "h", "_fresh": "d_is_velocity", "_longest": "longest",
     "_frame": "frame", "_drag": "drag", "_started": "started", "_owed": "owed", "_parted": "parted", "_placed": "first_moved",
-    "_energy": "energy", "_softened": "softened",
+    "_energy": "energy", "_softened": "softened", "_bound": "bound", "_kinetic": "kinetic", "_parting": "parting",
 }  # fmt: skip
+
+SHARE = 0.1  # of the largest kinetic energy: how much more a scene may have
+DIGITS = 1e-5  # of the energy
+PARTED = 0.01  # overlap [radii] down to which what was placed into each other pushes itself apart
+
+
+def room(bound: Any, kinetic: Any, energy: Any) -> Any:
+    """What a passive scene can have [J], see energy_bound.py. Numbers or arrays."""
+    return bound + SHARE * kinetic + DIGITS * abs(energy)
 
 
 @dataclass
@@ -24,7 +33,8 @@ class Clock:
     constraints that the velocities at the last start lacked. parted: velocities, until the next step, where constraints were
     removed that have a part in them. first_moved: the first of the particles that the user placed and that were not looked at
     yet. energy: at the end of the last frame [J]; None: not known. softened: whether loads had no direction in it, and were held
-    by violations.
+    by violations. bound, kinetic, parting: the energy that nothing should exceed [J], None where it is not known; the most of it
+    that was kinetic since; whether what was placed into each other still parts; see energy_bound.py.
     """
 
     time: float = 0.0
@@ -41,6 +51,9 @@ class Clock:
     first_moved: int | None = 0
     energy: float | None = None
     softened: bool = False
+    bound: float | None = None
+    kinetic: float = 0.0
+    parting: bool = False
 
     def copy(self) -> "Clock":
         """A clock with the same values."""
@@ -61,6 +74,15 @@ class Clock:
         if set(named) != set(NAMES):
             raise ValueError("The state is not one of this scene: it has other fields.")
         return Clock(**{own: named[name] for name, own in NAMES.items()})
+
+    def exceeds(self, energy: float, kinetic: float, overlap: float) -> bool:
+        """Take note of the energy at the end of a frame, and of its kinetic part. Returns whether it may be too much."""
+        if self.bound is None:
+            self.bound, self.kinetic = energy if self.energy is None else max(self.energy, energy), 0.0
+        self.kinetic = max(self.kinetic, kinetic)
+        if self.parting:
+            self.bound, self.parting = max(self.bound, energy), overlap > PARTED
+        return energy > room(self.bound, self.kinetic, energy)
 
     def counted(self, dt: float) -> tuple[float, float, int]:
         """When frames of this length began, their length, and their number with the coming one. Frames of one length are counted,
@@ -86,7 +108,8 @@ class Clock:
         if self.parted is not None and (np.shape(self.parted) != (particles, dim) or not np.isfinite(self.parted).all()):
             return False
         right = [type(k) is int and 0 <= k < 2**31 for k in (self.tick, self.since)]
-        right += [type(some) is bool for some in (self.d_is_velocity, self.started, self.softened)]
-        right += [type(v) in (int, float) for v in (self.time, self.h, self.longest, *self.frame, self.energy or 0)]
+        right += [type(some) is bool for some in (self.d_is_velocity, self.started, self.softened, self.parting)]
+        energies = self.energy or 0, self.bound or 0, self.kinetic
+        right += [type(v) in (int, float) for v in (self.time, self.h, self.longest, *self.frame, *energies)]
         right += [self.first_moved is None or 0 <= self.first_moved <= particles, len(self.frame) == 3]
         return all(right) and (self.drag is None or [type(v) for v in self.drag] == [float] * 5)

@@ -25,6 +25,7 @@ STIFF = 4.0  # (omega h)^2 beyond which Verlet diverges
 
 STEPPED, STARTED, UNSTEPPED = range(3)  # how a state came about: by a substep, by the first one after a start, by none yet
 BARE = 3  # added to one of these: nothing but energy is asked for
+REACH, KINETIC, EXTENT = 7, 11, 12  # on the sheet: the largest coordinate, kinetic energy, edges of the bounding box
 
 
 @ti.data_oriented
@@ -50,7 +51,7 @@ class Diagnostics:
         self.probes = [f for f in step.integrator.forces.all if not f.uniform]
         self.pair_forces = step.pair_forces
         self.measured = [f for f in self.pair_forces if f.potential_arity]
-        self.width = 8 if self.pair_forces else 6
+        self.width = 9 if self.pair_forces else 7
         self.stride = step.stride
         add = step.scene.memory.field
         self.blocks = BLOCKS if runtime.architecture() == "cpu" else BLOCKS**2
@@ -88,20 +89,25 @@ class Diagnostics:
 
     @ti.func
     def energy(self, i, x, scale, back):
-        """Kinetic and potential energy at x - back d, f64: second order at the middle of a substep, where d / h is v."""
+        """Kinetic and potential energy at x - back d, f64: second order at the middle of a substep, where d / h is v. Returns the
+        sum, and what is kinetic."""
         d = self.state.d[i] * ti.cast(1, ti.f64)
-        out = ti.cast(0, ti.f64)
+        out, kinetic = ti.cast(0, ti.f64), ti.cast(0, ti.f64)
         if self.state.w.positive(i):
             out = 0.5 * scale * scale * d.dot(d)
+            kinetic = out
             for f in ti.static(self.step.integrator.forces.all):
                 if ti.static(f.conservative):
                     out += f.potential(i, ti.cast(x, ti.f64) - back * d)
             if ti.static(self.state.spins):
-                out += scale * scale * self.state.spin.energy(i)
+                turning = scale * scale * self.state.spin.energy(i)
+                out += turning
+                kinetic += turning
             out /= self.state.w.of(i)
+            kinetic /= self.state.w.of(i)
             for f in ti.static(self.measured):
                 out += f.energy(i, back)
-        return out
+        return out, kinetic
 
     @ti.func
     def stiffness(self, i, x, h, t):
@@ -135,8 +141,8 @@ class Diagnostics:
     @ti.func
     def block(self, b, h, t, frame_fraction, fresh, begin, bare):
         """One block of particles and constraints; where it is to be bare, figures 2 and 3 and the box are not there. Returns
-        energy, residual, overlap, stiffness, contacts, bad, and where there are pair forces the two sums of pair_stiffness();
-        low, high."""
+        energy, residual, overlap, stiffness, contacts, bad, kinetic energy, and where there are pair forces the two sums of
+        pair_stiffness(); low, high."""
         figures, low, high = self.nothing()
         scale, back = ti.cast(1, ti.f64), ti.cast(0, self.step.real)
         if begin == 0:
@@ -152,15 +158,17 @@ class Diagnostics:
             else:
                 if bare == 0:
                     low, high = ti.min(low, ti.cast(x, ti.f64)), ti.max(high, ti.cast(x, ti.f64))
-                figures[0] += self.energy(i, x, scale, back)
+                energy, kinetic = self.energy(i, x, scale, back)
+                figures[0] += energy
+                figures[6] += kinetic
                 if ti.static(len(self.probes) > 0):
                     if begin == 0 and bare == 0:
                         figures[3] = ti.max(figures[3], self.stiffness(i, x, h, t))
                 if ti.static(len(self.pair_forces) > 0):
                     if begin == 0:
                         change, moved = self.pair_stiffness(i, h)
-                        figures[6] += change
-                        figures[7] += moved
+                        figures[7] += change
+                        figures[8] += moved
                 for c in ti.static(self.contacts):
                     if bare == 0:
                         touching, worst = c.worst_overlap(i)
@@ -237,13 +245,14 @@ class Diagnostics:
                 total, low, high = self.fold(0, max(1, self.blocks // BLOCKS), ti.min(filled, BLOCKS))
             for k in ti.static(range(6)):
                 sheet[k] = total[k]
+            sheet[KINETIC] = total[6]
             if ti.static(len(self.pair_forces) > 0):
-                if total[7] > 0:
-                    sheet[3] = ti.max(sheet[3], total[6] / total[7])
+                if total[8] > 0:
+                    sheet[3] = ti.max(sheet[3], total[7] / total[8])
             if low[0] <= high[0]:
                 for k in ti.static(range(self.dim)):
-                    sheet[7] = ti.max(sheet[7], -low[k], high[k])
-                    sheet[11 + k] = high[k] - low[k]
+                    sheet[REACH] = ti.max(sheet[REACH], -low[k], high[k])
+                    sheet[EXTENT + k] = high[k] - low[k]
             for c in ti.static(self.contacts):
                 sheet[6] = c.dev.fast[None]
                 c.dev.fast[None] = 0
@@ -317,7 +326,7 @@ class Reporter:
         self.remedy: str | None = None  # the setting that meets constraints better, known once it is asked for
         self.fastest = step.integrator.fastest
         self.regroup()
-        self.figures = sheet[: 11 + step.dim]
+        self.figures = sheet[: EXTENT + step.dim]
 
     def regroup(self) -> None:
         """Particles or constraints came or went: take their number, and how far out they may be."""
@@ -337,7 +346,7 @@ class Reporter:
     ) -> tuple[StepReport, list[float]]:
         """The report of a frame, and the size of the bounding box [m]. before: the energy one frame ago [J]. moved: how far
         particles were moved before the first substep [m]. released: see Runner."""
-        energy, residual, overlap, stiff, contacts, bad, fast, reach, broken, tension, turned, *extent = self.figures.tolist()
+        energy, residual, overlap, stiff, contacts, bad, fast, reach, broken, tension, turned, _, *extent = self.figures.tolist()
         stiff = max(stiff, self.fastest * h * h)
         first = int(bad) if bad < self.n else None
         notes = {}

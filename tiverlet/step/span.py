@@ -56,7 +56,7 @@ class Moment:
 # The sheet of a frame, one array, since a launch takes 0.25 us more for each. First what the frame came to, see Diagnostics; then
 # how it ended: whether, in which substep and before which half of a pass it stopped to have the list grown; how many threads of a
 # team were at work. Then what it is given, see Span, and the number of the first thread.
-FIGURES = 14
+FIGURES = 15
 HALT, ACTIVE_THREADS = FIGURES, FIGURES + 3
 GIVEN = tuple(range(ACTIVE_THREADS + 1, ACTIVE_THREADS + 16))
 H, START, END, TICK, SINCE, FRESH, SUBSTEPS, ITERATIONS, BEGIN, HALF, RESUMED, FIRST, ORIGIN, UNTIL, PART = GIVEN

@@ -4,14 +4,15 @@ import numpy as np
 
 from ..step.clock import Clock
 
-PLAIN = ("time", "tick", "since", "h", "d_is_velocity", "started", "longest", "owed", "softened")  # as they are in a Clock
+# As they are in a Clock.
+PLAIN = "time", "tick", "since", "h", "d_is_velocity", "started", "longest", "owed", "softened", "kinetic", "parting"
 NONE = -1  # for first_moved
 
 
 class Clocks:
     """Arrays with one value for each world; see Clock for what they mean.
 
-    energy: NaN where it is not known. first_moved: NONE where nothing was placed. frame: (worlds, 3).
+    energy, bound: NaN where it is not known. first_moved: NONE where nothing was placed. frame: (worlds, 3).
     """
 
     def __init__(self, clocks: list[Clock]):
@@ -21,6 +22,7 @@ class Clocks:
         self.frame = np.array([clock.frame for clock in clocks], dtype=np.float64)
         self.energy = np.array([np.nan if clock.energy is None else clock.energy for clock in clocks], dtype=np.float64)
         self.known = np.array([clock.energy is not None for clock in clocks])
+        self.bound = np.array([np.nan if clock.bound is None else clock.bound for clock in clocks], dtype=np.float64)
         self.first_moved = np.array([NONE if clock.first_moved is None else clock.first_moved for clock in clocks])
         # What differs from world to world in rare cases only, or is the same for all.
         self.drag = [clock.drag for clock in clocks]
@@ -35,6 +37,8 @@ class Clocks:
     longest: np.ndarray
     owed: np.ndarray
     softened: np.ndarray
+    kinetic: np.ndarray
+    parting: np.ndarray
 
     def of(self, k: int) -> Clock:
         """The clock of one world."""
@@ -42,6 +46,7 @@ class Clocks:
         since, length, count = self.frame[k].tolist()
         out.frame, out.drag, out.parted = (since, length, int(count)), self.drag[k], self.parted.get(k)
         out.energy = float(self.energy[k]) if self.known[k] else None
+        out.bound = None if np.isnan(self.bound[k]) else float(self.bound[k])
         out.first_moved = None if self.first_moved[k] == NONE else int(self.first_moved[k])
         return out
 
@@ -52,6 +57,7 @@ class Clocks:
         self.frame[k], self.drag[k] = clock.frame, clock.drag
         self.known[k] = clock.energy is not None
         self.energy[k] = np.nan if clock.energy is None else clock.energy
+        self.bound[k] = np.nan if clock.bound is None else clock.bound
         self.first_moved[k] = NONE if clock.first_moved is None else clock.first_moved
         if clock.parted is None:
             self.parted.pop(k, None)
@@ -64,7 +70,7 @@ class Clocks:
 
     def return_to(self, other: "Clocks", some: np.ndarray) -> None:
         """Give some the times of others."""
-        for name in (*PLAIN, "frame", "energy", "known", "first_moved"):
+        for name in (*PLAIN, "frame", "energy", "bound", "known", "first_moved"):
             getattr(self, name)[some] = getattr(other, name)[some]
         for k in map(int, some):
             self.drag[k] = other.drag[k]

@@ -17,9 +17,10 @@ from ..features.arguments import knobs_of, meant
 from ..features.feature import Feature
 from ..features.read_only import assign_whole, read_only
 from ..particles import in_range
-from ..step import checkpoint
+from ..step import checkpoint, energy_bound
 from ..step import frames as kernel
-from ..step.diagnostics import STARTED, STEPPED, TURNS, UNSTEPPED, risks
+from ..step.clock import PARTED, room
+from ..step.diagnostics import EXTENT, STARTED, STEPPED, TURNS, UNSTEPPED, risks
 from ..step.integrator import FREE
 from ..world import World
 from .clocks import NONE, Clocks
@@ -216,6 +217,7 @@ class Worlds:
         if len(unknown):
             energy, overlap = self._look(unknown)
             clocks.energy[unknown], clocks.known[unknown] = energy, True
+            clocks.bound[unknown], clocks.parting[unknown] = np.nan, clocks.first_moved[unknown] != NONE
             for k in unknown[(overlap > 0) & (clocks.first_moved[unknown] != NONE)]:
                 with self._at(k), runner.memory.compiler():
                     runner.ease(int(clocks.first_moved[k]))
@@ -247,6 +249,7 @@ class Worlds:
             knobs.check_kernels()
         if knobs.upload_to_all():
             self._runner.find_ramps()
+            self._clocks.bound[:] = np.nan
             return
         still = np.zeros(len(features), dtype=bool)
         for k in knobs.waiting:
@@ -323,8 +326,8 @@ class Worlds:
         """The worst of the figures of all frames, (worlds, frames, FIGURES). before: energies [J]."""
         world, runner, clocks = self._world, self._runner, self._clocks
         reporter, dim, n = runner.diagnostics.report, world.particles.dim, runner.n
-        energy, residual, overlap, stiff, contacts, bad, fast, reach, broken, tension, turned = np.moveaxis(
-            figures[..., :11], 2, 0
+        energy, residual, overlap, stiff, contacts, bad, fast, reach, broken, tension, turned, kinetic = np.moveaxis(
+            figures[..., :EXTENT], 2, 0
         )
         stiff = np.maximum(stiff, (self._fastest * clocks.h**2)[:, None])
         first = np.arange(figures.shape[1]) == 0
@@ -332,6 +335,7 @@ class Worlds:
             n, reporter.farthest, bad, reach, fast, overlap, turned, np.where(first, moved[:, None], 0.0), tension, stiff,
             np.where(first, released[:, None], 0.0), residual,
         )  # fmt: skip
+        every[energy_bound.FLAG] = self._gains(before, energy, kinetic, overlap, reach, figures[..., EXTENT : EXTENT + dim])
         clocks.softened = every["softened"][:, -1].copy()
         wrong = bad < n
         report = WorldsReport(
@@ -345,9 +349,37 @@ class Worlds:
         clocks.energy, clocks.known = energy[:, -1].copy(), np.ones(len(self), dtype=bool)
         clocks.first_moved = np.full(len(self), NONE)
         if runner.search:
-            extent = figures[:, -1, 11 : 11 + dim]
+            extent = figures[:, -1, EXTENT : EXTENT + dim]
             runner.search.fit(extent.max(0))
         return report
+
+    def _gains(
+        self,
+        before: np.ndarray,
+        energy: np.ndarray,
+        kinetic: np.ndarray,
+        overlap: np.ndarray,
+        reach: np.ndarray,
+        extent: np.ndarray,
+    ) -> np.ndarray:
+        """Which worlds have energy from nowhere, and in which frames: Clock.exceeds() and energy_bound.checked() of all. before:
+        (worlds,), others (worlds, frames, ...)."""
+        clocks, gain = self._clocks, np.empty_like(energy)
+        for k in range(energy.shape[1]):
+            unknown = np.isnan(clocks.bound)
+            clocks.bound = np.where(unknown, np.fmax(before, energy[:, k]), clocks.bound)
+            clocks.kinetic = np.maximum(np.where(unknown, 0.0, clocks.kinetic), kinetic[:, k])
+            clocks.bound = np.where(clocks.parting, np.maximum(clocks.bound, energy[:, k]), clocks.bound)
+            clocks.parting = clocks.parting & (overlap[:, k] > PARTED)
+            gain[:, k] = energy[:, k] - room(clocks.bound, clocks.kinetic, energy[:, k])
+        out = gain > 0
+        for k in np.flatnonzero(out.any(1)):
+            with self._at(k) as world:
+                if energy_bound.works(world):
+                    world._clock.bound, out[k] = None, False
+                else:
+                    out[k] = gain[k] > energy_bound.blur(world, extent[k], reach[k])
+        return out
 
     # Knobs and states of some.
 

@@ -191,7 +191,10 @@ def gravity_of(w: World) -> float:
 
 def sorted_notes(report: "StepReport") -> list[str]:
     """The notes of a report, one for each flag in the order of their names where there are as many."""
-    order = ("non-finite", "out-of-range", "tunnelling-risk", "compressed", "turned", "softened", "stiff-force", "unconverged")
+    order = (
+        "non-finite", "out-of-range", "tunnelling-risk", "compressed", "turned", "softened", "stiff-force", "unconverged",
+        "energy-gain",
+    )  # fmt: skip
     told = dict(zip([f for f in order if f in report.flags], report.notes, strict=False))
     return [told.get(flag, flag) for flag in sorted(report.flags)]
 

@@ -1,0 +1,123 @@
+"""A scene that nothing works on and that has more energy than it had says so; others do not.
+
+E(t) <= E(0) + O(h^2) where forces have a potential, constraints stand still, and walls and pins do not move
+"""
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+from tiverlet.device import ti
+
+FLAG = "energy-gain"
+
+
+@ti.func
+def push(r):
+    """Two particles push each other apart, whatever their distance."""
+    return 3.0 * r.normalized()
+
+
+@ti.func
+def of_push(r):
+    """Its potential, -F |r| for |r| = 0 ... 10."""
+    return 3.0 * (10.0 - r.norm())
+
+
+@ti.func
+def forgotten(r):
+    """A potential that does not belong to it."""
+    return 0.0 * r[0]
+
+
+@ti.func
+def wind(x, v, t):
+    """A force that does work."""
+    return ti.Vector([3.0, 0.0])
+
+
+def pair(*features, **settings):
+    """Two particles, one metre from each other."""
+    return tv.Particles([[0.0, 0.0], [1.0, 0.0]], radius=0.1, **settings), list(features)
+
+
+def test_what_no_figure_tells_is_told_by_energy(world):
+    # A rope of 20 links of 0.1 kg, level, with 100 kg at its end, which fall and swing: h is too long for its tension, but frames
+    # when it is slack tell nothing of that. It gained 400 J of the 1962 that it falls, in a hundred frames without a word. With
+    # twice the substeps it gains nothing.
+    n = 20
+    x, mass = np.stack([0.1 * np.arange(n + 1), np.zeros(n + 1)], axis=1), np.full(n + 1, 0.1)
+    mass[-1] = 100.0
+    links = np.stack([np.arange(n), np.arange(1, n + 1)], axis=1)
+    for substeps in (20, 40):
+        w = world(tv.Particles(x, mass=mass, pinned=[0]), [tv.Gravity(9.81), tv.Distance(links)], substeps=substeps)
+        reports = [w.step(1 / 60) for _ in range(1060)]
+        rise = np.array([r.energy for r in reports]) - reports[0].energy
+        told = np.array([FLAG in r.flags for r in reports])
+        fallen = 9.81 * 0.1 * (0.1 * np.arange(n + 1)).sum() + 9.81 * 99.9 * 2.0
+        if substeps == 20:
+            assert rise.max() > 0.15 * fallen
+            assert told[rise > 0.15 * fallen].all() and not told[rise < 0.05 * fallen].any()
+            note = next(r for r in reports if FLAG in r.flags).notes[-1]
+            assert "Nothing works on the scene" in note and "at first 40" in note
+        else:
+            assert rise.max() < 1e-3 * fallen and not told.any()
+
+
+@pytest.mark.parametrize("place", ["alone", "one of many"])
+def test_a_potential_that_is_wrong_is_found(world, place):
+    # E = K - F (|r| - 1) stays; of a potential that is 0, E = K = F (|r| - 1) comes from nowhere, at once.
+    for potential, wrong in ((of_push, False), (forgotten, True), (None, False)):
+        w = world(*pair(tv.PairForce(push, potential=potential)))
+        if place == "alone":
+            told = [FLAG in w.step(1 / 60).flags for _ in range(30)]
+            assert told == [False] + 29 * [True] if wrong else not any(told)
+            assert (FLAG in w.clone().step(1 / 60).flags) is wrong
+        else:
+            with tv.Worlds(w, 3) as many:
+                assert not many.step(1 / 60).flags
+                many.velocity = np.array([[[0.0, 0], [v, 0]] for v in (0.0, 0.0, 100.0)])  # a new start; fast, it is hardly more
+                assert many.step(1 / 60).flags.keys() == set()
+                flags = many.run(0.2).flags
+                assert flags[FLAG].tolist() == [True, True, False] if wrong else not flags
+
+
+def test_what_works_is_no_fault(world):
+    # A particle is lifted, thrown, turned or blown; gravity is turned up; a wall and a pin move; some come with a velocity.
+    gravity, pin = tv.Gravity(9.81), tv.Pin([0])
+    wall = tv.Capsule((-5.0, -1.0), (5.0, -1.0), 0.2)
+    lift = tv.Polygon([[-2, -0.4], [2, -0.4], [2, -0.2], [-2, -0.2]])
+    link = tv.Distance([[0, 1]], compliance=1e-3)
+    scenes = {
+        "force": world(*pair(tv.Force(wind))),
+        "wind": world(*pair(tv.Wind((20.0, 0.0), 1.0))),
+        "winch": world(*pair(gravity, tv.Winch([[0, 1]], speed=-1.0), pinned=[0])),
+        "gravity": world(*pair(g := tv.Gravity(1.0), wall.copy())),
+        "pin": world(*pair(pin, tv.Distance([[0, 1]]))),
+        "wall": world(*pair(tv.Gravity(9.81), lift)),
+        "rest": world(*pair(link)),
+        "edited": world(*pair(tv.Gravity(9.81), tv.Contact())),
+        "thrown": world(*pair(tv.Gravity(9.81))),
+    }
+    for k in range(30):
+        g.g = 1.0 + k
+        pin.target = (0.1 * k, 0.0)
+        lift.position = (0.0, 0.05 * k)
+        link.rest = 1.0 + 0.05 * k
+        if k == 10:
+            scenes["edited"].add(tv.Particles([[0.0, 50.0]], radius=0.1, velocity=(0.0, 30.0)))
+            scenes["thrown"].velocity = [[10.0, 0.0], [0.0, 30.0]]
+        for name, w in scenes.items():
+            before = w.last.energy if w.last else None
+            report = w.step(1 / 60)
+            assert FLAG not in report.flags, (name, k, before, report)
+    gained = {name: w.last.energy for name, w in scenes.items()}
+    assert all(gained[name] > 0.1 for name in ("force", "wind", "winch", "pin", "wall", "rest", "edited", "thrown")), gained
+
+
+def test_what_overlaps_parts_without_a_word(world):
+    # Placed into each other, they push each other apart: that is energy, which the overlap had.
+    rng = np.random.default_rng(1)
+    x = rng.uniform(0, 1, (40, 2))
+    w = world(tv.Particles(x, radius=0.1), [tv.Contact()])
+    assert all(FLAG not in w.step(1 / 60).flags for _ in range(60)) and w.last.energy > 0
