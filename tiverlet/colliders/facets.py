@@ -188,7 +188,7 @@ class FacetShape(Shape):
     @ti.func
     def strike(self, a, e, contact_distance, close, limit):
         """The first touch of any facet on the way. Where the start is inside of a closed shape, the nearest facet lets it out."""
-        way, s, piece = e.norm(), 0 * contact_distance, 0
+        way, s, piece, touch = e.norm(), 0 * contact_distance, 0, ti.max(self.touch, 4 * close)
         best, depth, normal = 0 * contact_distance + 2, 0 * contact_distance, 0 * e
         least, outside, exit = contact_distance + way + 1, 0 * contact_distance + 1, 0 * e
         while s < 1 and s < best and piece < self.pieces:
@@ -205,7 +205,7 @@ class FacetShape(Shape):
                         if ti.static(self.closed):
                             if k == 0 and piece == 0 and distance < least:
                                 least, outside, exit = distance, side, -n
-                            if distance <= self.touch:
+                            if distance <= touch:
                                 # On the surface itself, each facet that is touched there has its own direction.
                                 distance, n, at = ti.select(side < 0, -distance, distance), self.normal[f], -1
                         gap, slope = distance - contact_distance, e.dot(n)
@@ -230,7 +230,7 @@ class FacetShape(Shape):
             s += (clear - contact_distance) / way
             piece += 1
         if ti.static(self.closed):
-            if outside < 0 and least > self.touch:
+            if outside < 0 and least > touch:
                 below = contact_distance + least - e.dot(exit)
                 best = 0 * contact_distance + 2
                 if ti.min(below, limit - e.dot(exit)) > 2 * close:

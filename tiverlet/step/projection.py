@@ -22,6 +22,7 @@ import numpy as np
 
 from ..constraints.core.scalar import Scalar
 from ..neighbours.queries import between
+from ..particles import LARGEST
 from ..solvers.corners import bodies_of
 from .block_matrix import WIDEST, BlockMatrix, WideRows
 from .integrator import h2_effective_of
@@ -54,7 +55,7 @@ def project(runner: "Runner", h: float, longest: float) -> bool | None:
     slots = runner.scene.slots
     w, state, memory = runner.scene.inv_mass, runner.scene.state, runner.memory
     x = before = state.get(memory)
-    if not np.isfinite(x).all():
+    if not (np.abs(x) < LARGEST).all():  # nor what is no number
         return True
     batches: list[Any] = [b for b in runner.batches if isinstance(b, Scalar) and b.count]
     stays = left_out(runner.batches, w, x)
