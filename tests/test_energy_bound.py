@@ -36,6 +36,21 @@ def wind(x, v, t):
     return ti.Vector([3.0, 0.0])
 
 
+STIFF = 1800.0  # [N/m]
+
+
+@ti.func
+def spring(r):
+    """Of a metre."""
+    return -1800.0 * (r.norm() - 1.0) * r.normalized()
+
+
+@ti.func
+def of_spring(r):
+    """Its potential."""
+    return 900.0 * (r.norm() - 1.0) ** 2
+
+
 def pair(*features, **settings):
     """Two particles, one metre from each other."""
     return tv.Particles([[0.0, 0.0], [1.0, 0.0]], radius=0.1, **settings), list(features)
@@ -116,8 +131,37 @@ def test_what_works_is_no_fault(world):
 
 
 def test_what_overlaps_parts_without_a_word(world):
-    # Placed into each other, they push each other apart: that is energy, which the overlap had.
+    # Placed into each other, or into a wall, they are pushed out: that is energy, which the overlap had; also where velocities
+    # are assigned, or something goes, on the way, and where a wall comes back.
     rng = np.random.default_rng(1)
     x = rng.uniform(0, 1, (40, 2))
-    w = world(tv.Particles(x, radius=0.1), [tv.Contact()])
-    assert all(FLAG not in w.step(1 / 60).flags for _ in range(60)) and w.last.energy > 0
+    wall = tv.HalfSpace((0, 1), active=False)
+    heap = world(tv.Particles(x, radius=0.1), [tv.Gravity(9.81), tv.Contact(), wall])
+    alone = world(tv.Particles([[0.0, -0.5]], radius=0.1), [tv.Gravity(9.81), tv.HalfSpace((0, 1))])
+    for k in range(90):
+        if k == 3:
+            heap.velocity = 0 * heap.velocity
+            heap.remove([0])
+        wall.active = k > 20
+        assert not {FLAG} & (heap.step(1 / 60).flags | alone.step(1 / 60).flags), k
+    assert alone.last.energy > 0 > alone.last.energy - 9.81 * 0.6
+
+
+def test_what_forces_err_by_is_no_gain(world):
+    # A spring of omega h = 1.5, as a force: Verlet keeps E + O((omega h)^2) of it, up to (omega h)^2 / 8 more.
+    w = world(*pair(tv.PairForce(spring, potential=of_spring), velocity=[[-1.5, 0.0], [1.5, 0.0]]), substeps=1)
+    h = 1.5 / np.sqrt(2 * STIFF)
+    energies = [(report := w.step(h)).energy for _ in range(300)]
+    assert max(energies) > 1.1 * energies[0] and FLAG not in report.flags
+    assert all(FLAG not in w.step(h).flags for _ in range(300))
+
+
+def test_less_of_a_force_is_less_to_lose(world):
+    # Gravity is turned down: what energy was by the old one is no bound for the new.
+    for turned in (False, True):
+        gravity = tv.Gravity(2.0 if turned else 1.0)
+        w = world(*pair(gravity, tv.PairForce(push, potential=forgotten)))
+        w.position = w.position + [0.0, 100.0]
+        w.step(1 / 60)
+        gravity.g = 1.0
+        assert FLAG in w.run(1.0).flags

@@ -28,7 +28,7 @@ from .step import checkpoint, edit_scene, energy_bound
 from .step.adaptive import StepController
 from .step.build import Assembly, assemble, check_settings, checked_features, checked_solver
 from .step.build_again import Rebuild
-from .step.clock import Clock
+from .step.clock import CHANGED, Clock
 from .step.diagnostics import KINETIC
 from .step.edit_scene import Handle
 from .step.explain import compiling, explain
@@ -181,7 +181,7 @@ class World:
         """Bring the knobs to the device. Where a force has changed, displacements become velocities first, by the old force."""
         waiting = [f for f in self._features if f.changed or f.moving]
         if waiting:
-            self._clock.bound = None
+            self._clock.bound = CHANGED
             if self._runner.sleep and not all(isinstance(f, Batch) and f.drives for f in waiting):
                 self._runner.wake()
             self._adapt(steps=True)

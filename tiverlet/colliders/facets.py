@@ -188,7 +188,7 @@ class FacetShape(Shape):
     @ti.func
     def strike(self, a, e, contact_distance, close, limit):
         """The first touch of any facet on the way. Where the start is inside of a closed shape, the nearest facet lets it out."""
-        way, s, piece, touch = e.norm(), 0 * contact_distance, 0, ti.max(self.touch, 4 * close)
+        way, s, piece, on = e.norm(), 0 * contact_distance, 0, ti.max(self.touch, 4 * close)
         best, depth, normal = 0 * contact_distance + 2, 0 * contact_distance, 0 * e
         least, outside, exit = contact_distance + way + 1, 0 * contact_distance + 1, 0 * e
         while s < 1 and s < best and piece < self.pieces:
@@ -205,8 +205,12 @@ class FacetShape(Shape):
                         if ti.static(self.closed):
                             if k == 0 and piece == 0 and distance < least:
                                 least, outside, exit = distance, side, -n
-                            if distance <= touch:
-                                # On the surface itself, each facet that is touched there has its own direction.
+                            on_it = distance <= self.touch
+                            if not on_it and distance <= on:
+                                on_it = at < 0 or not self.alone(at, self.normal[f])
+                            if on_it:
+                                # On the surface, by the digits of the particle, each facet that is touched there has its own
+                                # direction; at a corner only where others rise in front of it, for they may be what it lies on.
                                 distance, n, at = ti.select(side < 0, -distance, distance), self.normal[f], -1
                         gap, slope = distance - contact_distance, e.dot(n)
                         if gap <= close or k == NEWTON - 1:
@@ -230,7 +234,7 @@ class FacetShape(Shape):
             s += (clear - contact_distance) / way
             piece += 1
         if ti.static(self.closed):
-            if outside < 0 and least > touch:
+            if outside < 0 and least > on:
                 below = contact_distance + least - e.dot(exit)
                 best = 0 * contact_distance + 2
                 if ti.min(below, limit - e.dot(exit)) > 2 * close:

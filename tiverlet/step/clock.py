@@ -14,6 +14,8 @@ NAMES = {
 
 SHARE = 0.1  # of the largest kinetic energy: how much more a scene may have
 DIGITS = 1e-5  # of the energy
+CHANGED = -np.inf  # the bound of a scene on which something works in the coming frame: what it had before does not count
+SQUEEZED = 0.1  # overlap [radii] from which what something has pressed into each other pushes itself apart, too
 PARTED = 0.01  # overlap [radii] down to which what was placed into each other pushes itself apart
 
 
@@ -79,6 +81,8 @@ class Clock:
         """Take note of the energy at the end of a frame, and of its kinetic part. Returns whether it may be too much."""
         if self.bound is None:
             self.bound, self.kinetic = energy if self.energy is None else max(self.energy, energy), 0.0
+        elif self.bound == CHANGED:
+            self.bound, self.kinetic, self.parting = energy, 0.0, self.parting or overlap > SQUEEZED
         self.kinetic = max(self.kinetic, kinetic)
         if self.parting:
             self.bound, self.parting = max(self.bound, energy), overlap > PARTED

@@ -98,7 +98,7 @@ class Runner:
         if self.prepare(substep, iterations):
             placed = self.clock.first_moved is not None
             if self.clock.energy is None:
-                self.clock.bound, self.clock.parting = None, placed
+                self.clock.bound, self.clock.parting = None, self.clock.parting or placed
                 self.look(bare=not placed)
                 if self.sleep:
                     with self.memory.compiler():
@@ -203,7 +203,6 @@ class Runner:
     def set_out(self) -> None:
         """Have rest values that were assigned go there in the coming frame."""
         if self.ramping:
-            self.clock.bound = None
             new = [b.ramp.memory for b in self.ramping if b.ramp.set_out()]
             self.ramping = [b for b in self.ramping if b.ramp.under_way]
             if new:

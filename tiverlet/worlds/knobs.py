@@ -105,6 +105,13 @@ class Knobs:
         return True
 
     @property
+    def turned(self) -> np.ndarray:
+        """The worlds in which a knob has another value than in the last frame."""
+        if len(self._waiting) > 1 or any(f.changed for f in self.features):
+            return np.ones(self.count, dtype=bool)
+        return np.any([np.zeros(self.count, dtype=bool), *self._set.values()], axis=0)
+
+    @property
     def waiting(self) -> np.ndarray:
         """The worlds in which something waits."""
         if len(self._waiting) > 1 or any(f.changed or f.moving for f in self.features):

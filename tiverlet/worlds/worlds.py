@@ -19,8 +19,8 @@ from ..features.read_only import assign_whole, read_only
 from ..particles import in_range
 from ..step import checkpoint, energy_bound
 from ..step import frames as kernel
-from ..step.clock import PARTED, room
-from ..step.diagnostics import EXTENT, STARTED, STEPPED, TURNS, UNSTEPPED, risks
+from ..step.clock import CHANGED, PARTED, SQUEEZED, room
+from ..step.diagnostics import EXTENT, KINETIC, REACH, STARTED, STEPPED, STIFFNESS, TURNS, UNSTEPPED, risks
 from ..step.integrator import FREE
 from ..world import World
 from .clocks import NONE, Clocks
@@ -88,6 +88,7 @@ class Worlds:
             self._rest()
         self._copies.closed = True
         self._last: WorldsReport | None = None
+        self._turned = np.zeros(len(self), dtype=bool)  # in which knobs were turned in the last frame
         self._start: _Start | None = None  # what reset() returns to; from the first step on
 
     def _take(self, k: int, world: World) -> None:
@@ -217,7 +218,8 @@ class Worlds:
         if len(unknown):
             energy, overlap = self._look(unknown)
             clocks.energy[unknown], clocks.known[unknown] = energy, True
-            clocks.bound[unknown], clocks.parting[unknown] = np.nan, clocks.first_moved[unknown] != NONE
+            clocks.bound[unknown] = np.nan
+            clocks.parting[unknown] |= clocks.first_moved[unknown] != NONE
             for k in unknown[(overlap > 0) & (clocks.first_moved[unknown] != NONE)]:
                 with self._at(k), runner.memory.compiler():
                     runner.ease(int(clocks.first_moved[k]))
@@ -245,18 +247,22 @@ class Worlds:
         world, features, knobs = self._world, self._world.features, self._knobs
         if knobs.idle():
             return
+        turned = knobs.turned
+        # Where something is under way, it is in those in which it was turned in the last frame.
+        works = np.where(turned | (self._turned & any(f.moving for f in features)), CHANGED, self._clocks.bound)
+        self._turned = turned
         with self._at(0):
             knobs.check_kernels()
         if knobs.upload_to_all():
             self._runner.find_ramps()
-            self._clocks.bound[:] = np.nan
-            return
-        still = np.zeros(len(features), dtype=bool)
-        for k in knobs.waiting:
-            with self._at(k), knobs.flagged(k):
-                world._upload_parameters()
-                still |= [f.moving for f in features]
-        knobs.note_uploaded(still.tolist())
+        else:
+            still = np.zeros(len(features), dtype=bool)
+            for k in knobs.waiting:
+                with self._at(k), knobs.flagged(k):
+                    world._upload_parameters()
+                    still |= [f.moving for f in features]
+            knobs.note_uploaded(still.tolist())
+        self._clocks.bound = works
 
     def _launch(
         self, dt: float, frames: int, moved: np.ndarray, released: np.ndarray, every: int = 0, track: np.ndarray | None = None,
@@ -326,8 +332,8 @@ class Worlds:
         """The worst of the figures of all frames, (worlds, frames, FIGURES). before: energies [J]."""
         world, runner, clocks = self._world, self._runner, self._clocks
         reporter, dim, n = runner.diagnostics.report, world.particles.dim, runner.n
-        energy, residual, overlap, stiff, contacts, bad, fast, reach, broken, tension, turned, kinetic = np.moveaxis(
-            figures[..., :EXTENT], 2, 0
+        energy, residual, overlap, stiff, contacts, bad, fast, reach, broken, tension, turned = np.moveaxis(
+            figures[..., :KINETIC], 2, 0
         )
         stiff = np.maximum(stiff, (self._fastest * clocks.h**2)[:, None])
         first = np.arange(figures.shape[1]) == 0
@@ -335,7 +341,7 @@ class Worlds:
             n, reporter.farthest, bad, reach, fast, overlap, turned, np.where(first, moved[:, None], 0.0), tension, stiff,
             np.where(first, released[:, None], 0.0), residual,
         )  # fmt: skip
-        every[energy_bound.FLAG] = self._gains(before, energy, kinetic, overlap, reach, figures[..., EXTENT : EXTENT + dim])
+        every[energy_bound.FLAG] = self._gains(before, figures)
         clocks.softened = every["softened"][:, -1].copy()
         wrong = bad < n
         report = WorldsReport(
@@ -353,22 +359,17 @@ class Worlds:
             runner.search.fit(extent.max(0))
         return report
 
-    def _gains(
-        self,
-        before: np.ndarray,
-        energy: np.ndarray,
-        kinetic: np.ndarray,
-        overlap: np.ndarray,
-        reach: np.ndarray,
-        extent: np.ndarray,
-    ) -> np.ndarray:
+    def _gains(self, before: np.ndarray, figures: np.ndarray) -> np.ndarray:
         """Which worlds have energy from nowhere, and in which frames: Clock.exceeds() and energy_bound.checked() of all. before:
-        (worlds,), others (worlds, frames, ...)."""
+        energies [J]. figures: (worlds, frames, FIGURES)."""
+        energy, overlap, stiff, reach, kinetic = (figures[..., k] for k in (0, 2, STIFFNESS, REACH, KINETIC))
+        extent = figures[..., EXTENT : EXTENT + self._world.particles.dim]
         clocks, gain = self._clocks, np.empty_like(energy)
         for k in range(energy.shape[1]):
-            unknown = np.isnan(clocks.bound)
-            clocks.bound = np.where(unknown, np.fmax(before, energy[:, k]), clocks.bound)
-            clocks.kinetic = np.maximum(np.where(unknown, 0.0, clocks.kinetic), kinetic[:, k])
+            unknown, changed = np.isnan(clocks.bound), clocks.bound == CHANGED
+            clocks.bound = np.where(unknown, np.fmax(before, energy[:, k]), np.where(changed, energy[:, k], clocks.bound))
+            clocks.parting |= changed & (overlap[:, k] > SQUEEZED)
+            clocks.kinetic = np.maximum(np.where(unknown | changed, 0.0, clocks.kinetic), kinetic[:, k])
             clocks.bound = np.where(clocks.parting, np.maximum(clocks.bound, energy[:, k]), clocks.bound)
             clocks.parting = clocks.parting & (overlap[:, k] > PARTED)
             gain[:, k] = energy[:, k] - room(clocks.bound, clocks.kinetic, energy[:, k])
@@ -378,7 +379,10 @@ class Worlds:
                 if energy_bound.works(world):
                     world._clock.bound, out[k] = None, False
                 else:
-                    out[k] = gain[k] > energy_bound.blur(world, extent[k], reach[k])
+                    err = energy_bound.blur(world, extent[k], reach[k]) + stiff[k] / 4 * world._clock.kinetic
+                    if (gain[k] > err).any() and energy_bound.inside(world, reach[k].max()):
+                        world._clock.bound, err = energy[k].max(), np.inf
+                    out[k] = gain[k] > err + energy_bound.let_out(world)
         return out
 
     # Knobs and states of some.
