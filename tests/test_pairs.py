@@ -5,6 +5,7 @@ import pytest
 
 import tiverlet as tv
 from tiverlet.step import build, checkpoint
+from tiverlet.step.diagnostics import EXTENT, REACH
 
 from .conftest import CROSSOVER
 
@@ -89,7 +90,7 @@ def test_pairs_equal_brute_force(world, path, name, radius, several):
             continue  # frames of a team are compiled for one cloud; what they come to is summed up alike for all
         w._runner.look()
         touching = w._runner.report()
-        reach, *extent = w._runner.diagnostics.report.figures[[7, *range(11, 11 + w.particles.dim)]]
+        reach, *extent = w._runner.diagnostics.report.figures[[REACH, *range(EXTENT, EXTENT + w.particles.dim)]]
         assert reach == np.abs(position).max() and extent == np.ptp(position, axis=0).tolist()
         brute, depth = tv.measure.overlapping(position, radius)
         assert touching.contacts == len(brute)
