@@ -63,7 +63,7 @@ class Path(Anchored):
         return bool(self.driver)
 
     @property
-    def does_work(self) -> bool:  # type: ignore[override]
+    def does_work(self) -> bool:
         """Whether the particles are driven."""
         return self.drives
 

@@ -232,7 +232,7 @@ class Acceleration(Feature):
     room = 0  # listed neighbours of a particle for which there is room at first
 
     @property
-    def does_work(self) -> bool:  # type: ignore[override]
+    def does_work(self) -> bool:
         """Whether it accelerates, and its potential is not known."""
         return self.accelerates and not self.conservative
 
@@ -287,7 +287,7 @@ class Batch(Feature):
     index_name = "indices"  # the argument of __init__ that they are, as `listing` gives them
 
     @property
-    def does_work(self) -> bool:  # type: ignore[override]
+    def does_work(self) -> bool:
         """Whether rest values move by themselves."""
         return self.driven
 

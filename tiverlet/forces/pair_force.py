@@ -71,7 +71,7 @@ class PairForce(Acceleration):
         self.listed = radius is not None
 
     @property
-    def does_work(self) -> bool:  # type: ignore[override]
+    def does_work(self) -> bool:
         """Whether its potential is not known."""
         return not self.potential_arity
 

@@ -77,7 +77,7 @@ class Periodic(Feature):
             raise ValueError(f"Periodic: shear = {self.shear:g} needs a box that is periodic along x and y, not {self.axes}.")
 
     @property
-    def does_work(self) -> bool:  # type: ignore[override]
+    def does_work(self) -> bool:
         """Whether images move."""
         return self.shear != 0
 

@@ -72,15 +72,20 @@ def let_out(world: "World") -> float:
     """What a wall gives a particle in the frame in which it has let it out [J]."""
     push = max([wall.push_out for wall in _walls(world)], default=0.0)
     lift = float(np.linalg.norm(_pull(world))) * world._clock.frame[1]
-    return float(1 / world._runner.scene.inv_mass[world._runner.scene.inv_mass > 0].min()) * push * (lift + push / 2)
+    return float(_masses(world).max()) * push * (lift + push / 2)
 
 
 def blur(world: "World", extent: np.ndarray, reach: Any) -> Any:
     """What contacts that begin to bear something, and the rounding of positions, may make of the energy [J]. extent: edges of
     the bounding box, (..., dim) [m]. reach: the largest coordinate, (...) [m]."""
-    inv_mass = world._runner.scene.inv_mass
     digit = ROUNDED * (2.0**-23 if world._precision != "f64" else 2.0**-52) * reach / world._clock.h
-    return (1 / inv_mass[inv_mass > 0]).sum() * (FALL * extent @ _pull(world) + digit**2)
+    return _masses(world).sum() * (FALL * extent @ _pull(world) + digit**2)
+
+
+def _masses(world: "World") -> np.ndarray:
+    """Of what can move [kg]."""
+    inv_mass = world._runner.scene.inv_mass
+    return 1 / inv_mass[inv_mass > 0]
 
 
 def _pull(world: "World") -> np.ndarray:
