@@ -57,26 +57,24 @@ def pair(*features, **settings):
 
 
 def test_what_no_figure_tells_is_told_by_energy(world):
-    # A rope of 20 links of 0.1 kg, level, with 100 kg at its end, which fall and swing: h is too long for its tension, but frames
-    # when it is slack tell nothing of that. It gained 400 J of the 1962 that it falls, in a hundred frames without a word. With
-    # twice the substeps it gains nothing.
-    n = 20
-    x, mass = np.stack([0.1 * np.arange(n + 1), np.zeros(n + 1)], axis=1), np.full(n + 1, 0.1)
-    mass[-1] = 100.0
+    # A rope of six links, level, that falls and cracks: two substeps do not resolve its cracks, and each constraint is met, so
+    # nothing else tells of it. It gains a fifth of what it falls by, and is told from a tenth on. With twenty it gains nothing.
+    n = 6
+    x = np.stack([0.1 * np.arange(n + 1), np.zeros(n + 1)], axis=1)
     links = np.stack([np.arange(n), np.arange(1, n + 1)], axis=1)
-    for substeps in (20, 40):
-        w = world(tv.Particles(x, mass=mass, pinned=[0]), [tv.Gravity(9.81), tv.Distance(links)], substeps=substeps)
-        reports = [w.step(1 / 60) for _ in range(1060)]
+    fallen = 9.81 * x[:, 0].sum()
+    for substeps in (2, 20):
+        w = world(tv.Particles(x, pinned=[0]), [tv.Gravity(9.81), tv.Distance(links)], substeps=substeps, iterations=2)
+        reports = [w.step(1 / 60) for _ in range(400)]
         rise = np.array([r.energy for r in reports]) - reports[0].energy
         told = np.array([FLAG in r.flags for r in reports])
-        fallen = 9.81 * 0.1 * (0.1 * np.arange(n + 1)).sum() + 9.81 * 99.9 * 2.0
-        if substeps == 20:
-            assert rise.max() > 0.15 * fallen
-            assert told[rise > 0.15 * fallen].all() and not told[rise < 0.05 * fallen].any()
+        if substeps == 2:
+            assert rise.max() > 0.15 * fallen and set().union(*[r.flags for r in reports]) == {FLAG}
+            assert told[rise > 0.15 * fallen].all() and not told[rise < 0.09 * fallen].any()
             note = next(r for r in reports if FLAG in r.flags).notes[-1]
-            assert "Nothing works on the scene" in note and "at first 40" in note
+            assert "Nothing works on the scene" in note and "at first 4" in note
         else:
-            assert rise.max() < 1e-3 * fallen and not told.any()
+            assert rise.max() < 0.01 * fallen and not told.any()
 
 
 @pytest.mark.parametrize("place", ["alone", "one of many"])

@@ -21,6 +21,13 @@ CONTRADICTION = 1e-6  # of its violation: what others leave of such a constraint
 SMALL_PIVOT = 2e-3  # of what the heaviest of its particles adds to it: with a pivot below, a load is hardly borne to first order
 AGREEMENT = 0.25  # of the tension: how far the two ends of a substep may differ about it there
 STABLE = 2.0  # (omega h)^2 that is allowed there: half the limit of stability
+
+
+# A second step of Newton's method is taken where a particle moved by more than LONG (of a length, squared), unless a tension was
+# above CALM, (omega h)^2: such vibrations are not resolved, and bring in energy, which what the first step leaves takes out.
+LONG, CALM = 1e-5, 0.35
+UNKNOWN, UNMET, ENDED = range(3)  # whether a system takes it: known by the moves of the first; yes; no, whatever these are
+
 ROUNDS = 8  # of finding out which ropes pull, and how soft a system has to be
 
 # (omega h)^2 to which a tension gives way with directions at the end of the substep. There the move is a step down the gradient
@@ -36,8 +43,9 @@ ROUGH, FORWARD, AGAIN, COMPARE, GIVE_WAY, DONE = range(6)
 class Direct(Solver):
     """Constraints that hang together like chains, trees or closed loops are solved as one linear system, by elimination.
 
-    Each iteration is a Newton step of all multipliers of a system, in the metric of SHAKE, with the gradients at the current
-    positions and the directions at the start of the step (Barth et al. 1995, Leimkuhler and Skeel 1994 for the same in f64):
+    Each iteration is a step of Newton's method for all multipliers of a system, in the metric of SHAKE, with the gradients at the
+    current positions and the directions at the start of the substep (Barth et al. 1995, Leimkuhler and Skeel 1994 for the same in
+    f64). With iterations=1 a system takes a second one where the first was long:
 
         A_j sum_k (grad C_j(x) . w . grad C_k(x_n)) dlam_k + alpha'_j dlam_j = -(A_j C_j + B_j + alpha'_j lam_j)
 
@@ -115,6 +123,16 @@ class Elimination(System):
         who = np.zeros(slots.total, dtype=np.int64)
         who[slot] = item
         self.particle_of, self.w, self.inverse_size = ints("who", who), scene.state.w, reals("close")
+        self.refines = scene.order == 2 and not self.limits_steps and not self.shares
+        if self.refines:
+            parts = np.repeat(np.arange(found.parts), np.diff(found.part_begin))
+            self.part_of, self.newton = ints("part_of", parts), ints("newton", np.full(found.parts, UNKNOWN))
+            near = np.zeros(len(scene.inv_mass))
+            for b in scalars:
+                inside = self.row(b) >= 0
+                np.maximum.at(near, b.indices[inside], b.inverse_size(b.start.position)[inside, None])
+            self.near = scene.memory.field("system.near", scene.count, values=near)
+            self.any_unmet = scene.memory.field("system.any_unmet", None, kind=ti.i32)
         self.sleeps = bool(scene.state.sleepers)
         if self.sleeps:  # all of a system, or nothing
             self.lead = ints("lead", self.leads(scalars, slots)[found.part_begin[:-1]])
@@ -355,6 +373,40 @@ class Elimination(System):
                 self.step[r] = ti.max(-most, ti.min(most, self.lam[r] + self.step[r])) - self.lam[r]
 
     @ti.func
+    def takes_step(self, b, newton):
+        """Whether system b takes this step of Newton's method in a pass."""
+        out = True
+        if ti.static(self.refines):
+            if newton == 0:
+                self.newton[b] = UNKNOWN
+                self.any_unmet[None] = 0  # all write the same
+            out = newton == 0 or self.newton[b] == UNMET
+        return out
+
+    @ti.func
+    def end_newton(self, b):
+        """System b takes no other step of Newton's method in this pass."""
+        if ti.static(self.refines):
+            self.newton[b] = ENDED
+
+    @ti.func
+    def is_unmet(self, r):
+        """Whether the system of row r takes another step of Newton's method."""
+        return self.newton[self.part_of[r]] == UNMET
+
+    @ti.func
+    def note_move(self, i, begin, end, move):
+        """Note where particle i moved so far that rigid constraints of its system are left unmet: a length l by |u|^2 / (2 l),
+        where its ends moved across it by u, relative to each other."""
+        if (self.near[i] * move).norm_sqr() > LONG:
+            for s in range(begin, end):
+                r = self.row_of[s]
+                b = self.part_of[r]
+                if self.alpha[r] == 0 and self.newton[b] == UNKNOWN:
+                    self.newton[b] = UNMET
+                    self.any_unmet[None] = 1
+
+    @ti.func
     def solve(self, b):
         """System b: the step of every multiplier in it.
 
@@ -382,12 +434,15 @@ class Elimination(System):
                 if (hard == 0 and tension <= TENSEST) or stage == AGAIN:
                     ti.atomic_max(self.tension[None], tension)
                     stage = DONE
+                    if tension > CALM:
+                        self.end_newton(b)
                 elif stage == ROUGH:
                     self.refine_violations(begin, end)
                     stage = FORWARD
                 elif hard == 2:
                     ti.atomic_max(self.tension[None], ti.cast(TENSEST, ti.f64))
                     softness, stage = LEAST_SOFTNESS * most, GIVE_WAY
+                    self.end_newton(b)
                 else:
                     tension_at_start, total_at_start, bound, stage = tension, total, hard == 0, COMPARE
             elif stage == COMPARE:
@@ -399,6 +454,7 @@ class Elimination(System):
                     # What more substeps do not help has the figure of what is just unstable.
                     ti.atomic_max(self.tension[None], ti.select(bound, tension_at_start, ti.min(tension, TENSEST)))
                     softness, stage = LEAST_SOFTNESS * most, GIVE_WAY
+                    self.end_newton(b)
                     if self.bears(begin, end) > SOFTENED_TO:
                         self.stay(begin, end)
                         stage = DONE

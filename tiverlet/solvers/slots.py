@@ -62,6 +62,7 @@ class Slots:
             self.broken = memory.field("slots.broken", None, kind=ti.i32)
         self.system: Any = solver.system(scene, batches, self)
         self.has_system = bool(self.system)
+        self.refines = self.has_system and self.system.refines
         # Whether a substep fulfils constraints to rounding, which is then the error that is left.
         scalars = solvable(batches)
         self.exact = bool(scalars) and (not self.system.steps if self.system else bool(degree.max(initial=0) <= 1))
@@ -160,7 +161,16 @@ class Slots:
         return total
 
     @ti.func
-    def gather(self, i):
-        """Move particle i by what the constraints want."""
-        if self.begin[i + 1] > self.begin[i]:
-            self.state.shift(i, self.wanted(i))
+    def gather(self, i, newton):
+        """Move particle i by what the constraints want; in later steps of Newton's method, by what its system wants."""
+        begin, end = self.begin[i], self.begin[i + 1]
+        if ti.static(self.refines):
+            if newton > 0 and end > begin:
+                r = self.system.row_of[begin]
+                if r < 0 or not self.system.is_unmet(r):
+                    end = begin
+        if end > begin:
+            wanted = self.wanted(i)
+            self.state.shift(i, wanted)
+            if ti.static(self.refines):
+                self.system.note_move(i, begin, end, wanted)

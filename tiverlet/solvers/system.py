@@ -34,6 +34,7 @@ class System:
     rows: Any = OnDevice()
     parts: Any = 1  # systems that have nothing to do with each other
     steps = 0  # of an iteration, by start(), iterate() and end(); 0 for a solution by solve()
+    refines = False  # whether parts may take a second step of Newton's method in a pass, which takes_step() and is_unmet() tell
     team: Any  # the threads that share the loops of start(), iterate() and end(), given when the kernels are made
     stride: int  # iterations of such a loop for each block of rows
 
@@ -123,6 +124,20 @@ class System:
     @ti.func
     def set_gradient(self, place, i, gradient):
         """The gradient at one corner, whose slot is `place` and particle i."""
+
+    @ti.func
+    def takes_step(self, b, newton):
+        """Whether part b takes this step of Newton's method in a pass: all take the first, 0."""
+        return True
+
+    @ti.func
+    def is_unmet(self, r):
+        """Where it refines: whether the part of row r takes another step of Newton's method."""
+        return False
+
+    @ti.func
+    def note_move(self, i, begin, end, move):
+        """Where it refines: particle i, with the slots from `begin` up to `end`, moved."""
 
     @ti.func
     def solve(self, b):

@@ -15,6 +15,7 @@ class ConstraintPass:
         self.integrator, self.batches, self.slots, self.team = integrator, batches, scene.slots, team
         self.systems = [scene.slots.system] if scene.slots and scene.slots.system else []
         self.steps = max([s.steps for s in self.systems], default=0)
+        self.refines = bool(scene.slots) and scene.slots.refines
         for system in self.systems:
             system.team, system.stride = team, stride
         self.semi_iterations = [scene.slots.semi_iteration] if scene.slots and scene.slots.semi_iteration else []
@@ -24,10 +25,11 @@ class ConstraintPass:
         self.springs = any(b.soft for b in batches) or bool(self.learners)
 
     @ti.func
-    def reduce_blocks(self, thread, h, h2_effective, first, fresh, some: ti.template()):  # type: ignore[valid-type]
-        """The sums of constraints on many particles, by blocks. some: for which; those of the residual, or all."""
+    def reduce_blocks(self, thread, h, h2_effective, first, fresh, some: ti.template(), newton=0):  # type: ignore[valid-type]
+        """The sums of constraints on many particles, by blocks. some: for which; those of the residual, or all. Systems have
+        none, so in later steps of Newton's method there is nothing to do."""
         for f in ti.static([f for f in self.ragged if f.reweighs or some]):
-            n = f.dev.corners.block_count
+            n = f.dev.corners.block_count * (1 - newton)
             for b in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
                 if ti.static(bool(self.slots.state.sleepers) and some):
                     if f.dev.corners.awake(f.dev.corners.block[b][2]):
@@ -37,10 +39,10 @@ class ConstraintPass:
             self.team.wait()
 
     @ti.func
-    def scatter_blocks(self, thread, h, h2_effective, first, fresh):
+    def scatter_blocks(self, thread, h, h2_effective, first, fresh, newton=0):
         """The moves of constraints on many particles."""
         for f in ti.static(self.ragged):
-            n = f.dev.corners.total
+            n = f.dev.corners.total * (1 - newton)
             for e in range(self.team.chunk_begin(n, thread), self.team.chunk_end(n, thread)):
                 if f.dev.corners.awake(f.dev.corners.owner[e]):
                     f.dev.scatter_corner(e, h, h2_effective, first, fresh)
@@ -65,11 +67,23 @@ class ConstraintPass:
                     f.dev.note_spring_turn(c)
 
     @ti.func
+    def takes_part(self, f: ti.template(), c, newton):  # type: ignore[valid-type]
+        """Whether constraint c of a batch takes part: in later steps of Newton's method only what the first left unmet."""
+        out = f.dev.corners.awake(c)
+        if ti.static(self.refines):
+            if newton > 0:
+                if ti.static(f in self.in_systems):
+                    out = out and f.dev.unmet(c)
+                else:
+                    out = False
+        return out
+
+    @ti.func
     def solve(self, now):
         """Every constraint leaves the moves that it wants in its slots, or tells its system what it is about."""
         fresh = now.fresh if ti.static(self.integrator.half_kick) else 0
         h2_effective = self.integrator.h2_effective(now.h, fresh)
-        self.reduce_blocks(now.thread, now.h, h2_effective, now.first, fresh, True)
+        self.reduce_blocks(now.thread, now.h, h2_effective, now.first, fresh, True, now.newton)
         for semi_iteration in ti.static(self.semi_iterations):
             ti.loop_config(serialize=True)
             for _ in range(self.team.one(1, now.thread)):
@@ -77,11 +91,11 @@ class ConstraintPass:
             self.team.wait()
         for f in ti.static(self.batches):
             for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
-                if f.dev.corners.awake(c):
+                if self.takes_part(f, c, now.newton):
                     f.dev.relax(c, now.h, h2_effective, now.frame_fraction, now.first, fresh)
         if ti.static(len(self.batches) > 0):
             self.team.wait()
-        self.scatter_blocks(now.thread, now.h, h2_effective, now.first, fresh)
+        self.scatter_blocks(now.thread, now.h, h2_effective, now.first, fresh, now.newton)
 
     @ti.func
     def learn(self, now):
@@ -105,7 +119,7 @@ class ConstraintPass:
                         f.dev.learn_load(c, now.h)
 
     @ti.func
-    def solve_systems(self, thread):
+    def solve_systems(self, thread, newton):
         """Find the steps of the multipliers of each system."""
         for system in ti.static(self.systems):
             if ti.static(system.steps > 0):
@@ -114,7 +128,8 @@ class ConstraintPass:
                     system.iterate(thread)
             else:
                 for b in range(self.team.chunk_begin(system.parts, thread), self.team.chunk_end(system.parts, thread)):
-                    system.solve(b)
+                    if system.takes_step(b, newton):
+                        system.solve(b)
                 self.team.wait()
 
     @ti.func
@@ -137,7 +152,7 @@ class ConstraintPass:
                 system.end(now.thread)
         for f in ti.static(self.in_systems):
             for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
-                if f.dev.corners.awake(c):
+                if self.takes_part(f, c, now.newton):
                     f.dev.update_multiplier(c, now.first)
         if ti.static(len(self.in_systems) > 0):
             self.team.wait()

@@ -19,14 +19,14 @@ class Launcher:
 
     def __init__(self, runner: "Runner"):
         self.runner, step = runner, runner.step
-        self.halves, self.has_restitution = step.halves, step.has_restitution
+        self.halves, self.newton_steps, self.has_restitution = step.halves, step.newton_steps, step.has_restitution
         self.finishes, self.projects_velocities = step.finishes, step.projects_velocities
         self.drives, self.constrains, self.touches, self.acts = map(
             bool, (step.drivers, step.batches, step.contacts, step.particles.acts)
         )
         self.has_pair_forces, self.lists_pairs = step.has_pair_forces, bool(step.listed_forces)
         self.systems, self.steps = bool(step.constraints.systems), step.constraints.steps
-        self.looks = step.looks
+        self.looks, self.applies_first = step.looks, step.particles.applies_first
         self.waiting: list[str] = []
         self.now: Any = None  # the half of a pass that they are in
 
@@ -41,11 +41,11 @@ class Launcher:
 
     def put(self, now: Moment, name: str, there: bool = True) -> None:
         """Have one more phase wait for the next launch, if the scene has it. Phases of another half of a pass are launched
-        before."""
+        before. In the second step of Newton's method its name ends with a stroke."""
         if there:
             if self.waiting and (self.now.s, self.now.half) != (now.s, now.half):
                 self.flush()
-            self.waiting.append(name)
+            self.waiting.append(name + "'" * now.newton)
             self.now = now
 
     def again(self, now: Moment) -> bool:
@@ -131,8 +131,12 @@ class Launcher:
         self.put(now, "update_multipliers", self.systems)
 
     def apply_constraints(self, now: Moment) -> None:
-        """The last phase of the first half of a pass."""
-        self.put(now, "apply_constraints", self.halves == 2)
+        """Where they are not moved once, as the pass ends."""
+        self.put(now, "apply_constraints", self.applies_first)
+
+    def unmet(self, now: Moment) -> bool:
+        """Where there is one pass: the host asks no more, and where all are met a step of Newton's method does nothing."""
+        return now.span.iterations == 1
 
     def solve_contacts(self, now: Moment) -> None:
         """The first phase of the second half."""

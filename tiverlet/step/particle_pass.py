@@ -38,10 +38,11 @@ class ParticlePass:
         self.whole = team.size == 1 and not team.launched  # all particles are one piece,
         self.undivided = self.whole and self.few  # and one tile: no loop over them is compiled
         self.slots, self.search, self.walls, self.radius = scene.slots, search, walls, scene.radius
-        self.gathers = bool(batches) and not contact  # else the moves of constraints are applied before contacts are solved
+        self.applies_first = bool(batches) and (bool(contact) or scene.slots.refines)  # what constraints want, before all else
+        self.gathers = bool(batches) and not self.applies_first
         self.held = bool(batches)
         self.contacts = [contact] if contact else []
-        self.acts = bool(batches or contact or walls)
+        self.acts = self.gathers or bool(contact or walls)
         self.knows_loads = bool(contact) and contact.has_loads
         self.weights = [scene.own_weight] if scene.own_weight else []
         self.rough = any(w.has_friction or w.has_restitution for w in walls)
@@ -180,19 +181,19 @@ class ParticlePass:
                     self.state.shift(i, -lean)
 
     @ti.func
-    def apply_constraints(self, thread):
+    def apply_constraints(self, now):
         """Move particles as constraints want, before their contacts are solved; the list has to hear of it."""
-        for c in ti.static(self.contacts):
-            for i in range(self.team.chunk_begin(self.n, thread), self.team.chunk_end(self.n, thread)):
-                self.gather(i)
+        for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
+            self.gather(i, now.newton)
+            for c in ti.static(self.contacts):
                 c.note_motion(self.search.moved_too_far(i), c.overshoots(i))
-            self.team.wait()
+        self.team.wait()
 
     @ti.func
-    def gather(self, i):
+    def gather(self, i, newton):
         """Move particle i as constraints want."""
         if self.state.awake(i):
-            self.slots.gather(i)
+            self.slots.gather(i, newton)
 
     @ti.func
     def apply_corrections(self, now):
@@ -209,7 +210,7 @@ class ParticlePass:
         """What a tile of particles gathers."""
         if ti.static(self.gathers):
             for i in range(begin, end):
-                self.gather(i)
+                self.gather(i, 0)
         if ti.static(self.knows_loads and len(self.walls) > 0):
             if now.first != 0:
                 self.look_back(begin, end)

@@ -32,25 +32,30 @@ class Moment:
 
     s, h, last, time: number, length, length of the one before, start [s]. frame_fraction: where it starts and ends in the frame.
     fresh: whether it is a start. damps: whether sound is taken out after it. final: whether it is the last of the frame.
-    it: the pass. first: whether it is the first one. checks_list: whether it is checked after it if the list is stale; the next
-    substep does so, too. half: of the passes, counted through.
+    it: the pass. first: whether multipliers begin in it. checks_list: whether it is checked after it if the list is stale; the
+    next substep does so, too. half: of the passes, counted through. newton: the step of Newton's method in the pass, 0 or 1.
     """
 
     def __init__(
         self, span, s, h=0.0, last=0.0, time=0.0, tick=0, frame_fraction=None, fresh=0, damps=0, final=0, it=0, first=0,
-        checks_list=0, half=0,
+        checks_list=0, half=0, newton=0,
     ):  # fmt: skip
         self.span, self.thread, self.s, self.h, self.last, self.time, self.tick = span, span.thread, s, h, last, time, tick
         self.frame_fraction, self.fresh, self.damps, self.final = frame_fraction, fresh, damps, final
-        self.it, self.first, self.checks_list, self.half = it, first, checks_list, half
+        self.it, self.first, self.checks_list, self.half, self.newton = it, first, checks_list, half, newton
 
     @inline
-    def of(self, it, first=0, checks_list=0, half=0):
+    def of(self, it, first=0, checks_list=0, half=0, newton=0):
         """The same, in a pass."""
         return Moment(
             self.span, self.s, self.h, self.last, self.time, self.tick, self.frame_fraction, self.fresh, self.damps, self.final,
-            it, first, checks_list, half,
+            it, first, checks_list, half, newton,
         )  # fmt: skip
+
+    @inline
+    def newton_step(self, k):
+        """The same, in the k-th step of Newton's method in its pass."""
+        return self.of(self.it, self.first * (1 - k), self.checks_list, self.half, k)
 
 
 # The sheet of a frame, one array, since a launch takes 0.25 us more for each. First what the frame came to, see Diagnostics; then

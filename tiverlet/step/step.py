@@ -37,7 +37,8 @@ def frame(do, span):
 
 @ti.pyfunc
 def substep(do, now):
-    """A substep. Where there are constraints and contacts, a pass has two halves, and each begins with a good list."""
+    """A substep. Where there are constraints and contacts, a pass has two halves, and each begins with a good list. In the first,
+    constraints may need a second step of Newton's method."""
     if ti.static(do.has_pair_forces):
         if do.begins(now):
             do.evaluate_pair_forces(now)
@@ -49,10 +50,12 @@ def substep(do, now):
         if do.solves(now):
             turn = do.turn(now, half)
             if half % do.halves == 0:
-                do.solve_constraints(turn)
-                do.solve_systems(turn)
-                do.update_multipliers(turn)
-                do.apply_constraints(turn)
+                for k in range(do.newton_steps):
+                    if k == 0 or do.unmet(now):
+                        do.solve_constraints(turn.newton_step(k))
+                        do.solve_systems(turn.newton_step(k))
+                        do.update_multipliers(turn.newton_step(k))
+                        do.apply_constraints(turn.newton_step(k))
             if half % do.halves == do.halves - 1:
                 do.solve_contacts(turn)
                 if ti.static(do.has_restitution):
@@ -100,6 +103,7 @@ class Step:
         self.contact_pass = ContactPass(scene, contact, self.particles, team)
         self.contacts = self.particles.contacts
         self.halves = 2 if batches and contact else 1  # of a pass, each with a list that is good
+        self.newton_steps = 2 if scene.slots and scene.slots.refines else 1  # in a pass, at most
         self.has_restitution, self.projects_velocities = self.contact_pass.has_restitution, self.contact_pass.projects_velocities
         self.orients = self.state.spins and self.state.spin.orients
         keeps = self.contact_pass.remembers or bool(self.breakers)
@@ -145,12 +149,12 @@ class Step:
     ):  # fmt: skip
         """Some phases of a substep, by their names. Nothing is returned: that would be waited for."""
         now = self.turn(self.moment(Span(h64, start, start, tick, since, fresh, 0, substeps, iterations), s), half)
-        for phase in ti.static(self.named(names)):
-            phase(now)
+        for phase, k in ti.static(self.named(names)):
+            phase(now.newton_step(k))
 
-    def named(self, names: str) -> list[Any]:
-        """The phases of these names, one after the other."""
-        return [getattr(self, name) for name in names.split()]
+    def named(self, names: str) -> list[tuple[Any, int]]:
+        """The phases of these names, one after the other, and in which step of Newton's method."""
+        return [(getattr(self, name.rstrip("'")), int(name.endswith("'"))) for name in names.split()]
 
     @ti.func
     def moment(self, span, s):
@@ -363,13 +367,13 @@ class Step:
     def solve_systems(self, now):
         """Chains and cloth are solved together."""
         if ti.static(len(self.constraints.systems) > 0):
-            self.solve_each(now.thread)
+            self.solve_each(now.thread, now.newton)
 
     @called
     @ti.func
-    def solve_each(self, thread: ti.i32):
+    def solve_each(self, thread: ti.i32, newton: ti.i32):
         """Each system."""
-        self.constraints.solve_systems(thread)
+        self.constraints.solve_systems(thread, newton)
 
     @ti.func
     def start_systems(self, now):
@@ -388,9 +392,17 @@ class Step:
 
     @ti.func
     def apply_constraints(self, now):
-        """Where there are contacts, particles move as constraints want before these are solved."""
-        if ti.static(self.halves == 2):
-            self.particles.apply_constraints(now.thread)
+        """Particles move as constraints want before contacts are solved, or the next step of Newton's method is taken."""
+        if ti.static(self.particles.applies_first):
+            self.particles.apply_constraints(now)
+
+    @ti.func
+    def unmet(self, now):
+        """Whether any system is to take a second step of Newton's method. Where there are more passes, these are such steps."""
+        out = False
+        if ti.static(self.newton_steps > 1):
+            out = now.span.iterations == 1 and self.slots.system.any_unmet[None] != 0
+        return out
 
     @ti.func
     def solve_contacts(self, now):

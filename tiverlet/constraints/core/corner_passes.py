@@ -260,6 +260,11 @@ class CornerPasses(Passes):
         return out
 
     @ti.func
+    def unmet(self, c):
+        """Whether constraint c belongs to a system that takes another step of Newton's method."""
+        return self.row[c] >= 0 and self.slots.system.is_unmet(self.row[c])
+
+    @ti.func
     def update_multiplier(self, c, first):
         """Add what the system has found to the multiplier."""
         if ti.static(self.in_system):
