@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
+from tiverlet.device import ti
 from tiverlet.step import block_matrix
 from tiverlet.step.adaptive import StepController
 from tiverlet.step.projection import Rows, paid
@@ -303,6 +304,128 @@ def test_wrong_aims_are_refused(world):
             w.step(1 / 60, budget=wrong)
     with pytest.raises(ValueError, match="substeps = 'adaptive', but it must be an integer of at least 1, or \"auto\""):
         w.substeps = "adaptive"
+
+
+S, END = 0.1, 0.35  # [m], where the force of Lennard and Jones is 0 and where it ends
+
+
+@ti.func
+def collide(r):
+    """24 (2 (s / r)^12 - (s / r)^6) / r, along r."""
+    q = (S * S / r.norm_sqr()) ** 3
+    return 24.0 * (2.0 * q * q - q) / r.norm_sqr() * r
+
+
+@ti.func
+def collide_energy(r):
+    """4 ((s / r)^12 - (s / r)^6), 0 where it ends."""
+    q, end = (S * S / r.norm_sqr()) ** 3, (S / END) ** 6
+    return 4.0 * (q * q - q) - 4.0 * (end * end - end)
+
+
+@ti.func
+def fall(r):
+    """Gravity between bodies that are a little soft, G = 0.01."""
+    return -0.01 * r / (r.norm_sqr() + 1e-4) ** 1.5
+
+
+@ti.func
+def fall_energy(r):
+    return -0.01 / ti.sqrt(r.norm_sqr() + 1e-4)
+
+
+@ti.func
+def spring(r):
+    """k = 300 N/m."""
+    return -300.0 * r
+
+
+@ti.func
+def well(x):
+    return -300.0 * x
+
+
+@pytest.mark.parametrize("forces", ["a field", "all pairs", "near pairs", "both"])
+def test_stiffness_of_forces_is_that_of_the_stiffest(world, forces):
+    # omega^2 = k w in a field F = -k x; (w_1 + w_2) k of two that pull each other by k r, and of more the sum over all others,
+    # which is at most twice too much. Whatever the others do, and however all fly.
+    k, h, mass = 300.0, 1e-3, np.array([0.5, 2.0, 1.0])
+    features = {
+        "a field": [tv.Force(well)], "all pairs": [tv.PairForce(spring)], "near pairs": [tv.PairForce(spring, 1.0)],
+        "both": [tv.Force(well), tv.PairForce(spring)],
+    }[forces]  # fmt: skip
+    x, v = np.array([[0.0, 0.0], [0.5, 0.1], [9.0, 0.0]]), np.array([[0.3, 0.1], [-0.2, 0.4], [0.0, -7.0]])
+    w = world(tv.Particles(x, velocity=v + 20.0, mass=mass), features, substeps=1, precision="f64")
+    w.step(h)
+    found = w._runner.diagnostics.force_stiffness(h, w.time)
+    field, pairs = k / mass, k / mass[:, None] + k / mass
+    pairs *= 1 - np.eye(3)
+    if forces == "near pairs":
+        pairs[:, 2] = pairs[2] = 0
+    exact = {"a field": field, "both": field + pairs.sum(axis=1)}.get(forces, pairs.sum(axis=1)).max() * h * h
+    assert abs(found / exact - 1) < 1e-9
+
+
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+def test_bodies_that_collide_or_fly_by_keep_their_energy(world, precision):
+    # E(t) = E(0) but for what frames may miss. Nothing but forces tells of both: "auto" went down to one substep, and made 1e7 to
+    # 1e15 J of two atoms, or 48, and 1.8 J of 1.3 of 20 bodies.
+    rng = np.random.default_rng(3)
+    grid = np.stack(np.meshgrid(0.25 * np.arange(8), 0.25 * np.arange(6)), axis=-1).reshape(-1, 2)
+    box, force = tv.Box((-1, -1.2), (3, 2.8), restitution=1.0), tv.PairForce(collide, END, potential=collide_energy)
+    gas = world(tv.Particles(grid, velocity=rng.normal(size=grid.shape)), [force, box], substeps="auto", precision=precision)
+    bodies = tv.Particles(np.random.default_rng(1).normal(size=(20, 3)))
+    stars = world(bodies, [tv.PairForce(fall, potential=fall_energy)], substeps="auto", precision=precision)
+    for w in (gas, stars):
+        reports = [w.step(1 / 60) for _ in range(600)]
+        energy, flags = np.array([r.energy for r in reports]), set().union(*[r.flags for r in reports])
+        assert np.abs(energy - energy[0]).max() < 0.03 * w._clock.kinetic and not flags
+        assert np.mean([r.substeps * r.tries for r in reports]) < 50  # nor are all frames cut as finely as the worst
+
+
+def test_how_two_atoms_vibrate_is_resolved_wherever_they_are(world):
+    # The same substeps, and the same energy of the two, alone, at 100 m/s, beside many that rest, and among some that fly.
+    x, still = np.array([[0.0, 0.0], [0.115, 0.0]]), 10.0 + np.stack([np.arange(300) % 20, np.arange(300) // 20], axis=1)
+    begun, made = {}, {}
+    for name, others, v, u in (
+        ("alone", still[:0], 0.0, 0.0), ("flying", still[:0], 100.0, 100.0), ("beside", still, 0.0, 0.0),
+        ("among", still[:5], 0.0, 300.0),
+    ):  # fmt: skip
+        speed = np.zeros((2 + len(others), 2))
+        speed[:2, 0], speed[2:, 1] = v, u
+        force = tv.PairForce(collide, END, potential=collide_energy)
+        w = world(tv.Particles(np.vstack([x, others]), velocity=speed), [force], substeps="auto", precision="f64")
+        reports = [w.step(1 / 60) for _ in range(120)]
+        apart, faster = np.diff(w.position[:2], axis=0)[0], np.diff(w.velocity[:2], axis=0)[0]
+        q, end = (S / np.linalg.norm(apart)) ** 6, (S / END) ** 6
+        begun[name] = 4.0 * ((S / 0.115) ** 12 - (S / 0.115) ** 6 - end * end + end)
+        made[name] = [r.substeps for r in reports], 4.0 * (q * q - q - end * end + end) + faster @ faster / 4
+        assert not any(r.flags for r in reports)
+    for substeps, energy in made.values():
+        assert substeps == made["alone"][0] and abs(energy - begun["alone"]) < 0.02
+
+
+def test_energy_that_no_substep_mends_costs_no_more(world):
+    # Charges that somebody changes between frames work on the scene. What each frame then has more or less is no fault of its
+    # substeps: there are no more of them, and nothing is said to be stuck, but that there is energy from nowhere.
+    strength = ti.field(ti.f32, shape=())
+
+    @ti.func
+    def push(r):
+        return strength[None] * r / (r.norm_sqr() + 1e-4) ** 1.5
+
+    @ti.func
+    def push_energy(r):
+        return strength[None] / ti.sqrt(r.norm_sqr() + 1e-4)
+
+    x = np.random.default_rng(1).normal(size=(20, 2))
+    w = world(tv.Particles(x), [tv.PairForce(push, potential=push_energy)], substeps="auto")
+    reports = []
+    for k in range(120):
+        strength[None] = 0.01 * np.sin(0.3 * k)
+        reports.append(w.step(1 / 60))
+    assert np.ptp([r.energy for r in reports]) > 1.0 and set().union(*[r.flags for r in reports]) == {"energy-gain"}
+    assert max(r.substeps for r in reports) <= 16 and max(r.tries for r in reports) <= 4
 
 
 def test_what_cannot_be_paid_or_said_in_numbers(world):

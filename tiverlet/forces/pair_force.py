@@ -145,9 +145,8 @@ class PairForce(Acceleration):
         return out
 
     @ti.func
-    def pull(self, i, j):
-        """The acceleration of particle i by particle j, per 1 / m_i: worked out once for both, from the lower index."""
-        r = self.dev.state.apart(i, j)
+    def pull(self, i, j, r):
+        """The force on particle i by particle j, r apart, worked out from the lower index."""
         out = 0 * r
         if self.near(r):
             if i < j:
@@ -164,17 +163,40 @@ class PairForce(Acceleration):
         if w > 0:
             if ti.static(self.listed):
                 for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):
-                    total += self.pull(i, self.dev.list.neighbour[e])
+                    j = self.dev.list.neighbour[e]
+                    total += self.pull(i, j, self.dev.state.apart(i, j))
             else:
                 for j in range(self.dev.n.now):
                     if j != i:
-                        total += self.pull(i, j)
+                        total += self.pull(i, j, self.dev.state.apart(i, j))
         self.dev.now[i] = w * total
 
     @ti.func
     def acceleration(self, i, x, v, t):
         """As evaluate() left it."""
         return self.dev.now[i]
+
+    @ti.func
+    def stiffness_between(self, i, j):
+        """omega^2 of a pair alone, (w_i + w_j) |F(r) - F(r - u)| / |u|, where r changed by u in the last substep."""
+        r, u = self.dev.state.apart(i, j), self.dev.state.slid(self.dev.state.d[i] - self.dev.state.d[j], i, j)
+        out, uu = 0 * r[0], u.norm_sqr()
+        if uu > 0:
+            out = (self.dev.w.of(i) + self.dev.w.of(j)) * (self.pull(i, j, r) - self.pull(i, j, r - u)).norm() / ti.sqrt(uu)
+        return out
+
+    @ti.func
+    def stiffness(self, i):
+        """At most omega^2 of particle i, by all others: the sum of what it is in each pair."""
+        out = 0 * self.dev.now[i][0]
+        if ti.static(self.listed):
+            for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):
+                out += self.stiffness_between(i, self.dev.list.neighbour[e])
+        else:
+            for j in range(self.dev.n.now):
+                if j != i:
+                    out += self.stiffness_between(i, j)
+        return out
 
     @ti.func
     def energy_between(self, i, j, back):

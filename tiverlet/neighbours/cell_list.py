@@ -72,8 +72,8 @@ class CellList:
         self, radius: np.ndarray, reach: np.ndarray, skin: float, level: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
         """Of each table the size of its cells [m], the bits of its number of buckets, and where it begins; and where all end."""
-        own = np.array([radius[level == m].max() for m in range(self.levels)])
-        finer, longest = (np.array([v[level >= m].max() for m in range(self.levels)]) for v in (radius, reach))
+        own = np.array([radius[level == m].max(initial=0.0) for m in range(self.levels)])
+        finer, longest = (np.array([v[level >= m].max(initial=0.0) for m in range(self.levels)]) for v in (radius, reach))
         # Rounding of floor(x * scale) must not hide a neighbour.
         sizes = (own + finer + longest + skin) * (1 + 2.0**-12)
         counts = np.bincount(level, minlength=self.levels)
@@ -278,7 +278,7 @@ class CellList:
 def levels_of(radius: np.ndarray, reach: np.ndarray) -> np.ndarray:
     """The level of each particle, of those that there are, (n,)."""
     size = radius + reach / 2
-    if len(size) and (size == size[0]).all():
+    if not len(size) or (size == size[0]).all():
         return np.zeros(len(size), dtype=int)
     with np.errstate(divide="ignore"):
         level = np.minimum(np.floor(np.log2(size.max() / size)), most_levels() - 1).astype(int)

@@ -97,7 +97,7 @@ class NeighbourSearch:
         one."""
         if not self.sheared:
             return skin
-        return min(skin, float(self._scene.periodic.lengths[GRADIENT]) / 2 - 2 * radius.max() - reach.max())
+        return min(skin, float(self._scene.periodic.lengths[GRADIENT]) / 2 - 2 * radius.max(initial=0.0) - reach.max(initial=0.0))
 
     def _blocks(self, n: int) -> int:
         """Parts of the list of n particles."""

@@ -8,7 +8,8 @@ import numpy as np
 
 from .. import checks
 from ..solvers.slots import TENSEST
-from . import checkpoint
+from . import checkpoint, energy_bound
+from .diagnostics import STIFFNESS
 from .step_report import StepReport
 
 if TYPE_CHECKING:
@@ -19,6 +20,7 @@ MOST = 4096  # substeps of a frame
 PASSES = 64  # iterations of a substep
 RESIDUAL, OVERLAP = 1e-2, 0.1  # what is good where the user asks for nothing else
 TENSION = 2.0  # (omega h)^2: half the limit of stability
+FORCE = 0.06  # (omega h)^2: 25 substeps to a vibration, as molecular dynamics takes them
 RISKS = {"tunnelling-risk", "stiff-force", "non-finite"}
 GAIN = 1.4  # by which twice the effort has to lower the figures; of second order they fall by 4, of first order by 2
 FEW = 16  # substeps with which what does not help yet may help later
@@ -26,10 +28,10 @@ IDLE = {"substeps": 2, "iterations": 1}  # doublings without a gain that are eno
 ROOM = 6.0  # by which the figures have to be better than asked before less is tried
 PATIENCE = 64  # frames, at most, until it is tried again
 
-Figures = tuple[float, ...]  # residual, overlap and tension, relative to what is asked
-TENSE = 2  # the place of the tension among them
-NOTHING: Figures = (1.0,) * 4
-WORST: Figures = (float("inf"),) * 4
+Figures = tuple[float, ...]  # residual, overlap, tension, turn, stiffness and energy, relative to what is asked
+TENSE, ENERGY = 2, 5  # the places of the tension and, as the last one, the energy among them
+NOTHING: Figures = (1.0,) * 6
+WORST: Figures = (float("inf"),) * 6
 
 
 class StepController:
@@ -42,6 +44,9 @@ class StepController:
     the one with the least effort of those that are as good, and what stays wrong is asked for no more in the next frames.
     A body that turns by phi in a substep does so by phi^2 / 24 of that too fast or too slowly, a relative error as a residual is:
     the 26 degrees above are one of 1e-2, and a tolerance that is asked for is asked of the turns of rigid constraints, too.
+    What vibrates or orbits in forces that differ from place to place is too fast by (omega h)^2 / 24 in the same way, of which
+    0.06 is allowed. Where a frame got more than a fiftieth of the energy wrong, see energy_bound.missed(), it is made again while
+    that helps. What does not help is no fault of the frame, for the energy before it was that of longer substeps.
 
     When all figures, which are of the order of h^2, leave room for it, the next frame is tried with half the effort. Each time
     that fails, twice as many frames pass before the next try, up to 64.
@@ -81,17 +86,19 @@ class StepController:
         tries, best, idle, kind = 0, WORST, 0, "substeps"
         known: dict[tuple[int, int], Figures] = {}  # of the tries without a risk
         world._runner.begin(dt / n, world.iterations)
+        energy = energy_bound.before(world)
         while True:
             tries, begun = tries + 1, perf_counter()
             report = world._runner.advance(dt, n, k)
             took = perf_counter() - begun
             self.learn(took / (n * k))
-            figures, risks = judge(report, tolerance, turned(world) if tolerance else 0.0)
+            angle, missed = turned(world) if tolerance else 0.0, energy_bound.missed(world, report, energy)
+            figures, risks = judge(report, tolerance, angle, stiffness(world), missed)
             wrong = [f > max(1.0, s) for f, s in zip(figures, stuck, strict=True)]
             if risks:
                 best, idle, kind = WORST, 0, "substeps"
             elif (n, k) in known or not any(wrong):
-                verdict = "stuck" if max(figures) > 1 else "good"
+                verdict = "stuck" if max(figures[:ENERGY]) > 1 else "good"
                 break
             else:
                 known[n, k] = figures
@@ -99,8 +106,8 @@ class StepController:
                 idle = 0 if gains else idle + 1
                 best = tuple(map(min, figures, best))
                 if idle >= IDLE[kind] and n >= FEW:
-                    if kind == "iterations" or k >= PASSES:
-                        verdict = "stuck"
+                    if kind == "iterations" or k >= PASSES or not any(wrong[:ENERGY]):
+                        verdict = "stuck" if any(wrong[:ENERGY]) else "good"
                         stuck = tuple(max(s, GAIN * f) if w else s for s, f, w in zip(stuck, figures, wrong, strict=True))
                         n, k, last = *cheapest(known, stuck), (n, k)
                         if (n, k) == last:
@@ -171,9 +178,21 @@ def turned(world: "World") -> float:
     return worst**0.5
 
 
-def judge(report: StepReport, tolerance: float | None, angle: float) -> tuple[Figures, set[str]]:
-    """How residual, overlap, tension and turn compare with what is asked (1: just met), and what shorter substeps have to
-    remove."""
+def stiffness(world: "World") -> float:
+    """(omega h)^2 of the fastest motion in forces that differ from place to place."""
+    runner, clock = world._runner, world._clock
+    probe = runner.diagnostics.force_stiffness
+    if not probe or not clock.h:
+        return 0.0
+    with runner.memory.compiler():
+        return max(probe(clock.h, clock.time), runner.sheet.item(STIFFNESS))
+
+
+def judge(
+    report: StepReport, tolerance: float | None, angle: float, stiffness: float, missed: float
+) -> tuple[Figures, set[str]]:  # fmt: skip
+    """How residual, overlap, tension, turn, stiffness and energy compare with what is asked (1: just met), and what shorter
+    substeps have to remove."""
     risks = set(report.flags & RISKS)
     if report.turn:
         risks.add("turned")
@@ -184,6 +203,8 @@ def judge(report: StepReport, tolerance: float | None, angle: float) -> tuple[Fi
         report.overlap / (tolerance or OVERLAP),
         report.tension / TENSION,
         angle**2 / (24 * (tolerance or RESIDUAL)),
+        stiffness / (24 * tolerance if tolerance else FORCE),
+        missed,
     )
     return tuple(r if r == r else float("inf") for r in ratios), risks  # NaN is the worst of all
 

@@ -13,6 +13,7 @@ from ..neighbours.cell_list import FARTHEST
 from ..particles import LARGEST
 from ..solvers.slots import TENSEST
 from ..solvers.solver import Solver
+from .force_stiffness import ForceStiffness
 from .span import END, FIGURES, ORIGIN, SHEET, H, integer
 from .step_report import COMPRESSED, UNCONVERGED, StepReport
 
@@ -37,7 +38,7 @@ class Diagnostics:
     measure() is the last one.
     """
 
-    host_only = ("sheet", "report", "details")
+    host_only = ("sheet", "report", "details", "force_stiffness")
     told_apart = True  # as a Feature
     n: Any = OnDevice()  # particles
 
@@ -66,6 +67,7 @@ class Diagnostics:
             self.low = add("survey.low", self.blocks, width=self.dim, kind=ti.f64)
             self.high = add("survey.high", self.blocks, width=self.dim, kind=ti.f64)
         self.details: dict[int, Residuals] = {}  # compiled when asked for
+        self.force_stiffness = ForceStiffness(step)
         self.sheet: Any = np.zeros(SHEET)
         self.report = Reporter(step, solver, self.sheet)
         step.diagnostics = self
@@ -76,7 +78,7 @@ class Diagnostics:
     def of(self, step: "Step") -> "Diagnostics":
         """The same fields, for another Step."""
         new = copy.copy(self)
-        new.step, new.details = step, {}
+        new.step, new.details, new.force_stiffness = step, {}, ForceStiffness(step)
         step.diagnostics = new
         return new
 

@@ -16,15 +16,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..colliders.collider import Collider
-from ..forces import Gravity
-from .clock import PARTED, room
-from .diagnostics import EXTENT, REACH, STIFFNESS
+from ..features.feature import Acceleration
+from ..forces.gravity import Gravity
+from ..neighbours.periodic import Periodic
+from .clock import CHANGED, DIGITS, PARTED, room
+from .diagnostics import EXTENT, KINETIC, REACH, STIFFNESS
 from .step_report import StepReport
 
 if TYPE_CHECKING:
     from ..world import World
 
 FALL = 1e-3  # of what all would gain in a fall through the scene: contacts lift what they begin to bear
+MISSED = 0.02  # of the largest kinetic energy: how much of it a frame with substeps="auto" may get wrong
 SKIN = 1e-5  # of the largest coordinate: how deep what lies on a wall may seem
 ROUNDED = 64  # units in the last place of a coordinate, by which positions may be off
 FLAG = "energy-gain"
@@ -51,6 +54,37 @@ def checked(world: "World", report: StepReport) -> StepReport:
         f"{clock.kinetic:.3g} J at most. Use more substeps, at first {2 * report.substeps}, or soften what is stiff and heavy."
     )
     return replace(report, flags=report.flags | {FLAG}, notes=(*report.notes, note))
+
+
+def before(world: "World") -> float | None:
+    """The energy before a frame of a scene with forces that differ from place to place, on which nothing works; else None."""
+    clock = world._clock
+    if not world._runner.diagnostics.force_stiffness or clock.bound == CHANGED or clock.parting or works(world):
+        return None
+    return clock.energy
+
+
+def missed(world: "World", report: StepReport, energy: float | None) -> float:
+    """By how much a frame that had `energy` before got it wrong, relative to what is good: what came from nowhere or, where
+    there is nothing but forces, was lost. What begins and ends in one frame, as when two bodies fly past each other, no other
+    figure tells. What all fly by is not counted, for it takes no part in that."""
+    if energy is None:
+        return 0.0
+    clock, sheet = world._clock, world._runner.sheet
+    if all(isinstance(f, Periodic) or (isinstance(f, Acceleration) and not f.decays) for f in world.features):
+        change = abs(report.energy - energy)
+    else:
+        change = report.energy - max(energy, energy if clock.bound is None else clock.bound)
+    kinetic = max(clock.kinetic, sheet.item(KINETIC))
+    allowed = MISSED * max(0.0, kinetic - _drift(world)) + DIGITS * (abs(report.energy) + kinetic)
+    return max(change, 0.0) / allowed if allowed else 0.0
+
+
+def _drift(world: "World") -> float:
+    """The kinetic energy of all that moves as one [J]."""
+    runner, inv_mass, mass = world._runner, world._runner.scene.inv_mass, _masses(world)
+    momentum = (runner.memory.read(runner.scene.state.d)[: len(inv_mass)][inv_mass > 0] / world._clock.h).T @ mass
+    return float(momentum @ momentum / (2 * mass.sum())) if len(mass) else 0.0
 
 
 def works(world: "World") -> bool:
