@@ -21,14 +21,12 @@ CONTRADICTION = 1e-6  # of its violation: what others leave of such a constraint
 SMALL_PIVOT = 2e-3  # of what the heaviest of its particles adds to it: with a pivot below, a load is hardly borne to first order
 AGREEMENT = 0.25  # of the tension: how far the two ends of a substep may differ about it there
 STABLE = 2.0  # (omega h)^2 that is allowed there: half the limit of stability
-
+ROUNDS = 8  # of finding out which ropes pull, and how soft a system has to be
 
 # A second step of Newton's method is taken where a particle moved by more than LONG (of a length, squared), unless a tension was
 # above CALM, (omega h)^2: such vibrations are not resolved, and bring in energy, which what the first step leaves takes out.
 LONG, CALM = 1e-5, 0.35
 UNKNOWN, UNMET, ENDED = range(3)  # whether a system takes it: known by the moves of the first; yes; no, whatever these are
-
-ROUNDS = 8  # of finding out which ropes pull, and how soft a system has to be
 
 # (omega h)^2 to which a tension gives way with directions at the end of the substep. There the move is a step down the gradient
 # of a convex energy, sum lam |r|; as long as this is at most 1, it brings in no more than lam times what the links shorten.

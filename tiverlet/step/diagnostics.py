@@ -26,8 +26,8 @@ STIFF = 4.0  # (omega h)^2 beyond which Verlet diverges
 
 STEPPED, STARTED, UNSTEPPED = range(3)  # how a state came about: by a substep, by the first one after a start, by none yet
 BARE = 3  # added to one of these: nothing but energy is asked for
-# On the sheet: (omega h)^2 of forces, the largest coordinate, kinetic energy, edges of the bounding box.
-STIFFNESS, REACH, KINETIC, EXTENT = 3, 7, 11, 12
+# On the sheet: energy, overlap, (omega h)^2 of forces, the largest coordinate, kinetic energy, edges of the bounding box.
+ENERGY, OVERLAP, STIFFNESS, REACH, KINETIC, EXTENT = 0, 2, 3, 7, 11, 12
 
 
 @ti.data_oriented

@@ -20,7 +20,7 @@ from ..particles import in_range
 from ..step import checkpoint, energy_bound
 from ..step import frames as kernel
 from ..step.clock import CHANGED, PARTED, SQUEEZED, room
-from ..step.diagnostics import EXTENT, KINETIC, REACH, STARTED, STEPPED, STIFFNESS, TURNS, UNSTEPPED, risks
+from ..step.diagnostics import ENERGY, EXTENT, KINETIC, OVERLAP, REACH, STARTED, STEPPED, STIFFNESS, TURNS, UNSTEPPED, risks
 from ..step.integrator import FREE
 from ..world import World
 from .clocks import NONE, Clocks
@@ -362,7 +362,7 @@ class Worlds:
     def _gains(self, before: np.ndarray, figures: np.ndarray) -> np.ndarray:
         """Which worlds have energy from nowhere, and in which frames: Clock.exceeds() and energy_bound.checked() of all. before:
         energies [J]. figures: (worlds, frames, FIGURES)."""
-        energy, overlap, stiff, reach, kinetic = (figures[..., k] for k in (0, 2, STIFFNESS, REACH, KINETIC))
+        energy, overlap, stiff, reach, kinetic = (figures[..., k] for k in (ENERGY, OVERLAP, STIFFNESS, REACH, KINETIC))
         extent = figures[..., EXTENT : EXTENT + self._world.particles.dim]
         clocks, gain = self._clocks, np.empty_like(energy)
         for k in range(energy.shape[1]):
