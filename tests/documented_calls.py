@@ -7,7 +7,7 @@ import tiverlet as tv
 links = np.array([[0, 1], [1, 2]])
 features = [
     tv.Gravity(), tv.Gravity(9.81), tv.Gravity((0, -9.81, 0)), tv.Gravity(np.zeros(2)), tv.Drag(0.3), tv.Wind((1, 0), 0.5),
-    tv.Attractor((0, 0), 1.0),
+    tv.Attractor((0, 0), 1.0), tv.Attractor((0, 0), 1.0, softening=0.1),
     tv.Hand((0, 0)), tv.Hand((0, 0), 3, rate=10), tv.Contact(), tv.Contact(friction=0.3), tv.Contact(friction=(0.5, 0.4)),
     tv.Contact(friction={(0, 1): 0.5}, restitution={(0, 0): 0.9}, groups=[(0, 1)], skin=0.1),
     tv.Polygons([range(4), [4, 5, 6]], friction=(0.5, 0.4)), tv.Box((0, 0), (np.inf, 2), friction=(0.5, 0.4), restitution=0.5),

@@ -383,6 +383,20 @@ def test_bodies_that_collide_or_fly_by_keep_their_energy(world, precision):
         assert np.mean([r.substeps * r.tries for r in reports]) < 50  # nor are all frames cut as finely as the worst
 
 
+def test_what_falls_through_a_soft_center_comes_back(world):
+    # A Plummer sphere: E = v^2 / 2 - G M / sqrt(r^2 + e^2) per mass. From rest at 1 m they fall through it, or past it, and come
+    # back to that distance; a circle of radius r has omega^2 = G M / (r^2 + e^2)^(3/2).
+    pull, e, r = 4.0, 0.05, 0.3
+    omega = np.sqrt(pull / (r * r + e * e) ** 1.5)
+    x, v = np.array([[1.0, 0.0], [0.0, 1.0], [r, 0.0]]), np.array([[0.0, 0.0], [0.02, 0.0], [0.0, omega * r]])
+    w = world(tv.Particles(x, velocity=v), [tv.Attractor((0, 0), pull, softening=e)], substeps="auto", precision="f64")
+    energy = (v**2).sum() / 2 - (pull / np.sqrt((x**2).sum(axis=1) + e * e)).sum()
+    reports = [w.step(1 / 240) for _ in range(960)]
+    assert not any(report.flags for report in reports) and reports[0].energy == pytest.approx(energy, rel=1e-3)
+    assert np.abs([report.energy - energy for report in reports]).max() < 0.02 * w._clock.kinetic
+    assert np.linalg.norm(w.position[2]) == pytest.approx(r, rel=0.01)
+
+
 def test_how_two_atoms_vibrate_is_resolved_wherever_they_are(world):
     # The same substeps, and the same energy of the two, alone, at 100 m/s, beside many that rest, and among some that fly.
     x, still = np.array([[0.0, 0.0], [0.115, 0.0]]), 10.0 + np.stack([np.arange(300) % 20, np.arange(300) // 20], axis=1)

@@ -59,7 +59,8 @@ ROWS3 = {
     "Drag": (lambda i, x, **k: tv.Drag(**k), PATH, {"rate": 0.1}, {"rate": 1.0}),
     "Wind": (lambda i, x, **k: tv.Wind(**k), PATH, {"velocity": (1, 0, 0), "rate": 0.2}, {"velocity": (0, 2, 0), "rate": 1.0}),
     "Attractor": (
-        lambda i, x, **k: tv.Attractor(**k), PATH, {"center": (0, 1, 0), "strength": 3.0}, {"center": (1, 0, 2), "strength": -3.0}
+        lambda i, x, **k: tv.Attractor(**k), PATH, {"center": (0, 1, 0), "strength": 3.0, "softening": 0.0},
+        {"center": (1, 0, 2), "strength": -3.0, "softening": 30.0},
     ),
     "Hand": (  # one of its own particles, which come after those of four others
         lambda i, x, **k: tv.Hand(**k), PATH, {"target": (0, 1, 0), "particle": 4 * len(PATH), "rate": 5.0},

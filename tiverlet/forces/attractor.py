@@ -11,21 +11,24 @@ from ..particles import Particles
 
 
 class Attractor(Acceleration):
-    """a = -strength r / |r|^3, r = x - center: a point of gravity (strength = G M); negative strength repels.
+    """a = -strength r / (r^2 + softening^2)^(3/2), r = x - center: a point of gravity (strength = G M); negative strength repels.
 
-    center: (dim,) [m]; strength: [m^3/s^2]. Both live. At the center itself the acceleration is taken as 0. The step
-    resolves an orbit of angular velocity omega while omega h is well below 1.
+    center: (dim,) [m]; strength: [m^3/s^2]; softening: the radius of a Plummer sphere (1911) in place of the point [m]. All live.
+    What falls into a point without softening has no bounded acceleration, and no substep resolves it; at the center itself it is
+    taken as 0. Elsewhere the step resolves an orbit of angular velocity omega while omega h is well below 1.
     """
 
     for_all = True
     conservative = True
     center = Knob(lambda f, v: checks.vector("Attractor", "center", v, f.dim or len(np.atleast_1d(v))), "[m].")
     strength = Knob(lambda f, v: checks.number("Attractor", "strength", v), "G M [m^3/s^2].")
+    softening = Knob(lambda f, v: checks.number("Attractor", "softening", v, least=0.0), "[m].")
     dim = 0
 
-    def __init__(self, center, strength):
+    def __init__(self, center, strength, *, softening=0.0):
         self.center = center
         self.strength = strength
+        self.softening = softening
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the vector's length."""
@@ -33,14 +36,14 @@ class Attractor(Acceleration):
         self.center = self.center
 
     def settings(self) -> dict[str, Any]:
-        """Both."""
-        return {"center": self.center, "strength": self.strength}
+        """All."""
+        return {"center": self.center, "strength": self.strength, "softening": self.softening}
 
     @ti.func
     def acceleration(self, i, x, v, t):
-        """-strength r / |r|^3."""
+        """-strength r / (r^2 + softening^2)^(3/2)."""
         r = x - self.dev.center[None]
-        rr = r.dot(r)
+        rr = r.dot(r) + self.dev.softening[None] * self.dev.softening[None]
         out = 0 * r
         if rr > 0:
             out = -self.dev.strength[None] / (rr * ti.sqrt(rr)) * r
@@ -48,9 +51,9 @@ class Attractor(Acceleration):
 
     @ti.func
     def potential(self, i, x):
-        """-strength / |r|."""
+        """-strength / sqrt(r^2 + softening^2)."""
         r = x - self.dev.center[None]
-        rr = r.dot(r)
+        rr = r.dot(r) + self.dev.softening[None] * self.dev.softening[None]
         out = 0 * rr
         if rr > 0:
             out = -self.dev.strength[None] / ti.sqrt(rr)
