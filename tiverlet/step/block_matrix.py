@@ -5,6 +5,7 @@ level before; neighbours are in the same level or in adjacent ones. A sheet of n
 one.
 """
 
+import functools
 from collections.abc import Callable
 
 import numpy as np
@@ -37,6 +38,8 @@ class WideRows:
 class BlockMatrix:
     """A matrix that is the sum of dim x dim blocks, block k between the particles a[k] and b[k] of `count`; positive definite."""
 
+    products = 0  # of numbers, in iterations so far
+
     def __init__(self, count: int, dim: int, a: np.ndarray, b: np.ndarray):
         self.count, self.dim, self.a, self.b = count, dim, a, b
         level, levels = ordered(count, a, b)
@@ -64,6 +67,14 @@ class BlockMatrix:
         """x with A x = right, (count, dim), for A the sum of blocks, (pairs, dim, dim), and of wide rows."""
         return self._eliminate(blocks, right) if self.narrow and wide is None else self._iterate(blocks, right, wide)
 
+    @functools.cached_property
+    def pairs(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Of each block the number of its pair; the two particles of each pair, and where those begin that have the same first
+        one: every particle has one with itself."""
+        pairs, pair = np.unique(self.a * self.count + self.b, return_inverse=True)
+        first, second = np.divmod(pairs, max(self.count, 1))
+        return pair, first, second, np.searchsorted(first, np.arange(self.count))
+
     def _eliminate(self, blocks: np.ndarray, right: np.ndarray) -> np.ndarray:
         """Level by level."""
         A = np.bincount(self.address, blocks[self.some].ravel(), minlength=self.between[-1])
@@ -85,12 +96,14 @@ class BlockMatrix:
 
     def _iterate(self, blocks: np.ndarray, right: np.ndarray, wide: WideRows | None) -> np.ndarray:
         """Conjugate gradients, with the blocks of particles for a preconditioner."""
-        own = self.a == self.b
-        diagonal = summed(blocks[own], self.a[own], self.count)
+        pair, first, second, begin = self.pairs
+        A = summed(blocks, pair, len(first))
+        diagonal, A = A[first == second], np.moveaxis(A, 0, 2).copy()
 
         def times(p: np.ndarray) -> np.ndarray:
             """The product of the matrix with p."""
-            out = summed(np.einsum("kab,kb->ka", blocks, p[self.b]), self.a, self.count)
+            self.products += A.size
+            out = np.add.reduceat(np.einsum("abk,bk->ak", A, p[second].T), begin, axis=1).T
             return out if wide is None else out + wide.times(p)
 
         inverse = np.linalg.inv(diagonal if wide is None else diagonal + wide.own())

@@ -24,7 +24,7 @@ from ..constraints.core.scalar import Scalar
 from ..neighbours.queries import between
 from ..particles import LARGEST
 from ..solvers.corners import bodies_of
-from .block_matrix import WIDEST, BlockMatrix, WideRows
+from .block_matrix import STEPS, WIDEST, BlockMatrix, WideRows
 from .integrator import h2_effective_of
 from .jacobian import Jacobian
 from .rigid_rows import RigidRows, left_out, rigid_rows
@@ -36,8 +36,11 @@ ENOUGH = 1e-3  # of its size: a violation that matters, over (r - 1)^2 / r with 
 FIRM = 0.9  # theta from where on velocities may not change a constraint
 FAR = 0.75  # of the longest: a substep in which what is small now has had its chance
 NEWTON = 40  # steps, at most
+PRODUCTS = 1e9  # of numbers: some seconds, after which the rest is left as it is
 BEGIN, HARDEST, LEAST = 1e-3, 10.0, 1e-9  # mu of the first, and of the last try; the least
+FINE, STALLED = 1e-5, 0.05  # mu from which on a step has to take out as much of what is stored: what cannot be met stays
 SLIGHT = 0.01  # of the kinetic energy: what violations may become where contacts are in the way
+SLIGHTEST = 1e-3  # of the kinetic energy of what they tie: what violations, and moves in the next substep, may make of it
 LEFT = 0.01  # of what violations store: what may be left of it in the shorter substep
 DONE = 1e-6  # of its size: a violation that is none
 TURNS = 16  # with walls, at most: a link that stands on one halves its violation in each
@@ -71,21 +74,24 @@ def project(runner: "Runner", h: float, longest: float) -> bool | None:
     if not matters(float(np.abs(undone * start.close).max(initial=0.0)), ratio):
         return ratio < FAR
     rows = start = start.towards(start.C - (1 - ratio**2) * undone)
-    converges = slots.converges or slots.exact  # what they leave is moved at once in the next substep, and flies on
     kept = memory.read(state.d)
     v = kept.astype(np.float64)
     n = len(x)
+    # Where the solver converges, it moves what is left at once in the next substep, and that flies on.
+    steps = (slots.system and slots.system.steps or STEPS) if slots.converges or slots.exact else 0
+    tied = np.unique(start.who)
+    slight = SLIGHTEST * float((start.mass[tied, None] * v[tied] ** 2).sum()) * h * h
     still = (undone != 0) & (start.theta > FIRM)
     v[:n] += rows.jacobian.solve(-rows.jacobian.rates(v[:n]) * still, still)
     energy, overlap = seen_before(runner)
     enough = LEFT * ratio**2 * start.stored
     for _ in range(TURNS):
-        state.put(memory, _newton(rows, enough, LEFT * ratio**2, converges))
+        state.put(memory, _newton(rows, enough, LEFT * ratio**2, steps, slight))
         sent = state.get(memory)
         runner.stop_at_walls(before)
         x = state.get(memory)
         last, rows = rows, rows.at(x)  # what walls stop is lifted by the others
-        if (x == sent).all():
+        if (x == sent).all() or rows.matrix.products > PRODUCTS:
             break
         if rows.stored > last.stored or last.wall.any():  # what lies on them would be sent back there again and again
             rows = rows.held(last.wall, x - sent)
@@ -97,7 +103,7 @@ def project(runner: "Runner", h: float, longest: float) -> bool | None:
         state.put(memory, before)
         memory.write(state.d, kept)
         stake = _over(start.weight * undone**2, start.diagonal).sum() / (2 * h * h)
-        kinetic = (_over(np.ones_like(w), w)[:, None] * kept[:n].astype(np.float64) ** 2).sum() / 2
+        kinetic = (start.mass[:, None] * kept[:n].astype(np.float64) ** 2).sum() / 2
         return None if stake > SLIGHT * kinetic else True
     if more > energy:
         v[:n] = paid(start.jacobian, v[:n], x - before, more - energy, rows.wall.any(axis=1))
@@ -105,21 +111,19 @@ def project(runner: "Runner", h: float, longest: float) -> bool | None:
     return True
 
 
-def _newton(rows: "Rows", enough: float, share: float, converges: bool) -> np.ndarray:
-    """Places at which what violations store is `enough` [J s^2]; where the solver converges, steps also have to be small, by this
-    share of the work of the first."""
-    mu, far = BEGIN, None
+def _newton(rows: "Rows", enough: float, share: float, steps: int, slight: float) -> np.ndarray:
+    """Places at which what violations store is `enough` [J s^2], and where a solver of so many steps would move less, by this
+    share of the work, m p^2, that it would do at the begin; both unless they are less than `slight`."""
+    mu, begin = BEGIN, rows.work(steps)
     for _ in range(NEWTON):
-        move = rows.step(mu)
-        work = float((_over(np.ones_like(rows.w), rows.w)[:, None] * move**2).sum())
-        far = work if far is None else far
-        new = rows.at(rows.x + move)
+        new = rows.at(rows.x + rows.step(mu))
         better = new.stored < rows.stored
+        stalled = better and mu <= FINE and new.stored > (1 - STALLED) * rows.stored
         mu = max(mu / 8, LEAST) if better else 8 * mu
         if better:
             rows = new
-        near = rows.stored <= enough and (not converges or work <= share * far)
-        if near or rows.worst <= DONE or mu > HARDEST:
+        near = rows.stored <= max(enough, slight) and rows.work(steps) <= max(share * begin, slight)
+        if near or stalled or rows.worst <= DONE or mu > HARDEST or rows.matrix.products > PRODUCTS:
             break
     return rows.x
 
@@ -171,6 +175,7 @@ class Rows:
 
     def __init__(self, batches: list[Scalar | RigidRows], w: np.ndarray, x: np.ndarray, box: Any = None):
         self.batches, self.w, self.n, self.dim = batches, w, *x.shape
+        self.mass = _over(np.ones_like(w), w)  # 0 of what cannot move
         self.box = box  # the Periodic of the world
         self.some = [~b.idle(w) & ~b.broken if b.breaks else ~b.idle(w) for b in batches]
         for b, some in zip(batches, self.some, strict=True):
@@ -273,6 +278,11 @@ class Rows:
     def _rigid(self, alpha: np.ndarray, reach: np.ndarray) -> np.ndarray:
         """theta, by what a force of 1 N moves in a substep."""
         return _over(reach * reach, reach * reach + alpha * alpha)
+
+    def work(self, steps: int) -> float:
+        """m p^2 of the moves p by which a solver of so many steps, 0 for none, meets the rows."""
+        move = self.jacobian.solve(-self.theta * self.C, steps=steps) if steps else np.zeros_like(self.x)
+        return float((self.mass[:, None] * move**2).sum())
 
     def step(self, mu: float) -> np.ndarray:
         """Moves p that minimize sum (C + J p)^2 / (2 D) + p^T M (mu + HELD n n^T) p / 2 + p^T K p / 2, with D the diagonal of
