@@ -29,7 +29,7 @@ class OwnWeight:
     @ti.func
     def weigh(self, i, now):
         """Note that of particle i."""
-        x, v = self.state.place(i), self.integrator.velocity_before(i, now.h, now.fresh)
+        x, v = self.state.place(i), self.state.d[i] / now.h
         a = self.forces.accelerate(i, x, v, now.time, self.forces.pull(now.time))
         for f in ti.static(self.loads):
             a -= f.acceleration(i, x, v, now.time)

@@ -114,7 +114,7 @@ class Diagnostics:
 
     @ti.func
     def stiffness(self, i, x, h, t):
-        """(omega h)^2 of the motion that dominates: the force's Rayleigh quotient along the last move."""
+        """(omega h)^2 of the motion that dominates: the force's Rayleigh quotient along the last move, or how fast it turns v."""
         d = self.state.d[i]
         dd, out = d.dot(d), ti.cast(0, ti.f64)
         if dd > 0 and self.state.w.positive(i):
@@ -122,6 +122,8 @@ class Diagnostics:
             for f in ti.static(self.probes):
                 change += f.acceleration(i, x, d / h, t) - f.acceleration(i, x - d, d / h, t)
             out = -change.dot(d) / dd * h * h
+            if ti.static(self.step.integrator.uses_velocity):
+                out = ti.max(out, ti.cast(self.step.integrator.forces.velocity_stiffness(i, x, d / h, t, h), ti.f64))
         return out
 
     @ti.func

@@ -19,6 +19,7 @@ from .integrator import decay
 from .sleep import Sleep
 
 NONE: Mapping[Feature, Feature] = MappingProxyType({})
+LAUNCHES = 100  # of the kernel of velocities, at most, for those that come where forces read them
 NOTHING = 2.0**-20  # of a velocity: less than this of it is in the next displacement
 
 
@@ -219,21 +220,27 @@ def _loses(feature: Feature, number: np.ndarray, features: tuple[Feature, ...]) 
 def _launch(world: Any, first: int) -> None:
     """Give particles from `first` on the displacements that their velocities need, between two substeps.
 
-    v = share d / h + what forces add, see decay(): from any d, what it lacks of v says what d lacks. Where drag leaves nothing of
-    a velocity in a substep, d does not matter.
+    v = share d / h + what forces add, see decay(): from any d, what it lacks of v says what d lacks, at once, or one time after
+    the other where forces read velocities. Where drag leaves nothing of a velocity in a substep, d does not matter.
     """
     h, memory, state = world._clock.h, world._runner.memory, world._runner.scene.state
     integrator = world._runner.integrator
-    want = np.where(world._runner.scene.inv_mass[first:, None] > 0, world._particles.velocity[first:], 0.0)
-    fields = [state.d, *([integrator.earlier] if integrator.uses_velocity else [])]
-    for field in fields:
-        memory.write_from(field, first, h * want)
+    held = world._runner.scene.inv_mass[first:] == 0
+    want = np.where(held[:, None], 0.0, world._particles.velocity[first:])
     if state.spins:
         memory.write_from(state.spin.s, first, h * state.spin.from_rates(world._particles.spin)[first:])
     share = max(decay(sum(f.rate for f in integrator.forces.drags), h)[0], NOTHING)
-    with world._runner.memory.compiler():
-        seen = world._runner.velocity(world.iterations, came=first)
-    d = h * want + h / share * (want - seen)
-    d[world._runner.scene.inv_mass[first:] == 0] = 0.0
-    for field, rows in zip(fields, (d, 3 * d - 2 * h * want), strict=False):  # so that 3 d - earlier = 2 h v
-        memory.write_from(field, first, rows)
+    fields = [state.d, *([integrator.free] if integrator.uses_velocity else [])]
+    d, least = h * want, np.inf
+    for _ in range(LAUNCHES if integrator.uses_velocity else 1):
+        for field in fields:
+            memory.write_from(field, first, d)
+        with memory.compiler():
+            lack = want - world._runner.velocity(world.iterations, came=first)
+        lack[held] = 0.0
+        most = np.abs(lack).max(initial=0.0)
+        if not most < least:
+            break
+        d, least = d + h / share * lack, most
+    for field in fields:
+        memory.write_from(field, first, d)

@@ -145,7 +145,7 @@ def _absent(world: "World") -> list[str]:
         (not step.sleepers, "islands and who sleeps: no Sleep"),
         (not step.integrator.forces.all, "accelerations: no force"),
         (not step.integrator.decays, "exponential drag: no Drag or Wind"),
-        (not step.integrator.uses_velocity, "second displacement: no force reads velocities"),
+        (not step.integrator.uses_velocity, "displacement by forces alone: no force reads velocities"),
         (
             not any(getattr(b, "soft", False) for b in step.batches),
             "compliance and its history: every constraint is rigid",

@@ -13,6 +13,9 @@ if TYPE_CHECKING:
 
 # Multiples of the golden ratio of two dimensions, mod 1, are the most even sequence of pairs: one for each of the two sums.
 DITHER = golden_steps(2)
+ALIKE = {ti.f32: 2.0**-12, ti.f64: 2.0**-26}  # of a velocity: by how much it is varied at least, the root of its rounding
+TINY = 1e-18  # [m/s], [m/s^2]: keeps what is divided by from 0
+LEAST = 0.25  # pivot with which a velocity is solved for; where a force feeds motion faster, it is taken as it is
 
 
 class Forces:
@@ -24,6 +27,7 @@ class Forces:
         self.common, self.others = ([f for f in self.all if f.common is it] for it in (True, False))
         self.pairwise = [f for f in self.all if f.pairwise]
         self.use_velocity = any(f.uses_velocity for f in accelerations)
+        self.positional, self.velocity_dependent = ([f for f in self.others if f.uses_velocity is it] for it in (False, True))
         self.drags = [f for f in accelerations if f.decays]
 
     @ti.func
@@ -41,6 +45,81 @@ class Forces:
         for f in ti.static(self.others):
             a += f.acceleration(i, x, v, t)
         return a
+
+    @ti.func
+    def velocity_part(self, i, x, v, t):
+        """The part of accelerate() that reads velocities."""
+        a = 0 * x
+        for f in ti.static(self.velocity_dependent):
+            a += f.acceleration(i, x, v, t)
+        return a
+
+    @ti.func
+    def velocity_slope(self, i, x, v, t, a, c):
+        """c times the derivatives of velocity_part() by v, where it is a.
+
+        They are differences over the way that v is about to go: |c a|, less where it brakes, and at most as far beyond rest as v
+        is from it. A kink on this way, as of friction at rest, is seen as a slope.
+        """
+        size, speed = a.norm(), v.norm()
+        least = ti.max(ti.static(ALIKE[self.real]) * speed, TINY)
+        along = a / ti.max(size, TINY)
+        near = ti.static(ALIKE[self.real]) * c * size + least
+        braked = c / near * (a - self.velocity_part(i, x, v + near * along, t)).dot(along)
+        full = c * size / (1 + ti.max(braked, 0))
+        way = ti.max(ti.min(full, 2 * speed), full / 64, least)
+        out = ti.Matrix.zero(self.real, self.dim, self.dim)
+        for k in ti.static(range(self.dim)):
+            other = v
+            other[k] += ti.select(a[k] < 0, -way, way)
+            change = c / (other[k] - v[k]) * (self.velocity_part(i, x, other, t) - a)
+            for j in ti.static(range(self.dim)):
+                out[j, k] = change[j]
+        return out
+
+    @ti.func
+    def velocity_stiffness(self, i, x, v, t, h):
+        """(omega h)^2 of what turns velocities faster than it brakes them, or feeds them; what brakes settles, however hard."""
+        a = self.velocity_part(i, x, v, t)
+        slope = self.velocity_slope(i, x, v, t, a, h)
+        rate = a.dot(slope @ a) / ti.max(a.dot(a), TINY * TINY)
+        turns, both = slope - slope.transpose(), ti.cast(0, self.real)
+        for k in ti.static(range(self.dim)):
+            both += turns[:, k].dot(turns[:, k])
+        return ti.max(both / 8 - rate * rate, rate * ti.max(rate, 0))
+
+    @ti.func
+    def accelerate_implicitly(self, i, x, u, c, part, t, pull):
+        """What accelerates particle i at the velocity that this gives it itself, v = u + (part + theta) c a(x, v), by one step of
+        Newton's method, which is exact where a is linear in v. part: 1, or 0 at a start, where u is v_n.
+
+        With theta = 0 a force that turns v leaves |v| as it is, whatever c is. Drag would overshoot from c rate = 1 on, so
+        theta = q^2 / (1 + q^2), where q is c times the rate at which a brakes: third order in h, and 1 where drag is stiff.
+        """
+        still = pull
+        for f in ti.static(self.positional):
+            still += f.acceleration(i, x, u, t)
+        v = u + part * c * still
+        a = self.velocity_part(i, x, v, t)
+        slope = self.velocity_slope(i, x, v, t, a, c)
+        q = ti.max(-a.dot(slope @ a) / ti.max(a.dot(a), TINY * TINY), 0)
+        theta = 1 - 1 / (1 + q * q)
+        left, more = -(part + theta) * slope, slope @ ((part + theta) * a + theta * still)
+        least = ti.cast(1, self.real)
+        for k in ti.static(range(self.dim)):  # Gauss; what brakes and turns has pivots of 1 or more
+            left[k, k] += 1
+            least = ti.min(least, left[k, k])
+            for j in ti.static(range(k + 1, self.dim)):
+                share = left[j, k] / left[k, k]
+                more[j] -= share * more[k]
+                for m in ti.static(range(k + 1, self.dim)):
+                    left[j, m] -= share * left[k, m]
+        for k in ti.static(range(self.dim - 1, -1, -1)):
+            for j in ti.static(range(k + 1, self.dim)):
+                more[k] -= left[k, j] * more[j]
+            more[k] /= left[k, k]
+        a += ti.select(least > LEAST, more, ti.zero(a))
+        return still + a
 
 
 class Verlet:
@@ -60,7 +139,7 @@ class Verlet:
         self.decays = bool(forces.drags)
         self.dithers = scene.real == ti.f32 and not scene.state.carries
         if self.uses_velocity:
-            self.earlier = scene.memory.field("displacement_before", scene.count, width=self.dim, state=True)
+            self.free = scene.memory.field("displacement_free", scene.count, width=self.dim, state=True)
         if self.decays:
             self.decay = scene.memory.field("decay", None, width=5)
 
@@ -91,13 +170,31 @@ class Verlet:
             self.integrate(i, now, pull, share, h2_effective)
 
     @ti.func
-    def velocity_before(self, i, h, fresh):
-        """v_n to second order, from the displacements of the last two substeps; at a start, d is the velocity itself."""
-        v = self.state.d[i]
+    def acceleration_at(self, i, h, t, fresh, pull):
+        """What forces accelerate particle i by at x_n and v_n; at a start, d is v_n. pull: what Forces.pull() returned.
+
+        v_n is what velocity_after() gives with the reaction of the last substep: the part of d that forces did not bring about.
+        """
+        x, u = self.state.place(i), self.state.d[i]
+        a = ti.zero(u)
         if ti.static(self.uses_velocity):
-            if fresh == 0:
-                v = (3 * self.state.d[i] - self.earlier[i]) / (2 * h)
-        return v
+            share, rest, phi1 = ti.cast(1, self.real), ti.cast(0.5, self.real), ti.cast(1, self.real)
+            if ti.static(self.decays):
+                share, phi1, rest = self.decay[None][0], self.decay[None][1], self.decay[None][3]
+            part = ti.select(fresh != 0, ti.cast(0, self.real), ti.cast(1, self.real))
+            u = ti.select(fresh != 0, u, (share * u + rest / phi1 * self.reaction_before(i, x, h, t, pull)) / h)
+            a = self.forces.accelerate_implicitly(i, x, u, rest * h, part, t, pull)
+        else:
+            a = self.forces.accelerate(i, x, u, t, pull)
+        return a
+
+    @ti.func
+    def reaction_before(self, i, x, h, t, pull):
+        """What of d did not come from forces; 0 where it is larger than d, and than twice what they do: a blow, which is over."""
+        d = self.state.d[i]
+        reaction = d - self.free[i]
+        force = h * h * self.forces.accelerate(i, x, d / h, t, pull)
+        return ti.select(reaction.dot(reaction) > ti.max(d.dot(d), 4 * force.dot(force)), ti.zero(d), reaction)
 
     @ti.func
     def dithered(self, big, small, tick, step: ti.template()):  # type: ignore[valid-type]
@@ -124,9 +221,8 @@ class Verlet:
         Only the writes depend on whether it moves, so that several particles are integrated at once.
         """
         live, x, d, h = self.state.moves(i), self.state.x[i], self.state.d[i], now.h
-        v = self.velocity_before(i, h, now.fresh)
-        a = self.forces.accelerate(i, self.state.place(i), v, now.time, pull)
-        before, low = ti.select(now.fresh != 0, h * v - h * h / 2 * a, d), ti.zero(d)
+        a = self.acceleration_at(i, h, now.time, now.fresh, pull)
+        before, low = ti.select(now.fresh != 0, h * d - h * h / 2 * a, d), ti.zero(d)
         if ti.static(self.state.carries):
             low = self.state.d_low[i]
         if ti.static(self.decays or len(self.forces.all) > 0):
@@ -156,7 +252,7 @@ class Verlet:
             if ti.static(self.state.befores):
                 self.state.before[i] = before
             if ti.static(self.uses_velocity):
-                self.earlier[i] = before
+                self.free[i] = d
         elif now.fresh != 0:
             self.state.d[i] = ti.zero(d)
 
@@ -179,9 +275,7 @@ class Verlet:
         d = self.state.d[i]
         v = d / h
         if self.state.w.positive(i):
-            if ti.static(self.uses_velocity):
-                v = (3 * d - self.earlier[i]) / (2 * h)
-            force = h * h * self.forces.accelerate(i, self.state.place(i), v, t, self.forces.pull(t)) + reaction
+            force = h * h * self.acceleration_at(i, h, t, 0, self.forces.pull(t)) + reaction
             if ti.static(self.decays):
                 v = (self.decay[None][0] * d + self.decay[None][3] * force) / h
             else:

@@ -301,6 +301,8 @@ class Step:
                 f.dev.place.drive(c, now.h, now.frame_fraction[1])
                 if ti.static(self.state.befores):  # at the velocity with which it is driven, others meet it
                     self.state.before[f.dev.corners.member(c, 0)] = self.state.d[f.dev.corners.member(c, 0)]
+                if ti.static(self.integrator.uses_velocity):  # nothing else acts on it, should it be let go
+                    self.integrator.free[f.dev.corners.member(c, 0)] = self.state.d[f.dev.corners.member(c, 0)]
                 for k in ti.static(self.contacts):
                     k.note_motion(self.search.moved_too_far(f.dev.corners.member(c, 0)), k.overshoots(f.dev.corners.member(c, 0)))
             self.team.wait()

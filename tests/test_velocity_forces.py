@@ -1,0 +1,277 @@
+"""Forces that read velocities: what turns motion keeps its energy, what brakes it never overshoots, and both to second order."""
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+from tiverlet.device import ti
+
+from .conftest import order, rerun
+
+OMEGA = 4.0  # [rad/s] of the magnet; tests take longer steps instead of a stronger one, which would be compiled anew
+
+
+@ti.func
+def magnet(x, v):
+    """m v' = -omega J v: a circle of radius |v| / omega."""
+    return OMEGA * ti.Vector([v[1], -v[0]])
+
+
+@ti.func
+def brake(x, v):
+    """-c v, with c = 1 / s: dt says how stiff it is."""
+    return -v
+
+
+@ti.func
+def air(x, v):
+    """-k |v| v, with k = 1 / m."""
+    return -v.norm() * v
+
+
+@ti.func
+def dry(x, v):
+    """Friction of 1 N against the velocity, whatever that is, but within 1e-6 m/s of rest."""
+    return -v / ti.max(v.norm(), 1e-6)
+
+
+def again(w, **settings):
+    """Put a world back to its start, with other settings."""
+    w.velocity, w.position = w.particles.velocity, w.particles.position
+    for name, value in settings.items():
+        setattr(w, name, value)
+
+
+def turned(z, omega_h, n):
+    """z after n substeps, each of which turns by 2 arctan(omega h / 2)."""
+    return z * np.exp(-2j * np.arctan(omega_h / 2) * n)
+
+
+@pytest.mark.parametrize("precision, limit", [("f64", 1e-12), ("f32", 2e-5)])
+def test_a_magnet_keeps_the_speed_whatever_the_substep(world, precision, limit):
+    # v_n = d_n / h + h a(v_n) / 2 says (1 + i omega h / 2) v_n = d_n / h, and d_(n+1) / h = (1 - i omega h / 2) v_n: v is turned
+    # by 2 arctan(omega h / 2), and x is on a circle of radius |v| / omega (1 + (omega h)^2 / 4).
+    w = world(tv.Particles([[0.0, 0.0]], velocity=(3.0, 0.0)), [tv.Force(magnet)], substeps=20, precision=precision)
+    for omega_h in (0.05, 0.33, 0.83, 1.67, 1.99):
+        h = omega_h / OMEGA
+        rerun(w, 600 * h, dt=20 * h)
+        assert abs(np.linalg.norm(w.velocity) / 3 - 1) <= limit and not w.last.flags
+        radius = 3 / OMEGA * (1 + omega_h**2 / 4)
+        assert abs(np.linalg.norm(w.position - [0, -radius]) / radius - 1) <= 10 * limit
+        if precision == "f64":
+            assert complex(*w.velocity[0]) == pytest.approx(turned(3, omega_h, 600), rel=1e-9)
+
+
+def test_substeps_that_change_keep_the_speed(world):
+    # A start from v_n, and the return to it, are the two halves of the same substep.
+    rng = np.random.default_rng(0)
+    w = world(tv.Particles([[0.0, 0.0]], velocity=(3.0, 0.0)), [tv.Force(magnet)], precision="f64")
+    angle = 0.0
+    for _ in range(200):
+        w.substeps = int(rng.integers(1, 6))
+        dt = float(rng.uniform(0.01, 0.4))
+        w.step(dt)
+        angle += 2 * w.substeps * np.arctan(OMEGA * dt / w.substeps / 2)
+    assert complex(*w.velocity[0]) == pytest.approx(3 * np.exp(-1j * angle), rel=1e-11)
+
+
+def test_crossed_fields_drift(world):
+    # v' = -i omega v + E has v = u + (v0 - u) exp(-i omega t) with u = -i E / omega, across E: |v - u| is kept to the last
+    # digits, and x - u t is second order.
+    @ti.func
+    def crossed(x, v):
+        return OMEGA * ti.Vector([v[1], -v[0]]) + ti.Vector([2.0, 0.0])
+
+    u, t = -2j / OMEGA, 3.0
+    w = world(tv.Particles([[0.0, 0.0]], velocity=(1.0, 0.0)), [tv.Force(crossed)], precision="f64")
+    errors = []
+    for substeps in (2, 4, 8, 16):
+        rerun(w, t, dt=0.25, substeps=substeps)
+        assert abs(complex(*w.velocity[0]) - u) == pytest.approx(abs(1 - u), rel=1e-12)
+        exact = u * t + (1 - u) * (1 - np.exp(-1j * OMEGA * t)) / (1j * OMEGA)
+        errors.append(abs(complex(*w.position[0]) - exact))
+    assert 1.9 <= order(errors) <= 2.1
+
+
+def test_a_spiral_in_space(world):
+    # omega x v of any axis: gravity along it does what it does, |v| across it stays. And with drag that is exact.
+    @ti.func
+    def spiral(x, v):
+        return ti.Vector([1.0, 2.0, 2.0]).cross(v)  # |omega| = 3
+
+    axis, v = np.array([1.0, 2.0, 2.0]) / 3, np.array([1.0, -0.5, 2.0])
+    w = world(tv.Particles([[0.0, 0, 0]], velocity=v), [tv.Force(spiral), tv.Gravity(2 * axis), tv.Drag(0.0)], precision="f64")
+    w.substeps = 3
+    w.run(10.0, dt=0.5)
+    assert w.velocity[0] @ axis == pytest.approx(v @ axis + 20, rel=1e-12)
+    assert np.linalg.norm(w.velocity[0] - w.velocity[0] @ axis * axis) == pytest.approx(
+        np.linalg.norm(v - v @ axis * axis), rel=1e-12
+    )
+    w.features[2].rate = 0.1
+    w.features[1].g = np.zeros(3)
+    errors = []
+    for substeps in (4, 8, 16):  # |v| = exp(-c t) |v0|
+        rerun(w, 5.0, dt=0.5, substeps=substeps)
+        errors.append(abs(np.linalg.norm(w.velocity) - np.exp(-0.5) * np.linalg.norm(v)))
+    assert errors[-1] <= 5e-4 and 1.9 <= order(errors) <= 2.1
+
+
+def test_drag_is_second_order_and_settles_however_stiff(world):
+    # v' = -c v: exp(-c t). A substep makes 1 - z / (1 + q (1 + theta)) of d, z = c h, q = z / 2, which is in (0, 1) for any z.
+    w = world(tv.Particles([[0.0, 0.0]], velocity=(0.6, -0.8)), [tv.Force(brake)], precision="f64")
+    errors = []
+    for substeps in (4, 8, 16, 32):
+        rerun(w, 2.0, dt=0.5, substeps=substeps)
+        errors.append(abs(np.linalg.norm(w.velocity) - np.exp(-2)))
+    assert 1.9 <= order(errors) <= 2.3 and errors[-1] < 2e-5
+    for z in (0.5, 1.0, 2.0, 5.0, 100.0):
+        q = z / 2
+        rerun(w, 3 * z, dt=z, substeps=1)
+        first, late = 1 - q / (1 + q * q**2 / (1 + q**2)), 1 - z / (1 + q * (1 + q**2 / (1 + q**2)))
+        want = first * late**2 * (1 - q / (1 + q * (1 + q**2 / (1 + q**2))))  # d_3 / h, and the half of a kick to v_3
+        assert w.velocity[0] == pytest.approx(want * np.array([0.6, -0.8]), rel=1e-9, abs=1e-15) and not w.last.flags
+
+
+@pytest.mark.parametrize("force", [air, dry], ids=lambda f: f.__name__)
+def test_what_brakes_takes_energy_and_is_no_stiff_force(world, force):
+    # Drag of the air v = v0 / (1 + k v0 t), and friction, which changes at once where v does: v goes down to 1 % of what friction
+    # takes in a substep, without a flag.
+    start = tv.Particles(np.zeros((2, 3)), velocity=[[3.0, 4.0, 12.0], [0.0, 0.0, -1.0]])
+    w = world(start, [tv.Force(force)], substeps=1, precision="f64")
+    for dt in (1e-3, 0.1, 1.0, 10.0):
+        again(w)
+        size = np.array([13.0, 1.0])
+        for _ in range(8):
+            w.step(dt)
+            now = np.linalg.norm(w.velocity, axis=1)
+            assert (now < np.maximum(size, 1e-2 * dt)).all() and not w.last.flags
+            size = now
+    rerun(w, 1.0, dt=0.1, substeps=200)
+    want = np.array([13 / 14, 1 / 2]) if force is air else np.array([12.0, 0.0])
+    np.testing.assert_allclose(np.linalg.norm(w.velocity, axis=1), want, atol=1e-3)
+
+
+def test_links_stay_second_order_beside_what_turns_and_brakes(world):
+    # A pendulum under a force that depends on all of v, also along the rod, where only its reaction makes v what it is.
+    @ti.func
+    def slanted(x, v):
+        return ti.Vector([-0.8 * v[0] - 0.5 * v[1], 0.9 * v[0] - 0.1 * v[1]])
+
+    def rate(y):  # theta'' by the force along the tangent
+        out, along = np.array([np.cos(y[0]), np.sin(y[0])]), np.array([-np.sin(y[0]), np.cos(y[0])])
+        v = y[1] * along
+        return np.array([y[1], along @ (np.array([0, -9.81]) - [[0.8, 0.5], [-0.9, 0.1]] @ v) + 0 * out[0]])
+
+    y, h = np.array([0.0, 0.5]), 1e-3
+    for _ in range(1000):  # Runge and Kutta, 1e-11
+        a = rate(y)
+        b = rate(y + h / 2 * a)
+        c = rate(y + h / 2 * b)
+        y = y + h / 6 * (a + 2 * b + 2 * c + rate(y + h * c))
+    start = tv.Particles([[0, 0], [1.0, 0]], velocity=[[0, 0], [0, 0.5]], pinned=[0])
+    w = world(start, [tv.Gravity(9.81), tv.Force(slanted), tv.Distance([(0, 1)])], precision="f64")
+    for turns in (1, 3):  # always as many substeps, or other ones in each frame
+        errors = []
+        for substeps in (4, 8, 16, 32):
+            again(w)
+            for k in range(32):
+                w.substeps = substeps * (1 + k % turns)
+                w.step(1 / 32)
+            errors.append(np.linalg.norm(w.position[1] - [np.cos(y[0]), np.sin(y[0])]))
+        assert 1.9 <= order(errors) <= 2.1
+
+
+def test_blows_do_not_count_as_forces(world):
+    # 64 balls in a box that gives all back, in a magnet, for tens of bounces each: none is taken for a force that goes on, which
+    # would more than double their energy. What is left is the substep in which they happen.
+    angle = np.arange(64) * np.pi / 32
+    start = tv.Particles(
+        0.4 * tv.golden(np.arange(64), dim=2) - 0.2, velocity=np.stack([np.cos(angle), np.sin(angle)], axis=1), radius=0.01
+    )
+    box = tv.Box((-0.5, -0.5), (0.5, 0.5), restitution=1.0)
+    w = world(start, [tv.Force(magnet), box], substeps=1, precision="f64")
+    w.run(20.0)
+    assert (w.velocity**2).sum(axis=1).mean() == pytest.approx(1, rel=0.15)
+
+
+def test_the_flag_comes_where_a_turn_is_not_resolved(world):
+    # omega h > 2: a substep turns by no more than half a turn, and does more slowly than the force. "auto" takes shorter ones.
+    w = world(tv.Particles([[0.0, 0.0]], velocity=(3.0, 0.0)), [tv.Force(magnet)], substeps=1, precision="f64")
+    for omega_h, flags in ((1.9, set()), (2.1, {"stiff-force"}), (9.0, {"stiff-force"})):
+        rerun(w, 3 * omega_h / OMEGA, dt=omega_h / OMEGA)
+        assert w.last.flags == flags
+        assert np.linalg.norm(w.velocity) == pytest.approx(3, rel=1e-12)
+    assert "omega h = 9" in w.last.notes[0] and "at least 6 substeps" in w.last.notes[0]
+    again(w, substeps="auto")
+    report = w.step(40.0 / OMEGA)
+    assert report.substeps > 20 and not report.flags
+
+
+def test_what_feeds_motion_is_flagged_and_stays_finite(world):
+    # v' = v: v grows by e^h; where h is too long for that, it says so.
+    @ti.func
+    def feeds(x, v):
+        return v
+
+    w = world(tv.Particles([[0.0, 0.0]], velocity=(1.0, 0.0)), [tv.Force(feeds)], substeps=1, precision="f64")
+    rerun(w, 1.0, dt=0.1, substeps=10)
+    assert w.velocity[0, 0] == pytest.approx(np.e, rel=1e-4) and not w.last.flags
+    rerun(w, 9.0, dt=3.0, substeps=1)
+    assert w.last.flags == {"stiff-force"} and np.isfinite(w.velocity).all()
+
+
+def test_a_hand_that_holds_still_is_not_stiff(world):
+    hand = tv.Hand((0.0, 1.0), particle=0, rate=20.0)
+    w = world(tv.Particles([[0.0, 0.0], [1.0, 0.0]]), [tv.Gravity(9.81), hand], substeps=1, precision="f64")
+    for _ in range(120):
+        assert not w.step(1 / 60).flags
+    # Its weight stretches it by g / rate^2, and nothing moves.
+    np.testing.assert_allclose(w.position[0], [0.0, 1 - 9.81 / 400], atol=1e-9)
+    hand.rate = 110.0  # rate h = 1.8: the spring is resolved up to 2, and the damping does not get into its way
+    w.run(1.0)
+    np.testing.assert_allclose(w.position[0], [0.0, 1 - 9.81 / 110**2], atol=1e-6)
+
+
+@ti.func
+def wild(x, v, t):
+    """Turns, brakes, and changes with time."""
+    return 3.0 * ti.Vector([v[1], -v[0]]) - (0.2 + 0.1 * ti.sin(t)) * v.norm() * v
+
+
+def scene():
+    """Discs that fall on each other in a wind that turns, some of them linked, one in a hand."""
+    x = np.stack(np.meshgrid(np.arange(18), np.arange(18)), axis=2).reshape(-1, 2) * 0.105
+    links, box = tv.Distance([(0, 1), (1, 2)]), tv.Box((-0.2, -0.2), (2.2, 4))
+    features = [tv.Gravity(9.81), tv.Force(wild), tv.Hand((1, 1), 7), links, tv.Contact(), box]
+    return tv.Particles(x, velocity=np.sin(7 * x), radius=0.05), features
+
+
+def test_the_same_bits_on_all_paths_and_in_copies(world):
+    made = set()
+    for path in ("fused", "parallel", "launched"):
+        w = world(*scene(), substeps=3, path=path)
+        for k in range(12):
+            w.substeps = 3 + k // 5
+            w.step(1 / 60)
+        if path == "fused":
+            with w.clone() as twin:
+                twin.run(0.1)
+                made.add(twin.hash())
+        w.run(0.1)
+        made.add(w.hash())
+    assert len(made) == 1
+
+
+def test_a_recording_proves_itself_and_goes_on(world, tmp_path):
+    w = world(*scene(), substeps=2)
+    path = tmp_path / "wild.rrd"
+    with tv.Recorder(path, w) as recorder:
+        w.run(0.1, recorder=recorder)
+        w.substeps = 5
+        w.run(0.1, recorder=recorder)
+    recording = tv.replay(path, [wild])
+    assert recording.verify()
+    with recording.world(6) as other:
+        other.substeps = 5
+        other.run(0.1)
+        assert other.hash() == w.hash()
