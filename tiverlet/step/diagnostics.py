@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 BLOCKS = 64  # partial sums: their number is fixed, so the total has the same bits on any number of threads; squared on a GPU
 TURNS = (0, 26, 41)  # degrees, for nothing, BENT and FAR
-STIFF = 4.0  # (omega h)^2 beyond which Verlet diverges
+STIFF = 4.0  # (omega h)^2 beyond which Verlet diverges, or turns velocities by less than a third of a turn where it is more
 
 STEPPED, STARTED, UNSTEPPED = range(3)  # how a state came about: by a substep, by the first one after a start, by none yet
 BARE = 3  # added to one of these: nothing but energy is asked for
@@ -422,7 +422,7 @@ class Reporter:
         if flag == "stiff-force":
             need = np.ceil(substeps * np.sqrt(stiff / STIFF)) + 1
             return (
-                f"A force changes too fast for the substep: omega h = {np.sqrt(stiff):.3g}, stable below 2. "
+                f"A force changes too fast for the substep: omega h = {np.sqrt(stiff):.3g}, resolved below 2. "
                 f"Use at least {need:.7g} substeps."
             )
         if released > 0:

@@ -24,7 +24,8 @@ class StepReport:
         "out-of-range"      a coordinate is too large for the precision, or for the cells of the contact grid
         "tunnelling-risk"   a particle moved by more than its own size in one substep, so it may have passed another
         "compressed"        a contact overlaps by more than half of the radius of the smaller particle
-        "stiff-force"       a force changes too fast for the substep (omega h > 2) and makes energy grow
+        "stiff-force"       a force changes too fast for the substep (omega h > 2): with place it makes energy grow, with
+                            velocity it turns motion by far too little
         "energy-gain"       the scene has more energy than it had, by a tenth of its kinetic energy, though nothing works on it
         "softened"          a system was made to give way, because its tension is too large for the substep
         "unconverged"       the residual is above 0.1: a link is off by a tenth of its length, an angle by a tenth of a radian
