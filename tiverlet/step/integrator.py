@@ -105,10 +105,10 @@ class Forces:
         q = ti.max(-a.dot(slope @ a) / ti.max(a.dot(a), TINY * TINY), 0)
         theta = 1 - 1 / (1 + q * q)
         left, more = -(part + theta) * slope, slope @ ((part + theta) * a + theta * still)
-        least = ti.cast(1, self.real)
+        regular = ti.cast(1, ti.i32)
         for k in ti.static(range(self.dim)):  # Gauss; what brakes and turns has pivots of 1 or more
             left[k, k] += 1
-            least = ti.min(least, left[k, k])
+            regular &= ti.cast(left[k, k] > LEAST, ti.i32)  # nor is NaN, as of v / |v| where v + way comes to be 0
             for j in ti.static(range(k + 1, self.dim)):
                 share = left[j, k] / left[k, k]
                 more[j] -= share * more[k]
@@ -118,7 +118,7 @@ class Forces:
             for j in ti.static(range(k + 1, self.dim)):
                 more[k] -= left[k, j] * more[j]
             more[k] /= left[k, k]
-        a += ti.select(least > LEAST, more, ti.zero(a))
+        a += ti.select(regular != 0, more, ti.zero(a))
         return still + a
 
 
