@@ -2,14 +2,15 @@
 
 from dataclasses import replace
 from time import perf_counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from .. import checks
 from ..solvers.slots import TENSEST
 from . import checkpoint, energy_bound
-from .diagnostics import STIFFNESS
+from .clock import room
+from .diagnostics import KINETIC, STIFFNESS
 from .step_report import StepReport
 
 if TYPE_CHECKING:
@@ -42,6 +43,8 @@ class StepController:
     left, a tension made particles vibrate with (omega h)^2 > 2, or when it has a flag that shorter substeps remove. Where twice
     the substeps, 16 or more, bring no gain, twice the iterations are tried; where they bring none, it is "stuck": the frame is
     the one with the least effort of those that are as good, and what stays wrong is asked for no more in the next frames.
+    Where they bring in energy, more with each try, what is left violated could not be put right first, and the frame is the best
+    of the tries.
     A body that turns by phi in a substep does so by phi^2 / 24 of that too fast or too slowly, a relative error as a residual is:
     the 26 degrees above are one of 1e-2, and a tolerance that is asked for is asked of the turns of rigid constraints, too.
     What vibrates or orbits in forces that differ from place to place is too fast by (omega h)^2 / 24 in the same way, of which
@@ -83,10 +86,12 @@ class StepController:
         n, k, stuck = self.substeps, self.iterations, self.stuck
         before, flags = world._undo  # type: ignore[misc]  # of the step; where nothing was uploaded since, it is the state now
         kept = checkpoint.keep(world) if any(map(any, flags)) else replace(before, controller=self.memory)
-        tries, best, idle, kind = 0, WORST, 0, "substeps"
+        tries, best, idle, kind, kinetic = 0, WORST, 0, "substeps", 0.0
         known: dict[tuple[int, int], Figures] = {}  # of the tries without a risk
+        made: dict[tuple[int, int], tuple] = {}  # how good all are, the best the least; final: the verdict, before the last one
         world._runner.begin(dt / n, world.iterations)
-        energy = energy_bound.before(world)
+        energy, final = energy_bound.before(world), ""
+        energies: list[Any] = [world._clock.energy]  # before the frame, and of the tries
         while True:
             tries, begun = tries + 1, perf_counter()
             report = world._runner.advance(dt, n, k)
@@ -95,11 +100,21 @@ class StepController:
             angle, missed = turned(world) if tolerance else 0.0, energy_bound.missed(world, report, energy)
             figures, risks = judge(report, tolerance, angle, stiffness(world), missed)
             wrong = [f > max(1.0, s) for f, s in zip(figures, stuck, strict=True)]
+            energies.append(report.energy)
+            kinetic = world._runner.sheet.item(KINETIC) if tries == 1 else kinetic  # of the first one
+            made[n, k] = bool(risks), max(figures), n * k
+            if final or not (risks or any(wrong)):
+                verdict = final or ("stuck" if max(figures[:ENERGY]) > 1 else "good")
+                break
+            if pumps(energies, kinetic):
+                final = "stuck"
+                n, k = min(made, key=made.__getitem__)
+                stuck = tuple(max(s, GAIN * f) for s, f in zip(stuck, known.get((n, k), NOTHING), strict=True))
+                checkpoint.put_back(world, kept)
+                world._runner.begin(dt / n, world.iterations)
+                continue
             if risks:
                 best, idle, kind = WORST, 0, "substeps"
-            elif (n, k) in known or not any(wrong):
-                verdict = "stuck" if max(figures[:ENERGY]) > 1 else "good"
-                break
             else:
                 known[n, k] = figures
                 gains = any(f * GAIN <= b for f, b, w in zip(figures, best, wrong, strict=True) if w)
@@ -107,7 +122,7 @@ class StepController:
                 best = tuple(map(min, figures, best))
                 if idle >= IDLE[kind] and n >= FEW:
                     if kind == "iterations" or k >= PASSES or not any(wrong[:ENERGY]):
-                        verdict = "stuck" if any(wrong[:ENERGY]) else "good"
+                        verdict = final = "stuck" if any(wrong[:ENERGY]) else "good"
                         stuck = tuple(max(s, GAIN * f) if w else s for s, f, w in zip(stuck, figures, wrong, strict=True))
                         n, k, last = *cheapest(known, stuck), (n, k)
                         if (n, k) == last:
@@ -188,6 +203,16 @@ def stiffness(world: "World") -> float:
         return max(probe(clock.h, clock.time), runner.sheet.item(STIFFNESS))
 
 
+def pumps(energies: list[float], kinetic: float) -> bool:
+    """Whether twice the effort brought in more energy than the time before, and more than there was before the frame, the first
+    of them: what is left violated, since it cannot be put right first, is a spring that a shorter substep makes stiffer, see
+    projection.py."""
+    if len(energies) < 4:
+        return False
+    first, second = np.diff(energies[-3:]).tolist()
+    return second > GAIN * first and energies[-1] > room(max(energies[:-2]), kinetic, energies[-1])
+
+
 def judge(
     report: StepReport, tolerance: float | None, angle: float, stiffness: float, missed: float
 ) -> tuple[Figures, set[str]]:  # fmt: skip
@@ -227,7 +252,8 @@ def told(report: StepReport, figure: float, risks: set[str], verdict: str, tries
     wrong = sorted(risks) or [f"a figure is {figure:.3g} times what is asked"]
     why = {
         "stuck": "Nothing helps: constraints contradict each other, a load has no direction to be carried in (that of a straight "
-        "rope between two pins; give it slack or compliance), or particles still part that began in one place.",
+        "rope between two pins; give it slack or compliance), particles still part that began in one place, or what is "
+        "violated cannot be put right first, and would be energy in a shorter substep.",
         "substeps-capped": f"More than {report.substeps} substeps are needed, but the budget is spent or there can be no more.",
     }[verdict]
     note = f"The frame is not as good as asked: {', '.join(wrong)}. {why}"
