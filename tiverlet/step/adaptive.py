@@ -83,63 +83,28 @@ class StepController:
         budget = None if budget is None else checks.number("World.step", "budget", budget, above=0.0)
         end = float("inf") if budget is None else perf_counter() + budget
         self.prepare(world.iterations, dt, tolerance, budget)
-        n, k, stuck = self.substeps, self.iterations, self.stuck
         before, flags = world._undo  # type: ignore[misc]  # of the step; where nothing was uploaded since, it is the state now
         kept = checkpoint.keep(world) if any(map(any, flags)) else replace(before, controller=self.memory)
-        tries, best, idle, kind, kinetic = 0, WORST, 0, "substeps", 0.0
-        known: dict[tuple[int, int], Figures] = {}  # of the tries without a risk
-        made: dict[tuple[int, int], tuple] = {}  # how good all are, the best the least; final: the verdict, before the last one
-        world._runner.begin(dt / n, world.iterations)
-        energy, final = energy_bound.before(world), ""
-        energies: list[Any] = [world._clock.energy]  # before the frame, and of the tries
+        world._runner.begin(dt / self.substeps, world.iterations)
+        tries = Tries(self.substeps, self.iterations, self.stuck, world._clock.energy)
+        energy = energy_bound.before(world)
         while True:
-            tries, begun = tries + 1, perf_counter()
+            n, k, begun = tries.substeps, tries.iterations, perf_counter()
             report = world._runner.advance(dt, n, k)
             took = perf_counter() - begun
             self.learn(took / (n * k))
             angle, missed = turned(world) if tolerance else 0.0, energy_bound.missed(world, report, energy)
             figures, risks = judge(report, tolerance, angle, stiffness(world), missed)
-            wrong = [f > max(1.0, s) for f, s in zip(figures, stuck, strict=True)]
-            energies.append(report.energy)
-            kinetic = world._runner.sheet.item(KINETIC) if tries == 1 else kinetic  # of the first one
-            made[n, k] = bool(risks), max(figures), n * k
-            if final or not (risks or any(wrong)):
-                verdict = final or ("stuck" if max(figures[:ENERGY]) > 1 else "good")
+            if tries.note(figures, risks, report.energy, world._runner.sheet.item(KINETIC)):
                 break
-            if pumps(energies, kinetic):
-                final = "stuck"
-                n, k = min(made, key=made.__getitem__)
-                stuck = tuple(max(s, GAIN * f) for s, f in zip(stuck, known.get((n, k), NOTHING), strict=True))
-                checkpoint.put_back(world, kept)
-                world._runner.begin(dt / n, world.iterations)
-                continue
-            if risks:
-                best, idle, kind = WORST, 0, "substeps"
-            else:
-                known[n, k] = figures
-                gains = any(f * GAIN <= b for f, b, w in zip(figures, best, wrong, strict=True) if w)
-                idle = 0 if gains else idle + 1
-                best = tuple(map(min, figures, best))
-                if idle >= IDLE[kind] and n >= FEW:
-                    if kind == "iterations" or k >= PASSES or not any(wrong[:ENERGY]):
-                        verdict = final = "stuck" if any(wrong[:ENERGY]) else "good"
-                        stuck = tuple(max(s, GAIN * f) if w else s for s, f, w in zip(stuck, figures, wrong, strict=True))
-                        n, k, last = *cheapest(known, stuck), (n, k)
-                        if (n, k) == last:
-                            break
-                        checkpoint.put_back(world, kept)
-                        world._runner.begin(dt / n, world.iterations)
-                        continue
-                    kind, idle = "iterations", 0
-            if n >= MOST or perf_counter() + 2 * took > end:
-                verdict = "substeps-capped"
+            if not tries.verdict and perf_counter() + 2 * took > end:
+                tries.verdict = "substeps-capped"
                 break
-            n, k = (min(2 * n, MOST), k) if kind == "substeps" else (n, 2 * k)
             checkpoint.put_back(world, kept)
-            world._runner.begin(dt / n, world.iterations)
-        self.substeps, self.iterations, self.stuck = n, k, stuck  # and the next frames do not try in vain
-        self.look_ahead(world.iterations, report, max(figures), verdict, tries)
-        return told(report, max(figures), risks, verdict, tries)
+            world._runner.begin(dt / tries.substeps, world.iterations)
+        self.substeps, self.iterations, self.stuck = n, k, tries.stuck  # and the next frames do not try in vain
+        self.look_ahead(world.iterations, report, max(figures), tries.verdict, tries.count)
+        return told(report, max(figures), risks, tries.verdict, tries.count)
 
     def prepare(self, iterations: int, dt: float, tolerance: float | None, budget: float | None) -> None:
         """Choose the effort to begin with."""
@@ -173,6 +138,57 @@ class StepController:
                 self.substeps = (self.substeps + 1) // 2
         elif not self.wait:
             self.patience = 1
+
+
+class Tries:
+    """The tries of one frame, and what is tried next: `substeps` x `iterations`.
+
+    stuck: figures that need not be better. energy: before the frame [J]. verdict: how the frame ends, once that is known.
+    """
+
+    def __init__(self, substeps: int, iterations: int, stuck: Figures, energy: Any):
+        self.substeps, self.iterations, self.stuck = substeps, iterations, stuck
+        self.verdict, self.count = "", 0
+        self._best, self._idle, self._kind = WORST, 0, "substeps"
+        self._known: dict[tuple[int, int], Figures] = {}  # of those without a risk
+        self._made: dict[tuple[int, int], tuple] = {}  # how good all are, the best the least
+        self._energies, self._kinetic = [energy], 0.0
+
+    def note(self, figures: Figures, risks: set[str], energy: float, kinetic: float) -> bool:
+        """Take note of a try, and of its energies [J]. Returns whether it is the last one; else it is known what comes next."""
+        n, k, stuck = self.substeps, self.iterations, self.stuck
+        wrong = [f > max(1.0, s) for f, s in zip(figures, stuck, strict=True)]
+        self.count += 1
+        self._energies.append(energy)
+        self._kinetic = kinetic if self.count == 1 else self._kinetic
+        self._made[n, k] = bool(risks), max(figures), n * k
+        if self.verdict or not (risks or any(wrong)):
+            self.verdict = self.verdict or ("stuck" if max(figures[:ENERGY]) > 1 else "good")
+            return True
+        if pumps(self._energies, self._kinetic):
+            self.verdict = "stuck"
+            self.substeps, self.iterations = to = min(self._made, key=self._made.__getitem__)
+            self.stuck = tuple(max(s, GAIN * f) for s, f in zip(stuck, self._known.get(to, NOTHING), strict=True))
+            return False
+        if risks:
+            self._best, self._idle, self._kind = WORST, 0, "substeps"
+        else:
+            self._known[n, k] = figures
+            gains = any(f * GAIN <= b for f, b, w in zip(figures, self._best, wrong, strict=True) if w)
+            self._idle = 0 if gains else self._idle + 1
+            self._best = tuple(map(min, figures, self._best))
+            if self._idle >= IDLE[self._kind] and n >= FEW:
+                if self._kind == "iterations" or k >= PASSES or not any(wrong[:ENERGY]):
+                    self.verdict = "stuck" if any(wrong[:ENERGY]) else "good"
+                    self.stuck = tuple(max(s, GAIN * f) if w else s for s, f, w in zip(stuck, figures, wrong, strict=True))
+                    self.substeps, self.iterations = cheapest(self._known, self.stuck)
+                    return (self.substeps, self.iterations) == (n, k)
+                self._kind, self._idle = "iterations", 0
+        if n >= MOST:
+            self.verdict = "substeps-capped"
+            return True
+        self.substeps, self.iterations = (min(2 * n, MOST), k) if self._kind == "substeps" else (n, 2 * k)
+        return False
 
 
 def turned(world: "World") -> float:
