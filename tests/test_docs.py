@@ -12,6 +12,8 @@ import tiverlet as tv
 from tiverlet.device.language import COMPILER
 from tiverlet.features.arguments import knobs_of
 
+from .conftest import parsed
+
 ROOT = pathlib.Path(__file__).parent.parent
 PAGES = [p.relative_to(ROOT) for p in (ROOT / "README.md", *ROOT.glob("demos/*.md"), *ROOT.glob("tiverlet/**/*.md"))]
 
@@ -80,8 +82,7 @@ def test_every_public_name_says_what_it_is():
     # Modules, classes, functions, methods and properties of the package, what sets these, and what is defined inside of them; and
     # live settings, which say it when they are made.
     missing = []
-    for path in ROOT.glob("tiverlet/**/*.py"):
-        tree = ast.parse(path.read_text())
+    for path, tree in parsed().items():
         name = str(path.relative_to(ROOT))
         missing += [] if ast.get_docstring(tree, clean=False) else [name]
         missing += [f"{name}:{what}" for what in undocumented(tree)]

@@ -12,7 +12,7 @@ import pytest
 import tiverlet as tv
 from tiverlet.device.patches import patched
 
-from .conftest import ARCH
+from .conftest import ARCH, parsed
 
 ROOT = Path(__file__).parents[1] / "tiverlet"
 DEPTH = 16  # modules, one importing the next
@@ -32,9 +32,9 @@ CHAIN = 4  # classes, each below the next: what acts on particles, how many of t
 def modules() -> dict[str, ast.Module]:
     """All modules of the package by their names."""
     out = {}
-    for path in ROOT.rglob("*.py"):
+    for path, tree in parsed().items():
         parts = path.relative_to(ROOT.parent).with_suffix("").parts
-        out[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = ast.parse(path.read_text())
+        out[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = tree
     return out
 
 
