@@ -39,7 +39,10 @@ def kept(taichi):
 
 
 class Forked:
-    """What is asked once and answers once, by a process that has imported tiverlet before."""
+    """What is asked once and answers once, by a process that has imported tiverlet before. Asked the same a second time, as where
+    nothing has to be compiled any more, it gives the first answer again: only seconds would be others."""
+
+    answers: dict[str, str] = {}
 
     def __init__(self, code, job, cache):
         keeps = {"TI_OFFLINE_CACHE": "1", "TI_OFFLINE_CACHE_FILE_PATH": cache}
@@ -48,7 +51,9 @@ class Forked:
         self.code = f"{before}\nsys.argv[1:] = [{json.dumps(job)!r}]\n{code}\n{after}\n"
 
     def ask(self):
-        return json.loads(python(self.code).stdout)
+        if self.code not in self.answers:
+            self.answers[self.code] = python(self.code).stdout
+        return json.loads(self.answers[self.code])
 
     def __enter__(self):
         return self
