@@ -1,5 +1,6 @@
 """Exports: what other programs read is what was recorded."""
 
+import importlib
 import json
 import pathlib
 import re
@@ -12,7 +13,6 @@ import imageio_ffmpeg
 import meshio
 import numpy as np
 import pytest
-import trimesh
 from PIL import Image
 
 import tiverlet as tv
@@ -85,9 +85,10 @@ def positions(recording: Replay) -> list[np.ndarray]:
     return [recording.position(int(k)) for k in recording.frames]
 
 
-def uv_of(mesh: trimesh.Trimesh) -> np.ndarray:
-    """Texture coordinates of vertices."""
-    return mesh.visual.uv  # type: ignore
+@pytest.fixture
+def trimesh():
+    """It takes a third of a second to import, in every worker where the file does."""
+    return importlib.import_module("trimesh")
 
 
 def parsed(path: pathlib.Path) -> tuple[dict, bytes]:
@@ -152,7 +153,7 @@ def test_gltf_holds_every_frame(recording, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["glb", "gltf"])
-def test_trimesh_reads_gltf(recording, whole, kind, tmp_path):
+def test_trimesh_reads_gltf(recording, whole, kind, tmp_path, trimesh):
     names = recording.export(tmp_path / f"a.{kind}", shape=whole)
     assert names == [str(tmp_path / name) for name in (["a.glb"] if kind == "glb" else ["a.gltf", "a.bin"])]
     meshes = [g for g in trimesh.load_scene(names[0]).geometry.values() if isinstance(g, trimesh.Trimesh)]
@@ -160,7 +161,7 @@ def test_trimesh_reads_gltf(recording, whole, kind, tmp_path):
     x, uv = recording.position(0), np.concatenate(whole.uv)
     around = np.concatenate(whole.polygons)
     pairs = sorted({(*x[i].tolist(), *place) for i, place in zip(around, uv.tolist(), strict=True)})
-    np.testing.assert_allclose(sorted(np.column_stack([mesh.vertices, uv_of(mesh)]).tolist()), pairs, atol=1e-7)
+    np.testing.assert_allclose(sorted(np.column_stack([mesh.vertices, mesh.visual.uv]).tolist()), pairs, atol=1e-7)
     assert len(pairs) == 6  # particle 3 is there twice
     np.testing.assert_allclose(mesh.area, 1 + np.sqrt(1.25) / 2, rtol=1e-6)
 
@@ -192,7 +193,7 @@ def test_vtk_plays_gltf_and_reads_vtu(recording, tmp_path):
     assert kinds == [5, 5, 5, 3, 3, 1, 1]
 
 
-def test_obj_files_keep_faces_and_texture_coordinates(recording, roof, whole, tmp_path):
+def test_obj_files_keep_faces_and_texture_coordinates(recording, roof, whole, tmp_path, trimesh):
     names = recording.export(tmp_path / "f_%03d.obj", shape=whole)
     assert names == [str(tmp_path / f"f_{k:03d}.obj") for k in range(5)]
     for name, x in zip(names, positions(recording), strict=True):
@@ -203,7 +204,7 @@ def test_obj_files_keep_faces_and_texture_coordinates(recording, roof, whole, tm
         assert back.links.tolist() == [[5, 6], [6, 7]]
     assert "p 9\np 10\n" in pathlib.Path(names[0]).read_text()
     mesh = trimesh.load_mesh(names[-1], process=False, maintain_order=True)
-    assert len(mesh.faces) == 3 and len(uv_of(mesh)) == len(mesh.vertices)
+    assert len(mesh.faces) == 3 and len(mesh.visual.uv) == len(mesh.vertices)
 
 
 def test_obj_files_without_a_shape_are_triangles(recording, tmp_path):

@@ -1,5 +1,6 @@
 """The reports: what they measure, what they say of it, and that a defect in the engine does not get past them."""
 
+import importlib
 import io
 import json
 import multiprocessing
@@ -10,8 +11,6 @@ import shutil
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 
-import dask
-import distributed
 import numpy as np
 import pytest
 from rich.console import Console
@@ -162,8 +161,9 @@ def test_sweeps_run_in_processes_and_survive_one_that_dies():
 
 
 def test_sweeps_run_on_dask_and_survive_a_worker_that_dies():
+    dask, distributed = map(importlib.import_module, ("dask.config", "distributed"))  # here, or every worker imports them
     with (
-        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
+        dask.set({"distributed.scheduler.allowed-failures": 0}),
         distributed.Client(n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None) as client,
     ):
         some = {"methods": ["Direct"], "precisions": ("f64",), "efforts": (20,), "runs": 1}

@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import importlib
 import importlib.util
 import json
 import multiprocessing
@@ -12,8 +13,6 @@ import subprocess
 import sys
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 
-import dask.config
-import distributed
 import numpy as np
 import pytest
 
@@ -99,8 +98,9 @@ def test_the_order_of_parts_does_not_matter(here):
 
 
 def test_dask_has_the_same_bits_and_survives_a_worker_that_dies(here, tmp_path):
+    dask, distributed = map(importlib.import_module, ("dask.config", "distributed"))  # here, or every worker imports them
     with (
-        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
+        dask.set({"distributed.scheduler.allowed-failures": 0}),
         # Threads of one worker would start Taichi in any of them.
         distributed.LocalCluster(n_workers=1, threads_per_worker=2, processes=True, dashboard_address=None) as cluster,
         distributed.Client(cluster) as client,
