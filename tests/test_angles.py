@@ -91,7 +91,7 @@ def test_limbs_stop_at_their_limits(world):
     assert np.arctan2(w.position[2, 1], w.position[2, 0]) == pytest.approx(-1.2, abs=1e-4) and w.position[5, 1] < 4.01
     assert limit.load[0] == pytest.approx(9.81 * np.cos(1.2), rel=1e-3)
     limit.lower = -1.5
-    w.run(3.0)
+    rerun(w, 5.0)
     assert np.arctan2(w.position[2, 1], w.position[2, 0]) == pytest.approx(-1.5, abs=1e-4)
     with pytest.raises(ValueError, match=r"lower\[0\] = 3 and upper\[0\] = 2.5, but lower must not exceed upper"):
         limit.lower = 3.0
