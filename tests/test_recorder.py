@@ -41,7 +41,7 @@ def test_every_frame_reads_back(world, tmp_path, dim):
     links = np.stack([np.arange(29), np.arange(1, 30)], axis=1)
     box = tv.Box([0] * dim, [1] * dim)
     features = [tv.Gravity(9.81), tv.Distance(links), tv.Contact(), box, tv.HalfSpace([0, 1, 0][:dim], 0.01)]
-    w = world(tv.Particles(x, radius=np.r_[0.0, np.full(29, 0.02)], pinned=[0]), features)
+    w = world(tv.Particles(x, radius=np.r_[0.0, np.full(29, 0.02)], pinned=[0]), features, solver=tv.Jacobi())
     path = tmp_path / "a.rrd"
     seen = [w.position]
     reports = []

@@ -17,7 +17,7 @@ def scene(k: int) -> tv.World:
     x, radius = np.concatenate([discs, chain.position]), np.concatenate([np.full(n, 0.08), np.full(6, 0.02)])
     links = tv.Distance(n + chain.links, break_at=5.0 if k == 2 else 500.0)
     features = [tv.Gravity(9.81 + k), tv.Contact(), tv.HalfSpace((0, 1)), tv.Ball((0.5, 0.2), 0.1), links]
-    return tv.World(tv.Particles(x, radius=radius, pinned=[n]), features, substeps=6)
+    return tv.World(tv.Particles(x, radius=radius, pinned=[n]), features, substeps=6, solver=tv.Jacobi())  # compiles soonest
 
 
 @pytest.mark.parametrize("overlays", [{}, {"forces": True, "velocities": True, "strain": False}], ids=str)
