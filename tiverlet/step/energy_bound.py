@@ -57,11 +57,9 @@ def checked(world: "World", report: StepReport) -> StepReport:
 
 
 def before(world: "World") -> float | None:
-    """The energy before a frame of a scene with forces that differ from place to place, on which nothing works; else None."""
+    """The energy before a frame; None where it may get more, for it was changed from outside, or parts from overlaps."""
     clock = world._clock
-    if not world._runner.diagnostics.force_stiffness or clock.bound == CHANGED or clock.parting or works(world):
-        return None
-    return clock.energy
+    return None if clock.bound == CHANGED or clock.parting else clock.energy
 
 
 def missed(world: "World", report: StepReport, energy: float | None) -> float:
@@ -75,9 +73,11 @@ def missed(world: "World", report: StepReport, energy: float | None) -> float:
         change = abs(report.energy - energy)
     else:
         change = report.energy - max(energy, energy if clock.bound is None else clock.bound)
+    if not change > 0 or works(world):
+        return 0.0
     kinetic = max(clock.kinetic, sheet.item(KINETIC))
     allowed = MISSED * max(0.0, kinetic - _drift(world)) + DIGITS * (abs(report.energy) + kinetic)
-    return max(change, 0.0) / allowed if allowed else 0.0
+    return change / allowed if allowed else 0.0
 
 
 def _drift(world: "World") -> float:
