@@ -211,13 +211,19 @@ class Rows:
 
     def _link(self) -> None:
         """The matrix of step(), for what its rows and their tensions couple."""
-        last = np.cumsum(self.arity)
-        wide = (self.arity * self.dim > 2 * WIDEST)[self.row]  # no two levels hold such a row
-        width = np.where(wide, 0, np.repeat(self.arity, self.arity))  # of the row of each corner
+        begin = np.cumsum(self.arity) - self.arity
+        wide = self.arity * self.dim > 2 * WIDEST  # no two levels hold such a row
+        rows = [r for r in self._alike() if len(r) > 1 and not wide[r[0]]]
+        self.alike = [begin[r, None] + np.arange(self.arity[r[0]]) for r in rows]  # corners of each
+        apart = wide.copy()
+        apart[np.concatenate([np.zeros(0, dtype=np.int64), *rows])] = True
+        width = np.where(apart[self.row], 0, np.repeat(self.arity, self.arity))  # of the row of each corner
         a = np.repeat(np.arange(len(self.who)), width)
-        b = np.repeat((last - self.arity)[self.row], width) + np.arange(len(a)) - np.repeat(np.cumsum(width) - width, width)
-        self.corners = a, b  # of each row, each with each
-        self.wide = np.flatnonzero(wide & (self.w[self.who] > 0))
+        b = np.repeat(begin[self.row], width) + np.arange(len(a)) - np.repeat(np.cumsum(width) - width, width)
+        self.corners = a, b  # of each other row, each with each
+        each = [self.who[c[0]] for c in self.alike]
+        both = [np.repeat(who, len(who)) for who in each], [np.tile(who, len(who)) for who in each]
+        self.wide = np.flatnonzero(wide[self.row] & (self.w[self.who] > 0))
         _, i, j = self.pairs
         self.inside = np.unique(self.who[self.w[self.who] > 0])
         number = np.full(self.n, -1)
@@ -225,11 +231,17 @@ class Rows:
         self.number = number
         sides = [i, j, i, j], [i, j, j, i]  # of tensions across links
         ends = np.stack([
-            np.concatenate([*(number[who] for who in (self.who[corner], *side)), every])
-            for corner, side in zip(self.corners, sides, strict=True)
+            np.concatenate([*(number[who] for who in (self.who[corner], *some, *side)), every])
+            for corner, some, side in zip(self.corners, both, sides, strict=True)
         ])  # fmt: skip
         self.free = (ends >= 0).all(axis=0)
         self.matrix = BlockMatrix(len(self.inside), self.dim, *ends[:, self.free])
+
+    def _alike(self) -> list[np.ndarray]:
+        """Rows that follow one another, by the same particles in the same order, as those of a cluster."""
+        before = np.maximum(np.arange(len(self.who)) - self.arity[self.row], 0)
+        other = (self.row[before] != self.row - 1) | (self.who[before] != self.who)
+        return np.split(np.arange(self.m), np.flatnonzero(np.bincount(self.row, other, minlength=self.m))[1:])
 
     def held(self, wall: np.ndarray, back: np.ndarray) -> "Rows":
         """The same rows where walls, of these normals, and of those along which particles were moved `back`, (n, dim), hold what
@@ -301,9 +313,12 @@ class Rows:
         sides = taut[:, None, None] * (one - across[:, :, None] * across[:, None, :])
         wall = self.wall[self.inside]
         mass = (mu * one + HELD * wall[:, :, None] * wall[:, None, :]) / self.w[self.inside][:, None, None]
-        along = (stiff[self.row[a], None] * self.J[a])[:, :, None] * self.J[b][:, None, :]
+        along = [(stiff[self.row[a], None] * self.J[a])[:, :, None] * self.J[b][:, None, :]]
+        for corners in self.alike:
+            J = self.J[corners]
+            along.append(np.einsum("r,ria,rjb->ijab", stiff[self.row[corners[:, 0]]], J, J).reshape(-1, self.dim, self.dim))
         right = self.jacobian.gathered(self.J * (stiff * self.C)[self.row, None])
-        blocks = np.concatenate((along, sides, sides, -sides, -sides, mass))[self.free]
+        blocks = np.concatenate((*along, sides, sides, -sides, -sides, mass))[self.free]
         out = np.zeros_like(right)
         some = self.wide
         wide = WideRows(len(self.inside), self.row[some], self.number[self.who[some]], self.J[some], stiff) if len(some) else None
