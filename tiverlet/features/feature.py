@@ -258,6 +258,11 @@ class Acceleration(Feature):
         """Where it is pairwise: declare its neighbour list and return it, None if it has none."""
 
     @ti.func
+    def acts_on(self, i):
+        """Where it reads velocities: whether it acts on particle i."""
+        return True
+
+    @ti.func
     def acceleration(self, i, x, v, t):
         """Acceleration [m/s^2] of particle i at position x [m] with velocity v [m/s] at time t [s]."""
         return 0.0 * x

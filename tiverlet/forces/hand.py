@@ -77,10 +77,15 @@ class Hand(Acceleration):
         self.dev.state = scene.state
 
     @ti.func
+    def acts_on(self, i):
+        """One particle."""
+        return i == self.dev.particle[None]
+
+    @ti.func
     def acceleration(self, i, x, v, t):
         """-rate^2 (x - target) - 2 rate v."""
         out, rate = 0 * x, self.dev.rate[None]
-        if i == self.dev.particle[None]:
+        if self.acts_on(i):
             out = -rate * (rate * self.dev.state.nearest(x - self.dev.target[None]) + 2 * v)
         return out
 
@@ -88,6 +93,6 @@ class Hand(Acceleration):
     def potential(self, i, x):
         """rate^2 |x - target|^2 / 2."""
         out, r = 0 * x[0], self.dev.state.nearest(x - self.dev.target[None])
-        if i == self.dev.particle[None]:
+        if self.acts_on(i):
             out = self.dev.rate[None] ** 2 * r.dot(r) / 2
         return out

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 BLOCKS = 64  # partial sums: their number is fixed, so the total has the same bits on any number of threads; squared on a GPU
 TURNS = (0, 26, 41)  # degrees, for nothing, BENT and FAR
-STIFF = 4.0  # (omega h)^2 beyond which Verlet diverges, or turns velocities by less than a third of a turn where it is more
+STIFF = 4.0  # (omega h)^2 beyond which Verlet diverges; velocities that are to turn by as much turn far too slowly
 
 STEPPED, STARTED, UNSTEPPED = range(3)  # how a state came about: by a substep, by the first one after a start, by none yet
 BARE = 3  # added to one of these: nothing but energy is asked for

@@ -231,7 +231,8 @@ def _launch(world: Any, first: int) -> None:
         memory.write_from(state.spin.s, first, h * state.spin.from_rates(world._particles.spin)[first:])
     share = max(decay(sum(f.rate for f in integrator.forces.drags), h)[0], NOTHING)
     fields = [state.d, *([integrator.free] if integrator.uses_velocity else [])]
-    d, least = h * want, np.inf
+    d = best = h * want
+    least = np.inf
     for _ in range(LAUNCHES if integrator.uses_velocity else 1):
         for field in fields:
             memory.write_from(field, first, d)
@@ -240,7 +241,8 @@ def _launch(world: Any, first: int) -> None:
         lack[held] = 0.0
         most = np.abs(lack).max(initial=0.0)
         if not most < least:
+            d = best
             break
-        d, least = d + h / share * lack, most
+        best, least, d = d, most, d + h / share * lack
     for field in fields:
         memory.write_from(field, first, d)

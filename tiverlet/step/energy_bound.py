@@ -69,7 +69,7 @@ def missed(world: "World", report: StepReport, energy: float | None) -> float:
     if energy is None:
         return 0.0
     clock, sheet = world._clock, world._runner.sheet
-    if all(isinstance(f, Periodic) or (isinstance(f, Acceleration) and not f.decays) for f in world.features):
+    if all(isinstance(f, Periodic) or (isinstance(f, Acceleration) and not brakes(f)) for f in world.features):
         change = abs(report.energy - energy)
     else:
         change = report.energy - max(energy, energy if clock.bound is None else clock.bound)
@@ -78,6 +78,11 @@ def missed(world: "World", report: StepReport, energy: float | None) -> float:
     kinetic = max(clock.kinetic, sheet.item(KINETIC))
     allowed = MISSED * max(0.0, kinetic - _drift(world)) + DIGITS * (abs(report.energy) + kinetic)
     return change / allowed if allowed else 0.0
+
+
+def brakes(force: Acceleration) -> bool:
+    """Whether it may take energy."""
+    return force.decays or force.uses_velocity
 
 
 def _drift(world: "World") -> float:
