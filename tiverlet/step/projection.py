@@ -24,7 +24,7 @@ from ..constraints.core.scalar import Scalar
 from ..neighbours.queries import between
 from ..particles import LARGEST
 from ..solvers.corners import bodies_of
-from .block_matrix import STEPS, WIDEST, BlockMatrix, WideRows
+from .block_matrix import WIDEST, BlockMatrix, WideRows, summed
 from .integrator import h2_effective_of
 from .jacobian import Jacobian
 from .rigid_rows import RigidRows, left_out, rigid_rows
@@ -40,7 +40,8 @@ PRODUCTS = 1e9  # of numbers: some seconds, after which the rest is left as it i
 BEGIN, HARDEST, LEAST = 1e-3, 10.0, 1e-9  # mu of the first, and of the last try; the least
 FINE, STALLED = 1e-5, 0.05  # mu from which on a step has to take out as much of what is stored: what cannot be met stays
 SLIGHT = 0.01  # of the kinetic energy: what violations may become where contacts are in the way
-SLIGHTEST = 1e-3  # of the kinetic energy of what they tie: what violations, and moves in the next substep, may make of it
+SLIGHTEST = 1e-3  # of the kinetic energy inside of bodies: what violations, and moves in the next substep, may make of it
+LOOKS = 8  # steps of conjugate gradients, to see what a solver would move
 LEFT = 0.01  # of what violations store: what may be left of it in the shorter substep
 DONE = 1e-6  # of its size: a violation that is none
 TURNS = 16  # with walls, at most: a link that stands on one halves its violation in each
@@ -78,9 +79,8 @@ def project(runner: "Runner", h: float, longest: float) -> bool | None:
     v = kept.astype(np.float64)
     n = len(x)
     # Where the solver converges, it moves what is left at once in the next substep, and that flies on.
-    steps = (slots.system and slots.system.steps or STEPS) if slots.converges or slots.exact else 0
-    tied = np.unique(start.who)
-    slight = SLIGHTEST * float((start.mass[tied, None] * v[tied] ** 2).sum()) * h * h
+    steps = LOOKS if slots.converges or slots.exact else 0
+    slight = SLIGHTEST * 2 * h * h * start.kinetic(v[:n])
     still = (undone != 0) & (start.theta > FIRM)
     v[:n] += rows.jacobian.solve(-rows.jacobian.rates(v[:n]) * still, still)
     energy, overlap = seen_before(runner)
@@ -290,6 +290,13 @@ class Rows:
     def _rigid(self, alpha: np.ndarray, reach: np.ndarray) -> np.ndarray:
         """theta, by what a force of 1 N moves in a substep."""
         return _over(reach * reach, reach * reach + alpha * alpha)
+
+    def kinetic(self, v: np.ndarray) -> float:
+        """The kinetic energy [J] of particles at velocities v, as they move in their bodies, of what constraints tie together."""
+        _, body = bodies_of(self.m, self.row, self.who, self.w)
+        mass = np.bincount(body, self.mass, minlength=self.m + 1)[:, None]
+        mean = summed(self.mass[:, None] * v, body, self.m + 1) * _over(np.ones_like(mass), mass)
+        return float((self.mass[:, None] * (v - mean[body]) ** 2)[body < self.m].sum()) / 2
 
     def work(self, steps: int) -> float:
         """m p^2 of the moves p by which a solver of so many steps, 0 for none, meets the rows."""
