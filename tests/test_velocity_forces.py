@@ -220,15 +220,16 @@ def test_what_feeds_motion_is_flagged_and_stays_finite(world):
     assert w.last.flags == {"stiff-force"} and np.isfinite(w.velocity).all()
 
 
-def test_a_force_that_is_not_defined_at_rest_is_not_asked_there_in_vain(world):
-    # -v / |v| is NaN at rest. Here the velocity after half a substep of the force is 0: what is not known there is left out.
+def test_a_force_that_is_not_defined_at_rest_goes_back_and_forth_at_most(world):
+    # -v / |v| is NaN at rest, where it brings v = 1 in one substep of 1 s. What is not known there is left out: that can end in
+    # going back and forth, see the page of forces, but within the 0.5 m in which it stops, and in numbers.
     @ti.func
     def bare(x, v):
         return -v / v.norm()
 
     w = world(tv.Particles([[0.0, 0.0]], velocity=(1.0, 0.0)), [tv.Force(bare)], substeps=1, precision="f64")
-    w.run(2.0, dt=1.0)
-    assert w.position[0] == pytest.approx([0.0, 0.0], abs=1e-12) and not w.last.flags
+    places = np.array([w.step(1.0) and w.position[0] for _ in range(8)])
+    assert (np.abs(places) <= [0.5 + 1e-12, 0.0]).all() and not w.last.flags
 
 
 def test_a_hand_that_holds_still_is_not_stiff(world):
