@@ -214,7 +214,7 @@ class Rows:
         begin = np.cumsum(self.arity) - self.arity
         wide = self.arity * self.dim > 2 * WIDEST  # no two levels hold such a row
         rows = [r for r in self._alike() if len(r) > 1 and not wide[r[0]]]
-        self.alike = [begin[r, None] + np.arange(self.arity[r[0]]) for r in rows]  # corners of each
+        self.alike = [begin[r, None] + np.arange(int(self.arity[r[0]])) for r in rows]  # corners of each
         apart = wide.copy()
         apart[np.concatenate([np.zeros(0, dtype=np.int64), *rows])] = True
         width = np.where(apart[self.row], 0, np.repeat(self.arity, self.arity))  # of the row of each corner
