@@ -49,9 +49,8 @@ def test_the_article_gains_no_energy_under_auto(taichi):
     energies = [world.step(1 / 60).energy for _ in range(90)]
     for w in (start, world):
         w.close()
-    assert (
-        all(b - a < 1e-3 * energies[0] for a, b in zip(energies, energies[1:], strict=False)) and energies[-1] < 0.4 * energies[0]
-    )
+    assert all(b - a < 1e-3 * energies[0] for a, b in zip(energies, energies[1:], strict=False))
+    assert energies[-1] < 0.4 * energies[0]
 
 
 def test_pay_finds_that_features_only_add(printed):

@@ -50,7 +50,6 @@ class Diagnostics:
         self.contacts = step.contacts
         self.bits: Any = ti.u32 if step.real == ti.f32 else ti.u64
         self.exponent = 0x7F800000 if step.real == ti.f32 else 0x7FF0000000000000  # of what is not finite
-        self.probes = [f for f in step.integrator.forces.all if not f.uniform]
         self.pair_forces = step.pair_forces
         self.measured = [f for f in self.pair_forces if f.potential_arity]
         self.width = 9 if self.pair_forces else 7
@@ -118,10 +117,7 @@ class Diagnostics:
         d = self.state.d[i]
         dd, out = d.dot(d), ti.cast(0, ti.f64)
         if dd > 0 and self.state.w.positive(i):
-            change = 0 * d
-            for f in ti.static(self.probes):
-                change += f.acceleration(i, x, d / h, t) - f.acceleration(i, x - d, d / h, t)
-            out = -change.dot(d) / dd * h * h
+            out = -self.step.integrator.forces.change_along(i, x, d, h, t).dot(d) / dd * h * h
             if ti.static(self.step.integrator.uses_velocity):
                 out = ti.max(out, ti.cast(self.step.integrator.forces.velocity_stiffness(i, x, d / h, t, h), ti.f64))
         return out
@@ -166,7 +162,7 @@ class Diagnostics:
                 energy, kinetic = self.energy(i, x, scale, back)
                 figures[0] += energy
                 figures[6] += kinetic
-                if ti.static(len(self.probes) > 0):
+                if ti.static(len(self.step.integrator.forces.uneven) > 0):
                     if begin == 0 and bare == 0:
                         figures[3] = ti.max(figures[3], self.stiffness(i, x, h, t))
                 if ti.static(len(self.pair_forces) > 0):

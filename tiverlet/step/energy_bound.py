@@ -69,10 +69,10 @@ def missed(world: "World", report: StepReport, energy: float | None) -> float:
     if energy is None:
         return 0.0
     clock, sheet = world._clock, world._runner.sheet
-    if all(isinstance(f, Periodic) or (isinstance(f, Acceleration) and not brakes(f)) for f in world.features):
+    if all(isinstance(f, Periodic) or (isinstance(f, Acceleration) and not _brakes(f)) for f in world.features):
         change = abs(report.energy - energy)
     else:
-        change = report.energy - max(energy, energy if clock.bound is None else clock.bound)
+        change = report.energy - (energy if clock.bound is None else max(energy, clock.bound))
     if not change > 0 or works(world):
         return 0.0
     kinetic = max(clock.kinetic, sheet.item(KINETIC))
@@ -80,7 +80,7 @@ def missed(world: "World", report: StepReport, energy: float | None) -> float:
     return change / allowed if allowed else 0.0
 
 
-def brakes(force: Acceleration) -> bool:
+def _brakes(force: Acceleration) -> bool:
     """Whether it may take energy."""
     return force.decays or force.uses_velocity
 

@@ -25,11 +25,10 @@ class ForceStiffness:
 
     def __init__(self, step: "Step"):
         self.n, self.state, self.real = step.scene.count, step.state, step.real
-        self.fields = [f for f in step.integrator.forces.all if not f.uniform]
-        self.pair_forces = step.pair_forces
+        self.forces, self.pair_forces = step.integrator.forces, step.pair_forces
 
     def __bool__(self) -> bool:
-        return bool(self.fields or self.pair_forces)
+        return bool(self.forces.uneven or self.pair_forces)
 
     def __call__(self, h: float, time: float) -> float:
         """After a substep h [s] that ended at a time [s]."""
@@ -49,10 +48,8 @@ class ForceStiffness:
     @ti.func
     def of(self, i, h, t):
         """omega^2 of particle i."""
-        d, x = self.state.d[i], self.state.place(i)
-        change, dd = 0 * d, d.norm_sqr()
-        for f in ti.static(self.fields):
-            change += f.acceleration(i, x, d / h, t) - f.acceleration(i, x - d, d / h, t)
+        d = self.state.d[i]
+        dd, change = d.norm_sqr(), self.forces.change_along(i, self.state.place(i), d, h, t)
         out = ti.select(dd > 0, change.norm() / ti.sqrt(dd), 0 * dd)
         for f in ti.static(self.pair_forces):
             out += f.stiffness(i)

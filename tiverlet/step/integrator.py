@@ -29,6 +29,15 @@ class Forces:
         self.use_velocity = any(f.uses_velocity for f in accelerations)
         self.positional, self.velocity_dependent = ([f for f in self.others if f.uses_velocity is it] for it in (False, True))
         self.drags = [f for f in accelerations if f.decays]
+        self.uneven = [f for f in self.all if not f.uniform]
+
+    @ti.func
+    def change_along(self, i, x, d, h, t):
+        """How much what accelerates particle i has changed along its last move d, in a substep h."""
+        change = 0 * d
+        for f in ti.static(self.uneven):
+            change += f.acceleration(i, x, d / h, t) - f.acceleration(i, x - d, d / h, t)
+        return change
 
     @ti.func
     def pull(self, t):
