@@ -80,7 +80,7 @@ class Clock:
     def exceeds(self, energy: float, kinetic: float, overlap: float) -> bool:
         """Take note of the energy at the end of a frame, and of its kinetic part. Returns whether it may be too much."""
         if self.bound is None:
-            self.bound, self.kinetic = energy if self.energy is None else max(self.energy, energy), 0.0
+            self.bound, self.kinetic = energy if self.energy is None else self.energy, 0.0  # of the state that it set out from
         elif self.bound == CHANGED:
             self.bound, self.kinetic, self.parting = energy, 0.0, self.parting or overlap > SQUEEZED
         self.kinetic = max(self.kinetic, kinetic)

@@ -10,7 +10,7 @@ from ..device.interrupts import whole
 from ..device.patches.compiler import CachedLaunch
 from ..particles.spin import moments
 from . import high_order, initial_violation
-from .clock import Clock
+from .clock import PARTED, Clock
 from .diagnostics import BARE, STARTED, STEPPED, UNSTEPPED
 from .frames import Frames
 from .integrator import FREE, decay
@@ -98,7 +98,7 @@ class Runner:
         if self.prepare(substep, iterations):
             placed = self.clock.first_moved is not None
             if self.clock.energy is None:
-                self.clock.bound, self.clock.parting = None, self.clock.parting or placed
+                self.clock.bound = None
                 self.look(bare=not placed)
                 if self.sleep:
                     with self.memory.compiler():
@@ -158,7 +158,7 @@ class Runner:
 
     def looked(self, energy: float, overlap: float) -> None:
         """The second half of begin(), with the energy [J] and the overlap of the state that the frame starts from."""
-        self.clock.energy = energy
+        self.clock.energy, self.clock.parting = energy, overlap > PARTED
         if overlap > 0 and self.clock.first_moved is not None:
             with self.memory.compiler():
                 self.ease(self.clock.first_moved)

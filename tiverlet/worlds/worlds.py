@@ -219,8 +219,9 @@ class Worlds:
             energy, overlap = self._look(unknown)
             clocks.energy[unknown], clocks.known[unknown] = energy, True
             clocks.bound[unknown] = np.nan
-            clocks.parting[unknown] |= clocks.first_moved[unknown] != NONE
-            for k in unknown[(overlap > 0) & (clocks.first_moved[unknown] != NONE)]:
+            placed = clocks.first_moved[unknown] != NONE
+            clocks.parting[unknown] = np.where(placed, overlap > PARTED, clocks.parting[unknown])
+            for k in unknown[(overlap > 0) & placed]:
                 with self._at(k), runner.memory.compiler():
                     runner.ease(int(clocks.first_moved[k]))
         for contact in runner.step.contacts:
@@ -367,7 +368,8 @@ class Worlds:
         clocks, gain = self._clocks, np.empty_like(energy)
         for k in range(energy.shape[1]):
             unknown, changed = np.isnan(clocks.bound), clocks.bound == CHANGED
-            clocks.bound = np.where(unknown, np.fmax(before, energy[:, k]), np.where(changed, energy[:, k], clocks.bound))
+            began = np.where(np.isnan(before), energy[:, k], before)
+            clocks.bound = np.where(unknown, began, np.where(changed, energy[:, k], clocks.bound))
             clocks.parting |= changed & (overlap[:, k] > SQUEEZED)
             clocks.kinetic = np.maximum(np.where(unknown | changed, 0.0, clocks.kinetic), kinetic[:, k])
             clocks.bound = np.where(clocks.parting, np.maximum(clocks.bound, energy[:, k]), clocks.bound)
