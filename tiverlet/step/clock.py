@@ -16,12 +16,19 @@ SHARE = 0.1  # of the largest kinetic energy: how much more a scene may have
 DIGITS = 1e-5  # of the energy
 CHANGED = -np.inf  # the bound of a scene on which something works in the coming frame: what it had before does not count
 SQUEEZED = 0.1  # overlap [radii] from which what something has pressed into each other pushes itself apart, too
+MET = 1e-6  # of its size: a violation that is none, but for rounding
 PARTED = 0.01  # overlap [radii] down to which what was placed into each other pushes itself apart
 
 
 def room(bound: Any, kinetic: Any, energy: Any) -> Any:
     """What a passive scene can have [J], see energy_bound.py. Numbers or arrays."""
     return bound + SHARE * kinetic + DIGITS * abs(energy)
+
+
+def slack(inv_mass: np.ndarray, extent: np.ndarray, h: Any) -> Any:
+    """What violations with which a scene begins may become [J], for none is stored: initial_violation.py leaves as much as MET of
+    its size, and that is gone in a substep of h [s]. extent: (..., dim) [m]. Numbers or arrays."""
+    return (MET * np.linalg.norm(extent, axis=-1) / h) ** 2 * (1 / inv_mass[inv_mass > 0]).sum() / 2
 
 
 @dataclass
@@ -77,10 +84,14 @@ class Clock:
             raise ValueError("The state is not one of this scene: it has other fields.")
         return Clock(**{own: named[name] for name, own in NAMES.items()})
 
+    def set_out(self, energy: float, slack: float) -> None:
+        """Note the energy of a scene that begins, and what it may get by itself."""
+        self.bound, self.kinetic = energy + slack, 0.0
+
     def exceeds(self, energy: float, kinetic: float, overlap: float) -> bool:
         """Take note of the energy at the end of a frame, and of its kinetic part. Returns whether it may be too much."""
         if self.bound is None:
-            self.bound, self.kinetic = energy if self.energy is None else self.energy, 0.0  # of the state that it set out from
+            self.bound, self.kinetic = energy if self.energy is None else max(self.energy, energy), 0.0
         elif self.bound == CHANGED:
             self.bound, self.kinetic, self.parting = energy, 0.0, self.parting or overlap > SQUEEZED
         self.kinetic = max(self.kinetic, kinetic)

@@ -28,11 +28,11 @@ from ..device import ti
 from ..features.feature import Batch, Feature, Scene
 from ..neighbours.queries import between
 from ..solvers.corners import bodies_of, corners_of
+from .clock import MET
 from .jacobian import Jacobian
 
 SEEN = 1e-3  # of its size: a violation from where on the report says that it was taken out
 ENOUGH = 0.2  # of its size: a violation after which loads are others
-DONE = 1e-6  # of its size: a violation that is none, but for rounding
 ROUNDING = {ti.f32: 8 * 2.0**-24, ti.f64: 8 * 2.0**-53}  # of coordinates: what lengths lose, and the Newton steps with them
 NEWTON = 60  # steps at most
 STEPS, LEFT = 1000, 1e-8  # of conjugate gradients in each, at most; what of r . z they may leave
@@ -135,7 +135,7 @@ def remove(
 def _off(batch: Scalar, x: np.ndarray) -> bool:
     """Whether any of its constraints is violated by more than rounding: what is asked of every scene, so it is quick."""
     C = batch.violation(x)
-    return bool(((np.abs(C) if batch.side == 0 else C * batch.side) > DONE * np.maximum(np.abs(batch.goal), DONE)).any())
+    return bool(((np.abs(C) if batch.side == 0 else C * batch.side) > MET * np.maximum(np.abs(batch.goal), MET)).any())
 
 
 def _borne(scene: Scene, batches: list[Scalar], x: np.ndarray, others: np.ndarray, part: float) -> list[np.ndarray]:
@@ -338,7 +338,7 @@ class Rows:
         """Which are violated by more than rounding: of coordinates X it changes C by about X |grad C|, (rows,)."""
         slope = np.sqrt(np.bincount(self.row, (self.J**2).sum(axis=1), minlength=len(self.C)))
         X = np.abs(self.x[self.who[self.first]]).max(axis=1, initial=0.0)
-        return np.abs(self.C) * self.close > DONE + self.rounding * X * slope * self.close
+        return np.abs(self.C) * self.close > MET + self.rounding * X * slope * self.close
 
     @property
     def legs(self) -> np.ndarray:

@@ -10,8 +10,8 @@ from ..device.interrupts import whole
 from ..device.patches.compiler import CachedLaunch
 from ..particles.spin import moments
 from . import high_order, initial_violation
-from .clock import PARTED, Clock
-from .diagnostics import BARE, STARTED, STEPPED, UNSTEPPED
+from .clock import Clock, slack
+from .diagnostics import BARE, EXTENT, STARTED, STEPPED, UNSTEPPED
 from .frames import Frames
 from .integrator import FREE, decay
 from .launcher import Launcher
@@ -96,21 +96,24 @@ class Runner:
         """Begin a frame with substeps of this length [s]. Where it differs from the last one, displacements stand for other
         velocities: they are turned into velocities first, and the frame is a start."""
         if self.prepare(substep, iterations):
-            placed = self.clock.first_moved is not None
-            if self.clock.energy is None:
-                self.clock.bound = None
+            clock, placed = self.clock, self.clock.first_moved is not None
+            if clock.energy is None:
+                clock.bound = None
                 self.look(bare=not placed)
                 if self.sleep:
                     with self.memory.compiler():
-                        self.sleep.compile(self.clock)
+                        self.sleep.compile(clock)
                 if self.asks_velocities:  # compile its kernel now, so that nobody waits for it later
                     self._velocities()
                     self.asks_velocities = False
                 if placed:
                     report = self.report()
+                    if not clock.tick:
+                        extent = self._data[EXTENT : EXTENT + self.step.dim]
+                        clock.set_out(report.energy, slack(self.scene.inv_mass, extent, clock.h))
                     self.looked(report.energy, report.overlap)
                 else:
-                    self.clock.energy = float(self._data[0])
+                    clock.energy = float(self._data[0])
             self.placed()
 
     def prepare(self, substep: float, iterations: int) -> bool:
@@ -158,7 +161,7 @@ class Runner:
 
     def looked(self, energy: float, overlap: float) -> None:
         """The second half of begin(), with the energy [J] and the overlap of the state that the frame starts from."""
-        self.clock.energy, self.clock.parting = energy, overlap > PARTED
+        self.clock.energy, self.clock.parting = energy, overlap > 0
         if overlap > 0 and self.clock.first_moved is not None:
             with self.memory.compiler():
                 self.ease(self.clock.first_moved)

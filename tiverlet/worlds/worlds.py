@@ -19,8 +19,20 @@ from ..features.read_only import assign_whole, read_only
 from ..particles import in_range
 from ..step import checkpoint, energy_bound
 from ..step import frames as kernel
-from ..step.clock import CHANGED, PARTED, SQUEEZED, room
-from ..step.diagnostics import ENERGY, EXTENT, KINETIC, OVERLAP, REACH, STARTED, STEPPED, STIFFNESS, TURNS, UNSTEPPED, risks
+from ..step.clock import CHANGED, PARTED, SQUEEZED, room, slack
+from ..step.diagnostics import (
+    ENERGY,
+    EXTENT,
+    KINETIC,
+    OVERLAP,
+    REACH,
+    STARTED,
+    STEPPED,
+    STIFFNESS,
+    TURNS,
+    UNSTEPPED,
+    risks,
+)
 from ..step.integrator import FREE
 from ..world import World
 from .clocks import NONE, Clocks
@@ -216,11 +228,15 @@ class Worlds:
                     moved[k], released[k], jumped[k] = runner.moved, runner.released, runner.jumped
         unknown = some[~clocks.known[some]]
         if len(unknown):
-            energy, overlap = self._look(unknown)
+            figures = self._look(unknown)
+            energy, overlap = figures[:, ENERGY], figures[:, OVERLAP]
             clocks.energy[unknown], clocks.known[unknown] = energy, True
-            clocks.bound[unknown] = np.nan
             placed = clocks.first_moved[unknown] != NONE
-            clocks.parting[unknown] = np.where(placed, overlap > PARTED, clocks.parting[unknown])
+            first = placed & (clocks.tick[unknown] == 0)
+            more = slack(runner.scene.inv_mass, figures[:, EXTENT : EXTENT + world.particles.dim], h)
+            clocks.bound[unknown] = np.where(first, energy + more, np.nan)
+            clocks.kinetic[unknown] = np.where(first, 0.0, clocks.kinetic[unknown])
+            clocks.parting[unknown] = np.where(placed, overlap > 0, clocks.parting[unknown])
             for k in unknown[(overlap > 0) & placed]:
                 with self._at(k), runner.memory.compiler():
                     runner.ease(int(clocks.first_moved[k]))
@@ -230,8 +246,8 @@ class Worlds:
         self._start = self._start or _Start(self)
         return moved, released
 
-    def _look(self, some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Energies [J] and overlaps of some, in the state in which they are."""
+    def _look(self, some: np.ndarray) -> np.ndarray:
+        """The figures of some, in the state in which they are, (k, FIGURES)."""
         clocks = self._clocks
         origin = np.where(clocks.d_is_velocity, UNSTEPPED, np.where(clocks.started, STARTED, STEPPED))
         sheets = kernel.sheets(
@@ -241,7 +257,7 @@ class Worlds:
         plan[kernel.FRAMES] = plan[kernel.KEEPS] = 1
         figures = np.zeros((len(self), 1, kernel.FIGURES))
         self._go(plan, some, sheets, np.zeros((len(self), kernel.DATES)), figures, np.zeros(1))
-        return figures[some, 0, 0], figures[some, 0, 2]
+        return figures[some, 0]
 
     def _upload(self) -> None:
         """Bring knobs to the device: those that were assigned for all, and those that were set for some."""
@@ -368,8 +384,7 @@ class Worlds:
         clocks, gain = self._clocks, np.empty_like(energy)
         for k in range(energy.shape[1]):
             unknown, changed = np.isnan(clocks.bound), clocks.bound == CHANGED
-            began = np.where(np.isnan(before), energy[:, k], before)
-            clocks.bound = np.where(unknown, began, np.where(changed, energy[:, k], clocks.bound))
+            clocks.bound = np.where(unknown, np.fmax(before, energy[:, k]), np.where(changed, energy[:, k], clocks.bound))
             clocks.parting |= changed & (overlap[:, k] > SQUEEZED)
             clocks.kinetic = np.maximum(np.where(unknown | changed, 0.0, clocks.kinetic), kinetic[:, k])
             clocks.bound = np.where(clocks.parting, np.maximum(clocks.bound, energy[:, k]), clocks.bound)
