@@ -17,6 +17,7 @@ from ..neighbours.neighbour_list import PairData
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
 from .events import EventLog
+from .exclusions import excluded_pairs
 from .force_share import ForceShare
 from .known_loads import KnownLoads
 from .mass_splitting import MassSplitting, lesser
@@ -60,7 +61,7 @@ class Contact(PairContact):
     then, see velocity_projection.py.
 
     Particles that are in the same place part in a direction made from their indices, another one for each pair. Linked particles
-    (Distance, Rope, Spacer) do not touch.
+    (Distance, Rope, Spacer) do not touch, nor do those that a chain of links holds closer than they reach, see exclusions.py.
 
     Friction wants back the slip s of a pair, up to friction times the overlap: what a pair has moved across its normal since it
     touched, kept as long as it touches (Cundall and Strack 1979). Restitution gives the pair, from the moment on when it meets,
@@ -136,8 +137,7 @@ class Contact(PairContact):
     def join(self, scene: Scene, batches: list[Batch], team: Team) -> NeighbourSearch:
         """Declare the fields, among them the neighbour list's, which is returned."""
         dim, dev = scene.particles.dim, self.dev
-        pairs = [b.excluded_pairs(b.start) for b in batches]
-        linked = np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=np.int32)
+        linked = excluded_pairs(batches, scene.particles.radius)
         self.enter(scene)
         dev.move = scene.memory.field("Contact.move", scene.count, width=dim)
         self.table.bind(scene)

@@ -6,6 +6,7 @@ import numpy as np
 
 from ..features.feature import Batch, Scene
 from ..particles import State
+from .exclusions import excluded_pairs
 
 FEW = 1_000_000  # pairs that are looked at one by one
 MANY = 20_000  # particles for which it is not worth the time
@@ -38,7 +39,7 @@ def overlapping(scene: Scene, batches: list[Batch], x: np.ndarray, first: int = 
     pairs = number[np.stack([i, j], axis=1)[near & (free[i] | free[j])]]
     if not len(pairs):
         return False
-    linked = np.concatenate([*(b.excluded_pairs(b.start) for b in batches), pairs[:0]])
+    linked = excluded_pairs(batches, scene.particles.radius)
     some, without = (np.sort(p, axis=1).astype(np.int64) @ [count, 1] for p in (pairs, linked))
     return not np.isin(some, without).all()
 

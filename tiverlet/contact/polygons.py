@@ -16,6 +16,7 @@ from ..geometry.ordered import median
 from ..neighbours.neighbour_list import PairData
 from ..neighbours.neighbour_search import NeighbourSearch
 from ..particles import Particles
+from .exclusions import excluded_pairs
 from .force_share import ForceShare
 from .loops import checked, flat, laid, refuse_deep
 from .pair_contact import PairContact
@@ -176,8 +177,7 @@ class Polygons(PairContact):
         if dev.has_restitution:
             dev.restitution = PolygonRestitution(scene, dev.geometry, self.table)
             dev.hit = dev.restitution.hit
-        pairs = [f.excluded_pairs(f.start) for f in batches]
-        linked = np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=np.int32)
+        linked = excluded_pairs(batches, scene.particles.radius)
         pair_data = [
             *dev.geometry.carried,
             *([dev.slip] if dev.has_friction else []),

@@ -406,6 +406,11 @@ class Batch(Feature):
         """Pairs of particles that may overlap, (k, 2), because this batch says where they are to each other."""
         return self.members.pairs()
 
+    def ties(self) -> tuple[np.ndarray, np.ndarray]:
+        """Pairs of particles that it keeps from getting further apart than they were at the start, (k, 2), and how far that is
+        [m], (k,)."""
+        return np.zeros((0, 2), dtype=np.int32), np.zeros(0)
+
     def passes(self, scene: Scene) -> Any:
         """Declare its fields, and make its `dev`: Passes, which have what a substep does with each constraint."""
         raise NotImplementedError

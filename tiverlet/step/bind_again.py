@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..constraints.core.anchored import refuse_held_twice
+from ..contact.exclusions import excluded_pairs
 from ..device.again import Again, Differs
 from ..features.extending import extended
 from ..features.feature import Batch, Feature
@@ -77,7 +78,7 @@ def bound_again(
                 f.built()
         if not (memory.holds(again.longest) and scene.slots.exact == exact and _structure(scene, bound) == structure):
             return None
-        linked = np.concatenate([b.excluded_pairs(b.start) for b in batches])
+        linked = excluded_pairs(batches, now.radius)
         if runner.search and not runner.search.can_exclude(linked):
             return None
         attributes = [(one, old, dict(vars(one))) for one, old in zip(objects, before, strict=True)]

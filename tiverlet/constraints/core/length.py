@@ -30,7 +30,7 @@ class Length(Quantity):
     Two particles in the same place have no direction between them; +x stands in for it.
     """
 
-    arity = 2
+    arity, apart = 2, True
     exchangeable = ((0, 1),)
     ends = precise = True
 

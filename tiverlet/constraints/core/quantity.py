@@ -25,6 +25,7 @@ class Quantity:
     """
 
     arity = 0  # corners of each constraint; 0: as many as each needs
+    apart = False  # whether f is how far two particles are from each other
     exchangeable: tuple[tuple[int, ...], ...] = ()  # groups of corners that may swap
     unit: float | None = None  # what residuals are relative to; None: the rest value
     precise = False  # whether exactly() measures to all the digits that positions have

@@ -114,6 +114,12 @@ class Scalar(Batch):
         """All corners of a constraint may overlap, but of outlines only neighbours."""
         return self.quantity.pairs()
 
+    def ties(self) -> tuple[np.ndarray, np.ndarray]:
+        """Links and ropes of fixed length, as long as they are at the start."""
+        if not self.quantity.apart or self.side < 0 or self.driven or not self.count:
+            return super().ties()
+        return self.indices, self.rest_of(self.start.position)
+
     def values(self, x: np.ndarray) -> np.ndarray:
         """f of corners x (m, arity, dim), (m,); of outlines, of all positions (n, dim)."""
         return self.quantity.values(x)

@@ -1,0 +1,84 @@
+"""Pairs that contacts leave out because links hold them together."""
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+from tiverlet.contact.exclusions import FOLDED, _inside
+
+
+def nearest(links: np.ndarray, lengths: np.ndarray, radius: np.ndarray) -> set[tuple[int, int]]:
+    """Pairs whose shortest way along links is at most r_i + r_j, by Floyd and Warshall."""
+    n = len(radius)
+    way = np.full((n, n), np.inf)
+    for (i, j), length in zip(links, lengths, strict=True):
+        if length > FOLDED * min(radius[i], radius[j]):
+            way[i, j] = way[j, i] = min(way[i, j], length)
+    for k in range(n):
+        way = np.minimum(way, way[:, [k]] + way[[k], :])
+    return {(i, j) for i in range(n) for j in range(i + 1, n) if way[i, j] <= radius[i] + radius[j]}
+
+
+def test_chains_are_found_as_by_brute_force():
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        n, m = rng.integers(2, 14), rng.integers(0, 20)
+        links = rng.integers(0, n, (m, 2), dtype=np.int32)
+        links = links[links[:, 0] != links[:, 1]]
+        lengths, radius = rng.uniform(0, 1, len(links)), rng.uniform(0, 1, n) * rng.choice([0.1, 1, 3])
+        found, direct = (
+            set(map(tuple, _inside(links, lengths, radius).tolist())),
+            set(map(tuple, np.sort(links, axis=1).tolist())),
+        )
+        right = nearest(links, lengths, radius)
+        assert found - direct == right - direct and found <= right
+
+
+def swing(world, contact: bool, ball: float, bead: float, **settings):
+    """A ball on a level rope of 14 links of 1/7 m."""
+    rope = tv.shapes.rope((0, 3), (2, 3), points=15)
+    radius, mass = np.full(15, bead), np.full(15, 0.2)
+    radius[-1], mass[-1] = ball, 200.0
+    features = [tv.Gravity(9.81), tv.Distance(rope.links), *([tv.Contact()] if contact else [])]
+    return world(tv.Particles(rope.position, radius=radius, mass=mass, pinned=[0]), features, **settings)
+
+
+@pytest.mark.parametrize(("ball", "bead"), [(0.3, 0.04), (0.3, 0.15)])
+def test_a_ball_on_a_rope_swings_as_without_contacts(world, ball, bead):
+    # It covers the end of the rope, and beads of more than 1/7 m the next but one, which no contact could part.
+    for substeps in (20, "auto"):
+        there, without = (swing(world, contact, ball, bead, substeps=substeps) for contact in (True, False))
+        for _ in range(90):
+            report = there.step(1 / 60)
+            without.step(1 / 60)
+            assert not report.flags and not report.contacts
+        assert np.array_equal(there.position, without.position)
+
+
+def test_other_contacts_stay(world):
+    # Beads that begin in one place have no lengths yet, and links that push get longer: these pairs meet, and part.
+    x = np.array([[0.0, 0.0], [0.02, 0.0], [0.0, 0.02]])
+    for links in (tv.Distance([[0, 1], [1, 2]], rest=1.0), tv.Spacer([[0, 1], [1, 2]], 0.02)):
+        w = world(tv.Particles(x, radius=0.5), [links, tv.Contact()])
+        w.run(1.0)
+        assert np.linalg.norm(w.position[2] - w.position[0]) >= 0.99
+
+
+def test_edits_and_copies_leave_out_the_same(world):
+    # A rope is lengthened, a thick one comes and goes in place; a clone, which is built anew, goes on alike.
+    w = swing(world, True, 0.3, 0.04)
+    links = w.features[1]
+    w.run(0.2)
+    links.rest = 1.5 * links.rest
+    w.run(0.2)
+    rope = tv.shapes.rope((0, 5), (1, 5), points=5)
+    w.add(tv.Particles(rope.position, radius=0.3), extend={links: tv.Distance(rope.links + 15)})
+    assert not w.step(1 / 60).contacts
+    w.remove([17])  # its ends are free of each other now, and part
+    w.run(0.5)
+    assert np.linalg.norm(w.position[17] - w.position[16]) >= 0.59
+    other = w.clone()
+    for _ in range(20):
+        w.step(1 / 60)
+        other.step(1 / 60)
+    assert w.hash() == other.hash()
