@@ -111,6 +111,10 @@ class Path(Anchored):
                 stacklevel=3,
             )
 
+    def tangents(self, x: np.ndarray) -> np.ndarray:
+        """Along the curve, where it is nearest."""
+        return self.curve.tangent(self.curve.nearest(x))
+
     def start_offset(self, position: np.ndarray) -> np.ndarray:
         """C at the start."""
         return position[self.indices[:, 0]] - self.curve.at(self._start)

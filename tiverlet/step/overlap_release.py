@@ -19,8 +19,9 @@ import numpy as np
 
 from ..constraints.core.scalar import Scalar
 from ..contact.candidates import Candidates, DiscCandidates
+from .free_bodies import FreeBodies
 from .jacobian import Jacobian
-from .projection import Rows, matters, paid, seen, seen_before
+from .projection import Rows, given_back, matters, paid, seen, seen_before
 from .rigid_rows import rigid_rows
 from .solids import Solids
 
@@ -52,12 +53,17 @@ def release(runner: Any, h: float, longest: float, small: bool = False) -> bool:
         runner.look()
         pairs = contact.dev.geometry.candidates(x)
     jacobian = part(runner, pairs, solids, x, ratio)
-    more = seen(runner)[0]
-    if jacobian and more > energy:
-        d = memory.read(state.d)
-        v = d.astype(np.float64)
-        v[: len(x)] = paid(jacobian, v[: len(x)], state.get(memory) - x, more - energy)
+    if jacobian:
+        v, now = memory.read(state.d).astype(np.float64), state.get(memory)
+        stopped = np.zeros(len(x), dtype=bool)
+        stopped[jacobian.who[np.bincount(jacobian.row)[jacobian.row] == 1]] = True
+        bodies = FreeBodies(jacobian, now, stopped)
+        v[: len(x)], spun = bodies.spun(v[: len(x)], x, v[: len(x)])
         memory.write(state.d, v)
+        due = seen(runner)[0] - energy - given_back(runner, energy, spun)
+        if due > 0:
+            v[: len(x)] = paid(jacobian, v[: len(x)], bodies.unturned(now - x), due)
+            memory.write(state.d, v)
     return True
 
 

@@ -20,11 +20,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..constraints.core.anchored import Anchored
 from ..constraints.core.scalar import Scalar
 from ..neighbours.queries import between
 from ..particles import LARGEST
 from ..solvers.corners import bodies_of
 from .block_matrix import WIDEST, BlockMatrix, WideRows, summed
+from .clock import CHANGED
+from .free_bodies import FreeBodies
 from .integrator import h2_effective_of
 from .jacobian import Jacobian
 from .rigid_rows import RigidRows, left_out, rigid_rows
@@ -70,7 +73,8 @@ def project(runner: "Runner", h: float, longest: float) -> bool | None:
     batches += rigid_rows(runner.batches, w)
     if not batches:
         return True
-    start = Rows(batches, w, x, runner.scene.periodic)
+    rails = Rails(runner, x)
+    start = Rows(batches, w, x, runner.scene.periodic, rails)
     undone = start.undone(runner)
     if not matters(float(np.abs(undone * start.close).max(initial=0.0)), ratio):
         return ratio < FAR
@@ -84,12 +88,13 @@ def project(runner: "Runner", h: float, longest: float) -> bool | None:
     still = (undone != 0) & (start.theta > FIRM)
     v[:n] += rows.jacobian.solve(-rows.jacobian.rates(v[:n]) * still, still)
     energy, overlap = seen_before(runner)
-    enough = LEFT * ratio**2 * start.stored
+    enough, stopped = LEFT * ratio**2 * start.stored, np.zeros(n, dtype=bool)
     for _ in range(TURNS):
         state.put(memory, _newton(rows, enough, LEFT * ratio**2, steps, slight))
         sent = state.get(memory)
         runner.stop_at_walls(before)
         x = state.get(memory)
+        stopped |= (x != sent).any(axis=1)
         last, rows = rows, rows.at(x)  # what walls stop is lifted by the others
         if (x == sent).all() or rows.matrix.products > PRODUCTS:
             break
@@ -97,6 +102,9 @@ def project(runner: "Runner", h: float, longest: float) -> bool | None:
             rows = rows.held(last.wall, x - sent)
             if rows.stored <= enough:
                 break
+    stopped[rails.who] = True
+    bodies = FreeBodies(start.jacobian, x, stopped)
+    v[:n], spun = bodies.spun(v[:n], before, kept[:n])
     memory.write(state.d, v)
     more, deeper = seen(runner)
     if deeper > overlap or rows.stored > WORSE * start.stored:
@@ -105,8 +113,9 @@ def project(runner: "Runner", h: float, longest: float) -> bool | None:
         stake = _over(start.weight * undone**2, start.diagonal).sum() / (2 * h * h)
         kinetic = (start.mass[:, None] * kept[:n].astype(np.float64) ** 2).sum() / 2
         return None if stake > SLIGHT * kinetic else True
-    if more > energy:
-        v[:n] = paid(start.jacobian, v[:n], x - before, more - energy, rows.wall.any(axis=1))
+    due = more - energy - given_back(runner, energy, spun)
+    if due > 0:
+        v[:n] = paid(start.jacobian, v[:n], bodies.unturned(x - before), due, rows.wall.any(axis=1))
         memory.write(state.d, v)
     return True
 
@@ -126,6 +135,32 @@ def _newton(rows: "Rows", enough: float, share: float, steps: int, slight: float
         if near or stalled or rows.worst <= DONE or mu > HARDEST or rows.matrix.products > PRODUCTS:
             break
     return rows.x
+
+
+class Rails:
+    """Rigid wires: the directions in which beads can move, which no row here knows. who: (k,) particles."""
+
+    def __init__(self, runner: "Runner", x: np.ndarray):
+        wires = [b for b in runner.batches if isinstance(b, Anchored) and not b.drives and (b.compliance == 0).any()]
+        rigid = [b.compliance == 0 for b in wires]
+        self.who = np.concatenate(
+            [np.zeros(0, dtype=np.int64), *(b.indices[some, 0] for b, some in zip(wires, rigid, strict=True))]
+        )
+        along = [b.tangents(x[b.indices[:, 0]])[some] for b, some in zip(wires, rigid, strict=True)]
+        self.along = np.concatenate([np.zeros((0, x.shape[1])), *along])
+
+    def moves(self, moves: np.ndarray) -> np.ndarray:
+        """Moves (n, dim), of beads along their wires."""
+        out = moves.copy()
+        out[self.who] = (moves[self.who] * self.along).sum(axis=1)[:, None] * self.along
+        return out
+
+    def across(self, n: int) -> np.ndarray:
+        """For each of n particles the projection on what is across its wire, (n, dim, dim)."""
+        dim = self.along.shape[1]
+        out = np.zeros((n, dim, dim))
+        out[self.who] = np.eye(dim) - self.along[:, :, None] * self.along[:, None, :]
+        return out
 
 
 def matters(violation: float, ratio: float) -> bool:
@@ -173,7 +208,12 @@ class Rows:
     theta: Any = 1.0  # how rigid they are
     weight: Any = 1.0  # the same as passes see it, which split masses
 
-    def __init__(self, batches: list[Scalar | RigidRows], w: np.ndarray, x: np.ndarray, box: Any = None):
+    rails: Any = None  # see Rails
+
+    def __init__(
+        self, batches: list[Scalar | RigidRows], w: np.ndarray, x: np.ndarray, box: Any = None, rails: Rails | None = None
+    ):  # fmt: skip
+        self.rails = rails if rails and len(rails.who) else None
         self.batches, self.w, self.n, self.dim = batches, w, *x.shape
         self.mass = _over(np.ones_like(w), w)  # 0 of what cannot move
         self.box = box  # the Periodic of the world
@@ -200,7 +240,8 @@ class Rows:
     def _measure(self, x: np.ndarray) -> None:
         self.x, self.C = x, self._bounded(self._each([b.violation(x) for b in self.batches]) - self.goal)
         J = [b.gradients(x).reshape(-1, self.dim)[some] for b, some in zip(self.batches, self.corner, strict=True)]
-        self.jacobian = Jacobian(self.m, self.row, self.who, self.w, np.concatenate(J))
+        whole = self.rails.moves if self.rails else None
+        self.jacobian = Jacobian(self.m, self.row, self.who, self.w, np.concatenate(J), whole)
         self.J, self.diagonal = self.jacobian.J, self.jacobian.diagonal
         self.worst = float(np.abs(self.C * self.close).max(initial=0.0))
         self.stored = float(_over(self.weight * self.C * self.C, self.diagonal).sum())
@@ -319,7 +360,8 @@ class Rows:
         one, (a, b) = np.eye(self.dim), self.corners
         sides = taut[:, None, None] * (one - across[:, :, None] * across[:, None, :])
         wall = self.wall[self.inside]
-        mass = (mu * one + HELD * wall[:, :, None] * wall[:, None, :]) / self.w[self.inside][:, None, None]
+        held = wall[:, :, None] * wall[:, None, :] + (self.rails.across(self.n)[self.inside] if self.rails else 0.0)
+        mass = (mu * one + HELD * held) / self.w[self.inside][:, None, None]
         along = [(stiff[self.row[a], None] * self.J[a])[:, :, None] * self.J[b][:, None, :]]
         for corners in self.alike:
             J = self.J[corners]
@@ -330,7 +372,13 @@ class Rows:
         some = self.wide
         wide = WideRows(len(self.inside), self.row[some], self.number[self.who[some]], self.J[some], stiff) if len(some) else None
         out[self.inside] = self.matrix.solve(blocks, -right[self.inside], wide)
-        return out
+        return self.rails.moves(out) if self.rails else out
+
+
+def given_back(runner: Any, energy: float, spun: float) -> float:
+    """How much of the energy [J] that bodies are spun up by they had before they were stretched: no more than the scene had."""
+    bound = runner.clock.bound
+    return spun if bound is None or bound == CHANGED else min(spun, max(bound - energy, 0.0))
 
 
 def paid(jacobian: Jacobian, v: np.ndarray, moves: np.ndarray, energy: float, walls: Any = False) -> np.ndarray:

@@ -81,6 +81,10 @@ class Anchored(Batch):
         """C at the start, (m, dim)."""
         return np.zeros((self.count, position.shape[1]))
 
+    def tangents(self, x: np.ndarray) -> np.ndarray:
+        """Unit vectors along which particles at x (m, dim) can move, where the constraints are rigid; 0 where there is none."""
+        return np.zeros_like(x)
+
     def place_of(self, scene: Scene, passes: AnchorPasses) -> Place:
         """Where its particles are drawn to, on the device."""
         raise NotImplementedError

@@ -178,9 +178,9 @@ class CornerPasses(Passes):
             self.slots.system.limit_row(row, u, spare, most, lam - new)
         for k in ti.static(range(self.arity)):
             self.slots.system.set_gradient(self.corners.places[c][k], self.corners.member(c, k), g[k, :])
-        acts = violation != 0
+        acts = violation != 0 and W > 0  # 0 where it is broken
         if ti.static(self.side != 0):  # one that is slack has a direction, but does nothing along it
-            acts = self.side * violation > 0 or lam != 0
+            acts = W > 0 and (self.side * violation > 0 or lam != 0)
         if acts:
             self.slots.note_turn(turn)
 

@@ -48,6 +48,13 @@ class Curve:
         r = r[..., None]
         return self.a[k] + r * (self.b[k] + r * (self.c[k] + r * self.d[k]))
 
+    def tangent(self, s) -> np.ndarray:
+        """Unit vectors along it at arc lengths s [m], (m, dim)."""
+        k, r = self.split(s)
+        r = r[..., None]
+        way = self.b[k] + r * (2 * self.c[k] + 3 * r * self.d[k])
+        return way / np.linalg.norm(way, axis=-1, keepdims=True)
+
     def nearest(self, x: np.ndarray) -> np.ndarray:
         """Arc lengths of the points of the curve that are nearest to x (m, dim), among 9 on each piece and between."""
         s = (self.starts[:-1, None] + self.lengths[:, None] * np.linspace(0, 1, 9)).ravel()

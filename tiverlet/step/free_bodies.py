@@ -1,0 +1,77 @@
+"""Bodies that are moved in themselves turn on as before: their velocities get back the angular momentum that the moves took.
+
+Moves p along constraints have sum m p = 0, but sum m p x v is lost with what p draws together: a body that turns, stretched by
+its substep, would be braked each time that the substep gets shorter. Each free body gets the spin u that is missing,
+
+    I u = sum m (x - c) x v - sum m (x' - c') x v',     v' += u x (x' - c'),
+
+as a skater does who draws in her arms. The energy of that is what the body gave when it was stretched.
+"""
+
+import numpy as np
+
+from ..solvers.corners import bodies_of
+from .block_matrix import summed
+from .jacobian import Jacobian
+
+FLAT = 1e-9  # of the largest: a moment of inertia that is none
+
+
+class FreeBodies:
+    """What the rows of a Jacobian tie together at places x, (n, dim), and what hangs on nothing.
+
+    stopped: (n,), whether a wall has moved each particle.
+    """
+
+    def __init__(self, jacobian: Jacobian, x: np.ndarray, stopped: np.ndarray):
+        rows, row, who, w = jacobian.m, jacobian.row, jacobian.who, jacobian.w
+        label, self.body = bodies_of(rows, row, who, w)
+        self.count = rows + 1
+        held = np.bincount(label[row[(w[who] == 0) | stopped[who]]], minlength=self.count) > 0
+        self.free = (~held[self.body] & (self.body < rows))[:, None]
+        self.mass = np.divide(1, w, out=np.zeros_like(w), where=w > 0)[:, None] * self.free
+        self.x = x
+        self.arm = self._about_center(x)
+        axes = 3 if x.shape[1] == 3 else 1
+        inertia = summed(self.mass * _inertia(self.arm).reshape(len(x), -1), self.body, self.count).reshape(-1, axes, axes)
+        self._mobility = np.linalg.pinv(inertia, rcond=FLAT, hermitian=True)  # about the axis of a rod there is none
+
+    def _about_center(self, x: np.ndarray) -> np.ndarray:
+        total = summed(self.mass, self.body, self.count)
+        return x - (summed(self.mass * x, self.body, self.count) / np.where(total > 0, total, 1.0))[self.body]
+
+    def moment(self, arm: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """sum m r x v of each."""
+        return summed(self.mass * _cross(arm, v), self.body, self.count)
+
+    def turned(self, moment: np.ndarray) -> np.ndarray:
+        """Velocities of bodies that turn with these moments, 0 of what is not free."""
+        spin = np.einsum("kij,kj->ki", self._mobility, moment)
+        return self.free * _turning(spin[self.body], self.arm)
+
+    def spun(self, v: np.ndarray, x: np.ndarray, before: np.ndarray) -> tuple[np.ndarray, float]:
+        """Velocities v with the moments that velocities `before` had at x, and what that takes [J]."""
+        if not self.free.any():
+            return v, 0.0
+        out = v + self.turned(self.moment(self._about_center(x), before) - self.moment(self.arm, v))
+        return out, float((self.mass * (out**2 - v**2)).sum() / 2)
+
+    def unturned(self, moves: np.ndarray) -> np.ndarray:
+        """Moves, or velocities, without those that turn."""
+        return moves - self.turned(self.moment(self.arm, moves)) if self.free.any() else moves
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """a x b of vectors (n, dim), (n, 1 or 3)."""
+    return np.cross(a, b) if a.shape[1] == 3 else (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])[:, None]
+
+
+def _turning(u: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """u x r, u as _cross() gives it."""
+    return np.cross(u, r) if r.shape[1] == 3 else u * np.stack([-r[:, 1], r[:, 0]], axis=1)
+
+
+def _inertia(r: np.ndarray) -> np.ndarray:
+    """r^2 1 - r r^T of points (n, dim), for the axes of _cross()."""
+    square = (r**2).sum(axis=1)[:, None, None]
+    return square * np.eye(3) - r[:, :, None] * r[:, None, :] if r.shape[1] == 3 else square
