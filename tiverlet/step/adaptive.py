@@ -27,6 +27,7 @@ GAIN = 1.4  # by which twice the effort has to lower the figures; of second orde
 FEW = 16  # substeps with which what does not help yet may help later
 IDLE = {"substeps": 2, "iterations": 1}  # doublings without a gain that are enough
 ROOM = 6.0  # by which the figures have to be better than asked before less is tried
+PLENTY = 60.0  # by which they have to be better before it is tried again and again
 PATIENCE = 64  # frames, at most, until it is tried again
 
 Figures = tuple[float, ...]  # residual, overlap, tension, turn, stiffness and energy, relative to what is asked
@@ -52,7 +53,8 @@ class StepController:
     that helps. What does not help is no fault of the frame, for the energy before it was that of longer substeps.
 
     When all figures, which are of the order of h^2, leave room for it, the next frame is tried with half the effort. Each time
-    that fails, twice as many frames pass before the next try, up to 64.
+    that fails, twice as many frames pass before the next try, up to 64, and half as many each time that less has lasted for as
+    many frames: a scene that went to and fro between two numbers would lose or gain with each change.
 
     Making a frame again needs the state at its begin, which is read back to the CPU before each frame: that is the price.
     """
@@ -136,8 +138,10 @@ class StepController:
                 self.iterations //= 2
             elif self.substeps > 1:
                 self.substeps = (self.substeps + 1) // 2
+            # Where there is plenty of room nothing is at stake; else it has to last as long as the last failure made it wait.
+            self.patience, self.wait = (1, 0) if figure * PLENTY <= 1 else (self.patience, self.patience)
         elif not self.wait:
-            self.patience = 1
+            self.patience = max(1, self.patience // 2)
 
 
 class Tries:
