@@ -11,9 +11,11 @@ if TYPE_CHECKING:
 
 
 class Candidates(Protocol):
-    """m contacts, of which some overlap, and others may once particles have moved. who: (m, k), the particles of each."""
+    """m contacts, of which some overlap, and others may once particles have moved. who: (m, k), the particles of each. size: (m,)
+    [m], what overlaps are deep beside."""
 
     who: np.ndarray
+    size: np.ndarray
 
     def at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """At positions x (n, dim): how deep each overlaps [m], (m,), negative where apart, and the gradients of C, which is the
@@ -25,7 +27,7 @@ class DiscCandidates:
     """Pairs of discs or spheres, who (m, 2). reach: at which distance each pair touches [m], (m,). box: the Periodic, or None."""
 
     def __init__(self, who: np.ndarray, reach: np.ndarray, box: "Periodic | None"):
-        self.who, self.reach, self.box = who, reach, box
+        self.who, self.reach, self.box, self.size = who, reach, box, reach / 2
 
     def at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """C = |x_i - x_j| - (r_i + r_j)."""
@@ -77,6 +79,8 @@ class EdgeCandidates:
         behind = fresh_edge & (overlap > 0)
         for name in ("who", "allowed", "sign", "edge", "fresh_edge", "fresh_disc", "low", "high"):
             setattr(self, name, vars(self)[name][~behind])
+        v, a, b = self.who.T
+        self.size = np.where(self.edge, np.linalg.norm(x[b] - x[a], axis=1), radius[v] + radius[a]) / 2
 
     def _measured(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Overlaps, normals, and where on the line of the edge each vertex is."""

@@ -24,7 +24,8 @@ class FreeBodies:
     """
 
     def __init__(self, jacobian: Jacobian, x: np.ndarray, stopped: np.ndarray):
-        rows, row, who, w = jacobian.m, jacobian.row, jacobian.who, jacobian.w
+        real = jacobian.diagonal[jacobian.row] > 0  # contacts that may be and are not tie nothing together
+        rows, row, who, w = jacobian.m, jacobian.row[real], jacobian.who[real], jacobian.w
         label, self.body = bodies_of(rows, row, who, w)
         self.count = rows + 1
         held = np.bincount(label[row[(w[who] == 0) | stopped[who]]], minlength=self.count) > 0

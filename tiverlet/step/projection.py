@@ -27,6 +27,7 @@ from ..particles import LARGEST
 from ..solvers.corners import bodies_of
 from .block_matrix import WIDEST, BlockMatrix, WideRows, summed
 from .clock import CHANGED
+from .contact_rows import ContactRows
 from .free_bodies import FreeBodies
 from .integrator import h2_effective_of
 from .jacobian import Jacobian
@@ -49,14 +50,17 @@ LEFT = 0.01  # of what violations store: what may be left of it in the shorter s
 DONE = 1e-6  # of its size: a violation that is none
 TURNS = 16  # with walls, at most: a link that stands on one halves its violation in each
 WORSE = 2.0  # times what violations stored before: what is left of it, at most, where it is taken at all
+BETTER = 0.5  # times that, where contacts move, too: what they and links store then
+TOGETHER = 4  # times that links and contacts move together: each may lead into others
 HELD = 1e3  # of its mass: how firmly a wall holds a particle that it has stopped
 
 
-def project(runner: "Runner", h: float, longest: float) -> bool | None:
+def project(runner: "Runner", h: float, longest: float, contacts: ContactRows | None = None) -> bool | None:
     """Take out what violations would store; d holds velocities. Nothing happens where they are small, or would overlap.
 
-    h: the coming substep [s]; longest: since this was done last. Returns whether positions have been looked after; None where
-    contacts are in the way of what would be more than a hundredth of the kinetic energy.
+    h: the coming substep [s]; longest: since this was done last. contacts: which move together with links. Returns whether
+    positions have been looked after; None where contacts are in the way of what would be more than a hundredth of the kinetic
+    energy.
     """
     ratio = h / longest
     slots = runner.scene.slots
@@ -70,9 +74,10 @@ def project(runner: "Runner", h: float, longest: float) -> bool | None:
         runner.released = stays
     if slots and slots.system and not slots.system.steps and not runner.clock.softened:  # it holds loads without a violation
         batches = [b for b in batches if ((slots.rows(b) < 0) & ~b.idle(w)).any() or matters(_off(b, x), ratio)]
-    batches += rigid_rows(runner.batches, w)
+    batches += rigid_rows(runner.batches, w, every=contacts is not None)
     if not batches:
         return True
+    batches += [contacts] if contacts and contacts.count else []
     rails = Rails(runner, x)
     start = Rows(batches, w, x, runner.scene.periodic, rails)
     undone = start.undone(runner)
@@ -85,12 +90,53 @@ def project(runner: "Runner", h: float, longest: float) -> bool | None:
     # Where the solver converges, it moves what is left at once in the next substep, and that flies on.
     steps = LOOKS if slots.converges or slots.exact else 0
     slight = SLIGHTEST * 2 * h * h * start.kinetic(v[:n])
-    still = (undone != 0) & (start.theta > FIRM)
+    still = (undone != 0) & (start.theta > FIRM) & ~start.touches
     v[:n] += rows.jacobian.solve(-rows.jacobian.rates(v[:n]) * still, still)
     energy, overlap = seen_before(runner)
-    enough, stopped = LEFT * ratio**2 * start.stored, np.zeros(n, dtype=bool)
+    aims = LEFT * ratio**2, steps, slight
+    rows, stopped = _moved(runner, start, rows, aims)
+    if contacts:
+        there, left = start.stored_in_links() + contacts.stored(before, w), np.inf
+        for _ in range(TOGETHER):
+            fresh: Any = ContactRows.of(runner)  # moves may have led into others than were listed
+            stored = rows.stored_in_links() + fresh.stored(rows.x, w)
+            if stored >= left:
+                break
+            best, left = (rows, stopped), stored
+            if left <= LEFT * ratio**2 * there:
+                break
+            rows, more = _moved(runner, start, rows.among([*batches[:-1], fresh], runner), aims)
+            stopped = stopped | more
+        rows, stopped = best
+        state.put(memory, rows.x)
+    x = rows.x
+    stopped[rails.who] = True
+    bodies = FreeBodies(start.jacobian, x, stopped)
+    v[:n], spun = bodies.spun(v[:n], before, kept[:n])
+    memory.write(state.d, v)
+    more, deeper = seen(runner)
+    fails = left > BETTER * there if contacts else deeper > overlap or rows.stored > WORSE * start.stored
+    if fails:
+        state.put(memory, before)
+        memory.write(state.d, kept)
+        stake = _over(start.weight * undone**2, start.diagonal).sum() / (2 * h * h)
+        kinetic = (start.mass[:, None] * kept[:n].astype(np.float64) ** 2).sum() / 2
+        return None if contacts or stake > SLIGHT * kinetic else True
+    due = more - energy - given_back(runner, energy, spun)
+    if due > 0:
+        v[:n] = paid(start.jacobian, v[:n], bodies.unturned(x - before), due, rows.wall.any(axis=1))
+        memory.write(state.d, v)
+    return True
+
+
+def _moved(runner: "Runner", start: "Rows", rows: "Rows", aims: tuple[float, int, float]) -> tuple["Rows", np.ndarray]:
+    """Rows where particles are then, and which of them walls have stopped, (n,). aims: what _newton() asks for, the first one of
+    what rows stored at the start."""
+    share, steps, slight = aims
+    state, memory, before = runner.scene.state, runner.memory, rows.x
+    enough, stopped = share * start.stored, np.zeros(rows.n, dtype=bool)
     for _ in range(TURNS):
-        state.put(memory, _newton(rows, enough, LEFT * ratio**2, steps, slight))
+        state.put(memory, _newton(rows, enough, share, steps, slight))
         sent = state.get(memory)
         runner.stop_at_walls(before)
         x = state.get(memory)
@@ -102,22 +148,7 @@ def project(runner: "Runner", h: float, longest: float) -> bool | None:
             rows = rows.held(last.wall, x - sent)
             if rows.stored <= enough:
                 break
-    stopped[rails.who] = True
-    bodies = FreeBodies(start.jacobian, x, stopped)
-    v[:n], spun = bodies.spun(v[:n], before, kept[:n])
-    memory.write(state.d, v)
-    more, deeper = seen(runner)
-    if deeper > overlap or rows.stored > WORSE * start.stored:
-        state.put(memory, before)
-        memory.write(state.d, kept)
-        stake = _over(start.weight * undone**2, start.diagonal).sum() / (2 * h * h)
-        kinetic = (start.mass[:, None] * kept[:n].astype(np.float64) ** 2).sum() / 2
-        return None if stake > SLIGHT * kinetic else True
-    due = more - energy - given_back(runner, energy, spun)
-    if due > 0:
-        v[:n] = paid(start.jacobian, v[:n], bodies.unturned(x - before), due, rows.wall.any(axis=1))
-        memory.write(state.d, v)
-    return True
+    return rows, stopped
 
 
 def _newton(rows: "Rows", enough: float, share: float, steps: int, slight: float) -> np.ndarray:
@@ -211,7 +242,8 @@ class Rows:
     rails: Any = None  # see Rails
 
     def __init__(
-        self, batches: list[Scalar | RigidRows], w: np.ndarray, x: np.ndarray, box: Any = None, rails: Rails | None = None
+        self, batches: list[Scalar | RigidRows | ContactRows], w: np.ndarray, x: np.ndarray, box: Any = None,
+        rails: Rails | None = None,
     ):  # fmt: skip
         self.rails = rails if rails and len(rails.who) else None
         self.batches, self.w, self.n, self.dim = batches, w, *x.shape
@@ -221,6 +253,7 @@ class Rows:
         for b, some in zip(batches, self.some, strict=True):
             if drive := getattr(b.dev, "drive", None):
                 some &= ~drive.slips(b.dev.equation.lam)[: b.count]
+        self.touches = self._each([np.full(b.count, isinstance(b, ContactRows)) for b in batches])
         self.side, arity = (self._each([of(b) for b in batches]) for of in (lambda b: np.full(b.count, b.side), sizes))
         self.m = len(self.side)
         self.corner = [some[b.owner] for b, some in zip(batches, self.some, strict=True)]
@@ -245,6 +278,10 @@ class Rows:
         self.J, self.diagonal = self.jacobian.J, self.jacobian.diagonal
         self.worst = float(np.abs(self.C * self.close).max(initial=0.0))
         self.stored = float(_over(self.weight * self.C * self.C, self.diagonal).sum())
+
+    def stored_in_links(self) -> float:
+        """What is stored in all but contacts."""
+        return float((_over(self.weight * self.C * self.C, self.diagonal) * ~self.touches).sum())
 
     def _bounded(self, C: np.ndarray) -> np.ndarray:
         """C on the side on which constraints act."""
@@ -307,6 +344,12 @@ class Rows:
         new._measure(self.x)
         new._link()
         return new
+
+    def among(self, batches: list[Any], runner: Any) -> "Rows":
+        """The same links, towards the same, among other contacts, the last of these batches, which are to store nothing."""
+        new = Rows(batches, self.w, self.x, self.box, self.rails)
+        new.undone(runner)  # for how rigid they are
+        return new.towards(np.concatenate([self.goal[~self.touches], np.zeros(int(new.touches.sum()))]))
 
     def undone(self, runner: Any) -> np.ndarray:
         """Z = theta C_(n+1) + (1 - theta) C_n + damping dC/dt + alpha lam / h^2, to second order; and how rigid the rows are."""

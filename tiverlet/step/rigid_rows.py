@@ -88,9 +88,10 @@ class Cluster:
         return R, p @ R - self.shape
 
 
-def rigid_rows(batches: list, w: np.ndarray) -> list[RigidRows]:
-    """Rows of the rigid clusters that share particles with anything, which passes leave violated; large clusters are left out."""
-    rows = [RigidRows(b, w, some & ~_wide(b)) for b, some in _coupled(batches, w) if (some & ~_wide(b)).any()]
+def rigid_rows(batches: list, w: np.ndarray, every: bool = False) -> list[RigidRows]:
+    """Rows of the rigid clusters that share particles with anything, which passes leave violated, or of every one; large clusters
+    are left out."""
+    rows = [RigidRows(b, w, some & ~_wide(b)) for b, some in _coupled(batches, w, every) if (some & ~_wide(b)).any()]
     return [some for some in rows if some.count]
 
 
@@ -105,12 +106,12 @@ def left_out(batches: list, w: np.ndarray, x: np.ndarray) -> float:
     return worst
 
 
-def _coupled(batches: list, w: np.ndarray) -> Iterator[tuple[Any, np.ndarray]]:
-    """Which rigid clusters share particles with anything."""
+def _coupled(batches: list, w: np.ndarray, every: bool = False) -> Iterator[tuple[Any, np.ndarray]]:
+    """Which rigid clusters share particles with anything, or all of them."""
     degree = np.bincount(np.concatenate([np.zeros(0, dtype=np.int64), *(b.indices.ravel() for b in batches)]), minlength=len(w))
     for b in batches:
         if b.clusters and b.count:
-            shares = np.maximum.reduceat(degree[b.indices], b.members.starts[:-1]) > 1
+            shares = every | (np.maximum.reduceat(degree[b.indices], b.members.starts[:-1]) > 1)
             yield b, (b.compliance == 0) & ~b.broken & ~b.idle(w) & shares
 
 

@@ -11,6 +11,7 @@ from ..device.patches.compiler import CachedLaunch
 from ..particles.spin import moments
 from . import high_order, initial_violation
 from .clock import Clock, slack
+from .contact_rows import ContactRows
 from .diagnostics import BARE, EXTENT, STARTED, STEPPED, UNSTEPPED
 from .frames import Frames
 from .integrator import FREE, decay
@@ -133,7 +134,9 @@ class Runner:
                 if h < clock.longest and not self.probe:
                     released = release(self, h, clock.longest)
                     projected = project(self, h, clock.longest)
-                    if projected is None and not released:  # links and contacts have to move together
+                    if projected is None:  # links and contacts have to move together
+                        projected = project(self, h, clock.longest, ContactRows.of(self))
+                    if projected is None and not released:
                         released = release(self, h, clock.longest, small=True)
                     if projected or projected is None or released:
                         clock.longest = h

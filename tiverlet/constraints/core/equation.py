@@ -10,6 +10,8 @@ from .spring import Spring, stiff
 from .step_limit import StepLimit
 from .strength import Strength
 
+SMALLEST = 1e-6  # of the size of the scene: a length that is more than rounding
+
 if TYPE_CHECKING:
     from ...features.feature import Scene
 
@@ -40,7 +42,7 @@ class Equation:
         name, m, add, unit = repr(batch), batch.count, scene.memory.field, batch.quantity.unit
         self.slots, self.real, self.side, self.corners = scene.slots, scene.real, batch.side, corners
         self.forces = bool(batch.acts_as_force(scene).any())
-        self.scene_sized = not unit and not np.any(start)
+        self.scene_sized = not unit and not (np.abs(start) > SMALLEST * batch.start.size).any()
         scale = unit or (batch.start.size if self.scene_sized else float(np.abs(start).mean()))
         self.scale = scene.memory.number(scale, scene.real)
         self.rest = add(f"{name}.rest", m, values=batch.goal, state=batch.driven)

@@ -12,6 +12,7 @@ from ...features.regrouping import Regrouping
 from ...geometry.ordered import distinct
 from .corner_passes import CornerPasses
 from .drive import Drive
+from .equation import SMALLEST
 from .members import FixedSize
 from .outline_passes import OutlinePasses
 from .quantity import Quantity
@@ -166,11 +167,15 @@ class Scalar(Batch):
         return self.quantity.gradients(self.placed(position) if self.arity else position)
 
     def inverse_size(self, position: np.ndarray) -> np.ndarray:
-        """What makes C a share of the size of its constraint, (m,): 1 / length for links, 0 for what has no extent."""
+        """What makes C a share of the size of its constraint, (m,): 1 / length for links, of which those between particles in one
+        place are as long as the others, or the scene; 0 for what else has no extent."""
         squares = self.gradients(position) ** 2
         if self.arity:
             x = self.placed(position)
             size = np.linalg.norm(x - x[:, :1], axis=2).max(axis=1, initial=0.0)
+            if self.quantity.apart:
+                some = size > SMALLEST * self.start.size
+                size = np.where(some, size, size[some].mean() if some.any() else self.start.size)
             size *= np.sqrt(squares.sum(axis=(1, 2)) / 2)
         elif self.count:
             x, starts, owner = position[self.indices], self.members.starts, self.owner
