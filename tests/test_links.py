@@ -290,3 +290,25 @@ def test_the_energy_of_springs_is_a_number_where_what_is_left_underflows(world):
     w = world(tv.Particles(x, velocity=v, mass=[np.inf, 10.0]), features, substeps=1)
     energy = [w.step(1e-6).energy for _ in range(2)]
     np.testing.assert_allclose(energy, 5.0 * np.sum(np.square(v[1])), rtol=0.1)
+
+
+def test_what_is_broken_turns_nothing(world):
+    # All links of a rope are torn, and its beads slide about: no direction of a link matters any more.
+    n, rng = 12, np.random.default_rng(0)
+    links = tv.Distance(np.stack([np.arange(n - 1), np.arange(1, n)], axis=1), break_at=1e-3)
+    start = tv.Particles([[0.1 * k, 1.0] for k in range(n)], radius=0.03, velocity=rng.normal(0, 0.3, (n, 2)))
+    w = world(start, [tv.Gravity((3.0, -9.81)), links, tv.Box((-0.2, 0), (1.4, 2), friction=0.1)], solver=tv.Direct())
+    w.run(0.5)
+    assert links.broken.all()
+    assert all(w.step(1 / 60).turn == 0 for _ in range(60))
+
+
+def test_ends_that_are_in_one_place_but_for_rounding(world):
+    # 0.1 + 0.2 and 0.3: a link of length 0 is measured beside the scene, not beside 5e-17 m.
+    told = []
+    for at in (0.3, 0.1 + 0.2):
+        start = tv.Particles([[0, 0], [0.3, 0], [at, 0], [0.6, 0]], pinned=[0])
+        joint = tv.Distance([[1, 2]], rest=0.0)
+        w = world(start, [tv.Gravity(9.81), tv.Distance([[0, 1], [2, 3]]), joint], substeps=20, precision="f64")
+        told.append(w.run(0.5).residual)
+    assert told[0] == pytest.approx(told[1], rel=1e-3) and told[1] < 1e-3

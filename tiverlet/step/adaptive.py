@@ -27,7 +27,7 @@ GAIN = 1.4  # by which twice the effort has to lower the figures; of second orde
 FEW = 16  # substeps with which what does not help yet may help later
 IDLE = {"substeps": 2, "iterations": 1}  # doublings without a gain that are enough
 ROOM = 6.0  # by which the figures have to be better than asked before less is tried
-PLENTY = 60.0  # by which they have to be better before it is tried again and again
+PLENTY = 24.0  # four times that: what is left after a try has room again, and failures are forgotten
 PATIENCE = 64  # frames, at most, until it is tried again
 
 Figures = tuple[float, ...]  # residual, overlap, tension, turn, stiffness and energy, relative to what is asked
@@ -53,8 +53,8 @@ class StepController:
     that helps. What does not help is no fault of the frame, for the energy before it was that of longer substeps.
 
     When all figures, which are of the order of h^2, leave room for it, the next frame is tried with half the effort. Each time
-    that fails, twice as many frames pass before the next try, up to 64, and half as many each time that less has lasted for as
-    many frames: a scene that went to and fro between two numbers would lose or gain with each change.
+    that fails, there has to be room in twice as many frames on end before the next try, up to 64, until it is room for two of
+    them: a scene that went to and fro between two numbers would lose or gain with each change.
 
     Making a frame again needs the state at its begin, which is read back to the CPU before each frame: that is the price.
     """
@@ -133,15 +133,14 @@ class StepController:
         if verdict != "good" or tries > 1:
             self.patience = min(2 * self.patience, PATIENCE) if tries > 1 else self.patience
             self.wait = self.patience
-        elif not self.wait and figure * ROOM <= 1:
+        elif figure * ROOM > 1:
+            self.wait = self.wait if self.patience == 1 or self.stuck != NOTHING else self.patience
+        elif not self.wait:
             if self.iterations > iterations:
                 self.iterations //= 2
             elif self.substeps > 1:
                 self.substeps = (self.substeps + 1) // 2
-            # Where there is plenty of room nothing is at stake; else it has to last as long as the last failure made it wait.
-            self.patience, self.wait = (1, 0) if figure * PLENTY <= 1 else (self.patience, self.patience)
-        elif not self.wait:
-            self.patience = max(1, self.patience // 2)
+            self.patience = 1 if figure * PLENTY <= 1 else self.patience
 
 
 class Tries:

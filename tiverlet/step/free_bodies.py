@@ -38,6 +38,7 @@ class FreeBodies:
         self._mobility = np.linalg.pinv(inertia, rcond=FLAT, hermitian=True)  # about the axis of a rod there is none
 
     def _about_center(self, x: np.ndarray) -> np.ndarray:
+        """Places, or velocities, relative to those of the centers of mass."""
         total = summed(self.mass, self.body, self.count)
         return x - (summed(self.mass * x, self.body, self.count) / np.where(total > 0, total, 1.0))[self.body]
 
@@ -56,6 +57,14 @@ class FreeBodies:
             return v, 0.0
         out = v + self.turned(self.moment(self._about_center(x), before) - self.moment(self.arm, v))
         return out, float((self.mass * (out**2 - v**2)).sum() / 2)
+
+    def calmed(self, v: np.ndarray, due: np.ndarray) -> np.ndarray:
+        """Velocities of which each free body has paid what is due, (n,) of its particles [J], by how it moves in itself."""
+        inner = self.free * self.unturned(self._about_center(v))
+        kinetic, owed = summed(self.mass * inner**2, self.body, self.count).sum(axis=1) / 2, np.zeros(self.count)
+        np.maximum.at(owed, self.body, due)
+        left = np.maximum(1 - np.divide(owed, kinetic, out=np.zeros_like(owed), where=kinetic > 0), 0.0) ** 0.5
+        return v - (1 - left)[self.body][:, None] * inner
 
     def unturned(self, moves: np.ndarray) -> np.ndarray:
         """Moves, or velocities, without those that turn."""

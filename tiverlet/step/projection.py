@@ -16,6 +16,7 @@ its fall became heat when it stretched.
 """
 
 import copy
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -96,14 +97,15 @@ def project(runner: "Runner", h: float, longest: float, contacts: ContactRows | 
     aims = LEFT * ratio**2, steps, slight
     rows, stopped = _moved(runner, start, rows, aims)
     if contacts:
-        there, left = start.stored_in_links() + contacts.stored(before, w), np.inf
+        there, left, products = start.stored_in_links() + contacts.stored(before, w), np.inf, 0
         for _ in range(TOGETHER):
             fresh: Any = ContactRows.of(runner)  # moves may have led into others than were listed
             stored = rows.stored_in_links() + fresh.stored(rows.x, w)
             if stored >= left:
                 break
             best, left = (rows, stopped), stored
-            if left <= LEFT * ratio**2 * there:
+            products += rows.matrix.products
+            if left <= LEFT * ratio**2 * there or products > PRODUCTS / TOGETHER:
                 break
             rows, more = _moved(runner, start, rows.among([*batches[:-1], fresh], runner), aims)
             stopped = stopped | more
@@ -124,7 +126,8 @@ def project(runner: "Runner", h: float, longest: float, contacts: ContactRows | 
         return None if contacts or stake > SLIGHT * kinetic else True
     due = more - energy - given_back(runner, energy, spun)
     if due > 0:
-        v[:n] = paid(start.jacobian, v[:n], bodies.unturned(x - before), due, rows.wall.any(axis=1))
+        moves = bodies.unturned(x - before)
+        v[:n] = paid(start.jacobian, v[:n], moves, due, rows.wall.any(axis=1), None if contacts else bodies)
         memory.write(state.d, v)
     return True
 
@@ -219,7 +222,7 @@ def seen_before(runner: Any) -> tuple[float, float]:
     return energy if runner.clock.energy is None else runner.clock.energy, overlap
 
 
-def sizes(batch: Scalar | RigidRows) -> np.ndarray:
+def sizes(batch: Scalar | RigidRows | ContactRows) -> np.ndarray:
     """The number of corners of each constraint, (m,)."""
     return np.bincount(batch.owner, minlength=batch.count)
 
@@ -242,7 +245,7 @@ class Rows:
     rails: Any = None  # see Rails
 
     def __init__(
-        self, batches: list[Scalar | RigidRows | ContactRows], w: np.ndarray, x: np.ndarray, box: Any = None,
+        self, batches: Sequence[Scalar | RigidRows | ContactRows], w: np.ndarray, x: np.ndarray, box: Any = None,
         rails: Rails | None = None,
     ):  # fmt: skip
         self.rails = rails if rails and len(rails.who) else None
@@ -424,9 +427,11 @@ def given_back(runner: Any, energy: float, spun: float) -> float:
     return spun if bound is None or bound == CHANGED else min(spun, max(bound - energy, 0.0))
 
 
-def paid(jacobian: Jacobian, v: np.ndarray, moves: np.ndarray, energy: float, walls: Any = False) -> np.ndarray:
+def paid(
+    jacobian: Jacobian, v: np.ndarray, moves: np.ndarray, energy: float, walls: Any = False, bodies: FreeBodies | None = None
+) -> np.ndarray:
     """Velocities without the energy [J] that moves added: of their part along them first, then of what is anchored, or stands on
-    something. walls: whether one holds each particle.
+    something. walls: whether one holds each particle. bodies: free ones, which pay by how they move in themselves.
 
     Each body, of what constraints tie together, pays by the mass that it has lifted, up to all it has.
     """
@@ -443,6 +448,8 @@ def paid(jacobian: Jacobian, v: np.ndarray, moves: np.ndarray, energy: float, wa
     part = _over(along, size)
     due, left = _settled(due, part * along / 2)
     v = v - ((1 - left) * part)[body][:, None] * moves
+    if bodies:
+        v = bodies.calmed(v, due[body])
     held = np.bincount(label[row[(w[who] == 0) | np.broadcast_to(walls, len(w))[who]]], minlength=rows + 1) > 0
     _, left = _settled(np.where(held, due, 0.0), summed((v**2).sum(axis=1)) / 2)
     return v * left[body][:, None]
