@@ -26,7 +26,7 @@ class ContactRows:
 
     @classmethod
     def of(cls, runner: Any) -> "ContactRows | None":
-        """Those of a world at the positions of now; None where there is no contact."""
+        """Those of a world at the positions of now; None where it has no Contact."""
         contact = next(iter(runner.step.contacts), None)
         if not contact:
             return None

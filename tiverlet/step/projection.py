@@ -9,6 +9,9 @@ first go to where the same loads need the violations (h' / h)^2 Z, and velocitie
 Z, C + alpha lam / h^2 for what is at rest, is what the last substep left of a constraint; springs that it resolves stay as they
 are. Positions move without velocities, as contacts do that an impact left overlapping.
 
+Where contacts are in the way, they are rows, too (ContactRows), and what they lead into are others, in a few rounds. Beads stay
+on their wires (Rails), and free bodies keep their angular momentum (FreeBodies).
+
 Where that lifts what hangs, motion pays for it as far as it can: a taut net has no direction to sag in, so velocities know
 nothing of its fall, and lifting it back at the end of each fall would be a pump. The energy that was gained is taken out of the
 velocities, of the part along the moves first, then of the whole of what is anchored. What hangs at rest is lifted for nothing:
@@ -21,7 +24,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..constraints.core.anchored import Anchored
 from ..constraints.core.scalar import Scalar
 from ..neighbours.queries import between
 from ..particles import LARGEST
@@ -32,6 +34,7 @@ from .contact_rows import ContactRows
 from .free_bodies import FreeBodies
 from .integrator import h2_effective_of
 from .jacobian import Jacobian
+from .rails import Rails
 from .rigid_rows import RigidRows, left_out, rigid_rows
 
 if TYPE_CHECKING:
@@ -78,7 +81,7 @@ def project(runner: "Runner", h: float, longest: float, contacts: ContactRows | 
     batches += rigid_rows(runner.batches, w, every=contacts is not None)
     if not batches:
         return True
-    batches += [contacts] if contacts and contacts.count else []
+    batches += [contacts] if contacts else []
     rails = Rails(runner, x)
     start = Rows(batches, w, x, runner.scene.periodic, rails)
     undone = start.undone(runner)
@@ -96,28 +99,16 @@ def project(runner: "Runner", h: float, longest: float, contacts: ContactRows | 
     energy, overlap = seen_before(runner)
     aims = LEFT * ratio**2, steps, slight
     rows, stopped = _moved(runner, start, rows, aims)
+    left = 0.0
     if contacts:
-        there, left, products = start.stored_in_links() + contacts.stored(before, w), np.inf, 0
-        for _ in range(TOGETHER):
-            fresh: Any = ContactRows.of(runner)  # moves may have led into others than were listed
-            stored = rows.stored_in_links() + fresh.stored(rows.x, w)
-            if stored >= left:
-                break
-            best, left = (rows, stopped), stored
-            products += rows.matrix.products
-            if left <= LEFT * ratio**2 * there or products > PRODUCTS / TOGETHER:
-                break
-            rows, more = _moved(runner, start, rows.among([*batches[:-1], fresh], runner), aims)
-            stopped = stopped | more
-        rows, stopped = best
-        state.put(memory, rows.x)
+        rows, stopped, left = _together(runner, start, rows, stopped, contacts.stored(before, w), batches[:-1], aims)
     x = rows.x
     stopped[rails.who] = True
     bodies = FreeBodies(start.jacobian, x, stopped)
     v[:n], spun = bodies.spun(v[:n], before, kept[:n])
     memory.write(state.d, v)
     more, deeper = seen(runner)
-    fails = left > BETTER * there if contacts else deeper > overlap or rows.stored > WORSE * start.stored
+    fails = left > BETTER if contacts else deeper > overlap or rows.stored > WORSE * start.stored
     if fails:
         state.put(memory, before)
         memory.write(state.d, kept)
@@ -154,6 +145,29 @@ def _moved(runner: "Runner", start: "Rows", rows: "Rows", aims: tuple[float, int
     return rows, stopped
 
 
+def _together(
+    runner: "Runner", start: "Rows", rows: "Rows", stopped: np.ndarray, pressed: float, links: list[Any],
+    aims: tuple[float, int, float],
+) -> tuple["Rows", np.ndarray, float]:  # fmt: skip
+    """The best rows and stops of some rounds, each among the contacts that the one before led into; and what links and contacts
+    store there, of what they did. pressed: what contacts stored at the start."""
+    before, left, products = start.stored_in_links() + pressed, np.inf, 0
+    for _ in range(TOGETHER):
+        contacts: Any = ContactRows.of(runner)
+        stored = rows.stored_in_links() + contacts.stored(rows.x, rows.w)
+        if stored >= left:
+            break
+        best, left = (rows, stopped), stored
+        products += rows.matrix.products
+        if left <= aims[0] * before or products > PRODUCTS / TOGETHER:
+            break
+        rows, more = _moved(runner, start, rows.among([*links, contacts], runner), aims)
+        stopped = stopped | more
+    runner.scene.state.put(runner.memory, best[0].x)
+    rows, stopped = best
+    return rows, stopped, left / before if before > 0 else np.inf
+
+
 def _newton(rows: "Rows", enough: float, share: float, steps: int, slight: float) -> np.ndarray:
     """Places at which what violations store is `enough` [J s^2], and where a solver of so many steps would move less, by this
     share of the work, m p^2, that it would do at the begin; both unless they are less than `slight`."""
@@ -169,32 +183,6 @@ def _newton(rows: "Rows", enough: float, share: float, steps: int, slight: float
         if near or stalled or rows.worst <= DONE or mu > HARDEST or rows.matrix.products > PRODUCTS:
             break
     return rows.x
-
-
-class Rails:
-    """Rigid wires: the directions in which beads can move, which no row here knows. who: (k,) particles."""
-
-    def __init__(self, runner: "Runner", x: np.ndarray):
-        wires = [b for b in runner.batches if isinstance(b, Anchored) and not b.drives and (b.compliance == 0).any()]
-        rigid = [b.compliance == 0 for b in wires]
-        self.who = np.concatenate(
-            [np.zeros(0, dtype=np.int64), *(b.indices[some, 0] for b, some in zip(wires, rigid, strict=True))]
-        )
-        along = [b.tangents(x[b.indices[:, 0]])[some] for b, some in zip(wires, rigid, strict=True)]
-        self.along = np.concatenate([np.zeros((0, x.shape[1])), *along])
-
-    def moves(self, moves: np.ndarray) -> np.ndarray:
-        """Moves (n, dim), of beads along their wires."""
-        out = moves.copy()
-        out[self.who] = (moves[self.who] * self.along).sum(axis=1)[:, None] * self.along
-        return out
-
-    def across(self, n: int) -> np.ndarray:
-        """For each of n particles the projection on what is across its wire, (n, dim, dim)."""
-        dim = self.along.shape[1]
-        out = np.zeros((n, dim, dim))
-        out[self.who] = np.eye(dim) - self.along[:, :, None] * self.along[:, None, :]
-        return out
 
 
 def matters(violation: float, ratio: float) -> bool:
