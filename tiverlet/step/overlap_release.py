@@ -55,7 +55,7 @@ def release(runner: Any, h: float, longest: float, small: bool = False) -> bool:
     jacobian = part(runner, pairs, solids, x, ratio)
     if jacobian:
         v, now = memory.read(state.d).astype(np.float64), state.get(memory)
-        stopped = np.zeros(len(x), dtype=bool)
+        stopped = np.full(len(x), runner.scene.periodic is not None)  # among images there is no moment
         stopped[jacobian.who[np.bincount(jacobian.row)[jacobian.row] == 1]] = True
         bodies = FreeBodies(jacobian, now, stopped)
         v[: len(x)], spun = bodies.spun(v[: len(x)], x, v[: len(x)])

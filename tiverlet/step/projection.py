@@ -104,6 +104,7 @@ def project(runner: "Runner", h: float, longest: float, contacts: ContactRows | 
         rows, stopped, left = _together(runner, start, rows, stopped, contacts.stored(before, w), batches[:-1], aims)
     x = rows.x
     stopped[rails.who] = True
+    stopped |= runner.scene.periodic is not None  # among images there is no moment
     bodies = FreeBodies(start.jacobian, x, stopped)
     v[:n], spun = bodies.spun(v[:n], before, kept[:n])
     memory.write(state.d, v)
