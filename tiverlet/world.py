@@ -155,7 +155,7 @@ class World:
                     with self._runner.memory.compiler():
                         report = self._controller.advance(self, dt, tolerance, budget)
                 else:
-                    self._runner.begin(dt / self._substeps, self._iterations)
+                    self._runner.begin(dt, self._substeps, self._iterations)
                     report = self._runner.advance(dt, self._substeps, self._iterations)
             except BaseException:
                 self._broken_off()

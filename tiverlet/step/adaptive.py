@@ -87,7 +87,7 @@ class StepController:
         self.prepare(world.iterations, dt, tolerance, budget)
         before, flags = world._undo  # type: ignore[misc]  # of the step; where nothing was uploaded since, it is the state now
         kept = checkpoint.keep(world) if any(map(any, flags)) else replace(before, controller=self.memory)
-        world._runner.begin(dt / self.substeps, world.iterations)
+        world._runner.begin(dt, self.substeps, world.iterations)
         tries = Tries(self.substeps, self.iterations, self.stuck, world._clock.energy)
         energy = energy_bound.before(world)
         while True:
@@ -103,7 +103,7 @@ class StepController:
                 tries.verdict = "substeps-capped"
                 break
             checkpoint.put_back(world, kept)
-            world._runner.begin(dt / tries.substeps, world.iterations)
+            world._runner.begin(dt, tries.substeps, world.iterations)
         self.substeps, self.iterations, self.stuck = n, k, tries.stuck  # and the next frames do not try in vain
         self.look_ahead(world.iterations, report, max(figures), tries.verdict, tries.count)
         return told(report, max(figures), risks, tries.verdict, tries.count)

@@ -93,10 +93,10 @@ class Runner:
 
     # Frames.
 
-    def begin(self, substep: float, iterations: int) -> None:
-        """Begin a frame with substeps of this length [s]. Where it differs from the last one, displacements stand for other
+    def begin(self, dt: float, substeps: int, iterations: int) -> None:
+        """Begin a frame of dt [s]. Where the length of substeps differs from the last one, displacements stand for other
         velocities: they are turned into velocities first, and the frame is a start."""
-        if self.prepare(substep, iterations):
+        if self.prepare(dt, substeps, iterations):
             clock, placed = self.clock, self.clock.first_moved is not None
             if clock.energy is None:
                 clock.bound = None
@@ -117,9 +117,9 @@ class Runner:
                     clock.energy = float(self._data[0])
             self.placed()
 
-    def prepare(self, substep: float, iterations: int) -> bool:
+    def prepare(self, dt: float, substeps: int, iterations: int) -> bool:
         """The first half of begin(). Returns whether there is a second: the state was changed, and has to be diagnosed."""
-        h, clock, self.released, self.jumped = substep * self.integrator.first, self.clock, 0.0, False
+        h, clock, self.released, self.jumped = dt / substeps * self.integrator.first, self.clock, 0.0, False
         drag = decay(sum(f.rate for f in self.drags), h) if self.drags else None
         if h == clock.h and drag == clock.drag and not clock.d_is_velocity and clock.first_moved is None:
             if clock.energy is None:
@@ -134,7 +134,8 @@ class Runner:
                 if h < clock.longest and not self.probe:
                     released = release(self, h, clock.longest)
                     projected = project(self, h, clock.longest)
-                    if projected is None:  # links and contacts have to move together
+                    # Links and contacts have to move together; where frames are of uneven length, stacks would walk off.
+                    if projected is None and dt == clock.frame[1]:
                         projected = project(self, h, clock.longest, ContactRows.of(self))
                     if projected is None and not released:
                         released = release(self, h, clock.longest, small=True)

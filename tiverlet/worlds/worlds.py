@@ -214,8 +214,7 @@ class Worlds:
         world, runner, clocks = self._world, self._runner, self._clocks
         drags = any(f.changed for f in runner.drags)  # what the clocks have of them is of other rates
         self._upload()
-        substep = dt / world.substeps
-        h = substep * runner.integrator.first
+        h = dt / world.substeps * runner.integrator.first
         looked_at = clocks.known & (clocks.first_moved == NONE) & (clocks.h == h) & (not drags)
         ready, begins = looked_at & ~clocks.d_is_velocity, looked_at & clocks.d_is_velocity
         clocks.since[begins] = 0
@@ -224,7 +223,7 @@ class Worlds:
         with runner.memory.compiler():
             for k in some:
                 with self._at(k):
-                    runner.prepare(substep, world.iterations)
+                    runner.prepare(dt, world.substeps, world.iterations)
                     moved[k], released[k], jumped[k] = runner.moved, runner.released, runner.jumped
         unknown = some[~clocks.known[some]]
         if len(unknown):
