@@ -293,6 +293,7 @@ def test_the_default_suits_the_structure(world):
         (x, [tv.Distance(chain), tv.AngleLimit([(0, 1, 2)], -2.0, 2.0)], "Jacobi"),
         (x, [tv.Distance(chain), tv.Motor([(0, 1, 2)], 0.0, torque=0.0)], "Direct"),
         (x, [tv.Distance(chain), tv.Motor([(0, 1, 2)], 0.0)], "Jacobi"),
+        (x[:3], [tv.Distance(chain[:1]), tv.Motor([(0, 1, 2)], 0.0, torque=1.0)], "Jacobi"),
         (flat, [tv.Distance([(0, 1), (1, 2), (2, 0), (2, 4), (4, 3), (3, 2)])], "Direct"),
         (truss.position, [beam], "Direct"),
         (truss.position, [beam.copy(), tv.Pin([0, 1, 20, 21])], "Jacobi"),

@@ -89,8 +89,8 @@ class Pieces:
         off = np.concatenate([_off(b) for b in links])
         self.exact = not off.any() and all(_eliminates(b, scene) for b in links)
         degree = np.bincount(np.concatenate([b.indices.ravel() for b in links]), minlength=len(w))
-        stiff = np.concatenate([_stiff(b, degree * w) & ~b.relaxed_alone(scene) for b in links])
-        self.stiff = stiff & self.acts & ~self._any(off)
+        self.solved = self.acts & ~np.concatenate([b.relaxed_alone(scene) for b in links])
+        self.stiff = np.concatenate([_stiff(b, degree * w) for b in links]) & self.solved & ~self._any(off)
         self.stands = self._stands(owner[~free], item[~free])
 
     def _any(self, some: np.ndarray) -> np.ndarray:
@@ -143,7 +143,8 @@ class Pieces:
                 continue
             if self.stands[first[wide | self.bends[first]]].all() and self._filled(self.piece[first[wide]]):
                 taken[found.rows] = True
-                return (Direct(max([CHAIN, *found.widths])) if len(found.column) else None), taken
+                crowd = np.bincount(self.item[(taken & self.solved)[self.owner]], minlength=1)
+                return (Direct(max([CHAIN, *found.widths])) if crowd.max() > 1 else None), taken
         return None, taken
 
     def many(self, some: np.ndarray) -> bool:
