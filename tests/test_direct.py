@@ -266,13 +266,19 @@ def test_direct_checks_its_arguments():
 
 @pytest.mark.filterwarnings("ignore:Contact. all radii are 0")
 def test_the_default_suits_the_structure(world):
-    # Links like chains, trees and loops are solved directly, stiff cloth by conjugate gradients; soft cloth, small braced bodies,
-    # limits of angles, single links and what starts violated are relaxed. explain() says what was chosen, and a solver that the
-    # user names is taken as it is.
+    # Links like chains, trees, loops and beams are solved directly; stiff cloth by conjugate gradients, whatever is beside it.
+    # Soft cloth, braced bodies, narrow nets, angles that elimination is not for, single links, chains that start violated, and
+    # beams that are held in two places are relaxed. explain() says what was chosen; a solver that the user names is taken.
     flat = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1], [2, 1]])
     x, chain = flat[[0, 1, 2, 4]], links(3)
-    braced = [(i, j) for i in range(4) for j in range(i)]
+    braced = np.array([(i, j) for i in range(4) for j in range(i)])
+    boxes = np.concatenate([flat[:4] + [3 * k, 0] for k in range(40)])
     sheet = tv.shapes.cloth((0, 0, 0), (1, 0, 0), (0, 0, 1), (11, 11))
+    ribbon, truss = tv.shapes.net((0, 0, 0), (2, 0, 0), (0, 0, 0.1), (21, 2)), tv.shapes.truss((0, 0), (2, 0.2), (10, 1))
+    beam = tv.Distance(np.concatenate([truss.links, truss.braces]))
+    both = np.concatenate([sheet.position, [[5.0, 0, 0], [5.5, 0, 0], [6, 0, 0]]])
+    cloth, rope, elbow = tv.Distance(sheet.links), links(2, 121), [(121, 122, 123)]
+    deep = np.column_stack([x, [0, 0, 1, 0]])
     for position, features, solver in (
         (x, [tv.Distance(chain)], "Direct"),
         (x, [tv.Rope(chain), tv.Contact(), tv.Gravity()], "Direct"),
@@ -280,19 +286,52 @@ def test_the_default_suits_the_structure(world):
         (flat, [tv.Distance([(0, 1), (1, 2), (1, 3)])], "Direct"),
         (flat, [tv.Distance([(0, 1), (2, 3)])], "Jacobi"),
         (flat[:4], [tv.Distance(braced)], "Jacobi"),
+        (boxes, [tv.Distance(np.concatenate([braced + 4 * k for k in range(40)]))], "Jacobi"),
         (x, [tv.Distance(chain), tv.Bend([(0, 1, 2)])], "Jacobi"),
+        (x, [tv.Distance(chain), tv.Bend([(0, 1, 2), (1, 2, 3)], compliance=1.0)], "Direct"),
+        (deep, [tv.Distance(chain), tv.Bend([(0, 1, 2)], compliance=1.0)], "Jacobi"),
+        (x, [tv.Distance(chain), tv.AngleLimit([(0, 1, 2)], -2.0, 2.0)], "Jacobi"),
+        (x, [tv.Distance(chain), tv.Motor([(0, 1, 2)], 0.0, torque=0.0)], "Direct"),
+        (x, [tv.Distance(chain), tv.Motor([(0, 1, 2)], 0.0)], "Jacobi"),
+        (x[:3], [tv.Distance(chain[:1]), tv.Motor([(0, 1, 2)], 0.0, torque=1.0)], "Jacobi"),
+        (flat, [tv.Distance([(0, 1), (1, 2), (2, 0), (2, 4), (4, 3), (3, 2)])], "Direct"),
+        (truss.position, [beam], "Direct"),
+        (truss.position, [beam.copy(), tv.Pin([0, 1, 20, 21])], "Jacobi"),
+        (ribbon.position, [tv.Distance(ribbon.links)], "Jacobi"),
         (x, [tv.Distance(chain, [1.0, 1.0, 3.0])], "Jacobi"),
         (x, [tv.Rope(chain, 5.0)], "Direct"),
         (x, [], "Jacobi"),
         (sheet.position, [tv.Distance(sheet.links), tv.Dihedral(sheet.quads, compliance=1.0)], "ConjugateGradient"),
-        (sheet.position, [tv.Distance(sheet.links), tv.Dihedral(sheet.quads)], "Jacobi"),
+        (sheet.position, [tv.Distance(sheet.links), tv.Dihedral(sheet.quads)], "ConjugateGradient"),
         (sheet.position, [tv.Distance(sheet.links, compliance=1e-3)], "Jacobi"),
+        (both, [cloth.copy(), tv.Distance(rope)], "ConjugateGradient"),
+        (both, [cloth.copy(), tv.Distance(rope, 0.6)], "ConjugateGradient"),
+        (both, [cloth.copy(), tv.Distance(rope), tv.AngleLimit(elbow, 0.0, 2.0)], "ConjugateGradient"),
+        (both, [cloth.copy(), tv.Distance(rope), tv.Bend(elbow)], "Jacobi"),
     ):
         w = world(tv.Particles(position), features)
         assert type(w._solver).__name__ == solver, features
         assert not features or f"Solved by {solver}" in w.explain() and "; chosen because links " in w.explain()
     w = world(tv.Particles(x), [tv.Distance(chain)], solver=tv.Jacobi())
     assert "Solved by Jacobi" in w.explain() and "chosen" not in w.explain()
+
+
+def test_what_is_beside_a_cloth_leaves_its_solver_alone(world):
+    # A cloth is stretched as much as alone, whatever else there is, for solvers are chosen by what they would leave to Jacobi,
+    # which stretches it four times as much.
+    sheet = tv.shapes.cloth((0, 0, 0), (1, 0, 0), (0, 0, 1), (13, 13))
+    arm, n = np.array([[5.0, 0, 0], [5.3, 0, 0], [5.6, 0, 0]]), len(sheet.position)
+    length, stretch = np.linalg.norm(np.diff(sheet.position[sheet.links], axis=1)[:, 0], axis=1), []
+    for beside, solver in ((False, None), (True, None), (True, tv.Jacobi())):
+        x = np.concatenate([sheet.position, arm]) if beside else sheet.position
+        pairs = np.concatenate([sheet.links, links(2, n)]) if beside else sheet.links
+        limit = [tv.AngleLimit([(n, n + 1, n + 2)], 0.0, 2.0)] if beside else []
+        start = tv.Particles(x, mass=0.01, pinned=[0, 12, *([n] if beside else [])])
+        w = world(start, [tv.Gravity(), tv.Drag(2.0), tv.Distance(pairs), *limit], solver=solver)
+        w.run(1.0)
+        stretch.append((np.linalg.norm(np.diff(w.position[sheet.links], axis=1)[:, 0], axis=1) / length - 1).max())
+    assert stretch[1] == pytest.approx(stretch[0], rel=0.1)
+    assert stretch[2] > 4 * stretch[0]
 
 
 def test_ropes_that_touch_are_solved_and_come_to_rest(world):

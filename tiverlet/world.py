@@ -46,8 +46,8 @@ class World:
     substeps: substeps of a frame, or "auto" for as many as it needs (see StepController). iterations: passes over the constraints
     in each. Both may change at any time, at no compile cost.
     solver: how constraints are solved: Direct for chains, trees and loops, Jacobi, Chebyshev or ConjugateGradient for cloth. None
-    takes Direct for what hangs together like chains, ConjugateGradient(5) for many stiff links that hang together more closely,
-    and Jacobi for the rest; explain() says what was chosen, and why.
+    takes ConjugateGradient(5) where elimination would leave many stiff links to Jacobi, such as those of cloth; else Direct for
+    what hangs together like chains or beams; else Jacobi. explain() says what was chosen, and why.
     precision: "f32" (position and displacement; the digits of a coordinate end at 6e-8 of it, 1 mm at 10 km and 6 cm at 1000 km),
     "f32-compensated" (the position carries a low word, which keeps 1e-4 m at any of these), "f64". Where constraints are solved
     to rounding, positions and displacements of f32 carry what rounding takes from them: shorter substeps never make it worse.

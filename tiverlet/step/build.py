@@ -148,7 +148,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
         scene.radius = Radii(memory, particles.radius, scene.count)
     surfaces = [*walls, *([contact] if contact else [])]
     has_friction, bounces = any(f.has_friction for f in surfaces), any(f.has_restitution for f in surfaces)
-    solver = solver or (by_structure(batches, scene.inv_mass) if scene.order == 2 else Direct())
+    solver = solver or (by_structure(batches, scene) if scene.order == 2 else Direct())
     if (batches and solver.loads) or (contact and contact.has_loads):
         scene.own_weight = OwnWeight(scene)
     if batches:
