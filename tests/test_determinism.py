@@ -142,7 +142,6 @@ def test_all_paths_have_the_same_bits(world):
     assert made[0] == made[1] == made[2]
 
 
-@pytest.mark.filterwarnings("ignore:Contact. all radii are 0")
 def test_what_is_no_number_is_hashed_alike(world):
     # The sign of inf - inf hangs on the order in which a compiler takes its operands, which paths need not share.
     w = world(tv.Particles(np.zeros((2, 2))), [])
@@ -154,6 +153,7 @@ def test_what_is_no_number_is_hashed_alike(world):
     assert told[0] == told[1] != told[2]
 
 
+@pytest.mark.filterwarnings("ignore:Contact. all radii are 0")
 def test_what_is_absent_has_no_field_and_no_kernel(world):
     # A point in free flight: position, displacement and counts. Each feature adds its own fields and nothing else; a
     # mass for each particle is needed where one has another than the rest, as what is pinned has.
