@@ -93,9 +93,9 @@ def cloud(dim, n, seed):
     return tv.Particles(x, radius=rng.uniform(0.08, 0.1, n), mass=mass, velocity=rng.uniform(-2, 2, (n, dim)))
 
 
-def brute(x, old, v, gravity, h, particles):
+def brute(x, old, v, gravity, h, particles, before):
     """Where free flight leads, who touches there, along which normals, at which speeds; whether it is clear who just met: others
-    had parted to the last digit."""
+    had parted to the last digit. before: who touched in the last substep."""
     free = np.isfinite(particles.mass)[:, None]
     ahead = np.where(free, x + v * h + gravity * h**2 / 2 if old is None else 2 * x - old + gravity * h**2, x)
     i, j = np.triu_indices(len(x), 1)
@@ -103,10 +103,11 @@ def brute(x, old, v, gravity, h, particles):
     some = (np.linalg.norm(ahead[i] - ahead[j], axis=1) < R) & (free[i] | free[j])[:, 0]
     i, j, R = i[some], j[some], R[some]
     r, d = x[i] - x[j], (ahead - x)[i] - (ahead - x)[j]
-    # |r + s d| = R, for what was apart: the time of impact, and the normal then.
+    # |r + s d| = R, for what was apart: the time of impact, and the normal then. What touched has that of the start.
     a, b, c = (d**2).sum(1), (r * d).sum(1), (r**2).sum(1) - R**2
     with np.errstate(all="ignore"):
-        s = np.where(c > 0, (-b - np.sqrt(b**2 - a * c)) / a, 1.0)
+        s = np.where(c > 0, (-b - np.sqrt(b**2 - a * c)) / a, 0.0)
+    s[[pair in before for pair in zip(i.tolist(), j.tolist(), strict=True)]] = 0.0
     n = r + s[:, None] * d
     n /= np.linalg.norm(n, axis=1)[:, None]
     return ahead, np.stack([i, j], axis=1), n, -(d * n).sum(1) / h, np.abs(c) > 1e-9
@@ -126,7 +127,7 @@ def test_what_brute_force_finds(world, dim):
         start, impulses, speeds, first, last, met = before, {}, {}, {}, {}, {}
         for s in range(6):
             x = single.position
-            ahead, pairs, n, speed, clear = brute(x, old, particles.velocity, gravity, h, particles)
+            ahead, pairs, n, speed, clear = brute(x, old, particles.velocity, gravity, h, particles, before)
             single.step(h)
             events, now = single.events(), rows(pairs)
             assert rows(events.begun.pairs) == now - before and rows(events.ended.pairs) == before - now

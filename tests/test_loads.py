@@ -160,11 +160,12 @@ def test_each_contact_of_a_pyramid_bears_what_statics_says(world):
 
 
 def test_the_floor_bears_the_weight(world):
-    # Walls without friction bear none of it: sum f = N m g on the floor, and the same on both sides.
+    # Walls without friction bear none of it: sum f = N m g on the floor, and the same on both sides. In f32, the last digit of a
+    # place would be 1e-4 of that.
     x, width = heap(6)
     walls = [tv.HalfSpace(n, offset, events=True) for n, offset in (((0, 1), 0.0), ((1, 0), 0.0), ((-1, 0), -width))]
     features = [tv.Gravity(G), tv.Contact(friction=0.5, loads=True), *walls]
-    w = world(tv.Particles(x, radius=R), features, substeps=8)
+    w = world(tv.Particles(x, radius=R), features, substeps=8, precision="f64")
     w.run(15.0)
     touches = w.wall_events().touches
     floor, left, right = (touches.impulse[touches.pairs[:, 1] == k].sum() * 60 for k in (2, 3, 4))
@@ -173,8 +174,10 @@ def test_the_floor_bears_the_weight(world):
 
 
 def test_loads_are_gone_with_what_bore_them(world):
-    # Where the ground goes, all fall: what is above is given at most the loads of one more substep, k g h.
-    w = pile(world, friction=0.0)
+    # Where the ground goes, all fall: what is above is given at most the loads of one more substep, k g h. Rows of five and four
+    # lie in each other's gaps, where they are stable; of heaps from a square lattice, without friction, one in fifty creeps on.
+    rows = [(R + 1.02 * i + 0.51 * (k % 2), R + k) for k in range(5) for i in range(5 - k % 2)]
+    w = boxed(world, np.array(rows), 5.1, 0.0, None, True, 0.0)
     start = w.step(1 / 60).energy
     assert max(w.step(1 / 60).energy for _ in range(600)) <= start * (1 + 1e-6) and overlap(w) < 1e-6
     box = w.features[2]

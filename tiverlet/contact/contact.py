@@ -45,13 +45,14 @@ class Contact(PairContact):
     World.events() tells which particles of the second group, the sensors, overlap with those of the first. It costs least where
     sensors are few. loads: pairs know what they bear at rest, and hold it without overlap; see known_loads.py.
 
-    A Jacobi pass: each pair wants C back along the current n, split by mass, p = C / (m_i w_i + m_j w_j), which conserves
-    momentum. A particle has its mass split m times, where m bounds the eigenvalues of S, the sum of n n^T over its overlapping
-    pairs: then sum w J J^T <= diag(sum w m) for the rows J of its pairs, and no eigenvalue of a pass exceeds 1. m is 3 for a disc
-    among six neighbours (counting pairs gives 6) and 4 for a sphere among twelve. With friction tangents are taken back too;
-    n n^T and t t^T sum up to the count, which is taken then, and for up to two pairs. m is worked out when other pairs
-    touch than before, where i moves by a 64th of its radius, and every 8 substeps, for pairs slide. It rises at once and decays
-    by 1/32 of its excess per pass; otherwise the stiffness would jump whenever a contact opens, and keep pairs moving.
+    A Jacobi pass: each pair wants C back along n, split by mass, p = C / (m_i w_i + m_j w_j), which conserves momentum, and
+    angular momentum with n at the start of the substep, see DiscGeometry.impact(). A particle has its mass split m times, where m
+    bounds the eigenvalues of S, the sum of n n^T over its overlapping pairs: then sum w J J^T <= diag(sum w m) for the rows J of
+    its pairs, and no eigenvalue of a pass exceeds 1. m is 3 for a disc among six neighbours (counting pairs gives 6) and 4 for a
+    sphere among twelve. With friction tangents are taken back too; n n^T and t t^T sum up to the count, which is taken then, and
+    for up to two pairs. m is worked out when other pairs touch than before, where i moves by a 64th of its radius, and every 8
+    substeps, for pairs slide. It rises at once and decays by 1/32 of its excess per pass; otherwise the stiffness would jump
+    whenever a contact opens, and keep pairs moving.
 
     Pushes are over-relaxed by r = 5/4, and a pair that overlapped in the last substep keeps a part of what it got. With M =
     m_i w_i + m_j w_j, p = r C / M + c p_last, but no more than what parts the pair alone, C / (w_i + w_j). For a mode with
@@ -164,9 +165,7 @@ class Contact(PairContact):
             pair_data.append(dev.events.touched)
         dev.search = NeighbourSearch(scene, self._listed, linked, self.table, pair_data, team, dev.move)
         dev.list = dev.search.list
-        dev.geometry = DiscGeometry(
-            scene, dev.search, self.push_out, dev.impulse if dev.has_restitution else dev.push, dev.has_loads
-        )
+        dev.geometry = DiscGeometry(scene, dev.search, self.push_out, dev.impulse if dev.has_restitution else dev.push)
         if dev.events:
             dev.events.bind(dev.list, dev.geometry)
         skips = not scene.memory.compiler.few and not dev.has_restitution  # in relax() what bounces forgets the last impact
@@ -244,7 +243,11 @@ class Contact(PairContact):
                     j = self.dev.list.neighbour[e]
                     last = self.dev.push.field[e]
                     shared = own + self.dev.splitting.weight[j]
-                    overlap, each, n, reach = self.dev.geometry.impact(i, j, self.dev.geometry.contact_distance(i, j), shared)
+                    contact_distance = self.dev.geometry.contact_distance(i, j)
+                    bears = last > 0 and first != 0
+                    if ti.static(self.dev.has_loads):
+                        bears = bears or self.dev.known.load.field[e] > 0
+                    overlap, each, n, reach = self.dev.geometry.impact(i, j, contact_distance, shared, bears)
                     each *= ti.static(RELAXATION)
                     paid, given, rests, alone = overlap, ti.zero(overlap), True, w + self.dev.w.of(j)
                     push, known = again * last, ti.zero(overlap)  # known: what of its push was given before
@@ -280,7 +283,8 @@ class Contact(PairContact):
                             part = ti.zero(part)
                             push -= known
                     if ti.static(self.dev.has_loads):
-                        carried += w * self.dev.known.remember(i, j, e, part, push + part, now) * n
+                        load = self.dev.known.remember(i, j, e, part, push + part, now)
+                        carried += w * load * self.dev.geometry.direction(i, j)  # as the next substep starts
                     pressed = part + known
                     if ti.static(self.dev.has_restitution):
                         self.dev.impulse.field[e] = self.dev.impulse.field[e] + pressed

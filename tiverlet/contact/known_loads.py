@@ -35,7 +35,8 @@ class Carried(Acceleration):
 
 class KnownLoads:
     """Each pair knows the load F [N] that it bears, and gives it in every substep like a force, before positions are looked at.
-    Contacts add what is missing, and may take back what was given, but never pull.
+    Contacts add what is missing, and may take back what was given, but never pull. It acts along the normal that the pair has as
+    the last substep ends: the next one starts there, so it has no moment.
 
     One pass per substep holds a load by an overlap, 2 k g h^2 for the k-th contact of a column; what is known needs none. F is
     learnt by and by, which is integral control: over a window, contacts added `mean`, and if that is what they added in the

@@ -31,12 +31,10 @@ class DiscGeometry:
 
     def __init__(
         self, scene: Scene, search: "NeighbourSearch", push_out: float = 0.0, impulse: PairData | None = None,
-        has_loads: bool = False,
     ):  # fmt: skip
         self.scene, self.search, self.list, self.impulse = scene, search, search.list, impulse
         self.push_out = scene.memory.number(push_out, scene.real)
         self.state, self.radius, self.real = scene.state, scene.radius, scene.real
-        self.has_loads = has_loads
         self.shrinks, self.store, self.senses = False, None, search.table.senses
 
     @ti.func
@@ -89,40 +87,49 @@ class DiscGeometry:
         return self.contact_distance(i, j) - length, r / length
 
     @ti.func
-    def impact(self, i, j, contact_distance, shared):
+    def direction(self, i, j):
+        """The normal of a pair that may be apart."""
+        r = self.state.apart(i, j)
+        length = r.norm()
+        n = 0 * r
+        if length > 0:
+            n = r / length
+        return n
+
+    @ti.func
+    def impact(self, i, j, contact_distance, shared, bears):
         """Overlap, 1 / shared, and normal, as in overlap(), of a pair that touches; and how far from each other it was where its
-        push acts, for particles that spin.
+        push acts, for particles that spin. bears: whether it pushed in the last substep, too.
 
         A pair that came together in this substep has the normal that it had at the time of impact: |r0 + s d| = contact_distance,
         with r0 at the start and d the relative displacement; what is left of d along n is the overlap. This is exact for free
         flight, where the normal at the end is off by the way that a pair slides past each other.
-        A pair of particles that spin, and that touched before, has the normal at the start, about which its push has no moment:
-        so angular momentum is kept to rounding, and what rolls on another is second order.
+        A pair that touched before has the normal at the start, as a rigid link has. With d_(n+1) = d_n + p and x_(n+1) = x_n +
+        d_(n+1), sum m x x d changes by sum m x_n x p, which is 0 for pushes along r0: angular momentum is kept to rounding, and
+        what slides or rolls on another is second order. Along normals at the end, a load would feed what slides past it: seven
+        discs that are drawn to a point doubled their angular momentum in 20 s at 20 substeps. What slides on a straight way ends
+        a little above what it slides on, so it counts as touching, too, if the pair bears a load.
         """
         r = self.state.apart(i, j)
-        rr = r.dot(r)
-        length = ti.sqrt(rr)
-        per = 1 / (shared * length)  # of all that takes time, divisions take most
-        overlap = contact_distance - length
-        each, n = per * length, (per * shared) * r
-        if rr <= contact_distance * contact_distance * ti.static(SAME_PLACE):
-            overlap, n = contact_distance, self.fallback_normal(i, j, r)
-            each = 1 / shared
         d = self.state.slid(self.state.d[i] - self.state.d[j], i, j)
-        r -= d
-        c = r.dot(r) - contact_distance * contact_distance
-        if c > 0 and (overlap > 0 or ti.static(not self.has_loads)):
-            a, b = d.dot(d), r.dot(d)
+        start, rr = r - d, r.dot(r)
+        before, near = start.dot(start), contact_distance * contact_distance * ti.static(SAME_PLACE)
+        c = before - contact_distance * contact_distance
+        overlap, each, n, reach = contact_distance - ti.sqrt(rr), 1 / shared, r, contact_distance
+        if (c <= 0 or bears) and before > near:
+            reach = ti.sqrt(before)
+            n = start / reach  # with 1 / shared, all in one division of a vector
+        else:
+            a, b = d.dot(d), start.dot(d)
             root = ti.sqrt(ti.max(b * b - a * c, 0)) - b
-            if b < 0 and root > 0:
+            if c > 0 and b < 0 and root > 0:
                 s = ti.min(c / root, 1)
-                n = (r + s * d) / contact_distance
+                n = (start + s * d) / contact_distance
                 overlap = ti.max((s - 1) * d.dot(n), 0)
-        reach = contact_distance
-        if ti.static(self.state.spins):
-            before = ti.sqrt(c + contact_distance * contact_distance)
-            if c <= 0 and before > contact_distance * ti.static(SAME_PLACE**0.5):
-                n, reach = r / before, before
+            elif rr > near:
+                n = r / ti.sqrt(rr)
+            else:
+                overlap, n = contact_distance, self.fallback_normal(i, j, r)
         return overlap, each, n, reach
 
     @ti.func

@@ -94,7 +94,8 @@ class Restitution:
             for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
                 if self.struck.field[e] > 0:
                     j = self.list.neighbour[e]
-                    overlap, _each, n, _reach = self.geometry.impact(i, j, self.geometry.contact_distance(i, j), self.weight[i])
+                    contact_distance = self.geometry.contact_distance(i, j)
+                    overlap, _each, n, _reach = self.geometry.impact(i, j, contact_distance, self.weight[i], False)
                     given, left, a = self.collision(i, j, n, overlap)
                     if overlap > 0 and a > 0 and given > 0:
                         if left > most or (left == most and earlier(i, j, partner)):
