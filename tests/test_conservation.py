@@ -94,20 +94,17 @@ def test_discs_that_lie_on_each_other_do_not_turn_by_themselves(world, loads):
     assert w.last.energy == pytest.approx(energy, rel=1e-5)
 
 
-@pytest.mark.parametrize("wall", [False, True])
-def test_what_slides_over_a_disc_is_second_order(world, wall):
+def test_what_slides_over_a_disc_is_second_order(world):
     # A pendulum that stands on its head, as long as the disc presses: theta'^2 = w^2 + 2 g / l (1 - cos theta), so the time that
     # it takes to theta is the integral of 1 / theta'. It would leave at cos theta = (2 + w^2 l / g) / 3, after 0.56 s.
     g, turning, until = 10.0, 1.0, 0.5
     node, share = np.polynomial.legendre.leggauss(20)
     late, gained = [], []
     for substeps in (10, 20, 40):
-        x, v, below = [(0.0, 1.0), (0.0, 0.0)], [(turning, 0.0), (0.0, 0.0)], tv.Ball((0, 0), 0.5) if wall else tv.Contact()
-        n = 1 if wall else 2
-        discs = tv.Particles(x[:n], velocity=v[:n], radius=0.5, pinned=range(1, n))
-        w = world(discs, [tv.Gravity(g), below], substeps=substeps, precision="f64")
+        discs = tv.Particles([(0.0, 0.0), (0.0, 1.0)], velocity=[(0.0, 0.0), (turning, 0.0)], radius=0.5, pinned=[0])
+        w = world(discs, [tv.Gravity(g), tv.Contact()], substeps=substeps, precision="f64")
         w.run(until)
-        x, v = w.position[0], w.velocity[0]
+        x, v = w.position[1], w.velocity[1]
         theta = np.arctan2(x[0], x[1])
         rate = np.sqrt(turning**2 + 2 * g * (1 - np.cos(theta * (1 + node) / 2)))
         late.append((share / rate).sum() * theta / 2 - until)
@@ -115,26 +112,6 @@ def test_what_slides_over_a_disc_is_second_order(world, wall):
         assert abs(np.linalg.norm(x) - 1.0) < 1e-9
     np.testing.assert_allclose(np.array(late[:-1]) / late[1:], 4.0, rtol=0.02)
     assert abs(late[0]) < 1e-5 * until and np.abs(gained).max() < 1e-5 * g
-
-
-def test_what_runs_round_in_a_ring_keeps_its_speed(world):
-    # From one point of a circle to the next, all chords are as long as the first one, to rounding; and that is at most
-    # (v h / R)^2 shorter than the way without the ring. In a bowl, a point gets as high again as it was, to second order.
-    for substeps in (1, 8):
-        ring, start = tv.Ball((0, 0), 1.0, inside=True), tv.Particles([(0.0, -1.0)], velocity=(5.0, 0.0))
-        w = world(start, [ring], substeps=substeps, precision="f64")
-        w.step(1 / 60)
-        first = np.linalg.norm(w.velocity)
-        w.run(5.0)
-        assert np.linalg.norm(w.velocity) == pytest.approx(first, rel=1e-11)
-        assert first == pytest.approx(5.0, rel=(5.0 / 60 / substeps) ** 2)
-    errors = []
-    for substeps in (5, 10):
-        bowl = [tv.Gravity(10.0), tv.Ball((0, 0), 1.0, inside=True)]
-        w = world(tv.Particles([(0.6, -0.8)]), bowl, substeps=substeps, precision="f64")
-        w.run(0.4)
-        errors.append((w.velocity[0] ** 2).sum() / 2 + 10.0 * (w.position[0, 1] + 0.8))
-    assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.1) and abs(errors[0]) < 1e-3
 
 
 def test_momentum_is_not_conserved_by_averaging_here(world):

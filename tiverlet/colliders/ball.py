@@ -26,9 +26,6 @@ class Ball(Collider):
 
     What passes through in one substep is caught on the way in: the moment when it met the surface is solved for, as for pairs.
     Nothing passes at any speed, nor can anything draw it through.
-    Without restitution it is pushed along n where it was met, or where it was at the start if it touched then, until C(x) = 0 at
-    the end, as a rigid link is (SHAKE): what slides or rolls on it is second order and keeps its energy, as far as the last
-    digits of its place can tell v^2 h^2 / R.
     """
 
     center = Knob(lambda f, v: checks.vector("Ball", "center", v, f.dim or len(np.atleast_1d(v))), "Middle of the ball [m].")
@@ -123,8 +120,7 @@ class Ball(Collider):
 
     @ti.func
     def confine(self, i, radius, h, frame_fraction, turn):
-        """The surface where it was met, or where it is nearest; without restitution, back onto it along the normal where it was
-        met, or at the start of the substep, see above."""
+        """The surface where it was met, or where it is nearest."""
         center, moved = self.dev.center.at(frame_fraction[1]), self.dev.center.step(frame_fraction)
         r = self.dev.state.nearest(self.dev.state.place(i) - center)
         own = ti.cast(self.radius, self.dev.real)
@@ -132,36 +128,16 @@ class Ball(Collider):
         d = self.dev.surface.path(i, moved)
         start = r - d
         start_depth, _n = self.nearest(start, own, radius)
-        reach = own + radius
-        if ti.static(self.inside):
-            reach = own - radius
-        c, b, a = start.dot(start) - reach * reach, start.dot(d), d.dot(d)
-        root = b * b - a * c
         if ti.static(not self.inside):
-            if c > -TOUCH * reach * reach and b < 0 and root > 0:
+            contact_distance = own + radius
+            c, b, a = start.dot(start) - contact_distance * contact_distance, start.dot(d), d.dot(d)
+            root = b * b - a * c
+            if c > -TOUCH * contact_distance * contact_distance and b < 0 and root > 0:
                 s = ti.max(c, 0) / (ti.sqrt(root) - b)
                 if s < 1:
                     n = (start + s * d).normalized()
                     depth = (s - 1) * d.dot(n)
-                    if ti.static(not self.dev.surface.has_restitution):
-                        if n.dot(r) > 0 and r.dot(r) < reach * reach:
-                            depth = self.back(r, n, reach)
-        elif ti.static(not self.dev.surface.has_restitution):
-            if depth > 0 and root > 0:
-                s = 0 * c
-                if c < -TOUCH * reach * reach:
-                    s = ti.min((ti.sqrt(root) - b) / a, 1)
-                m = -(start + s * d).normalized()
-                if m.dot(r) < 0 and m.dot(r) * m.dot(r) > r.dot(r) - reach * reach:
-                    depth, n = self.back(r, m, reach), m
         self.dev.surface.press(i, depth, start_depth, n, moved, h, turn)
-
-    @ti.func
-    def back(self, r, n, reach):
-        """How far it is from r along n to the sphere of radius `reach`, by the shorter way."""
-        along, over = r.dot(n), r.dot(r) - reach * reach
-        root = ti.sqrt(ti.max(along * along - over, 0))
-        return -over / (along + ti.select(along < 0, -root, root))
 
     @ti.func
     def nearest(self, r, own, radius):

@@ -26,10 +26,6 @@ class Collider(Feature):
     the displacement and give no energy. What is still not free then, in a wedge, stays where it was at the start of the substep.
     Walls that move towards each other may leave no room at all: then the last of them in the list has its way.
 
-    Particles are pushed along the normal where they are nearest at the end of the substep. On flat walls that is exact; on those
-    that are curved, what slides without friction loses speed, to first order in the substep: at 5 m/s in a circle of 1 m, 16 % in
-    10 s at 20 substeps. A Ball without restitution pushes as a rigid link does, to second order, and nothing is lost.
-
     friction: Coulomb, a number or (static, dynamic). The tangential displacement relative to the wall is taken back, up to
     friction times the normal displacement that the wall gave, so neither coefficient depends on h. What sticks goes back to
     where it was at the start of the substep, to the bit, so it does not creep.
