@@ -64,6 +64,15 @@ def test_other_contacts_stay(world):
         assert np.linalg.norm(w.position[2] - w.position[0]) >= 0.99
 
 
+def test_what_can_give_way_holds_nothing_inside(world):
+    # The ends of two links of 1 m that are 1.5 m wide overlap for good; not of springs, nor of links that may break.
+    x = np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]])
+    for more in ({}, {"compliance": 1e-3}, {"break_at": 5.0}):
+        w = world(tv.Particles(x, radius=1.5), [tv.Distance([[0, 1], [1, 2]], **more), tv.Contact()])
+        w.step(1 / 60)
+        assert ([0, 2] in w._runner.search._both.tolist()) is (not more)
+
+
 def test_edits_and_copies_leave_out_the_same(world):
     # A rope is lengthened, a thick one comes and goes in place; a clone, which is built anew, goes on alike.
     w = swing(world, True, 0.3, 0.04)

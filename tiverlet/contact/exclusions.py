@@ -4,8 +4,9 @@ These are the pairs of each constraint, and those that a chain of links holds cl
 
     sum l <= r_i + r_j
 
-They overlap however the chain bends, as a ball does with all of the rope that ends inside of it, or beads thicker than the links
-between them are long with the next but one: a contact would push against the links for good.
+They overlap however the chain bends, while links are as long as they were, as a ball does with all of the rope that ends inside
+of it, or beads thicker than the links between them are long with the next but one: a contact would push against the links for
+good. Links that give way, or break, hold nothing there.
 """
 
 from collections.abc import Sequence

@@ -21,7 +21,7 @@ from ..constraints.core.scalar import Scalar
 from ..contact.candidates import Candidates, DiscCandidates
 from .free_bodies import FreeBodies
 from .jacobian import Jacobian
-from .projection import Rows, given_back, matters, paid, seen, seen_before
+from .projection import Rows, given_back, matters, paid, seen, seen_before, tethered
 from .rigid_rows import rigid_rows
 from .solids import Solids
 
@@ -56,6 +56,7 @@ def release(runner: Any, h: float, longest: float, small: bool = False) -> bool:
     if jacobian:
         v, now = memory.read(state.d).astype(np.float64), state.get(memory)
         stopped = np.full(len(x), runner.scene.periodic is not None)  # among images there is no moment
+        stopped |= tethered(runner)
         stopped[jacobian.who[np.bincount(jacobian.row)[jacobian.row] == 1]] = True
         bodies = FreeBodies(jacobian, now, stopped)
         v[: len(x)], spun = bodies.spun(v[: len(x)], x, v[: len(x)])

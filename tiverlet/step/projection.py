@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..constraints.core.anchored import Anchored
 from ..constraints.core.scalar import Scalar
 from ..neighbours.queries import between
 from ..particles import LARGEST
@@ -97,13 +98,13 @@ def project(runner: "Runner", h: float, longest: float, contacts: ContactRows | 
     still = (undone != 0) & (start.theta > FIRM) & ~start.touches
     v[:n] += rows.jacobian.solve(-rows.jacobian.rates(v[:n]) * still, still)
     energy, overlap = seen_before(runner)
-    aims = LEFT * ratio**2, steps, slight
+    aims = LEFT * ratio**2, steps, slight, PRODUCTS / 8 if contacts else PRODUCTS
     rows, stopped = _moved(runner, start, rows, aims)
     left = 0.0
     if contacts:
         rows, stopped, left = _together(runner, start, rows, stopped, contacts.stored(before, w), batches[:-1], aims)
     x = rows.x
-    stopped[rails.who] = True
+    stopped |= tethered(runner)
     stopped |= runner.scene.periodic is not None  # among images there is no moment
     bodies = FreeBodies(start.jacobian, x, stopped)
     v[:n], spun = bodies.spun(v[:n], before, kept[:n])
@@ -124,20 +125,20 @@ def project(runner: "Runner", h: float, longest: float, contacts: ContactRows | 
     return True
 
 
-def _moved(runner: "Runner", start: "Rows", rows: "Rows", aims: tuple[float, int, float]) -> tuple["Rows", np.ndarray]:
+def _moved(runner: "Runner", start: "Rows", rows: "Rows", aims: tuple[float, int, float, float]) -> tuple["Rows", np.ndarray]:
     """Rows where particles are then, and which of them walls have stopped, (n,). aims: what _newton() asks for, the first one of
     what rows stored at the start."""
-    share, steps, slight = aims
+    share, steps, slight, most = aims
     state, memory, before = runner.scene.state, runner.memory, rows.x
     enough, stopped = share * start.stored, np.zeros(rows.n, dtype=bool)
     for _ in range(TURNS):
-        state.put(memory, _newton(rows, enough, share, steps, slight))
+        state.put(memory, _newton(rows, enough, aims))
         sent = state.get(memory)
         runner.stop_at_walls(before)
         x = state.get(memory)
         stopped |= (x != sent).any(axis=1)
         last, rows = rows, rows.at(x)  # what walls stop is lifted by the others
-        if (x == sent).all() or rows.matrix.products > PRODUCTS:
+        if (x == sent).all() or rows.matrix.products > most:
             break
         if rows.stored > last.stored or last.wall.any():  # what lies on them would be sent back there again and again
             rows = rows.held(last.wall, x - sent)
@@ -148,7 +149,7 @@ def _moved(runner: "Runner", start: "Rows", rows: "Rows", aims: tuple[float, int
 
 def _together(
     runner: "Runner", start: "Rows", rows: "Rows", stopped: np.ndarray, pressed: float, links: list[Any],
-    aims: tuple[float, int, float],
+    aims: tuple[float, int, float, float],
 ) -> tuple["Rows", np.ndarray, float]:  # fmt: skip
     """The best rows and stops of some rounds, each among the contacts that the one before led into; and what links and contacts
     store there, of what they did. pressed: what contacts stored at the start."""
@@ -160,7 +161,7 @@ def _together(
             break
         best, left = (rows, stopped), stored
         products += rows.matrix.products
-        if left <= aims[0] * before or products > PRODUCTS / TOGETHER:
+        if left <= aims[0] * before or products > aims[3]:
             break
         rows, more = _moved(runner, start, rows.among([*links, contacts], runner), aims)
         stopped = stopped | more
@@ -169,9 +170,11 @@ def _together(
     return rows, stopped, left / before if before > 0 else np.inf
 
 
-def _newton(rows: "Rows", enough: float, share: float, steps: int, slight: float) -> np.ndarray:
+def _newton(rows: "Rows", enough: float, aims: tuple[float, int, float, float]) -> np.ndarray:
     """Places at which what violations store is `enough` [J s^2], and where a solver of so many steps would move less, by this
-    share of the work, m p^2, that it would do at the begin; both unless they are less than `slight`."""
+    share of the work, m p^2, that it would do at the begin; both unless they are less than `slight`. aims: share, steps, slight,
+    and how many products it may take."""
+    share, steps, slight, most = aims
     mu, begin = BEGIN, rows.work(steps)
     for _ in range(NEWTON):
         new = rows.at(rows.x + rows.step(mu))
@@ -181,9 +184,18 @@ def _newton(rows: "Rows", enough: float, share: float, steps: int, slight: float
         if better:
             rows = new
         near = rows.stored <= max(enough, slight) and rows.work(steps) <= max(share * begin, slight)
-        if near or stalled or rows.worst <= DONE or mu > HARDEST or rows.matrix.products > PRODUCTS:
+        if near or stalled or rows.worst <= DONE or mu > HARDEST or rows.matrix.products > most:
             break
     return rows.x
+
+
+def tethered(runner: Any) -> np.ndarray:
+    """Which particles anything draws to a place of its own, (n,): bodies of theirs are not free."""
+    out = np.zeros(runner.n, dtype=bool)
+    for b in runner.batches:
+        if isinstance(b, Anchored):
+            out[b.indices[:, 0]] = True
+    return out
 
 
 def matters(violation: float, ratio: float) -> bool:
@@ -198,7 +210,8 @@ def _off(batch: Scalar, x: np.ndarray) -> float:
 
 
 def seen(runner: Any) -> tuple[float, float]:
-    """Energy [J], and the overlap of the worst contact, in radii."""
+    """Energy [J], and the overlap of the worst contact, in radii, whoever was near before particles moved."""
+    runner.invalidate()
     runner.look()
     report = runner.report()
     return report.energy, report.overlap

@@ -42,7 +42,8 @@ class Equation:
         name, m, add, unit = repr(batch), batch.count, scene.memory.field, batch.quantity.unit
         self.slots, self.real, self.side, self.corners = scene.slots, scene.real, batch.side, corners
         self.forces = bool(batch.acts_as_force(scene).any())
-        self.scene_sized = not unit and not (np.abs(start) > SMALLEST * batch.start.size).any()
+        least = SMALLEST * batch.start.size if batch.quantity.apart else 0.0
+        self.scene_sized = not unit and not (np.abs(start) > least).any()
         scale = unit or (batch.start.size if self.scene_sized else float(np.abs(start).mean()))
         self.scale = scene.memory.number(scale, scene.real)
         self.rest = add(f"{name}.rest", m, values=batch.goal, state=batch.driven)

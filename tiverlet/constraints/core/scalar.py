@@ -116,8 +116,8 @@ class Scalar(Batch):
         return self.quantity.pairs()
 
     def ties(self) -> tuple[np.ndarray, np.ndarray]:
-        """Links and ropes of fixed length, as long as they are at the start."""
-        if not self.quantity.apart or self.side < 0 or self.driven or not self.count:
+        """Rigid links and ropes that nothing drives or breaks, as long as they are at the start."""
+        if not self.quantity.apart or self.side < 0 or self.driven or self.breaks or self.soft or not self.count:
             return super().ties()
         return self.indices, self.rest_of(self.start.position)
 
