@@ -222,6 +222,7 @@ def stiffness(world: "World") -> float:
         return max(probe(clock.h, clock.time), runner.sheet.item(STIFFNESS))
 
 
+@np.errstate(all="ignore")  # they may be infinite
 def pumps(energies: list[float], kinetic: float) -> bool:
     """Whether twice the effort brought in more energy than the time before, and more than there was before the frame, the first
     of them: what is left violated, since it cannot be put right first, is a spring that a shorter substep makes stiffer, see

@@ -62,6 +62,7 @@ def before(world: "World") -> float | None:
     return None if clock.bound == CHANGED or clock.parting else clock.energy
 
 
+@np.errstate(all="ignore")  # energies may be infinite
 def missed(world: "World", report: StepReport, energy: float | None) -> float:
     """By how much a frame that had `energy` before got it wrong, relative to what is good: what came from nowhere or, where
     there is nothing but forces, was lost. What begins and ends in one frame, as when two bodies fly past each other, no other
