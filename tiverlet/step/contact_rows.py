@@ -14,7 +14,7 @@ class ContactRows:
     What is apart has no gradient: nothing holds it there.
     """
 
-    side, breaks, unit = -1, False, None
+    side, breaks = -1, False
 
     def __init__(self, pairs: Candidates, start: Any):
         self.pairs, self.start = pairs, start
@@ -48,11 +48,15 @@ class ContactRows:
 
     def stored(self, x: np.ndarray, w: np.ndarray) -> float:
         """What overlaps at positions x store, but for a factor, as Rows.stored."""
-        overlap, gradient = self.pairs.at(x)
-        D = (w[self.indices] * (gradient**2).sum(axis=2)).sum(axis=1)
-        return float(np.divide(np.maximum(overlap, 0.0) ** 2, D, out=np.zeros_like(D), where=D > 0).sum())
+        return stored_by(*self.pairs.at(x), w[self.indices])
 
     def inverse_size(self, x: np.ndarray) -> np.ndarray:
         """What makes C a share of a radius, or of half an edge, (m,)."""
         size = self.pairs.size
         return np.divide(1, size, out=np.zeros_like(size), where=size > 0)
+
+
+def stored_by(overlap: np.ndarray, gradient: np.ndarray, w: np.ndarray) -> float:
+    """What overlaps (m,) store, but for a factor; gradient: (m, k, dim), of particles with inverse masses w (m, k)."""
+    D = (w * (gradient**2).sum(axis=2)).sum(axis=1)
+    return float(np.divide(np.maximum(overlap, 0.0) ** 2, D, out=np.zeros_like(D), where=D > 0).sum())

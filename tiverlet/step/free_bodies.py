@@ -10,6 +10,7 @@ as a skater does who draws in her arms. The energy of that is what the body gave
 
 import numpy as np
 
+from ..geometry.ordered import distinct
 from ..solvers.corners import bodies_of
 from .block_matrix import summed
 from .jacobian import Jacobian
@@ -26,12 +27,12 @@ class FreeBodies:
     def __init__(self, jacobian: Jacobian, x: np.ndarray, stopped: np.ndarray):
         real = jacobian.diagonal[jacobian.row] > 0  # contacts that may be and are not tie nothing together
         rows, row, who, w = jacobian.m, jacobian.row[real], jacobian.who[real], jacobian.w
-        label, self.body = bodies_of(rows, row, who, w)
-        self.count = rows + 1
-        held = np.bincount(label[row[(w[who] == 0) | stopped[who]]], minlength=self.count) > 0
-        self.free = (~held[self.body] & (self.body < rows))[:, None]
+        label, body = bodies_of(rows, row, who, w)
+        held = np.bincount(label[row[(w[who] == 0) | stopped[who]]], minlength=rows + 1) > 0
+        self.free = (~held[body] & (body < rows))[:, None]
+        each, self.body, _ = distinct(np.where(self.free[:, 0], body, rows))  # all that is not free is one
+        self.count = len(each)
         self.mass = np.divide(1, w, out=np.zeros_like(w), where=w > 0)[:, None] * self.free
-        self.x = x
         self.arm = self._about_center(x)
         axes = 3 if x.shape[1] == 3 else 1
         inertia = summed(self.mass * _inertia(self.arm).reshape(len(x), -1), self.body, self.count).reshape(-1, axes, axes)

@@ -19,9 +19,11 @@ import numpy as np
 
 from ..constraints.core.scalar import Scalar
 from ..contact.candidates import Candidates, DiscCandidates
+from .contact_rows import stored_by
 from .free_bodies import FreeBodies
 from .jacobian import Jacobian
-from .projection import Rows, given_back, matters, paid, seen, seen_before, tethered
+from .projection import Rows, given_back, matters, paid, seen, seen_before
+from .rails import tethered
 from .rigid_rows import rigid_rows
 from .solids import Solids
 
@@ -55,8 +57,7 @@ def release(runner: Any, h: float, longest: float, small: bool = False) -> bool:
     jacobian = part(runner, pairs, solids, x, ratio)
     if jacobian:
         v, now = memory.read(state.d).astype(np.float64), state.get(memory)
-        stopped = np.full(len(x), runner.scene.periodic is not None)  # among images there is no moment
-        stopped |= tethered(runner)
+        stopped = tethered(runner)
         stopped[jacobian.who[np.bincount(jacobian.row)[jacobian.row] == 1]] = True
         bodies = FreeBodies(jacobian, now, stopped)
         v[: len(x)], spun = bodies.spun(v[: len(x)], x, v[: len(x)])
@@ -166,9 +167,3 @@ def bound(runner: Any, x: np.ndarray, ratio: float) -> Rows | None:
         return None
     rows = Rows(some, w, x, runner.scene.periodic)
     return rows.towards(rows.C - (1 - ratio**2) * rows.undone(runner))
-
-
-def stored_by(overlap: np.ndarray, gradient: np.ndarray, w: np.ndarray) -> float:
-    """What overlaps (m,) store, but for a factor; gradient: (m, k, dim), of particles with inverse masses w (m, k)."""
-    D = (w * (gradient**2).sum(axis=2)).sum(axis=1)
-    return float(np.divide(np.maximum(overlap, 0.0) ** 2, D, out=np.zeros_like(D), where=D > 0).sum())

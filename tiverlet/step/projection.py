@@ -24,7 +24,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..constraints.core.anchored import Anchored
 from ..constraints.core.scalar import Scalar
 from ..neighbours.queries import between
 from ..particles import LARGEST
@@ -35,7 +34,7 @@ from .contact_rows import ContactRows
 from .free_bodies import FreeBodies
 from .integrator import h2_effective_of
 from .jacobian import Jacobian
-from .rails import Rails
+from .rails import Rails, tethered
 from .rigid_rows import RigidRows, left_out, rigid_rows
 
 if TYPE_CHECKING:
@@ -46,6 +45,7 @@ FIRM = 0.9  # theta from where on velocities may not change a constraint
 FAR = 0.75  # of the longest: a substep in which what is small now has had its chance
 NEWTON = 40  # steps, at most
 PRODUCTS = 1e9  # of numbers: some seconds, after which the rest is left as it is
+SHARED = PRODUCTS / 8  # where contacts move, too: they are tried after links alone, some times
 BEGIN, HARDEST, LEAST = 1e-3, 10.0, 1e-9  # mu of the first, and of the last try; the least
 FINE, STALLED = 1e-5, 0.05  # mu from which on a step has to take out as much of what is stored: what cannot be met stays
 SLIGHT = 0.01  # of the kinetic energy: what violations may become where contacts are in the way
@@ -98,17 +98,16 @@ def project(runner: "Runner", h: float, longest: float, contacts: ContactRows | 
     still = (undone != 0) & (start.theta > FIRM) & ~start.touches
     v[:n] += rows.jacobian.solve(-rows.jacobian.rates(v[:n]) * still, still)
     energy, overlap = seen_before(runner)
-    aims = LEFT * ratio**2, steps, slight, PRODUCTS / 8 if contacts else PRODUCTS
+    aims = LEFT * ratio**2, steps, slight, SHARED if contacts else PRODUCTS
     rows, stopped = _moved(runner, start, rows, aims)
     left = 0.0
     if contacts:
         rows, stopped, left = _together(runner, start, rows, stopped, contacts.stored(before, w), batches[:-1], aims)
     x = rows.x
-    stopped |= tethered(runner)
-    stopped |= runner.scene.periodic is not None  # among images there is no moment
-    bodies = FreeBodies(start.jacobian, x, stopped)
+    bodies = FreeBodies(start.jacobian, x, stopped | tethered(runner))
     v[:n], spun = bodies.spun(v[:n], before, kept[:n])
     memory.write(state.d, v)
+    runner.invalidate()  # moves may have led into what was far
     more, deeper = seen(runner)
     fails = left > BETTER if contacts else deeper > overlap or rows.stored > WORSE * start.stored
     if fails:
@@ -189,15 +188,6 @@ def _newton(rows: "Rows", enough: float, aims: tuple[float, int, float, float]) 
     return rows.x
 
 
-def tethered(runner: Any) -> np.ndarray:
-    """Which particles anything draws to a place of its own, (n,): bodies of theirs are not free."""
-    out = np.zeros(runner.n, dtype=bool)
-    for b in runner.batches:
-        if isinstance(b, Anchored):
-            out[b.indices[:, 0]] = True
-    return out
-
-
 def matters(violation: float, ratio: float) -> bool:
     """Whether what a violation, as a share of its size, leaves to vibrate is worth a look."""
     return violation * (1 - ratio**2) ** 2 > ENOUGH * ratio**2
@@ -210,8 +200,7 @@ def _off(batch: Scalar, x: np.ndarray) -> float:
 
 
 def seen(runner: Any) -> tuple[float, float]:
-    """Energy [J], and the overlap of the worst contact, in radii, whoever was near before particles moved."""
-    runner.invalidate()
+    """Energy [J], and the overlap of the worst contact, in radii."""
     runner.look()
     report = runner.report()
     return report.energy, report.overlap

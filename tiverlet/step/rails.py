@@ -34,3 +34,13 @@ class Rails:
         out = np.zeros((n, dim, dim))
         out[self.who] = np.eye(dim) - self.along[:, :, None] * self.along[:, None, :]
         return out
+
+
+def tethered(runner: "Runner") -> np.ndarray:
+    """Which particles anything draws to a place of its own, (n,): bodies of theirs are not free; nor is any in a periodic box,
+    for among images there is no moment."""
+    out = np.full(runner.n, runner.scene.periodic is not None)
+    for b in runner.batches:
+        if isinstance(b, Anchored):
+            out[b.indices[:, 0]] = True
+    return out

@@ -19,7 +19,7 @@ class RigidRows:
     what is no motion of the whole, C_r = sum_i m_i B_ri . D_i; to first order R and c do not matter, grad_i C_r = m_i R B_ri.
     """
 
-    side, breaks, unit = 0, False, None
+    side, breaks = 0, False
 
     def __init__(self, batch: Any, w: np.ndarray, some: np.ndarray):
         self.clusters = [Cluster(batch, c, w) for c in np.flatnonzero(some).tolist()]

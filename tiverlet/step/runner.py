@@ -111,7 +111,7 @@ class Runner:
                     report = self.report()
                     if not clock.tick:
                         extent = self._data[EXTENT : EXTENT + self.step.dim]
-                        clock.set_out(report.energy, slack(self.scene.inv_mass, extent, clock.h))
+                        clock.begin_with(report.energy, slack(self.scene.inv_mass, extent, clock.h))
                     self.looked(report.energy, report.overlap)
                 else:
                     clock.energy = float(self._data[0])

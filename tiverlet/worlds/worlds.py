@@ -20,19 +20,7 @@ from ..particles import in_range
 from ..step import checkpoint, energy_bound
 from ..step import frames as kernel
 from ..step.clock import CHANGED, PARTED, SQUEEZED, room, slack
-from ..step.diagnostics import (
-    ENERGY,
-    EXTENT,
-    KINETIC,
-    OVERLAP,
-    REACH,
-    STARTED,
-    STEPPED,
-    STIFFNESS,
-    TURNS,
-    UNSTEPPED,
-    risks,
-)
+from ..step.diagnostics import ENERGY, EXTENT, KINETIC, OVERLAP, REACH, STARTED, STEPPED, STIFFNESS, TURNS, UNSTEPPED, risks
 from ..step.integrator import FREE
 from ..world import World
 from .clocks import NONE, Clocks
