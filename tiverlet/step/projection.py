@@ -313,6 +313,7 @@ class Rows:
         """Rows that follow one another, by the same particles in the same order, as those of a cluster."""
         before = np.maximum(np.arange(len(self.who)) - self.arity[self.row], 0)
         other = (self.row[before] != self.row - 1) | (self.who[before] != self.who)
+        other |= self.arity[np.maximum(self.row - 1, 0)] != self.arity[self.row]  # the last of more corners are others
         return np.split(np.arange(self.m), np.flatnonzero(np.bincount(self.row, other, minlength=self.m))[1:])
 
     def held(self, wall: np.ndarray, back: np.ndarray) -> "Rows":
