@@ -31,8 +31,8 @@ def row(k: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def struck(x, v, n, e: float) -> tuple[np.ndarray, np.ndarray]:
-    """Velocities of the center and all particles after a rigid body of unit masses, without spin, met a plane of normal n with its
-    lowest particle at the velocity v: v' = v + J n / M, J = -(1 + e) v.n / (1 / M + (r x n) . I^-1 (r x n))."""
+    """Velocities of the center and all particles after a rigid body of unit masses, without spin, met a plane of normal n at the
+    velocity v with its lowest particle: v' = v + J n / M, J = -(1 + e) v.n / (1 / M + (r x n) . I^-1 (r x n))."""
     r, m = x - x.mean(axis=0), len(x)
     low = int(np.argmin(x @ n))
     # In any dimension a turn is an antisymmetric matrix B, v_i = B r_i: the least squares fit of it is the rigid motion.

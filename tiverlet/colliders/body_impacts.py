@@ -7,10 +7,9 @@ from ..device import ti
 if TYPE_CHECKING:
     from ..features.feature import Batch, Scene
 
-FEW, MANY = (
-    8,
-    32,
-)  # passes over the constraints, at most, beside those of every substep: where a system solves them, and where not
+# Passes over the constraints, at most, beside those of every substep: where a system solves them, and where blows go from link to
+# link. Of those, most have little to do.
+FEW, MANY = 8, 32
 MET = 2.0**-9  # of the first push: a velocity that is missed by less is met
 LIGHTEST = 2.0**-7  # a particle is taken for this part, at least, of the mass that it has to stop
 WAITS, HELD = 1, 2  # what is struck is so in the pass in which it meets the wall, and in those after that
@@ -33,8 +32,8 @@ class BodyImpacts:
         p' = max(p + (t - d.n) / s, 0),    s = (miss_last - miss) / push_last,    miss = t - d.n
 
     where constraints are solved exactly: s is what they left of the last push, the secant of the particle's part of the mass, and
-    two or three passes do. Elsewhere s = 1, for what a pass leaves is on its way; what the last one leaves is lost. All impacts of
-    a substep together are Newton's law for a rigid body. It neither takes nor gives energy at e = 1, which is kept to O(h) in an
+    two or three passes do. Elsewhere s = 1, for what a pass leaves is on its way; what the last leaves is lost. All impacts of a
+    substep together are Newton's law for a rigid body. It neither takes nor gives energy at e = 1, which is kept to O(h) in an
     impact, for a body turns in a substep. Friction holds the tangential displacement by up to its coefficient times p.
 
     The first of these passes only notes what the passes of every substep left of violations. The others leave that: taken out all
@@ -50,7 +49,8 @@ class BodyImpacts:
         self.spreads = not system  # from link to link; a system takes all at once
         self.exact = bool(scene.slots.exact and (not system or system.left_out(batches) == 0))
         n, dim, add = scene.count, scene.particles.dim, scene.memory.field
-        self.state, self.slots, self.real = scene.state, scene.slots, scene.real
+        self.state, self.real = scene.state, scene.real
+        self.rigid = add("impacts.rigid", n, kind=ti.i32)  # whether a rigid constraint holds it
         self.struck = add("impacts.struck", n, kind=ti.i32)  # WAITS, HELD, or 0
         self.normal, self.moved = add("impacts.normal", n, width=dim), add("impacts.wall_moved", n, width=dim)
         self.coefficients = add("impacts.friction", n, width=2)
@@ -71,8 +71,22 @@ class BodyImpacts:
 
     @ti.func
     def linked(self, i):
-        """Whether constraints hold particle i."""
-        return self.slots.begin[i + 1] > self.slots.begin[i]
+        """Whether rigid constraints hold particle i."""
+        return self.rigid[i] != 0
+
+    @ti.func
+    def link(self, batch: ti.template(), c):  # type: ignore[valid-type]
+        """In the first pass: note whom constraint c holds, if it is rigid. Springs take no part in a blow: it is over before."""
+        holds = batch.dev.spring.is_rigid(c)
+        if ti.static(batch.breaks):
+            holds = holds and batch.dev.strength.holds(c)
+        if holds:
+            if ti.static(batch.arity > 0):
+                for k in ti.static(range(batch.arity)):
+                    self.rigid[batch.dev.corners.member(c, k)] = 1
+            else:
+                for e in range(batch.dev.corners.starts[c], batch.dev.corners.starts[c + 1]):
+                    self.rigid[batch.dev.corners.members[e]] = 1
 
     @ti.func
     def waits(self, i):
@@ -82,7 +96,7 @@ class BodyImpacts:
     @ti.func
     def clear(self, i):
         """As a substep begins."""
-        self.struck[i] = self.stirred[i] = 0
+        self.struck[i] = self.stirred[i] = self.rigid[i] = 0
 
     @ti.func
     def close(self):
@@ -112,20 +126,23 @@ class BodyImpacts:
 
     @ti.func
     def reaches(self, batch: ti.template(), c):  # type: ignore[valid-type]
-        """Whether anything of the blow has reached constraint c."""
+        """Whether anything of a blow has reached constraint c, which is rigid."""
         out = True
-        if ti.static(batch.arity > 0 and self.spreads):
-            out = False
-            for k in ti.static(range(batch.arity)):
-                out = out or self.stirred[batch.dev.corners.member(c, k)] != 0
+        if ti.static(batch.arity > 0):
+            out = batch.dev.spring.is_rigid(c)
+            if ti.static(self.spreads):
+                near = False
+                for k in ti.static(range(batch.arity)):
+                    near = near or self.stirred[batch.dev.corners.member(c, k)] != 0
+                out = out and near
         return out
 
     @ti.func
     def strike(self, i, n, moved, target, static, dynamic, log):
-        """A wall with the normal n that itself moved by `moved` is to take particle i to the normal displacement `target`, as seen
-        from it, and to note that in this log. Returns whether that can wait for another pass: not where particle i has struck a
+        """A wall with the normal n that itself moved by `moved` is to take particle i to the normal displacement `target`, as it
+        sees it, and to note that in this log. Returns whether that can wait for another pass: not where particle i has struck a
         wall before in this substep, nor in the last pass."""
-        out = self.struck[i] != HELD and self.open[ti.static(self.passes - 1)] == 0
+        out = self.struck[i] == 0 and self.open[ti.static(self.passes - 1)] == 0
         if out:
             self.struck[i] = WAITS
             self.normal[i], self.moved[i], self.target[i] = n, moved, target
@@ -133,6 +150,15 @@ class BodyImpacts:
             self.coefficients[i] = [static, dynamic]
             self.held[i] = ti.zero(n)
             self.log[i] = log
+        return out
+
+    @ti.func
+    def between_walls(self, i):
+        """Whether another wall presses particle i, which has struck one: there it does not bounce, for what one wall gives, the
+        other would make more."""
+        out = self.struck[i] == HELD
+        if out:
+            self.target[i] = ti.min(self.target[i], 0)
         return out
 
     @ti.func

@@ -36,7 +36,7 @@ class Surface:
         self.has_friction, self.has_restitution = friction is not None, restitution is not None
         self.impacts: Any = scene.impacts
         self.has_impacts = self.has_restitution and scene.impacts is not None
-        self.log_number = scene.impacts.enter(log) if self.has_impacts else -1
+        self.log_number = self.impacts.enter(log) if self.has_impacts else -1
         self.poses: list[Any] = []
         self.spins, self.turns, self.radius = scene.state.spins and self.has_friction, turns, scene.radius
         self.spin: Any = scene.state.spin if scene.state.spins else None
@@ -135,11 +135,9 @@ class Surface:
                 if gap >= 0 and leaving < 0 and turn != GENTLY:
                     before = (self.state.before[i] - moved).dot(n)
                     if self.takes_along(i):
-                        if self.restitution[None] > 0 and -before > ti.static(SLOW) * (before - leaving):
-                            after = -self.restitution[None] * before
-                            if turn == AHEAD or self.waits_for(i, n, moved, after):
-                                after = leaving
-                            move = after - leaving
+                        bounces = self.restitution[None] > 0 and -before > ti.static(SLOW) * (before - leaving)
+                        if self.waits(i, n, moved, -self.restitution[None] * before, bounces, turn):
+                            move, after = 0 * depth, leaving
                     else:
                         rise, after, left = self.bounce(gap, leaving, before, after)
                 if turn == AHEAD and rise > 0:  # what bounces in this substep does not lean on the wall
@@ -192,14 +190,20 @@ class Surface:
         return out
 
     @ti.func
-    def waits_for(self, i, n, moved, target):
-        """Whether particle i, which is linked, bounces in passes to come, to the normal displacement `target`."""
+    def waits(self, i, n, moved, target, bounces, turn):
+        """Whether particle i, which is linked, is left where it is for now: if it bounces, that is for passes to come, which take
+        it to the normal displacement `target`."""
         out = False
         if ti.static(self.has_impacts):
             static = dynamic = 0 * target
             if ti.static(self.has_friction and not self.spins):
                 static, dynamic = self.static(), self.dynamic()
-            out = self.impacts.strike(i, n, moved, target, static, dynamic, self.log_number)
+            if turn == AHEAD:
+                out = bounces
+            elif self.impacts.between_walls(i):
+                out = False
+            elif bounces:
+                out = self.impacts.strike(i, n, moved, target, static, dynamic, self.log_number)
         return out
 
     @ti.func

@@ -95,6 +95,9 @@ class ConstraintPass:
             self.team.wait()
         for f in ti.static(self.batches):
             for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
+                for impacts in ti.static(self.impacts):
+                    if now.first != 0:
+                        impacts.link(f, c)
                 if self.takes_part(f, c, now.newton):
                     f.dev.relax(c, now.h, h2_effective, now.frame_fraction, now.first, fresh)
         if ti.static(len(self.batches) > 0):

@@ -225,7 +225,7 @@ class CornerPasses(Passes):
 
     @ti.func
     def left_before(self, c, violation, lam):
-        """What the passes of every substep left of the violation, in those that bodies have which struck a wall, see BodyImpacts."""
+        """In passes for what struck a wall, see BodyImpacts: what the passes of every substep left of the violation; else 0."""
         out = 0 * violation
         if self.impacts.notes():
             self.left[c] = ti.select(ti.static(self.side == 0) or self.side * violation > 0 or lam != 0, violation, out)
