@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 # How a collider confines: as it comes; only what is further out than rounding; of that, without friction and bounces.
 FIRST, AGAIN, GENTLY, AHEAD = range(4)
 TOUCH = 2.0**-20  # of the size of a wall: a start that is no deeper inside than this counts as on the surface
+SLOW = 8.0  # what a linked particle comes nearer by before forces and links of a substep add to it, times that, does not bounce
 ON = 1e-3  # of its distance from the middle of a wall: what is no deeper inside than this lies on it
 
 
@@ -33,6 +34,9 @@ class Surface:
         self.has_log = log is not None
         self._memory, self.state, self.push_out, self.real = scene.memory, scene.state, push_out, scene.real
         self.has_friction, self.has_restitution = friction is not None, restitution is not None
+        self.impacts: Any = scene.impacts
+        self.has_impacts = self.has_restitution and scene.impacts is not None
+        self.log_number = self.impacts.enter(log) if self.has_impacts else -1
         self.poses: list[Any] = []
         self.spins, self.turns, self.radius = scene.state.spins and self.has_friction, turns, scene.radius
         self.spin: Any = scene.state.spin if scene.state.spins else None
@@ -117,6 +121,9 @@ class Surface:
         close = self.state.digits(i)
         if depth > -close:
             depth = ti.max(depth, ti.min(-leaving, close))
+        if ti.static(self.has_impacts):
+            if self.impacts.waits(i):
+                depth = ti.min(depth, 0)
         if depth > ti.select(turn == FIRST, 0, close):
             move = ti.max(depth - ti.max(start_depth - self.push_out * h, 0), 0)
             # Normal displacement after the substep; what has bounced may be moved further than that is to tell.
@@ -126,7 +133,13 @@ class Surface:
                 # Where the last bounce has put it back on a straight way, that way began at a height of `gap`.
                 gap = -depth - leaving
                 if gap >= 0 and leaving < 0 and turn != GENTLY:
-                    rise, after, left = self.bounce(gap, leaving, (self.state.before[i] - moved).dot(n), after)
+                    before = (self.state.before[i] - moved).dot(n)
+                    if self.takes_along(i):
+                        bounces = self.restitution[None] > 0 and -before > ti.static(SLOW) * (before - leaving)
+                        if self.waits(i, n, moved, -self.restitution[None] * before, bounces, turn):
+                            move, after = 0 * depth, leaving
+                    else:
+                        rise, after, left = self.bounce(gap, leaving, before, after)
                 if turn == AHEAD and rise > 0:  # what bounces in this substep does not lean on the wall
                     move, rise, after = 0 * depth, 0 * depth, leaving
             if ti.static(self.has_log):
@@ -167,6 +180,31 @@ class Surface:
             if not stuck:
                 self.state.advance(i, shift)
         return shift
+
+    @ti.func
+    def takes_along(self, i):
+        """Whether particle i is linked, so that it does not bounce alone, see BodyImpacts."""
+        out = False
+        if ti.static(self.has_impacts):
+            out = self.impacts.linked(i)
+        return out
+
+    @ti.func
+    def waits(self, i, n, moved, target, bounces, turn):
+        """Whether particle i, which is linked, is left where it is for now: if it bounces, that is for passes to come, which take
+        it to the normal displacement `target`."""
+        out = False
+        if ti.static(self.has_impacts):
+            static = dynamic = 0 * target
+            if ti.static(self.has_friction and not self.spins):
+                static, dynamic = self.static(), self.dynamic()
+            if turn == AHEAD:
+                out = bounces
+            elif self.impacts.between_walls(i):
+                out = False
+            elif bounces:
+                out = self.impacts.strike(i, n, moved, target, static, dynamic, self.log_number)
+        return out
 
     @ti.func
     def grip(self, i, n, across, support, bounces):

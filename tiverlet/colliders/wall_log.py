@@ -55,6 +55,11 @@ class WallLog:
         self.impulse[i] = self.impulse[i] + push
 
     @ti.func
+    def add(self, i, push):
+        """Its displacement gets so much more along the normal."""
+        self.impulse[i] = self.impulse[i] + push
+
+    @ti.func
     def close(self, i):
         """As a frame ends: keep whether particle i touches."""
         if self.state.awake(i):  # else it touches what it touched

@@ -59,6 +59,7 @@ class Scene:
     radius: Any = None  # where something asks for radii
     slots: Any = None  # where constraints leave their moves
     own_weight: Any = None  # the OwnWeight of particles, where loads become known
+    impacts: Any = None  # the BodyImpacts, where linked particles may bounce off walls
     residuals: Any = None  # batch -> what the last substep left of each of its violations
     order: int = 2  # of the substep in h
     periodic: Any = None  # the Periodic of the world

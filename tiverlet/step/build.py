@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from ..colliders.body_impacts import BodyImpacts, can_have_impacts
 from ..colliders.collider import Collider
 from ..constraints.core.anchored import refuse_held_twice
 from ..contact.pair_contact import PairContact
@@ -164,6 +165,8 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     size = size_of(path, scale.work)
     team = Team(memory, size, len(particles), path == "parallel" and size == 1, pieces=PIECES if contact else size)
     search = contact.join(scene, batches, team) if contact else None
+    if batches and can_have_impacts(scene) and any(w.has_restitution for w in walls):
+        scene.impacts = BodyImpacts(scene, batches)
     for feature in of(Batch):
         feature.scene = scene  # also of those that do nothing, because all of their particles are held
     for feature in [*accelerations, *drivers, *batches, *walls]:

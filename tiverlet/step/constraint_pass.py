@@ -14,6 +14,7 @@ class ConstraintPass:
     def __init__(self, scene: Scene, integrator: Any, batches: list[Batch], team: Team, stride: int):
         self.integrator, self.batches, self.slots, self.team = integrator, batches, scene.slots, team
         self.systems = [scene.slots.system] if scene.slots and scene.slots.system else []
+        self.impacts = [scene.impacts] if scene.impacts else []
         self.steps = max([s.steps for s in self.systems], default=0)
         self.refines = bool(scene.slots) and scene.slots.refines
         for system in self.systems:
@@ -76,6 +77,9 @@ class ConstraintPass:
                     out = out and f.dev.unmet(c)
                 else:
                     out = False
+        for impacts in ti.static(self.impacts):
+            if impacts.goes_on() and out:
+                out = impacts.reaches(f, c)
         return out
 
     @ti.func
@@ -91,6 +95,9 @@ class ConstraintPass:
             self.team.wait()
         for f in ti.static(self.batches):
             for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
+                for impacts in ti.static(self.impacts):
+                    if now.first != 0:
+                        impacts.link(f, c)
                 if self.takes_part(f, c, now.newton):
                     f.dev.relax(c, now.h, h2_effective, now.frame_fraction, now.first, fresh)
         if ti.static(len(self.batches) > 0):

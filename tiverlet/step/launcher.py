@@ -26,6 +26,7 @@ class Launcher:
         )
         self.has_pair_forces, self.lists_pairs = step.has_pair_forces, bool(step.listed_forces)
         self.systems, self.steps = bool(step.constraints.systems), step.constraints.steps
+        self.impacts = step.impacts
         self.looks, self.applies_first = step.looks, step.particles.applies_first
         self.waiting: list[str] = []
         self.now: Any = None  # the half of a pass that they are in
@@ -85,7 +86,20 @@ class Launcher:
 
     def last_half(self, now: Moment) -> int:
         """The one before which it ends; one more for the list after all of them."""
-        return now.span.iterations * self.halves if now.s < now.span.substeps else 1
+        passes = now.span.iterations + (self.impacts.passes if self.impacts else 0)
+        return passes * self.halves if now.s < now.span.substeps else 1
+
+    def regular(self, now: Moment, half: int) -> bool:
+        """Whether this half of a pass is one of those that every substep has."""
+        return half < now.span.iterations * self.halves or now.s >= now.span.substeps
+
+    def goes_on(self, now: Moment, half: int) -> bool:
+        """Whether there is this half of a pass. The host has to ask where there are bodies that may bounce off walls."""
+        if self.regular(now, half):
+            return True
+        it = half // self.halves - now.span.iterations
+        self.flush()
+        return bool(self.runner.memory.read(self.impacts.open)[it])
 
     def begins(self, now: Moment) -> bool:
         """Whether the substep, or what comes after all of them, begins here."""

@@ -44,6 +44,8 @@ class ParticlePass:
         self.contacts = [contact] if contact else []
         self.acts = self.gathers or bool(contact or walls)
         self.knows_loads = bool(contact) and contact.has_loads
+        self.impacts = [scene.impacts] if scene.impacts else []
+        self.spreads = bool(scene.impacts) and scene.impacts.spreads
         self.weights = [scene.own_weight] if scene.own_weight else []
         self.rough = any(w.has_friction or w.has_restitution for w in walls)
         self.turned_by_walls = scene.state.spins and any(w.has_friction for w in walls)
@@ -128,6 +130,9 @@ class ParticlePass:
             if now.fresh != 0:
                 for i in range(first, end):
                     self.state.spin.begin(i, now.h)
+        for impacts in ti.static(self.impacts):
+            for i in range(first, end):
+                impacts.clear(i)
         self.integrator.advance(first, end, now)
         for weights in ti.static(self.weights):
             if now.damps != 0:
@@ -193,7 +198,14 @@ class ParticlePass:
     def gather(self, i, newton):
         """Move particle i as constraints want."""
         if self.state.awake(i):
-            self.slots.gather(i, newton)
+            if ti.static(self.spreads):
+                d = self.state.d[i]
+                self.slots.gather(i, newton)
+                for impacts in ti.static(self.impacts):
+                    if impacts.goes_on() and (self.state.d[i] != d).any():
+                        impacts.stirred[i] = 1
+            else:
+                self.slots.gather(i, newton)
 
     @ti.func
     def apply_corrections(self, now):
@@ -215,11 +227,12 @@ class ParticlePass:
             if now.first != 0:
                 self.look_back(begin, end)
         for c in ti.static(self.contacts):
-            for b in range(blocks(begin, end)):
-                low, high = block(b, begin, end)
-                if c.busy(low) != 0:
-                    for i in range(low, high):
-                        c.apply_corrections(i, now.first)
+            if now.it < now.span.iterations:  # else there are none but walls, see BodyImpacts
+                for b in range(blocks(begin, end)):
+                    low, high = block(b, begin, end)
+                    if c.busy(low) != 0:
+                        for i in range(low, high):
+                            c.apply_corrections(i, now.first)
         if ti.static(len(self.walls) > 0):
             if now.final != 0:
                 for i in range(begin, end):
@@ -229,6 +242,11 @@ class ParticlePass:
                     for i in range(begin, end):
                         if self.state.awake(i):
                             accumulate(self.wall_turn, i, -self.state.spin.s[i], now.first)
+        for impacts in ti.static(self.impacts):
+            if now.it >= now.span.iterations:
+                for i in range(begin, end):
+                    if impacts.hold(i):
+                        impacts.ask(now)
         if ti.static(len(self.walls) > 0 and self.few):
             for i in range(begin, end):
                 self.confine(i, now.h, now.frame_fraction)
@@ -238,6 +256,10 @@ class ParticlePass:
                 if self.near_walls(low, high) != 0:
                     for i in range(low, high):
                         self.confine(i, now.h, now.frame_fraction)
+        for impacts in ti.static(self.impacts):
+            for i in range(begin, end):
+                if impacts.waits(i):
+                    impacts.ask(now)
         for c in ti.static(self.contacts):
             if now.checks_list != 0:
                 stale = 0

@@ -46,8 +46,9 @@ def substep(do, now):
         do.integrate(now)
         do.drive(now)
     for half in range(do.first_half(now), do.last_half(now)):
-        do.update_neighbours(now, half)
-        if do.solves(now):
+        if do.regular(now, half):
+            do.update_neighbours(now, half)
+        if do.solves(now) and do.goes_on(now, half):
             turn = do.turn(now, half)
             if half % do.halves == 0:
                 for k in range(do.newton_steps):
@@ -57,7 +58,8 @@ def substep(do, now):
                         do.update_multipliers(turn.newton_step(k))
                         do.apply_constraints(turn.newton_step(k))
             if half % do.halves == do.halves - 1:
-                do.solve_contacts(turn)
+                if do.regular(now, half):
+                    do.solve_contacts(turn)
                 if ti.static(do.has_restitution):
                     for _ in range(REBOUNDS):
                         if turn.first != 0 and do.struck() != 0:
@@ -103,6 +105,8 @@ class Step:
         self.contact_pass = ContactPass(scene, contact, self.particles, team)
         self.contacts = self.particles.contacts
         self.halves = 2 if batches and contact else 1  # of a pass, each with a list that is good
+        self.impacts: Any = scene.impacts
+        self.has_impacts = bool(scene.impacts)
         self.newton_steps = 2 if scene.slots and scene.slots.refines else 1  # in a pass, at most
         self.has_restitution, self.projects_velocities = self.contact_pass.has_restitution, self.contact_pass.projects_velocities
         self.orients = self.state.spins and self.state.spin.orients
@@ -169,7 +173,8 @@ class Step:
         """A pass over the constraints, by its first or second half."""
         it = half // self.halves
         first = ti.cast(it == 0, ti.i32)
-        checks_list = ti.select(it + 1 < now.span.iterations, 1, now.final)
+        another = it + 1 < now.span.iterations or self.has_impacts  # there may be
+        checks_list = ti.select(another, 1, now.final)
         return now.of(it, first, checks_list, half)
 
     @ti.func
@@ -203,7 +208,27 @@ class Step:
     @ti.func
     def last_half(self, now):
         """The one before which it ends; after all substeps there is one more for the list."""
-        return ti.select(now.s < now.span.substeps, now.span.part * self.halves, 1)
+        passes = now.span.part
+        if ti.static(self.has_impacts):
+            passes += ti.select(now.span.part == now.span.iterations, self.impacts.passes, 0)
+        return ti.select(now.s < now.span.substeps, passes * self.halves, 1)
+
+    @ti.func
+    def regular(self, now, half):
+        """Whether this half of a pass is one of those that every substep has."""
+        out = True
+        if ti.static(self.has_impacts):
+            out = half < now.span.iterations * self.halves or now.s >= now.span.substeps
+        return out
+
+    @ti.func
+    def goes_on(self, now, half):
+        """Whether there is this half of a pass: beyond those of every substep, only where bodies struck walls."""
+        out = True
+        if ti.static(self.has_impacts):
+            if not self.regular(now, half):
+                out = self.impacts.wanted(self.turn(now, half))
+        return out
 
     @ti.func
     def solves(self, now):
@@ -289,6 +314,10 @@ class Step:
             for _ in range(self.team.one(1, now.thread)):
                 self.state.images.slide(now.h)
             self.team.wait()
+        if ti.static(self.has_impacts):
+            ti.loop_config(serialize=True)
+            for _ in range(self.team.one(1, now.thread)):
+                self.impacts.close()
         self.particles.integrate(now)
         self.team.wait()
         self.team.watch(now.thread)

@@ -47,6 +47,10 @@ class CornerPasses(Passes):
         if self.steps:
             self.step = add(f"{name}.step", m)
         self.known = KnownLoad(scene, name, batch)
+        self.impacts: Any = scene.impacts
+        self.leaves = bool(self.impacts) and not self.impacts.exact  # violations, to the next substep
+        if self.leaves:
+            self.left = add(f"{name}.left", m)  # of the violation, by the passes of every substep
 
     @ti.func
     def relax(self, c, h, h2_effective, frame_fraction, first, fresh):
@@ -58,6 +62,8 @@ class CornerPasses(Passes):
         share = frame_fraction[1] - frame_fraction[0]
         violation, A, alpha, lam, W, n, g, turn, moved = self.linearise(c, h, h2_effective, share, first, fresh)
         step = ti.cast(1, self.real)
+        if ti.static(self.leaves):
+            violation -= self.left_before(c, violation, lam)
         if ti.static(self.in_system):
             if self.row[c] >= 0:
                 self.tell_system(c, violation, A, alpha, lam, W, n, g, turn, moved, share)
@@ -216,6 +222,16 @@ class CornerPasses(Passes):
             if new == 0 and (W == 0 or ti.static(self.side != 0)):
                 self.known.let_go(c)
         return step
+
+    @ti.func
+    def left_before(self, c, violation, lam):
+        """In passes for what struck a wall, see BodyImpacts: what the passes of every substep left of the violation; else 0."""
+        out = 0 * violation
+        if self.impacts.notes():
+            self.left[c] = ti.select(ti.static(self.side == 0) or self.side * violation > 0 or lam != 0, violation, out)
+        if self.impacts.notes() or self.impacts.goes_on():
+            out = self.left[c]
+        return out
 
     @ti.func
     def known_violation(self, c, start, W, h, h2_effective):
