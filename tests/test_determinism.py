@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
+from tiverlet.device import ti
 from tiverlet.device.patches.compiler import BRIEF, LEAN
 from tiverlet.device.runtime import cores
 from tiverlet.report.speed import counting
@@ -115,6 +116,18 @@ def test_a_large_pile_has_the_same_bits_on_all_paths_and_where_a_team_breaks_up(
     assert len(set(made)) == 1
 
 
+@ti.func
+def wild(x, v, t):
+    """Turns, brakes, and changes with time; not what is above 5 m."""
+    return ti.select(x[1] > 5.0, 0.0, 3.0) * ti.Vector([v[1], -v[0]]) - (0.2 + 0.1 * ti.sin(t)) * v.norm() * v
+
+
+@ti.func
+def apart(r):
+    """What ends at a distance."""
+    return 0.02 * r * (0.04 - r.dot(r))
+
+
 def test_all_paths_have_the_same_bits(world):
     # In three dimensions see the next but one, and the fuzzer; for spins, events, sleep and bodies of loops see test_sleep.py. A
     # column on the first disc learns its loads.
@@ -125,7 +138,7 @@ def test_all_paths_have_the_same_bits(world):
     made = []
     for path in ("fused", "parallel", "launched"):
         features = [
-            tv.Gravity(9.81), tv.Drag(0.1),
+            tv.Gravity(9.81), tv.Drag(0.1), tv.Force(wild), tv.Hand((1.0, 1.0), 7), tv.PairForce(apart, 0.2),
             tv.Distance(pairs, compliance=np.where(np.arange(len(pairs)) % 2, 1e-4, 0.0), damping=1.0),
             tv.Rope(pairs[:20] + 50, 0.5), tv.Contact(loads=True), tv.Box((0, 0), (4, 9)), tv.HalfSpace((0.2, 1), 0.1),
             tv.Pin([0]), tv.Pin([4], (1, 1), compliance=1e-3), tv.Pin([5], (1, 2)),
