@@ -254,6 +254,7 @@ def test_what_a_failed_frame_left_behind_is_gone(world):
     k = np.stack(np.divmod(np.arange(150), 10), axis=1)[:, ::-1]
     x = 0.21 * k + 0.01 * np.sin(7.0 * k[:, ::-1]) + 0.2
     x[:2] += [[0.0, 5.0], [0.1, 5.0]]
+    x[5, 0] += 0.03  # so that some overlap, as there
     w = tossed(world, tv.Particles(x, radius=0.1), [[0, 1]], 0.2, 0.3, (0, 0), (2.4, 9))
     w.run(0.5)
     kept = checkpoint.keep(w)
