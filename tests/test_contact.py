@@ -15,6 +15,14 @@ def smooth(world, start, wide=(99.0, 99.0), g=9.81, rate=0.0, low=(0.0, 0.0), pr
     return world(start, features, precision=precision, **settings)
 
 
+def rough(world, start, wide, friction, restitution, **settings):
+    """Discs that rub on each other and on the box, and bounce: one structure."""
+    contact, box = tv.Contact(friction=0.4, restitution=0.5), tv.Box((0, 0), wide, friction=0.4)
+    w = world(start, [tv.Gravity(9.81), contact, box], precision="f64", **settings)
+    contact.friction, contact.restitution, box.friction = friction, restitution, friction
+    return w
+
+
 def test_a_heap_comes_to_rest_without_overlap(world):
     n = 150
     spots = tv.golden(np.arange(n), dim=2) * [3.0, 12.0] + [0.2, 0.2]
@@ -101,11 +109,10 @@ def test_settled_piles_are_quiet(world):
     # bouncing discs.
     k = np.arange(300)
     x = np.stack([k % 15 * 1.02 + 0.5 + 0.01 * tv.golden(k), k // 15 * 1.02 + 0.5], axis=1)
-    for contact in (tv.Contact(), tv.Contact(friction=0.4), tv.Contact(restitution=0.5)):
-        box = tv.Box((0, 0), (15.5, 60), friction=0.4 if contact.has_friction else 0.0)
+    for friction, restitution in ((0.0, 0.0), (0.4, 0.0), (0.0, 0.5)):
         start = tv.Particles(x, radius=0.5)
-        if contact.has_friction or contact.has_restitution:
-            w = world(start, [tv.Gravity(9.81), contact, box], substeps=8, precision="f64")
+        if friction or restitution:
+            w = rough(world, start, (15.5, 60), friction, restitution, substeps=8)
         else:
             w = smooth(world, start, (15.5, 60), substeps=8)
         w.run(12.0)
@@ -117,7 +124,7 @@ def test_settled_piles_are_quiet(world):
         i, j = w.contacts.pairs.T
         across = (height[i] > level) != (height[j] > level)
         up = np.where(height[i] > level, 1, -1) * w.contacts.normal[:, 1] * w.contacts.impulse * 480
-        if not contact.has_friction:
+        if not friction:
             assert up[across].sum() == pytest.approx(9.81 * (height > level).sum(), rel=1e-2)
 
 
@@ -141,8 +148,7 @@ def test_idle_piles_do_not_creep(world):
     # Row 43: nor does a pile with friction, once it lies: in 1e5 substeps nothing but the last digits of coordinates changes.
     k = np.arange(40)
     x = np.stack([k % 10 * 1.02 + 0.5 + 0.01 * tv.golden(k), k // 10 * 1.02 + 0.5], axis=1)
-    features = [tv.Gravity(9.81), tv.Contact(friction=0.4), tv.Box((0, 0), (10.5, 60), friction=0.4)]
-    w = world(tv.Particles(x, radius=0.5), features, precision="f64")
+    w = rough(world, tv.Particles(x, radius=0.5), (10.5, 60), 0.4, 0.0)
     w.run(15.0)
     rest = w.position
     w.substeps = 1000

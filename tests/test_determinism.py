@@ -229,6 +229,23 @@ def test_launches_count_what_the_scene_needs(world):
         assert f"{total} per frame" in w.explain()
 
 
+def test_the_host_asks_once_in_a_frame(world):
+    # Launched phase by phase, as on a GPU: what is launched is not waited for. The host reads what the frame came to, and where a
+    # list of neighbours is stale, whether it fits, and the frame again, which goes on from there.
+    features = [tv.Gravity(0.0), tv.Distance([[0, 1]]), tv.Contact(friction=0.5, restitution=0.5)]
+    x = 1.8 * tv.golden(np.arange(200), dim=2) - 0.9
+    w = world(tv.Particles(x, velocity=-2 * x, radius=0.04), features, path="launched", substeps=8, iterations=2)
+    w.run(0.2)
+    built, frames = w._runner.list_neighbours, 10
+    lists: list[None] = []
+    w._runner.list_neighbours = lambda: (lists.append(None), built())
+    with counting.launches() as count:
+        for _ in range(frames):
+            w.step(counting.DT)
+    assert count["measure"] == frames + len(lists) and count["listed"] == len(lists) > 0
+    assert count.answers == count["measure"] + count["listed"]
+
+
 def test_unused_files_change_no_bit(tmp_path):
     # The same scene with the files of every other feature deleted from the package, and their names from the lists.
     import shutil
