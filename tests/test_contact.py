@@ -15,6 +15,14 @@ def smooth(world, start, wide=(99.0, 99.0), g=9.81, rate=0.0, low=(0.0, 0.0), pr
     return world(start, features, precision=precision, **settings)
 
 
+def rough(world, start, wide, friction, restitution, **settings):
+    """Discs that rub on each other and on the box, and bounce: one structure."""
+    contact, box = tv.Contact(friction=0.4, restitution=0.5), tv.Box((0, 0), wide, friction=0.4)
+    w = world(start, [tv.Gravity(9.81), contact, box], precision="f64", **settings)
+    contact.friction, contact.restitution, box.friction = friction, restitution, friction
+    return w
+
+
 def test_a_heap_comes_to_rest_without_overlap(world):
     n = 150
     spots = tv.golden(np.arange(n), dim=2) * [3.0, 12.0] + [0.2, 0.2]
@@ -73,8 +81,8 @@ def test_deep_overlap_leaves_at_no_more_than_push_out(world):
 
 
 def test_linked_particles_do_not_touch(world):
-    start = tv.Particles([[0.0, 0], [0.1, 0], [0.35, 0]], velocity=[[0, 0], [0, 0], [-0.5, 0]], radius=0.1)
-    w = world(start, [tv.Distance([[0, 1]]), tv.Contact()], precision="f64")
+    x, v = [[0.0, 0], [0.1, 0], [0.35, 0], [9.0, 9.0]], [[0, 0], [0, 0], [-0.5, 0], [0, 0]]
+    w = world(tv.Particles(x, velocity=v, radius=0.1, pinned=[3]), [tv.Distance([[0, 1]]), tv.Contact()], precision="f64")
     w.run(0.5)
     assert np.linalg.norm(w.position[0] - w.position[1]) == pytest.approx(0.1, abs=1e-6)
     assert np.linalg.norm(w.position[1] - w.position[2]) >= 0.2 - 1e-6
@@ -101,11 +109,10 @@ def test_settled_piles_are_quiet(world):
     # bouncing discs.
     k = np.arange(300)
     x = np.stack([k % 15 * 1.02 + 0.5 + 0.01 * tv.golden(k), k // 15 * 1.02 + 0.5], axis=1)
-    for contact in (tv.Contact(), tv.Contact(friction=0.4), tv.Contact(restitution=0.5)):
-        box = tv.Box((0, 0), (15.5, 60), friction=0.4 if contact.has_friction else 0.0)
+    for friction, restitution in ((0.0, 0.0), (0.4, 0.0), (0.0, 0.5)):
         start = tv.Particles(x, radius=0.5)
-        if contact.has_friction or contact.has_restitution:
-            w = world(start, [tv.Gravity(9.81), contact, box], substeps=8, precision="f64")
+        if friction or restitution:
+            w = rough(world, start, (15.5, 60), friction, restitution, substeps=8)
         else:
             w = smooth(world, start, (15.5, 60), substeps=8)
         w.run(12.0)
@@ -117,7 +124,7 @@ def test_settled_piles_are_quiet(world):
         i, j = w.contacts.pairs.T
         across = (height[i] > level) != (height[j] > level)
         up = np.where(height[i] > level, 1, -1) * w.contacts.normal[:, 1] * w.contacts.impulse * 480
-        if not contact.has_friction:
+        if not friction:
             assert up[across].sum() == pytest.approx(9.81 * (height > level).sum(), rel=1e-2)
 
 
@@ -141,8 +148,7 @@ def test_idle_piles_do_not_creep(world):
     # Row 43: nor does a pile with friction, once it lies: in 1e5 substeps nothing but the last digits of coordinates changes.
     k = np.arange(40)
     x = np.stack([k % 10 * 1.02 + 0.5 + 0.01 * tv.golden(k), k // 10 * 1.02 + 0.5], axis=1)
-    features = [tv.Gravity(9.81), tv.Contact(friction=0.4), tv.Box((0, 0), (10.5, 60), friction=0.4)]
-    w = world(tv.Particles(x, radius=0.5), features, precision="f64")
+    w = rough(world, tv.Particles(x, radius=0.5), (10.5, 60), 0.4, 0.0)
     w.run(15.0)
     rest = w.position
     w.substeps = 1000
@@ -241,12 +247,21 @@ def test_both_of_a_pair_agree_that_they_touch(world):
         assert w.last.contacts > n / 10
 
 
+def tossed(world, start, links, rest, friction, low, high, **settings):
+    """Discs in a box, some on springs."""
+    springs = tv.Distance(links, rest, compliance=1e-4)
+    features = [tv.Gravity(9.81), springs, tv.Contact(friction=friction), tv.Box(low, high)]
+    return world(start, features, solver=tv.Jacobi(), **settings)
+
+
 def test_what_a_failed_frame_left_behind_is_gone(world):
     # A frame that ended in NaN is undone, as the controller does it. What pairs of the new list carry is what they carried then,
     # or 0: not 0 times what the failed frame left in its place, which is NaN.
     k = np.stack(np.divmod(np.arange(150), 10), axis=1)[:, ::-1]
     x = 0.21 * k + 0.01 * np.sin(7.0 * k[:, ::-1]) + 0.2
-    w = world(tv.Particles(x, radius=0.1), [tv.Gravity(9.81), tv.Box((0, 0), (2.4, 9)), tv.Contact(friction=0.3)])
+    x[:2] += [[0.0, 5.0], [0.1, 5.0]]
+    x[5, 0] += 0.03  # so that some overlap, as there
+    w = tossed(world, tv.Particles(x, radius=0.1), [[0, 1]], 0.2, 0.3, (0, 0), (2.4, 9))
     w.run(0.5)
     kept = checkpoint.keep(w)
     ends = []
@@ -267,10 +282,8 @@ def test_the_skin_changes_no_bits_of_what_links_move(world):
     x, v = rng.uniform(-2, 2, (n, 2)), rng.normal(size=(n, 2)) * 4
     links = np.arange(n).reshape(-1, 2)
     start, rest = tv.Particles(x, velocity=v, radius=0.1), rng.uniform(0.2, 1.5, len(links))
-    hashes, contact = set(), tv.Contact(skin=0.002, friction=0.2)
-    features = [tv.Gravity(9.81), tv.Distance(links, rest, compliance=1e-4), contact, tv.Box((-2.2, -2.2), (2.2, 2.2))]
-    w = world(start, features, substeps=4, iterations=2, solver=tv.Jacobi())
-    begin = checkpoint.keep(w)
+    hashes, w = set(), tossed(world, start, links, rest, 0.2, (-2.2, -2.2), (2.2, 2.2), substeps=4, iterations=2)
+    contact, begin = w.features[2], checkpoint.keep(w)
     for contact.skin in (0.002, 0.4, 0.05):
         checkpoint.put_back(w, begin)
         for _ in range(25):
@@ -283,7 +296,7 @@ def test_what_a_link_draws_through_another_disc_is_flagged(world):
     # Row 82: in one substep from 0 to 2.3, through one that is pinned at 1.15; a link of nearly its length draws it to no other.
     start = tv.Particles([[0.0, 0], [3.0, 0], [1.15, 0.0]], radius=0.3, pinned=[1, 2])
     link = tv.Distance([[0, 1]], 3.0)
-    w = world(start, [link, tv.Contact()], substeps=1)
+    w = world(start, [link, tv.Contact()], substeps=1, precision="f64")
     for link.rest, flagged in ((2.99, False), (0.7, True)):
         assert ("tunnelling-risk" in w.step(1 / 60).flags) == flagged
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
+from tiverlet.device import ti
 from tiverlet.device.patches.compiler import BRIEF, LEAN
 from tiverlet.device.runtime import cores
 from tiverlet.report.speed import counting
@@ -98,11 +99,11 @@ def results(path):
 def test_a_large_pile_has_the_same_bits_on_all_paths_and_where_a_team_breaks_up(world, monkeypatch):
     # From 1000 particles on blocks of them are asked whether any touches. Where every wait of a team is a long one, the first
     # thread goes on alone after a few of them, and the others come back 32 frames later. Compiled as large worlds are on one
-    # path, as small ones on the others, which takes a third of the time and has the same bits.
+    # path, as small ones on the other, which takes a third of the time and has the same bits. Phase by phase, see test_grid.py.
     k = np.arange(1200)
     x = np.stack([k % 30 * 1.02, k // 30 * 1.02], axis=1) + 0.5 + 0.01 * tv.golden(k, dim=2)
     made = []
-    for path, patience in (("fused", 0), ("launched", 0), ("parallel", 0), ("parallel", -1)):
+    for path, patience in (("fused", 0), ("parallel", 0), ("parallel", -1)):
         features = [tv.Gravity(9.81), tv.Box((0, 0), (31, 60)), tv.Contact()]
         monkeypatch.setattr(build, "_passes", lambda *_, settings=LEAN if path == "fused" else BRIEF: settings)
         w = world(tv.Particles(x, radius=0.5), features, path=path, substeps=3)
@@ -115,6 +116,18 @@ def test_a_large_pile_has_the_same_bits_on_all_paths_and_where_a_team_breaks_up(
     assert len(set(made)) == 1
 
 
+@ti.func
+def wild(x, v, t):
+    """Turns, brakes, and changes with time; not what is above 5 m."""
+    return ti.select(x[1] > 5.0, 0.0, 3.0) * ti.Vector([v[1], -v[0]]) - (0.2 + 0.1 * ti.sin(t)) * v.norm() * v
+
+
+@ti.func
+def apart(r):
+    """What ends at a distance."""
+    return 0.02 * r * (0.04 - r.dot(r))
+
+
 def test_all_paths_have_the_same_bits(world):
     # In three dimensions see the next but one, and the fuzzer; for spins, events, sleep and bodies of loops see test_sleep.py. A
     # column on the first disc learns its loads.
@@ -125,7 +138,7 @@ def test_all_paths_have_the_same_bits(world):
     made = []
     for path in ("fused", "parallel", "launched"):
         features = [
-            tv.Gravity(9.81), tv.Drag(0.1),
+            tv.Gravity(9.81), tv.Drag(0.1), tv.Force(wild), tv.Hand((1.0, 1.0), 7), tv.PairForce(apart, 0.2),
             tv.Distance(pairs, compliance=np.where(np.arange(len(pairs)) % 2, 1e-4, 0.0), damping=1.0),
             tv.Rope(pairs[:20] + 50, 0.5), tv.Contact(loads=True), tv.Box((0, 0), (4, 9)), tv.HalfSpace((0.2, 1), 0.1),
             tv.Pin([0]), tv.Pin([4], (1, 1), compliance=1e-3), tv.Pin([5], (1, 2)),
@@ -214,6 +227,23 @@ def test_launches_count_what_the_scene_needs(world):
         assert count == expected
         total = "1 launch" if path != "launched" else f"{count.total()} launches"
         assert f"{total} per frame" in w.explain()
+
+
+def test_the_host_asks_once_in_a_frame(world):
+    # Launched phase by phase, as on a GPU: what is launched is not waited for. The host reads what the frame came to, and where a
+    # list of neighbours is stale, whether it fits, and the frame again, which goes on from there.
+    features = [tv.Gravity(0.0), tv.Distance([[0, 1]]), tv.Contact(friction=0.5, restitution=0.5)]
+    x = 1.8 * tv.golden(np.arange(200), dim=2) - 0.9
+    w = world(tv.Particles(x, velocity=-2 * x, radius=0.04), features, path="launched", substeps=8, iterations=2)
+    w.run(0.2)
+    built, frames = w._runner.list_neighbours, 10
+    lists: list[None] = []
+    w._runner.list_neighbours = lambda: (lists.append(None), built())
+    with counting.launches() as count:
+        for _ in range(frames):
+            w.step(counting.DT)
+    assert count["measure"] == frames + len(lists) and count["listed"] == len(lists) > 0
+    assert count.answers == count["measure"] + count["listed"]
 
 
 def test_unused_files_change_no_bit(tmp_path):

@@ -21,8 +21,9 @@ def frames_of(world, dt=1 / 60):
 
 
 def pile(**settings):
-    """Discs that touch, rub and bounce, on a rope that breaks: everything that a substep can have."""
-    x = np.array([[0.3 * k, 0.3 + 0.29 * (k % 2)] for k in range(6)])
+    """Discs that touch, rub and bounce, on a rope that breaks: everything that a substep can have. Two overlap, so that worlds of
+    recordings, where others do, have the same kernels."""
+    x = np.array([*([0.3 * k, 0.3 + 0.29 * (k % 2)] for k in range(6)), [2.0, 2.0], [2.3, 2.0]])
     features = [
         tv.Gravity(9.81), tv.Contact(friction=0.3, restitution=0.4), tv.Box((-1, 0), (3, 3)),
         tv.Distance([(k, k + 1) for k in range(5)], break_at=2.0), tv.Pin([0]),

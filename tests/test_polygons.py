@@ -31,20 +31,22 @@ def depths(points: np.ndarray, loop: np.ndarray) -> np.ndarray:
 
 
 def linked(world, start, links, loops, friction=0.0, restitution=0.0, g=0.0, walls=((-99, -99), (999, 99)), floor=0.0, **more):
-    """Bodies of links in a box, with friction even where it is 0: one structure for what bounces, and one for what does not."""
+    """Bodies of links in a box, with friction and restitution even where they are 0: one structure."""
     push_out = {"push_out": more.pop("push_out")} if "push_out" in more else {}
-    polygons = tv.Polygons(loops, friction=0.5, restitution=restitution, **push_out)
+    polygons = tv.Polygons(loops, friction=0.5, restitution=0.5, **push_out)
     features = [tv.Distance(links), polygons, tv.Gravity(g), tv.Box(*walls, friction=0.5)]
     w = world(start, features, **({"precision": "f64", "solver": tv.Jacobi()} | more))
-    polygons.friction, features[3].friction = friction, floor
+    polygons.friction, polygons.restitution, features[3].friction = friction, restitution, floor
     return w
 
 
 def rigid(world, x, loops, g=10.0, restitution=0.0, low=(-99, 0), high=(99, np.inf), mass=0.25, **settings):
-    """Rigid bodies that rub, and bounce or not, on a floor."""
-    features = [tv.Gravity(g), tv.Polygons(loops, friction=0.5, restitution=restitution), tv.ShapeMatch(loops)]
-    features.append(tv.Box(low, high, friction=0.5, restitution=restitution))
-    return world(tv.Particles(x, mass=mass), features, precision="f64", **settings)
+    """Rigid bodies that rub, and bounce or not, on a floor: one structure."""
+    features = [tv.Gravity(g), tv.Polygons(loops, friction=0.5, restitution=0.6), tv.ShapeMatch(loops)]
+    features.append(tv.Box(low, high, friction=0.5, restitution=0.6))
+    w = world(tv.Particles(x, mass=mass), features, precision="f64", **settings)
+    features[1].restitution = features[3].restitution = restitution
+    return w
 
 
 def dropped(columns, rows, size=1.0):

@@ -56,7 +56,7 @@ def test_what_stays_goes_on_to_the_bit(world):
     counts = [f.count // 2 for f in batches]
 
     def lead():
-        rope.rest = rope.rest * 0.99  # knobs wait to be uploaded, and a target is under way
+        rope.break_at = rope.break_at * 0.99  # knobs wait to be uploaded, and a target is under way
         hand.target = hand.target + [0.0, 0.05]
 
     def look():
@@ -66,11 +66,11 @@ def test_what_stays_goes_on_to_the_bit(world):
     lead()
     w.step(1 / 60)
     lead()
-    kept, knobs = checkpoint.keep(w), (rope.rest, hand.target, hand.moving)
+    kept, knobs = checkpoint.keep(w), (rope.break_at, hand.target, hand.moving)
     before = w.run(0.4)
     without = look()
     checkpoint.put_back(w, kept)
-    rope.rest, hand.target, hand.moving = knobs
+    rope.break_at, hand.target, hand.moving = knobs
     x, v = w.position, w.velocity
     new = w.add(tv.Particles([[50.0, 5.0], [50.3, 5.0]], velocity=(0.0, 1.0), radius=0.1, mass=2.0))
     np.testing.assert_array_equal(w.position[: 2 * n], x)
