@@ -140,6 +140,24 @@ def test_what_works_is_no_fault(world):
     assert all(gained[name] > 0.1 for name in ("force", "wind", "winch", "pin", "wall", "rest", "edited", "thrown")), gained
 
 
+@pytest.mark.parametrize("place", ["alone", "one of many"])
+def test_what_works_from_the_first_frame_on_is_no_fault(world, place):
+    # A wall that lifts, and one that turns, before anything was stepped.
+    for knob, value in (("position", (0.0, 0.3)), ("rotation", 0.3)):
+        lift = tv.Polygon([[-2, -0.4], [2, -0.4], [2, -0.1], [-2, -0.1]])
+        w = world(*pair(tv.Gravity(9.81), lift), substeps=8)
+        many = tv.Worlds(w, 2) if place == "one of many" else None
+        if many:
+            many.set(lift, **{knob: [value, getattr(lift, knob)]})
+        else:
+            setattr(lift, knob, value)
+        for _ in range(5):
+            assert FLAG not in (many or w).step(1 / 60).flags
+        if many:
+            assert many.position[0, 1, 1] > many.position[1, 1, 1] + 0.1
+            many.close()
+
+
 def test_what_overlaps_parts_without_a_word(world):
     # Placed into each other, or into a wall, they are pushed out: that is energy, which the overlap had; also where velocities
     # are assigned, or something goes, on the way, and where a wall comes back.

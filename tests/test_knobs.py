@@ -345,6 +345,27 @@ def test_what_is_not_live_refuses_and_says_what_is(world):
         w.substep = 3
 
 
+def test_rest_values_that_nobody_gave_are_read_only_too(world):
+    # A world does not notice when a part of them changes; neither do clones, nor worlds from which particles went.
+    for rows in (ROWS3, ROWS2):
+        names = [name for name, (_, _, old, _) in rows.items() if "rest" in old]
+        some = {name: rows[name] for name in names}
+        for name in {*names} - {"Spacer"}:
+            make, points, old, new = rows[name]
+            some[name] = make, points, old | {"rest": None}, new
+        scene = Scene(world, some, False)
+        scene.world.remove([*scene.indices.values()][0])
+        with scene.world.clone() as other:
+            for k, feature in enumerate(other.features):
+                for one in (feature, scene.world.features[k]):
+                    for setting in knobs_of(type(one)):
+                        value = getattr(one, setting)
+                        with pytest.raises(ValueError, match=f"{type(one).__name__}.{setting} is read-only.* Assign the whole"):
+                            value[:1] = 2.0
+                assert k == 0 or feature.rest.shape == (1,)
+        assert len(names) == len(scene.world.features) == (9 if rows is ROWS3 else 1)
+
+
 def falling(world, features, **settings):
     """Two linked discs that fall on a floor, and two that meet."""
     x = np.array([[0.0, 0.3], [0.9, 0.3], [4.0, 0.3], [4.9, 0.4]])

@@ -1,11 +1,14 @@
 """Replay: a recording leads to the same bits again, wherever it goes on from."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import tiverlet as tv
 from tiverlet.device import ti
 from tiverlet.recording import journal, scene
+from tiverlet.step import checkpoint
 
 pytestmark = pytest.mark.usefixtures("read_here")
 
@@ -207,6 +210,24 @@ def test_what_comes_and_goes_is_replayed(world, tmp_path):
         assert again.hash() == w.hash()
     with pytest.raises(ValueError, match="not the same in all frames"):
         recording.export("c.npz")
+
+
+def test_what_auto_tried_in_vain_is_replayed(world, tmp_path):
+    # What the controller keeps of a frame that nothing improves is hashed, and comes back from a file as numbers of Python's.
+    features = [tv.Gravity(), tv.HalfSpace((0, 1), 0), tv.Contact()]
+    w = world(tv.Particles([[0.1, 0.05], [2, 2]], radius=0.1), features, substeps="auto")
+    with tv.Recorder(tmp_path / "stuck.rrd", w) as recorder:
+        for _ in range(3):
+            w.step(1 / 60)
+            recorder.log()
+    kept = checkpoint.keep(w)
+    assert kept.controller[5:] != (1.0,) and {type(v) for v in kept.controller} == {int, float}
+    of_numpy = replace(kept, controller=tuple(np.float64(v) if type(v) is float else np.int64(v) for v in kept.controller))
+    assert checkpoint.digest(w, of_numpy) == checkpoint.digest(w, kept) == w.hash()
+    recording = tv.replay(tmp_path / "stuck.rrd")
+    assert recording.verify()
+    with recording.world(3) as again:
+        assert again.hash() == w.hash()
 
 
 def test_user_functions_must_be_given_again(tmp_path):

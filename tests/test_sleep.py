@@ -8,7 +8,7 @@ import pytest
 import tiverlet as tv
 from tiverlet.device import ti
 
-from .test_events import equal
+from .test_events import equal, rows
 
 R = 0.5
 
@@ -128,6 +128,83 @@ def test_clones_and_replays_sleep_alike(world, tmp_path, read_here):
         assert w.hash() == other.hash() and w.last.asleep != 32
         other.close()
     assert tv.replay(tmp_path / "sleep.rrd").verify()
+
+
+def both(w):
+    """The events of particles and of walls."""
+    return w.events(), w.wall_events()
+
+
+def follow(w, touching):
+    """Step, and have the events continue who touched, (touching | begun) - ended, for particles and walls."""
+    w.step(1 / 60)
+    for k, events in enumerate(both(w)):
+        begun, ended = rows(events.begun.pairs), rows(events.ended.pairs)
+        assert not begun & touching[k] and ended <= touching[k] | begun and touching[k] <= rows(events.touches.pairs)
+        touching[k] = (touching[k] | begun) - ended
+
+
+def test_what_sleeps_goes_on_touching(world):
+    """No pair of a heap ends as it falls asleep, sleeps or wakes: it lasts, without impulses and where it was, in frames that are
+    computed for what still moves and in those that are not; in clones too."""
+    w, touching = pile(world, height=10.0), [set(), set()]
+    while w.last is None or w.last.asleep < 32:
+        follow(w, touching)
+    follow(w, touching)
+    before, frames = both(w), 0
+    assert min(map(len, before)) >= 8 and np.linalg.norm(before[1].touches.normal, axis=1).min() > 0.99
+    while w.last.asleep == 32:
+        for events, held in zip(both(w), before, strict=True):
+            assert equal(events, held) == len(events.lasting) and not events.touches.impulse.any()
+        copy = w.clone() if frames == 3 else None
+        follow(w, touching)
+        if copy:
+            copy.step(1 / 60)
+            for own, others in zip(both(copy), both(w), strict=True):
+                equal(own, others)
+            copy.close()
+        frames += 1
+    assert frames > 10 and len(w.events().begun) and w.events().lasting.impulse.any()
+    for _ in range(60):
+        follow(w, touching)
+
+
+def test_nothing_begins_where_all_sleep(world):
+    """Frames that are not computed tell what touches, and not again what happened in the last one that was."""
+    w, touching = pile(world, height=0), [set(), set()]
+    while w.last is None or w.last.asleep < 32:
+        follow(w, touching)
+    for _ in range(3):
+        follow(w, touching)
+        for events, held in zip(both(w), touching, strict=True):
+            assert rows(events.lasting.pairs) == held and len(events) == len(events.lasting) >= 8
+            assert not events.touches.impulse.any() and not events.touches.speed.any()
+
+
+def test_a_sensor_that_sleeps_and_a_stack_that_wakes(world):
+    """What a sensor overlaps begins and ends as where it is awake. A pair that wakes in the middle of a frame has not met again:
+    the speed at which it came together is 0."""
+    x = [(0.0, R), (9.0, R), (9.0, 3 * R - 1e-3), (-9.0, 0.3 * R), (9.4, 6.0)]
+    v = np.zeros((5, 2))
+    v[3, 0] = 14.0
+    start = tv.Particles(x, velocity=v, radius=[R, R, R, 0.3 * R, R], group=[1, 0, 0, 0, 0])
+    floor, contact = tv.HalfSpace((0, 1), 0, events=True), tv.Contact(events=True, sensors=[(0, 1)])
+    w, touching, seen, asleep = (
+        world(start, [tv.Gravity(), floor, contact, tv.Sleep(0.05, 0.2)], substeps=8),
+        [set(), set()],
+        [],
+        0,
+    )
+    while not seen or seen[-1][1:] != (2, 4):
+        assert w.time < 1.5
+        asleep = w.last.asleep if w.last else 0
+        follow(w, touching)
+        if asleep:
+            seen += [(asleep, *pair) for pair in rows(w.events().begun.pairs)] + [pair for pair in rows(w.events().ended.pairs)]
+    assert seen == [(3, 0, 3), (0, 3), (3, 2, 4)] and w.last.asleep == 1
+    held = w.events().lasting, w.wall_events().lasting
+    assert rows(held[0].pairs) == {(1, 2)} and rows(held[1].pairs) == {(0, 1), (1, 1), (3, 1)}
+    assert not any(touches.speed.any() for touches in held) and held[0].impulse > 0
 
 
 def test_islands(world):
@@ -294,12 +371,13 @@ def test_bodies_of_loops(world):
         tv.Gravity(),
         tv.ShapeMatch(loops),
         tv.Polygons(loops, friction=0.5),
-        tv.HalfSpace((0, 1), friction=0.5),
+        tv.HalfSpace((0, 1), friction=0.5, events=True),
         tv.Sleep(0.02, 0.2),
     ]
     worlds = [world(tv.Particles(x), [f.copy() for f in features], substeps=12, path=path) for path in ("fused", "launched")]
     for w in worlds:
         until(w, 12, seconds=0.6)
+    stand = rows(worlds[0].wall_events().lasting.pairs)
     before = [(w.position[:12], w.velocity[:12], w.contacts.impulse, w.features[1].residual[:3]) for w in worlds]
     worlds.append(worlds[0].clone())
     h = 4.0 - 0.2 - worlds[0].position[4:8, 1].max()
@@ -308,10 +386,11 @@ def test_bodies_of_loops(world):
             after = w.position[:12], w.velocity[:12], w.contacts.impulse, w.features[1].residual[:3]
             assert all(map(np.array_equal, before[k % 2], after))
             w.step(1 / 60)
+            assert rows(w.wall_events().touches.pairs) == rows(w.wall_events().lasting.pairs) == stand
     assert len({(w.hash(), w.last.asleep) for w in worlds}) == 1 and worlds[0].last.asleep == 4
     assert 0 <= worlds[0].time - (2 * h / 9.81) ** 0.5 < 1 / 60 + 1e-6
     assert np.abs(worlds[0].velocity[4:8, 1]).min() > 0.1  # what was struck moves in the same frame
-    assert (worlds[0].position[8:12] == before[0][0][8:12]).all()
+    assert (worlds[0].position[8:12] == before[0][0][8:12]).all() and len(stand) > 3
     worlds[-1].close()
 
 

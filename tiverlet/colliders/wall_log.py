@@ -27,9 +27,12 @@ class WallLog:
         self.touching = add(f"events.{name}.touching", n, kind=ti.i32, state=True, told=True)
         self.when = add(f"events.{name}.when", n, width=2, kind=ti.i32)
         self.impulse, self.speed = add(f"events.{name}.impulse", n), add(f"events.{name}.speed", n)
-        self.normal, self.point = add(f"events.{name}.normal", n, width=dim), add(f"events.{name}.point", n, width=dim)
+        sleeps = bool(scene.state.sleepers)  # where what sleeps touches, nobody finds again
+        self.normal, self.point = (
+            add(f"events.{name}.{what}", n, width=dim, state=sleeps, told=sleeps) for what in ("normal", "point")
+        )
         self.substep = add(f"events.{name}.substep", None, kind=ti.i32)  # of the frame, from 1 on; 0 before any
-        self.in_state = {"touching": self.touching}
+        self.in_state = {"touching": self.touching} | ({"normal": self.normal, "point": self.point} if sleeps else {})
 
     @ti.func
     def open(self, i):
@@ -38,8 +41,15 @@ class WallLog:
         self.when[i] = [began, began]
         self.impulse[i] = 0
         self.speed[i] = 0
-        self.normal[i] = ti.zero(self.state.x[i])
-        self.point[i] = ti.zero(self.state.x[i])
+        if self.state.awake(i):
+            self.normal[i] = ti.zero(self.state.x[i])
+            self.point[i] = ti.zero(self.state.x[i])
+
+    @ti.func
+    def wake(self, i, substep):
+        """Particle i wakes after so many substeps of the frame: it has touched until then what it touched before."""
+        if self.when[i][0] == BEFORE:
+            self.when[i][1] = substep
 
     @ti.func
     def note(self, i, depth, n, push, approach):
@@ -61,9 +71,10 @@ class WallLog:
 
     @ti.func
     def close(self, i):
-        """As a frame ends: keep whether particle i touches."""
-        if self.state.awake(i):  # else it touches what it touched
-            self.touching[i] = ti.cast(self.when[i][1] == self.substep[None], ti.i32)
+        """As a frame ends: keep whether particle i touches; what sleeps touches what it touched."""
+        if self.when[i][0] == BEFORE and not self.state.awake(i):
+            self.when[i][1] = self.substep[None]
+        self.touching[i] = ti.cast(self.when[i][1] == self.substep[None], ti.i32)
 
     @property
     def made(self) -> Any:

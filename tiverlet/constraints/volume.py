@@ -81,7 +81,7 @@ class Volume(Scalar):
             self.hold(self.quantity.reversed(self.rest_of(particles.position) < 0))
         super().prepare(particles, inv_mass)
         if (self.rest < 0).any():  # of a flat body, by rounding, either way round
-            self.__dict__["rest"] = np.maximum(self.rest, 0.0)
+            self.start_from(np.maximum(self.rest, 0.0))
 
     def bind(self, scene: Scene) -> None:
         """Refuse what f32 cannot hold."""

@@ -39,6 +39,7 @@ class EventLog:
     def __init__(self, scene: Scene, table: Table):
         dim, add = scene.particles.dim, scene.memory.field
         self.state, self.radius, self.table, self.senses = scene.state, scene.radius, table, table.senses
+        self.can_sleep = bool(scene.state.sleepers)
         self.touched = PairData("touched", 0, lasting=True, kind=ti.i32, told=True)
         self.pair, self.when = Column("events.pair", 2, ti.i32), Column("events.when", 2, ti.i32)
         self.impulse, self.speed = Column("events.impulse"), Column("events.speed")
@@ -139,14 +140,34 @@ class EventLog:
                         self.write(i, j, e, n, 0 * overlap, final)
 
     @ti.func
+    def sleeps(self, i, j):
+        """Whether particle i sleeps, which writes, and j does not move from it: the pair touches what it touched. What sensors
+        overlap is found in every substep."""
+        out = False
+        if ti.static(self.can_sleep):
+            out = not self.state.awake(i) and not self.state.moves(j) and self.geometry.pushes(i, j) != 0
+        return out
+
+    @ti.func
+    def wake(self, i, substep):
+        """Particle i wakes after so many substeps of the frame: it has touched until then what it touched before."""
+        for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
+            row = self.touched.field[e] - 1
+            if row >= 0:
+                if self.when.field[row][0] == BEFORE and self.geometry.pushes(i, self.list.neighbour[e]) != 0:
+                    self.when.field[row][1] = substep
+
+    @ti.func
     def close(self, i):
         """As a frame ends: keep which pairs of particle i touch."""
         for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
             row = self.touched.field[e] - 1
             if row >= 0:
-                began, last = self.when.field[row][0], self.when.field[row][1]
+                began, last, j = self.when.field[row][0], self.when.field[row][1], self.list.neighbour[e]
                 if began == BEFORE and last != self.substep[None]:
-                    j = self.list.neighbour[e]
+                    if self.sleeps(i, j):
+                        last = self.substep[None]
+                        self.when.field[row][1] = last
                     r = self.state.apart(i, j)
                     length = r.norm()
                     if length > 0:
@@ -154,8 +175,6 @@ class EventLog:
                     else:
                         self.place(row, i, j, self.geometry.fallback_normal(i, j, r))
                 self.touched.field[e] = ti.cast(last == self.substep[None], ti.i32)
-                if not self.state.awake(i):  # which touches what it touched
-                    self.touched.field[e] = 1
 
     @property
     def made(self) -> Any:

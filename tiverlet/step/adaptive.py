@@ -251,7 +251,7 @@ def judge(
         stiffness / (24 * tolerance if tolerance else FORCE),
         missed,
     )
-    return tuple(r if r == r else float("inf") for r in ratios), risks  # NaN is the worst of all
+    return tuple(float(r) if r == r else float("inf") for r in ratios), risks  # NaN is the worst of all
 
 
 def cheapest(known: dict[tuple[int, int], Figures], stuck: Figures) -> tuple[int, int]:

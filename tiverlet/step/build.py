@@ -175,6 +175,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     searches = [(f.join(scene, team), f.room) for f in accelerations if f.pairwise]
     for feature in features:
         feature.new_force = False  # it was given when it was made
+        feature.changed = feature in drivers  # which go to their targets in the first frame; fields have what is given
         feature.built()
     known = contact.known if contact else None
     forces = Forces(scene, [*accelerations, known.carried] if known else accelerations)

@@ -52,7 +52,8 @@ def keep(world: "World", pairs: bool = True) -> Checkpoint:
 
 def digest(world: "World", kept: Checkpoint) -> str:
     """SHA-256 of a state of the world, its clock, and what its controller remembers."""
-    out = hashlib.sha256(repr((*kept.clock.hashed, *kept.controller)).encode())
+    numbers = [v.item() if isinstance(v, np.generic) else v for v in (*kept.clock.hashed, *kept.controller)]
+    out = hashlib.sha256(repr(tuple(numbers)).encode())  # of NumPy's as of Python's, which recordings give back
     for name, values in _hashed(world, kept.values).items():
         out.update(name.encode())
         lost = np.isnan(values) if values.dtype.kind == "f" else np.zeros(0)

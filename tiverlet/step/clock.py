@@ -84,9 +84,15 @@ class Clock:
             raise ValueError("The state is not one of this scene: it has other fields.")
         return Clock(**{own: named[name] for name, own in NAMES.items()})
 
+    def forget_bound(self) -> None:
+        """The state was changed. What works on the scene in the coming frame does so all the same."""
+        if self.bound != CHANGED:
+            self.bound = None
+
     def begin_with(self, energy: float, more: float) -> None:
-        """Note the energy of a scene that begins, and what it may get by itself."""
-        self.bound, self.kinetic = energy + more, 0.0
+        """Note the energy of a scene that begins, and what it may get by itself; unless something works on it already."""
+        if self.bound != CHANGED:
+            self.bound, self.kinetic = float(energy + more), 0.0
 
     def exceeds(self, energy: float, kinetic: float, overlap: float) -> bool:
         """Take note of the energy at the end of a frame, and of its kinetic part. Returns whether it may be too much."""

@@ -78,7 +78,7 @@ def missed(world: "World", report: StepReport, energy: float | None) -> float:
         return 0.0
     kinetic = max(clock.kinetic, sheet.item(KINETIC))
     allowed = MISSED * max(0.0, kinetic - _drift(world)) + DIGITS * (abs(report.energy) + kinetic)
-    return change / allowed if allowed else 0.0
+    return float(change / allowed) if allowed else 0.0
 
 
 def _brakes(force: Acceleration) -> bool:

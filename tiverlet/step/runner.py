@@ -99,7 +99,7 @@ class Runner:
         if self.prepare(dt, substeps, iterations):
             clock, placed = self.clock, self.clock.first_moved is not None
             if clock.energy is None:
-                clock.bound = None
+                clock.forget_bound()
                 self.look(bare=not placed)
                 if self.sleep:
                     with self.memory.compiler():

@@ -40,6 +40,8 @@ class Sleep(Feature):
     Decided by the state alone: on the same bits everywhere, in clones and replays too. What is pinned does not join two islands.
     Never asleep are particles of motors and winches, and what is linked to what is driven.
 
+    World.events() tells of what sleeps that it goes on touching what it touched, without impulses.
+
     StepReport.asleep says how many sleep. Where all do, a frame is not computed at all. (Box2D and others: sleeping islands.)
 
     Raises ValueError beside PairForce and a sheared Periodic box, which islands do not know of, in order above 2, and in Worlds.
@@ -350,6 +352,15 @@ class SleepPass:
                     if j >= 0:
                         self.call(j)
 
+    @ti.func
+    def note_wake(self, i, s):
+        """Tell of particle i that it wakes in substep s of a frame."""
+        for c in ti.static(self.contacts):
+            if ti.static(c.dev.has_events):
+                c.dev.events.wake(i, s)
+        for log in ti.static(self.step.wall_logs):
+            log.wake(i, s)
+
     @ti.kernel
     def wake_called(
         self, h64: ti.f64, start: ti.f64, tick: ti.i32, since: ti.i32, fresh: ti.i32, s: ti.i32, substeps: ti.i32,
@@ -365,6 +376,8 @@ class SleepPass:
                     ti.atomic_sub(self.sleepers.count[None], 1)
                     if s < substeps:
                         self.step.particles.advance(i, i + 1, now)
+                        if s > 0:
+                            self.note_wake(i, s)
         for i in range(self.n):
             self.sleepers.called[i] = 0
         ti.loop_config(serialize=True)

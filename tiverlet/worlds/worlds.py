@@ -221,7 +221,8 @@ class Worlds:
             placed = clocks.first_moved[unknown] != NONE
             first = placed & (clocks.tick[unknown] == 0)
             more = slack(runner.scene.inv_mass, figures[:, EXTENT : EXTENT + world.particles.dim], h)
-            clocks.bound[unknown] = np.where(first, energy + more, np.nan)
+            works = clocks.bound[unknown] == CHANGED  # in the coming frame
+            clocks.bound[unknown] = np.where(works, CHANGED, np.where(first, energy + more, np.nan))
             clocks.kinetic[unknown] = np.where(first, 0.0, clocks.kinetic[unknown])
             clocks.parting[unknown] = np.where(placed, overlap > 0, clocks.parting[unknown])
             for k in unknown[(overlap > 0) & placed]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from ... import checks
 from ...features.feature import Batch, Knob, Scene
+from ...features.read_only import assign_whole, handed_out
 from ...features.regrouping import Regrouping
 from ...geometry.ordered import distinct
 from .corner_passes import CornerPasses
@@ -190,9 +191,13 @@ class Scalar(Batch):
         self.check_indices(particles)
         if "rest" not in self.__dict__:
             if self._rest_given is None:
-                self.__dict__["rest"] = self.rest_of(particles.position)
+                self.start_from(self.rest_of(particles.position))
             else:
                 self.rest = self._rest_given
+
+    def start_from(self, rest: np.ndarray) -> None:
+        """Have these rest values, (m,), which nobody has given: as if they had been, but that nothing changes."""
+        self.__dict__["rest"] = handed_out(rest, assign_whole(type(self).__name__, "rest"))
 
     def review(self, particles: "Particles", inv_mass: np.ndarray) -> None:
         """Warn of constraints that are violated between particles that cannot move."""
