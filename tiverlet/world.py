@@ -429,7 +429,8 @@ class World:
 
     @property
     def contacts(self) -> Contacts:
-        """What touches now, as arrays: discs or spheres, and vertices and edges of Polygons. Empty without a Contact."""
+        """What touches now, as arrays: discs or spheres, and vertices and edges of Polygons; with impulses of the last substep,
+        where events() has those of the frame. Empty without a Contact."""
         self._runner.memory.check()
         if not self._runner.search:
             none, index = np.zeros(0), np.zeros((0, 2), dtype=np.int64)
