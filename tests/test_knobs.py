@@ -345,6 +345,18 @@ def test_what_is_not_live_refuses_and_says_what_is(world):
         w.substep = 3
 
 
+def test_what_is_wrong_is_said_where_it_is_made(world):
+    for make in (lambda: tv.Rope([[0, 1]], length=-1), lambda: tv.Spacer([[0, 1]], -1), lambda: tv.Distance([[0, 1]], rest=[-1])):
+        with pytest.raises(ValueError, match=r"(length|rest)(\[0\])? = -1"):
+            make()
+    with pytest.raises(ValueError, match="rest has shape"):
+        tv.Bend([[0, 1, 2]], rest=[0.1, 0.2])
+    with pytest.raises(TypeError, match="Box: there is no one_way. Capsule, Polygon and Mesh take it"):
+        tv.Box((0, 0), (1, 1), one_way=(0, 1))  # type: ignore[call-arg]
+    with pytest.raises(TypeError, match=r"particles = Drag is a feature; write features=\[...\]"):
+        world(tv.Particles([[0.0, 1.0]])).add(tv.Drag(1.0))
+
+
 def test_rest_values_that_nobody_gave_are_read_only_too(world):
     # A world does not notice when a part of them changes; neither do clones, nor worlds from which particles went.
     for rows in (ROWS3, ROWS2):

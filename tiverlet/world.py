@@ -429,7 +429,8 @@ class World:
 
     @property
     def contacts(self) -> Contacts:
-        """What touches now, as arrays: discs or spheres, and vertices and edges of Polygons. Empty without a Contact."""
+        """What touches now, as arrays: discs or spheres, and vertices and edges of Polygons; with impulses of the last substep,
+        where events() has those of the frame. Empty without a Contact."""
         self._runner.memory.check()
         if not self._runner.search:
             none, index = np.zeros(0), np.zeros((0, 2), dtype=np.int64)
@@ -597,6 +598,8 @@ class World:
         particles: a handle, indices or a Boolean mask. The others close up, in order. A constraint goes with any of its
         particles, and so do a loop, a surface, a cluster or a body of Polygons, whole; what it was part of stays, with what is
         left, in the same Python object, and costs nothing once it is empty. features: of world.features; they become free.
+        One link of many is cut by its strength: make them with break_at=np.inf, and assign an array that is 1e-30 at that link,
+        which breaks in the next substep in which it bears anything.
 
         What stays goes on to the bit, see add(). A force that goes with a particle is gone from the next substep on, as when a
         constraint breaks. Functions of the user's own that take the number of a particle or constraint get the new one.

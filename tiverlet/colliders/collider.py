@@ -45,6 +45,8 @@ class Collider(Feature):
     comes from below. Particles are held where they touch with a normal to that side; what was inside of the wall at the start of
     the substep, however it came there, is let through until it is free. Fixed, and turned with the wall. Nothing is remembered of
     a particle but where it is. Capsule, Polygon and Mesh take it; None is a wall for both sides.
+
+    A conveyor is a long Capsule or Polygon with friction that is moved along itself: its place is assigned before each frame.
     """
 
     friction = Knob(lambda f, v: _friction(f, v), "A number, or (static, dynamic, rolling, twisting).")

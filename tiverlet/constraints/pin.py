@@ -88,7 +88,8 @@ class Pin(Anchored):
     compliance: number or (m,) [m/N]. 0 takes the particles out of the solver and drives them, whatever pulls at them; above 0
     they are drawn by a spring of stiffness 1 / compliance, as by a mouse. damping: [N s/m], of that spring.
 
-    `load` is the force of each spring on its particle [N].
+    `load` is the force of each spring on its particle [N]; where particles are driven it raises, for nothing tells what holds
+    them: give a small compliance.
     """
 
     each = ("compliance", "damping", "target")

@@ -17,6 +17,8 @@ from ..device import at
 from ..device.language import inside_kernel
 from .read_only import assign_whole, handed_out, structure
 
+TAKEN_BY = {"one_way": "Capsule, Polygon and Mesh"}  # arguments that others of the same kind do not have
+
 
 class Knob:
     """A live setting: checked when assigned, written to the device before the next frame.
@@ -115,6 +117,8 @@ def _recording(init):
     @functools.wraps(init)
     def recorded(self, *args, **kwargs):
         """The same __init__, which keeps its arguments."""
+        for name in (kwargs.keys() - signature.parameters.keys()) & TAKEN_BY.keys():
+            raise TypeError(f"{type(self).__name__}: there is no {name}. {TAKEN_BY[name]} take it.")
         args, kwargs = _frozen(args), _frozen(kwargs)
         init(self, *args, **kwargs)
         if type(self).__init__ is recorded:  # and not that of a base class, whose subclass is not done yet

@@ -32,9 +32,9 @@ class Hand(Acceleration):
     It is a critically damped spring, so the particle comes to a target at rest without swinging, in a few times 1 / rate,
     whatever its mass; where others hang on it, they weigh it down. A Pin with compliance holds many, but always the same ones.
 
-    target: (dim,) [m]; in a periodic box its nearest image. particle: its number, -1 for none. rate: [1/s], at least 0; the step
-    resolves it while h times the rate is well below 1, and is stable below 2. All live: assign between frames, at no compile
-    cost. A particle that is pinned stays where it is.
+    target: (dim,) [m], which jumps as a frame begins, where that of a Pin glides; in a periodic box its nearest image. particle:
+    its number, -1 for none. rate: [1/s], at least 0; the step resolves it while h times the rate is well below 1, and is stable
+    below 2. All live: assign between frames, at no compile cost. A particle that is pinned stays where it is.
     """
 
     uses_velocity = True

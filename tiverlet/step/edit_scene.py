@@ -60,6 +60,8 @@ def add(world: Any, particles: Particles | None, features: Iterable[Feature], ex
     late, extend = listed("World.add", features), extend or {}
     check_extended(world, extend)
     if particles is not None:
+        if isinstance(particles, Feature):
+            raise TypeError(f"World.add: particles = {particles!r} is a feature; write features=[...].")
         if not isinstance(particles, Particles):
             raise TypeError(f"World.add: particles = {particles!r} is a {type(particles).__name__}; use tv.Particles(position).")
         if particles.dim != world.particles.dim:

@@ -52,6 +52,8 @@ class Scalar(Batch):
         """Keep the arguments of __init__; what depends on the particles is checked in prepare()."""
         self.hold_all(indices)
         self._warn_duplicates()
+        if rest is not None:
+            type(self).rest.check(self, rest)
         self._rest_given = rest
         self.break_at, self.compliance, self.damping = break_at, compliance, damping
 
