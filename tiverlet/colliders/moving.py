@@ -69,6 +69,7 @@ class Moving(Collider):
         self.dev.pose = Pose(scene, repr(self), self.position, self.rotation, self.dev.surface.turns)
         self.dev.surface.poses = [self.dev.pose]
         self.dev.shape = self.host_shape(self.dim).on_device(scene, repr(self), self.radius)
+        self.dev.shape.slides = type(self.dev.shape).slides and not self.dev.surface.has_restitution
         self.changed = False
 
     def upload(self) -> None:
@@ -146,7 +147,7 @@ class Moving(Collider):
                         e += self.dev.pose.inward(1, shift) - s * e
         if ti.static(self.dev.shape.guesses):
             if touched and not self.dev.shape.astray(first, contact_distance - 8 * close, close):
-                going = going or self.dev.shape.astray(a + e, contact_distance, close)
+                going = going or self.dev.shape.astray(a + e, contact_distance - 4 * close, close)
                 if going and self.dev.shape.astray(a, contact_distance, close):
                     a = first
         if going:
