@@ -114,6 +114,25 @@ def test_nothing_passes_a_shell(world, precision, restitution):
         assert (side * (np.linalg.norm(w.position, axis=1) - 0.7)).min() > 0.02 - (1e-9 if precision == "f64" else 4e-6)
 
 
+def test_a_thin_sheet_in_a_round_room(world):
+    # It turns by up to 3 rad in a substep, while discs of 1 mm slide and fly on both sides of it, by up to 1 m.
+    rng = np.random.default_rng(2)
+    x = rng.uniform(-0.9, 0.9, (150, 2))
+    x[:, 1] = np.where(np.abs(x[:, 1]) < 0.02, 0.1, x[:, 1])
+    x /= np.maximum(1, np.linalg.norm(x, axis=1) / 0.95)[:, None]
+    v = rng.normal(size=x.shape)
+    v *= (10.0 ** rng.uniform(-5, 0, len(x)) * 600 / np.linalg.norm(v, axis=1))[:, None]
+    sheet = tv.Polygon([[-3.0, 0], [3, 0]], closed=False)
+    start = tv.Particles(x, velocity=v, radius=0.001)
+    w = world(start, [sheet, tv.Sdf(round_room), tv.Gravity(9.81)], precision="f64", substeps=2)
+    side = np.sign(x[:, 1])
+    for k in range(60):
+        sheet.rotation = angle = 0.0 if k < 20 else 0.02 * (k - 19) if k < 40 else 0.4 + 3.0 * (k - 39)
+        w.step(1 / 300)
+        assert (side * (w.position @ (-np.sin(angle), np.cos(angle)))).min() >= 0.001 - 1e-9
+        assert np.linalg.norm(w.position, axis=1).max() <= 0.999 + 1e-9
+
+
 @ti.func
 def flatter_room(p):
     """No more than 0.92 of that distance."""

@@ -15,8 +15,9 @@ from ..tools import golden
 from .moving import Moving
 from .pose import rotation_matrix
 from .shape import HostShape, Shape
+from .surface import ALONG, NEAR
 
-FINE = 1 / 64  # of a way: closer than that, the surface is taken for its tangent plane
+FINE = NEAR  # of a way: closer than that, the surface is taken for its tangent plane
 MARCH = 64  # steps along a way, which are no shorter than FINE of it
 SAMPLES = 4096  # places where the function is looked at before it is used
 CAST = 1 << 14  # steps along a ray; one that grazes a plane at less than 1e-3 may miss it
@@ -25,7 +26,6 @@ SKIN = 2.0**-40  # of the size of the scene: rays that start no deeper than that
 AWAY = 1e16  # [m] where no particle can be
 SLOPE = 1e-6  # of the largest coordinate: the step of differences at a surface
 LEAST = 0.5  # gradient that is counted upon near a surface
-ALONG = 0.9  # cosine of the angle by which a surface turns along a way on it, at most, for that to be a slide: 26 degrees
 STEEP, FLAT = 1.1, 0.9  # bounds of the gradient that pass for 1
 
 
@@ -49,7 +49,7 @@ class Sdf(Moving):
     1996): nothing passes that is thicker than that with the particle's diameter added. A function that changes faster than
     distance would break this, and one that changes more slowly at the surface would keep particles too far away: the gradient is
     checked where particles start and around, and ValueError names the place. What slides in a hollow is second order in the
-    substep and keeps its energy; on a hump, or with restitution, it is first order and loses some.
+    substep, as in a Ball, and keeps its energy; on a hump, or with restitution, it is first order and loses some.
     """
 
     def __init__(
