@@ -58,6 +58,93 @@ def test_nothing_gets_out_of_a_function(world):
     keeps(world, room, lambda x, w: 1 - np.linalg.norm(x, axis=1), lambda s: {}, room)
 
 
+@pytest.mark.parametrize("precision", ["f64", "f32"])
+def test_what_slides_in_a_hollow_keeps_its_energy(world, precision):
+    # A point let go at the rim of a bowl of 1 m, with g = 10 m/s^2, has v^2 / 2 = 10 sin(a) when it has come down by the angle a,
+    # in every frame, at any number of substeps; also of a function that is no distance exactly. It was stopped dead.
+    for function in (round_room, flatter_room):
+        off = []
+        for substeps in (10, 20, 40, 80, 320):
+            features = [tv.Gravity(10.0), tv.Sdf(function)]
+            w = world(tv.Particles([(1.0, 0.0)]), features, substeps=substeps, precision=precision)
+            energy = []
+            for _ in range(90):
+                w.step(1 / 60)
+                energy.append((w.velocity[0] ** 2).sum() / 2 + 10 * w.position[0, 1])
+            off.append(np.abs(energy).max())
+            assert abs(np.linalg.norm(w.position) - 1) < (1e-13 if precision == "f64" else 4e-6)
+        assert max(off) < (1e-3 if precision == "f64" else 5e-3)
+        if precision == "f64":
+            assert np.log2(off[0] / off[3]) / 3 > 1.8
+
+
+def test_friction_in_a_hollow_has_its_closed_form(world):
+    # Sliding down by the angle a in a bowl of 1 m: y = v^2 / 2 has y' = g (cos a - mu sin a) - 2 mu y, so
+    # y = g (p cos a + q sin a - p exp(-2 mu a)) with q = (1 - 2 mu^2) / (1 + 4 mu^2), p = mu + 2 mu q.
+    g, mu = 10.0, 0.1
+    q = (1 - 2 * mu**2) / (1 + 4 * mu**2)
+    p = mu + 2 * mu * q
+    for substeps in (10, 20, 40, 80, 320):
+        features = [tv.Gravity(g), tv.Sdf(round_room, friction=mu)]
+        w = world(tv.Particles([(1.0, 0.0)]), features, substeps=substeps, precision="f64")
+        for _ in range(60):
+            w.step(1 / 60)
+            angle = np.arctan2(-w.position[0, 1], w.position[0, 0])
+            y = g * (p * np.cos(angle) + q * np.sin(angle) - p * np.exp(-2 * mu * angle))
+            if w.velocity[0, 0] > 0 or angle < 0:
+                break  # it turns back
+            assert (w.velocity[0] ** 2).sum() / 2 == pytest.approx(y, abs=2e-3 * g)
+        assert angle > 2.0
+
+
+@pytest.mark.parametrize("precision", ["f64", "f32"])
+@pytest.mark.parametrize("restitution", [0.0, 0.8])
+def test_nothing_passes_a_shell(world, precision, restitution):
+    # 4 cm thick, 1/50 of ways of up to 2 m: three radii in a substep. They slide, bounce and fly on both sides.
+    rng = np.random.default_rng(3)
+    x = rng.uniform(-1, 1, (3000, 2))
+    x = x[np.abs(np.linalg.norm(x, axis=1) - 0.7) > 0.023][:1500]
+    v = rng.normal(size=x.shape)
+    v *= (10.0 ** rng.uniform(-2.5, 0.3, len(x)) * 600 / np.linalg.norm(v, axis=1))[:, None]
+    side = np.sign(np.linalg.norm(x, axis=1) - 0.7)
+    walls = [tv.Gravity(9.81), tv.Sdf(shell, restitution=restitution)]
+    w = world(tv.Particles(x, velocity=v), walls, substeps=1, precision=precision)
+    for _ in range(20):
+        w.step(1 / 600)
+        assert (side * (np.linalg.norm(w.position, axis=1) - 0.7)).min() > 0.02 - (1e-9 if precision == "f64" else 4e-6)
+
+
+def test_a_thin_sheet_in_a_round_room(world):
+    # It turns by up to 3 rad in a substep, while discs of 1 mm slide and fly on both sides of it, by up to 1 m.
+    rng = np.random.default_rng(2)
+    x = rng.uniform(-0.9, 0.9, (150, 2))
+    x[:, 1] = np.where(np.abs(x[:, 1]) < 0.02, 0.1, x[:, 1])
+    x /= np.maximum(1, np.linalg.norm(x, axis=1) / 0.95)[:, None]
+    v = rng.normal(size=x.shape)
+    v *= (10.0 ** rng.uniform(-5, 0, len(x)) * 600 / np.linalg.norm(v, axis=1))[:, None]
+    sheet = tv.Polygon([[-3.0, 0], [3, 0]], closed=False)
+    start = tv.Particles(x, velocity=v, radius=0.001)
+    w = world(start, [sheet, tv.Sdf(round_room), tv.Gravity(9.81)], precision="f64", substeps=2)
+    side = np.sign(x[:, 1])
+    for k in range(60):
+        sheet.rotation = angle = 0.0 if k < 20 else 0.02 * (k - 19) if k < 40 else 0.4 + 3.0 * (k - 39)
+        w.step(1 / 300)
+        assert (side * (w.position @ (-np.sin(angle), np.cos(angle)))).min() >= 0.001 - 1e-9
+        assert np.linalg.norm(w.position, axis=1).max() <= 0.999 + 1e-9
+
+
+@ti.func
+def flatter_room(p):
+    """No more than 0.92 of that distance."""
+    return 0.92 * (1 - p.norm())
+
+
+@ti.func
+def shell(p):
+    """Distance from a circle of 0.7 m, 4 cm thick."""
+    return ti.abs(p.norm() - 0.7) - 0.02
+
+
 MU, BOUNCE = 0.4, 0.5
 
 

@@ -11,7 +11,7 @@ from ..geometry.nearest import away
 from ..particles import Particles
 from .collider import Collider
 from .round_mesh import rounded
-from .surface import TOUCH
+from .surface import ALONG, GENTLY, NEAR, TOUCH
 from .track import Track
 
 
@@ -26,6 +26,9 @@ class Ball(Collider):
 
     What passes through in one substep is caught on the way in: the moment when it met the surface is solved for, as for pairs.
     Nothing passes at any speed, nor can anything draw it through.
+    What slides inside without restitution is pushed along n at the start of the substep until C(x) = 0 at its end, as a rigid
+    link is (SHAKE): it is second order in the substep and keeps its energy. With restitution, and outside, it is pushed along n
+    where it is nearest or was met: first order, and it loses speed.
     """
 
     center = Knob(lambda f, v: checks.vector("Ball", "center", v, f.dim or len(np.atleast_1d(v))), "Middle of the ball [m].")
@@ -120,14 +123,15 @@ class Ball(Collider):
 
     @ti.func
     def confine(self, i, radius, h, frame_fraction, turn):
-        """The surface where it was met, or where it is nearest."""
+        """The surface where it was met, or where it is nearest; for what slides inside, where it was at the start."""
         center, moved = self.dev.center.at(frame_fraction[1]), self.dev.center.step(frame_fraction)
         r = self.dev.state.nearest(self.dev.state.place(i) - center)
         own = ti.cast(self.radius, self.dev.real)
         depth, n = self.nearest(r, own, radius)
         d = self.dev.surface.path(i, moved)
         start = r - d
-        start_depth, _n = self.nearest(start, own, radius)
+        slides = False
+        start_depth, first = self.nearest(start, own, radius)
         if ti.static(not self.inside):
             contact_distance = own + radius
             c, b, a = start.dot(start) - contact_distance * contact_distance, start.dot(d), d.dot(d)
@@ -137,7 +141,18 @@ class Ball(Collider):
                 if s < 1:
                     n = (start + s * d).normalized()
                     depth = (s - 1) * d.dot(n)
-        self.dev.surface.press(i, depth, start_depth, n, moved, h, turn)
+        elif ti.static(not self.dev.surface.has_restitution):
+            # A slide: it lay on the surface, and that turns little along its way.
+            close = self.dev.state.digits(i)
+            bounced, _lift = self.dev.surface.bounced(i)
+            near = d.norm() * ti.static(NEAR) + 4 * close
+            if turn != GENTLY and depth > -close and ti.abs(start_depth) <= near and not bounced:
+                along, reach = r.dot(first), own - radius
+                root = along * along - (r.dot(r) - reach * reach)
+                if along < 0 and root > ti.static(ALONG * ALONG) * reach * reach:
+                    depth, n = (r.dot(r) - reach * reach) / (ti.sqrt(root) - along), first
+                    slides = True
+        self.dev.surface.push(i, depth, start_depth, n, moved, h, turn, slides)
 
     @ti.func
     def nearest(self, r, own, radius):

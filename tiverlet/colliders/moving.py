@@ -69,6 +69,7 @@ class Moving(Collider):
         self.dev.pose = Pose(scene, repr(self), self.position, self.rotation, self.dev.surface.turns)
         self.dev.surface.poses = [self.dev.pose]
         self.dev.shape = self.host_shape(self.dim).on_device(scene, repr(self), self.radius)
+        self.dev.shape.slides = type(self.dev.shape).slides and not self.dev.surface.has_restitution
         self.changed = False
 
     def upload(self) -> None:
@@ -123,10 +124,11 @@ class Moving(Collider):
         first = self.dev.pose.inward(0, start - self.dev.pose.place[0])
         moved = self.dev.pose.place[2] + self.dev.pose.outward(2, first)
         e = self.dev.pose.inward(1, self.dev.state.d[i] - moved)
-        close = ti.max(self.dev.state.digits(i), self.dev.shape.rounding(first))
+        close, lifted = ti.max(self.dev.state.digits(i), self.dev.shape.rounding(first)), False
         if ti.static(self.dev.state.befores):
             # What has bounced in this substep is not where its displacement says.
             high, lift = self.dev.surface.bounced(i)
+            lifted = high
             if high:
                 e += self.dev.pose.inward(1, lift)
         a, going, touched = first, True, False
@@ -141,12 +143,15 @@ class Moving(Collider):
                         going = False
                     else:
                         touched = True
-                        shift = self.dev.surface.press(i, depth, start_depth, self.dev.pose.outward(1, n), moved, h, turn)
+                        out, slides = self.dev.pose.outward(1, n), False
+                        if ti.static(self.dev.shape.slides):
+                            slides = not lifted and start_depth <= 4 * close
+                        shift = self.dev.surface.push(i, depth, start_depth, out, moved, h, turn, slides)
                         a += s * e
                         e += self.dev.pose.inward(1, shift) - s * e
         if ti.static(self.dev.shape.guesses):
             if touched and not self.dev.shape.astray(first, contact_distance - 8 * close, close):
-                going = going or self.dev.shape.astray(a + e, contact_distance, close)
+                going = going or self.dev.shape.astray(a + e, contact_distance - 4 * close, close)
                 if going and self.dev.shape.astray(a, contact_distance, close):
                     a = first
         if going:

@@ -15,15 +15,17 @@ from ..tools import golden
 from .moving import Moving
 from .pose import rotation_matrix
 from .shape import HostShape, Shape
+from .surface import ALONG, NEAR
 
-MARCH = 64  # steps along a way; what has not come to its end by then stays where it is
-FINE = 1 / 64  # of a way: closer than that, the surface is taken for its tangent plane
+FINE = NEAR  # of a way: closer than that, the surface is taken for its tangent plane
+MARCH = 64  # steps along a way, which are no shorter than FINE of it
 SAMPLES = 4096  # places where the function is looked at before it is used
 CAST = 1 << 14  # steps along a ray; one that grazes a plane at less than 1e-3 may miss it
 STRIDE = 2.0**-16  # of the size of the scene: the shortest step of a ray; nothing that is as thin is seen from its side
 SKIN = 2.0**-40  # of the size of the scene: rays that start no deeper than that are outside
 AWAY = 1e16  # [m] where no particle can be
 SLOPE = 1e-6  # of the largest coordinate: the step of differences at a surface
+LEAST = 0.5  # gradient that is counted upon near a surface
 STEEP, FLAT = 1.1, 0.9  # bounds of the gradient that pass for 1
 
 
@@ -46,7 +48,8 @@ class Sdf(Moving):
     The way of a particle is followed by steps as long as the function says, never shorter than 1/64 of it (sphere tracing, Hart
     1996): nothing passes that is thicker than that with the particle's diameter added. A function that changes faster than
     distance would break this, and one that changes more slowly at the surface would keep particles too far away: the gradient is
-    checked where particles start and around, and ValueError names the place.
+    checked where particles start and around, and ValueError names the place. What slides in a hollow is second order in the
+    substep, as in a Ball, and keeps its energy; on a hump, or with restitution, it is first order and loses some.
     """
 
     def __init__(
@@ -132,7 +135,7 @@ class Sdf(Moving):
 class FunctionShape(Shape):
     """The shape where a function of the position is negative, on the device."""
 
-    guesses = True
+    guesses = slides = True
 
     def __init__(self, function: Any, gradient: Any, scene: Scene, dim: int):
         self.function, self.gradient, self.dim, self.real = function, gradient, dim, scene.real
@@ -153,13 +156,13 @@ class FunctionShape(Shape):
 
     @ti.func
     def normal(self, q, contact_distance):
-        """The direction of the gradient; +x where there is none."""
+        """The direction of the gradient, +x where there is none, and its size."""
         g = self.slope(q, contact_distance)
         size, n = g.norm(), 0 * q
         n[0] = 1
         if size > 0:
             n = g / size
-        return n
+        return n, size
 
     @ti.func
     def slope(self, q, contact_distance):
@@ -169,7 +172,7 @@ class FunctionShape(Shape):
         if ti.static(bool(self.gradient)):
             out = self.gradient(q)
         else:
-            step = ti.max(contact_distance, q.norm() / 100) * ti.cast(self.step, self.real)
+            step = self.difference(q, contact_distance)
             for k in range(self.dim):
                 ahead, behind = q, q
                 for a in ti.static(range(self.dim)):
@@ -183,48 +186,79 @@ class FunctionShape(Shape):
         return out
 
     @ti.func
+    def difference(self, q, contact_distance):
+        """The step of central differences [m]."""
+        return ti.max(contact_distance, q.norm() / 100) * ti.cast(self.step, self.real)
+
+    @ti.func
+    def blur(self, q, contact_distance):
+        """Angle by which rounding may turn the gradient [rad]: to hold anything more exactly above a plane would never end."""
+        out = ti.cast(self.slight, self.real)
+        if ti.static(not self.gradient):
+            out += self.rounding(q) / ti.max(self.difference(q, contact_distance), self.rounding(q))
+        return out
+
+    @ti.func
     def strike(self, a, e, contact_distance, close, limit):
         """The first touch on the way.
 
-        What starts close to the surface is first held above the tangent plane there. Then the way is followed at FINE * 4 of its
-        length above that plane, so that steps do not shrink to nothing; at last its end is looked at: in a hollow, it is below.
+        What starts close to the surface is first held above the tangent plane there. If nothing bounces, the end of its way on
+        that plane is looked at, too: in a hollow it is inside, and is pushed on along the same normal, as by SHAKE, which is of
+        second order. Then the way is followed at FINE * 4 of its length above the plane, so that steps do not shrink to nothing;
+        at last its end is looked at. Such a touch is at the start: a place on the way below could be behind a thin wall.
         """
         way = e.norm()
-        best, depth, normal = 0 * contact_distance + 2, 0 * contact_distance, 0 * e
-        fine, lift, s, going = way * FINE + close, 0 * e, 0 * contact_distance, True
+        best, depth, normal, first = 0 * contact_distance + 2, 0 * contact_distance, 0 * e, 0 * e
+        fine, lifted, s, going, end = way * FINE + close, 0 * contact_distance, 0 * contact_distance, True, a + e
+        lift, blur = 0 * e, self.blur(a, contact_distance) * way
         for k in range(MARCH + 2):
             if going:
                 ends = s >= 1
                 q = a + s * e + lift
                 if ends:
-                    q = a + e
+                    q = end
                 gap = self.function(q) - contact_distance
                 if k == 0 and gap > way + close:
                     going = False
-                elif k == 0 or gap <= fine or ends or k == MARCH:
-                    n = self.normal(q, contact_distance)
+                elif k == 0 or gap <= fine or ends:
+                    n, size = self.normal(q, contact_distance)
                     slope = e.dot(n)
                     toward = slope < -ti.cast(self.slight, self.real) * way
                     if k == 0:
                         below = -(gap + slope)
+                        lies = False
+                        if ti.static(self.slides):
+                            lies = -4 * close <= gap <= fine
+                        if lies:
+                            first = n
                         if gap <= 4 * fine:
                             if toward and gap <= close:
                                 below = ti.max(below, ti.min(-slope, close))
                             pushed = gap < 0 and ti.min(below, limit - slope) > 2 * close
-                            if (toward and below > 0) or pushed:
-                                best, depth, normal, going = ti.max(gap, 0) / ti.max(-slope, way * FINE + close), below, n, False
-                                best = ti.min(best, 1)
-                            lift = (4 * fine - gap) * n
+                            if (toward and below > blur) or pushed:
+                                best, depth, normal, going = 0 * contact_distance, below, n, lies
+                                end += below * n
+                                s += 1
+                            lifted = 4 * fine - gap
+                            lift = lifted * n
                     elif ends:
                         going = False
                         if ti.min(-gap, limit - slope) > 2 * close:
-                            best, depth, normal = 0 * contact_distance, -gap, n
+                            more, along, rise = -gap / ti.max(size, LEAST), first.dot(n), first.dot(e)
+                            if best == 0:
+                                if along > ALONG:
+                                    depth += more / along
+                            else:
+                                best, depth, normal = 0 * contact_distance, more, n
+                                # What is left of such a push, or was too little at the start to be told from rounding.
+                                if along > ALONG and (rise < blur or more < rise * FINE):
+                                    depth, normal = more / along, first
                     else:
                         below = -(gap - lift.dot(n) + (1 - s) * slope)
                         if toward and below > 0:
-                            best, depth, normal, going = s, below, n, False
-                        elif k == MARCH:
-                            best, depth, normal, going = s, (1 - s) * way, -e / way, False
+                            best, depth, normal, going = 0 * contact_distance, below, n, False
+                            if lifted == 0:
+                                best = ti.max(s + ti.min(gap, 0) / -slope, 0)
                 s += ti.max(gap, fine) / way
         return best, depth, normal
 

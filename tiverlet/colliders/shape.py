@@ -35,10 +35,12 @@ class HostShape(Protocol):
 class Shape:
     """What particles stay outside of, on the device, in a frame of its own; radius: what it is thickened by [m].
 
-    guesses: strike() may miss a touch, so that ends of ways are looked at: a place is free or astray().
+    guesses: strike() may miss a touch, so that ends of ways are looked at: a place is free or astray(). slides: nothing bounces,
+    so what slides on it may be pushed along the normal at the start of its way.
     """
 
     guesses = False
+    slides = False
 
     @ti.func
     def strike(self, a, e, contact_distance, close, limit):

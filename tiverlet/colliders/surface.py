@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 FIRST, AGAIN, GENTLY, AHEAD = range(4)
 TOUCH = 2.0**-20  # of the size of a wall: a start that is no deeper inside than this counts as on the surface
 SLOW = 8.0  # what a linked particle comes nearer by before forces and links of a substep add to it, times that, does not bounce
+NEAR = 1 / 64  # of its way: what starts no further from a surface than that lies on it, and may slide along
+ALONG = 0.9  # cosine of the angle by which a surface turns along a way on it, at most, for that to be a slide: 26 degrees
 ON = 1e-3  # of its distance from the middle of a wall: what is no deeper inside than this lies on it
 
 
@@ -109,9 +111,16 @@ class Surface:
 
     @ti.func
     def press(self, i, depth, start_depth, n, moved, h, turn):
+        """As push(), of what does not slide along a curved surface."""
+        return self.push(i, depth, start_depth, n, moved, h, turn, False)
+
+    @ti.func
+    def push(self, i, depth, start_depth, n, moved, h, turn, slides):
         """Take particle i out of a wall that it entered by `depth` [m], along the normal n; the wall itself moved by `moved`.
 
         start_depth: how deep it was at the start of the substep, 0 or less outside [m]. turn: FIRST, AGAIN, GENTLY or AHEAD.
+        slides: whether n is the normal at the start of its way along a surface that rises; it goes with its position then, for
+        walls that follow displacements would be passed otherwise.
         What comes as close as the last digits of the position can tell touches: it does not sink, or slip, by these digits.
         Returns how the position was shifted.
         """
@@ -127,7 +136,9 @@ class Surface:
         if depth > ti.select(turn == FIRST, 0, close):
             move = ti.max(depth - ti.max(start_depth - self.push_out * h, 0), 0)
             # Normal displacement after the substep; what has bounced may be moved further than that is to tell.
-            after = ti.min(leaving + move, ti.max(ti.abs(leaving), self.push_out * h))
+            after = leaving + move
+            if not slides:
+                after = ti.min(after, ti.max(ti.abs(leaving), self.push_out * h))
             rise, left = 0 * depth, 1 + 0 * depth
             if ti.static(self.has_restitution):
                 # Where the last bounce has put it back on a straight way, that way began at a height of `gap`.
