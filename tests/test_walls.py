@@ -366,3 +366,50 @@ def test_what_comes_near_a_rod_does_not_touch_it(world):
     w.step(h)
     np.testing.assert_allclose(w.position, start + h * v, atol=1e-12)
     np.testing.assert_allclose(w.velocity, v, atol=1e-12)
+
+
+@pytest.mark.parametrize("path", ["auto", "parallel", "launched"])
+@pytest.mark.parametrize("substeps", [1, 2, 8])
+def test_a_bounce_is_no_load(world, path, substeps):
+    # From rest at a height H, v = -g (t - T) where T is the time of the last apex, and apexes are 2 sqrt(2 H / g) apart. What
+    # bounced in the last substep of a frame was read g h / 2 too fast, and an elastic ball that was told so gained 0.4 J a
+    # second. Side by side, balls bounce everywhere in a substep.
+    heights = np.linspace(0.3, 1.2, 32)
+    start = tv.Particles(np.stack([np.arange(32), 0.1 + heights], axis=1), radius=0.1)
+    w = world(start, [tv.Gravity(), tv.HalfSpace((0, 1), 0, restitution=1.0)], substeps=substeps, precision="f64", path=path)
+    half = np.sqrt(2 * heights / 9.81)
+    for back in (False, True):
+        w.position, w.velocity = start.position, start.velocity
+        begun = w.time
+        for _ in range(120):
+            if back:
+                w.velocity = w.velocity
+            w.step(1 / 60)
+            since = (w.time - begun + half) % (2 * half) - half
+            np.testing.assert_allclose(w.velocity[:, 1], -9.81 * since, atol=1e-11)
+
+
+def test_what_lies_on_a_floor_is_carried_while_it_bounces_off_a_side(world):
+    # x = the triangle wave between the sides, y = the radius: with the load of the floor in it, v_y is 0 in every frame.
+    w = world(
+        tv.Particles([[0.5, 0.1], [0.3, 0.1]], velocity=[[2.9, 0], [0, 0]], radius=0.1),
+        [tv.Gravity(), tv.Box((0, 0), (1.0, 2.0), restitution=1.0)], substeps=2, precision="f64",
+    )  # fmt: skip
+    bounces = 0
+    for _ in range(240):
+        before = w.velocity[0, 0]
+        w.step(1 / 60)
+        bounces += before * w.velocity[0, 0] < 0
+        np.testing.assert_allclose(np.abs(w.velocity), [[2.9, 0], [0, 0]], atol=1e-9)
+    assert bounces > 10
+
+
+def test_what_slides_and_bounces_at_once_is_read_to_second_order(world):
+    # With friction below that which grips, sliding v = v0 - mu g t on a floor that also bounces what falls on it.
+    w = world(
+        tv.Particles([[0, 0.1]], velocity=(3.0, 0), radius=0.1),
+        [tv.Gravity(), tv.HalfSpace((0, 1), 0, friction=0.2, restitution=0.5)], substeps=2, precision="f64",
+    )  # fmt: skip
+    for _ in range(60):
+        w.step(1 / 60)
+        np.testing.assert_allclose(w.velocity[0], [3 - 0.2 * 9.81 * w.time, 0], atol=1e-11)

@@ -165,8 +165,8 @@ class ConstraintPass:
             self.team.wait()
 
     @ti.func
-    def reactions(self, firm, soft):
-        """Write what constraints added to h^2 a in the last substep to the slots, see Passes."""
+    def reactions(self, h, firm, soft):
+        """Write what constraints add to h^2 a now to the slots, see Passes."""
         for f in ti.static(self.batches):
             for c in range(f.count):
-                f.dev.push_reaction(c, firm, soft)
+                f.dev.push_reaction(c, h, firm, soft)

@@ -139,7 +139,7 @@ class Frames:
         for k in range(count):
             w = which[k]
             self.copies.enter(w)
-            self.step.constraints.reactions(ti.cast(given[k, 2], self.step.real), ti.cast(given[k, 3], self.step.real))
+            self.step.write_reactions(given[k, 0], given[k, 2], given[k, 3])
             for i in range(self.step.n):
                 v = self.step.velocity_of(i, given[k, 0], given[k, 1], given[k, 2])
                 for a in ti.static(range(self.step.dim)):

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 TILE = 256  # particles that a thread takes at a time, through several loops: their state stays in its cache
 SWEEPS = 8  # rounds over the walls, for particles that several of them push
+LEAVES = 1 / 16  # of a blow: what goes away from a wall less fast after it lies there
 ROUNDS = 32  # more of them, without friction and bounces
 
 
@@ -48,6 +49,7 @@ class ParticlePass:
         self.spreads = bool(scene.impacts) and scene.impacts.spreads
         self.weights = [scene.own_weight] if scene.own_weight else []
         self.rough = any(w.has_friction or w.has_restitution for w in walls)
+        self.bounces = any(w.has_restitution for w in walls)
         self.turned_by_walls = scene.state.spins and any(w.has_friction for w in walls)
         if walls:
             self.wall_displacement = scene.memory.field("thrust", scene.count, width=scene.particles.dim, state=True)
@@ -275,6 +277,27 @@ class ParticlePass:
                     for i in range(begin, end):
                         if self.state.awake(i):
                             self.wall_turn[i] = self.wall_turn[i] + self.state.spin.s[i]
+                if ti.static(self.bounces):
+                    for i in range(begin, end):
+                        if self.state.awake(i):
+                            self.forget_blow(i)
+
+    @ti.func
+    def forget_blow(self, i):
+        """Of particle i, if it bounced in this substep: keep of what walls did only what is across the blow.
+
+        A blow b at the part s of the substep leaves the particle -s b from where its displacement says, see Surface.bounce(), and
+        the velocity has all of it. What it leans on meanwhile, as on a floor while it bounces off a side, is across. What rests
+        with restitution bounces, too, by rounding, but does not leave.
+        """
+        lift = self.state.place(i) - self.state.begin(i) - self.state.d[i]
+        if lift.norm() > 4 * self.state.digits(i):
+            n = -lift.normalized()
+            blow = self.wall_displacement[i].dot(n)
+            if self.state.d[i].dot(n) > ti.static(LEAVES) * blow:
+                self.wall_displacement[i] = self.wall_displacement[i] - blow * n
+                if ti.static(self.turned_by_walls):
+                    self.wall_turn[i] = 0 * self.wall_turn[i]
 
     @ti.func
     def near_walls(self, begin, end):
@@ -387,8 +410,10 @@ class ParticlePass:
         if ti.static(len(self.walls) > 0):
             push = firm * self.wall_displacement[i]
             v = self.state.d[i] / h
-            limit = (h * h * self.forces.accelerate(i, self.state.place(i), v, t, self.forces.pull(t)) + reaction).norm()
-            size = push.norm()
+            load = (h * h * self.forces.accelerate(i, self.state.place(i), v, t, self.forces.pull(t)) + reaction).norm()
+            limit, size = load, push.norm()
+            for f in ti.static([f for f in self.walls if f.has_friction]):  # which comes on top of what is borne
+                limit = ti.max(limit, load * ti.sqrt(1 + f.dev.surface.static() ** 2))
             if size > limit:
                 part = limit / size
                 push *= part

@@ -580,7 +580,7 @@ class Step:
     @ti.kernel
     def spins(self, h64: ti.f64, t: ti.f64, firm64: ti.f64, soft64: ti.f64, out: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
         """Velocities r omega of surfaces, (n, axes), with the arguments of velocities()."""
-        self.constraints.reactions(ti.cast(firm64, self.real), ti.cast(soft64, self.real))
+        self.write_reactions(h64, firm64, soft64)
         for i in range(self.n):
             v = self.particles.surface_velocity(i, ti.cast(h64, self.real), ti.cast(t, self.real), ti.cast(firm64, self.real))
             for k in ti.static(range(self.state.spin.axes)):
@@ -590,14 +590,20 @@ class Step:
     def velocities(self, given: ti.types.ndarray(ti.f64, 1), out: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
         """Velocities as the user sees them. given: h, t, firm and soft of Batch.push_reaction, and the first particle.
 
-        With the multipliers of the last substep along the directions at its end they are second order, and have the momentum and
-        the angular momentum of the motion, sum m x_n x (x_n - x_(n-1)) / h and what forces from outside add in h / 2.
+        With the forces of constraints at x_n along the directions there they are second order, and have the momentum and the
+        angular momentum of the motion, sum m x_n x (x_n - x_(n-1)) / h and what forces from outside add in h / 2. Springs are
+        asked for their force at x_n, so that a start from these velocities neither pumps nor brakes them.
         """
-        self.constraints.reactions(ti.cast(given[2], self.real), ti.cast(given[3], self.real))
+        self.write_reactions(given[0], given[2], given[3])
         for i in range(integer(given, 4), self.n):
             v = self.velocity_of(i, given[0], given[1], given[2])
             for k in ti.static(range(self.dim)):
                 out[i, k] = v[k]
+
+    @ti.func
+    def write_reactions(self, h64, firm64, soft64):
+        """What constraints accelerate by, to the slots."""
+        self.constraints.reactions(ti.cast(h64, self.real), ti.cast(firm64, self.real), ti.cast(soft64, self.real))
 
     @ti.func
     def velocity_of(self, i, h64, t, firm64):

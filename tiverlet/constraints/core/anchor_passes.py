@@ -100,12 +100,15 @@ class AnchorPasses(Passes):
         self.corners.push(c, 0, move)
 
     @ti.func
-    def push_reaction(self, c, firm, soft):
+    def push_reaction(self, c, h, firm, soft):
         """As in CornerPasses, for each axis."""
-        scale = firm
+        i = self.corners.member(c, 0)
+        w, pull = self.w.of(i), firm * self.lam[c]
         if ti.static(self.spring.soft):
-            scale = ti.select(self.spring.alpha[c] > 0, soft, firm)
-        self.corners.push(c, 0, scale * self.w.of(self.corners.member(c, 0)) * self.lam[c])
+            if w > 0 and self.spring.alpha[c] > 0:
+                grown = self.place.offset_now(c, 0) - self.spring.last[c]
+                pull = soft * self.lam[c] + self.spring.change(c, grown, h, w, self.slots.split[i])
+        self.corners.push(c, 0, w * pull)
 
     @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):

@@ -203,33 +203,66 @@ class ClusterPasses(Passes):
             self.keep(self.pose, c, R)
 
     @ti.func
-    def push_reaction(self, c, firm, soft):
-        """What moved each corner, less its moment about the present places: as what turns the cluster, of least sum m move^2.
+    def push_reaction(self, c, h, firm, soft):
+        """What moves each corner, less its mean and its moment about the present places, as what turns the cluster, of least sum
+        m move^2.
 
-        Moves have no moment about the places at the start. Where something cannot move, forces from outside have one.
+        Moves have neither about the places at the start. Where something cannot move, forces from outside have one.
         """
         begin, end, i0 = self.corners.starts[c], self.corners.starts[c + 1], self.corners.hub(c)
-        scale = firm
-        if ti.static(self.spring.soft):
-            scale = ti.select(self.spring.alpha[c] > 0, soft, firm)
+        middle, center, R = self.best_fit(c, 0)
         total, mean, pull, held = ti.cast(0, ti.f64), self.nothing(), self.nothing(), False
         S = mean.outer_product(mean)
         X = 0 * S
         for e in range(begin, end):
             held = held or self.w.of(self.corners.members[e]) == 0
-            m, r = self.weight(e, c), self.arm(e, i0, 0)
+            m, r, move = self.weight(e, c), self.arm(e, i0, 0), self.reaction(e, c, middle, center, R, h, firm, soft)
             total += m
             mean += m * r
-            pull += m * self.pull[e]
+            pull += m * move
             S += m * r.outer_product(r)
-            X += m * r.outer_product(ti.cast(self.pull[e], ti.f64))
+            X += m * r.outer_product(move)
         mean, pull = mean / total, pull / total
         spin = rotation.spin(S - total * mean.outer_product(mean), X - total * mean.outer_product(pull))
         for e in range(begin, end):
-            move = ti.cast(self.pull[e], ti.f64)
+            move = self.reaction(e, c, middle, center, R, h, firm, soft)
             if not held:
-                move -= spin @ (self.arm(e, i0, 0) - mean)
-            self.corners.give(e, ti.cast(scale * move, self.real))
+                move -= pull + spin @ (self.arm(e, i0, 0) - mean)
+            self.corners.give(e, ti.cast(move, self.real))
+
+    @ti.func
+    def reaction(self, e, c, middle, center, R, h, firm, soft):
+        """What moves corner e: as in the last substep, and as far as the force of its spring has changed since. middle, center,
+        R: see best_fit()."""
+        move = firm * ti.cast(self.pull[e], ti.f64)
+        if ti.static(self.spring.soft):
+            w, mass = self.w.of(self.corners.members[e]), self.mass[c]
+            if self.spring.alpha[c] > 0:
+                move = soft * ti.cast(self.pull[e], ti.f64)
+                if w > 0 and self.strength.holds(c):
+                    C = self.arm(e, self.corners.hub(c), 0) - middle - R @ (self.shape[e] - center)
+                    grown = ti.cast(C - R @ ti.cast(self.spring.last[e], ti.f64), self.real)
+                    n = self.slots.split[self.corners.members[e]] / w
+                    move += ti.cast(self.spring.change(c, grown / mass, h, 1 / mass, n / mass), ti.f64)
+        return move
+
+    @ti.func
+    def best_fit(self, c, back):
+        """Of cluster c at x - back d: the mean place, that of its shape, and the rotation that fits best, where it is soft."""
+        middle, center = self.nothing(), self.nothing()
+        R = middle.outer_product(center)
+        if ti.static(self.spring.soft):
+            total, K, i0 = ti.cast(0, ti.f64), R, self.corners.hub(c)
+            for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
+                mu = self.weight(e, c)
+                x = self.arm(e, i0, back)
+                total += mu
+                middle += mu * x
+                center += mu * self.shape[e]
+                K += mu * self.shape[e].outer_product(x)
+            middle, center = middle / total, center / total
+            R = rotation.matrix(rotation.fit(K - total * center.outer_product(middle), self.turn[c], LEAST))
+        return middle, center, R
 
     @ti.func
     def off(self, e, c):
@@ -328,18 +361,7 @@ class ClusterPasses(Passes):
         if ti.static(self.spring.soft):
             alpha, mass, i0 = self.spring.alpha[c], self.mass[c], self.corners.hub(c)
             if alpha > 0 and mass > 0 and self.strength.holds(c):
-                total = ti.cast(0, ti.f64)
-                s, q = self.nothing(), self.nothing()
-                K = s.outer_product(q)
-                for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
-                    mu = self.weight(e, c)
-                    x = self.arm(e, i0, back)
-                    total += mu
-                    s += mu * x
-                    q += mu * self.shape[e]
-                    K += mu * self.shape[e].outer_product(x)
-                s, q = s / total, q / total
-                R = rotation.matrix(rotation.fit(K - total * q.outer_product(s), self.turn[c], LEAST))
+                s, q, R = self.best_fit(c, back)
                 most, borne = ti.cast(0, self.real), ti.cast(0, ti.f64)
                 for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
                     C = self.arm(e, i0, back) - s - R @ (self.shape[e] - q)

@@ -320,13 +320,20 @@ class CornerPasses(Passes):
                 self.slots.note_turn(self.slots.turn((g * n).sum(), g.norm() * n.norm()))
 
     @ti.func
-    def push_reaction(self, c, firm, soft):
-        """Push scale w_j lam grad_j C, by the scale `firm` where c is rigid, and `soft` where not."""
-        pull = self.equation.lam[c] * ti.select(self.spring.is_rigid(c), firm, soft)
+    def push_reaction(self, c, h, firm, soft):
+        """Push h^2 w_j F grad_j C, with F of Equation.reaction()."""
+        f, g = self.quantity.remeasure(c, self.seen.apart(c, 0))
+        w, W = ti.cast(0, self.real), ti.cast(0, self.real)
+        if ti.static(self.spring.soft):
+            f = self.quantity.unwrap(f, self.equation.rest[c])
+            for k in ti.static(range(self.arity)):
+                i, gg = self.corners.member(c, k), g[k, :].dot(g[k, :])
+                w += self.w.of(i) * gg
+                W += self.slots.split[i] * gg
+        pull = self.equation.reaction(c, f, w, W, h, firm, soft)
         if ti.static(self.known.learns):
             if self.spring.is_rigid(c):
                 pull += (soft - firm) * self.known.given[c]
-        _, g = self.quantity.remeasure(c, self.seen.apart(c, 0))
         for k in ti.static(range(self.arity)):
             self.corners.push(c, k, self.w.of(self.corners.member(c, k)) * pull * g[k, :])
 

@@ -178,6 +178,23 @@ class Equation:
         return force
 
     @ti.func
+    def reaction(self, c, f, w, W, h, firm, soft):
+        """h^2 F of the last substep; of a spring, with how much it has changed since. f: now. w, W: as in Spring.change()."""
+        pull = firm * self.lam[c]
+        if ti.static(self.spring.soft):
+            if not self.spring.is_rigid(c):
+                pull = soft * self.lam[c]
+                if w > 0 and self.strength.holds(c):
+                    now, last = self.bounded(f - self.rest[c]), self.quantity.unwrap(self.spring.last[c], f)
+                    grown = now - self.bounded(self.violation_then(c, last, 1))
+                    pull += self.spring.change(c, grown, h, w, W)
+                    if ti.static(self.side != 0):
+                        pull = -self.bounded(-pull)
+                    if ti.static(self.driven):
+                        pull = h * h * self.drive.clamp_force(c, pull / (h * h))
+        return pull
+
+    @ti.func
     def stores(self, c):
         """Whether constraint c is a spring, which can store energy."""
         return self.spring.alpha[c] > 0 and self.strength.holds(c)

@@ -95,9 +95,16 @@ class OutlinePasses(Passes):
         self.change[c], self.astray[c] = h * h * self.equation.spring_force(c, f, f0, w, h), 1
 
     @ti.func
-    def push_reaction(self, c, firm, soft):
+    def push_reaction(self, c, h, firm, soft):
         """As in CornerPasses."""
-        pull = self.equation.lam[c] * ti.select(self.spring.is_rigid(c), firm, soft)
+        f, w, W, i0 = ti.cast(0, self.real), ti.cast(0, self.real), ti.cast(0, self.real), self.corners.hub(c)
+        if ti.static(self.spring.soft):
+            for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
+                i, g = self.corners.members[e], self.quantity.slope(e, 0)
+                f += self.corners.arm(e, i0, 0).dot(g) / self.dim
+                w += self.w.of(i) * g.dot(g)
+                W += self.slots.split[i] * g.dot(g)
+        pull = self.equation.reaction(c, f, w, W, h, firm, soft)
         for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
             self.corners.give(e, self.w.of(self.corners.members[e]) * pull * self.quantity.slope(e, 0))
 

@@ -37,9 +37,12 @@ class Passes:
         """Where springs are forces (orders from 4 on): note how far this one turned in the last stage, see Slots.note_turn."""
 
     @ti.func
-    def push_reaction(self, c, firm, soft):
-        """Push what the constraint added to h^2 a in the last substep, along its directions at the present positions, about which
-        it has no moment. firm, soft: h^2 over what its multiplier stands for, where it is rigid and where not."""
+    def push_reaction(self, c, h, firm, soft):
+        """Push what the constraint adds to h^2 a, along its directions at the present positions, about which it has no moment:
+        what it did in the last substep, and of a spring, how much its force has changed since, see Spring.change().
+
+        firm, soft: h^2 over what its multiplier stands for, where it is rigid and where not.
+        """
 
     @ti.func
     def reduce_block(self, b, h, h2_effective, first, fresh):

@@ -105,6 +105,17 @@ class Spring:
         return stored + theta * (borne - stored)
 
     @ti.func
+    def change(self, c, grown, h, w, W):
+        """How much h^2 times the force of constraint c has changed since it acted in a substep of h, which it did at the start
+        of it. grown: by how much its violation has since. w: see stiff(). W: its weight with split masses.
+
+        Without it, velocities would get half a kick by the force of a substep ago, which pumps: 1 + (omega h)^2 / 2 times v. A
+        substep has alpha + W h^2 / 4 for alpha, see law(). What is stiff keeps the force that it had.
+        """
+        alpha = self.alpha[c]
+        return -(1 - stiff(alpha, h, w)) * grown / (alpha / (h * h) + W / 4)
+
+    @ti.func
     def before(self, c, present, fresh):
         """What is remembered of the substep before; at a start, the present, for what was before may be no number."""
         return ti.select(fresh != 0, present, self.last[c])
