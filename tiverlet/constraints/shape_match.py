@@ -11,6 +11,7 @@ from ..geometry.ordered import distinct
 from ..particles import Particles
 from .core.cluster_passes import ClusterPasses
 from .core.members import VariableSize, rows
+from .core.spring import per_newton
 from .core.strength import strength_of
 
 
@@ -164,7 +165,10 @@ class ShapeMatch(Batch):
         if not self.acts:
             return np.zeros(self.count)
         w = self.scene.inv_mass[self.indices]
-        scale = np.divide(1, w * self.scene.h2_effective, out=np.zeros_like(w), where=w * self.scene.h2_effective > 0)
+        mass = self.scene.memory.read(self.dev.mass)
+        weights = np.divide(1.0, mass, out=np.zeros(self.count), where=mass > 0)
+        firm = per_newton(self.scene.reach, self.compliance, lambda: weights)
+        scale = np.divide(firm[self.owner], w, out=np.zeros_like(w), where=w > 0)
         pull = self.scene.memory.read(self.dev.pull).astype(np.float64)
         return np.maximum.reduceat(scale * np.linalg.norm(pull, axis=1), self.members.starts[:-1])
 

@@ -50,7 +50,7 @@ BENT, FAR = 1, 2  # how far a constraint turned in a substep: by more than 26 de
 class Scene:
     """What a feature is bound to: the memory to declare fields in, and the particles they act on."""
 
-    host_only = ("inv_mass", "residuals", "h2_effective", "periodic")
+    host_only = ("inv_mass", "residuals", "reach", "periodic")
 
     memory: "Memory"
     state: "State"
@@ -63,7 +63,9 @@ class Scene:
     residuals: Any = None  # batch -> what the last substep left of each of its violations
     order: int = 2  # of the substep in h
     periodic: Any = None  # the Periodic of the world
-    h2_effective: float = 0.0  # [s^2] what an acceleration added to the displacement in the last substep, see Batch.relax
+    # [s^2] multipliers of the last substep for 1 N, of rigid and of soft constraints: h2_effective, see Batch.relax, and what the
+    # rigid ones did beside where it was a start from velocities that lacked it
+    reach: tuple[float, float] = (0.0, 0.0)
 
     @property
     def count(self) -> Number:

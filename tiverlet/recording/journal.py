@@ -29,7 +29,7 @@ from . import rrd
 if TYPE_CHECKING:
     from ..step.step_report import StepReport
 
-FORMAT = 7
+FORMAT = 8
 GUARD = {"stuck", "substeps-capped"}  # flags that do not follow from the steps: the StepController knows what it tried in vain
 JOURNAL = "tiverlet/journal"
 SCENE = "world/scene"

@@ -131,12 +131,12 @@ class Rebuild:
         """Put the parts into the world, and into these what stays."""
         world, last = self.world, self.world._runner
         contact = next((c for c in last.step.contacts if c in self.features), None)
-        h2_effective, left, memories = last.scene.h2_effective, last.left, last.memories
+        reach, left, memories = last.scene.reach, last.left, last.memories
         world._clock.parted = None
         world._install(world._particles.regrouped(self.some, self.added), self.features, parts)
         runner = world._runner
         runner.pass_on(left, self.some)
-        runner.scene.h2_effective = h2_effective
+        runner.scene.reach = reach
         runner.memory.restore(state)
         for f, rows in self.noted.items():
             if f in self.features:

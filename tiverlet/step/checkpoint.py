@@ -163,7 +163,7 @@ def transfer(old: "World", new: "World") -> None:
     kept = keep(old)
     if new._precision == old._precision and new._order == old._order:
         install(new, kept, flags(old))
-        new._runner.scene.h2_effective = old._runner.scene.h2_effective  # by which loads are known
+        new._runner.scene.reach = old._runner.scene.reach  # by which loads are known
         for mine, other in zip(new.features, old.features, strict=True):
             if isinstance(mine, Batch):  # what it noted in the last substep; walls tell of frames, and a clone made none
                 new._runner.memory.put_scratch(mine, old._runner.memory.scratch(other))

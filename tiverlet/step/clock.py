@@ -8,8 +8,9 @@ import numpy as np
 # Names in recordings.
 NAMES = {
     "_time": "time", "_tick": "tick", "_since": "since", "_h": "h", "_fresh": "d_is_velocity", "_longest": "longest",
-    "_frame": "frame", "_drag": "drag", "_started": "started", "_owed": "owed", "_parted": "parted", "_placed": "first_moved",
-    "_energy": "energy", "_softened": "softened", "_bound": "bound", "_kinetic": "kinetic", "_parting": "parting",
+    "_frame": "frame", "_drag": "drag", "_started": "started", "_owed": "owed", "_lacked": "lacked", "_parted": "parted",
+    "_placed": "first_moved", "_energy": "energy", "_softened": "softened", "_bound": "bound", "_kinetic": "kinetic",
+    "_parting": "parting",
 }  # fmt: skip
 
 SHARE = 0.1  # of the largest kinetic energy: how much more a scene may have
@@ -39,7 +40,8 @@ class Clock:
     d_is_velocity: whether displacements are velocities, as before a start. started: whether the last substep was the first after
     one. longest: substep [s] since violations were last taken out, see projection.py. frame: when frames of the present length
     began [s], their length [s], their number. drag: what it makes of h, see integrator.decay(). owed: [s] of the kick by rigid
-    constraints that the velocities at the last start lacked. parted: velocities, until the next step, where constraints were
+    constraints that velocities before a start lack. lacked: the same of the start that the last substep was; 0 where it was none.
+    parted: velocities, until the next step, where constraints were
     removed that have a part in them. first_moved: the first of the particles that the user placed and that were not looked at
     yet. energy: at the end of the last frame [J]; None: not known. softened: whether loads had no direction in it, and were held
     by violations. bound, kinetic, parting: the energy that nothing should exceed [J], None where it is not known; the most of it
@@ -56,6 +58,7 @@ class Clock:
     frame: tuple[float, float, int] = (0.0, 0.0, 0)
     drag: list[float] | None = None
     owed: float = 0.0
+    lacked: float = 0.0
     parted: np.ndarray | None = None
     first_moved: int | None = 0
     energy: float | None = None
@@ -115,6 +118,7 @@ class Clock:
         """Note that so many substeps have gone by, and with them a frame."""
         self.tick, self.since = (self.tick + substeps) % 2**31, (self.since + substeps) % 2**31
         self.started, self.d_is_velocity, self.parted = started, False, None
+        self.lacked = self.owed if started else 0.0
         self.frame, self.time = frame, frame[0] + frame[1] * frame[2]
 
     @property

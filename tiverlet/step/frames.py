@@ -21,6 +21,7 @@ from .span import (
     HALT,
     ITERATIONS,
     ORIGIN,
+    OWED,
     PART,
     RESUMED,
     SHEET,
@@ -45,10 +46,11 @@ DATES = 4  # of a copy: when frames of the present length began [s], their lengt
 WRAP = 2.0**31  # substeps are counted up to it
 
 
-def sheets(h, start, end, tick, since, fresh, origin, substeps: int, passes: int) -> np.ndarray:
+def sheets(h, start, end, tick, since, fresh, owed, origin, substeps: int, passes: int) -> np.ndarray:
     """What frames are given, one row for each copy, see Span: arrays with a value for each, and what is the same for all."""
     out = np.zeros((len(h), SHEET))
-    for k, values in ((H, h), (START, start), (END, end), (TICK, tick), (SINCE, since), (FRESH, fresh), (ORIGIN, origin)):
+    dates = (H, h), (START, start), (END, end), (TICK, tick), (SINCE, since)
+    for k, values in (*dates, (FRESH, fresh), (OWED, owed), (ORIGIN, origin)):
         out[:, k] = values
     out[:, STAGES], out[:, ITERATIONS] = substeps, passes
     out[:, UNTIL], out[:, PART] = substeps + 1, passes

@@ -178,7 +178,7 @@ class Probe:
         """One more stage of h after one of `last`. end: in frames."""
         ti.loop_config(serialize=True)
         for _ in range(1):
-            span = Span(h, t, t, 0, 0, 0, 0, 1, passes, part=passes)
+            span = Span(h, t, t, 0, 0, 0, 0.0, 0, 1, passes, part=passes)
             substep(self.step, Moment(span, 0, h, last, t, 0, ti.Vector([1.0, end]), final=1))
 
 

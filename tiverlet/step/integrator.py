@@ -291,6 +291,15 @@ class Verlet:
         return h2_effective
 
     @ti.func
+    def h2_rigid(self, h, fresh, owed):
+        """The same of a rigid constraint: at a start it also makes up for `owed` [s] of its kick, which velocities lack, see
+        to_velocity(). That is h (h + h_old) / 2: h times what is between the middles of two substeps."""
+        late = h * owed
+        if ti.static(self.decays):
+            late *= self.decay[None][1]
+        return self.h2_effective(h, fresh) + ti.select(fresh != 0, late, 0 * late)
+
+    @ti.func
     def velocity_after(self, i, h, t, reaction):
         """v_n from d_n and the acceleration at x_n: d / h + (h a + reaction / h) / 2, or what the solution with drag makes of it.
 
@@ -333,3 +342,8 @@ FREE = decay(0.0, 1.0)  # what no drag makes of a substep
 def h2_effective_of(clock: "Clock") -> float:
     """What a constant acceleration added to the displacement in the last substep, per m/s^2 [s^2]."""
     return clock.h**2 * (clock.drag or FREE)[2 if clock.started else 1]
+
+
+def h2_rigid_of(clock: "Clock") -> float:
+    """The same of a rigid constraint, which in a start also made up for the kick that velocities lacked [s^2]."""
+    return h2_effective_of(clock) + clock.h * clock.lacked * (clock.drag or FREE)[1]

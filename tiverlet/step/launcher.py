@@ -37,7 +37,17 @@ class Launcher:
             names, now, span = template(" ".join(self.waiting)), self.now, self.now.span
             self.waiting = []
             self.runner.step.phases(
-                names, span.h64, span.start, span.tick, span.since, span.fresh, now.s, span.substeps, span.iterations, now.half
+                names,
+                span.h64,
+                span.start,
+                span.tick,
+                span.since,
+                span.fresh,
+                span.owed,
+                now.s,
+                span.substeps,
+                span.iterations,
+                now.half,
             )
 
     def put(self, now: Moment, name: str, there: bool = True) -> None:

@@ -14,7 +14,7 @@ from .clock import Clock, slack
 from .contact_rows import ContactRows
 from .diagnostics import BARE, EXTENT, STARTED, STEPPED, UNSTEPPED
 from .frames import Frames
-from .integrator import FREE, decay
+from .integrator import FREE, decay, h2_effective_of, h2_rigid_of
 from .launcher import Launcher
 from .overlap_release import release
 from .projection import project
@@ -184,17 +184,22 @@ class Runner:
             with self.memory.compiler():
                 semi_iteration.prepare(iterations)
         clock = self.clock
-        span, started = clock.counted(dt), clock.d_is_velocity and substeps == 1
+        span, started = clock.counted(dt), clock.d_is_velocity and substeps * self.integrator.stages == 1
         if not (self.sleep and self.sleep.rests):
             self.run(substeps if self.n else 0, iterations, span[0] + span[1] * span[2], STARTED if started else STEPPED)
         clock.advance(substeps, span, started)
         self.left = None
         if self.sleep:
             self.settle(dt)
-        self.scene.h2_effective = clock.h**2 * self.integrator.h2_factor * (clock.drag or FREE)[2 if started else 1]
+        self.know_reach()
         report, self.moved, self.released = self.report(substeps, iterations), 0.0, 0.0
         clock.softened = "softened" in report.flags
         return report
+
+    def know_reach(self) -> None:
+        """Have loads read from the multipliers of the last substep."""
+        factor = self.integrator.h2_factor
+        self.scene.reach = factor * h2_rigid_of(self.clock), factor * h2_effective_of(self.clock)
 
     def find_ramps(self) -> None:
         """After knobs were uploaded: find the batches whose rest values are others now."""
@@ -357,8 +362,8 @@ class Runner:
         drag = clock.drag or FREE
         if not clock.started:
             return 1 / drag[1], 1 / drag[1]
-        owed = drag[1] * clock.owed / clock.h
-        return 1 / (drag[2] + owed), 1 / drag[2]
+        late = drag[1] * clock.lacked / clock.h
+        return 1 / (drag[2] + late), 1 / drag[2]
 
     # Launches.
 
@@ -367,7 +372,9 @@ class Runner:
         clock, stages = self.clock, self.integrator.stages * substeps
         passes = self.integrator.passes(iterations)
         if self.launched:
-            span = Span(clock.h, clock.time, end, clock.tick, clock.since, clock.d_is_velocity, state_origin, stages, passes)
+            span = Span(
+                clock.h, clock.time, end, clock.tick, clock.since, clock.d_is_velocity, clock.owed, state_origin, stages, passes
+            )
             span.until, span.part = stages + 1, passes
             with self.memory.compiler():
                 self._launch(span)
@@ -380,8 +387,8 @@ class Runner:
             until, part = max(1, some // passes), min(passes, some) if splits else passes
         while True:
             GIVE(
-                self._given, 0, clock.h, clock.time, end, clock.tick, clock.since, clock.d_is_velocity, stages, passes,
-                begin, half, resumed, 0, state_origin, until, part,
+                self._given, 0, clock.h, clock.time, end, clock.tick, clock.since, clock.d_is_velocity, clock.owed, stages,
+                passes, begin, half, resumed, 0, state_origin, until, part,
             )  # fmt: skip
             self._fused()
             if self._data[HALT]:

@@ -367,7 +367,7 @@ class SleepPass:
         iterations: ti.i32, half: ti.i32,
     ):  # fmt: skip
         """Wake the islands that were called. In substep s they move as all others have done; where s = substeps, they do not."""
-        now = self.step.turn(self.step.moment(Span(h64, start, start, tick, since, fresh, 0, substeps, iterations), s), half)
+        now = self.step.turn(self.step.moment(Span(h64, start, start, tick, since, fresh, 0.0, 0, substeps, iterations), s), half)
         for i in range(self.n):
             if not self.sleepers.awake(i):
                 if self.sleepers.called[self.sleepers.island[i]] != 0:

@@ -12,17 +12,25 @@ class Span:
     """What a launch is to do.
 
     h64: the substep (of orders above 2: its first stage) [s]. start, end: of the frame [s]. tick, since: substeps so far, and
-    since the last start. fresh: whether displacements are velocities. state_origin: how the state that it leaves came about, see
+    since the last start. fresh: whether displacements are velocities; owed: [s] of the kick by rigid constraints that these lack.
+    state_origin: how the state that it leaves came about, see
     Diagnostics. substeps, iterations: of the frame. begin, until: substeps of it that this launch makes. part: iterations of the
     last of these. resumed: 1 where `begin` was interrupted before its `half`-th half of a pass.
     """
 
     def __init__(
-        self, h64, start, end, tick, since, fresh, state_origin, substeps, iterations, begin=0, half=0, resumed=0, until=1,
+        self, h64, start, end, tick, since, fresh, owed, state_origin, substeps, iterations, begin=0, half=0, resumed=0, until=1,
         part=1, thread=0, sheet=None,
     ):  # fmt: skip
         self.h64, self.start, self.end, self.tick, self.since, self.fresh = h64, start, end, tick, since, fresh
-        self.state_origin, self.substeps, self.iterations, self.begin, self.half = state_origin, substeps, iterations, begin, half
+        self.owed, self.state_origin, self.substeps, self.iterations, self.begin, self.half = (
+            owed,
+            state_origin,
+            substeps,
+            iterations,
+            begin,
+            half,
+        )
         self.resumed, self.until, self.part, self.thread, self.sheet = resumed, until, part, thread, sheet
 
 
@@ -63,8 +71,8 @@ class Moment:
 # team were at work. Then what it is given, see Span, and the number of the first thread.
 FIGURES = 15
 HALT, ACTIVE_THREADS = FIGURES, FIGURES + 3
-GIVEN = tuple(range(ACTIVE_THREADS + 1, ACTIVE_THREADS + 16))
-H, START, END, TICK, SINCE, FRESH, SUBSTEPS, ITERATIONS, BEGIN, HALF, RESUMED, FIRST, ORIGIN, UNTIL, PART = GIVEN
+GIVEN = tuple(range(ACTIVE_THREADS + 1, ACTIVE_THREADS + 17))
+H, START, END, TICK, SINCE, FRESH, OWED, SUBSTEPS, ITERATIONS, BEGIN, HALF, RESUMED, FIRST, ORIGIN, UNTIL, PART = GIVEN
 SHEET = PART + 1
 GIVE = Struct(f"{len(GIVEN)}d").pack_into  # in a third of the time of an assignment to an array
 
@@ -80,11 +88,11 @@ def span_on(sheet: ti.template(), thread):  # type: ignore[valid-type]
     """The span that is on it, for a thread."""
     h64, start, end = sheet[H], sheet[START], sheet[END]
     tick, since, fresh = integer(sheet, TICK), integer(sheet, SINCE), integer(sheet, FRESH)
-    state_origin = integer(sheet, ORIGIN)
+    owed, state_origin = sheet[OWED], integer(sheet, ORIGIN)
     substeps, iterations = integer(sheet, SUBSTEPS), integer(sheet, ITERATIONS)
     begin, half, resumed = integer(sheet, BEGIN), integer(sheet, HALF), integer(sheet, RESUMED)
     until, part = integer(sheet, UNTIL), integer(sheet, PART)
     return Span(
-        h64, start, end, tick, since, fresh, state_origin, substeps, iterations, begin, half, resumed, until, part, thread,
-        sheet,
+        h64, start, end, tick, since, fresh, owed, state_origin, substeps, iterations, begin, half, resumed, until, part,
+        thread, sheet,
     )  # fmt: skip

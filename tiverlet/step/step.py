@@ -148,11 +148,11 @@ class Step:
 
     @ti.kernel
     def phases(
-        self, names: ti.template(), h64: ti.f64, start: ti.f64, tick: ti.i32, since: ti.i32, fresh: ti.i32, s: ti.i32,  # type: ignore[valid-type]
-        substeps: ti.i32, iterations: ti.i32, half: ti.i32,
+        self, names: ti.template(), h64: ti.f64, start: ti.f64, tick: ti.i32, since: ti.i32, fresh: ti.i32,  # type: ignore[valid-type]
+        owed: ti.f64, s: ti.i32, substeps: ti.i32, iterations: ti.i32, half: ti.i32,
     ):  # fmt: skip
         """Some phases of a substep, by their names. Nothing is returned: that would be waited for."""
-        now = self.turn(self.moment(Span(h64, start, start, tick, since, fresh, 0, substeps, iterations), s), half)
+        now = self.turn(self.moment(Span(h64, start, start, tick, since, fresh, owed, 0, substeps, iterations), s), half)
         for phase, k in ti.static(self.named(names)):
             phase(now.newton_step(k))
 
@@ -460,11 +460,13 @@ class Step:
         """What bears too much breaks; loads become known; contacts keep what friction and restitution need; the orientation of
         what spins follows; as a frame ends, walls keep what touches them.
 
-        A rigid constraint may find a whole kick in a start that follows another step, so loads are never taken for half a kick.
+        At a start loads act for half a kick, and rigid constraints do what velocities lack, too: see Integrator.h2_rigid().
         """
+        h2_effective = self.integrator.h2_effective(now.h, now.fresh)
+        h2_rigid = self.integrator.h2_rigid(now.h, now.fresh, ti.cast(now.span.owed, self.real))
         for f in ti.static(self.breakers):
             for c in range(self.team.chunk_begin(f.count, now.thread), self.team.chunk_end(f.count, now.thread)):
-                f.dev.break_overloaded(c, self.integrator.h2_effective(now.h, 0), now.tick)
+                f.dev.break_overloaded(c, h2_rigid, h2_effective, now.tick)
         self.constraints.learn(now)
         self.contact_pass.finish(now)
         if ti.static(self.orients):

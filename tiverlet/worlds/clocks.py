@@ -5,7 +5,7 @@ import numpy as np
 from ..step.clock import Clock
 
 # As they are in a Clock.
-PLAIN = "time", "tick", "since", "h", "d_is_velocity", "started", "longest", "owed", "softened", "kinetic", "parting"
+PLAIN = "time", "tick", "since", "h", "d_is_velocity", "started", "longest", "owed", "lacked", "softened", "kinetic", "parting"
 NONE = -1  # for first_moved
 
 
@@ -36,6 +36,7 @@ class Clocks:
     started: np.ndarray
     longest: np.ndarray
     owed: np.ndarray
+    lacked: np.ndarray
     softened: np.ndarray
     kinetic: np.ndarray
     parting: np.ndarray
@@ -90,5 +91,6 @@ class Clocks:
         self.frame[:, 2] += frames
         self.time = self.frame[:, 0] + self.frame[:, 1] * self.frame[:, 2]
         self.started = started & (frames == 1)
+        self.lacked = np.where(self.started, self.owed, 0.0)
         self.d_is_velocity = np.zeros(self.count, dtype=bool)
         self.parted.clear()

@@ -21,7 +21,6 @@ from ..step import checkpoint, energy_bound
 from ..step import frames as kernel
 from ..step.clock import CHANGED, PARTED, SQUEEZED, room, slack
 from ..step.diagnostics import ENERGY, EXTENT, KINETIC, OVERLAP, REACH, STARTED, STEPPED, STIFFNESS, TURNS, UNSTEPPED, risks
-from ..step.integrator import FREE
 from ..world import World
 from .clocks import NONE, Clocks
 from .knobs import Knobs
@@ -128,9 +127,8 @@ class Worlds:
         """Meanwhile the world stands for the k-th."""
         world, runner, k = self._world, self._runner, int(k)
         runner.memory.choose(k)
-        clock = world._clock = runner.clock = self._clocks.of(k)
-        share = (clock.drag or FREE)[2 if clock.started else 1]
-        runner.scene.h2_effective = clock.h**2 * runner.integrator.h2_factor * share
+        world._clock = runner.clock = self._clocks.of(k)
+        runner.know_reach()
         if self._sources:
             self._sources[k].put_on(world)
         self._knobs.show(k)
@@ -239,7 +237,8 @@ class Worlds:
         clocks = self._clocks
         origin = np.where(clocks.d_is_velocity, UNSTEPPED, np.where(clocks.started, STARTED, STEPPED))
         sheets = kernel.sheets(
-            clocks.h, clocks.time, clocks.time, clocks.tick, clocks.since, clocks.d_is_velocity, origin, substeps=0, passes=1
+            clocks.h, clocks.time, clocks.time, clocks.tick, clocks.since, clocks.d_is_velocity, clocks.owed, origin, substeps=0,
+            passes=1,
         )  # fmt: skip
         plan = np.zeros(kernel.PLAN, dtype=np.int32)
         plan[kernel.FRAMES] = plan[kernel.KEEPS] = 1
@@ -282,12 +281,13 @@ class Worlds:
                 semi_iteration.prepare(iterations)
         begun = perf_counter()
         clocks.count_frame(dt, np.ones(len(self), dtype=bool))
-        started = clocks.d_is_velocity & (substeps == 1)
+        started = clocks.d_is_velocity & (substeps * stages == 1)
         dates = np.zeros((len(self), kernel.DATES))
         dates[:, :3] = clocks.frame
         sheets = kernel.sheets(
             clocks.h, clocks.time, dates[:, 0] + dates[:, 1] * (dates[:, 2] + 1), clocks.tick, clocks.since, clocks.d_is_velocity,
-            np.where(started, STARTED, STEPPED), stages * substeps if runner.n else 0, runner.integrator.passes(iterations),
+            clocks.owed, np.where(started, STARTED, STEPPED), stages * substeps if runner.n else 0,
+            runner.integrator.passes(iterations),
         )  # fmt: skip
         plan = np.zeros(kernel.PLAN, dtype=np.int32)
         plan[kernel.FRAMES], plan[kernel.SUBSTEPS] = frames, substeps if runner.n else 0

@@ -10,6 +10,7 @@ from ...features.feature import Batch, Feature, Knob, Scene
 from ...features.regrouping import Regrouping
 from .anchor_passes import AnchorPasses, Place
 from .members import FixedSize
+from .spring import per_newton
 
 if TYPE_CHECKING:
     from ...particles import Particles
@@ -104,8 +105,8 @@ class Anchored(Batch):
             raise RuntimeError(f"{self!r}.load: driven particles are taken along whatever it takes; give compliance to measure.")
         if not self.acts:
             return np.zeros((self.count, self.scene.particles.dim))
-        scale = 1 / self.scene.h2_effective if self.scene.h2_effective else 0.0
-        return scale * self.scene.memory.read(self.dev.lam)[: self.count].astype(np.float64)
+        scale = per_newton(self.scene.reach, self.compliance, lambda: self.scene.inv_mass[self.indices[:, 0]])
+        return scale[:, None] * self.scene.memory.read(self.dev.lam)[: self.count].astype(np.float64)
 
 
 def refuse_held_twice(particles: "Particles", features: tuple[Feature, ...], some: Sequence[Feature] | None = None) -> None:

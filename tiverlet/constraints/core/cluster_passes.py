@@ -328,7 +328,7 @@ class ClusterPasses(Passes):
         return out
 
     @ti.func
-    def break_overloaded(self, c, h2_effective, tick):
+    def break_overloaded(self, c, h2_rigid, h2_effective, tick):
         """Let cluster c fall apart if the force on one of its particles was too large."""
         if self.strength.holds(c):
             most = ti.cast(0, self.real)
@@ -336,7 +336,10 @@ class ClusterPasses(Passes):
                 w = self.w.of(self.corners.members[e])
                 if w > 0:
                     most = ti.max(most, self.pull[e].norm() / w)
-            self.strength.test(c, most, h2_effective, tick)
+            w = self.mass[c]
+            if w > 0:
+                w = 1 / w
+            self.strength.test(c, most, self.spring.reach(c, w, h2_rigid, h2_effective), tick)
 
     @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):

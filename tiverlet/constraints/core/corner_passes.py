@@ -338,9 +338,16 @@ class CornerPasses(Passes):
             self.corners.push(c, k, self.w.of(self.corners.member(c, k)) * pull * g[k, :])
 
     @ti.func
-    def break_overloaded(self, c, h2_effective, tick):
-        """By its multiplier."""
-        self.strength.test(c, ti.abs(self.equation.lam[c]), h2_effective, tick)
+    def break_overloaded(self, c, h2_rigid, h2_effective, tick):
+        """By its multiplier. The load that it knows is a force in velocities, as a spring's is."""
+        lam, w = self.equation.lam[c], ti.cast(0, self.real)
+        if ti.static(self.spring.soft):
+            if h2_rigid > h2_effective:
+                w = self.weight(c)
+        reach = self.spring.reach(c, w, h2_rigid, h2_effective)
+        if ti.static(self.known.learns):
+            lam += (reach / h2_effective - 1) * self.known.given[c]
+        self.strength.test(c, ti.abs(lam), reach, tick)
 
     @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
@@ -369,9 +376,14 @@ class CornerPasses(Passes):
         if ti.static(self.spring.soft):
             if self.equation.stores(c):
                 f, _ = self.quantity.remeasure(c, self.seen.apart(c, back))
-                _, g = self.quantity.remeasure(c, self.seen.apart(c, 0))
-                w = ti.cast(0, self.real)
-                for k in ti.static(range(self.arity)):
-                    w += self.w.of(self.corners.member(c, k)) * g[k, :].dot(g[k, :])
-                out = self.equation.energy(c, f, w, h2_effective, residual)
+                out = self.equation.energy(c, f, self.weight(c), h2_effective, residual)
         return out
+
+    @ti.func
+    def weight(self, c):
+        """sum_j w_j |grad_j f|^2 where its corners are."""
+        _, g = self.quantity.remeasure(c, self.seen.apart(c, 0))
+        w = ti.cast(0, self.real)
+        for k in ti.static(range(self.arity)):
+            w += self.w.of(self.corners.member(c, k)) * g[k, :].dot(g[k, :])
+        return w

@@ -109,9 +109,10 @@ class OutlinePasses(Passes):
             self.corners.give(e, self.w.of(self.corners.members[e]) * pull * self.quantity.slope(e, 0))
 
     @ti.func
-    def break_overloaded(self, c, h2_effective, tick):
+    def break_overloaded(self, c, h2_rigid, h2_effective, tick):
         """By its multiplier."""
-        self.strength.test(c, ti.abs(self.equation.lam[c]), h2_effective, tick)
+        reach = self.equation.spring.reach(c, self.weight(c), h2_rigid, h2_effective)
+        self.strength.test(c, ti.abs(self.equation.lam[c]), reach, tick)
 
     @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):
@@ -131,10 +132,17 @@ class OutlinePasses(Passes):
         out = ti.cast(0, ti.f64)
         if ti.static(self.spring.soft):
             if self.equation.stores(c):
-                f, w, i0 = ti.cast(0, self.real), ti.cast(0, self.real), self.corners.hub(c)
+                f, i0 = ti.cast(0, self.real), self.corners.hub(c)
                 for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
                     f += self.corners.arm(e, i0, back).dot(self.quantity.slope(e, back))
-                for b in range(self.corners.blocks[c], self.corners.blocks[c + 1]):
-                    w += self.sums[b][2]
-                out = self.equation.energy(c, f / self.dim, w, h2_effective, residual)
+                out = self.equation.energy(c, f / self.dim, self.weight(c), h2_effective, residual)
         return out
+
+    @ti.func
+    def weight(self, c):
+        """sum_j w_j |grad_j f|^2 of a spring, as the last pass summed it up."""
+        w = ti.cast(0, self.real)
+        if ti.static(self.spring.soft):
+            for b in range(self.corners.blocks[c], self.corners.blocks[c + 1]):
+                w += self.sums[b][2]
+        return w

@@ -53,8 +53,9 @@ class Passes:
         """Of VariableCorners, after relax() and push_spring_force(): give corner e its move."""
 
     @ti.func
-    def break_overloaded(self, c, h2_effective, tick):
-        """Where it `breaks`: break constraint c if its load in this substep was too large; it acts no more from the next on."""
+    def break_overloaded(self, c, h2_rigid, h2_effective, tick):
+        """Where it `breaks`: break constraint c if its load in this substep was too large; it acts no more from the next on.
+        h2_rigid, h2_effective: its multiplier for 1 N, where it is rigid and where not."""
 
     @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):

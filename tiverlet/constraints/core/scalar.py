@@ -18,6 +18,7 @@ from .members import FixedSize
 from .outline_passes import OutlinePasses
 from .quantity import Quantity
 from .ramp import Ramp
+from .spring import per_newton
 from .strength import strength_of
 
 if TYPE_CHECKING:
@@ -168,6 +169,11 @@ class Scalar(Batch):
     def gradients(self, position: np.ndarray) -> np.ndarray:
         """grad_k f of every constraint at the given positions, (m, arity, dim); of outlines (total, dim)."""
         return self.quantity.gradients(self.placed(position) if self.arity else position)
+
+    def weights(self, position: np.ndarray) -> np.ndarray:
+        """The sum of w |grad f|^2 of every constraint at the given positions, (m,)."""
+        w, squares = self.scene.inv_mass[self.indices], (self.gradients(position) ** 2).sum(axis=-1)
+        return (w * squares).sum(axis=1) if self.arity else np.bincount(self.owner, w * squares, minlength=self.count)
 
     def inverse_size(self, position: np.ndarray) -> np.ndarray:
         """What makes C a share of the size of its constraint, (m,): 1 / length for links, of which those between particles in one
@@ -331,8 +337,10 @@ class Scalar(Batch):
             raise RuntimeError(f"{self!r}.load: there is none before a world has been stepped with it.")
         if not self.acts:
             return np.zeros(self.count)
-        scale = 1 / self.scene.h2_effective if self.scene.h2_effective else 0.0
-        return -scale * self.scene.memory.read(self.dev.equation.lam)[: self.count].astype(np.float64)
+        memory, missing = self.scene.memory, self.sagging
+        known = memory.read(self.dev.equation.lam)[: self.count] - missing  # a force in velocities, as a spring's is
+        scale = per_newton(self.scene.reach, self.compliance, lambda: self.weights(self.scene.state.get(memory)))
+        return -scale * missing - np.divide(known, self.scene.reach[1], out=np.zeros(self.count), where=known != 0)
 
     @property
     def _learns(self) -> bool:

@@ -1,5 +1,6 @@
 """Springs of constraints: one law from soft to rigid, for every constraint that has a spring. See Equation for the letters."""
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,11 +11,29 @@ if TYPE_CHECKING:
     from ...features.feature import Scene
 
 
+@ti.pyfunc
+def stiff_at(ratio):
+    """theta by alpha / (w h^2), see stiff()."""
+    return 1 / (1 + ratio * ratio)
+
+
 @ti.func
 def stiff(alpha, h, w):
     """theta = s^4 / (1 + s^4), s^2 = w h^2 / alpha: 0 where the step resolves the spring, 1 where it is rigid."""
-    ratio = alpha / (h * h * w)  # 1 / s^2; s^4 would overflow in f32
-    return 1 / (1 + ratio * ratio)
+    return stiff_at(alpha / (h * h * w))  # 1 / s^2; s^4 would overflow in f32
+
+
+@ti.pyfunc
+def made_up(alpha, w, h2_effective, late):
+    """The share of `late`, what a rigid constraint makes up for in a start, that a spring does: 1 where stiff, 0 where resolved.
+
+    Velocities lack half a kick h_old F / 2 of what is rigid, and theta of it of springs, see Equation.spring_force(). Of what is
+    missing at the end of the start, lam = -C* h^2 / (2 alpha) finds theta s / (1 + theta s), with s = w h^2 / (2 alpha). Here
+    h^2 / 2 = h2_effective, and h h_old / 2 = late.
+    """
+    ratio = alpha / (w * h2_effective)
+    theta = stiff_at(ratio / 2)
+    return stiff_at(ratio / 2 * (h2_effective / late) ** 2) * theta / (theta + ratio)
 
 
 @ti.func
@@ -26,6 +45,20 @@ def law(alpha, damping, h, w, fresh):
     if fresh != 0:
         A, now, last = rigid + gamma, 1 - rigid - gamma, 0 * rigid
     return A, now, last
+
+
+def per_newton(reach: tuple[float, float], compliance: np.ndarray, weights: Callable[[], np.ndarray]) -> np.ndarray:
+    """What makes multipliers of the last substep forces, (m,); 0 before the first. reach: of the Scene. weights: w of each, see
+    stiff(), asked for where springs differ from what is rigid."""
+    h2_rigid, h2_effective = reach
+    late, soft, share = h2_rigid - h2_effective, compliance > 0, np.ones(len(compliance))
+    if late > 0 and soft.any():
+        w = weights()
+        some = soft & (w > 0)
+        share[soft] = 0.0
+        share[some] = made_up(compliance[some], w[some], h2_effective, late)
+    stands_for = h2_effective + share * late
+    return np.divide(1, stands_for, out=np.zeros(len(compliance)), where=stands_for > 0)
 
 
 class Spring:
@@ -69,6 +102,18 @@ class Spring:
         if ti.static(self.soft):
             out = self.alpha[c] == 0
         return out
+
+    @ti.func
+    def reach(self, c, w, h2_rigid, h2_effective):
+        """What 1 N in constraint c is as a multiplier. w: see stiff()."""
+        late = h2_rigid - h2_effective
+        share = ti.cast(1, self.real)
+        if ti.static(self.soft):
+            if self.alpha[c] > 0:
+                share = 0 * share
+                if late > 0 and w > 0:
+                    share = made_up(self.alpha[c], w, h2_effective, late)
+        return h2_effective + share * late
 
     @ti.func
     def dashpot(self, c):

@@ -56,8 +56,8 @@ class Strength:
         return out
 
     @ti.func
-    def test(self, c, load, h2_effective, tick):
-        """Break constraint c in this substep if its load, given as a multiplier, is too large."""
-        if self.stamp[c] == 0 and load > self.limit[c] * h2_effective:
+    def test(self, c, load, reach, tick):
+        """Break constraint c in this substep if its load, given as a multiplier, which is `reach` for 1 N, is too large."""
+        if self.stamp[c] == 0 and load > self.limit[c] * reach:
             self.stamp[c] = tick % ti.static(BREAKS) + 1
             self.counter[None] += 1

@@ -1,0 +1,183 @@
+"""What constraints and walls say that they bear: where the substep changes it is what they bore."""
+
+import numpy as np
+import pytest
+
+import tiverlet as tv
+from tiverlet.device import ti
+
+G, MASS = 9.81, 2.0
+WEIGHT = MASS * G
+H = 0.002
+RATIOS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 10.0)
+
+
+@ti.func
+def length(a, b):
+    """Of a link."""
+    return (a - b).norm()
+
+
+class Bodies:
+    """Bodies side by side at rest, each on a place of its own, and the features that hold them.
+
+    loads: of each feature, in newtons or what it counts in.
+    """
+
+    def __init__(self, dim):
+        self.dim, self.x, self.held = dim, [], []
+        self.features: list = []
+        self.loads: list[float] = []
+
+    def put(self, corners, make, load, held=-1, copies=1):
+        """Hold bodies of these corners, of which the first `held` are pinned, by make(their numbers), which bears `load`."""
+        first, (k, dim) = len(self.x), np.shape(corners)
+        for copy in range(copies):
+            place = np.zeros(self.dim)
+            place[:dim] = [6.0 * len(self.features) + 6.0 + 3.0 * copy / copies, 0.0, 0.0][:dim]
+            self.x += [place + np.resize([*corner, 0.0], self.dim) for corner in corners]
+            self.held += [first + copy * k + j for j in range(held % k)]
+        self.features.append(make(first + np.arange(copies * k).reshape(copies, k)))
+        self.loads.append(load)
+        return self.features[-1]
+
+    def world(self, world, **settings):
+        """All of them."""
+        gravity = np.zeros(self.dim)
+        gravity[1] = -G
+        particles = tv.Particles(self.x, mass=MASS, pinned=self.held)
+        return world(particles, [tv.Gravity(gravity), *self.features], **({"substeps": 1, "precision": "f64"} | settings))
+
+
+HANGING, BENT = [(0, 0), (0, -2)], [(0, 1), (0, 0), (1, 0)]
+FAN, SIMPLEX = [(-0.5, 0), (0.5, 0), (0, -1)], [(0, 0, 0), (1, 0, 0), (0, 0, 1), (0.3, -1, 0.3)]
+
+
+def all_kinds(dim):
+    """Each kind of rigid constraint bears the weight of a body, by an arm of 1 m where it is a moment."""
+    bodies = Bodies(dim)
+    for make in (tv.Distance, tv.Rope, lambda p: tv.Winch(p, 0.0), lambda p: tv.Constraint(length, p, rest=2.0)):
+        bodies.put(HANGING, make, WEIGHT)
+    bodies.put([(0, 0), (0, 2)], lambda pairs: tv.Spacer(pairs, 2.0), WEIGHT)
+    bodies.put(BENT, tv.Bend, WEIGHT)
+    bodies.put(BENT, lambda triples: tv.AngleLimit(triples, np.pi / 2, 3.0), WEIGHT)
+    bodies.put([(0, 0), (0, -1), (0, -2)], lambda three: tv.ShapeMatch(three[:, 1:]), WEIGHT, held=1)
+    bodies.features.append(tv.Distance([(len(bodies.x) - 3, len(bodies.x) - 2)]))  # by which that hangs
+    bodies.loads.append(2 * WEIGHT)
+    if dim == 2:
+        bodies.put(BENT, lambda hinges: tv.Motor(hinges, 0.0), WEIGHT)
+        bodies.put(FAN, tv.Area, 2 * WEIGHT)  # which it changes by 1 / 2 m^2 per m
+        bodies.put([(0, -2)], lambda one: tv.Path(one[:, 0], [(0, -2), (1e3, -2)], smooth=False), WEIGHT, held=0)
+    else:
+        bodies.put([(0, 0, -1), (0, 0, 1), (-1, 0, 0), (1, 0, 0)], tv.Dihedral, WEIGHT)
+        bodies.put(SIMPLEX, tv.Volume, 6 * WEIGHT)
+        faces = np.array([(0, 2, 1), (0, 1, 3), (1, 2, 3), (2, 0, 3)])
+        bodies.put(SIMPLEX, lambda four: tv.Volume(four[0][faces]), 6 * WEIGHT)
+    return bodies
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_what_is_at_rest_bears_its_weight_however_the_substep_changes(world, dim):
+    # A constraint moves a body at rest by h^2 g in a substep. Where this is the first of another length than h_old, displacements
+    # become velocities that lack h_old g / 2 along the constraint, and gravity acts for h / 2, so it moves the body by
+    # (h^2 + h h_old) g / 2; where velocities are given, by h^2 g / 2.
+    bodies = all_kinds(dim)
+    w = bodies.world(world, iterations=200)
+
+    def told():
+        """What each says that it bears, over what it does."""
+        return [np.linalg.norm(f.load) / load for f, load in zip(bodies.features, bodies.loads, strict=True)]
+
+    for ratio in RATIOS:
+        w.velocity = np.zeros_like(w.position)
+        for h in (H, H, ratio * H, ratio * H):
+            w.step(h)
+            np.testing.assert_allclose(told(), 1.0, rtol=1e-6, err_msg=f"{h} s after {H} s")
+
+
+def test_springs_at_rest_bear_their_weight(world):
+    # Velocities lack theta of the half kick of a spring: all of it where it is as good as rigid, and the start finds it again.
+    compliance = np.concatenate([[0.0], 10.0 ** np.arange(-12, -1)])
+    x = np.stack([np.arange(len(compliance)), np.zeros(len(compliance))], axis=1)
+    low = x - [0, 2]
+    pairs = np.arange(len(x))[:, None] + [0, len(x)]
+    link = tv.Distance(pairs, 2.0 - compliance * WEIGHT, compliance=compliance)
+    soft = compliance[1:]
+    pin = tv.Pin(2 * len(x) + np.arange(len(soft)), low[1:] + np.outer(soft * WEIGHT, [0, 1]), compliance=soft)
+    particles = tv.Particles(np.concatenate([x, low, low[1:]]), mass=MASS, pinned=np.arange(len(x)))
+    w = world(particles, [tv.Gravity(G), link, pin], substeps=1, precision="f64")
+    for ratio in RATIOS:
+        w.position, w.velocity = particles.position, np.zeros_like(w.position)
+        for h in (H, H, ratio * H):
+            w.step(h)
+            np.testing.assert_allclose(link.load, WEIGHT, rtol=1e-6, err_msg=f"{h} s after {H} s")
+            np.testing.assert_allclose(pin.load, np.outer(np.ones(len(soft)), [0, WEIGHT]), rtol=1e-6, atol=1e-9)
+
+
+BREAKING = [  # corners, what holds them, its load, how many corners are held
+    (HANGING, lambda p: tv.Distance(p, break_at=np.inf), WEIGHT, 1),
+    (HANGING, lambda p: tv.Distance(p, 2.0 - 1e-10 * WEIGHT, compliance=1e-10, break_at=np.inf), WEIGHT, 1),
+    (FAN, lambda p: tv.Area(p, break_at=np.inf), 2 * WEIGHT, 2),
+    ([(0, 0), (0, -1), (0, -2)], lambda p: tv.ShapeMatch(p[:, 1:], break_at=np.inf), WEIGHT, 1),
+]
+
+
+@pytest.mark.parametrize("path", ["fused", "parallel", "launched", "many"])
+def test_only_what_is_too_weak_breaks_where_the_substep_changes(world, path):
+    # Two of each kind: one bears a thousandth more than it has to, the other that much less. None: where velocities are given.
+    bodies = Bodies(2)
+    kinds = [bodies.put(corners, make, load, held, copies=2) for corners, make, load, held in BREAKING]
+    upper = bodies.features[-1].indices.reshape(2, 2)[:, 0]
+    bodies.features.append(tv.Distance(np.stack([upper - 1, upper], axis=1)))
+    with bodies.world(world, iterations=60, path="fused" if path == "many" else path) as made:
+        made.step(H)
+        for ratio in (*RATIOS, None):
+            with tv.Worlds(made, 2) if path == "many" else made.clone() as w:
+                if ratio is None:
+                    w.velocity = 0 * w.velocity
+                for feature, load in zip(w.features[1:], bodies.loads, strict=False):
+                    feature.break_at = load * np.array([1.001, 0.999])
+                w.step((ratio or 1.0) * H)
+                for told in w.each(broken) if path == "many" else [broken(w)]:
+                    assert told == len(kinds) * [[False, True]], ratio
+
+
+def broken(w):
+    """Which of each kind have."""
+    return [f.broken.tolist() for f in w.features[1:-1]]
+
+
+@pytest.mark.parametrize("angle", [60, 90, 120])
+def test_a_pendulum_breaks_at_its_strength_under_auto(world, angle):
+    # Let go at rest at an angle a it pulls with T = m g (3 cos b - 2 cos a) at b, and most at its lowest point. The load of a
+    # substep is the mean over a time around it that is no longer than a frame, so within a frame it breaks where T passes its
+    # strength, and one that is stronger than the largest T by more than the motion is wrong holds.
+    a = np.radians(angle)
+    top = 3 - 2 * np.cos(a)
+    links = [tv.Distance([(0, 1)], break_at=share * top * G) for share in (0.6, 0.8, 0.95, 1.02)]
+    for link, share in zip(links, (0.6, 0.8, 0.95, 1.02), strict=True):
+        particles = tv.Particles([(0.0, 0.0), (np.sin(a), -np.cos(a))], pinned=[0])
+        w = world(particles, [tv.Gravity(G), link], substeps="auto", precision="f64")
+        tension = [np.cos(a) / top]
+        for _ in range(240):
+            report = w.step(1 / 60)
+            tension.append((-3 * w.position[1, 1] - 2 * np.cos(a)) / top)
+            if report.broken:
+                break
+        if share > 1:
+            assert not link.broken.any() and max(tension) > 0.999
+        else:
+            change = abs(tension[-1] - tension[-2])
+            assert link.broken.all() and tension[-2] - change < share < tension[-1] + change
+
+
+def test_walls_give_as_much_as_gravity_takes_away(world):
+    # What a wall gave is a change of momentum: all that gravity gave to what lies on it, up to the middle of the last substep,
+    # whose displacement has the velocity there. So nothing is lost or counted twice where the substep changes.
+    floor = tv.HalfSpace((0, 1), -2.0, events=True)
+    w = world(tv.Particles([[0.0, -2.0]], mass=MASS), [tv.Gravity(G), floor], substeps=4, precision="f64")
+    given = 0.0
+    for dt in (4 * H, 4 * H, 40 * H, 4 * H, 0.4 * H, 8 * H, H, 3 * H):
+        w.step(dt)
+        given += w.wall_events().touches.impulse.sum()
+        assert given == pytest.approx(WEIGHT * (w.time - dt / 8), rel=1e-9)
