@@ -20,10 +20,10 @@ class Touches:
     (m,) [N s] along the normal, the sum over all substeps of the frame, where that of World.contacts is of the last one alone,
     without friction; i got impulse * normal, and j the opposite. 0 for sensors, and for what sleeps. A substep has what was given
     from the middle of the one before to its own, so that a frame whose substeps h follow others of h_old has (h_old - h) / 2 of a
-    steady force more, and sums over frames miss no more than half a substep. speed: (m,) [m/s], the highest at which the pair came
-    together where it met in this frame, before the impact; 0 where it did not meet. began: (m,) [s], when it first met in this
-    frame; NaN where it touched before. ended: (m,) [s], when it was apart again; NaN where it still touches. Times are those of the
-    ends of substeps.
+    steady force more, and sums over frames miss no more than half a substep. speed: (m,) [m/s], the highest at which the pair
+    came together where it met in this frame, before the impact; 0 where it did not meet. began: (m,) [s], when it first met in
+    this frame; NaN where it touched before. ended: (m,) [s], when it was apart again; NaN where it still touches. Times are those
+    of the ends of substeps.
 
     Of walls, pairs are a particle and the number of the wall in world.features, and normals point from the wall to the particle;
     of what left a wall as the frame began neither normal nor point are known, they are 0.

@@ -20,9 +20,8 @@ class Contacts:
     particle where the edge ends; j for discs. place: (m,), where on the edge, 0 at its begin and 1 at its end, beyond them where
     two corners cross; 0 for discs. overlap: (m,) [m], 0 or less for what has just been pushed apart. normal: (m, dim), from j or
     the edge to i. point: (m, dim) [m], in the middle of the overlap. impulse: (m,) [N s] along the normal in the last substep;
-    divided by the substep it is the force, but in the first of another length, see Touches. That of World.events() is the sum over
-    the frame. i got impulse * normal, and
-    -(1 - place) and -place of that went to j and the end of the edge.
+    divided by the substep it is the force, but in the first of another length, see Touches. That of World.events() is the sum
+    over the frame. i got impulse * normal, and -(1 - place) and -place of that went to j and the end of the edge.
     """
 
     pairs: np.ndarray
