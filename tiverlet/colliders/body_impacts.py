@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 FEW, MANY = 8, 32
 MET = 2.0**-9  # of the first push: a velocity that is missed by less is met
 LIGHTEST = 2.0**-7  # a particle is taken for this part, at least, of the mass that it has to stop
+FELT = 2.0**-20  # of the square of a displacement: a change that is less is no blow
 WAITS, HELD = 1, 2  # what is struck is so in the pass in which it meets the wall, and in those after that
 
 
@@ -59,7 +60,7 @@ class BodyImpacts:
         self.held = add("impacts.held", n, width=dim)  # by friction
         self.logs: list[Any] = []  # of walls that tell of events
         self.log = add("impacts.log", n, kind=ti.i32)  # of the wall, by its number, or -1
-        self.stirred = add("impacts.stirred", n, kind=ti.i32)  # whether anything of the blow has reached it
+        self.stirred = add("impacts.stirred", n, kind=ti.i32, state=True)  # whether a blow of the last substep has reached it
         self.open = add("impacts.open", self.passes + 1, kind=ti.i32)
 
     def enter(self, log: Any) -> int:
@@ -123,6 +124,12 @@ class BodyImpacts:
     def goes_on(self):
         """Whether this is a later one."""
         return self.open[1] != 0
+
+    @ti.func
+    def stir(self, i, change):
+        """The displacement of particle i changed by so much in such a pass."""
+        if change.norm_sqr() > ti.static(FELT) * self.state.d[i].norm_sqr():
+            self.stirred[i] = 1
 
     @ti.func
     def reaches(self, batch: ti.template(), c):  # type: ignore[valid-type]

@@ -46,7 +46,6 @@ class ParticlePass:
         self.acts = self.gathers or bool(contact or walls)
         self.knows_loads = bool(contact) and contact.has_loads
         self.impacts = [scene.impacts] if scene.impacts else []
-        self.spreads = bool(scene.impacts) and scene.impacts.spreads
         self.weights = [scene.own_weight] if scene.own_weight else []
         self.rough = any(w.has_friction or w.has_restitution for w in walls)
         self.bounces = any(w.has_restitution for w in walls)
@@ -200,13 +199,12 @@ class ParticlePass:
     def gather(self, i, newton):
         """Move particle i as constraints want."""
         if self.state.awake(i):
-            if ti.static(self.spreads):
+            for impacts in ti.static(self.impacts):
                 d = self.state.d[i]
                 self.slots.gather(i, newton)
-                for impacts in ti.static(self.impacts):
-                    if impacts.goes_on() and (self.state.d[i] != d).any():
-                        impacts.stirred[i] = 1
-            else:
+                if impacts.goes_on():
+                    impacts.stir(i, self.state.d[i] - d)
+            if ti.static(not self.impacts):
                 self.slots.gather(i, newton)
 
     @ti.func
@@ -400,7 +398,7 @@ class ParticlePass:
         part of what walls did is in it.
 
         Walls count as far as they balance the rest: a body at rest has velocity 0, but one that has just bounced is not credited
-        with half of the blow.
+        with half of the blow, nor is any of the body that it belongs to.
         """
         reaction, part = 0 * self.state.d[i], 1 + 0 * h
         if ti.static(self.held):
@@ -418,6 +416,9 @@ class ParticlePass:
                 part = limit / size
                 push *= part
             reaction += push
+        for impacts in ti.static(self.impacts):
+            if impacts.stirred[i] != 0:
+                reaction, part = 0 * reaction, 0 * part
         return reaction, part
 
     @ti.func
