@@ -204,7 +204,7 @@ class ParticlePass:
                 self.slots.gather(i, newton)
                 if impacts.goes_on():
                     impacts.stir(i, self.state.d[i] - d)
-            if ti.static(not self.impacts):
+            if ti.static(len(self.impacts) == 0):
                 self.slots.gather(i, newton)
 
     @ti.func
