@@ -58,8 +58,8 @@ def _frames() -> Finding:
 @row(19, "rest length < 0, NaN", "build error")
 def _rest() -> Finding:
     return refused(
-        (scene(Distance([[0, 1], [1, 2]], rest=[1, -2])), r"rest\[1\] = -2"),
-        (scene(Rope([[0, 1]], length=NAN)), r"length\[0\] = nan"),
+        (lambda: Distance([[0, 1], [1, 2]], rest=[1, -2]), r"rest\[1\] = -2"),
+        (lambda: Rope([[0, 1]], length=NAN), r"length\[0\] = nan"),
     )
 
 
