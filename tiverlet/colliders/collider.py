@@ -31,7 +31,8 @@ class Collider(Feature):
     where it was at the start of the substep, to the bit, so it does not creep.
     restitution: 0 ... 1. The moment of the impact within the substep is solved for, with the acceleration in it; the particle
     leaves at restitution times its velocity then, and is placed where it would be at the end of the substep. What is linked takes
-    its body along, see BodyImpacts; it rests where 8 substeps of forces and links gave it its speed.
+    its body along, see BodyImpacts, but not beside ShapeMatch, Area of loops, Path or Snap; it rests where 8 substeps of forces
+    and links gave it its speed.
     Of particles that spin, the displacement of the point that touches is taken back. friction = (static, dynamic, rolling,
     twisting) then also resists rolling, by a moment of up to rolling * radius times the normal force, and spinning about the
     normal, by up to twisting * radius times it; what these hold does not roll. restitution = (normal, tangential): in a bounce

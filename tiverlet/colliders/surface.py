@@ -146,7 +146,7 @@ class Surface:
                 if gap >= 0 and leaving < 0 and turn != GENTLY:
                     before = (self.state.before[i] - moved).dot(n)
                     if self.takes_along(i):
-                        bounces = self.restitution[None] > 0 and -before > ti.static(SLOW) * (before - leaving)
+                        bounces = self.restitution[None] > 0 and -before > ti.static(SLOW) * ti.abs(before - leaving)
                         if self.waits(i, n, moved, -self.restitution[None] * before, bounces, turn):
                             move, after = 0 * depth, leaving
                     else:

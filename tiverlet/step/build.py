@@ -165,7 +165,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
     size = size_of(path, scale.work)
     team = Team(memory, size, len(particles), path == "parallel" and size == 1, pieces=PIECES if contact else size)
     search = contact.join(scene, batches, team) if contact else None
-    if batches and can_have_impacts(scene) and any(w.has_restitution for w in walls):
+    if can_have_impacts(scene, batches) and any(w.has_restitution for w in walls):
         scene.impacts = BodyImpacts(scene, batches)
     for feature in of(Batch):
         feature.scene = scene  # also of those that do nothing, because all of their particles are held
