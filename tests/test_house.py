@@ -23,7 +23,7 @@ CONTRACTS = (
 )  # fmt: skip
 # Whose functions of kernels others inherit; elsewhere they hold an object that has them.
 SHARED = ("Baseline", "Moving", "PairContact", "System")
-INHERITED = 200  # lines that a constraint like Rope has from the classes above it
+INHERITED = 210  # lines that a constraint like Rope has from the classes above it
 CHAIN = 4  # classes, each below the next: what acts on particles, how many of them, of which kind, and which
 
 

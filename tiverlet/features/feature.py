@@ -292,6 +292,7 @@ class Batch(Feature):
     members: Any  # FixedSize or VariableSize: the particles of each constraint
     bulk = 1.0
     each: tuple[str, ...] = ()  # its arrays with one row for each constraint, beside the indices
+    rest_name = "rest"  # the argument of __init__ that is `rest`
     index_name = "indices"  # the argument of __init__ that they are, as `listing` gives them
 
     @property
@@ -364,7 +365,9 @@ class Batch(Feature):
 
     def note_arguments(self) -> None:
         """Keep what it would be made with now: other particles, and rows."""
-        now = {self.index_name: self.listing} | {name: self.__dict__[name] for name in self.each if name in self.__dict__}
+        now = {name: self.__dict__[name] for name in self.each if name in self.__dict__} | {self.index_name: self.listing}
+        if "rest" in now:
+            now[self.rest_name] = now["rest"]
         self.arguments = {k: v if type(v) in ONE or np.isscalar(v) else now.get(k, v) for k, v in self.arguments.items()}
 
     @property

@@ -44,7 +44,6 @@ class Scalar(Batch):
     compiled_for = ("soft", "damped", "breaks", "limited", "cusp", "capped")
 
     each = ("rest", "compliance", "damping", "break_at")
-    rest_name = "rest"
     uploads_all = True
     _scene_sized = False  # whether any of its constraints, which has no size of its own, has that of the whole scene
     grows = True
