@@ -134,6 +134,26 @@ def test_all_paths_have_the_same_bits(world, solver):
     assert run("fused") == run("parallel") == run("launched")
 
 
+@pytest.mark.parametrize("lean", [0.0, -0.1, -5.0])
+def test_what_leans_on_another_wall_bounces_all_the_same(world, lean):
+    # An upright rod between a floor and a smooth wall at its side, which has nothing to do with e^2 y.
+    walls = [tv.HalfSpace((0, 1), restitution=0.9), tv.HalfSpace((1, 0), restitution=0.9)]
+    w = world(tv.Particles([[0, 0.5], [0, 0.8]]), [tv.Gravity((lean, -9.81)), tv.Distance([(0, 1)]), *walls], precision="f64")
+    w.run(0.35)  # it lands after 0.319 s
+    top = max(w.position[0, 1] for _ in range(40) if w.step(1 / 60))
+    assert top == pytest.approx(0.81 * 0.5, abs=1e-3)
+
+
+def test_what_spins_and_rubs_has_all_of_its_friction(world):
+    # v_x - mu (1 + e) v_y, as where it does not spin.
+    w = world(
+        tv.Particles([[0, 0.5], [0.3, 0.5]], radius=0.05, velocity=(2.0, -1.0), spin=0.0),
+        [tv.Distance([(0, 1)]), tv.HalfSpace((0, 1), restitution=0.5, friction=0.3)], precision="f64",
+    )  # fmt: skip
+    w.run(0.8)
+    assert w.velocity[:, 0] == pytest.approx(2 - 0.3 * 1.5, abs=1e-6) and (w.spin < -1).all()
+
+
 def test_what_is_struck_is_never_inside(world):
     # Passes wait for what a wall has struck, but no substep ends with it inside, however short the last passes are.
     x, pairs = row(12)

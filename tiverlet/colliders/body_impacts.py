@@ -28,9 +28,9 @@ class BodyImpacts:
     """A linked particle that strikes a wall leaves it with -e times its normal velocity, and takes along what it is linked to.
 
     A wall that turns one particle round has only begun: links take back what it gave. In a substep with such an impact there are
-    more passes, until both hold: constraints are met, and what was struck has the normal displacement t = -e d_n, with d_n that
-    before the substep. So the impact is at the start of the substep, and positions and displacements stay one. In each pass the
-    sum p >= 0 of all pushes on the particle is corrected,
+    more passes, at most FEW or MANY, until both hold: constraints are met, as far as a pass meets them, and what was struck has the
+    normal displacement t = -e d_n, with d_n that before the substep. So the impact is at the start of the substep, and positions
+    and displacements stay one. In each pass the sum p >= 0 of all pushes on the particle is corrected,
 
         p' = max(p + (t - d.n) / s, 0),    s = (miss_last - miss) / push_last,    miss = t - d.n
 
@@ -105,8 +105,9 @@ class BodyImpacts:
 
     @ti.func
     def ask(self, now):
-        """Have more passes."""
-        self.open[ti.max(now.it + 1 - now.span.iterations, 0)] = 1
+        """Have more passes, once those of every substep are done."""
+        if now.it + 1 >= now.span.iterations:
+            self.open[now.it + 1 - now.span.iterations] = 1
 
     @ti.func
     def wanted(self, now):
@@ -156,13 +157,11 @@ class BodyImpacts:
         return out
 
     @ti.func
-    def between_walls(self, i):
-        """Whether another wall presses particle i, which has struck one: there it does not bounce, for what one wall gives, the
-        other would make more."""
-        out = self.struck[i] == HELD
-        if out:
+    def calm_between(self, i, n):
+        """A wall with the normal n presses particle i, too: if it faces the one that i has struck, i does not bounce off that,
+        for what one of them gives, the other would make more."""
+        if self.struck[i] == HELD and n.dot(self.normal[i]) < 0:
             self.target[i] = ti.min(self.target[i], 0)
-        return out
 
     @ti.func
     def hold(self, i):

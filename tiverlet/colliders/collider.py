@@ -30,9 +30,9 @@ class Collider(Feature):
     friction times the normal displacement that the wall gave, so neither coefficient depends on h. What sticks goes back to
     where it was at the start of the substep, to the bit, so it does not creep.
     restitution: 0 ... 1. The moment of the impact within the substep is solved for, with the acceleration in it; the particle
-    leaves at restitution times its velocity then, and is placed where it would be at the end of the substep. What is linked takes
-    its body along, see BodyImpacts, but not beside ShapeMatch, Area of loops, Path or Snap; it rests where 8 substeps of forces
-    and links gave it its speed.
+    leaves at restitution times its velocity then, and is placed where it would be at the end of the substep. What rigid
+    links hold takes its body along, see BodyImpacts, and rests where 8 substeps of forces and links gave it its speed; on
+    springs, beside ShapeMatch, Area of loops, Path or Snap, and where it spins and rubs, it bounces alone.
     Of particles that spin, the displacement of the point that touches is taken back. friction = (static, dynamic, rolling,
     twisting) then also resists rolling, by a moment of up to rolling * radius times the normal force, and spinning about the
     normal, by up to twisting * radius times it; what these hold does not roll. restitution = (normal, tangential): in a bounce

@@ -37,7 +37,8 @@ class Surface:
         self._memory, self.state, self.push_out, self.real = scene.memory, scene.state, push_out, scene.real
         self.has_friction, self.has_restitution = friction is not None, restitution is not None
         self.impacts: Any = scene.impacts
-        self.has_impacts = self.has_restitution and scene.impacts is not None
+        # What spins and rubs bounces alone, for passes do not turn it.
+        self.has_impacts = self.has_restitution and scene.impacts is not None and not (scene.state.spins and friction)
         self.log_number = self.impacts.enter(log) if self.has_impacts else -1
         self.poses: list[Any] = []
         self.spins, self.turns, self.radius = scene.state.spins and self.has_friction, turns, scene.radius
@@ -147,7 +148,7 @@ class Surface:
                     before = (self.state.before[i] - moved).dot(n)
                     if self.takes_along(i):
                         bounces = self.restitution[None] > 0 and -before > ti.static(SLOW) * ti.abs(before - leaving)
-                        if self.waits(i, n, moved, -self.restitution[None] * before, bounces, turn):
+                        if self.left_to_passes(i, n, moved, -self.restitution[None] * before, bounces, turn):
                             move, after = 0 * depth, leaving
                     else:
                         rise, after, left = self.bounce(gap, leaving, before, after)
@@ -201,20 +202,20 @@ class Surface:
         return out
 
     @ti.func
-    def waits(self, i, n, moved, target, bounces, turn):
-        """Whether particle i, which is linked, is left where it is for now: if it bounces, that is for passes to come, which take
-        it to the normal displacement `target`."""
+    def left_to_passes(self, i, n, moved, target, bounces, turn):
+        """Whether particle i, which is linked, is left where it is for now: if it bounces, passes to come take it to the normal
+        displacement `target`."""
         out = False
         if ti.static(self.has_impacts):
             static = dynamic = 0 * target
-            if ti.static(self.has_friction and not self.spins):
+            if ti.static(self.has_friction):
                 static, dynamic = self.static(), self.dynamic()
             if turn == AHEAD:
                 out = bounces
-            elif self.impacts.between_walls(i):
-                out = False
-            elif bounces:
-                out = self.impacts.strike(i, n, moved, target, static, dynamic, self.log_number)
+            else:
+                self.impacts.calm_between(i, n)
+                if bounces:
+                    out = self.impacts.strike(i, n, moved, target, static, dynamic, self.log_number)
         return out
 
     @ti.func
