@@ -28,9 +28,9 @@ class BodyImpacts:
     """A linked particle that strikes a wall leaves it with -e times its normal velocity, and takes along what it is linked to.
 
     A wall that turns one particle round has only begun: links take back what it gave. In a substep with such an impact there are
-    more passes, at most FEW or MANY, until both hold: constraints are met, as far as a pass meets them, and what was struck has the
-    normal displacement t = -e d_n, with d_n that before the substep. So the impact is at the start of the substep, and positions
-    and displacements stay one. In each pass the sum p >= 0 of all pushes on the particle is corrected,
+    more passes, at most FEW or MANY, until both hold: constraints are met, as far as a pass meets them, and what was struck has
+    the normal displacement t = -e d_n, with d_n that before the substep. So the impact is at the start of the substep, and
+    positions and displacements stay one. In each pass the sum p >= 0 of all pushes on the particle is corrected,
 
         p' = max(p + (t - d.n) / s, 0),    s = (miss_last - miss) / push_last,    miss = t - d.n
 

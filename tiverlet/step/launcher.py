@@ -37,18 +37,9 @@ class Launcher:
             names, now, span = template(" ".join(self.waiting)), self.now, self.now.span
             self.waiting = []
             self.runner.step.phases(
-                names,
-                span.h64,
-                span.start,
-                span.tick,
-                span.since,
-                span.fresh,
-                span.owed,
-                now.s,
-                span.substeps,
-                span.iterations,
-                now.half,
-            )
+                names, span.h64, span.start, span.tick, span.since, span.fresh, span.owed, now.s, span.substeps,
+                span.iterations, now.half,
+            )  # fmt: skip
 
     def put(self, now: Moment, name: str, there: bool = True) -> None:
         """Have one more phase wait for the next launch, if the scene has it. Phases of another half of a pass are launched

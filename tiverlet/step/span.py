@@ -23,14 +23,8 @@ class Span:
         part=1, thread=0, sheet=None,
     ):  # fmt: skip
         self.h64, self.start, self.end, self.tick, self.since, self.fresh = h64, start, end, tick, since, fresh
-        self.owed, self.state_origin, self.substeps, self.iterations, self.begin, self.half = (
-            owed,
-            state_origin,
-            substeps,
-            iterations,
-            begin,
-            half,
-        )
+        self.owed, self.state_origin = owed, state_origin
+        self.substeps, self.iterations, self.begin, self.half = substeps, iterations, begin, half
         self.resumed, self.until, self.part, self.thread, self.sheet = resumed, until, part, thread, sheet
 
 
