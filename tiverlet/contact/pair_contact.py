@@ -177,6 +177,12 @@ class PairContact(Feature):
         # `reports`: pairs that push each other are noted, not only what sensors overlap. `events`: an EventLog, or None.
         dev.has_events, dev.reports, dev.events = self.has_events, bool(vars(self).get("events")), None
 
+    def built_for(self) -> dict[str, Any]:
+        """The same, and the groups that are told apart; those that no longer need be go on being."""
+        named = self._pairs.named
+        told = self.table.named if self.scene and self.matters else frozenset()
+        return super().built_for() | {"named": told if named <= told else named}
+
     def upload(self) -> None:
         """Write friction and restitution."""
         if self.scene:

@@ -120,10 +120,16 @@ class Table:
         m = rank.max() + 1
         return table.reshape(m, m, -1)[rank[pairs[:, 0]], rank[pairs[:, 1]], 3] == TOUCHES
 
-    def rows(self, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The rank of each particle's group, (n,), and the table, (ranks * ranks, 7)."""
-        named = {k for given in (self.friction, self.restitution) if isinstance(given, Mapping) for pair in given for k in pair}
-        named |= {k for pair in (*(self.touching or ()), *self.sensing) for k in pair}
+    @property
+    def named(self) -> frozenset[int]:
+        """The groups that are named."""
+        given = [v for v in (self.friction, self.restitution) if isinstance(v, Mapping)]
+        return frozenset(k for pairs in (*given, self.touching or (), self.sensing) for pair in pairs for k in pair)
+
+    def rows(self, group: np.ndarray, also: frozenset[int] = frozenset()) -> tuple[np.ndarray, np.ndarray]:
+        """The rank of each particle's group, (n,), and the table, (ranks * ranks, 7). also: groups to tell apart beside those
+        that are named."""
+        named = self.named | also
         names, which, _ = distinct(group)
         at = {int(name): k for k, name in enumerate(name for name in names if name in named)}
         m = len(at) + (len(at) < len(names))  # all others are one
@@ -177,9 +183,9 @@ class Table:
             scene.memory.write(self.rank, self.rows(group)[0])
 
     def upload(self, scene: "Scene", other: "Table") -> None:
-        """Write the values of another table, for the same kernels."""
+        """Write the values of another table, which names no other groups, for the same kernels."""
         if "entries" in vars(self):
-            rows = other.rows(scene.particles.group)[1][: 1 if self.uniform else None]
+            rows = other.rows(scene.particles.group, self.named)[1][: 1 if self.uniform else None]
             scene.memory.write(self.entries, rows[:, : self.width])
 
     @ti.func
