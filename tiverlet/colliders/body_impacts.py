@@ -52,7 +52,7 @@ class BodyImpacts:
         self.spreads = not system  # from link to link; a system takes all at once
         self.exact = bool(scene.slots.exact and (not system or system.left_out(batches) == 0))
         n, dim, add = scene.count, scene.particles.dim, scene.memory.field
-        self.state, self.real = scene.state, scene.real
+        self.state = scene.state
         self.rigid = add("impacts.rigid", n, kind=ti.i32)  # whether a rigid constraint holds it
         self.struck = add("impacts.struck", n, kind=ti.i32)  # WAITS, HELD, or 0
         self.normal, self.moved = add("impacts.normal", n, width=dim), add("impacts.wall_moved", n, width=dim)
@@ -150,7 +150,7 @@ class BodyImpacts:
         if out:
             self.struck[i] = WAITS
             self.normal[i], self.moved[i], self.target[i] = n, moved, target
-            self.pushed[i] = self.first_push[i] = self.last_push[i] = 0 * target
+            self.pushed[i] = self.last_push[i] = 0 * target
             self.coefficients[i] = [static, dynamic]
             self.held[i] = ti.zero(n)
             self.log[i] = log
