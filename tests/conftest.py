@@ -252,9 +252,10 @@ def rms(position, reference) -> float:
 
 
 def rerun(w: tv.World, seconds: float, dt: float = 1 / 60, **settings) -> tv.World:
-    """Put a world back to its start and run it with other substeps or iterations, which costs no compilation: velocities come
-    first, or else a kernel would make those of the last frame, which nobody wants, out of displacements."""
-    w.velocity, w.position = w.particles.velocity, w.particles.position
+    """Put a world back to its start and run it with other substeps or iterations, which costs no compilation: it starts from
+    velocities, or else a kernel would make those of the last frame, which nobody wants, out of displacements."""
+    w._start_from(w.particles.velocity)
+    w.position = w.particles.position
     for name, value in settings.items():
         setattr(w, name, value)
     w.run(seconds, dt=dt)

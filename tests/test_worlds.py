@@ -123,6 +123,12 @@ def test_each_has_the_bits_that_it_has_alone(taichi, name):
             w.substeps = 3 if name[:5] != "order" else 1
             w.velocity = np.sin(np.arange(alone[0].position.size).reshape(alone[0].position.shape))
         both()
+        for w in (many, *alone):  # between substeps of one length: impulses, to some of them
+            v = w.velocity.copy()
+            v[..., ::2, :] *= 0.5
+            w.velocity = v
+            np.testing.assert_array_equal(w.velocity, v)
+        both()
         assert many[1].hash() == alone[1].hash()
         first = [many.hash(k) for k in range(3)]
         many.reset([0, 2])

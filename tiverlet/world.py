@@ -24,7 +24,7 @@ from .neighbours.queries import Contacts, PointSearch, near_by_all, nearest
 from .particles import Particles, at_rest, in_range, spin_of
 from .solvers.jacobi import Jacobi
 from .solvers.solver import Solver
-from .step import checkpoint, edit_scene, energy_bound
+from .step import checkpoint, edit_scene, energy_bound, impulse
 from .step.adaptive import StepController
 from .step.build import Assembly, assemble, check_settings, checked_features, checked_solver
 from .step.build_again import Rebuild
@@ -315,13 +315,21 @@ class World:
 
     @velocity.setter
     def velocity(self, value) -> None:
-        """Have particles go on with (n, dim) [m/s]; the next substep is a start."""
+        """Have particles go on with (n, dim) [m/s]; those that have these velocities go on as they are, to the bit."""
         value = checks.points("World", "velocity", value, dim=self._particles.dim, count=len(self._particles))
         self._runner.memory.check()
         with whole:
             for watcher in self._watchers:
                 watcher.assigned("velocity", value)
-            self._start_from(value)
+            others = (value != self.velocity).any(axis=1)
+            if not others.any():
+                return
+            if self._clock.d_is_velocity or self._order > 2:
+                self._start_from(value)
+            else:
+                self._runner.wake(np.flatnonzero(others))
+                impulse.give(self._runner, value, others, self._iterations)
+                self._clock.energy, self._clock.parted = None, value.copy()
 
     @property
     def spin(self) -> np.ndarray:
@@ -343,10 +351,15 @@ class World:
         with whole:
             for watcher in self._watchers:
                 watcher.assigned("spin", value)
-            self._let_go()
-            spin = self._runner.scene.state.spin
-            self._runner.memory.write(spin.s, spin.from_rates(value))
-            self._clock.energy = None
+            runner, clock, spin = self._runner, self._clock, self._runner.scene.state.spin
+            new, others = spin.from_rates(value), (value != self.spin).reshape(len(value), -1).any(axis=1)
+            if not clock.d_is_velocity:
+                with runner.memory.compiler():
+                    lack = np.where(others[:, None], new - runner.spin(), 0.0)
+                runner.wake(np.flatnonzero(others))
+                new = runner.memory.read(spin.s)[: runner.n] + clock.h * lack
+            runner.memory.write(spin.s, new)
+            clock.energy = None
 
     @property
     def orientation(self) -> np.ndarray:

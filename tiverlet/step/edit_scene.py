@@ -13,14 +13,11 @@ from ..contact.touches import ContactEvents
 from ..features.feature import Batch, Feature
 from ..neighbours.periodic import Periodic
 from ..particles import Particles
-from . import edit_in_place, initial_violation
+from . import edit_in_place, impulse, initial_violation
 from .build import check_settings, checked_features, listed
-from .integrator import decay
 from .sleep import Sleep
 
 NONE: Mapping[Feature, Feature] = MappingProxyType({})
-LAUNCHES = 100  # of the kernel of velocities, at most, for those that come where forces read them
-NOTHING = 2.0**-20  # of a velocity: less than this of it is in the next displacement
 
 
 class Handle:
@@ -136,7 +133,7 @@ def change(
         build_again(world, some, added, features, extend)
         return
     with world._runner.memory.compiler():
-        told, seen = world._all_events(), _seen(world, number, features)
+        told, (seen, loose) = world._all_events(), _seen(world, some, number, features)
         others = (added is not None or not some.all()) and world._runner.step.has_pair_forces
         if world._force_waits or others or any(more.soft for more in planned.more):
             world._runner.restart_between(world.iterations)
@@ -145,7 +142,7 @@ def change(
         world._runner.pass_on(world._runner.left, some)
         world._runner.wake()
         tied = initial_violation.first_off([*planned.more], world.position) if planned.more else None
-        _edited(world, some, added, told, seen, np.arange(len(features)), bool(extend), tied)
+        _edited(world, some, added, told, seen, loose, np.arange(len(features)), bool(extend), tied)
 
 
 def renew(world: Any) -> None:
@@ -156,12 +153,18 @@ def renew(world: Any) -> None:
         build_again(world, np.ones(len(world.particles), dtype=bool), None, world.features, NONE)
         return
     told = world._all_events() if runner.logs else world._events
+    loose = np.zeros(runner.n, dtype=bool)
+    loose[grabbing.some] = runner.scene.inv_mass[grabbing.some] == 0
+    seen = world.velocity if loose.any() and not clock.d_is_velocity else None
     if grabbing.soft:
         with runner.memory.compiler():
             runner.restart_between(world.iterations)
     clock.parted = clock.energy = None
+    runner.wake()
     edit_in_place.grab(world, grabbing)
     world._events = told
+    if seen is not None:
+        impulse.give(runner, seen, loose, world.iterations)
     for watcher in world._watchers:
         watcher.regrouped()
 
@@ -172,26 +175,39 @@ def build_again(
     """Make a change by building the world anew."""
     world._runner.memory.check()
     again = world._rebuild(some, added, features, extend)
-    before, told, seen = world.features, world._all_events(), _seen(world, again.number, features)
+    before, told, (seen, loose) = world.features, world._all_events(), _seen(world, some, again.number, features)
     again.run()
     walls = np.array([features.index(f) if f in features else -1 for f in before], dtype=np.int64)
     new = [*(f for f in again.came if f not in before), *again.extending.values()]
     tied = initial_violation.first_off(new, world.position)
-    _edited(world, some, added, told, seen, walls, bool(again.came or again.went or new), tied)
+    _edited(world, some, added, told, seen, loose, walls, bool(again.came or again.went or new), tied)
 
 
-def _seen(world: Any, number: np.ndarray, features: tuple[Feature, ...]) -> np.ndarray | None:
-    """Velocities before an edit, where what goes has a part in them; None where they are what displacements say."""
-    loses = any(_loses(f, number, features) for f in world.features)
-    return world.velocity if not world._clock.d_is_velocity and (world._clock.parted is not None or loses) else None
+def _seen(
+    world: Any, some: np.ndarray, number: np.ndarray, features: tuple[Feature, ...]
+) -> tuple[np.ndarray | None, np.ndarray]:
+    """Velocities before an edit, where what goes has a part in them, else None; and the particles that rigid constraints hold
+    which are about to go, a mask, (n,)."""
+    loose, loses = np.zeros(len(some), dtype=bool), world._clock.parted is not None
+    for f in world.features:
+        if isinstance(f, Batch) and f in features and f.afresh:  # a pin that takes others
+            loose[f.held] = loses = f.drives
+        elif isinstance(f, Batch | PairContact):
+            stays = f.kept_mask(number)[0] if f in features else np.zeros(1, dtype=bool)
+            if not stays.all():
+                loses = True
+                if isinstance(f, Batch) and f.acts:
+                    goes = ~np.broadcast_to(stays, f.count) & (f.compliance == 0)
+                    loose[f.indices.ravel()[goes[f.owner]]] = True
+    return world.velocity if loses and not world._clock.d_is_velocity else None, loose
 
 
 def _edited(
     world: Any, some: np.ndarray, added: Particles | None, told: tuple[ContactEvents, ContactEvents], seen: np.ndarray | None,
-    walls: np.ndarray, features_too: bool, tied: int | None = None,
+    loose: np.ndarray, walls: np.ndarray, features_too: bool, tied: int | None = None,
 ) -> None:  # fmt: skip
     """What else there is to an edit once particles and features are there. told: events, of walls that have these numbers now.
-    seen: velocities, see _seen(). features_too: whether features came or went, too.
+    seen: velocities, see _seen(). loose: likewise. features_too: whether features came or went, too.
     tied: the first particle of constraints that came and are not met."""
     number, clock = np.where(some, np.cumsum(some) - 1, -1), world._clock
     n, m = int(np.count_nonzero(some)), 0 if added is None else len(added)
@@ -208,43 +224,20 @@ def _edited(
         clock.first_moved = min(tied, n if clock.first_moved is None else clock.first_moved)
     if m and not clock.d_is_velocity:
         _launch(world, n)
-    if seen is not None and not clock.d_is_velocity:  # what went has left its part in the velocities of what stays
-        clock.parted = seen[some] if added is None else np.concatenate([seen[some], added.velocity])
+    if seen is not None:  # what went has left its part in the velocities of what stays
+        seen = seen[some] if added is None else np.concatenate([seen[some], added.velocity])
+        impulse.give(world._runner, seen, np.concatenate([loose[some], np.zeros(m, dtype=bool)]), world.iterations)
+        if not clock.d_is_velocity:
+            d, held = world._runner.memory.read(world._runner.scene.state.d)[: n + m], world._runner.scene.inv_mass == 0
+            clock.parted = np.where(held[:, None], d / clock.h, seen)
     for watcher in world._watchers:
         watcher.regrouped()
 
 
-def _loses(feature: Feature, number: np.ndarray, features: tuple[Feature, ...]) -> bool:
-    """Whether constraints go, or what may touch."""
-    return isinstance(feature, Batch | PairContact) and (feature not in features or not feature.kept_mask(number)[0].all())
-
-
 def _launch(world: Any, first: int) -> None:
-    """Give particles from `first` on the displacements that their velocities need, between two substeps.
-
-    v = share d / h + what forces add, see decay(): from any d, what it lacks of v says what d lacks, at once, or one time after
-    the other where forces read velocities. Where drag leaves nothing of a velocity in a substep, d does not matter.
-    """
-    h, memory, state = world._clock.h, world._runner.memory, world._runner.scene.state
-    integrator = world._runner.integrator
-    held = world._runner.scene.inv_mass[first:] == 0
-    want = np.where(held[:, None], 0.0, world._particles.velocity[first:])
+    """Give particles from `first` on the displacements that their velocities need, between two substeps."""
+    runner = world._runner
+    state, h = runner.scene.state, runner.clock.h
     if state.spins:
-        memory.write_from(state.spin.s, first, h * state.spin.from_rates(world._particles.spin)[first:])
-    share = max(decay(sum(f.rate for f in integrator.forces.drags), h)[0], NOTHING)
-    fields = [state.d, *([integrator.free] if integrator.uses_velocity else [])]
-    d = best = h * want
-    least = np.inf
-    for _ in range(LAUNCHES if integrator.uses_velocity else 1):
-        for field in fields:
-            memory.write_from(field, first, d)
-        with memory.compiler():
-            lack = want - world._runner.velocity(world.iterations, came=first)
-        lack[held] = 0.0
-        most = np.abs(lack).max(initial=0.0)
-        if not most < least:
-            d = best
-            break
-        best, least, d = d, most, d + h / share * lack
-    for field in fields:
-        memory.write_from(field, first, d)
+        runner.memory.write_from(state.spin.s, first, h * state.spin.from_rates(world._particles.spin)[first:])
+    impulse.give_new(runner, first, world._particles.velocity[first:], world.iterations)

@@ -122,8 +122,6 @@ class Runner:
         h, clock, self.released, self.jumped = dt / substeps * self.integrator.first, self.clock, 0.0, False
         drag = decay(sum(f.rate for f in self.drags), h) if self.drags else None
         if h == clock.h and drag == clock.drag and not clock.d_is_velocity and clock.first_moved is None:
-            if clock.energy is None:
-                self.wake()
             return clock.energy is None
         self.wake()
         with self.memory.compiler():
@@ -273,7 +271,10 @@ class Runner:
         substep, for velocities of higher order."""
         clock = self.clock
         if not clock.d_is_velocity:
-            if self.probe:
+            if clock.parted is not None:
+                self.scene.state.start(self.memory, clock.parted)
+                clock.owed = 0.0
+            elif self.probe:
                 self.memory.write(self.scene.state.d, high_order.velocity(self.probe, clock, self.memory, iterations))
             else:
                 self.step.to_velocity(clock.h, clock.time)

@@ -32,9 +32,10 @@ class Sleep(Feature):
 
     - a particle that moves, or a driven one, touches it: before that contact is solved;
     - a force on it is another one than it was when it fell asleep (those of the user's own, in frames);
+    - it, or another of its island, is given another velocity or spin;
 
-    and before a frame in which a wall is moved, a knob is changed, a position, velocity or spin is assigned, particles or
-    features come or go, or substeps become shorter or longer. Against a world that never sleeps, it is off by less than speed
+    and before a frame in which a wall is moved, a knob is changed, positions are assigned, particles or features come or go, or
+    substeps become shorter or longer. Against a world that never sleeps, it is off by less than speed
     times time where it sleeps, for it would have crept by less.
 
     Decided by the state alone: on the same bits everywhere, in clones and replays too. What is pinned does not join two islands.
@@ -142,7 +143,7 @@ class Sleepers:
     def wake(self, particles: Any = None) -> None:
         """Have the islands of some particles wake; None: all."""
         memory = self.scene.memory
-        if not memory.read(self.count)[0]:
+        if particles is None and not memory.read(self.count)[0]:
             memory.write(self.still, 0.0)
             return
         asleep, still = memory.read(self.asleep), memory.read(self.still)
@@ -150,6 +151,7 @@ class Sleepers:
         if particles is not None:
             island = memory.read(self.island)
             up &= np.isin(island, island[particles][up[particles]])
+            still[particles] = 0.0
         asleep[up], still[up if particles is not None else ...] = 0, 0.0
         memory.write(self.asleep, asleep)
         memory.write(self.still, still)

@@ -21,6 +21,7 @@ from ..step import checkpoint, energy_bound
 from ..step import frames as kernel
 from ..step.clock import CHANGED, PARTED, SQUEEZED, room, slack
 from ..step.diagnostics import ENERGY, EXTENT, KINETIC, OVERLAP, REACH, STARTED, STEPPED, STIFFNESS, TURNS, UNSTEPPED, risks
+from ..step.impulse import Displacements, factor
 from ..world import World
 from .clocks import NONE, Clocks
 from .knobs import Knobs
@@ -420,8 +421,7 @@ class Worlds:
                 new[chosen] = self._per_particle("position", position, len(chosen))
                 self._place(new, chosen)
             if velocity is not None:
-                v = self._per_particle("velocity", velocity, len(chosen))
-                self._start_from(v, chosen)
+                self._give(self._per_particle("velocity", velocity, len(chosen)), chosen)
 
     def _feature(self, feature: Feature) -> int:
         """Its number."""
@@ -532,8 +532,12 @@ class Worlds:
         out = runner.memory.read(runner.scene.state.d)[:, : runner.n].astype(np.float64)
         saved = runner.memory.read(runner.search.list.old_saved)[:, 0] if runner.search else np.zeros(len(self))
         alone = ~clocks.d_is_velocity & ((saved != 0) | bool(runner.probe))
-        alone[list(clocks.parted)] = True
-        some = np.flatnonzero(~clocks.d_is_velocity & ~alone).astype(np.int32)
+        for k, known in clocks.parted.items():
+            out[k] = known
+        there = clocks.d_is_velocity.copy()
+        there[list(clocks.parted)] = True
+        alone &= ~there
+        some = np.flatnonzero(~there & ~alone).astype(np.int32)
         if len(some):
             given = np.zeros((len(some), 4))
             for row, k in zip(given, some, strict=True):
@@ -550,7 +554,7 @@ class Worlds:
     def velocity(self, value) -> None:
         """Have them go on with (worlds, n, dim), or (n, dim) for each [m/s]."""
         with self._open():
-            self._start_from(self._per_particle("velocity", value, len(self)), np.arange(len(self)))
+            self._give(self._per_particle("velocity", value, len(self)), np.arange(len(self)))
 
     def _per_particle(self, name: str, value, count: int) -> np.ndarray:
         """An array with a row for each particle of so many worlds; (n, dim) is for all of them."""
@@ -562,6 +566,27 @@ class Worlds:
             raise ValueError(f"Worlds: {name} has shape {value.shape}, but it must be (worlds, n, dim) = {shape}, or (n, dim).")
         value = checks.points("Worlds", name, np.broadcast_to(value, shape).reshape(-1, dim), dim=dim, count=count * n)
         return value.reshape(shape)
+
+    def _give(self, velocity: np.ndarray, chosen: np.ndarray) -> None:
+        """Have some go on with these velocities, (some, n, dim), see World.velocity."""
+        clocks, runner = self._clocks, self._runner
+        others = (velocity != self._velocities()[chosen]).any(axis=2)
+        moved = others.any(axis=1)
+        fresh = moved & (clocks.d_is_velocity[chosen] | bool(runner.probe))
+        self._start_from(velocity[fresh], chosen[fresh])
+        given = moved & ~fresh
+        if given.any():
+            some, memory, n = chosen[given], runner.memory, runner.n
+            for k in some:
+                clocks.parted.pop(int(k), None)
+            inv_mass = [self._sources[k].inv_mass for k in some] if self._sources else runner.scene.inv_mass
+            free = others[given] & (np.asarray(inv_mass) > 0)
+            those = Displacements(
+                runner, free, lambda field: memory.read(field)[some, :n], lambda field, v: memory.write_some(field, v, some)
+            )
+            those.give(velocity[given], lambda: self._velocities()[some], np.array([factor(clocks.of(k)) for k in some]))
+            clocks.known[some] = False
+            clocks.parted.update(zip(some.tolist(), velocity[given], strict=True))
 
     def _start_from(self, velocity: np.ndarray, chosen: np.ndarray) -> None:
         """Have some go on with these velocities, (some, n, dim)."""

@@ -1,0 +1,109 @@
+"""Velocities that are given between two substeps, as impulses: to particles that come, that are let go, or that a user steers.
+
+A velocity is (share d + rest (h^2 a + reaction)) / h, see Integrator.velocity_after(). So what a particle lacks of the velocity
+that it is to have, times h / share, is what its displacement lacks. Nothing else of the state changes: what is to have the
+velocity that it has goes on to the bit, known loads stay known, and sound goes on being damped, as they would not after a start.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from .clock import Clock
+from .integrator import FREE
+
+ROUNDS = 100  # of asking for velocities, at most, where forces read them
+NOTHING = 2.0**-20  # of a velocity: less than this of it is in the next displacement
+Write = Callable[[Any, np.ndarray], None]
+
+
+def factor(clock: Clock) -> float:
+    """By how much a displacement has to be longer for a velocity of 1 m/s more [s]. Where drag leaves nothing of a velocity in a
+    substep, d does not matter."""
+    return clock.h / max((clock.drag or FREE)[0], NOTHING)
+
+
+class Displacements:
+    """Those of some particles, (..., dim), and what goes with them: what of them forces did, and their low words.
+
+    some: the mask of those that change, (...,). read, write: get and set a field's rows.
+    """
+
+    def __init__(self, runner: Any, some: np.ndarray, read: Callable[[Any], np.ndarray], write: Write):
+        state, integrator = runner.scene.state, runner.integrator
+        self.field, self.low = state.d, state.d_low if state.carries else None
+        self.some, self.write, self.again = some[..., None], write, integrator.uses_velocity
+        self.others = [integrator.free] if integrator.uses_velocity else []
+        self.was = {field: read(field) for field in (state.d, *([self.low] if self.low else []), *self.others)}
+
+    def begin_with(self, d: np.ndarray) -> None:
+        """Of particles that come: what forces alone would have made of them."""
+        for field in (self.field, *self.others):
+            self.was[field] = d
+            self.write(field, d)
+
+    def lengthen(self, more: np.ndarray) -> None:
+        """Have them be as they were, and longer by `more`, (..., dim)."""
+        d = self.was[self.field]
+        new = d.astype(np.float64) + more
+        if self.low:
+            low = self.was[self.low]
+            whole = new + low
+            new = whole.astype(d.dtype)
+            self.write(self.low, np.where(self.some, whole - new, low))
+        self.write(self.field, np.where(self.some, new, d))
+        for field in self.others:
+            self.write(field, np.where(self.some, self.was[field] + more, self.was[field]))
+
+    def give(self, want: np.ndarray, velocity: Callable[[], np.ndarray], factor: np.ndarray) -> None:
+        """Have them stand for velocities `want`, (worlds, ..., dim): at once, or one time after the other where forces read
+        velocities, until these come no nearer. velocity: those that they stand for now. factor: of each world, see factor()."""
+        more = best = np.zeros(want.shape)
+        least, factor = np.full(len(want), np.inf), factor.reshape(-1, 1, 1)
+        for _ in range(ROUNDS if self.again else 1):
+            lack = np.where(self.some, want - velocity(), 0.0)
+            most = np.abs(lack).max(axis=(1, 2), initial=0.0)
+            nearer = most < least
+            better = nearer[:, None, None]
+            best, least = np.where(better, more, best), np.where(nearer, most, least)
+            more = np.where(better, more + factor * lack, best)
+            self.lengthen(more)
+            if not nearer.any():
+                break
+
+
+def give(runner: Any, want: np.ndarray, some: np.ndarray, iterations: int) -> None:
+    """Have the particles of the mask `some`, (n,), that can move go on with velocities `want`, (n, dim) [m/s]."""
+    rows = np.flatnonzero(some & (runner.scene.inv_mass > 0))
+    if not len(rows):
+        return
+    memory, first, end = runner.memory, int(rows[0]), int(rows[-1]) + 1
+    chosen = np.zeros(end - first, dtype=bool)
+    chosen[rows - first] = True
+    if runner.clock.d_is_velocity:
+        d = memory.read(runner.scene.state.d)[first:end]
+        memory.write_from(runner.scene.state.d, first, np.where(chosen[:, None], want[first:end], d))
+        return
+    with memory.compiler():
+        _those(runner, first, chosen).give(
+            want[None, first:end], lambda: runner.velocity(iterations)[None, first:end], np.array([factor(runner.clock)])
+        )
+
+
+def give_new(runner: Any, first: int, want: np.ndarray, iterations: int) -> None:
+    """Give particles from number `first` on, which touch nothing yet, the displacements that velocities `want` need, (m, dim)."""
+    moves = runner.scene.inv_mass[first:] > 0
+    want = np.where(moves[:, None], want, 0.0)[None]
+    with runner.memory.compiler():
+        those = _those(runner, first, moves)
+        those.begin_with(runner.clock.h * want)
+        those.give(want, lambda: runner.velocity(iterations, came=first)[None], np.array([factor(runner.clock)]))
+
+
+def _those(runner: Any, first: int, some: np.ndarray) -> Displacements:
+    """Of a world alone, those of particles from number `first` on."""
+    memory, rows = runner.memory, slice(first, first + len(some))
+    return Displacements(
+        runner, some[None], lambda field: memory.read(field)[None, rows], lambda field, v: memory.write_from(field, first, v[0])
+    )
