@@ -321,14 +321,15 @@ class World:
         with whole:
             for watcher in self._watchers:
                 watcher.assigned("velocity", value)
-            others = (value != self.velocity).any(axis=1)
+            seen = self.velocity
+            others = (value != seen).any(axis=1)
             if not others.any():
                 return
             if self._clock.d_is_velocity or self._order > 2:
                 self._start_from(value)
             else:
                 self._runner.wake(np.flatnonzero(others))
-                impulse.give(self._runner, value, others, self._iterations)
+                impulse.give(self._runner, value, others, self._iterations, seen if self._clock.parted is None else None)
                 self._clock.energy, self._clock.parted = None, value.copy()
 
     @property

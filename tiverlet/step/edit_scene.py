@@ -155,7 +155,8 @@ def renew(world: Any) -> None:
     told = world._all_events() if runner.logs else world._events
     loose = np.zeros(runner.n, dtype=bool)
     loose[grabbing.some] = runner.scene.inv_mass[grabbing.some] == 0
-    seen = world.velocity if loose.any() and not clock.d_is_velocity else None
+    free = not clock.d_is_velocity and loose.any()
+    seen = runner.memory.seen(runner.scene.state.d)[: runner.n] / clock.h if free else None
     if grabbing.soft:
         with runner.memory.compiler():
             runner.restart_between(world.iterations)

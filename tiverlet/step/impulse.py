@@ -56,13 +56,17 @@ class Displacements:
         for field in self.others:
             self.write(field, np.where(self.some, self.was[field] + more, self.was[field]))
 
-    def give(self, want: np.ndarray, velocity: Callable[[], np.ndarray], factor: np.ndarray) -> None:
+    def give(
+        self, want: np.ndarray, velocity: Callable[[], np.ndarray], factor: np.ndarray, seen: np.ndarray | None = None
+    ) -> None:
         """Have them stand for velocities `want`, (worlds, ..., dim): at once, or one time after the other where forces read
-        velocities, until these come no nearer. velocity: those that they stand for now. factor: of each world, see factor()."""
+        velocities, until these come no nearer. velocity: asks for those that they stand for. factor: of each world, see factor().
+        seen: what velocity() would say at first, if that is known."""
         more = best = np.zeros(want.shape)
         least, factor = np.full(len(want), np.inf), factor.reshape(-1, 1, 1)
         for _ in range(ROUNDS if self.again else 1):
-            lack = np.where(self.some, want - velocity(), 0.0)
+            lack = np.where(self.some, want - (velocity() if seen is None else seen), 0.0)
+            seen = None
             most = np.abs(lack).max(axis=(1, 2), initial=0.0)
             nearer = most < least
             better = nearer[:, None, None]
@@ -73,8 +77,9 @@ class Displacements:
                 break
 
 
-def give(runner: Any, want: np.ndarray, some: np.ndarray, iterations: int) -> None:
-    """Have the particles of the mask `some`, (n,), that can move go on with velocities `want`, (n, dim) [m/s]."""
+def give(runner: Any, want: np.ndarray, some: np.ndarray, iterations: int, seen: np.ndarray | None = None) -> None:
+    """Have the particles of the mask `some`, (n,), that can move go on with velocities `want`, (n, dim) [m/s]. seen: those that
+    they have, where that is known."""
     rows = np.flatnonzero(some & (runner.scene.inv_mass > 0))
     if not len(rows):
         return
@@ -82,12 +87,15 @@ def give(runner: Any, want: np.ndarray, some: np.ndarray, iterations: int) -> No
     chosen = np.zeros(end - first, dtype=bool)
     chosen[rows - first] = True
     if runner.clock.d_is_velocity:
-        d = memory.read(runner.scene.state.d)[first:end]
+        d = memory.seen(runner.scene.state.d)[first:end]
         memory.write_from(runner.scene.state.d, first, np.where(chosen[:, None], want[first:end], d))
         return
     with memory.compiler():
         _those(runner, first, chosen).give(
-            want[None, first:end], lambda: runner.velocity(iterations)[None, first:end], np.array([factor(runner.clock)])
+            want[None, first:end],
+            lambda: runner.velocity(iterations, first, end)[None],
+            np.array([factor(runner.clock)]),
+            None if seen is None else seen[None, first:end],
         )
 
 
@@ -98,12 +106,15 @@ def give_new(runner: Any, first: int, want: np.ndarray, iterations: int) -> None
     with runner.memory.compiler():
         those = _those(runner, first, moves)
         those.begin_with(runner.clock.h * want)
-        those.give(want, lambda: runner.velocity(iterations, came=first)[None], np.array([factor(runner.clock)]))
+        those.give(want, lambda: runner.velocity(iterations, first, came=True)[None], np.array([factor(runner.clock)]))
 
 
 def _those(runner: Any, first: int, some: np.ndarray) -> Displacements:
     """Of a world alone, those of particles from number `first` on."""
     memory, rows = runner.memory, slice(first, first + len(some))
     return Displacements(
-        runner, some[None], lambda field: memory.read(field)[None, rows], lambda field, v: memory.write_from(field, first, v[0])
+        runner,
+        some[None],
+        lambda field: memory.seen(field)[None, rows].copy(),
+        lambda field, v: memory.write_from(field, first, v[0]),
     )

@@ -305,31 +305,32 @@ class Runner:
         if self.step.walls:
             self.step.stopped(before)
 
-    def velocity(self, iterations: int, came: int | None = None) -> np.ndarray:
-        """Velocities as the user sees them, to the order of the world; of all particles, or of those from number `came` on, which
-        touch nothing yet."""
+    def velocity(self, iterations: int, first: int = 0, end: int | None = None, came: bool = False) -> np.ndarray:
+        """Velocities as the user sees them, to the order of the world; of particles from number `first` on, up to `end`. came:
+        they touch nothing yet."""
         clock = self.clock
         if clock.d_is_velocity:
             out = self.memory.read(self.scene.state.d).astype(np.float64)
         elif self.probe:
             out = high_order.velocity(self.probe, clock, self.memory, iterations)
         else:
-            if came is None:
+            if not came:
                 self._list_again()
-            return self._velocities(came or 0)
-        return out[came or 0 : self.n]
+            return self._velocities(first, end)
+        return out[first : self.n if end is None else end]
 
-    def _velocities(self, first: int = 0) -> np.ndarray:
+    def _velocities(self, first: int = 0, end: int | None = None) -> np.ndarray:
         """Have the kernel make velocities of displacements."""
         launch = self._velocity
         if launch is None or len(launch.arrays[1]) < self.n:
             room = np.zeros((1 << self.n.bit_length(), self.step.dim))
-            launch = CachedLaunch(self.step, "velocities", self.memory.compiler, np.zeros(5), room)
+            launch = CachedLaunch(self.step, "velocities", self.memory.compiler, np.zeros(6), room)
         self._velocity = launch if self.n <= KEPT else None
         given, out = launch.arrays
-        given[:] = self.clock.h, self.clock.time, *self.shares(), first
+        end = self.n if end is None else end
+        given[:] = self.clock.h, self.clock.time, *self.shares(), first, end
         launch()
-        return out[first : self.n].copy()
+        return out[first:end].copy()
 
     def _list_again(self) -> None:
         """After a state was put back: build the neighbour list, which reactions of contacts need."""

@@ -489,7 +489,7 @@ class Worlds:
         """The positions [m] of all, (worlds, n, dim), where the device has them: no copy, in their own precision, and always as
         they are now. Read-only, and valid until close().
 
-        name: "position", or "displacement", what the last substep added (just after velocities were assigned: those). "position"
+        name: "position", or "displacement", what the last substep added (before a start: velocities). "position"
         of "f32-compensated", and of "f32" where links are solved directly, lacks its low word. Others read it without a copy,
         too: jnp.from_dlpack(worlds.view()), torch.from_dlpack(worlds.view()); nobody is to write there. On a GPU it is a copy.
         """
@@ -570,7 +570,8 @@ class Worlds:
     def _give(self, velocity: np.ndarray, chosen: np.ndarray) -> None:
         """Have some go on with these velocities, (some, n, dim), see World.velocity."""
         clocks, runner = self._clocks, self._runner
-        others = (velocity != self._velocities()[chosen]).any(axis=2)
+        seen = self._velocities()[chosen]
+        others = (velocity != seen).any(axis=2)
         moved = others.any(axis=1)
         fresh = moved & (clocks.d_is_velocity[chosen] | bool(runner.probe))
         self._start_from(velocity[fresh], chosen[fresh])
@@ -584,7 +585,8 @@ class Worlds:
             those = Displacements(
                 runner, free, lambda field: memory.read(field)[some, :n], lambda field, v: memory.write_some(field, v, some)
             )
-            those.give(velocity[given], lambda: self._velocities()[some], np.array([factor(clocks.of(k)) for k in some]))
+            factors = np.array([factor(clocks.of(k)) for k in some])
+            those.give(velocity[given], lambda: self._velocities()[some], factors, seen[given])
             clocks.known[some] = False
             clocks.parted.update(zip(some.tolist(), velocity[given], strict=True))
 
