@@ -182,7 +182,7 @@ class BodyImpacts:
             change = (pushed - self.pushed[i]) * n
             for k in ti.static(range(len(self.logs))):
                 if self.log[i] == k:
-                    self.logs[k].add(i, pushed - self.pushed[i])
+                    self.logs[k].add(i, change)
             self.last_push[i], self.last_miss[i], self.pushed[i] = pushed - self.pushed[i], miss, pushed
             held = self.held[i] + d - d.dot(n) * n
             size = held.norm()

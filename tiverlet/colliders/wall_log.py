@@ -10,13 +10,16 @@ from ..device import ti
 if TYPE_CHECKING:
     from ..features.feature import Scene
 
+ASIDE = 1e-6  # of an impulse: it is longer by more than that than along the first normal where others gave to it, too
+
 
 class WallLog:
     """A row for each particle, written where the wall presses it, see Surface.press().
 
     touching: whether it was pressed in the last substep of the last frame, all that is carried on between frames. when: the
     substeps of the frame, from 1 on, in which it was first pressed and pressed last, or BEFORE or NEVER. impulse: what the
-    displacement got along the normal [m]; speed: what it came nearer in the substep in which it met the wall [m].
+    displacement got along normals [m], of which there are several in corners and in hollows; normal: the first of them. speed:
+    what it came nearer in the substep in which it met the wall [m].
     """
 
     per_particle = True
@@ -26,7 +29,7 @@ class WallLog:
         self._scene, self.state, self.radius = scene, scene.state, scene.radius
         self.touching = add(f"events.{name}.touching", n, kind=ti.i32, state=True, told=True)
         self.when = add(f"events.{name}.when", n, width=2, kind=ti.i32)
-        self.impulse, self.speed = add(f"events.{name}.impulse", n), add(f"events.{name}.speed", n)
+        self.impulse, self.speed = add(f"events.{name}.impulse", n, width=dim), add(f"events.{name}.speed", n)
         sleeps = bool(scene.state.sleepers)  # where what sleeps touches, nobody finds again
         self.normal, self.point = (
             add(f"events.{name}.{what}", n, width=dim, state=sleeps, told=sleeps) for what in ("normal", "point")
@@ -39,7 +42,7 @@ class WallLog:
         """As a frame begins: what particle i has, which touched before or not."""
         began = ti.select(self.touching[i] != 0, BEFORE, NEVER)
         self.when[i] = [began, began]
-        self.impulse[i] = 0
+        self.impulse[i] = ti.zero(self.state.x[i])
         self.speed[i] = 0
         if self.state.awake(i):
             self.normal[i] = ti.zero(self.state.x[i])
@@ -62,11 +65,11 @@ class WallLog:
             self.normal[i] = n
             self.point[i] = self.state.place(i) - (self.radius.of(i) - depth) * n
         self.when[i] = [ti.select(began == NEVER, now, began), now]
-        self.impulse[i] = self.impulse[i] + push
+        self.add(i, push * n)
 
     @ti.func
     def add(self, i, push):
-        """Its displacement gets so much more along the normal."""
+        """Its displacement gets so much more, a vector."""
         self.impulse[i] = self.impulse[i] + push
 
     @ti.func
@@ -92,6 +95,9 @@ class WallLog:
         some = np.flatnonzero(when[:, 0] != NEVER) if substeps else np.zeros(0, dtype=np.int64)
         columns = (self.point, self.normal, self.impulse, self.speed)
         point, normal, impulse, speed = (memory.read(field)[some].astype(np.float64) for field in columns)
-        mass = 1 / self._scene.inv_mass[some]
+        along, size = (impulse * normal).sum(axis=1), np.linalg.norm(impulse, axis=1)
+        several = size > np.abs(along) * (1 + ASIDE)
+        normal[several] = impulse[several] / size[several, None]
         pairs = np.stack([some, np.full(len(some), number)], axis=1)
-        return Touches(pairs, point, normal, impulse * mass / h, speed / h, *span(when[some], substeps, h, time))
+        given = np.where(several, size, along) / self._scene.inv_mass[some] / h
+        return Touches(pairs, point, normal, given, speed / h, *span(when[some], substeps, h, time))

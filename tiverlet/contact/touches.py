@@ -25,7 +25,8 @@ class Touches:
     this frame; NaN where it touched before. ended: (m,) [s], when it was apart again; NaN where it still touches. Times are those
     of the ends of substeps.
 
-    Of walls, pairs are a particle and the number of the wall in world.features, and normals point from the wall to the particle;
+    Of walls, pairs are a particle and the number of the wall in world.features, and normals point from the wall to the particle,
+    in corners and in hollows along the sum of what the wall gave from all sides;
     of what left a wall as the frame began neither normal nor point are known, they are 0.
     """
 
