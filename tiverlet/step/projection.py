@@ -20,7 +20,7 @@ its fall became heat when it stretched.
 
 import copy
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from .runner import Runner
 
 ENOUGH = 1e-3  # of its size: a violation that matters, over (r - 1)^2 / r with r = (h / h')^2: what one jump leaves to vibrate
+FRAIL = 0.01  # of what breaks a constraint: a load that a violation may have by itself
 FIRM = 0.9  # theta from where on velocities may not change a constraint
 FAR = 0.75  # of the longest: a substep in which what is small now has had its chance
 NEWTON = 40  # steps, at most
@@ -52,12 +53,23 @@ SLIGHT = 0.01  # of the kinetic energy: what violations may become where contact
 SLIGHTEST = 1e-3  # of the kinetic energy inside of bodies: what violations, and moves in the next substep, may make of it
 LOOKS = 8  # steps of conjugate gradients, to see what a solver would move
 LEFT = 0.01  # of what violations store: what may be left of it in the shorter substep
-DONE = 1e-6  # of its size: a violation that is none
+DONE = 1e-6, 1e-13  # of its size: a violation that is none; and that breaks nothing in the shortest substep
 TURNS = 16  # with walls, at most: a link that stands on one halves its violation in each
 WORSE = 2.0  # times what violations stored before: what is left of it, at most, where it is taken at all
 BETTER = 0.5  # times that, where contacts move, too: what they and links store then
 TOGETHER = 4  # times that links and contacts move together: each may lead into others
 HELD = 1e3  # of its mass: how firmly a wall holds a particle that it has stopped
+
+
+class Aims(NamedTuple):
+    """Of what violations store, and of the work that a solver of so many `steps` would do: the share that may be left, unless it
+    is less than `slight`. products: how many numbers it may multiply. done: a violation that is none, of its size."""
+
+    share: float
+    steps: int
+    slight: float
+    products: float
+    done: float
 
 
 def project(runner: "Runner", h: float, longest: float, contacts: ContactRows | None = None) -> bool | None:
@@ -86,7 +98,8 @@ def project(runner: "Runner", h: float, longest: float, contacts: ContactRows | 
     rails = Rails(runner, x)
     start = Rows(batches, w, x, runner.scene.periodic, rails)
     undone = start.undone(runner)
-    if not matters(float(np.abs(undone * start.close).max(initial=0.0)), ratio):
+    frail = start.would_break(undone, h, longest)
+    if not frail and not matters(float(np.abs(undone * start.close).max(initial=0.0)), ratio):
         return ratio < FAR
     rows = start = start.towards(start.C - (1 - ratio**2) * undone)
     kept = memory.read(state.d)
@@ -98,7 +111,8 @@ def project(runner: "Runner", h: float, longest: float, contacts: ContactRows | 
     still = (undone != 0) & (start.theta > FIRM) & ~start.touches
     v[:n] += rows.jacobian.solve(-rows.jacobian.rates(v[:n]) * still, still)
     energy, overlap = seen_before(runner)
-    aims = LEFT * ratio**2, steps, slight, SHARED if contacts else PRODUCTS
+    finest = ratio**4 if frail else ratio**2  # by loads, or by energies
+    aims = Aims(LEFT * finest, steps, 0.0 if frail else slight, SHARED if contacts else PRODUCTS, DONE[frail])
     rows, stopped = _moved(runner, start, rows, aims)
     left = 0.0
     if contacts:
@@ -124,12 +138,11 @@ def project(runner: "Runner", h: float, longest: float, contacts: ContactRows | 
     return True
 
 
-def _moved(runner: "Runner", start: "Rows", rows: "Rows", aims: tuple[float, int, float, float]) -> tuple["Rows", np.ndarray]:
-    """Rows where particles are then, and which of them walls have stopped, (n,). aims: what _newton() asks for, the first one of
-    what rows stored at the start."""
-    share, steps, slight, most = aims
+def _moved(runner: "Runner", start: "Rows", rows: "Rows", aims: Aims) -> tuple["Rows", np.ndarray]:
+    """Rows where particles are then, and which of them walls have stopped, (n,). aims: for _newton(), a share of what rows stored
+    at the start."""
     state, memory, before = runner.scene.state, runner.memory, rows.x
-    enough, stopped = share * start.stored, np.zeros(rows.n, dtype=bool)
+    enough, stopped = aims.share * start.stored, np.zeros(rows.n, dtype=bool)
     for _ in range(TURNS):
         state.put(memory, _newton(rows, enough, aims))
         sent = state.get(memory)
@@ -137,7 +150,7 @@ def _moved(runner: "Runner", start: "Rows", rows: "Rows", aims: tuple[float, int
         x = state.get(memory)
         stopped |= (x != sent).any(axis=1)
         last, rows = rows, rows.at(x)  # what walls stop is lifted by the others
-        if (x == sent).all() or rows.matrix.products > most:
+        if (x == sent).all() or rows.matrix.products > aims.products:
             break
         if rows.stored > last.stored or last.wall.any():  # what lies on them would be sent back there again and again
             rows = rows.held(last.wall, x - sent)
@@ -148,7 +161,7 @@ def _moved(runner: "Runner", start: "Rows", rows: "Rows", aims: tuple[float, int
 
 def _together(
     runner: "Runner", start: "Rows", rows: "Rows", stopped: np.ndarray, pressed: float, links: list[Any],
-    aims: tuple[float, int, float, float],
+    aims: Aims,
 ) -> tuple["Rows", np.ndarray, float]:  # fmt: skip
     """The best rows and stops of some rounds, each among the contacts that the one before led into; and what links and contacts
     store there, of what they did. pressed: what contacts stored at the start."""
@@ -160,7 +173,7 @@ def _together(
             break
         best, left = (rows, stopped), stored
         products += rows.matrix.products
-        if left <= aims[0] * before or products > aims[3]:
+        if left <= aims.share * before or products > aims.products:
             break
         rows, more = _moved(runner, start, rows.among([*links, contacts], runner), aims)
         stopped = stopped | more
@@ -169,12 +182,10 @@ def _together(
     return rows, stopped, left / before if before > 0 else np.inf
 
 
-def _newton(rows: "Rows", enough: float, aims: tuple[float, int, float, float]) -> np.ndarray:
+def _newton(rows: "Rows", enough: float, aims: Aims) -> np.ndarray:
     """Places at which what violations store is `enough` [J s^2], and where a solver of so many steps would move less, by this
-    share of the work, m p^2, that it would do at the begin; both unless they are less than `slight`. aims: share, steps, slight,
-    and how many products it may take."""
-    share, steps, slight, most = aims
-    mu, begin = BEGIN, rows.work(steps)
+    share of the work, m p^2, that it would do at the begin; both unless they are less than `slight`."""
+    mu, begin = BEGIN, rows.work(aims.steps)
     for _ in range(NEWTON):
         new = rows.at(rows.x + rows.step(mu))
         better = new.stored < rows.stored
@@ -182,8 +193,8 @@ def _newton(rows: "Rows", enough: float, aims: tuple[float, int, float, float]) 
         mu = max(mu / 8, LEAST) if better else 8 * mu
         if better:
             rows = new
-        near = rows.stored <= max(enough, slight) and rows.work(steps) <= max(share * begin, slight)
-        if near or stalled or rows.worst <= DONE or mu > HARDEST or rows.matrix.products > most:
+        near = rows.stored <= max(enough, aims.slight) and rows.work(aims.steps) <= max(aims.share * begin, aims.slight)
+        if near or stalled or rows.worst <= aims.done or mu > HARDEST or rows.matrix.products > aims.products:
             break
     return rows.x
 
@@ -365,6 +376,13 @@ class Rows:
             for b in self.batches
         ]
         return self._bounded(gamma * self.C + (1 - gamma) * self._bounded(self._each(before)) + self._each(borne))
+
+    def would_break(self, undone: np.ndarray, h: float, longest: float) -> bool:
+        """Whether a violation pulls harder in a substep h than it did, by so much that it counts beside what breaks its row."""
+        if not any(b.breaks for b in self.batches):
+            return False
+        strength = self._each([np.broadcast_to(b.break_at if b.breaks else np.inf, b.count) for b in self.batches])
+        return bool((np.abs(undone) * (1 / h**2 - 1 / longest**2) > FRAIL * strength * self.diagonal).any())
 
     def _rigid(self, alpha: np.ndarray, reach: np.ndarray) -> np.ndarray:
         """theta, by what a force of 1 N moves in a substep."""
