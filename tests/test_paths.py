@@ -69,13 +69,17 @@ def test_driven_along_a_path(world):
     square = [[0, 0], [1, 0], [1, 1], [0, 1]]
     belt = tv.Path([0, 1], square, closed=True, smooth=False, speed=[1.0, -2.0])
     lift = tv.Path([3], [[5, 0], [5, 2]], at=0.5)
-    features = [tv.Gravity(9.81), tv.Distance([[0, 2], [3, 4]]), belt, lift]
-    start = tv.Particles([[0.0, 0], [0.5, 0], [0, -1], [5, 0], [5, -1]])
+    turn = np.linspace(0, 2 * np.pi, 200, endpoint=False)
+    ring = tv.Path([5], np.stack([9 + np.cos(turn), np.sin(turn)], axis=1), closed=True, speed=2.0)
+    features = [tv.Gravity(9.81), tv.Distance([[0, 2], [3, 4]]), belt, lift, ring]
+    start = tv.Particles([[0.0, 0], [0.5, 0], [0, -1], [5, 0], [5, -1], [10, 0]])
     w = world(start, features, precision="f64")
     for k in range(1, 7):
         w.run(0.5)
         s = 0.5 * k
         np.testing.assert_allclose(w.position[:2], belt.place([s % 4, (0.5 - 2 * s) % 4]), atol=1e-10)
+        # Velocities are those of now, not of half a substep ago, when they pointed elsewhere by omega h / 2 = 8e-4.
+        np.testing.assert_allclose(w.velocity[5], 2.0 * np.array([-np.sin(2 * s), np.cos(2 * s)]), atol=1e-6)
     assert w.position[3] == pytest.approx([5, 0.5])
     lift.at = 1.5
     w.step(1 / 60)

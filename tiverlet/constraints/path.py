@@ -136,6 +136,17 @@ class Path(Anchored):
             self.scene.memory.write(self.dev.place.target, self.speed if self.dev.place.moves else self.at)
             self.moving = not self.dev.place.moves
 
+    def point_along(self, velocity: np.ndarray, some: np.ndarray | None = None) -> None:
+        """Of what it drives, turn velocities (..., n, dim), each along its way in the last substep, to where the curve goes now.
+        some: of these worlds, where there are many."""
+        place, rows = self.dev.place, self.indices[:, 0]
+        s = self.scene.memory.read(place.source if place.moves else place.target)[..., : self.count]
+        s = s if some is None else s[some]
+        tangent = self.curve.tangent(s)
+        v = velocity[..., rows, :]
+        forward = np.copysign(np.linalg.norm(v, axis=-1), (v * tangent).sum(axis=-1))
+        velocity[..., rows, :] = forward[..., None] * tangent
+
     def end_motion(self) -> None:
         """The next frame starts from where this one went."""
         if self.acts:

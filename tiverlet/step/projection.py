@@ -381,7 +381,8 @@ class Rows:
         """Whether a violation pulls harder in a substep h than it did, by so much that it counts beside what breaks its row."""
         if not any(b.breaks for b in self.batches):
             return False
-        strength = self._each([np.broadcast_to(b.break_at if b.breaks else np.inf, b.count) for b in self.batches])
+        each: list[Any] = [getattr(b, "break_at", None) for b in self.batches]
+        strength = self._each([np.full(b.count, np.inf if s is None else s) for b, s in zip(self.batches, each, strict=True)])
         return bool((np.abs(undone) * (1 / h**2 - 1 / longest**2) > FRAIL * strength * self.diagonal).any())
 
     def _rigid(self, alpha: np.ndarray, reach: np.ndarray) -> np.ndarray:

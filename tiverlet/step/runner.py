@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from ..constraints.path import Path
 from ..contact.initial_overlap import overlapping
 from ..device.interrupts import whole
 from ..device.patches.compiler import CachedLaunch
@@ -50,6 +51,7 @@ class Runner:
         step = self.step
         self.n, self.launched, self.team, self.integrator = step.n, step.launched, step.team, step.integrator
         self.driven = [b for b in self.batches if b.driven]
+        self.paths = [f for f in step.drivers if isinstance(f, Path)]
         self.known = [c.known for c in step.contacts if c.known]  # loads of contacts
         self.logs: list[Any] = [*(c.dev.events for c in step.contacts if c.dev.events), *step.wall_logs]  # of events
         self.semi_iterations, self.drags = step.constraints.semi_iterations, step.integrator.forces.drags
@@ -316,7 +318,10 @@ class Runner:
         else:
             if not came:
                 self._list_again()
-            return self._velocities(first, end)
+            out = self._velocities(first, end)
+            for path in self.paths if out.shape[0] == self.n else ():
+                path.point_along(out)
+            return out
         return out[first : self.n if end is None else end]
 
     def _velocities(self, first: int = 0, end: int | None = None) -> np.ndarray:

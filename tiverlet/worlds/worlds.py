@@ -545,6 +545,10 @@ class Worlds:
                 row[:] = runner.clock.h, runner.clock.time, *runner.shares()
             with runner.memory.compiler():
                 self._kernels.velocities(len(some), some, given, out.reshape(-1))
+            for path in runner.paths:
+                turned = out[some]
+                path.point_along(turned, some)
+                out[some] = turned
         for k in np.flatnonzero(alone):
             with self._at(k) as world:
                 out[k] = world.velocity
