@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from .. import checks
+from ..constraints.pin import Pin
 from ..contact.pair_contact import PairContact
 from ..contact.touches import ContactEvents
 from ..features.feature import Batch, Feature
@@ -191,14 +192,15 @@ def _seen(
     which are about to go, a mask, (n,)."""
     loose, loses = np.zeros(len(some), dtype=bool), world._clock.parted is not None
     for f in world.features:
-        if isinstance(f, Batch) and f in features and f.afresh:  # a pin that takes others
+        if isinstance(f, Pin) and f in features and f.afresh:  # which takes others
             loose[f.held] = loses = f.drives
         elif isinstance(f, Batch | PairContact):
             stays = f.kept_mask(number)[0] if f in features else np.zeros(1, dtype=bool)
             if not stays.all():
                 loses = True
                 if isinstance(f, Batch) and f.acts:
-                    goes = ~np.broadcast_to(stays, f.count) & (f.compliance == 0)
+                    batch: Any = f
+                    goes = ~np.broadcast_to(stays, f.count) & (batch.compliance == 0)
                     loose[f.indices.ravel()[goes[f.owner]]] = True
     return world.velocity if loses and not world._clock.d_is_velocity else None, loose
 
