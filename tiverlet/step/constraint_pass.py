@@ -22,6 +22,8 @@ class ConstraintPass:
         self.semi_iterations = [scene.slots.semi_iteration] if scene.slots and scene.slots.semi_iteration else []
         self.in_systems = [b for b in batches if b.solvable_together and b.dev.in_system]
         self.ragged = [b for b in batches if not b.arity]
+        self.capped: list[Any] = [b for b in batches if b.driven and b.dev.drive.capped]
+        self.real = scene.real
         self.learners = [b for b in batches if b.solvable_together and b.dev.known.learns]
         self.springs = any(b.soft for b in batches) or bool(self.learners)
 
@@ -87,6 +89,11 @@ class ConstraintPass:
         """Every constraint leaves the moves that it wants in its slots, or tells its system what it is about."""
         fresh = now.fresh if ti.static(self.integrator.half_kick) else 0
         h2_effective = self.integrator.h2_effective(now.h, fresh)
+        if ti.static(len(self.capped) > 0):
+            for _ in range(self.team.one(now.first, now.thread)):
+                for f in ti.static(self.capped):
+                    f.dev.drive.h2_rigid[None] = self.integrator.h2_rigid(now.h, fresh, ti.cast(now.span.owed, self.real))
+            self.team.wait()
         self.reduce_blocks(now.thread, now.h, h2_effective, now.first, fresh, True, now.newton)
         for semi_iteration in ti.static(self.semi_iterations):
             ti.loop_config(serialize=True)

@@ -121,7 +121,7 @@ class CornerPasses(Passes):
                     alpha = self.spring.alpha[c]
                 self.equation.rest[c] = self.drive.advance(
                     c, f0, self.side, ti.max(here, both), alpha, self.equation.lam[c], h, h2_effective,
-                    self.equation.residual_scale(c), fresh,
+                    self.equation.residual_scale(c),
                 )  # fmt: skip
             f0 = self.quantity.unwrap(f0, self.equation.rest[c])
             f = self.quantity.unwrap(f, f0)

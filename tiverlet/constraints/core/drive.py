@@ -33,8 +33,8 @@ class Drive:
     of that size. Then the rest value slips: it is never further away than where the multiplier reaches the limit,
     |f - rest| <= largest h^2 (W + alpha'), so that nothing is wound up that would be given back once the load is gone.
 
-    In the substep after a start from velocities a rigid constraint also does what it owes for the half kick that these lack (see
-    Runner.shares), so a drive that was at work may do twice as much there.
+    where, of a rigid constraint, h^2 is what a load of 1 N is by its multiplier in this substep: h h / 2 in a start from given
+    velocities, and h (h + h_old) / 2 where these lack half of its last kick, see Integrator.h2_rigid().
 
     The rest value is kept in f64, where slow motion is not lost in rounding. start: where it begins, (m,). largest: (m,), or None
     where all are infinite, which costs nothing. period: of the values that mean the same, 0 for none. settle: [s]. in_state: what
@@ -56,6 +56,7 @@ class Drive:
         if largest is not None:
             self.largest = add(f"{name}.largest", m, values=np.minimum(largest, LARGEST))
             self.most = add(f"{name}.largest_multiplier", m, state=True)
+            self.h2_rigid = add(f"{name}.h2_rigid", None)
             self.in_state["most"] = self.most
 
     def upload(self, goal: np.ndarray, pace: np.ndarray, largest: np.ndarray) -> None:
@@ -86,7 +87,7 @@ class Drive:
         return value
 
     @ti.func
-    def advance(self, c, f, side: ti.template(), W, alpha, lam, h, h2_effective, size, fresh):  # type: ignore[valid-type]
+    def advance(self, c, f, side: ti.template(), W, alpha, lam, h, h2_effective, size):  # type: ignore[valid-type]
         """The rest value at the end of a substep that starts at f.
 
         side, W: see Equation. alpha: compliance. lam: the multiplier of the last substep. size: of the constraint.
@@ -96,9 +97,7 @@ class Drive:
         lag = self.near(lag, 0 * lag)
         start = ti.cast(f, ti.f64) - lag  # where the rest value is, next to f
         if ti.static(self.capped):
-            most = self.largest[c] * h2_effective
-            if fresh != 0 and lam != 0 and alpha == 0:
-                most *= 2
+            most = self.largest[c] * ti.select(alpha == 0, self.h2_rigid[None], h2_effective)
             self.most[c] = most
             slack = ti.cast(W * most, ti.f64) + ti.cast(alpha * (most / h2_effective), ti.f64)
             if lag > slack:
