@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from .clock import Clock
 from .integrator import FREE
 
 ROUNDS = 100  # of asking for velocities, at most, where forces read them
@@ -18,10 +17,10 @@ NOTHING = 2.0**-20  # of a velocity: less than this of it is in the next displac
 Write = Callable[[Any, np.ndarray], None]
 
 
-def factor(clock: Clock) -> float:
-    """By how much a displacement has to be longer for a velocity of 1 m/s more [s]. Where drag leaves nothing of a velocity in a
-    substep, d does not matter."""
-    return clock.h / max((clock.drag or FREE)[0], NOTHING)
+def factor(h: Any, drag: np.ndarray) -> np.ndarray:
+    """By how much a displacement has to be longer for a velocity of 1 m/s more [s], after a substep h. Where drag leaves nothing
+    of a velocity in a substep, d does not matter. Of one world, or arrays of many, with drag (..., 5) of each."""
+    return h / np.maximum(drag[..., 0], NOTHING)
 
 
 class Displacements:
@@ -94,7 +93,7 @@ def give(runner: Any, want: np.ndarray, some: np.ndarray, iterations: int, seen:
         _those(runner, first, chosen).give(
             want[None, first:end],
             lambda: runner.velocity(iterations, first, end)[None],
-            np.array([factor(runner.clock)]),
+            _factor(runner),
             None if seen is None else seen[None, first:end],
         )
 
@@ -106,7 +105,12 @@ def give_new(runner: Any, first: int, want: np.ndarray, iterations: int) -> None
     with runner.memory.compiler():
         those = _those(runner, first, moves)
         those.begin_with(runner.clock.h * want)
-        those.give(want, lambda: runner.velocity(iterations, first, came=True)[None], np.array([factor(runner.clock)]))
+        those.give(want, lambda: runner.velocity(iterations, first, came=True)[None], _factor(runner))
+
+
+def _factor(runner: Any) -> np.ndarray:
+    """Of a world alone."""
+    return factor(runner.clock.h, np.array([runner.clock.drag or FREE]))
 
 
 def _those(runner: Any, first: int, some: np.ndarray) -> Displacements:

@@ -15,7 +15,7 @@ from .clock import Clock, slack
 from .contact_rows import ContactRows
 from .diagnostics import BARE, EXTENT, STARTED, STEPPED, UNSTEPPED
 from .frames import Frames
-from .integrator import FREE, decay, h2_effective_of, h2_rigid_of
+from .integrator import FREE, decay, h2_effective_of, h2_rigid_of, shares_of
 from .launcher import Launcher
 from .overlap_release import release
 from .projection import project
@@ -362,15 +362,10 @@ class Runner:
         return np.divide(moments(particles), r, out=np.zeros(len(r)), where=r > 0)[:, None] * half * (2 / clock.h)
 
     def shares(self) -> tuple[float, float]:
-        """By what multipliers of the last substep become h^2 times accelerations, for rigid and for soft constraints: h^2 over
-        what a constant acceleration added to the displacement. In a start from velocities that lacked half a kick of rigid
-        constraints, these gave that, too."""
+        """Those of the last substep, for rigid and for soft constraints, see shares_of()."""
         clock = self.clock
-        drag = clock.drag or FREE
-        if not clock.started:
-            return 1 / drag[1], 1 / drag[1]
-        late = drag[1] * clock.lacked / clock.h
-        return 1 / (drag[2] + late), 1 / drag[2]
+        firm, soft = shares_of(clock.h, clock.started, clock.lacked, np.array(clock.drag or FREE))
+        return float(firm), float(soft)
 
     # Launches.
 

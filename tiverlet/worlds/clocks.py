@@ -3,6 +3,7 @@
 import numpy as np
 
 from ..step.clock import Clock
+from ..step.integrator import FREE
 
 # As they are in a Clock.
 PLAIN = "time", "tick", "since", "h", "d_is_velocity", "started", "longest", "owed", "lacked", "softened", "kinetic", "parting"
@@ -50,6 +51,11 @@ class Clocks:
         out.bound = None if np.isnan(self.bound[k]) else float(self.bound[k])
         out.first_moved = None if self.first_moved[k] == NONE else int(self.first_moved[k])
         return out
+
+    @property
+    def drags(self) -> np.ndarray:
+        """What drag makes of the substep of each, (worlds, 5)."""
+        return np.array([drag or FREE for drag in self.drag])
 
     def put(self, k: int, clock: Clock) -> None:
         """Take what a clock of one world says now."""

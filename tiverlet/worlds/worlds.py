@@ -22,6 +22,7 @@ from ..step import frames as kernel
 from ..step.clock import CHANGED, PARTED, SQUEEZED, room, slack
 from ..step.diagnostics import ENERGY, EXTENT, KINETIC, OVERLAP, REACH, STARTED, STEPPED, STIFFNESS, TURNS, UNSTEPPED, risks
 from ..step.impulse import Displacements, factor
+from ..step.integrator import shares_of
 from ..world import World
 from .clocks import NONE, Clocks
 from .knobs import Knobs
@@ -202,17 +203,16 @@ class Worlds:
         drags = any(f.changed for f in runner.drags)  # what the clocks have of them is of other rates
         self._upload()
         h = dt / world.substeps * runner.integrator.first
-        looked_at = clocks.known & (clocks.first_moved == NONE) & (clocks.h == h) & (not drags)
-        ready, begins = looked_at & ~clocks.d_is_velocity, looked_at & clocks.d_is_velocity
-        clocks.since[begins] = 0
+        ready = (clocks.first_moved == NONE) & (clocks.h == h) & (not drags)
+        clocks.since[ready & clocks.d_is_velocity] = 0
         moved, released, jumped = np.zeros(len(self)), np.zeros(len(self)), np.zeros(len(self), dtype=bool)
-        some = np.flatnonzero(~(ready | begins))
+        some = np.flatnonzero(~ready)
         with runner.memory.compiler():
             for k in some:
                 with self._at(k):
                     runner.prepare(dt, world.substeps, world.iterations)
                     moved[k], released[k], jumped[k] = runner.moved, runner.released, runner.jumped
-        unknown = some[~clocks.known[some]]
+        unknown = np.flatnonzero(~clocks.known)
         if len(unknown):
             figures = self._look(unknown)
             energy, overlap = figures[:, ENERGY], figures[:, OVERLAP]
@@ -539,10 +539,8 @@ class Worlds:
         alone &= ~there
         some = np.flatnonzero(~there & ~alone).astype(np.int32)
         if len(some):
-            given = np.zeros((len(some), 4))
-            for row, k in zip(given, some, strict=True):
-                runner.clock = clocks.of(int(k))
-                row[:] = runner.clock.h, runner.clock.time, *runner.shares()
+            firm, soft = shares_of(clocks.h[some], clocks.started[some], clocks.lacked[some], clocks.drags[some])
+            given = np.stack([clocks.h[some], clocks.time[some], firm, soft], axis=1)
             with runner.memory.compiler():
                 self._kernels.velocities(len(some), some, given, out.reshape(-1))
             for path in runner.paths:
@@ -582,15 +580,14 @@ class Worlds:
         given = moved & ~fresh
         if given.any():
             some, memory, n = chosen[given], runner.memory, runner.n
-            for k in some:
-                clocks.parted.pop(int(k), None)
+            known = {int(k): clocks.parted.pop(int(k)) for k in some if int(k) in clocks.parted}
             inv_mass = [self._sources[k].inv_mass for k in some] if self._sources else runner.scene.inv_mass
             free = others[given] & (np.asarray(inv_mass) > 0)
             those = Displacements(
                 runner, free, lambda field: memory.read(field)[some, :n], lambda field, v: memory.write_some(field, v, some)
             )
-            factors = np.array([factor(clocks.of(k)) for k in some])
-            those.give(velocity[given], lambda: self._velocities()[some], factors, seen[given])
+            seen = self._velocities()[some] if known else seen[given]
+            those.give(velocity[given], lambda: self._velocities()[some], factor(clocks.h[some], clocks.drags[some]), seen)
             clocks.known[some] = False
             clocks.parted.update(zip(some.tolist(), velocity[given], strict=True))
 
