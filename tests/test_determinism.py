@@ -52,15 +52,16 @@ from tiverlet.device import ti
 import tiverlet as tv
 import article
 def results(path):
-    scene = article.build(discs=140, path=path)
-    for _ in range(120):
-        article.lead(scene)
-        scene.world.step(1 / 60)
-    assert scene.world.last.contacts > 100
-    yield scene.world.hash()
-    scene.world.close()
+    for _ in range(1 if path == "parallel" else 2):
+        scene = article.build(discs=140, path=path)
+        for _ in range(120):
+            article.lead(scene)
+            scene.world.step(1 / 60)
+        assert scene.world.last.contacts > 100
+        yield scene.world.hash()
+        scene.world.close()
 """
-    made = hashes(code, '((8, "parallel"), (1, "fused"), (1, "fused"))')
+    made = hashes(code, '((8, "parallel"), (1, "fused"))')
     assert len(made) == 3 and len(made[0]) == 64 and len(set(made)) == 1
 
 
@@ -128,30 +129,37 @@ def apart(r):
     return 0.02 * r * (0.04 - r.dot(r))
 
 
-def test_all_paths_have_the_same_bits(world):
-    # In three dimensions see the next but one, and the fuzzer; for spins, events, sleep and bodies of loops see test_sleep.py. A
-    # column on the first disc learns its loads.
+@pytest.mark.parametrize("acting", [True, False], ids=["forces and contacts", "constraints"])
+def test_all_paths_have_the_same_bits(world, acting):
+    # Apart, since the time that features take to compile grows faster than their number. In three dimensions see the next but
+    # one, and the fuzzer; for spins, events, sleep and bodies of loops see test_sleep.py. A column on the first disc learns its
+    # loads.
     n = 160
     x = tv.golden(np.arange(n), dim=2) * [4, 1.6]
     x[:4] = [1.0, 7.0] + np.outer(np.arange(4), [0.0, 0.16])
     pairs = np.stack([np.arange(8, n - 1, 2), np.arange(9, n, 2)], axis=1)
     made = []
     for path in ("fused", "parallel", "launched"):
-        features = [
-            tv.Gravity(9.81), tv.Drag(0.1), tv.Force(wild), tv.Hand((1.0, 1.0), 7), tv.PairForce(apart, 0.2),
-            tv.Distance(pairs, compliance=np.where(np.arange(len(pairs)) % 2, 1e-4, 0.0), damping=1.0),
-            tv.Rope(pairs[:20] + 50, 0.5), tv.Contact(loads=True), tv.Box((0, 0), (4, 9)), tv.HalfSpace((0.2, 1), 0.1),
-            tv.Pin([0]), tv.Pin([4], (1, 1), compliance=1e-3), tv.Pin([5], (1, 2)),
-        ]  # fmt: skip
+        if acting:
+            features = [
+                tv.Gravity(9.81), tv.Drag(0.1), tv.Force(wild), tv.Hand((1.0, 1.0), 7), tv.PairForce(apart, 0.2),
+                tv.Contact(loads=True), tv.Box((0, 0), (4, 9)), tv.HalfSpace((0.2, 1), 0.1),
+            ]  # fmt: skip
+        else:
+            features = [
+                tv.Gravity(9.81), tv.Distance(pairs, compliance=np.where(np.arange(len(pairs)) % 2, 1e-4, 0.0), damping=1.0),
+                tv.Rope(pairs[:20] + 50, 0.5), tv.Pin([0]), tv.Pin([4], (1, 1), compliance=1e-3), tv.Pin([5], (1, 2)),
+            ]  # fmt: skip
         w = world(
-            tv.Particles(x, radius=0.08, mass=1 + np.arange(n) % 5), features, path=path,
-            precision="f32-compensated", substeps=7, iterations=2,
+            tv.Particles(x, radius=0.08, mass=1 + np.arange(n) % 5, pinned=[0] if acting else ()), features, path=path,
+            precision="f32" if acting else "f32-compensated", substeps=7, iterations=2,
         )  # fmt: skip
         w.run(0.6)
         w.substeps = 9
         w.run(0.5)
         made.append((w.hash(), w.last.energy, w.last.residual, w.last.overlap))
-        assert w.last.contacts > 60 and (w._runner.search.list.lasting_data()[1]["load"] > 0).any()
+        if acting:
+            assert w.last.contacts > 60 and (w._runner.search.list.lasting_data()[1]["load"] > 0).any()
     assert made[0] == made[1] == made[2]
 
 
