@@ -69,8 +69,8 @@ def test_a_signal_waits_for_the_end_of_the_frame(w, tmp_path):
                     signal.raise_signal(signal.SIGINT)
                 return watch
 
-        while came == place // 41:  # every 41st line of those that are run, until there are no more
-            place, lines[0] = place + 41, 0
+        while came == place // 83:  # every 83rd line of those that are run, until there are no more
+            place, lines[0] = place + 83, 0
             try:
                 sys.settrace(watch)
                 everything()
