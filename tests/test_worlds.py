@@ -38,16 +38,16 @@ def every_constraint(dim, k, part):
 
 
 def every_force(dim, k):
-    """All forces and walls, with friction and restitution, between particles that touch."""
+    """All forces and walls, between particles that touch; for friction and restitution see test_events.py and test_spin.py."""
     along, far = np.eye(dim)[0], np.full(dim, 9.0)
     forces = [tv.Gravity(9.81), tv.Drag(0.1), tv.Wind(along, 0.1 + k), tv.Attractor(far, 1.0), tv.Hand(far, 1), tv.Force(spring)]
     pairs = [tv.PairForce(spring, 2.5)]
-    walls = [tv.Box(0 * far, far, friction=0.2), tv.HalfSpace(along, 0.1), tv.Ball(far / 2, 1.0, restitution=0.5)]
+    walls = [tv.Box(0 * far, far), tv.HalfSpace(along, 0.1), tv.Ball(far / 2, 1.0)]
     walls += [tv.Capsule(0.2 * far, 0.2 * far + along, 0.3)]
     n = np.arange(40)
     x = np.stack([n % 5 + 0.6, n // 5 + 0.6, 0.5 + 0 * n], axis=1)[:, :dim] + 0.02 * tv.golden(n, dim=dim) + 0.01 * k
-    touch = tv.Contact(friction=0.3, restitution=0.4)
-    return tv.World(tv.Particles(x, radius=0.45, mass=1 + n % 3 + k), [*forces, *pairs, *walls, touch], substeps=6, iterations=2)
+    parts = [*forces, *pairs, *walls, tv.Contact()]
+    return tv.World(tv.Particles(x, radius=0.45, mass=1 + n % 3 + k), parts, substeps=6, iterations=2)
 
 
 def cloth(solver, k, precision="f32", order=2, substeps=5, links=None, iterations=2):
