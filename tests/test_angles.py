@@ -119,7 +119,8 @@ def test_hinged_triangles_fold_to_either_side(world):
 
 
 def test_a_rope_tears_where_it_is_told_to(world):
-    # For a team see test_determinism.py. Link k of a hanging chain of 8 carries (8 - k) m g = 9.81 (8 - k) N. Only the one of 4 with break_at = 45 is too weak: 49 N.
+    # Link k of a hanging chain of 8 carries (8 - k) m g = 9.81 (8 - k) N. Only the one of 4 with break_at = 45 is too weak: 49 N.
+    # For a team see test_determinism.py.
     strength = np.full(8, 200.0)
     strength[[3, 6]] = 45.0, 25.0
     rope = tv.Distance(line(8), 1.0, break_at=strength)
