@@ -288,7 +288,7 @@ assert tv.__file__.startswith({path!r})
 i = np.arange(39)
 x = np.stack([np.arange(40) * 0.05, np.zeros(40)], axis=1)
 w = tv.World(tv.Particles(x, radius=0.02, pinned=[0]), [tv.Gravity(9.81), tv.Distance(np.stack([i, i + 1], 1)), tv.Contact(),
-             tv.Box((-3, -1), (3, 3))])
+             tv.Box((-3, -1), (3, 3))], solver=tv.Jacobi())
 w.run(1.0)
 print(w.hash())
 """
