@@ -24,6 +24,7 @@ import pytest
 import tiverlet as tv
 from tiverlet.device import thread_team, ti
 from tiverlet.device.patches import patched
+from tiverlet.device.patches.compiler import BRIEF
 from tiverlet.recording import reader, rrd, scene
 from tiverlet.report.accuracy.cases import entries, known
 from tiverlet.step import build
@@ -168,6 +169,12 @@ def world():
     yield build
     for w in made:
         w.close()
+
+
+@pytest.fixture
+def briefly(monkeypatch):
+    """Large worlds are compiled as small ones are, in a third of the time, to the same bits: see test_determinism.py."""
+    monkeypatch.setattr(build, "_passes", lambda *_: BRIEF)
 
 
 @pytest.fixture

@@ -216,7 +216,7 @@ def test_functions_are_cut_out_of_their_files_as_python_does_it():
 
 def test_compiling_leaves_nothing_behind(world):
     # Nobody is compiling any more, and Python goes on to collect garbage.
-    w = world(tv.Particles([[0.0, 1.0], [1.0, 1.0]], radius=0.1), [tv.Gravity(9.81), tv.Contact()])
+    w = world(tv.Particles([[0.0, 1.0], [1.0, 1.0]]), [tv.Gravity(9.81), tv.Distance([[0, 1]])])
     w.run(0.1)
     assert not source_cache.active and gc.isenabled()
 

@@ -258,31 +258,6 @@ def test_splitting_a_run_changes_nothing(world):
     assert hashes[0] == hashes[1]
 
 
-def test_clones_go_on_alike(world):
-    # Some overlap at the start, and are still about to part.
-    x, v, m, pairs, rest, alpha, damping = net(3, seed=5)
-    hand = tv.Pin([0], (0.0, 0.0, 0.0), compliance=1e-3)
-    features = [
-        tv.Gravity(9.81),
-        tv.Drag(0.1),
-        tv.Distance(pairs, rest, compliance=alpha),
-        hand,
-        tv.Contact(),
-        tv.HalfSpace((0, 1, 0), -3),
-    ]
-    w = world(tv.Particles(x, velocity=v, mass=m, radius=0.3), features, precision="f32-compensated")
-    w.run(0.2)
-    twin = w.clone()
-    assert twin.hash() == w.hash()
-    np.testing.assert_array_equal(twin.velocity, w.velocity)
-    w.run(0.3)
-    twin.run(0.3)
-    assert twin.hash() == w.hash()
-    twin.close()
-    with w.clone(precision="f64", substeps=40) as other:
-        np.testing.assert_allclose(other.position, w.position, atol=1e-6)
-
-
 def test_a_force_that_was_just_turned_goes_along(world, tmp_path):
     # Velocities at the end of a frame are d / h + h a / 2 by the force of that frame, though the knob is at the next one already.
     def turned():

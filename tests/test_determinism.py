@@ -21,18 +21,18 @@ DEMOS = pathlib.Path(__file__).parent.parent / "demos"
 
 def test_what_a_gpu_sums_up_is_the_same(world, monkeypatch):
     # By 64^2 blocks and then 64, where a CPU has 64: the same figures, but for the rounding of a sum of n numbers.
-    rng = np.random.default_rng(0)
-    x = rng.uniform(-3, 3, (900, 2))
-    links = np.arange(600).reshape(300, 2)
+    # A scene of those below, which takes their kernels.
+    x = 1.8 * tv.golden(np.arange(200), dim=2) - 0.9
     reports = []
     for architecture in ("cpu", "cuda"):
         monkeypatch.setattr(diagnostics, "runtime", SimpleNamespace(architecture=lambda a=architecture: a))
-        features = [tv.Gravity(9.81), tv.Distance(links, compliance=1e-3), tv.Contact(), tv.Box((-4, -4), (4, 4))]
-        w = world(tv.Particles(x, radius=0.1), features, substeps=4, path="launched")
+        features = [tv.Gravity(9.81), tv.Distance([[0, 1]]), tv.Contact(friction=0.5, restitution=0.5)]
+        w = world(tv.Particles(x, velocity=-4 * x, radius=0.04), features, substeps=4, path="launched")
         assert w._runner.diagnostics.blocks == (64 if architecture == "cpu" else 64**2)
+        w.run(0.15)
         reports.append([w.step(1 / 60) for _ in range(2)])
     for one, two in zip(*reports, strict=True):
-        assert abs(one.energy - two.energy) <= 900 * 2.0**-53 * 900 * 9.81 * 4
+        assert abs(one.energy - two.energy) <= 200 * 2.0**-53 * 200 * 9.81 * 2
         assert one.contacts > 100 and (one.overlap, one.contacts, one.residual) == (two.overlap, two.contacts, two.residual)
 
 
@@ -52,15 +52,16 @@ from tiverlet.device import ti
 import tiverlet as tv
 import article
 def results(path):
-    scene = article.build(discs=140, path=path)
-    for _ in range(120):
-        article.lead(scene)
-        scene.world.step(1 / 60)
-    assert scene.world.last.contacts > 100
-    yield scene.world.hash()
-    scene.world.close()
+    for _ in range(1 if path == "parallel" else 2):
+        scene = article.build(discs=140, path=path)
+        for _ in range(120):
+            article.lead(scene)
+            scene.world.step(1 / 60)
+        assert scene.world.last.contacts > 100
+        yield scene.world.hash()
+        scene.world.close()
 """
-    made = hashes(code, '((8, "parallel"), (1, "fused"), (1, "fused"))')
+    made = hashes(code, '((8, "parallel"), (1, "fused"))')
     assert len(made) == 3 and len(made[0]) == 64 and len(set(made)) == 1
 
 
@@ -128,30 +129,39 @@ def apart(r):
     return 0.02 * r * (0.04 - r.dot(r))
 
 
-def test_all_paths_have_the_same_bits(world):
-    # In three dimensions see the next but one, and the fuzzer; for spins, events, sleep and bodies of loops see test_sleep.py. A
-    # column on the first disc learns its loads.
+@pytest.mark.parametrize("acting", [True, False], ids=["forces and contacts", "constraints"])
+def test_all_paths_have_the_same_bits(world, acting):
+    # Apart, since the time that features take to compile grows faster than their number. In three dimensions see the next but
+    # one, and the fuzzer; for spins, events, sleep and bodies of loops see test_sleep.py. A column on the first disc learns its
+    # loads.
     n = 160
     x = tv.golden(np.arange(n), dim=2) * [4, 1.6]
     x[:4] = [1.0, 7.0] + np.outer(np.arange(4), [0.0, 0.16])
     pairs = np.stack([np.arange(8, n - 1, 2), np.arange(9, n, 2)], axis=1)
-    made = []
+    soft, made = np.where(np.arange(len(pairs)) % 2, 1e-4, 0.0), []
     for path in ("fused", "parallel", "launched"):
-        features = [
-            tv.Gravity(9.81), tv.Drag(0.1), tv.Force(wild), tv.Hand((1.0, 1.0), 7), tv.PairForce(apart, 0.2),
-            tv.Distance(pairs, compliance=np.where(np.arange(len(pairs)) % 2, 1e-4, 0.0), damping=1.0),
-            tv.Rope(pairs[:20] + 50, 0.5), tv.Contact(loads=True), tv.Box((0, 0), (4, 9)), tv.HalfSpace((0.2, 1), 0.1),
-            tv.Pin([0]), tv.Pin([4], (1, 1), compliance=1e-3), tv.Pin([5], (1, 2)),
-        ]  # fmt: skip
+        if acting:
+            features = [
+                tv.Gravity(9.81), tv.Drag(0.1), tv.Force(wild), tv.Hand((1.0, 1.0), 7), tv.PairForce(apart, 0.2),
+                tv.Contact(loads=True), tv.Box((0, 0), (4, 9)), tv.HalfSpace((0.2, 1), 0.1),
+            ]  # fmt: skip
+        else:
+            features = [
+                tv.Gravity(9.81), tv.Distance(pairs, compliance=soft, damping=1.0, break_at=np.where(soft > 0, 200.0, np.inf)),
+                tv.Rope(pairs[:20] + 50, 0.5), tv.Pin([0]), tv.Pin([4], (1, 1), compliance=1e-3), tv.Pin([5], (1, 2)),
+            ]  # fmt: skip
         w = world(
-            tv.Particles(x, radius=0.08, mass=1 + np.arange(n) % 5), features, path=path,
-            precision="f32-compensated", substeps=7, iterations=2,
+            tv.Particles(x, radius=0.08, mass=1 + np.arange(n) % 5, pinned=[0] if acting else ()), features, path=path,
+            precision="f32" if acting else "f32-compensated", substeps=7, iterations=2,
         )  # fmt: skip
         w.run(0.6)
         w.substeps = 9
         w.run(0.5)
         made.append((w.hash(), w.last.energy, w.last.residual, w.last.overlap))
-        assert w.last.contacts > 60 and (w._runner.search.list.lasting_data()[1]["load"] > 0).any()
+        if acting:
+            assert w.last.contacts > 60 and (w._runner.search.list.lasting_data()[1]["load"] > 0).any()
+        else:
+            assert 0 < features[1].broken.sum() < len(pairs)
     assert made[0] == made[1] == made[2]
 
 
@@ -278,7 +288,7 @@ assert tv.__file__.startswith({path!r})
 i = np.arange(39)
 x = np.stack([np.arange(40) * 0.05, np.zeros(40)], axis=1)
 w = tv.World(tv.Particles(x, radius=0.02, pinned=[0]), [tv.Gravity(9.81), tv.Distance(np.stack([i, i + 1], 1)), tv.Contact(),
-             tv.Box((-3, -1), (3, 3))])
+             tv.Box((-3, -1), (3, 3))], solver=tv.Jacobi())
 w.run(1.0)
 print(w.hash())
 """

@@ -24,7 +24,7 @@ def blocks(page: pathlib.Path) -> list[str]:
 
 
 @pytest.mark.parametrize("page", [p for p in PAGES if blocks(p)], ids=str)
-def test_code_runs(page, tmp_path, monkeypatch, capsys):
+def test_code_runs(page, tmp_path, monkeypatch, capsys, briefly):
     # In the order in which it is read, each page in a file of its own, since Taichi reads the source of functions.
     script = tmp_path / "page.py"
     script.write_text("\n\n".join(blocks(page)).replace("import taichi as ti", f"import {COMPILER} as ti"))

@@ -167,7 +167,7 @@ def edited(scene, anew: bool) -> tuple[list, int]:
 
 
 @pytest.mark.parametrize("scene", [discs, grains, beside_a_rope, beside_a_net, crowd, charges, asleep])
-def test_in_place_is_to_the_bit_as_built_anew(scene):
+def test_in_place_is_to_the_bit_as_built_anew(scene, briefly):
     seen, count = edited(scene, anew=False)
     known, none = edited(scene, anew=True)
     assert count == 8 and none == 0

@@ -14,12 +14,13 @@ from .chains import beyond
 from .conftest import ARCH, CASES, case, figures, pendulums, rerun, rms
 
 DOORS = (10, 13, 19, 20, 28, 38, 59, 60, 63, 65, 66)
-MOTION = (2, 4, 6, 7, 11, 15, 17, 18, 22, 29, 37, 45, 48, 50, 51, 52, 55, 61, 62, 67, 82)
+MOTION = (4, 6, 7, 11, 18, 29, 37, 50, 51, 52, 61, 62, 67)
 
 
 @pytest.mark.parametrize("number", DOORS + MOTION)
-def test_rows_pass(number):
-    # All of them take minutes: python -m tiverlet stress.
+def test_rows_pass(number, briefly):
+    # All of them take minutes: python -m tiverlet stress. Others are shown by tests that name them: 2 by test_chains.py, 15 and
+    # 17 by test_properties.py, 22 by test_direct.py, 45, 48 and 82 by test_contact.py, 55 by test_bodies.py.
     result = certify(number)
     if ARCH not in tv.runtime.LLVM and any(ARCH in why for why in result.failing):  # refused because of the architecture
         pytest.skip(str(result.failing))
@@ -104,7 +105,7 @@ def test_18_a_whip_asks_for_more_substeps(world):
 
 def test_36_nothing_and_almost_nothing(world):
     one = [[1.0, 2.0]]
-    for x, path in ((np.zeros((0, 3)), "parallel"), (one, "fused"), (one, "parallel")):
+    for x, path in ((np.zeros((0, 3)), "parallel"), (one, "fused")):
         dim = np.shape(x)[1]
         features = [tv.Gravity(), tv.Drag(1.0), tv.Distance(np.zeros((0, 2), int)), tv.Contact(), tv.Box([-9] * dim, [9] * dim)]
         w = world(tv.Particles(x, radius=0.1), features, path=path)
@@ -128,10 +129,10 @@ def test_50_nan_is_flagged_on_both_paths(path):
 
 
 def test_34_thousands_in_one_cell(world):
-    # Correct, n^2, warned of, and nothing overflows.
+    # Correct, n^2, warned of, and nothing overflows. Phase by phase, where the list has a kernel of its own.
     n = 2048
     x = np.random.default_rng(0).uniform(0, 0.01, (n, 2))
-    w = world(tv.Particles(x, radius=0.5), [tv.Contact()])
+    w = world(tv.Particles(x, radius=0.5), [tv.Contact()], path="launched")
     with pytest.warns(UserWarning, match="near pairs per particle"):
         w._runner.list_neighbours()
     np.testing.assert_array_equal(w._runner.memory.read(w._runner.search.list.number), n - 1)

@@ -13,6 +13,8 @@ from tiverlet.device.thread_team import Team
 
 from .conftest import ARCH
 
+pytestmark = pytest.mark.usefixtures("briefly")
+
 N = 1600  # more than Taichi gives to one thread
 LENGTHS = (0, 1, 2, RADIX, RADIX + 1, 3 * RADIX - 1, RADIX**2, RADIX**2 + 1, 2 * RADIX**2 + 7, RADIX**3 + 1)
 

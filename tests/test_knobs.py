@@ -270,11 +270,11 @@ def test_the_rows_have_every_feature():
 @pytest.mark.parametrize("friction", [{(0, 0): 0.3}, {(0, 0): 0.3, (1, 2): 0.6, (2, 2): 0.1}, {(2, 1): 0.5}, 0.4], ids=repr)
 def test_friction_may_name_other_groups(world, friction):
     # Fewer, more or others than before: as in a world that had it from the start. Rows of another table did not fit (ValueError).
-    x = np.stack([0.9 * (np.arange(12) % 4), 0.6 + 0.9 * (np.arange(12) // 4)], axis=1)
+    x = np.stack([0.9 * (np.arange(12) % 4), 0.5 + 0.9 * (np.arange(12) // 4)], axis=1)  # apart, and so compiled once
     ends = []
     for first in ({(0, 0): 0.5, (1, 1): 0.5}, friction):
         start = tv.Particles(
-            x + 0.05 * np.cos(np.arange(24)).reshape(12, 2), radius=0.44, group=np.arange(12) % 3, velocity=(1, 0)
+            x + 0.02 * np.cos(np.arange(24)).reshape(12, 2), radius=0.43, group=np.arange(12) % 3, velocity=(1, 0)
         )
         w = world(start, [tv.Gravity(), contact := tv.Contact(friction=first), tv.Box((-1, 0), (4, 9))], precision="f64")
         w.step(1e-9)

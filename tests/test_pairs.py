@@ -57,10 +57,12 @@ def clouds():
     yield "two", np.full(2, 0.3), [([[0.0, 0], [0.5, 0]], None), ([[-7.0, 0], [-7, 0.5]], None)]
 
 
-LEFT_OUT = {  # of a team, what others show: one level in the plane, many in space; in the plane see test_many_particles
+# Of a team, what others show: one level in the plane, many in space; in the plane see test_many_particles. Phase by phase see
+# test_grid.py.
+LEFT_OUT = {
     "fused": (),
     "parallel": ("space", "radii 1:1000"),
-    "launched": ("radii 1:1000", "radii 1:1000 in space"),
+    "launched": ("space", "radii 1:1000", "radii 1:1000 in space"),
 }
 
 
@@ -99,7 +101,7 @@ def test_pairs_equal_brute_force(world, path, name, radius, several):
         assert touching.overlap == pytest.approx((depth / small).max(initial=0.0), rel=1e-12)
 
 
-def test_many_particles(world, monkeypatch):
+def test_many_particles(world, monkeypatch, briefly):
     monkeypatch.setattr(build, "CROSSOVER", CROSSOVER)
     rng = np.random.default_rng(8)
     position = rng.uniform(-63, 63, (40_000, 2))

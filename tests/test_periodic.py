@@ -257,12 +257,11 @@ def test_a_shear_is_live_and_survives_whatever_happens_to_the_world(world, tmp_p
             recorder.log()
         box.shear = -1.0
         x = w.position
-        w.add(tv.Particles([[9.0, 9.0]], radius=0.1), [tv.Distance([[3, 4]], compliance=1e-3)])
+        w.add(tv.Particles([[9.0, 9.0]], radius=0.15), extend={features[1]: tv.Distance([[3, 4]], compliance=1e-3)})
         w.step(DT)
         recorder.log()
     assert np.isclose(box.strain, 5 * DT) and np.isclose(box.offset, 5 * DT * 3.0)
-    links = w.features[-1]
-    assert abs(links.rest[0] - by_images(x[[3]], x[[4]], (4, 3), (0, 1), 6 * DT * 3.0)[0, 0]) < 1e-12
+    assert abs(features[1].rest[-1] - by_images(x[[3]], x[[4]], (4, 3), (0, 1), 6 * DT * 3.0)[0, 0]) < 1e-12
     twin, other = w.clone(), w.clone(precision="f32")
     replay = tv.replay(tmp_path / "shear.rrd")
     assert replay.verify().kind == "intact"

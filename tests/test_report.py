@@ -1,6 +1,5 @@
 """The reports: what they measure, what they say of it, and that a defect in the engine does not get past them."""
 
-import importlib
 import io
 import json
 import multiprocessing
@@ -151,6 +150,7 @@ class Deadly:
 
 
 def test_sweeps_run_in_processes_and_survive_one_that_dies():
+    # As on any executor; what takes parts on Dask is tried in test_sweep.py.
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         found = tv.report.error_vs_time(
             "D01", methods=["Direct"], precisions=("f64",), efforts=(20, 40), runs=1, executor=Deadly(pool)
@@ -158,18 +158,6 @@ def test_sweeps_run_in_processes_and_survive_one_that_dies():
     assert [p.substeps for p in found.curve("D01_double_pendulum", "Direct")] == [20, 40]
     assert any(m.task == "D01_double_pendulum, XPBD, f64" for m in found.missing) and "missing" in str(found)
     assert any("BrokenProcessPool" in why for why in found.failures["D01_double_pendulum, XPBD, f64"])
-
-
-def test_sweeps_run_on_dask_and_survive_a_worker_that_dies():
-    dask, distributed = map(importlib.import_module, ("dask.config", "distributed"))  # here, or every worker imports them
-    with (
-        dask.set({"distributed.scheduler.allowed-failures": 0}),
-        distributed.Client(n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None) as client,
-    ):
-        some = {"methods": ["Direct"], "precisions": ("f64",), "efforts": (20,), "runs": 1}
-        found = tv.report.error_vs_time("D01", **some, executor=Deadly(client.get_executor()))
-    assert "D01_double_pendulum, XPBD, f64" in {m.task for m in found.missing}
-    assert [p.substeps for p in found.curve("D01_double_pendulum", "Direct")] == [20]
 
 
 def test_the_certificate_tells_what_holds_and_what_does_not(monkeypatch, tmp_path, capsys):

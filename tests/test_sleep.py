@@ -184,7 +184,7 @@ def test_nothing_begins_where_all_sleep(world):
 def test_a_sensor_that_sleeps_and_a_stack_that_wakes(world):
     """What a sensor overlaps begins and ends as where it is awake. A pair that wakes in the middle of a frame has not met again:
     the speed at which it came together is 0."""
-    x = [(0.0, R), (9.0, R), (9.0, 3 * R - 1e-3), (-9.0, 0.3 * R), (9.4, 6.0)]
+    x = [(0.0, R), (9.0, R), (9.0, 3 * R + 1e-3), (-9.0, 0.3 * R), (9.4, 6.0)]
     v = np.zeros((5, 2))
     v[3, 0] = 14.0
     start = tv.Particles(x, velocity=v, radius=[R, R, R, 0.3 * R, R], group=[1, 0, 0, 0, 0])
@@ -364,7 +364,8 @@ def square(side, center):
 
 
 def test_bodies_of_loops(world):
-    """Two squares on each other sleep, and a third beside them, until a fourth falls on the two: after sqrt(2 h / g)."""
+    """Two squares on each other sleep, and a third beside them, until a fourth falls on the two: after sqrt(2 h / g). Phase by
+    phase; in one kernel they sleep in test_polygons.py."""
     x = np.concatenate([square(0.6, (0, 0.31)), square(0.5, (0.03, 0.87)), square(0.6, (0.65, 0.31)), square(0.4, (0.1, 4.0))])
     loops = np.arange(16).reshape(4, 4)
     features = [
@@ -374,23 +375,23 @@ def test_bodies_of_loops(world):
         tv.HalfSpace((0, 1), friction=0.5, events=True),
         tv.Sleep(0.02, 0.2),
     ]
-    worlds = [world(tv.Particles(x), [f.copy() for f in features], substeps=12, path=path) for path in ("fused", "launched")]
-    for w in worlds:
-        until(w, 12, seconds=0.6)
+    worlds = [world(tv.Particles(x), features, substeps=12, path="launched")]
+    until(worlds[0], 12, seconds=0.6)
     stand = rows(worlds[0].wall_events().lasting.pairs)
-    before = [(w.position[:12], w.velocity[:12], w.contacts.impulse, w.features[1].residual[:3]) for w in worlds]
+    w = worlds[0]
+    before = w.position[:12], w.velocity[:12], w.contacts.impulse, w.features[1].residual[:3]
     worlds.append(worlds[0].clone())
     h = 4.0 - 0.2 - worlds[0].position[4:8, 1].max()
     while worlds[0].last.asleep == 12 and worlds[0].time < 3.0:
-        for k, w in enumerate(worlds):
+        for w in worlds:
             after = w.position[:12], w.velocity[:12], w.contacts.impulse, w.features[1].residual[:3]
-            assert all(map(np.array_equal, before[k % 2], after))
+            assert all(map(np.array_equal, before, after))
             w.step(1 / 60)
             assert rows(w.wall_events().touches.pairs) == rows(w.wall_events().lasting.pairs) == stand
     assert len({(w.hash(), w.last.asleep) for w in worlds}) == 1 and worlds[0].last.asleep == 4
     assert 0 <= worlds[0].time - (2 * h / 9.81) ** 0.5 < 1 / 60 + 1e-6
     assert np.abs(worlds[0].velocity[4:8, 1]).min() > 0.1  # what was struck moves in the same frame
-    assert (worlds[0].position[8:12] == before[0][0][8:12]).all() and len(stand) > 3
+    assert (worlds[0].position[8:12] == before[0][8:12]).all() and len(stand) > 3
     worlds[-1].close()
 
 

@@ -50,10 +50,13 @@ class Forked:
         after = "from tiverlet.device import ti\nti.reset()"  # which keeps what was compiled; what was forked does not at its end
         self.code = f"{before}\nsys.argv[1:] = [{json.dumps(job)!r}]\n{code}\n{after}\n"
 
-    def ask(self):
+    def said(self):
         if self.code not in self.answers:
             self.answers[self.code] = python(self.code).stdout
-        return json.loads(self.answers[self.code])
+        return self.answers[self.code]
+
+    def ask(self):
+        return json.loads(self.said())
 
     def __enter__(self):
         return self
@@ -261,13 +264,35 @@ def test_command(capsys):
     assert "D01_double_pendulum" in capsys.readouterr().out
 
 
+# All jobs one after the other, each of which takes what it prints to for its own.
+TOGETHER = """
+import json, os, sys
+import tiverlet as tv
+from tiverlet.report.speed import worlds
+worlds.QUICK["pile"] = ()
+out = os.dup(1)
+tv.init(threads=1)
+tv.init = lambda **_: None
+for job in json.loads(sys.argv[1]):
+    os.dup2(out, 1)
+    worlds.main(job)
+"""
+
+
 @pytest.fixture(scope="module")
-def batch(kept, forked):
-    """Many worlds, few of them; piles only where they are beside one of all their discs, for they take longest to compile."""
+def batch(kept):
+    """Many worlds, few of them; piles only where they are beside one of all their discs, for they take longest to compile. All
+    parts in one process, where they share kernels; first the one that counts those that it compiles."""
+    jobs, rows = {}, {}
     with pytest.MonkeyPatch.context() as patch:
-        folder = contextlib.nullcontext(str(kept / "worlds"))
-        patch.setattr(worlds, "START", f"from tiverlet.report.speed import worlds; worlds.QUICK['pile'] = (); {worlds.START}")
-        patch.setattr(worlds, "tempfile", types.SimpleNamespace(TemporaryDirectory=lambda: folder))
+        patch.setattr(worlds, "tempfile", types.SimpleNamespace(TemporaryDirectory=lambda: contextlib.nullcontext(str(kept))))
+        patch.setattr(processes, "started", lambda code, job, cache: contextlib.nullcontext(types.SimpleNamespace(
+            ask=lambda: rows.get(job["part"]) or jobs.update({job["part"]: job}) or []
+        )))  # fmt: skip
+        worlds.worlds(threads=(1,), quick=True, peers=False)  # which asks for all of them
+        names = sorted(jobs, key="costs".__ne__)
+        said = Forked(TOGETHER, [jobs[name] for name in names], str(kept / "worlds")).said()
+        rows = dict(zip(names, map(json.loads, said.splitlines()), strict=True))
         return worlds.worlds(threads=(1,), quick=True, peers=False)
 
 

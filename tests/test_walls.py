@@ -168,7 +168,7 @@ def keeps(world, walls, outside, moves, there):
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_points_stay_in_corners_far_from_the_origin(world, dim):
+def test_points_stay_in_corners_far_from_the_origin(world, dim, briefly):
     # Points, which have no radius to be inside by, fly into the corners of a triangle or a tetrahedron. Far out the last digits
     # of their places are larger than those of the wall's: what lay on one face, and by rounding behind it, was not stopped by
     # the next one (267 of 2000 in a triangle, at 100 m; 2 in a tetrahedron at the origin).

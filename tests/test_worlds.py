@@ -38,16 +38,16 @@ def every_constraint(dim, k, part):
 
 
 def every_force(dim, k):
-    """All forces and walls, with friction and restitution, between particles that touch."""
+    """All forces and walls, between particles that touch; for friction and restitution see test_events.py and test_spin.py."""
     along, far = np.eye(dim)[0], np.full(dim, 9.0)
     forces = [tv.Gravity(9.81), tv.Drag(0.1), tv.Wind(along, 0.1 + k), tv.Attractor(far, 1.0), tv.Hand(far, 1), tv.Force(spring)]
     pairs = [tv.PairForce(spring, 2.5)]
-    walls = [tv.Box(0 * far, far, friction=0.2), tv.HalfSpace(along, 0.1), tv.Ball(far / 2, 1.0, restitution=0.5)]
+    walls = [tv.Box(0 * far, far), tv.HalfSpace(along, 0.1), tv.Ball(far / 2, 1.0)]
     walls += [tv.Capsule(0.2 * far, 0.2 * far + along, 0.3)]
     n = np.arange(40)
     x = np.stack([n % 5 + 0.6, n // 5 + 0.6, 0.5 + 0 * n], axis=1)[:, :dim] + 0.02 * tv.golden(n, dim=dim) + 0.01 * k
-    touch = tv.Contact(friction=0.3, restitution=0.4)
-    return tv.World(tv.Particles(x, radius=0.45, mass=1 + n % 3 + k), [*forces, *pairs, *walls, touch], substeps=6, iterations=2)
+    parts = [*forces, *pairs, *walls, tv.Contact()]
+    return tv.World(tv.Particles(x, radius=0.45, mass=1 + n % 3 + k), parts, substeps=6, iterations=2)
 
 
 def cloth(solver, k, precision="f32", order=2, substeps=5, links=None, iterations=2):
@@ -205,10 +205,10 @@ def test_what_is_wrong_in_one_is_flagged_for_it_alone(taichi):
 
 
 def pendulum(length=1.0, mass=1.0, g=9.81, **settings):
-    """Two rods, horizontal."""
+    """Two rods, horizontal; relaxed, if nothing else is said, which compiles sooner than a system."""
     start = tv.Particles([[0, 0], [length, 0], [2 * length, 0]], mass=[1, 1, mass], pinned=[0])
     features = [tv.Gravity(g), tv.Distance([[0, 1], [1, 2]]), tv.Pin([2], (2.0, 0.0), compliance=10.0)]
-    return tv.World(start, features, precision="f64", **settings)
+    return tv.World(start, features, precision="f64", **({"solver": tv.Jacobi()} | settings))
 
 
 def test_knobs_are_for_one_some_or_all(taichi):
@@ -269,7 +269,7 @@ def test_one_that_is_taken_out_has_the_knobs_that_wait(taichi):
 
 def test_knobs_that_wait_for_other_kernels_are_there(taichi):
     # A rest length of 0 has no direction, so its constraint leaves the system: assigned, and not stepped with yet.
-    world, alone = pendulum(), pendulum()
+    world, alone = pendulum(solver=tv.Direct()), pendulum(solver=tv.Direct())
     for w in (world, alone):
         w.run(0.1)
         w.features[1].rest = [1.0, 0.0]
