@@ -94,15 +94,13 @@ class Scene:
 def leave_nothing_behind(w: tv.World) -> None:
     """Frames with NaN for every place, which tests have their worlds make at last: the state is put back to what it was, and goes
     on to the bit; so a frame that is tried again with more substeps is what it would have been. And places and velocities that
-    are assigned are a new start; not for clusters in space, whose turn stays what is no number."""
+    are assigned are a new start."""
     x, (memory, state) = w.position, (w._runner.memory, w._runner.scene.state)
     w.step(1e-3)
     kept, waiting = checkpoint.keep(w), checkpoint.flags(w)
     w.step(1e-3)
     after = w.hash()
-    turns = w.particles.dim == 3 and any(isinstance(f, tv.ShapeMatch) for f in w.features)
-    again = [] if turns else [lambda: (setattr(w, "velocity", 0 * x), setattr(w, "position", x))]
-    for mend in (lambda: checkpoint.undo(w, kept, waiting), *again):
+    for mend in (lambda: checkpoint.undo(w, kept, waiting), lambda: (setattr(w, "velocity", 0 * x), setattr(w, "position", x))):
         for field in (state.x, state.d):
             memory.write(field, np.full_like(memory.read(field), np.nan))
         assert "non-finite" in w.step(1e-3).flags

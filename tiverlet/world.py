@@ -325,7 +325,7 @@ class World:
             others = (value != seen).any(axis=1)
             if not others.any():
                 return
-            if self._clock.d_is_velocity or self._order > 2:
+            if self._clock.d_is_velocity or self._order > 2 or not np.isfinite(seen).all():
                 self._start_from(value)
             else:
                 self._runner.wake(np.flatnonzero(others))

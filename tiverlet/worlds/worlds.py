@@ -575,7 +575,7 @@ class Worlds:
         seen = self._velocities()[chosen]
         others = (velocity != seen).any(axis=2)
         moved = others.any(axis=1)
-        fresh = moved & (clocks.d_is_velocity[chosen] | bool(runner.probe))
+        fresh = moved & (clocks.d_is_velocity[chosen] | bool(runner.probe) | ~np.isfinite(seen).all(axis=(1, 2)))
         self._start_from(velocity[fresh], chosen[fresh])
         given = moved & ~fresh
         if given.any():
