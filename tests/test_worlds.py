@@ -247,6 +247,32 @@ def test_knobs_are_for_one_some_or_all(taichi):
     assert world.time == 0 and gravity.g == 9.81
 
 
+def test_drag_that_is_set_on_the_way_acts_from_then_on(taichi):
+    # v falls by exp(-rate t): the same rates set before and after a reset, with velocities assigned, and of one of them.
+    rate = np.array([0.5, 1.0, 2.0])
+    with tv.Worlds(tv.World(tv.Particles([[0.0, 0]], velocity=(1.0, 0)), [tv.Drag(0.1)], precision="f64"), 3) as many:
+        drag = many.features[0]
+
+        def falls(exponent):
+            many.run(0.5)
+            np.testing.assert_allclose(many.velocity[:, 0, 0], np.exp(-exponent * np.ones(3)), rtol=1e-12)
+
+        falls(0.05)
+        many.set(drag, rate=rate)
+        falls(0.05 + rate / 2)
+        many.reset()
+        falls(rate / 2)
+        many.reset()
+        many.set(drag, rate=2 * rate)
+        falls(rate)
+        many.velocity = [(1.0, 0)]
+        many.set(drag, some=[1], rate=[0.3])
+        falls(np.array([0.5, 0.15, 2.0]))
+        many.run(0.5, 1 / 50)
+        many.reset()
+        falls(np.array([0.5, 0.15, 2.0]))
+
+
 def test_one_that_is_taken_out_has_the_knobs_that_wait(taichi):
     # A force that changed: velocities are taken by what it was, as a clone of the world alone does. The others go on alike.
     world, alone = pendulum(), pendulum()

@@ -111,6 +111,11 @@ class Knobs:
             return np.ones(self.count, dtype=bool)
         return np.any([np.zeros(self.count, dtype=bool), *self._set.values()], axis=0)
 
+    def waiting_of(self, feature: Feature) -> np.ndarray:
+        """The worlds in which a knob of a feature waits."""
+        of = self._set.get(self.features.index(feature), np.zeros(self.count, dtype=bool))
+        return of | feature.changed
+
     @property
     def waiting(self) -> np.ndarray:
         """The worlds in which something waits."""

@@ -198,10 +198,11 @@ class Worlds:
         """Make all ready for substeps of this length, see Runner.begin(). Returns of each how far particles were moved, and what
         a shorter substep released."""
         world, runner, clocks = self._world, self._runner, self._clocks
-        drags = any(f.changed for f in runner.drags)  # what the clocks have of them is of other rates
+        for drag in runner.drags:
+            clocks.asks_drag |= self._knobs.waiting_of(drag)
         self._upload()
         h = dt / world.substeps * runner.integrator.first
-        looked_at = clocks.known & (clocks.first_moved == NONE) & (clocks.h == h) & (not drags)
+        looked_at = clocks.known & (clocks.first_moved == NONE) & (clocks.h == h) & ~clocks.asks_drag
         ready, begins = looked_at & ~clocks.d_is_velocity, looked_at & clocks.d_is_velocity
         clocks.since[begins] = 0
         moved, released, jumped = np.zeros(len(self)), np.zeros(len(self)), np.zeros(len(self), dtype=bool)
@@ -228,7 +229,7 @@ class Worlds:
                     runner.ease(int(clocks.first_moved[k]))
         for contact in runner.step.contacts:
             runner.memory.write_some(contact.dev.fast, 1, np.flatnonzero(jumped))
-        clocks.first_moved[some] = NONE
+        clocks.first_moved[some], clocks.asks_drag[some] = NONE, False
         self._start = self._start or _Start(self)
         return moved, released
 
@@ -684,6 +685,8 @@ class _Start:
             runner.memory.write_some(log.made, 0, chosen)
         runner.invalidate(chosen)
         worlds._clocks.return_to(self.clocks, chosen)
+        if runner.drags:
+            runner.memory.write_some(runner.integrator.decay, [[self.clocks.drag[k]] for k in chosen], chosen)
 
 
 class _Source:
