@@ -273,6 +273,37 @@ def test_drag_that_is_set_on_the_way_acts_from_then_on(taichi):
         falls(np.array([0.5, 0.15, 2.0]))
 
 
+def sliding(friction=0.4, restitution=0.3, offset=0.0, between=0.5, apart=0.2):
+    """Two discs that slide on a floor, one into the other."""
+    start = tv.Particles([[0.0, 0.55], [1.3, 0.5]], radius=0.5, velocity=[[5.0, 0.0], [0.0, 0.0]])
+    floor = tv.HalfSpace((0, 1), offset, friction=friction, restitution=restitution)
+    return tv.World(start, [tv.Gravity(9.81), floor, tv.Contact(friction=between, restitution=apart)], precision="f64")
+
+
+def test_walls_and_contacts_take_each_knob_per_world(taichi):
+    # One after the other or in one call, before and after steps, with numbers for all in between: as worlds made with them.
+    first = dict(friction=[0.1, (0.3, 0.2), 0.5], restitution=[0.2, 0.3, 0.4]), dict(offset=[0.0, -0.1, -0.2])
+    second = dict(offset=[0.0, -0.2, -0.1], restitution=[0.5, 0.4, 0.3]), dict(friction=[(0.2, 0.1), (0.3, 0.2), (0.5, 0.1)])
+    between, apart = [0.1, (0.4, 0.3), 0.2], [0.3, 0.2, 0.1]
+    with tv.Worlds(sliding(), 3) as many:
+        _, floor, contact = many.features
+        for parts in first, second:
+            many.reset()
+            floor.offset = 0.3
+            for knobs in parts:
+                many.set(floor, **knobs)
+            assert many.velocity.shape == (3, 2, 2)
+            many.set(contact, friction=between)
+            many.set(contact, restitution=apart)
+            many.run(0.2)
+            values = parts[0] | parts[1] | dict(between=between, apart=apart)
+            with tv.Worlds([sliding(**{name: v[k] for name, v in values.items()}) for k in range(3)]) as made:
+                made.run(0.2)
+                np.testing.assert_array_equal(many.position, made.position)
+                np.testing.assert_array_equal(many.velocity, made.velocity)
+        assert [w.features[1].friction for w in map(many.__getitem__, range(3))] == second[1]["friction"]
+
+
 def test_one_that_is_taken_out_has_the_knobs_that_wait(taichi):
     # A force that changed: velocities are taken by what it was, as a clone of the world alone does. The others go on alike.
     world, alone = pendulum(), pendulum()

@@ -315,11 +315,8 @@ class Worlds:
         while len(some):
             plan[kernel.COUNT], plan[kernel.GRAIN] = len(some), self._kernels.grain(len(some))
             which[: len(some)] = some
-            self._knobs.show(0)  # kernels are compiled for whether there is friction, which is the same in all
-            try:
+            with self._knobs.shown(0):  # kernels are compiled for whether there is friction, which is the same in all
                 CachedLaunch(self._kernels, "run", memory.compiler, plan, which, figures.reshape(-1), track)()
-            finally:
-                self._knobs.show(None)
             if not runner.step.searches:
                 return
             sheets = memory.read(self._kernels.sheet)
@@ -540,7 +537,7 @@ class Worlds:
             for row, k in zip(given, some, strict=True):
                 runner.clock = clocks.of(int(k))
                 row[:] = runner.clock.h, runner.clock.time, *runner.shares()
-            with runner.memory.compiler():
+            with runner.memory.compiler(), self._knobs.shown(0):
                 self._kernels.velocities(len(some), some, given, out.reshape(-1))
         for k in np.flatnonzero(alone):
             with self._at(k) as world:
