@@ -273,10 +273,10 @@ def test_drag_that_is_set_on_the_way_acts_from_then_on(taichi):
         falls(np.array([0.5, 0.15, 2.0]))
 
 
-def sliding(friction=0.4, restitution=0.3, offset=0.0, between=0.5, apart=0.2):
+def sliding(friction=0.4, restitution=0.3, offset=0.0, between=0.5, apart=0.2, active=True):
     """Two discs that slide on a floor, one into the other."""
     start = tv.Particles([[0.0, 0.55], [1.3, 0.5]], radius=0.5, velocity=[[5.0, 0.0], [0.0, 0.0]])
-    floor = tv.HalfSpace((0, 1), offset, friction=friction, restitution=restitution)
+    floor = tv.HalfSpace((0, 1), offset, friction=friction, restitution=restitution, active=active)
     return tv.World(start, [tv.Gravity(9.81), floor, tv.Contact(friction=between, restitution=apart)], precision="f64")
 
 
@@ -302,6 +302,17 @@ def test_walls_and_contacts_take_each_knob_per_world(taichi):
                 np.testing.assert_array_equal(many.position, made.position)
                 np.testing.assert_array_equal(many.velocity, made.velocity)
         assert [w.features[1].friction for w in map(many.__getitem__, range(3))] == second[1]["friction"]
+
+
+def test_a_wall_that_is_off_in_some_lets_go_in_these_alone(taichi):
+    # Moved, then off in all: each goes on as in worlds that all had it, or had it not.
+    off, on = sliding(active=False), sliding()
+    with tv.Worlds([on, off]) as mixed, tv.Worlds(off, 2) as without, tv.Worlds(on, 2) as there:
+        for knobs in dict(restitution=[0.0, 0.0]), dict(offset=[-0.01, -0.01]), dict(active=[False, False]):
+            for many in mixed, without, there:
+                many.set(many.features[1], **knobs)
+                many.run(0.1)
+            assert mixed.hash(0) == there.hash(0) == there.hash(1) and mixed.hash(1) == without.hash(0) == without.hash(1)
 
 
 def test_one_that_is_taken_out_has_the_knobs_that_wait(taichi):
