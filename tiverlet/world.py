@@ -240,7 +240,8 @@ class World:
         self, seconds: float, dt: float = 1 / 60, recorder=None, progress: bool = False, *, tolerance: float | None = None,
         budget: float | None = None,
     ) -> StepReport:  # fmt: skip
-        """Step for `seconds` [s] in frames of dt [s]; returns the worst figures of all frames.
+        """Step for `seconds` [s], to the nearest whole number of frames of dt [s] and at least one; returns the worst figures of
+        all frames.
 
         tolerance, budget: of each frame, see step(). recorder: a Recorder that logs each frame, or the path of one that is made
         for this run. progress: show a bar.

@@ -147,7 +147,8 @@ class Worlds:
             return self._launch(dt, 1, *self._begin(dt))
 
     def run(self, seconds: float, dt: float = 1 / 60, progress: bool = False) -> WorldsReport:
-        """Step all of them for `seconds` [s] in frames of dt [s], many in a launch; returns the worst figures of all frames."""
+        """Step all of them for `seconds` [s], to the nearest whole number of frames of dt [s], many in a launch; returns the
+        worst figures of all frames."""
         return self._frames("Worlds.run", seconds, dt, 0, None, progress)
 
     def rollout(self, seconds: float, dt: float = 1 / 60, every: int = 1, progress: bool = False) -> Rollout:
