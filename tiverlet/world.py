@@ -577,7 +577,8 @@ class World:
         Particles that overlap others part gently, as at the start.
 
         extend: features of the world, and others of their kind, whose constraints or bodies they take behind their own:
-        world.add(tv.Particles(more.position), extend={ropes: tv.Distance(more.links + n)}). Each feature has kernels to compile,
+        world.add(tv.Particles(more.position), extend={ropes: tv.Distance(more.links + n)}). All constraints take more but Pin,
+        Path, Constraint, and a ShapeMatch whose rest is given; and so does Polygons. Each feature has kernels to compile,
         but no kernel knows how many constraints there are: the first rope that comes as a tv.Distance of its own takes seconds,
         and so does the next one; those that a Distance is extended by take milliseconds.
 
