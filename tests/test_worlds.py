@@ -301,7 +301,9 @@ def test_walls_and_contacts_take_each_knob_per_world(taichi):
                 made.run(0.2)
                 np.testing.assert_array_equal(many.position, made.position)
                 np.testing.assert_array_equal(many.velocity, made.velocity)
-        assert [w.features[1].friction for w in map(many.__getitem__, range(3))] == second[1]["friction"]
+        assert [many[k].features[1].friction for k in range(3)] == second[1]["friction"]
+    with tv.Worlds([sliding(between={(0, 0): value}) for value in between]) as many:
+        assert many.each(lambda w: w.features[2].friction) == [{(0, 0): value} for value in between]
 
 
 def test_a_wall_that_is_off_in_some_lets_go_in_these_alone(taichi):

@@ -189,9 +189,14 @@ def _other_knobs(worlds: "list[World]") -> dict[tuple[int, str], Any]:
     for i, alike in enumerate(zip(*(world.features for world in worlds), strict=True)):
         for name in knobs_of(type(alike[0])):
             values = [vars(f)[name] for f in alike if name in vars(f)]
-            if len(values) == len(worlds) and any(not np.array_equal(v, values[0]) for v in values):
+            if len(values) == len(worlds) and any(not _same(v, values[0]) for v in values):
                 out[i, name] = _stacked(values)
     return out
+
+
+def _same(one: Any, other: Any) -> bool:
+    """Whether two values of a knob are equal; of mappings, NumPy would compare the keys."""
+    return one == other if isinstance(one, Mapping) else not isinstance(other, Mapping) and np.array_equal(one, other)
 
 
 def _stacked(values: list[Any]) -> Any:
