@@ -98,6 +98,44 @@ def test_a_world_that_was_extended_is_the_one_that_has_all(kind, tmp_path):
     w.close()
 
 
+OCTAHEDRON = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1.0]])
+SIDES = np.array([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])
+MACHINE = np.concatenate([[[0, 0, 0], [1, 0, 0], [1.5, 0.5, 0], [3, 1, 0], [3, 0, 0], [4.3, 0, 0]], OCTAHEDRON + [6, 0, 0]])
+
+
+def machines(some: list[int]) -> list:
+    """A hinge that turns, a rope that is wound up, a grid and a closed surface."""
+    k, all_of = np.array(some), several(some, len(MACHINE))
+    return [
+        tv.Motor(all_of([[0, 1, 2]]), 1.0 + k, torque=5.0), tv.Winch(all_of([[3, 4]]), -0.3 * (k + 1.0)),
+        tv.Snap(all_of([5]), 1.0, compliance=0.01 * (k + 1)), tv.Volume(all_of(6 + SIDES), pressure=1.1 + k, compliance=1e-3),
+    ]  # fmt: skip
+
+
+def test_drives_grids_and_surfaces_take_more_as_links_do(tmp_path):
+    def made(some):
+        x = np.concatenate([MACHINE + [20.0 * k, 0, 0] for k in some])
+        return tv.Particles(x, pinned=(len(MACHINE) * np.arange(len(some))[:, None] + [0, 1, 3]).ravel())
+
+    w, whole = (tv.World(made(some), machines(some), substeps=2, precision="f64") for some in ([0], [0, 1, 2]))
+    for k in (1, 2):
+        w.add(made([k]), extend=dict(zip(w.features, machines([k]), strict=True)))
+    w.run(0.1)
+    whole.run(0.1)
+    assert w.hash() == whole.hash() and w.features[1].rest.tolist() == pytest.approx([0.97, 0.94, 0.91])
+    with tv.Recorder(tmp_path / "more.rrd", w) as recorder:
+        w.add(made([3]), extend=dict(zip(w.features, machines([3]), strict=True)))
+        w.step(1 / 60)
+        recorder.log()
+    assert tv.replay(tmp_path / "more.rrd").verify() and w.features[3].count == 4
+    with pytest.raises(TypeError, match="one Motor turns to an angle"):
+        w.add(extend={w.features[0]: tv.Motor([[0, 1, 2]], 1.0, angle=1.0)})
+    with pytest.raises(TypeError, match="Snap of spacing = 1.0 cannot take one of spacing = 2.0"):
+        w.add(extend={w.features[2]: tv.Snap([0], 2.0, compliance=0.01)})
+    w.close()
+    whole.close()
+
+
 def test_what_comes_moves_as_under_a_feature_of_its_own():
     # One more link of a running rope; and one to a particle that was there, which starts where that is now.
     def scene():

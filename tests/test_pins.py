@@ -89,6 +89,8 @@ def test_a_pin_that_takes_other_particles_is_as_a_new_one(world, compliance, pre
         assert pin.indices[:, 0].tolist() == indices
     w.remove([0])
     assert pin.indices[:, 0].tolist() == [0, 2]
+    pin.target = w.position[pin.indices]
+    np.testing.assert_array_equal(pin.target, w.position[[0, 2]])
     for value, words in (
         ([0], "has 1 particles, but this Pin holds 2"),
         ([0, 9], "there are 5 particles"),

@@ -82,15 +82,15 @@ def test_a_muscle_does_the_work_of_its_load(world):
     assert w.step(DT).energy - before == pytest.approx(M * g * a, rel=1e-6)
 
 
-def crowd():
-    """Of what has rest values some, apart from each other: particles, features, and a function that turns all knobs."""
+def crowd(first=0):
+    """Of what has rest values some, apart from each other: particles, features of those from this number on, and a function that
+    turns all knobs."""
     x = [
         (-5.0, 0), (0, 0), (0.5, 0), (1, 0), (1.5, 0.2),  # one by itself; links, stop, rope
         (9, 0), (10, 0), (10, 1), (9, 1),  # loop
     ]  # fmt: skip
-    features = [
-        tv.Distance([[1, 2], [2, 3]]), tv.AngleLimit([[1, 2, 3]], -0.2, 0.3), tv.Area([[5, 6, 7, 8]]), tv.Rope([[3, 4]])
-    ]  # fmt: skip
+    links, stops, loops, ropes = (first + np.array(rows) for rows in ([[1, 2], [2, 3]], [[1, 2, 3]], [[5, 6, 7, 8]], [[3, 4]]))
+    features = [tv.Distance(links), tv.AngleLimit(stops, -0.2, 0.3), tv.Area(loops), tv.Rope(ropes)]
 
     def turn(features, by):
         link, stop, loop, rope = features
@@ -148,6 +148,21 @@ def test_copies_edits_and_recordings_know_where_a_ramp_begins(world, tmp_path):
             w.step(DT)
             recorder.log()
     assert tv.replay(tmp_path / "a.rrd").verify().kind == "intact"
+
+
+def test_what_comes_while_a_ramp_waits_begins_at_rest_values_of_its_own(world):
+    particles, features, turn = crowd()
+    n, far = len(particles), particles.position + [0, 20.0]
+    w = world(particles, features, solver=tv.Jacobi())
+    w.step(DT)
+    turn(features, 0.95)
+    twin = w.clone()
+    w.add(tv.Particles(far, mass=0.1), extend=dict(zip(features, crowd(n)[1], strict=True)))
+    w.step(DT)
+    twin.step(DT)
+    np.testing.assert_allclose(w.position[:n], twin.position, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(w.position[n:], far, rtol=0, atol=1e-5)
+    twin.close()
 
 
 def test_what_is_placed_anew_has_its_rest_values_at_once(world):

@@ -7,6 +7,7 @@ import tiverlet as tv
 from tiverlet.device import ti
 from tiverlet.features.feature import Batch
 from tiverlet.step import checkpoint
+from tiverlet.step.runner import Runner
 
 pytestmark = pytest.mark.usefixtures("read_here")
 
@@ -180,7 +181,12 @@ def test_bodies_go_whole_and_numbers_follow():
     assert shape._rest[[3, 4, 5]].tolist() == [[8.0, 9.0], [12.0, 13.0], [14.0, 15.0]]
 
 
-def test_after_an_error_the_world_is_as_before(world):
+def fails(*given):
+    """What goes wrong late."""
+    raise KeyError("late")
+
+
+def test_after_an_error_the_world_is_as_before(world, monkeypatch):
     x = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
     link, pin, used = tv.Distance([[0, 1], [1, 2]], compliance=1e-3), tv.Pin([0]), tv.Gravity(1.0)
     w = world(tv.Particles(x), [tv.Gravity(), link, pin], solver=tv.Jacobi())
@@ -210,6 +216,9 @@ def test_after_an_error_the_world_is_as_before(world):
         w.remove([0, 3])
     with pytest.raises(ValueError, match=r"mask of shape \(3,\)"):
         w.handle([True])
+    with monkeypatch.context() as patch, pytest.raises(KeyError, match="late"):  # when the world has its new parts already
+        patch.setattr(Runner, "pass_on", fails)
+        w.add(more, [tv.Gravity(1.0)])
     assert w.hash() == before and w.features[1] is link and (link.rest == rest).all() and len(w.particles) == 3
     w.run(0.1)
     assert w.add() is not None and w.time == pytest.approx(0.2)

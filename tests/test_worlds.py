@@ -253,6 +253,76 @@ def test_knobs_are_for_one_some_or_all(taichi):
     assert world.time == 0 and gravity.g == 9.81
 
 
+def test_drag_that_is_set_on_the_way_acts_from_then_on(taichi):
+    # v falls by exp(-rate t): the same rates set before and after a reset, with velocities assigned, and of one of them.
+    rate = np.array([0.5, 1.0, 2.0])
+    with tv.Worlds(tv.World(tv.Particles([[0.0, 0]], velocity=(1.0, 0)), [tv.Drag(0.1)], precision="f64"), 3) as many:
+        drag = many.features[0]
+
+        def falls(exponent):
+            many.run(0.5)
+            np.testing.assert_allclose(many.velocity[:, 0, 0], np.exp(-exponent * np.ones(3)), rtol=1e-12)
+
+        falls(0.05)
+        many.set(drag, rate=rate)
+        falls(0.05 + rate / 2)
+        many.reset()
+        falls(rate / 2)
+        many.reset()
+        many.set(drag, rate=2 * rate)
+        falls(rate)
+        many.velocity = [(1.0, 0)]
+        many.set(drag, some=[1], rate=[0.3])
+        falls(np.array([0.5, 0.15, 2.0]))
+        many.run(0.5, 1 / 50)
+        many.reset()
+        falls(np.array([0.5, 0.15, 2.0]))
+
+
+def sliding(friction=0.4, restitution=0.3, offset=0.0, between=0.5, apart=0.2, active=True):
+    """Two discs that slide on a floor, one into the other."""
+    start = tv.Particles([[0.0, 0.55], [1.3, 0.5]], radius=0.5, velocity=[[5.0, 0.0], [0.0, 0.0]])
+    floor = tv.HalfSpace((0, 1), offset, friction=friction, restitution=restitution, active=active)
+    return tv.World(start, [tv.Gravity(9.81), floor, tv.Contact(friction=between, restitution=apart)], precision="f64")
+
+
+def test_walls_and_contacts_take_each_knob_per_world(taichi):
+    # One after the other or in one call, before and after steps, with numbers for all in between: as worlds made with them.
+    first = dict(friction=[0.1, (0.3, 0.2), 0.5], restitution=[0.2, 0.3, 0.4]), dict(offset=[0.0, -0.1, -0.2])
+    second = dict(offset=[0.0, -0.2, -0.1], restitution=[0.5, 0.4, 0.3]), dict(friction=[(0.2, 0.1), (0.3, 0.2), (0.5, 0.1)])
+    between, apart = [0.1, (0.4, 0.3), 0.2], [0.3, 0.2, 0.1]
+    with tv.Worlds(sliding(), 3) as many:
+        _, floor, contact = many.features
+        for parts in first, second:
+            many.reset()
+            floor.offset = 0.3
+            for knobs in parts:
+                many.set(floor, **knobs)
+            assert many.velocity.shape == (3, 2, 2)
+            many.set(contact, friction=between)
+            many.set(contact, restitution=apart)
+            many.run(0.2)
+            values = parts[0] | parts[1] | dict(between=between, apart=apart)
+            with tv.Worlds([sliding(**{name: v[k] for name, v in values.items()}) for k in range(3)]) as made:
+                made.run(0.2)
+                np.testing.assert_array_equal(many.position, made.position)
+                np.testing.assert_array_equal(many.velocity, made.velocity)
+        assert [many[k].features[1].friction for k in range(3)] == second[1]["friction"]
+    with tv.Worlds([sliding(between={(0, 0): value}) for value in between]) as many:
+        assert many.each(lambda w: w.features[2].friction) == [{(0, 0): value} for value in between]
+
+
+def test_a_wall_that_is_off_in_some_lets_go_in_these_alone(taichi):
+    # Moved, then off in all: each goes on as in worlds that all had it, or had it not.
+    off, on = sliding(active=False), sliding()
+    with tv.Worlds([on, off]) as mixed, tv.Worlds(off, 2) as without, tv.Worlds(on, 2) as there:
+        for knobs in dict(restitution=[0.0, 0.0]), dict(offset=[-0.01, -0.01]), dict(active=[False, False]):
+            for many in mixed, without, there:
+                many.set(many.features[1], **knobs)
+                many.run(0.1)
+            assert mixed.hash(0) == there.hash(0) == there.hash(1) and mixed.hash(1) == without.hash(0) == without.hash(1)
+
+
 def test_one_that_is_taken_out_has_the_knobs_that_wait(taichi):
     # A force that changed: velocities are taken by what it was, as a clone of the world alone does. The others go on alike.
     world, alone = pendulum(), pendulum()

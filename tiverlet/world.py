@@ -240,7 +240,8 @@ class World:
         self, seconds: float, dt: float = 1 / 60, recorder=None, progress: bool = False, *, tolerance: float | None = None,
         budget: float | None = None,
     ) -> StepReport:  # fmt: skip
-        """Step for `seconds` [s] in frames of dt [s]; returns the worst figures of all frames.
+        """Step for `seconds` [s], to the nearest whole number of frames of dt [s] and at least one; returns the worst figures of
+        all frames.
 
         tolerance, budget: of each frame, see step(). recorder: a Recorder that logs each frame, or the path of one that is made
         for this run. progress: show a bar.
@@ -590,7 +591,8 @@ class World:
         Particles that overlap others part gently, as at the start.
 
         extend: features of the world, and others of their kind, whose constraints or bodies they take behind their own:
-        world.add(tv.Particles(more.position), extend={ropes: tv.Distance(more.links + n)}). Each feature has kernels to compile,
+        world.add(tv.Particles(more.position), extend={ropes: tv.Distance(more.links + n)}). All constraints take more but Pin,
+        Path, Constraint, and a ShapeMatch whose rest is given; and so does Polygons. Each feature has kernels to compile,
         but no kernel knows how many constraints there are: the first rope that comes as a tv.Distance of its own takes seconds,
         and so does the next one; those that a Distance is extended by take milliseconds.
 

@@ -59,7 +59,6 @@ class Collider(Feature):
     host_only = ("widest",)
     one_way: Any = None  # unit vector along which particles pass
     _switch = False  # it was made with one
-    _stands = True  # on the device
     sweeps = False  # needs the exact position at the start of the substep
     repeats = False  # one confine() may leave a particle that rubs or bounces where it has to be confined again
     dim = 0  # 2 or 3; 0 while it is not known
@@ -107,12 +106,12 @@ class Collider(Feature):
     @property
     def lets_go(self) -> bool:
         """Whether it bore what it no longer will."""
-        return self._stands and not self.active
+        return not self.active and self.stands
 
     @property
     def stands(self) -> bool:
         """Whether it is there, as the last frame had it."""
-        return self.active if self.scene is None else self._stands
+        return self.active if self.scene is None else self.dev.surface.stands
 
     @property
     def has_switch(self) -> bool:
@@ -130,12 +129,10 @@ class Collider(Feature):
         self.dev.surface = Surface(
             scene, repr(self), both, restitution, self.push_out, active, self.turns, self.dev.log, self.one_way
         )
-        self._stands = self.active
 
     def upload(self) -> None:
         """Write friction and restitution, and whether it is there."""
         self.dev.surface.upload(friction_of(repr(self), "friction", self.friction), self._bounce, self.active)
-        self._stands = self.active
 
     def can_regroup(self, change: Regrouping) -> bool:
         """Whether the widest particle, for which it was checked and made, is as wide as before."""

@@ -69,6 +69,11 @@ class Surface:
         if self.has_switch:
             self._memory.write(self.active, float(active))
 
+    @property
+    def stands(self) -> bool:
+        """Whether it is there, as the last frame had it."""
+        return not self.has_switch or bool(self._memory.read(self.active))
+
     @inline
     def static(self):
         """The coefficient of static friction."""

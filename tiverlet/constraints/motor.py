@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import checks
-from ..features.feature import Knob, Scene
+from ..features.feature import Feature, Knob, Scene
 from ..particles import Particles
 from .core.angle import TURN, DihedralAngle, PathAngle
 from .core.drive import Drive, largest_load
@@ -40,7 +40,7 @@ class Motor(Scalar):
     """
 
     index_name = "hinges"
-    driven, grows = True, False
+    driven = True
     each = ("speed", "angle", "torque", "compliance", "damping", "break_at")
     uploads_all = False  # goals are of one
     speed = Knob(lambda f, v: checks.per_item("Motor", "speed", v, f.count), "Angular velocity [rad/s].")
@@ -58,6 +58,12 @@ class Motor(Scalar):
         self.speed, self.torque = speed, torque
         if angle is not None:
             self.angle = angle
+
+    def check_more(self, more: Feature) -> None:
+        """Both turn at a speed, or to angles."""
+        super().check_more(more)
+        if more.serves != self.serves:  # type: ignore[attr-defined]
+            raise TypeError("World.add: extend: one Motor turns to an angle, and the other at a speed. Add it to features.")
 
     def _angle(self, value) -> np.ndarray:
         if not self.serves:

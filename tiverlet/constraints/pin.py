@@ -15,6 +15,8 @@ from .core.anchored import Anchored, one_each
 
 def _targets(pin: "Pin", target):
     target = checks.plain("Pin", "target", target)
+    if target.ndim == 3 and target.shape[1] == 1:  # as world.position[pin.indices]
+        target = target[:, 0]
     if target.ndim == 1:  # one point for all
         target = target[None].repeat(pin.count, axis=0)
     target = checks.points("Pin", "target", target, dim=pin.dim, count=pin.count)
@@ -82,9 +84,10 @@ class Pin(Anchored):
 
     C(x) = x - target (a vector), with unit gradients.
 
-    indices: (m,) particles. target: (m, dim) or (dim,) [m]; None holds them where they start. Both are live: assign to .target
-    between frames, and the particles go there in a straight line during the next frame; assign as many other particles to
-    .indices, and these are held from then on, as by a new Pin. That compiles nothing; a tv.Hand takes others faster still.
+    indices: (m,) particles, read as (m, 1), a row for each. target: (m, dim), (m, 1, dim) as world.position[pin.indices], or
+    (dim,) [m]; None holds them where they start. Both are live: assign to .target between frames, and the particles go there in a
+    straight line during the next frame; assign as many other particles to .indices, and these are held from then on, as by a new
+    Pin. That compiles nothing; a tv.Hand takes others faster still.
     compliance: number or (m,) [m/N]. 0 takes the particles out of the solver and drives them, whatever pulls at them; above 0
     they are drawn by a spring of stiffness 1 / compliance, as by a mouse. damping: [N s/m], of that spring.
 

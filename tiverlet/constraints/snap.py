@@ -5,7 +5,7 @@ from numpy.typing import ArrayLike
 
 from .. import checks
 from ..device import ti
-from ..features.feature import Scene
+from ..features.feature import Feature, Scene
 from ..particles import Particles
 from .core.anchor_passes import AnchorPasses, Place
 from .core.anchored import Anchored
@@ -77,6 +77,8 @@ class Snap(Anchored):
     `load` is the force on each particle [N].
     """
 
+    grows = True
+
     def __init__(self, indices, spacing, origin: ArrayLike = 0.0, *, compliance: ArrayLike, damping: ArrayLike = 0.0):
         self.setup(indices, compliance, damping)
         self.spacing, self.origin = spacing, origin
@@ -87,6 +89,16 @@ class Snap(Anchored):
             i = int(np.argmin(value))
             raise ValueError(f"Snap: compliance[{i}] = 0, but a rigid grid leaves nothing free; use Pin, or a small compliance.")
         return value
+
+    def check_more(self, more: Feature) -> None:
+        """Only of the same grid."""
+        super().check_more(more)
+        for name in ("spacing", "origin"):
+            mine, other = getattr(self, name), getattr(more, name)
+            if np.shape(mine) != np.shape(other) or np.any(np.asarray(mine) != other):
+                raise TypeError(
+                    f"World.add: extend: a Snap of {name} = {mine!r} cannot take one of {name} = {other!r}. Add it to features."
+                )
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Settle the grid."""

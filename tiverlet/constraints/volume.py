@@ -61,11 +61,6 @@ class Volume(Scalar):
         return Tetrahedra(self.fixed(indices, 4))
 
     @property
-    def grows(self) -> bool:
-        """Faces of surfaces are sorted anew into bodies."""
-        return bool(self.arity)
-
-    @property
     def faces(self) -> np.ndarray:
         """Faces of closed surfaces, (k, 3), as seen from outside. Raises AttributeError where there are tetrahedra."""
         if self.arity:

@@ -34,7 +34,7 @@ class Winch(Scalar):
 
     measures = Length
     side = 1
-    driven, grows = True, False
+    driven = True
     each = ("speed", "length", "shortest", "longest", "force", "compliance", "damping", "break_at")
     uploads_all = False  # goals are of one
     speed = Knob(lambda f, v: checks.per_item("Winch", "speed", v, f.count), "Change of length [m/s].")

@@ -39,9 +39,10 @@ class Contact(PairContact):
 
     friction: Coulomb, a number or (static, dynamic), or a mapping from pairs of groups to these: {(0, 1): 0.5}. restitution:
     0 to 1, or such a mapping. groups: the pairs of groups that touch, None for all. skin: how far beyond touching pairs are
-    listed [m], "auto" for 0.75 of the median radius; speed only, never the result. push_out: particles that overlap at the
-    start, or after positions were assigned, part at this speed [m/s] at most: they act as if they were small enough to fit, and
-    grow back. events: whether World.events() tells which pairs met and parted. sensors: pairs of groups that do not touch;
+    listed [m], "auto" for 0.75 of the median radius; speed only, never the result. push_out: two particles that overlap at
+    the start, or after positions were assigned, part at this speed [m/s] at most: they act as if they were small enough to fit,
+    and grow back. In a cluster each pair parts at about that speed, so its rim moves as much faster as there are pairs on the way
+    to it. events: whether World.events() tells which pairs met and parted. sensors: pairs of groups that do not touch;
     World.events() tells which particles of the second group, the sensors, overlap with those of the first. It costs least where
     sensors are few. loads: pairs know what they bear at rest, and hold it without overlap; see known_loads.py.
 

@@ -45,18 +45,20 @@ class Rebuild:
 
     def run(self) -> None:
         """Do it."""
-        parts = None
+        parts, before, memories = None, dict(vars(self.world)), self.world._runner.memories
         try:
             self._settle()
             self._take_apart()
             parts = self._assembled()
-            state = self._carried(parts.memory)
+            self._install(parts, self._carried(parts.memory))
         except BaseException:
             if parts:
                 parts.memory.destroy()
+            vars(self.world).update(before)
             self._undo()
             raise
-        self._install(parts, state)
+        for memory in memories:
+            memory.destroy()
 
     def _settle(self) -> None:
         """Keep the state; where forces will be others, such as displacements are in between, without a part of them."""
@@ -126,12 +128,13 @@ class Rebuild:
             f.__dict__.update(values)
         if self.world._clock.d_is_velocity != self.checkpoint.clock.d_is_velocity:
             checkpoint.put_back(self.world, self.checkpoint)
+        self.world._clock.put_back(self.checkpoint.clock)
 
     def _install(self, parts: Any, state: dict[str, np.ndarray]) -> None:
         """Put the parts into the world, and into these what stays."""
         world, last = self.world, self.world._runner
         contact = next((c for c in last.step.contacts if c in self.features), None)
-        reach, left, memories = last.scene.reach, last.left, last.memories
+        reach, left = last.scene.reach, last.left
         world._clock.parted = None
         world._install(world._particles.regrouped(self.some, self.added), self.features, parts)
         runner = world._runner
@@ -152,10 +155,8 @@ class Rebuild:
                 f.changed, f.moving = self.attributes[f].get("changed", True), self.attributes[f].get("moving", False)
                 f.new_force = self.attributes[f].get("new_force", False)
         for f, values in self.rests.items():
-            if f.ramp:
-                f.ramp.put([*values])  # from where they go to those that were assigned
-        for memory in memories:
-            memory.destroy()
+            if f.ramp:  # from where they go to those that were assigned; what came begins at its own
+                f.ramp.put([np.append(rows, now[len(rows) :]) for rows, now in zip(values, f.ramp.now(), strict=True)])
         if any(isinstance(f, PairContact) for f in self.came):
             world._clock.first_moved = 0
 

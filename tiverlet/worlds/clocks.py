@@ -13,7 +13,8 @@ NONE = -1  # for first_moved
 class Clocks:
     """Arrays with one value for each world; see Clock for what they mean.
 
-    energy, bound: NaN where it is not known. first_moved: NONE where nothing was placed. frame: (worlds, 3).
+    energy, bound: NaN where it is not known. first_moved: NONE where nothing was placed. frame: (worlds, 3). asks_drag: whether
+    knobs may ask for other factors of drag than a clock and the device have.
     """
 
     def __init__(self, clocks: list[Clock]):
@@ -27,6 +28,7 @@ class Clocks:
         self.first_moved = np.array([NONE if clock.first_moved is None else clock.first_moved for clock in clocks])
         # What differs from world to world in rare cases only, or is the same for all.
         self.drag = [clock.drag for clock in clocks]
+        self.asks_drag = np.zeros(self.count, dtype=bool)
         self.parted = {k: clock.parted for k, clock in enumerate(clocks) if clock.parted is not None}
 
     time: np.ndarray
@@ -80,6 +82,7 @@ class Clocks:
         for name in (*PLAIN, "frame", "energy", "bound", "known", "first_moved"):
             getattr(self, name)[some] = getattr(other, name)[some]
         for k in map(int, some):
+            self.asks_drag[k] |= self.drag[k] != other.drag[k]
             self.drag[k] = other.drag[k]
             self.parted.pop(k, None)
             if k in other.parted:

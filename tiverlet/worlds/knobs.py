@@ -1,7 +1,7 @@
 """Knobs that differ from world to world."""
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -41,28 +41,40 @@ class Knobs:
         for (i, name), values in self._given.items():
             self.features[i].__dict__[name] = values if k is None else values[k]
 
+    @contextlib.contextmanager
+    def shown(self, k: int) -> Iterator[None]:
+        """Meanwhile features have the knobs of the k-th."""
+        self.show(k)
+        try:
+            yield
+        finally:
+            self.show(None)
+
     def set(self, i: int, chosen: np.ndarray, knobs: dict[str, Any]) -> None:
         """Give knobs of the i-th feature other values in the chosen worlds, see Worlds.set()."""
         f = self.features[i]
+        self.forget_assigned()
         for name, values in knobs.items():
             if name not in knobs_of(type(f)):
                 live = ", ".join(knobs_of(type(f))) or "nothing"
                 raise AttributeError(f"Worlds.set: {name} is no knob of {f!r}{meant(name, knobs_of(type(f)))}. Live are {live}.")
-            if np.ndim(values) == 0 or len(values) != len(chosen):
-                has = "one value" if np.ndim(values) == 0 else f"{len(values)} values"
+            one = not isinstance(values, (list, tuple)) and np.ndim(values) == 0
+            if one or len(values) != len(chosen):
+                has = "one value" if one else f"{len(values)} values"
                 raise ValueError(f"Worlds.set: {name} has {has}, but there are {len(chosen)} worlds. Give each its own.")
             knob, before = getattr(type(f), name), vars(f)[name]
-            every = list(before) if (i, name) in self._given and before is self._given[i, name] else [before] * self.count
+            every = list(before) if (i, name) in self._given else [before] * self.count
             k = -1
             try:
                 for k, value in zip(chosen, values, strict=True):
-                    every[k] = knob.check(f, value)
-                    if not f.uploads_all:
-                        _check_fits(f, name, every[k], before)
+                    with self.shown(k):  # for knobs are checked against each other
+                        every[k] = knob.check(f, value)
+                        if not f.uploads_all:
+                            _check_fits(f, name, every[k])
                 together = _stacked(every)
                 if f.uploads_all:
                     k = -1
-                    _check_fits(f, name, together, before)
+                    _check_fits(f, name, together)
             except (ValueError, TypeError) as error:
                 if k >= 0:
                     error.add_note(f"That is what Worlds.set was given for world {k}.")
@@ -111,6 +123,11 @@ class Knobs:
             return np.ones(self.count, dtype=bool)
         return np.any([np.zeros(self.count, dtype=bool), *self._set.values()], axis=0)
 
+    def waiting_of(self, feature: Feature) -> np.ndarray:
+        """The worlds in which a knob of a feature waits."""
+        of = self._set.get(self.features.index(feature), np.zeros(self.count, dtype=bool))
+        return of | feature.changed
+
     @property
     def waiting(self) -> np.ndarray:
         """The worlds in which something waits."""
@@ -140,9 +157,9 @@ class Knobs:
                 _set_flags(f, flags)
 
 
-def _check_fits(feature: Feature, name: str, value: Any, before: Any) -> None:
+def _check_fits(feature: Feature, name: str, value: Any) -> None:
     """Refuse what asks for other kernels."""
-    vars(feature)[name] = value
+    before, vars(feature)[name] = vars(feature)[name], value
     try:
         if feature.outgrown:
             _refuse_outgrown(feature)
@@ -172,14 +189,16 @@ def _other_knobs(worlds: "list[World]") -> dict[tuple[int, str], Any]:
     for i, alike in enumerate(zip(*(world.features for world in worlds), strict=True)):
         for name in knobs_of(type(alike[0])):
             values = [vars(f)[name] for f in alike if name in vars(f)]
-            if len(values) == len(worlds) and any(not np.array_equal(v, values[0]) for v in values):
+            if len(values) == len(worlds) and any(not _same(v, values[0]) for v in values):
                 out[i, name] = _stacked(values)
     return out
 
 
+def _same(one: Any, other: Any) -> bool:
+    """Whether two values of a knob are equal; of mappings, NumPy would compare the keys."""
+    return one == other if isinstance(one, Mapping) else not isinstance(other, Mapping) and np.array_equal(one, other)
+
+
 def _stacked(values: list[Any]) -> Any:
-    """An array of what each world has; a list of what makes none."""
-    try:
-        return np.array(values)
-    except ValueError:
-        return values
+    """An array of what each world has; a list of what is no number and no array, such as (static, dynamic)."""
+    return values if any(isinstance(v, (tuple, Mapping)) for v in values) else np.array(values)

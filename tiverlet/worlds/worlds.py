@@ -149,7 +149,8 @@ class Worlds:
             return self._launch(dt, 1, *self._begin(dt))
 
     def run(self, seconds: float, dt: float = 1 / 60, progress: bool = False) -> WorldsReport:
-        """Step all of them for `seconds` [s] in frames of dt [s], many in a launch; returns the worst figures of all frames."""
+        """Step all of them for `seconds` [s], to the nearest whole number of frames of dt [s], many in a launch; returns the
+        worst figures of all frames."""
         return self._frames("Worlds.run", seconds, dt, 0, None, progress)
 
     def rollout(self, seconds: float, dt: float = 1 / 60, every: int = 1, progress: bool = False) -> Rollout:
@@ -200,10 +201,11 @@ class Worlds:
         """Make all ready for substeps of this length, see Runner.begin(). Returns of each how far particles were moved, and what
         a shorter substep released."""
         world, runner, clocks = self._world, self._runner, self._clocks
-        drags = any(f.changed for f in runner.drags)  # what the clocks have of them is of other rates
+        for drag in runner.drags:
+            clocks.asks_drag |= self._knobs.waiting_of(drag)
         self._upload()
         h = dt / world.substeps * runner.integrator.first
-        ready = (clocks.first_moved == NONE) & (clocks.h == h) & (not drags)
+        ready = (clocks.first_moved == NONE) & (clocks.h == h) & ~clocks.asks_drag
         clocks.since[ready & clocks.d_is_velocity] = 0
         moved, released, jumped = np.zeros(len(self)), np.zeros(len(self)), np.zeros(len(self), dtype=bool)
         some = np.flatnonzero(~ready)
@@ -229,7 +231,7 @@ class Worlds:
                     runner.ease(int(clocks.first_moved[k]))
         for contact in runner.step.contacts:
             runner.memory.write_some(contact.dev.fast, 1, np.flatnonzero(jumped))
-        clocks.first_moved[some] = NONE
+        clocks.first_moved[some], clocks.asks_drag[some] = NONE, False
         self._start = self._start or _Start(self)
         return moved, released
 
@@ -315,11 +317,8 @@ class Worlds:
         while len(some):
             plan[kernel.COUNT], plan[kernel.GRAIN] = len(some), self._kernels.grain(len(some))
             which[: len(some)] = some
-            self._knobs.show(0)  # kernels are compiled for whether there is friction, which is the same in all
-            try:
+            with self._knobs.shown(0):  # kernels are compiled for whether there is friction, which is the same in all
                 CachedLaunch(self._kernels, "run", memory.compiler, plan, which, figures.reshape(-1), track)()
-            finally:
-                self._knobs.show(None)
             if not runner.step.searches:
                 return
             sheets = memory.read(self._kernels.sheet)
@@ -541,7 +540,7 @@ class Worlds:
         if len(some):
             firm, soft = shares_of(clocks.h[some], clocks.started[some], clocks.lacked[some], clocks.drags[some])
             given = np.stack([clocks.h[some], clocks.time[some], firm, soft], axis=1)
-            with runner.memory.compiler():
+            with runner.memory.compiler(), self._knobs.shown(0):
                 self._kernels.velocities(len(some), some, given, out.reshape(-1))
             for path in runner.paths:
                 turned = out[some]
@@ -712,6 +711,8 @@ class _Start:
             runner.memory.write_some(log.made, 0, chosen)
         runner.invalidate(chosen)
         worlds._clocks.return_to(self.clocks, chosen)
+        if runner.drags:
+            runner.memory.write_some(runner.integrator.decay, [[self.clocks.drag[k]] for k in chosen], chosen)
 
 
 class _Source:

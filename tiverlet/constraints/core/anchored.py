@@ -52,6 +52,10 @@ class Anchored(Batch):
         """The particle of each constraint."""
         return self.indices[:, 0]
 
+    def hold_all(self, listing: Any) -> None:
+        """Act on these."""
+        self._keep(members=one_each(repr(self), listing))
+
     @property
     def soft(self) -> bool:
         """Whether any of them is a spring, or was when kernels were compiled."""
