@@ -211,12 +211,9 @@ class World:
             self._start_from(self.velocity)
 
     def _start_from(self, velocity: np.ndarray) -> None:
-        clock, state = self._clock, self._runner.scene.state
-        if state.spins and not clock.d_is_velocity:
-            with self._runner.memory.compiler():
-                self._runner.memory.write(state.spin.s, self._runner.spin())
-        state.start(self._runner.memory, velocity)
-        clock.d_is_velocity, clock.energy, clock.owed, clock.parted = True, None, 0.0, None
+        with self._runner.memory.compiler():
+            self._runner.start(velocity)
+        self._clock.energy = None
 
     def _adapt(self, steps: bool = False) -> None:
         """Settle forces; where knobs ask for what the kernels do not have, build the world anew. steps: a frame comes next,
@@ -326,12 +323,13 @@ class World:
             others = (value != seen).any(axis=1)
             if not others.any():
                 return
-            if self._clock.d_is_velocity or self._order > 2 or not np.isfinite(seen).all():
+            runner, clock = self._runner, self._clock
+            known = seen if clock.parted is None else None
+            if clock.d_is_velocity or runner.probe or not impulse.steer(runner, value, others, self._iterations, known):
                 self._start_from(value)
             else:
-                self._runner.wake(np.flatnonzero(others))
-                impulse.give(self._runner, value, others, self._iterations, seen if self._clock.parted is None else None)
-                self._clock.energy, self._clock.parted = None, value.copy()
+                runner.wake(np.flatnonzero(others))
+                clock.energy, clock.parted = None, value.copy()
 
     @property
     def spin(self) -> np.ndarray:
@@ -355,6 +353,8 @@ class World:
                 watcher.assigned("spin", value)
             runner, clock, spin = self._runner, self._clock, self._runner.scene.state.spin
             new, others = spin.from_rates(value), (value != self.spin).reshape(len(value), -1).any(axis=1)
+            if runner.probe or (impulse.rubs(runner) and impulse.leans(runner, others, self._iterations)):
+                self._let_go()  # friction becomes another one
             if not clock.d_is_velocity:
                 with runner.memory.compiler():
                     lack = np.where(others[:, None], new - runner.spin(), 0.0)

@@ -1,6 +1,7 @@
 """Beads on a wire."""
 
 import warnings
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -136,16 +137,17 @@ class Path(Anchored):
             self.scene.memory.write(self.dev.place.target, self.speed if self.dev.place.moves else self.at)
             self.moving = not self.dev.place.moves
 
-    def point_along(self, velocity: np.ndarray, some: np.ndarray | None = None) -> None:
-        """Of what it drives, turn velocities (..., n, dim), each along its way in the last substep, to where the curve goes now.
-        some: of these worlds, where there are many."""
-        place, rows = self.dev.place, self.indices[:, 0]
-        s = self.scene.memory.read(place.source if place.moves else place.target)[..., : self.count]
-        s = s if some is None else s[some]
-        tangent = self.curve.tangent(s)
-        v = velocity[..., rows, :]
-        forward = np.copysign(np.linalg.norm(v, axis=-1), (v * tangent).sum(axis=-1))
-        velocity[..., rows, :] = forward[..., None] * tangent
+    def point_along(self, velocity: np.ndarray, dt: Any, some: np.ndarray | None = None) -> None:
+        """Give what it drives its part of velocities (..., n, dim): along the curve where it is now, at the speed of the last
+        frame, dt [s]; 0 at the ends of an open curve. some: of these worlds, where there are many."""
+        place, read = self.dev.place, self.scene.memory.read
+        begin, end = (read(field)[..., : self.count] for field in (place.source, place.target))
+        if some is not None:
+            begin, end = begin[some], end[some]
+        s, speed = (begin, end) if place.moves else (end, (end - begin) / np.reshape(dt, (-1, 1) if np.ndim(dt) else ()))
+        if not self.curve.closed:
+            speed = np.where((s <= 0) & (speed < 0) | (s >= self.length) & (speed > 0), 0.0, speed)
+        velocity[..., self.indices[:, 0], :] = speed[..., None] * self.curve.tangent(s)
 
     def end_motion(self) -> None:
         """The next frame starts from where this one went."""

@@ -37,15 +37,16 @@ class Clock:
     """The time of a world, and what belongs to it.
 
     time: simulated [s]. tick, since: substeps so far, and since the last start, modulo 2^31. h: the last substep [s].
-    d_is_velocity: whether displacements are velocities, as before a start. started: whether the last substep was the first after
-    one. longest: substep [s] since violations were last taken out, see projection.py. frame: when frames of the present length
-    began [s], their length [s], their number. drag: what it makes of h, see integrator.decay(). owed: [s] of the kick by rigid
-    constraints that velocities before a start lack. lacked: the same of the start that the last substep was; 0 where it was none.
-    parted: velocities, until the next step, where constraints were
-    removed that have a part in them. first_moved: the first of the particles that the user placed and that were not looked at
-    yet. energy: at the end of the last frame [J]; None: not known. softened: whether loads had no direction in it, and were held
-    by violations. bound, kinetic, parting: the energy that nothing should exceed [J], None where it is not known; the most of it
-    that was kinetic since; whether what was placed into each other still parts; see energy_bound.py.
+    d_is_velocity: whether displacements are velocities, as before a start. started: whether the last substep was the first
+    after one. longest: substep [s] since violations were last taken out, see projection.py. frame: when frames of the present
+    length began [s], their length [s], their number. drag: what it makes of h, see integrator.decay(). owed: [s] of the kick
+    by rigid constraints that velocities before a start lack. lacked: the same of the start that the last substep was; 0 where
+    it was none. parted: velocities, until the next step, where constraints were removed that have a part in them, or where
+    they were assigned: a start before that starts from these. first_moved: the first of the particles that the user placed
+    and that were not looked at yet. energy: at the end of the last frame [J]; None: not known. softened: whether loads had no
+    direction in it, and were held by violations. bound, kinetic, parting: the energy that nothing should exceed [J], None
+    where it is not known; the most of it that was kinetic since; whether what was placed into each other still parts; see
+    energy_bound.py.
     """
 
     time: float = 0.0
@@ -126,6 +127,7 @@ class Clock:
         """What of it is hashed: what the next frames depend on."""
         later: list[Any] = [self.longest] if self.longest > self.h else []  # seen when h changes
         later += ["softened"] if self.softened else []
+        later += [] if self.parted is None else [np.asarray(self.parted, dtype=np.float64).tobytes()]
         return [self.time, self.tick, self.since, self.h, self.d_is_velocity, *later]
 
     def sound(self, particles: int, dim: int) -> bool:

@@ -16,6 +16,7 @@ from ..neighbours.periodic import Periodic
 from ..particles import Particles
 from . import edit_in_place, impulse, initial_violation
 from .build import check_settings, checked_features, listed
+from .integrator import FREE
 from .sleep import Sleep
 
 NONE: Mapping[Feature, Feature] = MappingProxyType({})
@@ -156,17 +157,21 @@ def renew(world: Any) -> None:
     told = world._all_events() if runner.logs else world._events
     loose = np.zeros(runner.n, dtype=bool)
     loose[grabbing.some] = runner.scene.inv_mass[grabbing.some] == 0
-    free = not clock.d_is_velocity and loose.any()
-    seen = runner.memory.seen(runner.scene.state.d)[: runner.n] / clock.h if free else None
+    seen = clock.parted
+    if seen is None and loose.any() and not clock.d_is_velocity:
+        seen = runner.memory.seen(runner.scene.state.d)[: runner.n] / clock.h
     if grabbing.soft:
         with runner.memory.compiler():
             runner.restart_between(world.iterations)
-    clock.parted = clock.energy = None
+    clock.energy = None
     runner.wake()
     edit_in_place.grab(world, grabbing)
     world._events = told
     if seen is not None:
-        impulse.give(runner, seen, loose, world.iterations)
+        _let_go(world, seen, loose)
+    if clock.parted is not None:
+        held = runner.scene.inv_mass == 0
+        clock.parted = np.where(held[:, None], runner.memory.read(runner.scene.state.d)[: runner.n] / clock.h, clock.parted)
     for watcher in world._watchers:
         watcher.regrouped()
 
@@ -193,7 +198,8 @@ def _seen(
     loose, loses = np.zeros(len(some), dtype=bool), world._clock.parted is not None
     for f in world.features:
         if isinstance(f, Pin) and f in features and f.afresh:  # which takes others
-            loose[f.held] = loses = f.drives
+            if f.drives:
+                loose[f.held] = loses = True
         elif isinstance(f, Batch | PairContact):
             stays = f.kept_mask(number)[0] if f in features else np.zeros(1, dtype=bool)
             if not stays.all():
@@ -229,12 +235,21 @@ def _edited(
         _launch(world, n)
     if seen is not None:  # what went has left its part in the velocities of what stays
         seen = seen[some] if added is None else np.concatenate([seen[some], added.velocity])
-        impulse.give(world._runner, seen, np.concatenate([loose[some], np.zeros(m, dtype=bool)]), world.iterations)
+        _let_go(world, seen, np.concatenate([loose[some], np.zeros(m, dtype=bool)]))
         if not clock.d_is_velocity:
             d, held = world._runner.memory.read(world._runner.scene.state.d)[: n + m], world._runner.scene.inv_mass == 0
             clock.parted = np.where(held[:, None], d / clock.h, seen)
     for watcher in world._watchers:
         watcher.regrouped()
+
+
+def _let_go(world: Any, seen: np.ndarray, loose: np.ndarray) -> None:
+    """Have the particles in the mask `loose` go on with the velocities that they had, (n, dim)."""
+    runner, clock = world._runner, world._clock
+    drag = (clock.drag or FREE)[0]
+    plain = clock.d_is_velocity or not (runner.probe or drag < impulse.WEAK)
+    if loose.any() and not (plain and impulse.give(runner, seen, loose, world.iterations)):
+        world._start_from(seen)
 
 
 def _launch(world: Any, first: int) -> None:

@@ -3,6 +3,9 @@
 A velocity is (share d + rest (h^2 a + reaction)) / h, see Integrator.velocity_after(). So what a particle lacks of the velocity
 that it is to have, times h / share, is what its displacement lacks. Nothing else of the state changes: what is to have the
 velocity that it has goes on to the bit, known loads stay known, and sound goes on being damped, as they would not after a start.
+
+The half of the reaction that this leaves in d has to go on in the next substep. It does not where what leaned on something
+leaves it, or friction turns round: there velocities are a start, see suffices().
 """
 
 from collections.abc import Callable
@@ -12,8 +15,11 @@ import numpy as np
 
 from .integrator import FREE
 
-ROUNDS = 100  # of asking for velocities, at most, where forces read them
+ROUNDS = 2, 100  # of asking for velocities, at most: one for what the first one rounded; or more, where forces read them
 NOTHING = 2.0**-20  # of a velocity: less than this of it is in the next displacement
+WEAK = 0.01  # the same: below it, displacements tell velocities by too few digits
+LEANS = 0.25  # of what half of a reaction gives: a change of velocity after which it goes on
+MET = 1e-5  # of the largest velocity: what may be lacking where forces read velocities
 Write = Callable[[Any, np.ndarray], None]
 
 
@@ -57,13 +63,13 @@ class Displacements:
 
     def give(
         self, want: np.ndarray, velocity: Callable[[], np.ndarray], factor: np.ndarray, seen: np.ndarray | None = None
-    ) -> None:
+    ) -> np.ndarray:
         """Have them stand for velocities `want`, (worlds, ..., dim): at once, or one time after the other where forces read
         velocities, until these come no nearer. velocity: asks for those that they stand for. factor: of each world, see factor().
-        seen: what velocity() would say at first, if that is known."""
+        seen: what velocity() would say at first, if that is known. Returns in which worlds that was found, (worlds,)."""
         more = best = np.zeros(want.shape)
         least, factor = np.full(len(want), np.inf), factor.reshape(-1, 1, 1)
-        for _ in range(ROUNDS if self.again else 1):
+        for _ in range(ROUNDS[self.again]):
             lack = np.where(self.some, want - (velocity() if seen is None else seen), 0.0)
             seen = None
             most = np.abs(lack).max(axis=(1, 2), initial=0.0)
@@ -74,28 +80,68 @@ class Displacements:
             self.lengthen(more)
             if not nearer.any():
                 break
+        return least <= MET * np.abs(want).max(axis=(1, 2), initial=0.0) if self.again else np.ones(len(want), dtype=bool)
 
 
-def give(runner: Any, want: np.ndarray, some: np.ndarray, iterations: int, seen: np.ndarray | None = None) -> None:
-    """Have the particles of the mask `some`, (n,), that can move go on with velocities `want`, (n, dim) [m/s]. seen: those that
-    they have, where that is known."""
+def suffices(want: np.ndarray, seen: np.ndarray, bare: np.ndarray, some: np.ndarray, rubs: bool, drag: np.ndarray) -> np.ndarray:
+    """In which worlds an impulse does for velocities `want` of the particles `some`, (worlds,).
+
+    seen: those that they have; bare: without what constraints, contacts and walls give in half a substep. A change by more than
+    a part of that, along it, or with friction in any direction, may end it. drag: of each world, (worlds, 5).
+    """
+    change, leaning = want - seen, seen - bare
+    size = np.linalg.norm(leaning, axis=2)
+    part = np.linalg.norm(change, axis=2) * size if rubs else np.abs((change * leaning).sum(axis=2))
+    ends = some & ~(part <= LEANS * size * size)  # so is what is no number
+    return ~ends.any(axis=1) & (drag[:, 0] >= WEAK)
+
+
+def rubs(runner: Any) -> bool:
+    """Whether anything has friction."""
+    return any(c.has_friction for c in runner.step.contacts) or any(wall.has_friction for wall in runner.step.walls)
+
+
+def steer(runner: Any, want: np.ndarray, some: np.ndarray, iterations: int, seen: np.ndarray | None = None) -> bool:
+    """Have the particles of the mask `some`, (n,), that can move go on with velocities `want`, (n, dim) [m/s], if an impulse does
+    for it; returns whether. seen: what Runner.velocity() says, if that is known."""
     rows = np.flatnonzero(some & (runner.scene.inv_mass > 0))
     if not len(rows):
-        return
+        return True
+    first, end = int(rows[0]), int(rows[-1]) + 1
+    chosen, drag = np.isin(np.arange(first, end), rows), np.array([runner.clock.drag or FREE])
+    with runner.memory.compiler():
+        had = runner.velocity(iterations) if seen is None else seen
+        bare = runner.velocity(iterations, first, end, firm=False)[None]
+    if not suffices(want[None, first:end], had[None, first:end], bare, chosen[None], rubs(runner), drag)[0]:
+        return False
+    return give(runner, want, some, iterations, had)
+
+
+def leans(runner: Any, some: np.ndarray, iterations: int) -> bool:
+    """Whether constraints, contacts or walls gave anything to any of the particles `some`, (n,)."""
+    with runner.memory.compiler():
+        seen, bare = (runner.velocity(iterations, firm=firm) for firm in (True, False))
+    return bool((seen != bare)[some].any())
+
+
+def give(runner: Any, want: np.ndarray, some: np.ndarray, iterations: int, seen: np.ndarray | None = None) -> bool:
+    """Have the particles of the mask `some`, (n,), that can move go on with velocities `want`, (n, dim) [m/s]. Returns whether
+    displacements were found that stand for these. seen: what Runner.velocity() says, if that is known."""
+    rows = np.flatnonzero(some & (runner.scene.inv_mass > 0))
+    if not len(rows):
+        return True
     memory, first, end = runner.memory, int(rows[0]), int(rows[-1]) + 1
     chosen = np.zeros(end - first, dtype=bool)
     chosen[rows - first] = True
     if runner.clock.d_is_velocity:
         d = memory.seen(runner.scene.state.d)[first:end]
         memory.write_from(runner.scene.state.d, first, np.where(chosen[:, None], want[first:end], d))
-        return
+        return True
     with memory.compiler():
-        _those(runner, first, chosen).give(
-            want[None, first:end],
-            lambda: runner.velocity(iterations, first, end)[None],
-            _factor(runner),
-            None if seen is None else seen[None, first:end],
-        )
+        those = _those(runner, first, chosen)
+        had = None if seen is None else seen[None, first:end]
+        found = those.give(want[None, first:end], lambda: runner.velocity(iterations, first, end)[None], _factor(runner), had)
+    return bool(found[0])
 
 
 def give_new(runner: Any, first: int, want: np.ndarray, iterations: int) -> None:

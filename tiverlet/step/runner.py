@@ -274,14 +274,22 @@ class Runner:
         clock = self.clock
         if not clock.d_is_velocity:
             if clock.parted is not None:
-                self.scene.state.start(self.memory, clock.parted)
-                clock.owed = 0.0
+                held = (self.scene.inv_mass == 0)[:, None]
+                self.start(np.where(held, self.memory.read(self.scene.state.d)[: self.n] / clock.h, clock.parted))
             elif self.probe:
                 self.memory.write(self.scene.state.d, high_order.velocity(self.probe, clock, self.memory, iterations))
             else:
                 self.step.to_velocity(clock.h, clock.time)
                 clock.owed = (clock.drag or FREE)[3] * clock.h
             clock.d_is_velocity, clock.parted = True, None
+
+    def start(self, velocity: np.ndarray) -> None:
+        """Have the next substep start from these velocities, (n, dim), and the present spins; with memory.compiler()."""
+        clock, state = self.clock, self.scene.state
+        if state.spins and not clock.d_is_velocity:
+            self.memory.write(state.spin.s, self.spin())
+        state.start(self.memory, velocity)
+        clock.d_is_velocity, clock.owed, clock.parted = True, 0.0, None
 
     def restart_between(self, iterations: int) -> None:
         """The same between frames: what residuals of the last substep go by stays known."""
@@ -307,9 +315,11 @@ class Runner:
         if self.step.walls:
             self.step.stopped(before)
 
-    def velocity(self, iterations: int, first: int = 0, end: int | None = None, came: bool = False) -> np.ndarray:
+    def velocity(
+        self, iterations: int, first: int = 0, end: int | None = None, came: bool = False, firm: bool = True
+    ) -> np.ndarray:
         """Velocities as the user sees them, to the order of the world; of particles from number `first` on, up to `end`. came:
-        they touch nothing yet."""
+        they touch nothing yet. firm: with what rigid constraints, contacts and walls give to them."""
         clock = self.clock
         if clock.d_is_velocity:
             out = self.memory.read(self.scene.state.d).astype(np.float64)
@@ -318,13 +328,13 @@ class Runner:
         else:
             if not came:
                 self._list_again()
-            out = self._velocities(first, end)
-            for path in self.paths if out.shape[0] == self.n else ():
-                path.point_along(out)
+            out = self._velocities(first, end, firm)
+            for path in self.paths if len(out) == self.n else ():
+                path.point_along(out, clock.frame[1])
             return out
         return out[first : self.n if end is None else end]
 
-    def _velocities(self, first: int = 0, end: int | None = None) -> np.ndarray:
+    def _velocities(self, first: int = 0, end: int | None = None, firm: bool = True) -> np.ndarray:
         """Have the kernel make velocities of displacements."""
         launch = self._velocity
         if launch is None or len(launch.arrays[1]) < self.n:
@@ -334,6 +344,7 @@ class Runner:
         given, out = launch.arrays
         end = self.n if end is None else end
         given[:] = self.clock.h, self.clock.time, *self.shares(), first, end
+        given[2] *= firm
         launch()
         return out[first:end].copy()
 

@@ -17,11 +17,10 @@ from ..features.arguments import knobs_of, meant
 from ..features.feature import Feature
 from ..features.read_only import assign_whole, read_only
 from ..particles import in_range
-from ..step import checkpoint, energy_bound
+from ..step import checkpoint, energy_bound, impulse
 from ..step import frames as kernel
 from ..step.clock import CHANGED, PARTED, SQUEEZED, room, slack
 from ..step.diagnostics import ENERGY, EXTENT, KINETIC, OVERLAP, REACH, STARTED, STEPPED, STIFFNESS, TURNS, UNSTEPPED, risks
-from ..step.impulse import Displacements, factor
 from ..step.integrator import shares_of
 from ..world import World
 from .clocks import NONE, Clocks
@@ -526,7 +525,8 @@ class Worlds:
         with self._open():
             return read_only(self._velocities(), assign_whole("Worlds", "velocity"))
 
-    def _velocities(self) -> np.ndarray:
+    def _velocities(self, firm: bool = True) -> np.ndarray:
+        """Those of all. firm: with what rigid constraints, contacts and walls give to them."""
         runner, clocks = self._runner, self._clocks
         out = runner.memory.read(runner.scene.state.d)[:, : runner.n].astype(np.float64)
         saved = runner.memory.read(runner.search.list.old_saved)[:, 0] if runner.search else np.zeros(len(self))
@@ -538,13 +538,13 @@ class Worlds:
         alone &= ~there
         some = np.flatnonzero(~there & ~alone).astype(np.int32)
         if len(some):
-            firm, soft = shares_of(clocks.h[some], clocks.started[some], clocks.lacked[some], clocks.drags[some])
-            given = np.stack([clocks.h[some], clocks.time[some], firm, soft], axis=1)
+            rigid, soft = shares_of(clocks.h[some], clocks.started[some], clocks.lacked[some], clocks.drags[some])
+            given = np.stack([clocks.h[some], clocks.time[some], rigid * firm, soft], axis=1)
             with runner.memory.compiler(), self._knobs.shown(0):
                 self._kernels.velocities(len(some), some, given, out.reshape(-1))
             for path in runner.paths:
                 turned = out[some]
-                path.point_along(turned, some)
+                path.point_along(turned, clocks.frame[some, 1], some)
                 out[some] = turned
         for k in np.flatnonzero(alone):
             with self._at(k) as world:
@@ -571,24 +571,30 @@ class Worlds:
     def _give(self, velocity: np.ndarray, chosen: np.ndarray) -> None:
         """Have some go on with these velocities, (some, n, dim), see World.velocity."""
         clocks, runner = self._clocks, self._runner
-        seen = self._velocities()[chosen]
-        others = (velocity != seen).any(axis=2)
+        others = (velocity != self._velocities()[chosen]).any(axis=2)
         moved = others.any(axis=1)
-        fresh = moved & (clocks.d_is_velocity[chosen] | bool(runner.probe) | ~np.isfinite(seen).all(axis=(1, 2)))
-        self._start_from(velocity[fresh], chosen[fresh])
-        given = moved & ~fresh
-        if given.any():
-            some, memory, n = chosen[given], runner.memory, runner.n
-            known = {int(k): clocks.parted.pop(int(k)) for k in some if int(k) in clocks.parted}
+        steered = moved & ~clocks.d_is_velocity[chosen] & (not runner.probe)
+        if steered.any():
+            some, memory, n = chosen[steered], runner.memory, runner.n
+            for k in some:
+                clocks.parted.pop(int(k), None)
             inv_mass = [self._sources[k].inv_mass for k in some] if self._sources else runner.scene.inv_mass
-            free = others[given] & (np.asarray(inv_mass) > 0)
-            those = Displacements(
-                runner, free, lambda field: memory.read(field)[some, :n], lambda field, v: memory.write_some(field, v, some)
-            )
-            seen = self._velocities()[some] if known else seen[given]
-            those.give(velocity[given], lambda: self._velocities()[some], factor(clocks.h[some], clocks.drags[some]), seen)
-            clocks.known[some] = False
-            clocks.parted.update(zip(some.tolist(), velocity[given], strict=True))
+            free, want, drag = others[steered] & (np.asarray(inv_mass) > 0), velocity[steered], clocks.drags[some]
+            seen, bare = (self._velocities(firm)[some] for firm in (True, False))
+            does = impulse.suffices(want, seen, bare, free, impulse.rubs(runner), drag)
+            some, free, want, drag = some[does], free[does], want[does], drag[does]
+            steered[steered] = does
+            if len(some):
+                those = impulse.Displacements(
+                    runner, free, lambda field: memory.read(field)[some, :n], lambda field, v: memory.write_some(field, v, some)
+                )
+                factor = impulse.factor(clocks.h[some], drag)
+                found = those.give(want, lambda: self._velocities()[some], factor)
+                steered[steered] = found
+                clocks.known[some] = False
+                clocks.parted.update((int(k), want[i]) for i, k in enumerate(some) if found[i])
+        fresh = moved & ~steered
+        self._start_from(velocity[fresh], chosen[fresh])
 
     def _start_from(self, velocity: np.ndarray, chosen: np.ndarray) -> None:
         """Have some go on with these velocities, (some, n, dim)."""

@@ -184,7 +184,8 @@ class ClusterPasses(Passes):
             start, end, cosine = rotation.turn(K, X, U, first > 0, rigid, soft, self.turn[c], LEAST, self.spring.soft)
             pose = rotation.matrix(end)
             self.place[c] = p - pose @ q
-            if not ti.math.isnan(end.sum()):  # else it is how it was turned when places were numbers
+            if not ti.math.isnan(end.sum()):  # type: ignore[reportOptionalCall]
+                # Else it is how it was turned when places were numbers.
                 self.turn[c] = end
             self.keep(self.pose, c, pose)
             self.slots.note_turn(self.slots.turn(cosine, 1.0))
