@@ -153,3 +153,79 @@ def test_piles_come_to_rest_and_sleep_while_one_steers(world):
     w.velocity = v
     w.step(1 / 60)
     assert w.last.asleep == 30 and w.velocity[5, 1] > 1  # its column is awake
+
+
+def ways(world, substeps, friction=0.0):
+    """A disc at rest on a floor, one on a pinned disc, and one that hangs on a taut rope: what leans, and is sent off."""
+    x = [(0, 0.1), (2, 0.1), (2, 0.3), (4, 3), (4, 2)]
+    features = [tv.Gravity(9.81), tv.Contact(), tv.HalfSpace((0, 1), friction=friction), tv.Rope([[3, 4]], 1.0)]
+    w = world(tv.Particles(x, radius=0.1, pinned=[1, 3], spin=0), features, substeps=substeps, precision="f64")
+    w.run(0.5)
+    return w
+
+
+@pytest.mark.parametrize("substeps", [1, 5, 20])
+def test_what_leans_and_is_sent_off_flies(world, substeps):
+    # x + v t - g t^2 / 2, to rounding: half of what it leaned on is over. An impulse alone had it fly slower by g h / 2.
+    w = ways(world, substeps)
+    begin, v = w.position, w.velocity.copy()
+    v[[0, 2, 4]] = (0.3, 3.0)
+    w.velocity = v
+    w.run(0.2)
+    flown = 0.2 * v[0] - (0, 9.81 * 0.2**2 / 2)
+    np.testing.assert_allclose((w.position - begin)[[0, 2, 4]], [flown] * 3, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(w.velocity[[0, 2, 4]], [v[0] - (0, 9.81 * 0.2)] * 3, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("substeps", [5, 20])
+def test_what_rubs_and_is_pushed_slides(world, substeps):
+    # x + v t - mu g t^2 / 2 from where it rested, and what is spun up on the spot goes off at mu g t: friction was none before.
+    mu, g, v = 0.5, 9.81, 3.0
+    for spun in (False, True):
+        w = ways(world, substeps, friction=mu)
+        if spun:
+            w.spin = [-400.0, *w.spin[1:]]
+        else:
+            w.velocity = [(v, 0.0), *w.velocity[1:]]
+        w.run(0.1)
+        want = mu * g * 0.1**2 / 2 if spun else v * 0.1 - mu * g * 0.1**2 / 2
+        assert w.position[0] == pytest.approx([want, 0.1], abs=1e-11)
+        assert w.spin[0] == pytest.approx((-400 if spun else 0) + (1 if spun else -1) * 2 * mu * g * 0.1 / 0.1, abs=1e-8)
+
+
+def test_spins_and_throws_survive_what_comes_next(world):
+    # A velocity that is assigned before the substep changes, places are assigned, or a pin takes another particle.
+    pin = tv.Pin([0])
+    w = world(tv.Particles([(0, 0), (3, 0), (6, 0)], spin=5.0, radius=0.1), [tv.Gravity(9.81), pin], precision="f64")
+    w.run(0.1)
+    v, fallen = w.velocity.copy(), 9.81 / 60
+    for change in (lambda: setattr(w, "substeps", 7), lambda: setattr(w, "position", w.position)):
+        v[2] = 1.0, 2.0
+        w.velocity = v
+        change()
+        w.step(1 / 60)
+        assert w.spin[1:] == pytest.approx([5, 5]) and w.velocity[2] == pytest.approx([1, 2 - fallen])
+        v = w.velocity.copy()
+    v[0] = 3.0, 4.0
+    w.velocity = v
+    pin.indices, pin.target = [1], w.position[[1]]
+    w.step(1 / 60)
+    assert w.velocity[0] == pytest.approx([3, 4 - fallen]) and w.velocity[1] == pytest.approx([0, 0])
+
+
+@pytest.mark.parametrize("precision", ["f64", "f32"])
+def test_what_is_stopped_stands_still(world, precision):
+    # However fast it was, and however strong the drag is; and what is pushed then goes v / rate.
+    for rate, fast in ((0.0, 146.0), (0.0, 1e9), (8.0 * 1200, 1.0), (20.0 * 1200, 1.0)):
+        start = tv.Particles([(0, 0), (9, 0)], velocity=[(fast, 0.3 * fast), (0, 0)])
+        w = world(start, [tv.Gravity(0.0), tv.Drag(rate)], substeps=20, precision=precision)
+        w.step(1 / 60)
+        x = w.position
+        w.velocity = np.zeros((2, 2))
+        w.step(1 / 60)
+        assert (w.position[0] == x[0]).all() and np.abs(w.velocity[0]).max() <= 2.0**-44 * fast
+        if rate:
+            w.velocity = [(0.0, 0.0), (1.0, 0.0)]
+            x = w.position
+            w.step(1 / 60)
+            assert w.position[1, 0] - x[1, 0] == pytest.approx(1 / rate, rel=1e-3 if precision == "f64" else 0.1)

@@ -248,7 +248,7 @@ def _let_go(world: Any, seen: np.ndarray, loose: np.ndarray) -> None:
     runner, clock = world._runner, world._clock
     drag = (clock.drag or FREE)[0]
     plain = clock.d_is_velocity or not (runner.probe or drag < impulse.WEAK)
-    if loose.any() and not (plain and impulse.give(runner, seen, loose, world.iterations)):
+    if loose.any() and not (plain and impulse.give(runner, seen, loose, world.iterations, rounds=1)):
         world._start_from(seen)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from .integrator import FREE
 
-ROUNDS = 2, 100  # of asking for velocities, at most: one for what the first one rounded; or more, where forces read them
+ROUNDS = 100  # of asking for velocities, at most, where forces read them
 NOTHING = 2.0**-20  # of a velocity: less than this of it is in the next displacement
 WEAK = 0.01  # the same: below it, displacements tell velocities by too few digits
 LEANS = 0.25  # of what half of a reaction gives: a change of velocity after which it goes on
@@ -62,14 +62,16 @@ class Displacements:
             self.write(field, np.where(self.some, self.was[field] + more, self.was[field]))
 
     def give(
-        self, want: np.ndarray, velocity: Callable[[], np.ndarray], factor: np.ndarray, seen: np.ndarray | None = None
-    ) -> np.ndarray:
-        """Have them stand for velocities `want`, (worlds, ..., dim): at once, or one time after the other where forces read
-        velocities, until these come no nearer. velocity: asks for those that they stand for. factor: of each world, see factor().
-        seen: what velocity() would say at first, if that is known. Returns in which worlds that was found, (worlds,)."""
+        self, want: np.ndarray, velocity: Callable[[], np.ndarray], factor: np.ndarray, seen: np.ndarray | None = None,
+        rounds: int = 2,
+    ) -> np.ndarray:  # fmt: skip
+        """Have them stand for velocities `want`, (worlds, ..., dim): at once, but for a round for what the first one rounded, or
+        one time after the other where forces read velocities, until these come no nearer. velocity: asks for those that they
+        stand for. factor: of each world, see factor(). seen: what velocity() would say at first, if that is known. Returns in
+        which worlds that was found, (worlds,)."""
         more = best = np.zeros(want.shape)
         least, factor = np.full(len(want), np.inf), factor.reshape(-1, 1, 1)
-        for _ in range(ROUNDS[self.again]):
+        for _ in range(ROUNDS if self.again else rounds):
             lack = np.where(self.some, want - (velocity() if seen is None else seen), 0.0)
             seen = None
             most = np.abs(lack).max(axis=(1, 2), initial=0.0)
@@ -124,9 +126,12 @@ def leans(runner: Any, some: np.ndarray, iterations: int) -> bool:
     return bool((seen != bare)[some].any())
 
 
-def give(runner: Any, want: np.ndarray, some: np.ndarray, iterations: int, seen: np.ndarray | None = None) -> bool:
+def give(
+    runner: Any, want: np.ndarray, some: np.ndarray, iterations: int, seen: np.ndarray | None = None, rounds: int = 2
+) -> bool:
     """Have the particles of the mask `some`, (n,), that can move go on with velocities `want`, (n, dim) [m/s]. Returns whether
-    displacements were found that stand for these. seen: what Runner.velocity() says, if that is known."""
+    displacements were found that stand for these. seen: what Runner.velocity() says, if that is known. rounds: see
+    Displacements.give()."""
     rows = np.flatnonzero(some & (runner.scene.inv_mass > 0))
     if not len(rows):
         return True
@@ -140,7 +145,9 @@ def give(runner: Any, want: np.ndarray, some: np.ndarray, iterations: int, seen:
     with memory.compiler():
         those = _those(runner, first, chosen)
         had = None if seen is None else seen[None, first:end]
-        found = those.give(want[None, first:end], lambda: runner.velocity(iterations, first, end)[None], _factor(runner), had)
+        found = those.give(
+            want[None, first:end], lambda: runner.velocity(iterations, first, end)[None], _factor(runner), had, rounds
+        )
     return bool(found[0])
 
 
