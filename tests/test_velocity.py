@@ -149,10 +149,14 @@ def test_piles_come_to_rest_and_sleep_while_one_steers(world):
         v[-1, 0] = np.cos(k / 20)
         w.velocity = v
     assert w.last.asleep == 36 and abs(w.velocity[-1, 0]) <= 1
+    v[5] = 1e-3, 0.0
+    w.velocity = v
+    w.step(1 / 60)
+    assert w.last.asleep == 30 and w.velocity[5, 0] == pytest.approx(1e-3, rel=0.1)  # its column is awake
     v[5] = 0.0, 2.0
     w.velocity = v
     w.step(1 / 60)
-    assert w.last.asleep == 30 and w.velocity[5, 1] > 1  # its column is awake
+    assert w.last.asleep == 0 and w.velocity[5, 1] == pytest.approx(2 - 9.81 / 60)  # what leaves another is a start
 
 
 def ways(world, substeps, friction=0.0):
