@@ -41,9 +41,9 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as it is in the backgro
 collect_ignore = [] if patched else ["test_compiling.py", "test_sharing.py"]  # which are about what is not there then
 # Files that take longest, which come first: else one worker would go on with one of them when the others are done.
 LONG = (
-    "demos", "determinism", "worlds", "edit_in_place", "sleep", "properties", "speed", "periodic", "extremes", "docs", "loads",
-    "compiling", "guard", "polygons", "direct", "overlap_release", "solvers", "impacts", "contact", "events", "knobs", "pairs",
-    "conservation", "walls", "spin", "recordings", "regroup", "sharing", "fuzz", "sweep", "motors", "report", "granular",
+    "demos", "worlds", "edit_in_place", "determinism", "sleep", "speed", "properties", "periodic", "impacts", "overlap_release",
+    "compiling", "polygons", "guard", "docs", "knobs", "direct", "solvers", "regroup", "loads", "contact", "pairs", "conservation",
+    "events", "walls", "spin", "recordings", "sharing", "fuzz", "motors", "extremes", "velocity", "granular", "report", "sweep",
 )  # fmt: skip
 ARCH = os.environ.get("TIVERLET_ARCH", "cpu")
 SOURCES = str(pathlib.Path(tv.__file__).parent)

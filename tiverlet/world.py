@@ -303,7 +303,11 @@ class World:
 
     @property
     def velocity(self) -> np.ndarray:
-        """Velocities [m/s], (n, dim), a read-only copy in f64; of the order of the world. Assign an array to set them."""
+        """Velocities [m/s], (n, dim), a read-only copy in f64; of the order of the world.
+
+        Assign an array to set them, as an impulse to those whose velocity it changes; where it makes anything leave what it leans
+        on, or rub another way, all start from these velocities. To write back what was read changes nothing.
+        """
         out = self._clock.parted
         if out is None:
             self._runner.memory.check()
@@ -313,7 +317,7 @@ class World:
 
     @velocity.setter
     def velocity(self, value) -> None:
-        """Have particles go on with (n, dim) [m/s]; those that have these velocities go on as they are, to the bit."""
+        """Have particles go on with (n, dim) [m/s]."""
         value = checks.points("World", "velocity", value, dim=self._particles.dim, count=len(self._particles))
         self._runner.memory.check()
         with whole:
