@@ -42,8 +42,9 @@ collect_ignore = [] if patched else ["test_compiling.py", "test_sharing.py"]  # 
 # Files that take longest, which come first: else one worker would go on with one of them when the others are done.
 LONG = (
     "demos", "worlds", "edit_in_place", "determinism", "sleep", "speed", "properties", "periodic", "impacts", "overlap_release",
-    "compiling", "polygons", "guard", "docs", "knobs", "direct", "solvers", "regroup", "loads", "contact", "pairs", "conservation",
-    "events", "walls", "spin", "recordings", "sharing", "fuzz", "motors", "extremes", "velocity", "granular", "report", "sweep",
+    "compiling", "polygons", "guard", "docs", "knobs", "direct", "solvers", "regroup", "loads", "contact", "pairs",
+    "conservation", "events", "walls", "spin", "recordings", "sharing", "fuzz", "motors", "extremes", "velocity", "granular",
+    "report", "sweep",
 )  # fmt: skip
 ARCH = os.environ.get("TIVERLET_ARCH", "cpu")
 SOURCES = str(pathlib.Path(tv.__file__).parent)
