@@ -581,7 +581,8 @@ class Worlds:
             inv_mass = [self._sources[k].inv_mass for k in some] if self._sources else runner.scene.inv_mass
             free, want, drag = others[steered] & (np.asarray(inv_mass) > 0), velocity[steered], clocks.drags[some]
             seen, bare = (self._velocities(firm)[some] for firm in (True, False))
-            does = impulse.suffices(want, seen, bare, free, impulse.rubs(runner), drag)
+            with self._knobs.shown(0):
+                does = impulse.suffices(want, seen, bare, free, impulse.rubs(runner), drag) | ~free.any(axis=1)
             some, free, want, drag = some[does], free[does], want[does], drag[does]
             steered[steered] = does
             if len(some):
