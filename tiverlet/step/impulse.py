@@ -158,7 +158,7 @@ def give_new(runner: Any, first: int, want: np.ndarray, iterations: int) -> None
     with runner.memory.compiler():
         those = _those(runner, first, moves)
         those.begin_with(runner.clock.h * want)
-        those.give(want, lambda: runner.velocity(iterations, first, came=True)[None], _factor(runner))
+        those.give(want, lambda: runner.velocity(iterations, first, came=True)[None], _factor(runner), rounds=1)
 
 
 def _factor(runner: Any) -> np.ndarray:
