@@ -135,7 +135,7 @@ def change(
         build_again(world, some, added, features, extend)
         return
     with world._runner.memory.compiler():
-        told, (seen, loose) = world._all_events(), _seen(world, some, number, features)
+        told, (seen, loose, moved) = world._all_events(), _seen(world, some, number, features)
         others = (added is not None or not some.all()) and world._runner.step.has_pair_forces
         if world._force_waits or others or any(more.soft for more in planned.more):
             world._runner.restart_between(world.iterations)
@@ -144,7 +144,7 @@ def change(
         world._runner.pass_on(world._runner.left, some)
         world._runner.wake()
         tied = initial_violation.first_off([*planned.more], world.position) if planned.more else None
-        _edited(world, some, added, told, seen, loose, np.arange(len(features)), bool(extend), tied)
+        _edited(world, some, added, told, seen, loose, moved, np.arange(len(features)), bool(extend), tied)
 
 
 def renew(world: Any) -> None:
@@ -155,7 +155,7 @@ def renew(world: Any) -> None:
         build_again(world, np.ones(len(world.particles), dtype=bool), None, world.features, NONE)
         return
     told = world._all_events() if runner.logs else world._events
-    loose = np.zeros(runner.n, dtype=bool)
+    loose, moved = np.zeros(runner.n, dtype=bool), runner.scene.inv_mass > 0
     loose[grabbing.some] = runner.scene.inv_mass[grabbing.some] == 0
     seen = clock.parted
     if seen is None and loose.any() and not clock.d_is_velocity:
@@ -170,8 +170,7 @@ def renew(world: Any) -> None:
     if seen is not None:
         _let_go(world, seen, loose)
     if clock.parted is not None:
-        held = runner.scene.inv_mass == 0
-        clock.parted = np.where(held[:, None], runner.memory.read(runner.scene.state.d)[: runner.n] / clock.h, clock.parted)
+        clock.parted = _held(runner, clock.parted, moved)
     for watcher in world._watchers:
         watcher.regrouped()
 
@@ -182,19 +181,20 @@ def build_again(
     """Make a change by building the world anew."""
     world._runner.memory.check()
     again = world._rebuild(some, added, features, extend)
-    before, told, (seen, loose) = world.features, world._all_events(), _seen(world, some, again.number, features)
+    before, told = world.features, world._all_events()
+    seen, loose, moved = _seen(world, some, again.number, features)
     again.run()
     walls = np.array([features.index(f) if f in features else -1 for f in before], dtype=np.int64)
     new = [*(f for f in again.came if f not in before), *again.extending.values()]
     tied = initial_violation.first_off(new, world.position)
-    _edited(world, some, added, told, seen, loose, walls, bool(again.came or again.went or new), tied)
+    _edited(world, some, added, told, seen, loose, moved, walls, bool(again.came or again.went or new), tied)
 
 
 def _seen(
     world: Any, some: np.ndarray, number: np.ndarray, features: tuple[Feature, ...]
-) -> tuple[np.ndarray | None, np.ndarray]:
-    """Velocities before an edit, where what goes has a part in them, else None; and the particles that rigid constraints hold
-    which are about to go, a mask, (n,)."""
+) -> tuple[np.ndarray | None, np.ndarray, np.ndarray]:
+    """Velocities before an edit, where what goes has a part in them, else None; the particles that rigid constraints hold which
+    are about to go; and those that nothing drives: masks, (n,)."""
     loose, loses = np.zeros(len(some), dtype=bool), world._clock.parted is not None
     for f in world.features:
         if isinstance(f, Pin) and f in features and f.afresh:  # which takes others
@@ -208,15 +208,16 @@ def _seen(
                     batch: Any = f
                     goes = ~np.broadcast_to(stays, f.count) & (batch.compliance == 0)
                     loose[f.indices.ravel()[goes[f.owner]]] = True
-    return world.velocity if loses and not world._clock.d_is_velocity else None, loose
+    seen = world.velocity if loses and not world._clock.d_is_velocity else None
+    return seen, loose, world._runner.scene.inv_mass > 0
 
 
 def _edited(
     world: Any, some: np.ndarray, added: Particles | None, told: tuple[ContactEvents, ContactEvents], seen: np.ndarray | None,
-    loose: np.ndarray, walls: np.ndarray, features_too: bool, tied: int | None = None,
+    loose: np.ndarray, moved: np.ndarray, walls: np.ndarray, features_too: bool, tied: int | None = None,
 ) -> None:  # fmt: skip
     """What else there is to an edit once particles and features are there. told: events, of walls that have these numbers now.
-    seen: velocities, see _seen(). loose: likewise. features_too: whether features came or went, too.
+    seen: velocities, see _seen(). loose, moved: likewise. features_too: whether features came or went, too.
     tied: the first particle of constraints that came and are not met."""
     number, clock = np.where(some, np.cumsum(some) - 1, -1), world._clock
     n, m = int(np.count_nonzero(some)), 0 if added is None else len(added)
@@ -237,10 +238,15 @@ def _edited(
         seen = seen[some] if added is None else np.concatenate([seen[some], added.velocity])
         _let_go(world, seen, np.concatenate([loose[some], np.zeros(m, dtype=bool)]))
         if not clock.d_is_velocity:
-            d, held = world._runner.memory.read(world._runner.scene.state.d)[: n + m], world._runner.scene.inv_mass == 0
-            clock.parted = np.where(held[:, None], d / clock.h, seen)
+            clock.parted = _held(world._runner, seen, np.concatenate([moved[some], np.ones(m, dtype=bool)]))
     for watcher in world._watchers:
         watcher.regrouped()
+
+
+def _held(runner: Any, velocity: np.ndarray, moved: np.ndarray) -> np.ndarray:
+    """Velocities in which what moved, a mask, and is driven now goes as its displacement says."""
+    now = moved & (runner.scene.inv_mass == 0)
+    return np.where(now[:, None], runner.memory.read(runner.scene.state.d)[: runner.n] / runner.clock.h, velocity)
 
 
 def _let_go(world: Any, seen: np.ndarray, loose: np.ndarray) -> None:
