@@ -66,12 +66,14 @@ class Displacements:
         rounds: int = 2,
     ) -> np.ndarray:  # fmt: skip
         """Have them stand for velocities `want`, (worlds, ..., dim): at once, but for a round for what the first one rounded, or
-        one time after the other where forces read velocities, until these come no nearer. velocity: asks for those that they
+        one time after the other where forces read velocities, until these come no nearer. rounds: 1 for neither, which does for
+        what lacks little. velocity: asks for those that they
         stand for. factor: of each world, see factor(). seen: what velocity() would say at first, if that is known. Returns in
         which worlds that was found, (worlds,)."""
         more = best = np.zeros(want.shape)
         least, factor = np.full(len(want), np.inf), factor.reshape(-1, 1, 1)
-        for _ in range(ROUNDS if self.again else rounds):
+        again = self.again and rounds > 1
+        for _ in range(ROUNDS if again else rounds):
             lack = np.where(self.some, want - (velocity() if seen is None else seen), 0.0)
             seen = None
             most = np.abs(lack).max(axis=(1, 2), initial=0.0)
@@ -82,7 +84,7 @@ class Displacements:
             self.lengthen(more)
             if not nearer.any():
                 break
-        return least <= MET * np.abs(want).max(axis=(1, 2), initial=0.0) if self.again else np.ones(len(want), dtype=bool)
+        return least <= MET * np.abs(want).max(axis=(1, 2), initial=0.0) if again else np.ones(len(want), dtype=bool)
 
 
 def suffices(want: np.ndarray, seen: np.ndarray, bare: np.ndarray, some: np.ndarray, rubs: bool, drag: np.ndarray) -> np.ndarray:
@@ -158,7 +160,8 @@ def give_new(runner: Any, first: int, want: np.ndarray, iterations: int) -> None
     with runner.memory.compiler():
         those = _those(runner, first, moves)
         those.begin_with(runner.clock.h * want)
-        those.give(want, lambda: runner.velocity(iterations, first, came=True)[None], _factor(runner), rounds=1)
+        rounds = 2 if runner.integrator.uses_velocity else 1
+        those.give(want, lambda: runner.velocity(iterations, first, came=True)[None], _factor(runner), rounds=rounds)
 
 
 def _factor(runner: Any) -> np.ndarray:
