@@ -108,11 +108,10 @@ def rubs(runner: Any) -> bool:
 def steer(runner: Any, want: np.ndarray, some: np.ndarray, iterations: int, seen: np.ndarray | None = None) -> bool:
     """Have the particles of the mask `some`, (n,), that can move go on with velocities `want`, (n, dim) [m/s], if an impulse does
     for it; returns whether. seen: what Runner.velocity() says, if that is known."""
-    rows = np.flatnonzero(some & (runner.scene.inv_mass > 0))
-    if not len(rows):
+    first, end, chosen = _movable(runner, some)
+    if first == end:
         return True
-    first, end = int(rows[0]), int(rows[-1]) + 1
-    chosen, drag = np.isin(np.arange(first, end), rows), np.array([runner.clock.drag or FREE])
+    drag = np.array([runner.clock.drag or FREE])
     with runner.memory.compiler():
         had = runner.velocity(iterations) if seen is None else seen
         bare = runner.velocity(iterations, first, end, firm=False)[None]
@@ -134,12 +133,9 @@ def give(
     """Have the particles of the mask `some`, (n,), that can move go on with velocities `want`, (n, dim) [m/s]. Returns whether
     displacements were found that stand for these. seen: what Runner.velocity() says, if that is known. rounds: see
     Displacements.give()."""
-    rows = np.flatnonzero(some & (runner.scene.inv_mass > 0))
-    if not len(rows):
+    memory, (first, end, chosen) = runner.memory, _movable(runner, some)
+    if first == end:
         return True
-    memory, first, end = runner.memory, int(rows[0]), int(rows[-1]) + 1
-    chosen = np.zeros(end - first, dtype=bool)
-    chosen[rows - first] = True
     if runner.clock.d_is_velocity:
         d = memory.seen(runner.scene.state.d)[first:end]
         memory.write_from(runner.scene.state.d, first, np.where(chosen[:, None], want[first:end], d))
@@ -162,6 +158,14 @@ def give_new(runner: Any, first: int, want: np.ndarray, iterations: int) -> None
         those.begin_with(runner.clock.h * want)
         rounds = 2 if runner.integrator.uses_velocity else 1
         those.give(want, lambda: runner.velocity(iterations, first, came=True)[None], _factor(runner), rounds=rounds)
+
+
+def _movable(runner: Any, some: np.ndarray) -> tuple[int, int, np.ndarray]:
+    """Of the particles of a mask that can move, the first, the number behind the last, and which in between they are, a mask."""
+    some = some & (runner.scene.inv_mass > 0)
+    rows = np.flatnonzero(some)
+    first, end = (int(rows[0]), int(rows[-1]) + 1) if len(rows) else (0, 0)
+    return first, end, some[first:end]
 
 
 def _factor(runner: Any) -> np.ndarray:
