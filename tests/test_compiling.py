@@ -47,6 +47,36 @@ def test_the_bits_do_not_depend_on_the_patches():
     assert sum(r.contacts for r in made[1][0]) > 100 and len(re.findall("StepReport", alone)) == 48
 
 
+@pytest.mark.skipif(not (ARCH == "cpu" and sys.platform == "linux"), reason="LLVM's switches are found there")
+def test_loops_are_copied_for_the_user_alone():
+    # LLVM says which loops it copies. Those of ours whose length it does not know stay as they are; in the same process a
+    # kernel of the user's has several rounds written one after the other, as ever.
+    code = """
+import os
+from tiverlet.device import ti
+import tiverlet as tv
+from tiverlet.device.patches import unrolling
+told = "-pass-remarks=loop-unroll"
+unrolling.SWITCHES = (told, *unrolling.SWITCHES[:COUNT])
+world = tv.World(tv.Particles([(0, 0.2), (0.15, 0.1)], radius=0.1), [tv.Gravity(), tv.Contact(), tv.HalfSpace((0, 1))])
+world.step(1 / 60)
+print(world.hash())
+unrolling.command_line().give(told)
+seen = ti.field(ti.f32, 100)
+@ti.kernel
+def add(count: ti.i32):
+    for _ in range(1):
+        for k in range(count):
+            seen[k] += seen[count - k - 1]
+os.write(2, b"theirs")
+add(5)
+"""
+    ours, as_ever = (python(code.replace("COUNT", count), TI_OFFLINE_CACHE="0") for count in ("3", "0"))
+    copies = [[part.count("by a factor of") for part in done.stderr.split("theirs")] for done in (ours, as_ever)]
+    assert ours.stdout == as_ever.stdout and copies[0][0] == 0 and copies[1][0] > 10
+    assert copies[0][1] == copies[1][1] > 0
+
+
 def test_what_the_user_compiles_is_compiled_as_ever():
     # parts() leaves a vector in a variable that is a number. Without Taichi's analysis, which finds that nobody reads it, LLVM
     # ends the process. Only then is the frame analysed: with contacts that would take ten times as long.

@@ -22,6 +22,7 @@ import numpy as np
 
 from ..language import active, impl, sources
 from . import lean, patched
+from .unrolling import as_ever, leave_loops
 
 HOSTS = ("Arch.x64", "Arch.arm64")  # whose kernels LLVM makes as fast without it; measured on x64
 # No variables for what loops read and write at one address: Taichi does not see that another address may be the same place, such
@@ -68,6 +69,7 @@ class Compiler:
         self._host: bool | None = None  # whether they are for the host, once that is asked: Taichi takes 6 us to say so
         self._settings: dict[str, Any] = {}  # that Taichi was started with
         self._thread = 0
+        self._hurried = False
         self.refused: Exception | None = None  # what is wrong with a function that is being compiled, see refuse()
         self.times = Times({}, {})
         self.places: list[tuple[Any, int]] = []  # where the world's fields are: layouts and addresses
@@ -116,6 +118,9 @@ class Compiler:
                 raise error from None
             finally:
                 active.pop()
+                if self._hurried:
+                    as_ever()
+                    self._hurried = False
                 if active:
                     active[-1].point()
                 runtime.set_default_fp(literals)
@@ -123,6 +128,12 @@ class Compiler:
                 if collects:
                     _pass_over()
                     gc.enable()
+
+    def hurry(self) -> None:
+        """A kernel is about to be compiled, and launched before the context ends: have LLVM take less time for it."""
+        if self._host and not self.thorough:
+            leave_loops()
+            self._hurried = True
 
     def beware(self) -> None:
         """Be thorough from here on: there is what LLVM does not take as it is."""

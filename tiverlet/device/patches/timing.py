@@ -47,6 +47,7 @@ def compiled(kernel: Any, key: Any, name: str, translate: Any) -> None:
     """Translate and compile a kernel, and note how long that took: in all, and by features, in parts as their statements took."""
     if key in kernel.compiled_kernels:
         return
+    active[-1].hurry()
     begin, outer, translation = perf_counter(), Translation.now, Translation()
     Translation.now = translation
     try:
