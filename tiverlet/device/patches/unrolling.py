@@ -8,6 +8,7 @@ library's table of symbols, as the one that sets all switches back. Where it doe
 nothing is told.
 """
 
+import contextlib
 import ctypes
 import functools
 import mmap
@@ -52,8 +53,10 @@ class CommandLine:
 @functools.cache
 def command_line() -> CommandLine | None:
     """That of the LLVM in Taichi's library; None where it is not found."""
-    path = getattr(sys.modules.get("taichi._lib.core.taichi_python"), "__file__", None)
-    at = _addresses(path, PARSE, RESET, SEEN) if path and sys.platform == "linux" and sys.byteorder == "little" else None
+    path, at = getattr(sys.modules.get("taichi._lib.core.taichi_python"), "__file__", None), None
+    if path and sys.platform == "linux" and sys.byteorder == "little":
+        with contextlib.suppress(OSError, ValueError, struct.error):  # a file that is none, or not as others are
+            at = _addresses(path, PARSE, RESET, SEEN)
     if at is None:
         return None
     start = ctypes.cast(ctypes.PyDLL(path)[SEEN.decode()], ctypes.c_void_p).value or 0
