@@ -230,6 +230,21 @@ def test_what_auto_tried_in_vain_is_replayed(world, tmp_path):
         assert again.hash() == w.hash()
 
 
+def test_a_knob_that_is_set_to_minus_zero_is_replayed(world, tmp_path):
+    # As -0.002 * k is in the first frame. It equals 0, so it was not written down, but the hash has its sign.
+    ball = tv.Ball((0, 0), 0.28)
+    w = world(tv.Particles([[0, 0.5], [0.1, 0.9]], radius=0.1), [tv.Gravity(), ball])
+    with tv.Recorder(tmp_path / "zero.rrd", w) as recorder:
+        for k in range(3):
+            ball.center = (-0.002 * k, 0)
+            w.step(1 / 60)
+            recorder.log()
+    recording = tv.replay(tmp_path / "zero.rrd")
+    assert recording.verify()
+    with recording.world(3) as again:
+        assert again.hash() == w.hash()
+
+
 def test_user_functions_must_be_given_again(tmp_path):
     path = tmp_path / "f.rrd"
     with tv.World(tv.Particles([[1.0, 0.0]]), [tv.Force(swirl)]) as world, tv.Recorder(path, world):

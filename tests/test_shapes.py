@@ -120,6 +120,8 @@ def test_counts_and_sizes():
     assert volumes(BODIES["ball 2D"]).sum() == pytest.approx(0.25 * 12 * np.sin(np.pi / 12))  # 24 sides, R = 1/2
     assert 0.8 < volumes(BODIES["ball 3D"]).sum() / (np.pi / 6) < 1
     assert volumes(BODIES["blob"]).sum() == pytest.approx(5 * np.sin(np.pi / 5) * 0.5)
+    closed = np.concatenate([STAR, STAR[-1:], STAR[:1]])  # a corner twice in a row
+    assert (S.blob(closed, 0.15).position == BODIES["blob"].position).all()
     assert volumes(BODIES["truss 3D"]).sum() == pytest.approx(6) and len(BODIES["truss 3D"].tetrahedra) == 36
     assert len(BODIES["balloon"]) == 10 * 16 + 2 and len(BODIES["balloon"].faces) == 320
     assert len(BODIES["cloth 3D"].links) == 40 and len(BODIES["cloth 3D"].braces) == 32 + 30

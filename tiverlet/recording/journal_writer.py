@@ -90,7 +90,7 @@ class Journal:
         for k, feature in enumerate(self.world.features):
             if feature.changed:
                 now, known = scene.knobs(feature), self._known[k]
-                new = {name: v for name, v in now.items() if name not in known or not np.array_equal(v, known[name])}
+                new = {name: v for name, v in now.items() if name not in known or not _same(v, known[name])}
                 turned[k] = {name: scene.encode(v, f"{k}.{name}", arrays, scene.Needs()) for name, v in new.items()}
                 known.update(copy.deepcopy(new))
         if turned:
@@ -120,3 +120,10 @@ class Journal:
         """Look away."""
         if self in self.world._watchers:
             self.world._watchers.remove(self)
+
+
+def _same(value: Any, known: Any) -> bool:
+    """Whether two settings are equal, the signs of zeros too: 0 and -0 are other bits in kernels and in hashes."""
+    if not np.array_equal(value, known):
+        return False
+    return np.asarray(value).dtype.kind != "f" or np.array_equal(np.signbit(value), np.signbit(known))

@@ -145,12 +145,14 @@ def balloon(center, radius: float, level: int = 2) -> Shape:
 
 def blob(outline, spacing: float) -> Shape:
     """A body of any form in 2D: a closed outline (k, 2), in either sense, filled with particles about `spacing` [m] apart.
+    A corner that is given twice in a row, as where the last is the first again, counts once.
 
     The inside is sampled by the golden ratio and triangulated (Delaunay). faces: triangles; loops: the rim. ValueError where the
     spacing is too large to follow the outline.
     """
     corners = checks.points("blob", "outline", outline, dim=2)
     spacing = checks.number("blob", "spacing", spacing, above=0.0)
+    corners = corners[(corners != np.roll(corners, -1, axis=0)).any(axis=1)]
     if len(corners) < 3:
         raise ValueError(f"blob: an outline of {len(corners)} points encloses nothing; give 3 or more.")
     x, y = corners.T

@@ -134,8 +134,8 @@ class Runner:
                 if h < clock.longest and not self.probe:
                     released = release(self, h, clock.longest)
                     projected = project(self, h, clock.longest)
-                    # Links and contacts have to move together; where frames are of uneven length, stacks would walk off.
-                    if projected is None and dt == clock.frame[1]:
+                    # Links and contacts have to move together. Where frames are of slightly uneven length, stacks would walk off.
+                    if projected is None and (dt == clock.frame[1] or 2 * h <= clock.longest):
                         projected = project(self, h, clock.longest, ContactRows.of(self))
                     if projected is None and not released:
                         released = release(self, h, clock.longest, small=True)
