@@ -147,8 +147,8 @@ def test_bits_are_the_same_after_a_replay(world, tmp_path):
 
 
 def test_hashes_know_nothing_of_who_is_listed(world, tmp_path):
-    """A pair that is listed and too far apart to act left -0 where one that is not listed leaves 0: worlds that went on from a
-    frame in the middle of a recording had other hashes, and were refused."""
+    # A pair that is listed and too far apart to act left -0 where one that is not listed leaves 0: worlds that went on from a
+    # frame in the middle of a recording had other hashes, and were refused.
     rng = np.random.default_rng(0)
     p = tv.Particles(rng.uniform(0, 3, (8, 2)), velocity=rng.normal(0, 1.5, (8, 2)), radius=0.03)
     w = world(p, [tv.Periodic((0, 0), (3, 3)), tv.Contact(restitution=1.0), tv.PairForce(short, 0.3)], substeps=4)

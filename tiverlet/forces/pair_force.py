@@ -82,7 +82,7 @@ class PairForce(Acceleration):
         """Two fields of accelerations; the list comes with join()."""
         self.scene, dev = scene, self.dev
         dim = scene.particles.dim
-        dev.state, dev.w, dev.dim, dev.n = scene.state, scene.state.w, dim, scene.count
+        dev.state, dev.w, dev.real, dev.dim, dev.n = scene.state, scene.state.w, scene.real, dim, scene.count
         dev.now = scene.memory.field("PairForce.acceleration", scene.count, width=dim, state=True)
         dev.last = scene.memory.field("PairForce.acceleration_before", scene.count, width=dim)
 
@@ -148,43 +148,29 @@ class PairForce(Acceleration):
     def pull(self, i, j, r):
         """The force on particle i by particle j, r apart, worked out from the lower index."""
         out = 0 * r
-        if i < j:
-            out = self.between(i, j, r)
-        else:
-            out = -self.between(j, i, -r)
-        return out
-
-    @ti.func
-    def pull_if_near(self, i, j, r):
-        """The same, 0 of pairs that are too far apart."""
-        out = 0 * r
         if self.near(r):
-            out = self.pull(i, j, r)
+            if i < j:
+                out = self.between(i, j, r)
+            else:
+                out = -self.between(j, i, -r)
         return out
 
     @ti.func
     def evaluate(self, i):
-        """The acceleration of particle i by all others, in the order of their indices. Where nobody acts it is +0: a sum of
-        zeros may be -0, and the hash would know that somebody far away is listed."""
+        """The acceleration of particle i by all others, in the order of their indices. The sum begins at +0, not at 0 times
+        something: where nobody acts that might be -0, and the hash would know whether somebody far away is listed."""
         self.dev.last[i] = self.dev.now[i]
-        total, w, near = ti.zero(self.dev.now[i]), self.dev.w.of(i), 0
+        total, w = ti.Vector.zero(self.dev.real, self.dev.dim), self.dev.w.of(i)
         if w > 0:
             if ti.static(self.listed):
                 for e in range(self.dev.list.first[i], self.dev.list.first[i] + self.dev.list.number[i]):
                     j = self.dev.list.neighbour[e]
-                    r = self.dev.state.apart(i, j)
-                    if self.near(r):
-                        total += self.pull(i, j, r)
-                        near = 1
+                    total += self.pull(i, j, self.dev.state.apart(i, j))
             else:
                 for j in range(self.dev.n.now):
-                    r = self.dev.state.apart(i, j)
-                    if j != i and self.near(r):
-                        total += self.pull(i, j, r)
-                        near = 1
-        self.dev.now[i] = ti.zero(total)
-        if near > 0:
-            self.dev.now[i] = w * total
+                    if j != i:
+                        total += self.pull(i, j, self.dev.state.apart(i, j))
+        self.dev.now[i] = w * total
 
     @ti.func
     def acceleration(self, i, x, v, t):
@@ -197,8 +183,7 @@ class PairForce(Acceleration):
         r, u = self.dev.state.apart(i, j), self.dev.state.slid(self.dev.state.d[i] - self.dev.state.d[j], i, j)
         out, uu = 0 * r[0], u.norm_sqr()
         if uu > 0:
-            change = self.pull_if_near(i, j, r) - self.pull_if_near(i, j, r - u)
-            out = (self.dev.w.of(i) + self.dev.w.of(j)) * change.norm() / ti.sqrt(uu)
+            out = (self.dev.w.of(i) + self.dev.w.of(j)) * (self.pull(i, j, r) - self.pull(i, j, r - u)).norm() / ti.sqrt(uu)
         return out
 
     @ti.func
