@@ -104,7 +104,9 @@ def indices(who: str, name: str, value, count: int, *, arity: int | None = None,
         raise TypeError(f"{who}: {name} has type {array.dtype}, but integers (indices of {things}) are needed.")
     shape = f"(m, {arity})" if arity else "(m,)"
     if array.ndim != (2 if arity else 1) or (arity and array.shape[1] != arity):
-        raise ValueError(f"{who}: {name} has shape {array.shape}, but {shape} is needed.")
+        one = array.ndim == (1 if arity else 0) and array.size <= 4
+        write = f"; write [{array.tolist()}]" if one else ""
+        raise ValueError(f"{who}: {name} has shape {array.shape}, but {shape} is needed{write}.")
     if array.astype(np.uint64).max() >= count:  # which those below 0 are then, too
         bad = (array < 0) | (array >= count)
         i = int(np.argmax(bad.any(axis=1) if arity else bad))

@@ -136,7 +136,8 @@ class World:
         many substeps there were, and has a flag when the aim was missed. Results of a budget depend on the speed of the machine.
 
         Raises ValueError for dt, tolerance or budget that is not finite and above 0. With another substep length than before,
-        displacements are turned into velocities first and back after (time-corrected Verlet), so the step stays second order.
+        displacements are turned into velocities first and back after (time-corrected Verlet), so the step stays second order. But
+        piles that stand by friction creep where frames differ: keep to one dt, and take as many steps of it as a clock asks for.
         A signal such as Ctrl-C is handled after the frame. One that takes seconds is undone at once if the handler raises.
         """
         self._runner.memory.check()
