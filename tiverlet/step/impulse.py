@@ -87,17 +87,13 @@ class Displacements:
         return least <= MET * np.abs(want).max(axis=(1, 2), initial=0.0) if again else np.ones(len(want), dtype=bool)
 
 
-def suffices(want: np.ndarray, seen: np.ndarray, bare: np.ndarray, some: np.ndarray, rubs: bool, drag: np.ndarray) -> np.ndarray:
-    """In which worlds an impulse does for velocities `want` of the particles `some`, (worlds,).
-
-    seen: those that they have; bare: without what constraints, contacts and walls give in half a substep. A change by more than
-    a part of that, along it, or with friction in any direction, may end it. drag: of each world, (worlds, 5).
-    """
-    change, leaning = want - seen, seen - bare
-    size = np.linalg.norm(leaning, axis=2)
-    part = np.linalg.norm(change, axis=2) * size if rubs else np.abs((change * leaning).sum(axis=2))
-    ends = some & ~(part <= LEANS * size * size)  # so is what is no number
-    return ~ends.any(axis=1) & (drag[:, 0] >= WEAK)
+def ends(change: np.ndarray, seen: np.ndarray, had: np.ndarray, leaning: np.ndarray, rubs: bool) -> np.ndarray:
+    """Which share of the half of a reaction, `leaning`, changes of velocity end, (worlds, n, 1): those along it, or with friction
+    in any direction. seen: velocities so far; had: what displacements stand for, beyond which is what ended before."""
+    square = (leaning**2).sum(axis=2)
+    part = np.linalg.norm(change, axis=2) * np.sqrt(square) if rubs else np.abs((change * leaning).sum(axis=2))
+    over = part / LEANS + ((had - seen) * leaning).sum(axis=2)
+    return np.clip(np.divide(over, square, out=np.zeros_like(over), where=square != 0), 0, 1)[..., None]
 
 
 def rubs(runner: Any) -> bool:
@@ -105,26 +101,52 @@ def rubs(runner: Any) -> bool:
     return any(c.has_friction for c in runner.step.contacts) or any(wall.has_friction for wall in runner.step.walls)
 
 
-def steer(runner: Any, want: np.ndarray, some: np.ndarray, iterations: int, seen: np.ndarray | None = None) -> bool:
-    """Have the particles of the mask `some`, (n,), that can move go on with velocities `want`, (n, dim) [m/s], if an impulse does
-    for it; returns whether. seen: what Runner.velocity() says, if that is known."""
-    first, end, chosen = _movable(runner, some)
-    if first == end:
-        return True
-    drag = np.array([runner.clock.drag or FREE])
-    with runner.memory.compiler():
-        had = runner.velocity(iterations) if seen is None else seen
-        bare = runner.velocity(iterations, first, end, firm=False)[None]
-    if not suffices(want[None, first:end], had[None, first:end], bare, chosen[None], rubs(runner), drag)[0]:
+def known(runner: Any, h: Any, drag: np.ndarray, read: Callable[[Any], np.ndarray]) -> Any:
+    """What loads that contacts know give in half a substep h [m/s], as forces. read: gets a field's rows. Of one world, or many."""
+    return h * drag[..., 3] * sum(read(each.carried.field).astype(np.float64) for each in runner.known)
+
+
+def steer(runner: Any, want: np.ndarray, seen: np.ndarray, change: np.ndarray, iterations: int) -> bool:
+    """Have particles with a `change` of velocity or spin, (n, any) [m/s], that can move go on with velocities `want`, (n, dim)
+    [m/s], instead of `seen`. Returns whether that was found; else it takes a start."""
+    some, clock = change.any(axis=1), runner.clock
+    drag = np.array(clock.drag or FREE)
+    if clock.d_is_velocity or runner.probe or drag[0] < WEAK:
         return False
-    return give(runner, want, some, iterations, had)
+    first, end, chosen = _movable(runner, some)
+    rows = slice(first, end)
+    if first < end:
+        with runner.memory.compiler():
+            had = seen if clock.parted is None else runner.velocity(iterations)
+            leaning = had[rows] - runner.velocity(iterations, first, end, firm=False)
+        leaning += known(runner, clock.h, drag, lambda field: runner.memory.seen(field)[rows])
+        share = ends(*(v[None, rows] for v in (change, seen, had)), leaning[None], rubs(runner))[0] * chosen[:, None]
+        more = np.zeros(want.shape)
+        more[rows] = share * leaning
+        if not (np.isfinite(more).all() and give(runner, want + more, some, iterations, had)):
+            return False
+        turn_on(runner, first, share)
+    runner.wake(np.flatnonzero(some))
+    clock.energy, clock.parted = None, want.copy()
+    return True
 
 
-def leans(runner: Any, some: np.ndarray, iterations: int) -> bool:
-    """Whether constraints, contacts or walls gave anything to any of the particles `some`, (n,)."""
-    with runner.memory.compiler():
-        seen, bare = (runner.velocity(iterations, firm=firm) for firm in (True, False))
-    return bool((seen != bare)[some].any())
+def turn_on(runner: Any, first: int, share: np.ndarray) -> None:
+    """Have particles from number `first` on keep of what friction turned them by in half a substep the part that is over."""
+    state, memory, step = runner.scene.state, runner.memory, runner.step
+    turned = [c.dev.forces.turned for c in step.contacts if c.dev.forces.spins]
+    turned += [step.particles.wall_turn] if step.particles.turned_by_walls else []
+    if not (state.spins and turned and share.any()):
+        return
+    with memory.compiler():
+        half = runner.clock.h * runner.spin() - memory.read(state.spin.s)[: runner.n]
+    rows, s = slice(first, first + len(share)), memory.read(state.spin.s)
+    s[rows] += share * half[rows]
+    memory.write(state.spin.s, s)
+    for field in turned:
+        left = memory.read(field)
+        left[rows] *= 1 - share
+        memory.write(field, left)
 
 
 def give(

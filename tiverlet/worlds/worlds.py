@@ -571,29 +571,35 @@ class Worlds:
     def _give(self, velocity: np.ndarray, chosen: np.ndarray) -> None:
         """Have some go on with these velocities, (some, n, dim), see World.velocity."""
         clocks, runner = self._clocks, self._runner
-        others = (velocity != self._velocities()[chosen]).any(axis=2)
-        moved = others.any(axis=1)
-        steered = moved & ~clocks.d_is_velocity[chosen] & (not runner.probe)
+        seen = self._velocities()[chosen]
+        change = velocity - seen
+        moved = change.any(axis=(1, 2))
+        drag = clocks.drags[chosen]
+        steered = moved & ~clocks.d_is_velocity[chosen] & (not runner.probe) & (drag[:, 0] >= impulse.WEAK)
         if steered.any():
             some, memory, n = chosen[steered], runner.memory, runner.n
             for k in some:
                 clocks.parted.pop(int(k), None)
+            want, seen, change, drag = velocity[steered], seen[steered], change[steered], drag[steered]
             inv_mass = [self._sources[k].inv_mass for k in some] if self._sources else runner.scene.inv_mass
-            free, want, drag = others[steered] & (np.asarray(inv_mass) > 0), velocity[steered], clocks.drags[some]
-            seen, bare = (self._velocities(firm)[some] for firm in (True, False))
+            free = change.any(axis=2) & (np.asarray(inv_mass) > 0)
+            had, bare = (self._velocities(firm)[some] for firm in (True, False))
+            h = clocks.h[some, None, None]
+            leaning = had - bare + impulse.known(runner, h, drag[:, None, None], lambda field: memory.read(field)[some, :n])
             with self._knobs.shown(0):
-                does = impulse.suffices(want, seen, bare, free, impulse.rubs(runner), drag) | ~free.any(axis=1)
-            some, free, want, drag = some[does], free[does], want[does], drag[does]
-            steered[steered] = does
-            if len(some):
-                those = impulse.Displacements(
-                    runner, free, lambda field: memory.read(field)[some, :n], lambda field, v: memory.write_some(field, v, some)
-                )
-                factor = impulse.factor(clocks.h[some], drag)
-                found = those.give(want, lambda: self._velocities()[some], factor)
-                steered[steered] = found
-                clocks.known[some] = False
-                clocks.parted.update((int(k), want[i]) for i, k in enumerate(some) if found[i])
+                share = free[..., None] * impulse.ends(change, seen, had, leaning, impulse.rubs(runner))
+            more = share * leaning
+            those = impulse.Displacements(
+                runner, free, lambda field: memory.read(field)[some, :n], lambda field, v: memory.write_some(field, v, some)
+            )
+            found = those.give(want + more, lambda: self._velocities()[some], impulse.factor(clocks.h[some], drag))
+            found &= np.isfinite(more).all(axis=(1, 2))
+            for k, parts in zip(some[found], share[found], strict=True) if runner.scene.state.spins else ():
+                with self._at(k):
+                    impulse.turn_on(runner, 0, parts)
+            steered[steered] = found
+            clocks.known[some] = False
+            clocks.parted.update((int(k), want[i]) for i, k in enumerate(some) if found[i])
         fresh = moved & ~steered
         self._start_from(velocity[fresh], chosen[fresh])
 
