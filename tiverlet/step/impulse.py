@@ -86,13 +86,26 @@ class Displacements:
                 break
         return least <= MET * np.abs(want).max(axis=(1, 2), initial=0.0) if again else np.ones(len(want), dtype=bool)
 
+    def steer(
+        self, want: np.ndarray, change: np.ndarray, seen: np.ndarray, had: np.ndarray, leaning: np.ndarray, rubs: bool,
+        velocity: Callable[[], np.ndarray], factor: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+        """The same where velocities or spins get a `change`, by which part of a reaction may end. Returns that share of it,
+        (worlds, n, 1), and in which worlds that was found. seen: velocities so far, for the user; had: what displacements stand
+        for, with more of a reaction where part of it has ended; leaning: what reactions give in half a substep."""
+        share = self.some * ended(change, had - seen, leaning, rubs)
+        for field in self.others:  # forces that read velocities do without it, too
+            self.was[field] = self.was[field] + share * (self.was[self.field] - self.was[field])
+        want = want + share * leaning
+        return share, self.give(want, velocity, factor, had) & np.isfinite(want).all(axis=(1, 2))
 
-def ends(change: np.ndarray, seen: np.ndarray, had: np.ndarray, leaning: np.ndarray, rubs: bool) -> np.ndarray:
-    """Which share of the half of a reaction, `leaning`, changes of velocity end, (worlds, n, 1): those along it, or with friction
-    in any direction. seen: velocities so far; had: what displacements stand for, beyond which is what ended before."""
+
+def ended(change: np.ndarray, before: np.ndarray, leaning: np.ndarray, rubs: bool) -> np.ndarray:
+    """Which share of `leaning`, what reactions give in half a substep, is over once velocities change, (worlds, n, 1): all of it
+    from LEANS of it on, along it or, with friction, in any direction. before: what was over of it."""
     square = (leaning**2).sum(axis=2)
     part = np.linalg.norm(change, axis=2) * np.sqrt(square) if rubs else np.abs((change * leaning).sum(axis=2))
-    over = part / LEANS + ((had - seen) * leaning).sum(axis=2)
+    over = part / LEANS + (before * leaning).sum(axis=2)
     return np.clip(np.divide(over, square, out=np.zeros_like(over), where=square != 0), 0, 1)[..., None]
 
 
@@ -101,31 +114,25 @@ def rubs(runner: Any) -> bool:
     return any(c.has_friction for c in runner.step.contacts) or any(wall.has_friction for wall in runner.step.walls)
 
 
-def known(runner: Any, h: Any, drag: np.ndarray, read: Callable[[Any], np.ndarray]) -> Any:
-    """What loads that contacts know give in half a substep h [m/s], as forces. read: gets a field's rows. Of one world, or many."""
-    return h * drag[..., 3] * sum(read(each.carried.field).astype(np.float64) for each in runner.known)
-
-
 def steer(runner: Any, want: np.ndarray, seen: np.ndarray, change: np.ndarray, iterations: int) -> bool:
     """Have particles with a `change` of velocity or spin, (n, any) [m/s], that can move go on with velocities `want`, (n, dim)
-    [m/s], instead of `seen`. Returns whether that was found; else it takes a start."""
-    some, clock = change.any(axis=1), runner.clock
-    drag = np.array(clock.drag or FREE)
-    if clock.d_is_velocity or runner.probe or drag[0] < WEAK:
+    [m/s], instead of `seen`. Returns whether displacements were found that stand for these; else it takes a start."""
+    some, clock, drag = change.any(axis=1), runner.clock, np.array([runner.clock.drag or FREE])
+    if clock.d_is_velocity or runner.probe or drag[0, 0] < WEAK:
         return False
     first, end, chosen = _movable(runner, some)
-    rows = slice(first, end)
     if first < end:
+        rows, those = slice(first, end), _those(runner, first, chosen)
         with runner.memory.compiler():
-            had = seen if clock.parted is None else runner.velocity(iterations)
-            leaning = had[rows] - runner.velocity(iterations, first, end, firm=False)
-        leaning += known(runner, clock.h, drag, lambda field: runner.memory.seen(field)[rows])
-        share = ends(*(v[None, rows] for v in (change, seen, had)), leaning[None], rubs(runner))[0] * chosen[:, None]
-        more = np.zeros(want.shape)
-        more[rows] = share * leaning
-        if not (np.isfinite(more).all() and give(runner, want + more, some, iterations, had)):
+            had = (seen if clock.parted is None else runner.velocity(iterations))[None, rows]
+            leaning = had - runner.velocity(iterations, first, end, firm=False)
+            share, found = those.steer(
+                want[None, rows], change[None, rows], seen[None, rows], had, leaning, rubs(runner),
+                lambda: runner.velocity(iterations, first, end)[None], factor(clock.h, drag),
+            )  # fmt: skip
+        if not found[0]:
             return False
-        turn_on(runner, first, share)
+        turn_on(runner, first, share[0])
     runner.wake(np.flatnonzero(some))
     clock.energy, clock.parted = None, want.copy()
     return True

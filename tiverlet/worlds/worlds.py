@@ -584,16 +584,13 @@ class Worlds:
             inv_mass = [self._sources[k].inv_mass for k in some] if self._sources else runner.scene.inv_mass
             free = change.any(axis=2) & (np.asarray(inv_mass) > 0)
             had, bare = (self._velocities(firm)[some] for firm in (True, False))
-            h = clocks.h[some, None, None]
-            leaning = had - bare + impulse.known(runner, h, drag[:, None, None], lambda field: memory.read(field)[some, :n])
-            with self._knobs.shown(0):
-                share = free[..., None] * impulse.ends(change, seen, had, leaning, impulse.rubs(runner))
-            more = share * leaning
             those = impulse.Displacements(
                 runner, free, lambda field: memory.read(field)[some, :n], lambda field, v: memory.write_some(field, v, some)
             )
-            found = those.give(want + more, lambda: self._velocities()[some], impulse.factor(clocks.h[some], drag))
-            found &= np.isfinite(more).all(axis=(1, 2))
+            with self._knobs.shown(0):
+                rubs = impulse.rubs(runner)
+            factor = impulse.factor(clocks.h[some], drag)
+            share, found = those.steer(want, change, seen, had, had - bare, rubs, lambda: self._velocities()[some], factor)
             for k, parts in zip(some[found], share[found], strict=True) if runner.scene.state.spins else ():
                 with self._at(k):
                     impulse.turn_on(runner, 0, parts)
