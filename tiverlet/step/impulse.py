@@ -87,26 +87,40 @@ class Displacements:
         return least <= MET * np.abs(want).max(axis=(1, 2), initial=0.0) if again else np.ones(len(want), dtype=bool)
 
     def steer(
-        self, want: np.ndarray, change: np.ndarray, seen: np.ndarray, had: np.ndarray, leaning: np.ndarray, rubs: bool,
-        velocity: Callable[[], np.ndarray], factor: np.ndarray,
+        self, want: np.ndarray, change: np.ndarray, seen: np.ndarray, had: np.ndarray, bare: np.ndarray, free: np.ndarray,
+        pulled: np.ndarray, rubs: bool, velocity: Callable[[], np.ndarray], h: Any, drag: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-        """The same where velocities or spins get a `change`, by which part of a reaction may end. Returns that share of it,
-        (worlds, n, 1), and in which worlds that was found. seen: velocities so far, for the user; had: what displacements stand
-        for, with more of a reaction where part of it has ended; leaning: what reactions give in half a substep."""
-        share = self.some * ended(change, had - seen, leaning, rubs)
+        """The same for `want` where velocities or spins get a `change`, with which what particles lean on may end. Returns which
+        share of that is over, (worlds, n, 1), and in which worlds that was found.
+
+        seen: velocities so far, for the user; had: what displacements stand for, which is more where something is over; bare:
+        that without reactions; free: without those of contacts and walls. pulled: by links that may go slack. h, drag: of each.
+        """
+        leaning = had - free
+        over = _ratio(((had - seen) * leaning).sum(axis=2), leaning) + _ended(change, had - bare, rubs)
+        share = np.where(self.some, np.clip(over, 0, 1)[..., None], 0.0)
+        more = np.where(self.some, share * leaning, 0.0)
+        r = (h * drag[:, 1] / drag[:, 3]).reshape(-1, 1, 1) * more
         for field in self.others:  # forces that read velocities do without it, too
-            self.was[field] = self.was[field] + share * (self.was[self.field] - self.was[field])
-        want = want + share * leaning
-        return share, self.give(want, velocity, factor, had) & np.isfinite(want).all(axis=(1, 2))
+            self.was[field] = self.was[field] + r
+        found = np.isfinite(more).all(axis=(1, 2)) & ~(pulled & (share[..., 0] == 1)).any(axis=1)
+        return share, found & self.give(want + more, velocity, factor(h, drag), had)
 
 
-def ended(change: np.ndarray, before: np.ndarray, leaning: np.ndarray, rubs: bool) -> np.ndarray:
-    """Which share of `leaning`, what reactions give in half a substep, is over once velocities change, (worlds, n, 1): all of it
-    from LEANS of it on, along it or, with friction, in any direction. before: what was over of it."""
+def _ended(change: np.ndarray, leaning: np.ndarray, rubs: bool) -> np.ndarray:
+    """Which share of what particles lean with a change of velocity ends, (worlds, n): all from LEANS of it on, along it or, with
+    friction, in any direction. leaning: what reactions give in half a substep."""
+    if rubs:
+        part = np.sqrt((change**2).sum(axis=2) * (leaning**2).sum(axis=2))
+    else:
+        part = np.abs((change * leaning).sum(axis=2))
+    return _ratio(part, leaning) / LEANS
+
+
+def _ratio(part: np.ndarray, leaning: np.ndarray) -> np.ndarray:
+    """By the square of `leaning`; 0 where nothing leans."""
     square = (leaning**2).sum(axis=2)
-    part = np.linalg.norm(change, axis=2) * np.sqrt(square) if rubs else np.abs((change * leaning).sum(axis=2))
-    over = part / LEANS + (before * leaning).sum(axis=2)
-    return np.clip(np.divide(over, square, out=np.zeros_like(over), where=square != 0), 0, 1)[..., None]
+    return np.divide(part, square, out=np.zeros_like(square), where=square != 0)
 
 
 def rubs(runner: Any) -> bool:
@@ -114,21 +128,33 @@ def rubs(runner: Any) -> bool:
     return any(c.has_friction for c in runner.step.contacts) or any(wall.has_friction for wall in runner.step.walls)
 
 
+def pulled(runner: Any, worlds: int, read: Callable[[Any], np.ndarray]) -> np.ndarray:
+    """The particles that rigid links hold which may go slack, a mask (worlds, n). read: gets a field, of each."""
+    out = np.zeros((worlds, runner.n), dtype=bool)
+    for batch in runner.batches:
+        if getattr(batch, "side", 0):
+            world, c = np.nonzero((read(batch.dev.equation.lam)[:, : batch.count] != 0) & (batch.compliance == 0))
+            out[world[:, None], batch.indices[c]] = True
+    return out
+
+
 def steer(runner: Any, want: np.ndarray, seen: np.ndarray, change: np.ndarray, iterations: int) -> bool:
     """Have particles with a `change` of velocity or spin, (n, any) [m/s], that can move go on with velocities `want`, (n, dim)
     [m/s], instead of `seen`. Returns whether displacements were found that stand for these; else it takes a start."""
-    some, clock, drag = change.any(axis=1), runner.clock, np.array([runner.clock.drag or FREE])
+    some, clock, drag = (change != 0).any(axis=1), runner.clock, np.array([runner.clock.drag or FREE])
     if clock.d_is_velocity or runner.probe or drag[0, 0] < WEAK:
         return False
     first, end, chosen = _movable(runner, some)
     if first < end:
         rows, those = slice(first, end), _those(runner, first, chosen)
         with runner.memory.compiler():
-            had = (seen if clock.parted is None else runner.velocity(iterations))[None, rows]
-            leaning = had - runner.velocity(iterations, first, end, firm=False)
+            had = seen if clock.parted is None else runner.velocity(iterations)
+            free = runner.velocity(iterations, first, end, touches=False)[None]
+            bare = runner.velocity(iterations, first, end, links=False, touches=False)[None] if runner.batches else free
             share, found = those.steer(
-                want[None, rows], change[None, rows], seen[None, rows], had, leaning, rubs(runner),
-                lambda: runner.velocity(iterations, first, end)[None], factor(clock.h, drag),
+                want[None, rows], change[None, rows], seen[None, rows], had[None, rows], bare, free,
+                pulled(runner, 1, lambda field: runner.memory.read(field)[None])[:, rows], rubs(runner),
+                lambda: runner.velocity(iterations, first, end)[None], clock.h, drag,
             )  # fmt: skip
         if not found[0]:
             return False

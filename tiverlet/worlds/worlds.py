@@ -525,8 +525,8 @@ class Worlds:
         with self._open():
             return read_only(self._velocities(), assign_whole("Worlds", "velocity"))
 
-    def _velocities(self, firm: bool = True) -> np.ndarray:
-        """Those of all. firm: with what rigid constraints, contacts and walls give to them."""
+    def _velocities(self, links: bool = True, touches: bool = True) -> np.ndarray:
+        """Those of all. links, touches: with what rigid constraints, and contacts and walls, give to them."""
         runner, clocks = self._runner, self._clocks
         out = runner.memory.read(runner.scene.state.d)[:, : runner.n].astype(np.float64)
         saved = runner.memory.read(runner.search.list.old_saved)[:, 0] if runner.search else np.zeros(len(self))
@@ -539,7 +539,7 @@ class Worlds:
         some = np.flatnonzero(~there & ~alone).astype(np.int32)
         if len(some):
             rigid, soft = shares_of(clocks.h[some], clocks.started[some], clocks.lacked[some], clocks.drags[some])
-            given = np.stack([clocks.h[some], clocks.time[some], rigid * firm, soft], axis=1)
+            given = np.stack([clocks.h[some], clocks.time[some], rigid * links, soft, rigid * touches], axis=1)
             with runner.memory.compiler(), self._knobs.shown(0):
                 self._kernels.velocities(len(some), some, given, out.reshape(-1))
             for path in runner.paths:
@@ -547,8 +547,8 @@ class Worlds:
                 path.point_along(turned, clocks.frame[some, 1], some)
                 out[some] = turned
         for k in np.flatnonzero(alone):
-            with self._at(k) as world:
-                out[k] = world.velocity
+            with self._at(k) as world, runner.memory.compiler():
+                out[k] = runner.velocity(world.iterations, links=links, touches=touches)
         return out
 
     @velocity.setter
@@ -582,15 +582,17 @@ class Worlds:
                 clocks.parted.pop(int(k), None)
             want, seen, change, drag = velocity[steered], seen[steered], change[steered], drag[steered]
             inv_mass = [self._sources[k].inv_mass for k in some] if self._sources else runner.scene.inv_mass
-            free = change.any(axis=2) & (np.asarray(inv_mass) > 0)
-            had, bare = (self._velocities(firm)[some] for firm in (True, False))
+            moves = change.any(axis=2) & (np.asarray(inv_mass) > 0)
+            had, free = (self._velocities(touches=touches)[some] for touches in (True, False))
+            bare = self._velocities(links=False, touches=False)[some] if runner.batches else free
             those = impulse.Displacements(
-                runner, free, lambda field: memory.read(field)[some, :n], lambda field, v: memory.write_some(field, v, some)
+                runner, moves, lambda field: memory.read(field)[some, :n], lambda field, v: memory.write_some(field, v, some)
             )
             with self._knobs.shown(0):
-                rubs = impulse.rubs(runner)
-            factor = impulse.factor(clocks.h[some], drag)
-            share, found = those.steer(want, change, seen, had, had - bare, rubs, lambda: self._velocities()[some], factor)
+                rubs, pulled = impulse.rubs(runner), impulse.pulled(runner, len(some), lambda field: memory.read(field)[some])
+            share, found = those.steer(
+                want, change, seen, had, bare, free, pulled, rubs, lambda: self._velocities()[some], clocks.h[some], drag
+            )
             for k, parts in zip(some[found], share[found], strict=True) if runner.scene.state.spins else ():
                 with self._at(k):
                     impulse.turn_on(runner, 0, parts)
