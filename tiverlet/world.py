@@ -305,8 +305,9 @@ class World:
     def velocity(self) -> np.ndarray:
         """Velocities [m/s], (n, dim), a read-only copy in f64; of the order of the world.
 
-        Assign an array to set them, as an impulse to those whose velocity it changes; where it makes anything leave what it leans
-        on, or rub another way, all start from these velocities. To write back what was read changes nothing.
+        Assign an array to set them, as an impulse to those whose velocity it changes; others go on to the bit, also where these
+        leave what they lean on, or rub another way. But where what hangs on a taut rope is sent off, and in orders above 2, all
+        start from these velocities. To write back what was read changes nothing.
         """
         out = self._clock.parted
         if out is None:

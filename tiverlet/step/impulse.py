@@ -4,8 +4,10 @@ A velocity is (share d + rest (h^2 a + reaction)) / h, see Integrator.velocity_a
 that it is to have, times h / share, is what its displacement lacks. Nothing else of the state changes: what is to have the
 velocity that it has goes on to the bit, known loads stay known, and sound goes on being damped, as they would not after a start.
 
-The half of the reaction that this leaves in d has to go on in the next substep. It does not where what leaned on something
-leaves it, or friction turns round: there velocities are a start, see suffices().
+The half of the reaction that this leaves in d has to go on in the next substep. That of links does, or they would part. What a
+particle leans on by contacts and walls may end, where it is sent off or friction turns round: it gets that half back, so that the
+next substep finds as much to bear as a start would, see Displacements.steer(). What touches it has its own half all the same, and
+falls by g h / 2 too fast where that ends with it. Where a rope that is taut may go slack, all start.
 """
 
 from collections.abc import Callable
@@ -18,7 +20,7 @@ from .integrator import FREE
 ROUNDS = 100  # of asking for velocities, at most, where forces read them
 NOTHING = 2.0**-20  # of a velocity: less than this of it is in the next displacement
 WEAK = 0.01  # the same: below it, displacements tell velocities by too few digits
-LEANS = 0.25  # of what half of a reaction gives: a change of velocity after which it goes on
+LEANS = 0.25  # of what half of a reaction gives: a change of velocity that ends it, and smaller ones a part of it
 MET = 1e-5  # of the largest velocity: what may be lacking where forces read velocities
 Write = Callable[[Any, np.ndarray], None]
 
