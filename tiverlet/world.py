@@ -306,8 +306,9 @@ class World:
     def velocity(self) -> np.ndarray:
         """Velocities [m/s], (n, dim), a read-only copy in f64; of the order of the world.
 
-        Assign an array to set them, as an impulse to those whose velocity it changes; where it makes anything leave what it leans
-        on, or rub another way, all start from these velocities. To write back what was read changes nothing.
+        Assign an array to set them, as an impulse to those whose velocity it changes; others go on to the bit, also where these
+        leave what they lean on, or rub another way. But where what hangs on a taut rope is sent off, and in orders above 2, all
+        start from these velocities. To write back what was read changes nothing.
         """
         out = self._clock.parted
         if out is None:
@@ -325,16 +326,9 @@ class World:
             for watcher in self._watchers:
                 watcher.assigned("velocity", value)
             seen = self.velocity
-            others = (value != seen).any(axis=1)
-            if not others.any():
-                return
-            runner, clock = self._runner, self._clock
-            known = seen if clock.parted is None else None
-            if clock.d_is_velocity or runner.probe or not impulse.steer(runner, value, others, self._iterations, known):
+            change = value - seen
+            if change.any() and not impulse.steer(self._runner, value, seen, change, self._iterations):
                 self._start_from(value)
-            else:
-                runner.wake(np.flatnonzero(others))
-                clock.energy, clock.parted = None, value.copy()
 
     @property
     def spin(self) -> np.ndarray:
@@ -357,15 +351,19 @@ class World:
             for watcher in self._watchers:
                 watcher.assigned("spin", value)
             runner, clock, spin = self._runner, self._clock, self._runner.scene.state.spin
-            new, others = spin.from_rates(value), (value != self.spin).reshape(len(value), -1).any(axis=1)
-            if runner.probe or (impulse.rubs(runner) and impulse.leans(runner, others, self._iterations)):
-                self._let_go()  # friction becomes another one
-            if not clock.d_is_velocity:
-                with runner.memory.compiler():
-                    lack = np.where(others[:, None], new - runner.spin(), 0.0)
-                runner.wake(np.flatnonzero(others))
-                new = runner.memory.read(spin.s)[: runner.n] + clock.h * lack
-            runner.memory.write(spin.s, new)
+            with runner.memory.compiler():
+                has = runner.spin()
+            others = (value != spin.to_rates(has)).reshape(len(value), -1).any(axis=1)
+            change = np.where(others[:, None], spin.from_rates(value) - has, 0.0)
+            if not change.any():
+                return
+            if impulse.rubs(runner) or runner.probe:  # friction becomes another one
+                seen = self.velocity
+                if not impulse.steer(runner, seen, seen, change, self._iterations):
+                    self._let_go()
+            runner.wake(np.flatnonzero(others))
+            s = runner.memory.read(spin.s)[: runner.n]
+            runner.memory.write(spin.s, has + change if clock.d_is_velocity else s + clock.h * change)
             clock.energy = None
 
     @property

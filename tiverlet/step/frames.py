@@ -137,13 +137,14 @@ class Frames:
         self, count: ti.i32, which: ti.types.ndarray(ti.i32, 1), given: ti.types.ndarray(ti.f64, 2),  # type: ignore[valid-type]
         out: ti.types.ndarray(ti.f64, 1),  # type: ignore[valid-type]
     ):  # fmt: skip
-        """Velocities of the copies that are listed, as the user sees them. given: the arguments of Step.velocities, of each."""
+        """Velocities of the copies that are listed, as the user sees them. given: of each, h, t, and firm
+        and soft of Batch.push_reaction; and firm for contacts and walls."""
         for k in range(count):
             w = which[k]
             self.copies.enter(w)
             self.step.write_reactions(given[k, 0], given[k, 2], given[k, 3])
             for i in range(self.step.n):
-                v = self.step.velocity_of(i, given[k, 0], given[k, 1], given[k, 2])
+                v = self.step.velocity_of(i, given[k, 0], given[k, 1], given[k, 4])
                 for a in ti.static(range(self.step.dim)):
                     out[(w * self.step.n + i) * self.step.dim + a] = v[a]
 

@@ -4,8 +4,10 @@ A velocity is (share d + rest (h^2 a + reaction)) / h, see Integrator.velocity_a
 that it is to have, times h / share, is what its displacement lacks. Nothing else of the state changes: what is to have the
 velocity that it has goes on to the bit, known loads stay known, and sound goes on being damped, as they would not after a start.
 
-The half of the reaction that this leaves in d has to go on in the next substep. It does not where what leaned on something
-leaves it, or friction turns round: there velocities are a start, see suffices().
+The half of the reaction that this leaves in d has to go on in the next substep. That of links does, or they would part. What a
+particle leans on by contacts and walls may end, where it is sent off or friction turns round: it gets that half back, so that the
+next substep finds as much to bear as a start would, see Displacements.steer(). What touches it has its own half all the same, and
+falls by g h / 2 too fast where that ends with it. Where a rope that is taut may go slack, all start.
 """
 
 from collections.abc import Callable
@@ -18,7 +20,7 @@ from .integrator import FREE
 ROUNDS = 100  # of asking for velocities, at most, where forces read them
 NOTHING = 2.0**-20  # of a velocity: less than this of it is in the next displacement
 WEAK = 0.01  # the same: below it, displacements tell velocities by too few digits
-LEANS = 0.25  # of what half of a reaction gives: a change of velocity after which it goes on
+LEANS = 0.25  # of what half of a reaction gives: a change of velocity that ends it, and smaller ones a part of it
 MET = 1e-5  # of the largest velocity: what may be lacking where forces read velocities
 Write = Callable[[Any, np.ndarray], None]
 
@@ -86,18 +88,41 @@ class Displacements:
                 break
         return least <= MET * np.abs(want).max(axis=(1, 2), initial=0.0) if again else np.ones(len(want), dtype=bool)
 
+    def steer(
+        self, want: np.ndarray, change: np.ndarray, seen: np.ndarray, had: np.ndarray, bare: np.ndarray, free: np.ndarray,
+        pulled: np.ndarray, rubs: bool, velocity: Callable[[], np.ndarray], h: Any, drag: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+        """The same for `want` where velocities or spins get a `change`, with which what particles lean on may end. Returns which
+        share of that is over, (worlds, n, 1), and in which worlds that was found.
 
-def suffices(want: np.ndarray, seen: np.ndarray, bare: np.ndarray, some: np.ndarray, rubs: bool, drag: np.ndarray) -> np.ndarray:
-    """In which worlds an impulse does for velocities `want` of the particles `some`, (worlds,).
+        seen: velocities so far, for the user; had: what displacements stand for, which is more where something is over; bare:
+        that without reactions; free: without those of contacts and walls. pulled: by links that may go slack. h, drag: of each.
+        """
+        leaning = had - free
+        over = _ratio(((had - seen) * leaning).sum(axis=2), leaning) + _ended(change, had - bare, rubs)
+        share = np.where(self.some, np.clip(over, 0, 1)[..., None], 0.0)
+        more = np.where(self.some, share * leaning, 0.0)
+        r = (h * drag[:, 1] / drag[:, 3]).reshape(-1, 1, 1) * more
+        for field in self.others:  # forces that read velocities do without it, too
+            self.was[field] = self.was[field] + r
+        found = np.isfinite(more).all(axis=(1, 2)) & ~(pulled & (share[..., 0] == 1)).any(axis=1)
+        return share, found & self.give(want + more, velocity, factor(h, drag), had)
 
-    seen: those that they have; bare: without what constraints, contacts and walls give in half a substep. A change by more than
-    a part of that, along it, or with friction in any direction, may end it. drag: of each world, (worlds, 5).
-    """
-    change, leaning = want - seen, seen - bare
-    size = np.linalg.norm(leaning, axis=2)
-    part = np.linalg.norm(change, axis=2) * size if rubs else np.abs((change * leaning).sum(axis=2))
-    ends = some & ~(part <= LEANS * size * size)  # so is what is no number
-    return ~ends.any(axis=1) & (drag[:, 0] >= WEAK)
+
+def _ended(change: np.ndarray, leaning: np.ndarray, rubs: bool) -> np.ndarray:
+    """Which share of what particles lean with a change of velocity ends, (worlds, n): all from LEANS of it on, along it or, with
+    friction, in any direction. leaning: what reactions give in half a substep."""
+    if rubs:
+        part = np.sqrt((change**2).sum(axis=2) * (leaning**2).sum(axis=2))
+    else:
+        part = np.abs((change * leaning).sum(axis=2))
+    return _ratio(part, leaning) / LEANS
+
+
+def _ratio(part: np.ndarray, leaning: np.ndarray) -> np.ndarray:
+    """By the square of `leaning`; 0 where nothing leans."""
+    square = (leaning**2).sum(axis=2)
+    return np.divide(part, square, out=np.zeros_like(square), where=square != 0)
 
 
 def rubs(runner: Any) -> bool:
@@ -105,26 +130,58 @@ def rubs(runner: Any) -> bool:
     return any(c.has_friction for c in runner.step.contacts) or any(wall.has_friction for wall in runner.step.walls)
 
 
-def steer(runner: Any, want: np.ndarray, some: np.ndarray, iterations: int, seen: np.ndarray | None = None) -> bool:
-    """Have the particles of the mask `some`, (n,), that can move go on with velocities `want`, (n, dim) [m/s], if an impulse does
-    for it; returns whether. seen: what Runner.velocity() says, if that is known."""
-    first, end, chosen = _movable(runner, some)
-    if first == end:
-        return True
-    drag = np.array([runner.clock.drag or FREE])
-    with runner.memory.compiler():
-        had = runner.velocity(iterations) if seen is None else seen
-        bare = runner.velocity(iterations, first, end, firm=False)[None]
-    if not suffices(want[None, first:end], had[None, first:end], bare, chosen[None], rubs(runner), drag)[0]:
+def pulled(runner: Any, worlds: int, read: Callable[[Any], np.ndarray]) -> np.ndarray:
+    """The particles that rigid links hold which may go slack, a mask (worlds, n). read: gets a field, of each."""
+    out = np.zeros((worlds, runner.n), dtype=bool)
+    for batch in runner.batches:
+        if getattr(batch, "side", 0):
+            world, c = np.nonzero((read(batch.dev.equation.lam)[:, : batch.count] != 0) & (batch.compliance == 0))
+            out[world[:, None], batch.indices[c]] = True
+    return out
+
+
+def steer(runner: Any, want: np.ndarray, seen: np.ndarray, change: np.ndarray, iterations: int) -> bool:
+    """Have particles with a `change` of velocity or spin, (n, any) [m/s], that can move go on with velocities `want`, (n, dim)
+    [m/s], instead of `seen`. Returns whether displacements were found that stand for these; else it takes a start."""
+    some, clock, drag = (change != 0).any(axis=1), runner.clock, np.array([runner.clock.drag or FREE])
+    if clock.d_is_velocity or runner.probe or drag[0, 0] < WEAK:
         return False
-    return give(runner, want, some, iterations, had)
+    first, end, chosen = _movable(runner, some)
+    if first < end:
+        rows, those = slice(first, end), _those(runner, first, chosen)
+        with runner.memory.compiler():
+            had = seen if clock.parted is None else runner.velocity(iterations)
+            free = runner.velocity(iterations, first, end, touches=False)[None]
+            bare = runner.velocity(iterations, first, end, links=False, touches=False)[None] if runner.batches else free
+            share, found = those.steer(
+                want[None, rows], change[None, rows], seen[None, rows], had[None, rows], bare, free,
+                pulled(runner, 1, lambda field: runner.memory.read(field)[None])[:, rows], rubs(runner),
+                lambda: runner.velocity(iterations, first, end)[None], clock.h, drag,
+            )  # fmt: skip
+        if not found[0]:
+            return False
+        turn_on(runner, first, share[0])
+    runner.wake(np.flatnonzero(some))
+    clock.energy, clock.parted = None, want.copy()
+    return True
 
 
-def leans(runner: Any, some: np.ndarray, iterations: int) -> bool:
-    """Whether constraints, contacts or walls gave anything to any of the particles `some`, (n,)."""
-    with runner.memory.compiler():
-        seen, bare = (runner.velocity(iterations, firm=firm) for firm in (True, False))
-    return bool((seen != bare)[some].any())
+def turn_on(runner: Any, first: int, share: np.ndarray) -> None:
+    """Have particles from number `first` on keep of what friction turned them by in half a substep the part that is over."""
+    state, memory, step = runner.scene.state, runner.memory, runner.step
+    turned = [c.dev.forces.turned for c in step.contacts if c.dev.forces.spins]
+    turned += [step.particles.wall_turn] if step.particles.turned_by_walls else []
+    if not (state.spins and turned and share.any()):
+        return
+    with memory.compiler():
+        half = runner.clock.h * runner.spin() - memory.read(state.spin.s)[: runner.n]
+    rows, s = slice(first, first + len(share)), memory.read(state.spin.s)
+    s[rows] += share * half[rows]
+    memory.write(state.spin.s, s)
+    for field in turned:
+        left = memory.read(field)
+        left[rows] *= 1 - share
+        memory.write(field, left)
 
 
 def give(

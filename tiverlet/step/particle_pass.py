@@ -395,7 +395,7 @@ class ParticlePass:
     @ti.func
     def reaction(self, i, h, t, firm):
         """h^2 times what constraints (from Slots), contacts and walls accelerated particle i by in the last substep; and which
-        part of what walls did is in it.
+        part of what walls did is in it. firm: see Batch.push_reaction(); with 0, loads that contacts know are taken out, too.
 
         Walls count as far as they balance the rest: a body at rest has velocity 0, but one that has just bounced is not credited
         with half of the blow, nor is any of the body that it belongs to.
@@ -405,6 +405,8 @@ class ParticlePass:
             reaction = self.slots.total_of(i)
         for c in ti.static(self.contacts):
             reaction += firm * c.reaction(i, h)
+            if ti.static(self.knows_loads):
+                reaction -= ti.select(firm == 0, h * h, 0 * h) * c.dev.known.carried.field[i]
         if ti.static(len(self.walls) > 0):
             push = firm * self.wall_displacement[i]
             v = self.state.d[i] / h

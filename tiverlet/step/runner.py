@@ -316,10 +316,16 @@ class Runner:
             self.step.stopped(before)
 
     def velocity(
-        self, iterations: int, first: int = 0, end: int | None = None, came: bool = False, firm: bool = True
+        self,
+        iterations: int,
+        first: int = 0,
+        end: int | None = None,
+        came: bool = False,
+        links: bool = True,
+        touches: bool = True,
     ) -> np.ndarray:
         """Velocities as the user sees them, to the order of the world; of particles from number `first` on, up to `end`. came:
-        they touch nothing yet. firm: with what rigid constraints, contacts and walls give to them."""
+        they touch nothing yet. links, touches: with what rigid constraints, and contacts and walls, give to them."""
         clock = self.clock
         if clock.d_is_velocity:
             out = self.memory.read(self.scene.state.d).astype(np.float64)
@@ -328,23 +334,23 @@ class Runner:
         else:
             if not came:
                 self._list_again()
-            out = self._velocities(first, end, firm)
+            out = self._velocities(first, end, links, touches)
             for path in self.paths if len(out) == self.n else ():
                 path.point_along(out, clock.frame[1])
             return out
         return out[first : self.n if end is None else end]
 
-    def _velocities(self, first: int = 0, end: int | None = None, firm: bool = True) -> np.ndarray:
+    def _velocities(self, first: int = 0, end: int | None = None, links: bool = True, touches: bool = True) -> np.ndarray:
         """Have the kernel make velocities of displacements."""
         launch = self._velocity
         if launch is None or len(launch.arrays[1]) < self.n:
             room = np.zeros((1 << self.n.bit_length(), self.step.dim))
-            launch = CachedLaunch(self.step, "velocities", self.memory.compiler, np.zeros(6), room)
+            launch = CachedLaunch(self.step, "velocities", self.memory.compiler, np.zeros(7), room)
         self._velocity = launch if self.n <= KEPT else None
         given, out = launch.arrays
         end = self.n if end is None else end
-        given[:] = self.clock.h, self.clock.time, *self.shares(), first, end
-        given[2] *= firm
+        firm, soft = self.shares()
+        given[:] = self.clock.h, self.clock.time, firm * links, soft, first, end, firm * touches
         launch()
         return out[first:end].copy()
 

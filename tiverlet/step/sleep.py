@@ -32,7 +32,7 @@ class Sleep(Feature):
 
     - a particle that moves, or a driven one, touches it: before that contact is solved;
     - a force on it is another one than it was when it fell asleep (those of the user's own, in frames);
-    - it, or another of its island, is given another velocity or spin (all wake where that makes it leave what it leans on);
+    - it, or another of its island, is given another velocity or spin (all wake where a start is made of it);
 
     and before a frame in which a wall is moved, a knob is changed, positions are assigned, particles or features come or go, or
     substeps become shorter or longer. Against a world that never sleeps, it is off by less than speed

@@ -590,8 +590,8 @@ class Step:
 
     @ti.kernel
     def velocities(self, given: ti.types.ndarray(ti.f64, 1), out: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
-        """Velocities as the user sees them. given: h, t, firm and soft of Batch.push_reaction, and of which particles: the first
-        of them, and that behind the last.
+        """Velocities as the user sees them. given: h, t, firm and soft of Batch.push_reaction, of which particles: the first of
+        them, and that behind the last; and firm for contacts and walls.
 
         With the forces of constraints at x_n along the directions there they are second order, and have the momentum and the
         angular momentum of the motion, sum m x_n x (x_n - x_(n-1)) / h and what forces from outside add in h / 2. Springs are
@@ -599,7 +599,7 @@ class Step:
         """
         self.write_reactions(given[0], given[2], given[3])
         for i in range(integer(given, 4), integer(given, 5)):
-            v = self.velocity_of(i, given[0], given[1], given[2])
+            v = self.velocity_of(i, given[0], given[1], given[6])
             for k in ti.static(range(self.dim)):
                 out[i, k] = v[k]
 

@@ -525,8 +525,8 @@ class Worlds:
         with self._open():
             return read_only(self._velocities(), assign_whole("Worlds", "velocity"))
 
-    def _velocities(self, firm: bool = True) -> np.ndarray:
-        """Those of all. firm: with what rigid constraints, contacts and walls give to them."""
+    def _velocities(self, links: bool = True, touches: bool = True) -> np.ndarray:
+        """Those of all. links, touches: with what rigid constraints, and contacts and walls, give to them."""
         runner, clocks = self._runner, self._clocks
         out = runner.memory.read(runner.scene.state.d)[:, : runner.n].astype(np.float64)
         saved = runner.memory.read(runner.search.list.old_saved)[:, 0] if runner.search else np.zeros(len(self))
@@ -539,7 +539,7 @@ class Worlds:
         some = np.flatnonzero(~there & ~alone).astype(np.int32)
         if len(some):
             rigid, soft = shares_of(clocks.h[some], clocks.started[some], clocks.lacked[some], clocks.drags[some])
-            given = np.stack([clocks.h[some], clocks.time[some], rigid * firm, soft], axis=1)
+            given = np.stack([clocks.h[some], clocks.time[some], rigid * links, soft, rigid * touches], axis=1)
             with runner.memory.compiler(), self._knobs.shown(0):
                 self._kernels.velocities(len(some), some, given, out.reshape(-1))
             for path in runner.paths:
@@ -547,8 +547,8 @@ class Worlds:
                 path.point_along(turned, clocks.frame[some, 1], some)
                 out[some] = turned
         for k in np.flatnonzero(alone):
-            with self._at(k) as world:
-                out[k] = world.velocity
+            with self._at(k) as world, runner.memory.compiler():
+                out[k] = runner.velocity(world.iterations, links=links, touches=touches)
         return out
 
     @velocity.setter
@@ -571,29 +571,34 @@ class Worlds:
     def _give(self, velocity: np.ndarray, chosen: np.ndarray) -> None:
         """Have some go on with these velocities, (some, n, dim), see World.velocity."""
         clocks, runner = self._clocks, self._runner
-        others = (velocity != self._velocities()[chosen]).any(axis=2)
-        moved = others.any(axis=1)
-        steered = moved & ~clocks.d_is_velocity[chosen] & (not runner.probe)
+        seen = self._velocities()[chosen]
+        change = velocity - seen
+        moved = change.any(axis=(1, 2))
+        drag = clocks.drags[chosen]
+        steered = moved & ~clocks.d_is_velocity[chosen] & (not runner.probe) & (drag[:, 0] >= impulse.WEAK)
         if steered.any():
             some, memory, n = chosen[steered], runner.memory, runner.n
             for k in some:
                 clocks.parted.pop(int(k), None)
+            want, seen, change, drag = velocity[steered], seen[steered], change[steered], drag[steered]
             inv_mass = [self._sources[k].inv_mass for k in some] if self._sources else runner.scene.inv_mass
-            free, want, drag = others[steered] & (np.asarray(inv_mass) > 0), velocity[steered], clocks.drags[some]
-            seen, bare = (self._velocities(firm)[some] for firm in (True, False))
+            moves = change.any(axis=2) & (np.asarray(inv_mass) > 0)
+            had, free = (self._velocities(touches=touches)[some] for touches in (True, False))
+            bare = self._velocities(links=False, touches=False)[some] if runner.batches else free
+            those = impulse.Displacements(
+                runner, moves, lambda field: memory.read(field)[some, :n], lambda field, v: memory.write_some(field, v, some)
+            )
             with self._knobs.shown(0):
-                does = impulse.suffices(want, seen, bare, free, impulse.rubs(runner), drag) | ~free.any(axis=1)
-            some, free, want, drag = some[does], free[does], want[does], drag[does]
-            steered[steered] = does
-            if len(some):
-                those = impulse.Displacements(
-                    runner, free, lambda field: memory.read(field)[some, :n], lambda field, v: memory.write_some(field, v, some)
-                )
-                factor = impulse.factor(clocks.h[some], drag)
-                found = those.give(want, lambda: self._velocities()[some], factor)
-                steered[steered] = found
-                clocks.known[some] = False
-                clocks.parted.update((int(k), want[i]) for i, k in enumerate(some) if found[i])
+                rubs, pulled = impulse.rubs(runner), impulse.pulled(runner, len(some), lambda field: memory.read(field)[some])
+            share, found = those.steer(
+                want, change, seen, had, bare, free, pulled, rubs, lambda: self._velocities()[some], clocks.h[some], drag
+            )
+            for k, parts in zip(some[found], share[found], strict=True) if runner.scene.state.spins else ():
+                with self._at(k):
+                    impulse.turn_on(runner, 0, parts)
+            steered[steered] = found
+            clocks.known[some] = False
+            clocks.parted.update((int(k), want[i]) for i, k in enumerate(some) if found[i])
         fresh = moved & ~steered
         self._start_from(velocity[fresh], chosen[fresh])
 

@@ -333,7 +333,7 @@ class CornerPasses(Passes):
         pull = self.equation.reaction(c, f, w, W, h, firm, soft)
         if ti.static(self.known.learns):
             if self.spring.is_rigid(c):
-                pull += (soft - firm) * self.known.given[c]
+                pull += ti.select(firm == 0, 0 * firm, soft - firm) * self.known.given[c]
         for k in ti.static(range(self.arity)):
             self.corners.push(c, k, self.w.of(self.corners.member(c, k)) * pull * g[k, :])
 

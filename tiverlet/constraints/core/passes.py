@@ -41,7 +41,8 @@ class Passes:
         """Push what the constraint adds to h^2 a, along its directions at the present positions, about which it has no moment:
         what it did in the last substep, and of a spring, how much its force has changed since, see Spring.change().
 
-        firm, soft: h^2 over what its multiplier stands for, where it is rigid and where not.
+        firm, soft: h^2 over what its multiplier stands for, where it is rigid and where not. With firm = 0, what is rigid pushes
+        nothing, not even a load that it knows.
         """
 
     @ti.func
