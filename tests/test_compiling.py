@@ -287,7 +287,7 @@ def test_who_waits_is_told_what_for(world, monkeypatch):
 
     features = [tv.Force(pull), tv.Contact(friction=0.123), tv.Box((-9, -9), (9, 9))]
     w = world(tv.Particles([[0.0, 0.0], [1.0, 0.0]], radius=0.4), features)
-    assert "Nothing was compiled for it" in w.explain()
+    assert "fused" not in w._runner.memory.compiler.times.kernels
     w.step(1 / 60)
     assert "compiling fused: Box, Contact, Force" in shown.getvalue()
     times, (line,) = w._runner.memory.compiler.times, [row for row in w.explain().splitlines() if row.startswith("Compiled in")]
@@ -298,6 +298,8 @@ def test_who_waits_is_told_what_for(world, monkeypatch):
     other = w.clone()
     other.step(1 / 60)
     assert "Nothing was compiled for it" in other.explain()
+    w.add(features=[tv.Drag(0.123)])  # it is built anew, and goes on telling
+    assert w._runner.memory.compiler.times.kernels["fused"] == times.kernels["fused"]
 
 
 def squares():

@@ -138,6 +138,7 @@ class Rebuild:
         world._clock.parted = None
         world._install(world._particles.regrouped(self.some, self.added), self.features, parts)
         runner = world._runner
+        runner.memory.compiler.times.add(last.memory.compiler.times)
         runner.pass_on(left, self.some)
         runner.scene.reach = reach
         runner.memory.restore(state)

@@ -49,6 +49,12 @@ class Times:
     kernels: dict[str, float]
     features: dict[str, float]
 
+    def add(self, earlier: "Times") -> None:
+        """Count what was compiled before the world was built anew, too."""
+        for own, more in ((self.kernels, earlier.kernels), (self.features, earlier.features)):
+            for name, seconds in more.items():
+                own[name] = own.get(name, 0.0) + seconds
+
 
 class Compiler:
     """How the kernels of one world are compiled, while it is called as a context.
