@@ -1,6 +1,7 @@
 """How frames get to the device: in one launch, with lists that grow, and kernels that are made anew for it."""
 
 import copy
+import functools
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,12 @@ from .step_report import StepReport
 
 KEPT = 100_000  # particles: up to so many, the array for velocities is kept; for more, making one costs next to nothing
 LONG = 10_000_000  # particles and constraints, times passes, in a launch: it takes about a second
+
+
+@functools.lru_cache(16)  # they are asked for several times between two frames
+def _shares(h: float, started: bool, lacked: float, drag: tuple[float, ...]) -> tuple[float, float]:
+    firm, soft = shares_of(h, started, lacked, np.array(drag))
+    return float(firm), float(soft)
 
 
 class Runner:
@@ -380,9 +387,7 @@ class Runner:
 
     def shares(self) -> tuple[float, float]:
         """Those of the last substep, for rigid and for soft constraints, see shares_of()."""
-        clock = self.clock
-        firm, soft = shares_of(clock.h, clock.started, clock.lacked, np.array(clock.drag or FREE))
-        return float(firm), float(soft)
+        return _shares(self.clock.h, self.clock.started, self.clock.lacked, tuple(self.clock.drag or FREE))
 
     # Launches.
 

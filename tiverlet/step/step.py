@@ -582,6 +582,15 @@ class Step:
     @ti.kernel
     def spins(self, h64: ti.f64, t: ti.f64, firm64: ti.f64, soft64: ti.f64, out: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
         """Velocities r omega of surfaces, (n, axes), with the arguments of velocities()."""
+        if ti.static(self.particles.whole):
+            if h64 > 0:  # loops inside of a branch wake no threads
+                self.write_spins(h64, t, firm64, soft64, out)
+        else:
+            self.write_spins(h64, t, firm64, soft64, out)
+
+    @ti.func
+    def write_spins(self, h64, t, firm64, soft64, out: ti.template()):  # type: ignore[valid-type]
+        """To an array."""
         self.write_reactions(h64, firm64, soft64)
         for i in range(self.n):
             v = self.particles.surface_velocity(i, ti.cast(h64, self.real), ti.cast(t, self.real), ti.cast(firm64, self.real))
@@ -597,6 +606,15 @@ class Step:
         angular momentum of the motion, sum m x_n x (x_n - x_(n-1)) / h and what forces from outside add in h / 2. Springs are
         asked for their force at x_n, so that a start from these velocities neither pumps nor brakes them.
         """
+        if ti.static(self.particles.whole):
+            if given[0] > 0:  # loops inside of a branch wake no threads
+                self.write_velocities(given, out)
+        else:
+            self.write_velocities(given, out)
+
+    @ti.func
+    def write_velocities(self, given: ti.template(), out: ti.template()):  # type: ignore[valid-type]
+        """To an array."""
         self.write_reactions(given[0], given[2], given[3])
         for i in range(integer(given, 4), integer(given, 5)):
             v = self.velocity_of(i, given[0], given[1], given[6])
