@@ -251,7 +251,7 @@ def test_what_is_left_out_of_the_writing_is_not_read(world, monkeypatch):
         r = w._runner
         with monkeypatch.context() as patch:
             patch.setattr(Kernel, "materialize", translate)
-            for owner, name, given in ((r.step, "fused", (r.sheet,)), (r.step, "to_velocity", (0.1, 0.0))):
+            for owner, name, given in ((r.step, "fused", (r.sheet,)), (r.step, "to_velocity", (np.zeros(2),))):
                 with pytest.raises(Translated), r.memory.compiler():
                     getattr(owner, name)(*given)
 

@@ -338,6 +338,17 @@ class Memory:
         else:
             view[first : first + len(values)] = values
 
+    def write_rows(self, field, some: np.ndarray, values) -> None:
+        """Overwrite some elements of a field, by their numbers; of a world alone."""
+        self.check()
+        view = self._seen().get(id(self._find(field)))
+        if view is None:
+            rows = self.read(field)
+            rows[some] = values
+            self.write(field, rows)
+        else:
+            view[some] = values
+
     def write_some(self, field, values, some: np.ndarray) -> None:
         """Overwrite a field of some copies; values: the same for all, or one row for each of them."""
         self.check()

@@ -16,7 +16,6 @@ from ..neighbours.periodic import Periodic
 from ..particles import Particles
 from . import edit_in_place, impulse, initial_violation
 from .build import check_settings, checked_features, listed
-from .integrator import FREE
 from .sleep import Sleep
 
 NONE: Mapping[Feature, Feature] = MappingProxyType({})
@@ -155,20 +154,23 @@ def renew(world: Any) -> None:
         build_again(world, np.ones(len(world.particles), dtype=bool), None, world.features, NONE)
         return
     told = world._all_events() if runner.logs else world._events
-    loose, moved = np.zeros(runner.n, dtype=bool), runner.scene.inv_mass > 0
-    loose[grabbing.some] = runner.scene.inv_mass[grabbing.some] == 0
-    seen = clock.parted
-    if seen is None and loose.any() and not clock.d_is_velocity:
-        seen = runner.memory.seen(runner.scene.state.d)[: runner.n] / clock.h
-    if grabbing.soft:
+    loose = grabbing.some[runner.scene.inv_mass[grabbing.some] == 0]
+    loose = np.unique(loose) if len(loose) > 1 else loose
+    seen, moved = clock.parted, runner.scene.inv_mass > 0
+    had = None
+    if seen is not None:
+        had = seen[loose]
+    elif not clock.d_is_velocity:
+        had = runner.memory.seen(runner.scene.state.d)[loose] / clock.h
+    if grabbing.soft or not impulse.tells(runner):
         with runner.memory.compiler():
             runner.restart_between(world.iterations)
     clock.energy = None
     runner.wake()
     edit_in_place.grab(world, grabbing)
     world._events = told
-    if seen is not None:
-        _let_go(world, seen, loose)
+    if had is not None:
+        impulse.let_go(runner, loose, had, world.iterations)
     if clock.parted is not None:
         clock.parted = _held(runner, clock.parted, moved)
     for watcher in world._watchers:
@@ -251,10 +253,10 @@ def _held(runner: Any, velocity: np.ndarray, moved: np.ndarray) -> np.ndarray:
 
 def _let_go(world: Any, seen: np.ndarray, loose: np.ndarray) -> None:
     """Have the particles in the mask `loose` go on with the velocities that they had, (n, dim)."""
-    runner, clock = world._runner, world._clock
-    drag = (clock.drag or FREE)[0]
-    plain = clock.d_is_velocity or not (runner.probe or drag < impulse.WEAK)
-    if loose.any() and not (plain and impulse.give(runner, seen, loose, world.iterations, rounds=1)):
+    runner, some = world._runner, np.flatnonzero(loose)
+    if runner.clock.d_is_velocity or impulse.tells(runner):
+        impulse.let_go(runner, some, seen[some], world.iterations)
+    elif len(some):
         world._start_from(seen)
 
 

@@ -22,13 +22,14 @@ NOTHING = 2.0**-20  # of a velocity: less than this of it is in the next displac
 WEAK = 0.01  # the same: below it, displacements tell velocities by too few digits
 LEANS = 0.25  # of what half of a reaction gives: a change of velocity that ends it, and smaller ones a part of it
 MET = 1e-5  # of the largest velocity: what may be lacking where forces read velocities
+DIGITS = 4  # roundings of it: as near as one comes
 Write = Callable[[Any, np.ndarray], None]
 
 
-def factor(h: Any, drag: np.ndarray) -> np.ndarray:
+def factor(h: np.ndarray, drag: np.ndarray) -> np.ndarray:
     """By how much a displacement has to be longer for a velocity of 1 m/s more [s], after a substep h. Where drag leaves nothing
-    of a velocity in a substep, d does not matter. Of one world, or arrays of many, with drag (..., 5) of each."""
-    return h / np.maximum(drag[..., 0], NOTHING)
+    of a velocity in a substep, d does not matter. Of many worlds, with drag (worlds, 5)."""
+    return h / np.maximum(drag[:, 0], NOTHING)
 
 
 class Displacements:
@@ -64,29 +65,31 @@ class Displacements:
             self.write(field, np.where(self.some, self.was[field] + more, self.was[field]))
 
     def give(
-        self, want: np.ndarray, velocity: Callable[[], np.ndarray], factor: np.ndarray, seen: np.ndarray | None = None,
-        rounds: int = 2,
-    ) -> np.ndarray:  # fmt: skip
+        self, want: np.ndarray, velocity: Callable[[], np.ndarray], factor: np.ndarray, seen: np.ndarray | None = None
+    ) -> np.ndarray:
         """Have them stand for velocities `want`, (worlds, ..., dim): at once, but for a round for what the first one rounded, or
-        one time after the other where forces read velocities, until these come no nearer. rounds: 1 for neither, which does for
-        what lacks little. velocity: asks for those that they
+        one time after the other where forces read velocities, until these come no nearer. velocity: asks for those that they
         stand for. factor: of each world, see factor(). seen: what velocity() would say at first, if that is known. Returns in
         which worlds that was found, (worlds,)."""
         more = best = np.zeros(want.shape)
         least, factor = np.full(len(want), np.inf), factor.reshape(-1, 1, 1)
-        again = self.again and rounds > 1
-        for _ in range(ROUNDS if again else rounds):
+        largest = np.abs(want).max(axis=(1, 2), initial=0.0)
+        enough = DIGITS * np.finfo(self.was[self.field].dtype).eps * largest if self.again else 0.0
+        for _ in range(ROUNDS if self.again else 2):
             lack = np.where(self.some, want - (velocity() if seen is None else seen), 0.0)
             seen = None
             most = np.abs(lack).max(axis=(1, 2), initial=0.0)
             nearer = most < least
             better = nearer[:, None, None]
             best, least = np.where(better, more, best), np.where(nearer, most, least)
-            more = np.where(better, more + factor * lack, best)
-            self.lengthen(more)
-            if not nearer.any():
+            ends = ~nearer | (least <= enough)
+            if (ends & nearer).all():
                 break
-        return least <= MET * np.abs(want).max(axis=(1, 2), initial=0.0) if again else np.ones(len(want), dtype=bool)
+            more = np.where(ends[:, None, None], best, more + factor * lack)
+            self.lengthen(more)
+            if ends.all():
+                break
+        return least <= MET * largest if self.again else np.ones(len(want), dtype=bool)
 
     def steer(
         self, want: np.ndarray, change: np.ndarray, seen: np.ndarray, had: np.ndarray, bare: np.ndarray, free: np.ndarray,
@@ -140,11 +143,16 @@ def pulled(runner: Any, worlds: int, read: Callable[[Any], np.ndarray]) -> np.nd
     return out
 
 
+def tells(runner: Any) -> bool:
+    """Whether displacements tell velocities: in order 2, by enough digits."""
+    return not runner.probe and (runner.clock.drag or FREE)[0] >= WEAK
+
+
 def steer(runner: Any, want: np.ndarray, seen: np.ndarray, change: np.ndarray, iterations: int) -> bool:
     """Have particles with a `change` of velocity or spin, (n, any) [m/s], that can move go on with velocities `want`, (n, dim)
     [m/s], instead of `seen`. Returns whether displacements were found that stand for these; else it takes a start."""
     some, clock, drag = (change != 0).any(axis=1), runner.clock, np.array([runner.clock.drag or FREE])
-    if clock.d_is_velocity or runner.probe or drag[0, 0] < WEAK:
+    if clock.d_is_velocity or not tells(runner):
         return False
     first, end, chosen = _movable(runner, some)
     if first < end:
@@ -184,37 +192,41 @@ def turn_on(runner: Any, first: int, share: np.ndarray) -> None:
         memory.write(field, left)
 
 
-def give(
-    runner: Any, want: np.ndarray, some: np.ndarray, iterations: int, seen: np.ndarray | None = None, rounds: int = 2
-) -> bool:
-    """Have the particles of the mask `some`, (n,), that can move go on with velocities `want`, (n, dim) [m/s]. Returns whether
-    displacements were found that stand for these. seen: what Runner.velocity() says, if that is known. rounds: see
-    Displacements.give()."""
-    memory, (first, end, chosen) = runner.memory, _movable(runner, some)
-    if first == end:
-        return True
+def let_go(runner: Any, some: np.ndarray, want: np.ndarray, iterations: int) -> None:
+    """Have those of the particles `some` that can move, (k,), in the order of their numbers, go on with velocities `want`, (k, dim)
+    [m/s]."""
+    memory, moves = runner.memory, runner.scene.inv_mass[some] > 0
+    if not moves.all():
+        some, want = some[moves], want[moves]
+    if not len(some):
+        return
     if runner.clock.d_is_velocity:
-        d = memory.seen(runner.scene.state.d)[first:end]
-        memory.write_from(runner.scene.state.d, first, np.where(chosen[:, None], want[first:end], d))
-        return True
-    with memory.compiler():
-        those = _those(runner, first, chosen)
-        had = None if seen is None else seen[None, first:end]
-        found = those.give(
-            want[None, first:end], lambda: runner.velocity(iterations, first, end)[None], _factor(runner), had, rounds
-        )
-    return bool(found[0])
+        memory.write_rows(runner.scene.state.d, some, want)
+        return
+    first = int(some[0])
+    lack = want - runner.velocity(iterations, first, int(some[-1]) + 1)[some - first]
+    those = Displacements(
+        runner, moves[moves], lambda field: memory.seen(field)[some], lambda field, rows: memory.write_rows(field, some, rows)
+    )
+    those.lengthen(_factor(runner) * lack)
 
 
 def give_new(runner: Any, first: int, want: np.ndarray, iterations: int) -> None:
     """Give particles from number `first` on, which touch nothing yet, the displacements that velocities `want` need, (m, dim)."""
     moves = runner.scene.inv_mass[first:] > 0
     want = np.where(moves[:, None], want, 0.0)[None]
-    with runner.memory.compiler():
-        those = _those(runner, first, moves)
-        those.begin_with(runner.clock.h * want)
-        rounds = 2 if runner.integrator.uses_velocity else 1
-        those.give(want, lambda: runner.velocity(iterations, first, came=True)[None], _factor(runner), rounds=rounds)
+    those = _those(runner, first, moves)
+    those.begin_with(runner.clock.h * want)
+
+    def velocity() -> np.ndarray:
+        """What they stand for."""
+        return runner.velocity(iterations, first, came=True)[None]
+
+    with runner.memory.compiler():  # for orders above 2
+        if runner.integrator.uses_velocity:
+            those.give(want, velocity, np.array([_factor(runner)]))
+        else:
+            those.lengthen(_factor(runner) * (want - velocity()))
 
 
 def _movable(runner: Any, some: np.ndarray) -> tuple[int, int, np.ndarray]:
@@ -225,9 +237,9 @@ def _movable(runner: Any, some: np.ndarray) -> tuple[int, int, np.ndarray]:
     return first, end, some[first:end]
 
 
-def _factor(runner: Any) -> np.ndarray:
-    """Of a world alone."""
-    return factor(runner.clock.h, np.array([runner.clock.drag or FREE]))
+def _factor(runner: Any) -> float:
+    """That of factor() for a world alone."""
+    return runner.clock.h / max((runner.clock.drag or FREE)[0], NOTHING)
 
 
 def _those(runner: Any, first: int, some: np.ndarray) -> Displacements:

@@ -80,6 +80,9 @@ class Runner:
             self._fused = self.frames.launch_one(self.sheet)
         self._measure = CachedLaunch(self.diagnostics, "measure", self.memory.compiler, self.sheet)
         self._velocity: CachedLaunch | None = None  # once it is asked for
+        self._spin: CachedLaunch | None = None  # likewise
+        self._turned = np.zeros(2)
+        self._to_velocity = CachedLaunch(self.step, "to_velocity", self.memory.compiler, self._turned)
         self._data, self._given, self._reporter = self.sheet.data, self.sheet.data[H:], self.diagnostics.report
 
     def renew(self) -> None:
@@ -286,7 +289,8 @@ class Runner:
             elif self.probe:
                 self.memory.write(self.scene.state.d, high_order.velocity(self.probe, clock, self.memory, iterations))
             else:
-                self.step.to_velocity(clock.h, clock.time)
+                self._turned[:] = clock.h, clock.time
+                self._to_velocity()
                 clock.owed = (clock.drag or FREE)[3] * clock.h
             clock.d_is_velocity, clock.parted = True, None
 
@@ -349,10 +353,7 @@ class Runner:
 
     def _velocities(self, first: int = 0, end: int | None = None, links: bool = True, touches: bool = True) -> np.ndarray:
         """Have the kernel make velocities of displacements."""
-        launch = self._velocity
-        if launch is None or len(launch.arrays[1]) < self.n:
-            room = np.zeros((1 << self.n.bit_length(), self.step.dim))
-            launch = CachedLaunch(self.step, "velocities", self.memory.compiler, np.zeros(7), room)
+        launch = self._with_room(self._velocity, "velocities", 7, self.step.dim)
         self._velocity = launch if self.n <= KEPT else None
         given, out = launch.arrays
         end = self.n if end is None else end
@@ -360,6 +361,13 @@ class Runner:
         given[:] = self.clock.h, self.clock.time, firm * links, soft, first, end, firm * touches
         launch()
         return out[first:end].copy()
+
+    def _with_room(self, launch: CachedLaunch | None, kernel: str, numbers: int, axes: int) -> CachedLaunch:
+        """A launch of a kernel that is given so many numbers, and has room for a row of each particle; the same, if it has."""
+        if launch is not None and len(launch.arrays[1]) >= self.n:
+            return launch
+        room = np.zeros((1 << self.n.bit_length(), axes))
+        return CachedLaunch(self.step, kernel, self.memory.compiler, np.zeros(numbers), room)
 
     def _list_again(self) -> None:
         """After a state was put back: build the neighbour list, which reactions of contacts need."""
@@ -372,9 +380,12 @@ class Runner:
         if clock.d_is_velocity:
             return self.memory.read(spin.s).astype(np.float64)[: self.n]
         self._list_again()
-        out = np.zeros((max(1, self.n), spin.axes))
-        self.step.spins(clock.h, clock.time, *self.shares(), out)
-        return out[: self.n]
+        launch = self._with_room(self._spin, "spins", 4, spin.axes)
+        self._spin = launch if self.n <= KEPT else None
+        given, out = launch.arrays
+        given[:] = clock.h, clock.time, *self.shares()
+        launch()
+        return out[: self.n].copy()
 
     def torque(self) -> np.ndarray:
         """Moments of contacts and walls in the last substep, (n, axes) [N m]: I alpha, by r omega = s / h + r alpha h / 2."""

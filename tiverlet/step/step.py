@@ -554,13 +554,22 @@ class Step:
                 self.particles.stop(i, move)
 
     @ti.kernel
-    def to_velocity(self, h64: ti.f64, t: ti.f64):
-        """Turn displacements into velocities, for a start with another h or another state.
+    def to_velocity(self, given: ti.types.ndarray(ti.f64, 1)):  # type: ignore[valid-type]
+        """Turn displacements into velocities, for a start with another h or another state. given: h, t.
 
         Springs count with their force at x_n. Rigid links do not: the part of v_n along them is what the next substep corrects,
         and across them d / h + h a / 2 is what RATTLE has, so nothing is lost to second order nor to any other.
         """
-        h = ti.cast(h64, self.real)
+        if ti.static(self.particles.whole):
+            if given[0] > 0:  # loops inside of a branch wake no threads
+                self.turn_to_velocity(given[0], given[1])
+        else:
+            self.turn_to_velocity(given[0], given[1])
+
+    @ti.func
+    def turn_to_velocity(self, h64, t64):
+        """To where displacements are."""
+        h, t = ti.cast(h64, self.real), ti.cast(t64, self.real)
         if ti.static(self.constraints.springs):
             if ti.static(self.team.size == 1):
                 self.constraints.spring_forces(0, h)
@@ -572,7 +581,7 @@ class Step:
             force = 0 * self.state.d[i]
             if ti.static(self.constraints.springs):
                 force = self.slots.total_of(i)
-            self.state.d[i] = self.integrator.velocity_after(i, h, ti.cast(t, self.real), force)
+            self.state.d[i] = self.integrator.velocity_after(i, h, t, force)
             if ti.static(self.state.carries):
                 self.state.d_low[i] = ti.zero(self.state.d[i])
         if ti.static(self.state.spins):
@@ -580,20 +589,21 @@ class Step:
                 self.state.spin.end(i, h)
 
     @ti.kernel
-    def spins(self, h64: ti.f64, t: ti.f64, firm64: ti.f64, soft64: ti.f64, out: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
-        """Velocities r omega of surfaces, (n, axes), with the arguments of velocities()."""
+    def spins(self, given: ti.types.ndarray(ti.f64, 1), out: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
+        """Velocities r omega of surfaces, (n, axes). given: h, t, firm and soft, as those of velocities()."""
         if ti.static(self.particles.whole):
-            if h64 > 0:  # loops inside of a branch wake no threads
-                self.write_spins(h64, t, firm64, soft64, out)
+            if given[0] > 0:  # loops inside of a branch wake no threads
+                self.write_spins(given, out)
         else:
-            self.write_spins(h64, t, firm64, soft64, out)
+            self.write_spins(given, out)
 
     @ti.func
-    def write_spins(self, h64, t, firm64, soft64, out: ti.template()):  # type: ignore[valid-type]
+    def write_spins(self, given: ti.template(), out: ti.template()):  # type: ignore[valid-type]
         """To an array."""
-        self.write_reactions(h64, firm64, soft64)
+        self.write_reactions(given[0], given[2], given[3])
         for i in range(self.n):
-            v = self.particles.surface_velocity(i, ti.cast(h64, self.real), ti.cast(t, self.real), ti.cast(firm64, self.real))
+            h, time, firm = ti.cast(given[0], self.real), ti.cast(given[1], self.real), ti.cast(given[2], self.real)
+            v = self.particles.surface_velocity(i, h, time, firm)
             for k in ti.static(range(self.state.spin.axes)):
                 out[i, k] = v[k]
 
