@@ -672,10 +672,10 @@ class World:
     def report(self, seconds: float, tolerance: float | None = None, **options):
         """Measure error against run time of this scene from its present state; returns a SceneReport with the cheapest settings.
 
-        The report shows the settings ready to paste. seconds [s]: length of the measured motion. tolerance: error at the end [m], by
-        default a thousandth of the motion. options: dt [s] of a frame; substeps: those to try; progress: show a bar. Clones run;
-        this world does not change. Knobs keep their present values. There is no known answer: the reference is the finest run,
-        and its own error is estimated and reported.
+        The report shows the settings ready to paste. seconds [s]: length of the measured motion. tolerance: error at the end [m],
+        by default a thousandth of the motion. options: dt [s] of a frame; substeps: those to try; progress: show a bar. Clones
+        run; this world does not change. Knobs keep their present values. There is no known answer: the reference is the finest
+        run, and its own error is estimated and reported.
         """
         from .report.accuracy.scene import scene_report
 
