@@ -7,8 +7,7 @@ from .shape import Shape, point, quads_of
 
 
 def cloth(corner, along, across, points: tuple[int, int], *, shear: bool = True, bend: bool = True) -> Shape:
-    """Make a sheet of points[0] x points[1] particles from `corner`, spanned by the vectors `along` and `across` [m], in 2D or
-    3D.
+    """Make a sheet of points[0] x points[1] particles from `corner`, spanned by vectors `along` and `across` [m], in 2D or 3D.
 
     links: to the neighbours. braces: the diagonals (shear), and links over two edges (bend). faces: two triangles per cell, with
     their quads in 3D. bends: the corners along rows and columns. Particle (i, j) has the number i points[1] + j.
