@@ -213,7 +213,7 @@ class World:
                 (self._runner.restart if steps else self._runner.restart_between)(self._iterations)
 
     def _let_go(self) -> None:
-        """Start from the present velocities, which include the part of the constraints that are about to let go."""
+        """Start from the present velocities, which include the reaction that is about to end."""
         if not self._clock.d_is_velocity:
             self._start_from(self.velocity)
 
@@ -223,7 +223,7 @@ class World:
         self._clock.energy = None
 
     def _adapt(self, steps: bool = False) -> None:
-        """Settle forces, and rebuild the world where knobs need other kernels.
+        """Handle changed forces, see _settle_forces(), and rebuild the world where knobs need other kernels.
 
         steps: whether a frame follows at once, so that residuals of the last frame are not read before it.
         """
@@ -469,7 +469,7 @@ class World:
         with whole:
             self._runner.list_neighbours()
             if contact.detects and self._runner.step.launched:
-                self._runner.look()  # measures contacts; on other paths the list build has done so
+                self._runner.look()  # measures contacts; on other paths list_neighbours() has called it
         return contact.found(self.position, self._clock.h or 1.0)
 
     def events(self, groups: Iterable | None = None) -> ContactEvents:

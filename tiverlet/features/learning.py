@@ -46,8 +46,8 @@ def steady(mean, earlier):
 def gain(own, slow, window):
     """Return the share of the missing load that is learnt at the end of a window of so many substeps.
 
-    Integral control must be slower than the decay of the slowest sound of the connected particles. That decay takes substeps in
-    proportion to k^2, where a load is that of k particles. So learning takes LAG + slow / own substeps, with slow in proportion
-    to k^2 and own to 1.
+    Integral control must be slower than the decay of the slowest sound of the connected particles. This decay takes a number of
+    substeps in proportion to k^2, for the load of k particles. So learning takes LAG + slow / own substeps. slow is in proportion
+    to k^2, own to 1.
     """
     return ti.min(window * own / (LAG * own + slow), GAIN)

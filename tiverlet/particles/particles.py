@@ -7,7 +7,7 @@ from .. import checks
 from ..features.arguments import meant
 from ..features.read_only import read_only, structure
 
-LARGEST = 1e15  # [m] beyond this, squared lengths leave the range of f32, 1e38
+LARGEST = 1e15  # [m] squared lengths up to 1e30 leave room below the largest f32, 3e38
 
 
 class Particles:
@@ -145,7 +145,7 @@ def _fixed(name: str, array: np.ndarray) -> np.ndarray:
 
 
 def in_range(who: str, name: str, position: np.ndarray) -> None:
-    """Raise ValueError for coordinates whose squares would overflow in f32."""
+    """Raise ValueError for coordinates above LARGEST, whose squares might overflow in f32."""
     if np.abs(position).max(initial=0.0) > LARGEST:
         far = np.abs(position) > LARGEST
         i, k = np.unravel_index(int(np.argmax(far)), far.shape)

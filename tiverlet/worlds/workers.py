@@ -194,8 +194,8 @@ def _serve(pipe: Any, job: bytes, threads: int) -> None:
 class Given:
     """A user's executor with submit(). If it accepts no more parts after a loss, processes of the sweep do the rest.
 
-    A part that ended a worker is not computed in this process, which it might end, too. Only if make and figures cannot be sent
-    to processes of the sweep is there no other place.
+    A part that ended a worker is not computed in this process, which it might end, too. The exception is a job that cannot be
+    sent to processes of the sweep: then this process is the only place left.
     """
 
     def __init__(self, executor: Any, job: Job):

@@ -536,7 +536,9 @@ class Worlds:
             return read_only(self._velocities(), assign_whole("Worlds", "velocity"))
 
     def _velocities(self, links: bool = True, touches: bool = True) -> np.ndarray:
-        """Return the velocities of all worlds. links, touches: include reactions of rigid constraints, and of contacts and walls.
+        """Return the velocities of all worlds.
+
+        links, touches: whether reactions of rigid constraints, and of contacts and walls, are included.
         """
         runner, clocks = self._runner, self._clocks
         out = runner.memory.read(runner.scene.state.d)[:, : runner.n].astype(np.float64)
