@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 # Passes over the constraints, at most, beside the regular ones of every substep: FEW where a system solves them, MANY where
 # impulses propagate from link to link. Most of the latter have little to do.
 FEW, MANY = 8, 32
-MET = 2.0**-9  # of the first push: a smaller velocity error counts as met
+MET = 2.0**-9  # of the first push: a smaller error of the normal displacement counts as met
 LIGHTEST = 2.0**-7  # the least share that a particle may have in the mass that its impact stops
 FELT = 2.0**-20  # of a squared displacement: a smaller change is no impact
 WAITS, HELD = 1, 2  # a particle is struck: in the pass in which it meets the wall, and in later passes

@@ -32,13 +32,14 @@ class Collider(Feature):
     where it was at the start of the substep, so it does not creep.
     restitution: 0 ... 1. The time of impact within the substep is solved for, with the acceleration during the substep. The
     particle leaves at restitution times its velocity at that time, and is placed where it would be at the end of the substep. A
-    particle that rigid links hold takes its body along, see BodyImpacts. It does not bounce if 8 substeps of forces and links
+    particle that rigid links hold takes its body along, see BodyImpacts; it does not bounce if 8 substeps of forces and links
     account for its speed. On springs, beside ShapeMatch, Area of loops, Path or Snap, and where it spins and has friction, a
-    particle bounces alone. For particles that spin, the displacement of the contact point is removed. friction = (static,
-    dynamic, rolling, twisting) then also resists rolling, by a moment of up to rolling * radius times the normal force, and
-    spinning about the normal, by up to twisting * radius times it; a particle that these moments hold does not roll. restitution
-    = (normal, tangential): in a bounce the contact point leaves across the normal at -tangential times its velocity, as far as
-    friction holds it; 0 grips, 1 is a super ball (Garwin 1969).
+    particle bounces alone.
+    For particles that spin, the displacement of the contact point is removed. Then friction = (static, dynamic, rolling,
+    twisting) also resists rolling, by a moment of up to rolling * radius times the normal force, and spinning about the normal,
+    by up to twisting * radius times it; a particle that these moments hold does not roll. With restitution = (normal, tangential)
+    the contact point leaves a bounce across the normal at -tangential times its velocity, as far as friction holds it; 0 grips, 1
+    is a super ball (Garwin 1969).
     active: whether the wall is present, for a gate that opens and closes. With True or False given it is a switch, which costs
     nothing to turn. None is always present; switching it off for the first time compiles another scene. Particles inside of a
     wall that returns are pushed out at push_out.

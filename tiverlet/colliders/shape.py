@@ -46,10 +46,11 @@ class Shape:
 
     @ti.func
     def strike(self, a, e, contact_distance, close, limit):
-        """Find the first touch of a particle on its way from a to a + e. Its center must stay at `contact_distance` from the
+        """Find the first touch of a particle on its way from a to a + e.
 
-        close: the size of rounding. limit: how far a start that is inside may be pushed out.
-        Returns the fraction of the way (2 for none), the depth at a + e below the plane that touches there, and its normal.
+        contact_distance: of its center from the shape. close: the size of rounding. limit: how far a start that is inside may be
+        pushed out. Returns the fraction of the way (2 for none), the depth at a + e below the plane that touches there, and its
+        normal.
         """
         return 0 * contact_distance + 2, 0 * contact_distance, 0 * e
 

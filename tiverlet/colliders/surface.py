@@ -229,12 +229,12 @@ class Surface:
 
     @ti.func
     def grip(self, i, n, across, support, bounces):
-        """Return what friction removes from the displacement `across` the normal of a spinning particle, and whether it stays in
+        """Return what friction removes from the displacement `across` the normal of a spinning particle, and whether it rests.
 
-        It stays where it neither slides nor rolls. support: the normal displacement from the wall. The spin of particle i is
-        updated. The displacement of the contact point, d - s x n, is removed. Where the wall resists rolling, by up to a moment
-        of rolling r N, both are solved for together. A particle that sticks stops as long as that moment holds it; one that rolls
-        on does so against it.
+        A particle rests where it neither slides nor rolls. support: the normal displacement from the wall. The spin is updated.
+        The displacement of the contact point, d - s x n, is removed. Where the wall resists rolling, by up to a moment of rolling
+        r N, both are solved for together. A particle that sticks stops as long as that moment holds it; one that rolls on does so
+        against it.
         """
         k, s = self.spin.share.of(i), self.spin.s[i]
         most, least = self.static() * support, self.dynamic() * support

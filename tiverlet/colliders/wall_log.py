@@ -17,9 +17,9 @@ class WallLog:
     """A row for each particle, written where the wall presses it, see Surface.press().
 
     touching: whether it was pressed in the last substep of the last frame; only this is kept between frames. when: the substeps
-    of the frame, from 1 on, in which it was first pressed and last pressed, or BEFORE or NEVER. impulse: the displacement that it
-    got along normals [m]; there are several normals in corners and in hollows. normal: the first of them. speed: its approach in
-    the substep in which it met the wall [m].
+    of the frame, from 1 on, in which it was first pressed and last pressed, or BEFORE or NEVER. impulse: the sum of the changes
+    of its displacement along normals [m]; there are several normals in corners and in hollows. normal: the first of them. speed:
+    its approach in the substep in which it met the wall [m].
     """
 
     per_particle = True
@@ -39,7 +39,7 @@ class WallLog:
 
     @ti.func
     def open(self, i):
-        """At the start of a frame: clear the row of particle i, which touched before or not."""
+        """At the start of a frame: clear the events of particle i. Whether it touched before is kept."""
         began = ti.select(self.touching[i] != 0, BEFORE, NEVER)
         self.when[i] = [began, began]
         self.impulse[i] = ti.zero(self.state.x[i])
@@ -58,7 +58,7 @@ class WallLog:
     def note(self, i, depth, n, push, approach):
         """Record that particle i is `depth` [m] inside of the wall with the normal n.
 
-        push: what its displacement gets along n [m]. approach: its displacement towards the wall [m].
+        push: change of its displacement along n [m]. approach: its displacement towards the wall [m].
         """
         began, last, now = self.when[i][0], self.when[i][1], self.substep[None]
         if last < now - 1:
@@ -71,7 +71,7 @@ class WallLog:
 
     @ti.func
     def add(self, i, push):
-        """Add a vector to the displacement that particle i got."""
+        """Add a vector to the impulse of particle i."""
         self.impulse[i] = self.impulse[i] + push
 
     @ti.func

@@ -56,7 +56,10 @@ class BendAngle(Angle):
 
     @ti.func
     def direction_reliable(self, f, f0):
-        """Whether |f| is above 0.1 in 3D: the plane of a nearly straight path turns with the least motion."""
+        """Whether the path is bent by more than 0.1 rad; in 2D always True.
+
+        In 3D the plane of a nearly straight path turns with the least motion.
+        """
         out = True
         if ti.static(self.state.dim == 3):
             out = ti.max(ti.abs(f), ti.abs(f0)) > 0.1

@@ -30,8 +30,8 @@ class Drive:
         |lam| <= largest h^2
 
     Below the largest load the constraint acts as with that rest value; at the largest load it is a force of that size. The rest
-    value then slips. Its distance from f is at most that where the multiplier reaches the limit, |f - rest| <= largest h^2 (W +
-    alpha'), so nothing is wound up that would be released once the load is gone.
+    value then slips, so that nothing is wound up that would be released once the load is gone. It stays within the distance at
+    which the multiplier reaches the limit, |f - rest| <= largest h^2 (W + alpha').
 
     For a rigid constraint, h^2 stands for the multiplier of a load of 1 N in this substep: h h / 2 in a start from given
     velocities, and h (h + h_old) / 2 where these velocities lack half of the last kick, see Integrator.h2_rigid().

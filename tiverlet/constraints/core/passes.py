@@ -56,9 +56,10 @@ class Passes:
 
     @ti.func
     def break_overloaded(self, c, h2_rigid, h2_effective, tick):
-        """Where the batch `breaks`: break constraint c if its load in this substep was too large; it does not act from the next
+        """Where the batch `breaks`: break constraint c if its load in this substep was too large.
 
-        h2_rigid, h2_effective: its multiplier for 1 N, for rigid and for soft constraints.
+        It does not act from the next substep on. h2_rigid, h2_effective: its multiplier for 1 N, for rigid and for soft
+        constraints.
         """
 
     @ti.func

@@ -267,9 +267,10 @@ class Scalar(Batch):
 
     @property
     def outgrown(self) -> bool:
-        """Whether the world has to be rebuilt: other constraints must be relaxed alone, or compliances differ in a world of
+        """Whether the world has to be rebuilt.
 
-        The result depends on the current values of knobs, not on earlier ones.
+        It has to be where other constraints than before must be relaxed alone, or where compliances differ in a world of order
+        above 2. The result depends on the current values of knobs, not on earlier ones.
         """
         if not (self.scene and self.acts):
             return super().outgrown

@@ -128,11 +128,11 @@ class Spring:
 
     @ti.func
     def solved(self, borne, h2_effective, left):
-        """Return F C / 2 relative to C^2 / (2 alpha): the share of a violation that bears the load. `left` is the rest of the
+        """Return F C / 2 relative to C^2 / (2 alpha): the share of a violation that bears the load.
 
-        The part of a violation that the solver leaves bears no load. The spring is then softer than alpha, F = C / (alpha + ...),
-        and C^2 / (2 alpha) would count energy that nothing supplied. borne: alpha |lam|, for the violation alpha |lam| /
-        h2_effective that bears the load; h2_effective is 0 before the first substep.
+        The part that the solver leaves, `left`, bears no load. The spring is then as soft as it was solved: F = C / (alpha + the
+        compliance that this adds). With 1 / alpha the energy would include some that nothing supplied.
+        borne: alpha |lam|. The part alpha |lam| / h2_effective bears the load. h2_effective is 0 before the first substep.
         """
         out, gone = ti.cast(1, self.real), left * h2_effective  # may underflow to 0
         if h2_effective > 0 and gone > 0:
@@ -141,7 +141,7 @@ class Spring:
 
     @ti.func
     def energy(self, c, w, h2_effective, stored, borne):
-        """Return the energy [J] of constraint c: `stored` where the substep resolves the spring, `borne` where the spring is
+        """Return the energy [J] of constraint c: `stored` where the substep resolves it, `borne` where it is stiff.
 
         stored: from the violation in the middle of a substep. borne: alpha F^2 / 2 with the load F. w: see stiff().
         A link that turns by phi in a substep is shorter in the middle of it, by phi^2 / 8 of its length. A stiff spring stores no

@@ -64,9 +64,11 @@ class StepLimit:
 
     @ti.func
     def limit(self, c, lam, new, u, W, longest, fastest, reach, size, share):
-        """Return the multiplier `new` of constraint c, or one that only removes motion where a Newton step is not valid; and
+        """Return the multiplier `new` of constraint c, or one that only removes motion; and whether it is the latter.
 
-        u, W, longest, fastest: see CornerPasses.motion. reach: see Quantity. size, share: see postpone().
+        It only removes motion where a Newton step is not valid. u, W, longest, fastest: see CornerPasses.motion. reach: see
+        Quantity.
+        size, share: see postpone().
         """
         far = False
         if W > 0 and (self.postponed[c] != 0 or ti.abs(new - lam) * longest > TRUST * reach):
