@@ -27,7 +27,7 @@ class Copies:
         self.chosen: int | None = None
         self.closed = False  # whether Memory.check() refuses access, because the caller may not handle copies
         self.number: Any = None  # a field with one number: the chosen copy
-        self._strides: set[int] = set()  # of all fields
+        self._strides: set[int] = set()  # the strides of all fields
         self._now: tuple[Any, dict[int, Any]] = (None, {})  # a kernel, and the offset of its copy by stride
         self._seen: np.ndarray | None = None  # the field `number` as an array, where the host can access it
 

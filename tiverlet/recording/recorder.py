@@ -86,7 +86,7 @@ class Recorder:
         if not os.path.isdir(folder):
             raise ValueError(f"Recorder: the folder {folder} does not exist. Make it first: os.makedirs({folder!r}).")
         self.frames = self._calls = 0
-        self._stride = self.every  # one of how many frames is drawn
+        self._stride = self.every  # one of so many frames is drawn
         self._each = 0  # about the bytes of a frame
         self._note = ""  # which frames the budget has left out
         self._full = self._closed = False  # whether the budget has ended the recording; whether close() was called

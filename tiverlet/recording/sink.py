@@ -27,7 +27,7 @@ class Sink:
     With a full disk, rerun's own file writer waits forever when the stream is flushed, and when the process ends. So rerun writes
     into a pipe, and a thread copies messages from there to the file. If that fails, the rest is read and dropped, and `error` is
     set. On the way data are compressed better. rerun's footer is left out, an index of all chunks that takes 90 kB; `rerun rrd
-    optimize` makes it again. On systems without named pipes, rerun writes the file itself.
+    optimize` makes it again. Without /dev/fd, rerun writes the file itself.
 
     A file to be overwritten stays as it is until keep(). viewer: the address of a viewer that shows the recording meanwhile.
     """
