@@ -127,7 +127,7 @@ class Memory:
 
     @contextlib.contextmanager
     def owned(self, owner: Any) -> Iterator[None]:
-        """Within this context, declarations belong to `owner`, who may repeat them within again()."""
+        """Within this context, declarations belong to `owner`, which may repeat them within again()."""
         if self._again:
             with self._again.owned(*self._owned[owner]):
                 yield

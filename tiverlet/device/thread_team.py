@@ -176,7 +176,7 @@ class Team:
 
     @inline
     def wait(self):
-        """Wait until all threads have arrived, and see what they have written."""
+        """Wait until all threads have arrived; everything that they wrote before is then visible."""
         return self._wait() if self.size > 1 else None
 
     @ti.func

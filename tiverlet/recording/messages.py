@@ -94,8 +94,8 @@ def smaller(message: bytes) -> bytes:
 def droppable(frames: np.ndarray, stride: int) -> np.ndarray:
     """Return which rows of an entity may be removed if one of `stride` frames is kept. frames: the frame of each row, ascending.
 
-    Two kinds of rows stay: those of the kept frames, and the last row before a kept frame without its own row, since it still
-    shows then.
+    Rows of kept frames stay. If a kept frame has no row of its own, the last row before it stays too, since the viewer shows it
+    there.
     """
     following = np.append(frames[1:], np.iinfo(np.int64).max)
     return (frames % stride != 0) & (following <= -(-frames // stride) * stride)

@@ -229,7 +229,7 @@ class Recorder:
         raise file_error(error, f"Recorder: writing {self.path} failed at frame {self._calls}", f". {rest}") from None
 
     def _left(self) -> int:
-        """Return what is left of the budget [bytes], without the waiting data and the end of the recording."""
+        """Return the free bytes of the budget, after the data that wait to be written and the end of the recording."""
         assert self.budget is not None
         return self.budget - self.bytes - RESERVE
 

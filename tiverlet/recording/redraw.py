@@ -128,7 +128,7 @@ class Redraw:
         self.stride, self.thin = checks.integer("replay", "stride", entry.data["stride"], least=1), entry.frame
 
     def _thinned(self, found: list[Row]) -> list[Row]:
-        """Return the drawn rows, without those that are missing in the file and may be."""
+        """Return the drawn rows, except rows that are missing in the file because it was thinned."""
         there = Counter(found)
         frames: dict[str, list[int]] = defaultdict(list)
         for entity, static, frame, *_ in self.rows:
@@ -204,7 +204,7 @@ def _rows_of(blueprint: Any) -> list[Row]:
 
 
 def _amended(report: StepReport, told: dict[str, Any]) -> tuple[StepReport, str | None]:
-    """Return a report with the flags of the journal, which may be more, and what is wrong with them, or None."""
+    """Return a report with the flags of the journal, which may have more, and what is wrong with these flags, or None."""
     if "flags" not in told:
         return report, None
     flags, notes = set(told["flags"]), tuple(told["notes"])

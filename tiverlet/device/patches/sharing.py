@@ -191,7 +191,7 @@ def _is_ours(kind: type) -> bool:
 
 @lru_cache(1000)
 def _read_of(kind: type, names: tuple[str, ...]) -> list[str]:
-    """Return those of the attribute names that kernels may read of objects of a class."""
+    """Return the attributes that kernels may read, out of the `names` of an object's attributes, sorted."""
     return sorted(name for name in names if may_read(kind, name))
 
 

@@ -16,9 +16,8 @@ class Geometry:
     """The surface of a scene, and everything that is not part of a surface.
 
     faces: particles around each face, in the same sense all over a surface. uv: the texture coordinates of each face's corners,
-    (corners, 2), or (0, 2) without any. links: those that are no part of a surface, (m, 2). loose: particles that are joined to
-    none. bare: particles with a radius that no surface hides. hues: colours of particles, (n, 3). up: the direction against
-    gravity, (dim,).
+    (corners, 2), or (0, 2) without any. links: links outside surfaces, (m, 2). loose: particles without any face or link. bare:
+    particles with a radius that no surface hides. hues: colours of particles, (n, 3). up: the direction against gravity, (dim,).
     """
 
     faces: tuple[np.ndarray, ...]
