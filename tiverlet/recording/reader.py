@@ -1,8 +1,9 @@
 """Reads the rows of an .rrd file in a process of its own, since a file may come from an untrusted source. rrd.py starts it.
 
-It runs as a script, without the rest of the package, which takes 0.1 s. It writes arrays one behind the other to a given file,
-and their places to the standard output. It accepts only what rerun writes, so that the viewer can show nothing that is not read
-here. A file has messages, each a protobuf record with a chunk of rows as an Arrow stream, compressed by LZ4.
+It runs as a script that does not import the rest of the package, so that it takes only 0.1 s. It writes arrays one behind the
+other to a given file, and their places to the standard output. It accepts only what rerun writes, so that the viewer can show
+nothing that is not read here. A file has messages, each a protobuf record with a chunk of rows as an Arrow stream, compressed by
+LZ4.
 
     file       "RRF2", version and options (12 bytes); messages; the end
     message    kind, length (2 x u64); 1: a store, 2: a chunk of rows of a store, 3: which layout is shown; 0: the end, with

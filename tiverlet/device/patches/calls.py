@@ -65,7 +65,7 @@ def called_with(types: Callable[[Any], tuple[tuple[Any, ...], tuple[Any, ...]]])
 
 
 def _real(function: Any) -> Any:
-    """Make a function that is called from one that would be copied."""
+    """Turn a function that would be copied into one that is called."""
     return kernel_impl.Func(function, _classfunc=True, is_real_function=True)
 
 

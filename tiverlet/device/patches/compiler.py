@@ -24,7 +24,7 @@ from ..language import active, impl, sources
 from . import lean, patched
 from .unrolling import as_ever, leave_loops
 
-HOSTS = ("Arch.x64", "Arch.arm64")  # kernels are as fast without these passes here; measured on x64
+HOSTS = ("Arch.x64", "Arch.arm64")  # where LLVM makes kernels as fast without Taichi's passes; measured on x64
 # Loops do not cache a field element in a variable: Taichi misses that another index may be the same element, such as field[k] for
 # field[0].
 SAFE = {"cache_loop_invariant_global_vars": False}
@@ -36,7 +36,7 @@ BRIEF = LEAN | {"advanced_optimization": False}
 # Between LEAN and BRIEF: the simplifier without its search for equal expressions, which takes most of its time in long kernels.
 UNSEARCHED = LEAN | {"opt_level": 0}
 SETTINGS = {*BRIEF, *UNSEARCHED}
-FEW = 1000  # particles; with fewer, BRIEF is used
+FEW = 1000  # worlds with fewer particles count as small
 MADE = 20_000  # new objects; a context that compiles a kernel makes more, any other one fewer
 _INSIDE = contextlib.nullcontext()
 _lock = threading.RLock()  # all threads share the type of literals

@@ -141,7 +141,7 @@ def _nodes(tree: Any) -> list[Any]:
 def _in_class(level_of_class_stackframe: int) -> bool:
     """Whether a decorator runs in the body of a class.
 
-    Taichi searches for the source of the statement around it, which took half of the time to import all of tiverlet's classes.
+    Taichi searches for the source of the statement around it, which for all of tiverlet's classes takes half of the import time.
     """
     body = sys._getframe(level_of_class_stackframe - 1)
     if body.f_code.co_filename.startswith(HOME):
