@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from ..features.feature import Scene
     from ..neighbours.neighbour_list import NeighbourList
 
-WINDOW = 128  # substeps over which the missing load is averaged; each window begins just after a removal of sound
+WINDOW = 128  # substeps over which the missing load is averaged; it begins just after sound is removed (EVERY)
 SLOW = 0.3  # substeps that it takes to learn the load of k particles, per k^2
 SAME = 1e-3  # relative change of the vector between a pair beyond which it forgets its load when positions are assigned
 

@@ -126,7 +126,7 @@ class PairContact(Feature):
 
     @property
     def uniform(self) -> bool:
-        """Whether all pairs are alike."""
+        """Whether all pairs have the same friction and restitution, and touch."""
         return self._pairs.uniform
 
     @property
@@ -197,7 +197,7 @@ class PairContact(Feature):
         return super().built_for() | {"named": told if named <= told else named}
 
     def upload(self) -> None:
-        """Write friction and restitution."""
+        """Write changed friction and restitution to the device."""
         if self.scene:
             self.table.upload(self.scene, self.wanted)
 

@@ -274,8 +274,9 @@ class PolygonGeometry:
     def detect(self, i: ti.i32, moved: ti.i32):
         """Find the contacts in which particle i is the vertex, or one of two discs: at most one with each listed particle.
 
-        moved: 1 or 2 in a substep: by how particles moved in it, less the allowed overlap; 2 in passes after the first. 0
-        otherwise: by present positions and the nearest edges, because d is the velocity before the first substep after a start.
+        moved: 1 in the first pass of a substep, 2 in later ones: by how particles moved in it, less the allowed overlap. 0
+        otherwise: by present positions and the nearest edges. Then d may be a velocity, as it is at a start (before the first
+        substep after velocities were set).
         """
         for e in range(self.list.first[i], self.list.first[i] + self.list.number[i]):
             j = self.list.neighbour[e]

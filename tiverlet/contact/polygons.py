@@ -23,7 +23,7 @@ from .pair_contact import PairContact
 from .polygon_narrow_phase import VERTEX, Beside, Outline, PolygonGeometry
 from .restitution import SLOW, under_force
 
-SKIN = 0.15  # of the longer edge of a vertex
+SKIN = 0.15  # skin of a vertex, relative to its longer edge
 
 
 class Polygons(PairContact):

@@ -1,4 +1,4 @@
-"""What World.events() and World.wall_events() return: which contacts began, ended and lasted in a frame."""
+"""The results of World.events() and World.wall_events(): the contacts that began, ended and lasted in a frame."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace

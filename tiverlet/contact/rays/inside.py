@@ -1,4 +1,4 @@
-"""Which particles are inside of a shape."""
+"""The query of World.inside(): which particles are inside of a shape."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""What rays meet first."""
+"""The query of World.ray(): what rays meet first."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
