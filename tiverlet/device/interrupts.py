@@ -80,7 +80,7 @@ class Whole:
 whole = Whole()
 
 
-def uncut(function: Callable) -> Callable:
+def uninterrupted(function: Callable) -> Callable:
     """Return the function wrapped so that no signal handler interrupts it."""
 
     @functools.wraps(function)

@@ -98,7 +98,7 @@ class Recorder:
     def __exit__(self, *exc) -> None:
         self.close()
 
-    @interrupts.uncut
+    @interrupts.uninterrupted
     def _open(self, overwrite: bool) -> None:
         world = self.world
         title = "live" if self.path == os.devnull else os.path.splitext(os.path.basename(self.path))[0]
@@ -161,7 +161,7 @@ class Recorder:
         """About how many bytes the file will have when it is closed."""
         return self._sink.bytes + self._logged - self._flushed
 
-    @interrupts.uncut
+    @interrupts.uninterrupted
     def log(self, **quantities) -> None:
         """Write the present frame, if it is one of `every`, and quantities of your own.
 
@@ -198,7 +198,7 @@ class Recorder:
         if self._sink.error:
             self._fail()
 
-    @interrupts.uncut
+    @interrupts.uninterrupted
     def flush(self) -> None:
         """Wait until everything logged is in the file, where it stays even if the process is killed."""
         if self._full:
@@ -283,7 +283,7 @@ class Recorder:
         journal.frame_drawn({"time": world.time, "hash": brief(checkpoint.digest(world, now)), "crc": zlib.crc32(x32.tobytes())})
         self.frames += 1
 
-    @interrupts.uncut
+    @interrupts.uninterrupted
     def close(self) -> None:
         """Write the summary and finish the file. Calling it twice does nothing."""
         if self._closed or self._sink.forked():

@@ -97,7 +97,7 @@ class WorldsRecorder:
     def __exit__(self, *exc) -> None:
         self.close()
 
-    @interrupts.uncut
+    @interrupts.uninterrupted
     def log(self) -> None:
         """Write the present frame, if it is one of `every`."""
         if self._sink.forked() or self._sink.stream is None:
@@ -140,7 +140,7 @@ class WorldsRecorder:
             self._closing()
             raise file_error(error, f"WorldsRecorder: writing {self.path} failed at frame {self._calls}")
 
-    @interrupts.uncut
+    @interrupts.uninterrupted
     def close(self) -> None:
         """Finish the file. Calling it twice does nothing."""
         if self._sink.forked() or self._sink.stream is None:

@@ -13,7 +13,7 @@ def _assigned(self: Any, value: Any) -> Any:
     """
     if active and type(self) is type(value) is Expression and not self.is_tensor():
         if value.is_tensor() or self.ptr.get_rvalue_type() == ti.u1 and value.ptr.get_rvalue_type() != ti.u1:
-            active[-1].beware()
+            active[-1].compile_thoroughly()
     return _assign(self, value)
 
 

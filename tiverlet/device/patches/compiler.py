@@ -22,7 +22,7 @@ import numpy as np
 
 from ..language import active, impl, sources
 from . import lean, patched
-from .unrolling import as_ever, leave_loops
+from .unrolling import disable_unrolling, restore_switches
 
 HOSTS = ("Arch.x64", "Arch.arm64")  # where LLVM makes kernels as fast without Taichi's passes; measured on x64
 # Loops do not cache a field element in a variable: Taichi misses that another index may be the same element, such as field[k] for
@@ -75,7 +75,7 @@ class Compiler:
         self._host: bool | None = None  # whether kernels run on the host; cached, since asking Taichi takes 6 us
         self._settings: dict[str, Any] = {}  # the settings that Taichi was started with
         self._thread = 0
-        self._hurried = False
+        self._fast = False
         self.refused: Exception | None = None  # the error in a function that is being compiled, see refuse()
         self.times = Times({}, {})
         self.places: list[tuple[Any, int]] = []  # layouts and addresses of the world's fields
@@ -126,9 +126,9 @@ class Compiler:
                 raise error from None
             finally:
                 active.pop()
-                if self._hurried:
-                    as_ever()
-                    self._hurried = False
+                if self._fast:
+                    restore_switches()
+                    self._fast = False
                 if active:
                     active[-1].point()
                 runtime.set_default_fp(literals)
@@ -137,13 +137,13 @@ class Compiler:
                     _pass_over()
                     gc.enable()
 
-    def hurry(self) -> None:
+    def compile_fast(self) -> None:
         """Have LLVM spend less time on the kernel that is compiled next. Its first launch must come before the context ends."""
         if self._host and not self.thorough:
-            leave_loops()
-            self._hurried = True
+            disable_unrolling()
+            self._fast = True
 
-    def beware(self) -> None:
+    def compile_thoroughly(self) -> None:
         """Compile with all passes from here on: the kernel has an assignment that LLVM cannot handle."""
         runtime: Any = impl.get_runtime()
         self.thorough = True

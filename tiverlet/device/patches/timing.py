@@ -47,7 +47,7 @@ def compiled(kernel: Any, key: Any, name: str, translate: Any) -> None:
     """Translate and compile a kernel, and record the time: in all, and by feature in proportion to the time of translation."""
     if key in kernel.compiled_kernels:
         return
-    active[-1].hurry()
+    active[-1].compile_fast()
     begin, outer, translation = perf_counter(), Translation.now, Translation()
     Translation.now = translation
     try:

@@ -39,13 +39,13 @@ class CommandLine:
     reset: Callable
     given: bool = False  # whether switches are set
 
-    def give(self, *switches: str) -> None:
+    def set_switches(self, *switches: str) -> None:
         """Set switches. LLVM ignores unknown ones."""
         words = [b"tiverlet", *[s.encode() for s in switches]]
         self.parse(len(words), (ctypes.c_char_p * len(words))(*words), None)
         self.given = True
 
-    def take_back(self) -> None:
+    def reset_switches(self) -> None:
         """Reset all switches."""
         self.reset()
         self.given = False
@@ -66,18 +66,18 @@ def command_line() -> CommandLine | None:
     return CommandLine(ctypes.CFUNCTYPE(None, *arguments)(parse), ctypes.CFUNCTYPE(None)(reset))
 
 
-def leave_loops() -> None:
-    """Have LLVM leave loops as they are in kernels compiled until as_ever()."""
+def disable_unrolling() -> None:
+    """Have LLVM leave loops as they are in kernels compiled until restore_switches()."""
     line = command_line()
     if line and not line.given:
-        line.give(*SWITCHES)
+        line.set_switches(*SWITCHES)
 
 
-def as_ever() -> None:
+def restore_switches() -> None:
     """Have LLVM unroll loops as by default."""
     line = command_line()
     if line and line.given:
-        line.take_back()
+        line.reset_switches()
 
 
 def _addresses(path: str, *names: bytes) -> list[int] | None:
