@@ -375,7 +375,7 @@ def chains(job: dict[str, Any], sizes: dict[str, Any]) -> Iterator[tuple]:
 
 
 def piles(job: dict[str, Any], sizes: dict[str, Any]) -> Iterator[tuple]:
-    """Yield the rows of many piles beside one pile of all their discs, falling and packed from the start, with contacts of both."""
+    """Yield the rows of many piles beside one pile of all their discs, falling and packed, with the contacts of both."""
     import tiverlet as tv
 
     from .scenes import SCENES
