@@ -54,7 +54,8 @@ def virial(n: int, dim: int, fraction: float, h: float, seconds: float) -> dict[
     pressure: from the virial, P V = N kT + sum J / (dim t) over all impulses J of pairs, from world.contacts.
     g: pairs in the shell of SHELL diameters beyond contact, extrapolated to contact with the shell behind it.
     D: d <x^2> / dt / (2 dim) of unwrapped positions, between 3 and 6 times D m / kT, when velocities are no longer correlated. It
-    exceeds Enskog's because of long-time tails, which these times cut off, more so in dense gases (Alder, Gass and Wainwright 1970).
+    exceeds Enskog's because of long-time tails, which these times cut off, more so in dense gases (Alder, Gass and Wainwright
+    1970).
     """
     world, box = gas(n, dim, fraction, Contact(restitution=1.0))
     known_d = diffusion(fraction, dim)
