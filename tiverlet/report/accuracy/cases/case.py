@@ -62,15 +62,17 @@ class Run:
 class Case:
     """A scene with a known answer, built only through public names.
 
-    name: the name of its entry in cases.json, with a suffix if the entry has several cases. build: () -> particles and features,
-    new ones at each call. seconds: when the error is measured [s], a whole number of frames of `frame` [s]. error: Run -> error
-    in `unit`. watch: World -> an array to store after every frame, for errors of whole runs. size: the error in `unit` beyond
-    which a run counts as diverged: that of a run unrelated to the answer. methods: names in METHODS, the best first. efforts:
-    substeps of a frame to try. fit: those of the efforts whose substep is short enough for an order of convergence; empty for
-    all. order: the order that every method must show in f64; None if the error does not come from the step. limit: the largest
-    error allowed with the first method in f64 at `at` substeps. trusted: the uncertainty of the answer, in `unit`. single: the
-    error that f32 may have, in `unit`. momentum: World -> a conserved array and its natural size; None if there is none.
-    conserves: whether energy is conserved.
+    name: the name of its entry in cases.json, with a suffix if the entry has several cases.
+    build: () -> particles and features, new ones at each call.
+    seconds: when the error is measured [s], a whole number of frames of `frame` [s].
+    error: Run -> error in `unit`. watch: World -> an array to store after every frame, for errors of whole runs.
+    size: the error in `unit` beyond which a run counts as diverged: that of a run unrelated to the answer.
+    methods: names in METHODS, the best first. efforts: substeps of a frame to try.
+    fit: the efforts whose substep is short enough for an order of convergence; empty for all.
+    order: the order in f64 of all methods that show one; None if the error does not come from the step.
+    limit: the largest error allowed with the first method in f64 at `at` substeps.
+    trusted: the uncertainty of the answer, in `unit`. single: the error that f32 may always have, in `unit`.
+    momentum: World -> a conserved array and its natural size; None if there is none. conserves: whether energy is conserved.
     """
 
     name: str

@@ -37,7 +37,7 @@ def glanced() -> tuple[Particles, list[Feature]]:
 
 def turned(run: Run) -> float:
     """Return the largest error of the directions after the collision [rad]."""
-    want = np.array([known("R15_oblique_discs")["values"]["e1"][k] for k in ("v1", "v2")]) * [1, -1]  # b points downwards
+    want = np.array([known("R15_oblique_discs")["values"]["e1"][k] for k in ("v1", "v2")]) * [1, -1]  # b is counted downwards
     v = run.world.velocity
     return float(np.abs(np.arctan2(v[:, 1], v[:, 0]) - np.arctan2(want[:, 1], want[:, 0])).max())
 
