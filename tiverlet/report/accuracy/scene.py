@@ -144,7 +144,7 @@ def scene_report(
     world: World, seconds: float, tolerance: float | None = None, *, dt: float = 1 / 60, substeps: Sequence[int] = EFFORTS,
     progress: bool = False,
 ) -> SceneReport:  # fmt: skip
-    """See World.report."""
+    """Return the report of World.report(), which describes the arguments."""
     seconds = checks.number("World.report", "seconds", seconds, above=0.0)
     dt = checks.number("World.report", "dt", dt, above=0.0)
     if tolerance is not None:
