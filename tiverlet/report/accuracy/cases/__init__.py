@@ -14,7 +14,7 @@ CASES: dict[str, Case] = {c.name: c for file in (chains, free, statics, impacts)
 LEFT_OUT = {
     "R04_oscillator_k100_dt0.1": "the same scene as R04_oscillator_k100_dt0.01, at another step",
     "R10_catenary": "a continuum; R10b are the ropes of links that it is the limit of",
-    "R20_rolling": "particles do not spin",
+    "R20_rolling": "spheres that roll: python -m tiverlet.report.accuracy.grains",
     "R22_packing": "statistics of many contacts: python -m tiverlet.report.accuracy.granular",
     "R23_hard_gas_pressure": "statistics of many contacts: python -m tiverlet.report.accuracy.granular",
     "R24_maxwell": "statistics of many contacts: python -m tiverlet.report.accuracy.granular",
