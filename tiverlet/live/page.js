@@ -52,7 +52,7 @@ const discs = program(
      color = vec4(hue.rgb * light, 1.0 - smoothstep(1.0 - edge, 1.0 + edge, rr));
    }`);
 
-// Lines with round ends. width: in pixels, or in scene units.
+// Lines with round ends. wide: half of their width, in pixels, or, negative, in scene units.
 const lines = program(
   `layout(location=0) in vec2 corner; layout(location=1) in vec3 a; layout(location=2) in vec3 b;
    layout(location=3) in vec4 color; uniform float wide; uniform float pixels; out vec2 at; out float len; out vec4 hue; out float r;
