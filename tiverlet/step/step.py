@@ -619,8 +619,8 @@ class Step:
         Batch.push_reaction, the first particle, the one behind the last, and `firm` for contacts and walls.
 
         With the forces of constraints at x_n, along the directions at x_n, velocities are second order. They have the momentum
-        and the angular momentum of the motion, sum m x_n x (x_n - x_(n-1)) / h plus what external forces add in h / 2. Springs enter
-        with their force at x_n, so that a start from these velocities neither pumps nor brakes them.
+        and the angular momentum of the motion, sum m x_n x (x_n - x_(n-1)) / h plus what external forces add in h / 2. Springs
+        enter with their force at x_n, so that a start from these velocities neither pumps nor brakes them.
         """
         if ti.static(self.particles.whole):
             if given[0] > 0:  # Taichi wakes no threads for loops inside a branch
