@@ -260,6 +260,10 @@ class Acceleration(Feature):
     def join(self, scene: Scene, team: Any) -> Any:
         """Where it is pairwise: declare its neighbour list and return it, None if it has none."""
 
+    def may_act_from(self, first: int) -> bool:
+        """Whether it may act on particles from number `first` on."""
+        return True
+
     @ti.func
     def acts_on(self, i):
         """Where it reads velocities: whether it acts on particle i."""

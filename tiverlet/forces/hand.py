@@ -76,6 +76,10 @@ class Hand(Acceleration):
         super().bind(scene)
         self.dev.state = scene.state
 
+    def may_act_from(self, first: int) -> bool:
+        """Whether its particle is one of these."""
+        return self.particle >= first
+
     @ti.func
     def acts_on(self, i):
         """One particle."""

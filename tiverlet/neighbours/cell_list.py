@@ -72,8 +72,8 @@ class CellList:
         self, radius: np.ndarray, reach: np.ndarray, skin: float, level: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
         """Of each table the size of its cells [m], the bits of its number of buckets, and where it begins; and where all end."""
-        own = np.array([radius[level == m].max(initial=0.0) for m in range(self.levels)])
         finer, longest = (np.array([v[level >= m].max(initial=0.0) for m in range(self.levels)]) for v in (radius, reach))
+        own = finer if self.levels == 1 else np.array([radius[level == m].max(initial=0.0) for m in range(self.levels)])
         # Rounding of floor(x * scale) must not hide a neighbour.
         sizes = (own + finer + longest + skin) * (1 + 2.0**-12)
         counts = np.bincount(level, minlength=self.levels)

@@ -223,7 +223,7 @@ def give_new(runner: Any, first: int, want: np.ndarray, iterations: int) -> None
         return runner.velocity(iterations, first, came=True)[None]
 
     with runner.memory.compiler():  # for orders above 2
-        if runner.integrator.uses_velocity:
+        if any(f.may_act_from(first) for f in runner.integrator.forces.velocity_dependent):
             those.give(want, velocity, np.array([_factor(runner)]))
         else:
             those.lengthen(_factor(runner) * (want - velocity()))
