@@ -193,8 +193,8 @@ def turn_on(runner: Any, first: int, share: np.ndarray) -> None:
 
 
 def let_go(runner: Any, some: np.ndarray, want: np.ndarray, iterations: int) -> None:
-    """Have those of the particles `some` that can move, (k,), in the order of their numbers, go on with velocities `want`, (k, dim)
-    [m/s]."""
+    """Let particles `some`, (k,) numbers in ascending order, go on with velocities `want`, (k, dim) [m/s], as far as they can
+    move."""
     memory, moves = runner.memory, runner.scene.inv_mass[some] > 0
     if not moves.all():
         some, want = some[moves], want[moves]

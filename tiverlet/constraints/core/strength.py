@@ -1,4 +1,4 @@
-"""When constraints break."""
+"""Strength of constraints: the loads at which they break."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -10,23 +10,23 @@ from ...device import ti
 if TYPE_CHECKING:
     from ...features.feature import Batch, Scene
 
-BREAKS = 2**30  # substeps after which the number of one comes again
+BREAKS = 2**30  # substeps after which stamps repeat
 
 
 def strength_of(batch: "Batch", value: Any) -> np.ndarray | None:
-    """break_at as the user gives it, checked: (m,), or None for never."""
+    """Return break_at as the user gives it, checked: (m,), or None for never."""
     if value is None:
         return None
     return checks.per_item(repr(batch), "break_at", value, batch.count, above=0.0, infinite=True)
 
 
 class Strength:
-    """The loads at which the constraints of a batch (with break_at and breaks) break, and which of them have, on the device.
+    """The loads at which the constraints of a batch (with break_at and breaks) break, and which have broken, on the device.
 
-    A constraint whose load exceeds break_at at the end of a substep acts no more from the next one on. It keeps its share of the
-    masses that are split between constraints, which is safe, if slower than need be, until the world is built anew.
+    A constraint whose load exceeds break_at at the end of a substep does not act from the next one on. It keeps its share of the
+    masses that are split between constraints until the world is rebuilt. That is safe, but slows convergence.
 
-    Where the batch never `breaks` it costs nothing. in_state: what it has in the exact state, by name.
+    Where the batch never `breaks` it costs nothing. in_state: its fields in the exact state, by name.
     """
 
     def __init__(self, scene: "Scene", name: str, batch: Any):
@@ -44,7 +44,7 @@ class Strength:
             self._memory.write(self.limit, np.inf if break_at is None else break_at)
 
     def stamps(self) -> np.ndarray:
-        """When each constraint broke, (m,): the number of the substep from 1 on, modulo BREAKS; 0 where it holds."""
+        """Return when each constraint broke, (m,): the number of the substep from 1 on, modulo BREAKS; 0 where it holds."""
         return self._memory.read(self.stamp)
 
     @ti.func
@@ -57,7 +57,7 @@ class Strength:
 
     @ti.func
     def test(self, c, load, reach, tick):
-        """Break constraint c in this substep if its load, given as a multiplier, which is `reach` for 1 N, is too large."""
+        """Break constraint c in this substep if its load, given as a multiplier, is too large. reach: the multiplier of 1 N."""
         if self.stamp[c] == 0 and load > self.limit[c] * reach:
             self.stamp[c] = tick % ti.static(BREAKS) + 1
             self.counter[None] += 1
