@@ -40,8 +40,8 @@ class StepController:
     """Chooses the number of substeps of each frame.
 
     A frame is undone, and repeated with twice the substeps, in these cases: a constraint turned by more than 26 degrees in a
-    substep (cos < 0.9, where SHAKE's direction is no longer good); it left a residual above 1e-2 or an overlap above a tenth of
-    a radius; particles vibrated across a tension with (omega h)^2 > 2; or it has a flag that shorter substeps remove. If
+    substep (cos < 0.9, where SHAKE's direction is no longer good); the frame left a residual above 1e-2 or an overlap above a
+    tenth of a radius; particles vibrated across a tension with (omega h)^2 > 2; or a flag is set that shorter substeps remove. If
     doubling the substeps, 16 or more, brings no gain, the iterations are doubled. If that brings no gain either, the frame is
     "stuck": among the tries that are as good, the one with the least effort is kept, and the next frames no longer aim at the
     figures that stay wrong. If each try adds more energy than the one before, violations could not be removed first, and the
@@ -49,8 +49,8 @@ class StepController:
     A body that turns by phi in a substep turns too fast or too slowly by phi^2 / 24 of that. This is a relative error like the
     residual: for the 26 degrees above it is 1e-2, and a tolerance also applies to the turns of rigid constraints.
     In the same way, motion in forces that vary in space is too fast by (omega h)^2 / 24; by default (omega h)^2 may be 0.06. A
-    frame whose energy is wrong by more than a fiftieth, see energy_bound.missed(), is repeated as long as that helps. If it does
-    not help, the frame counts as good, since the energy before it was computed with longer substeps.
+    frame whose energy is wrong by more than a fiftieth of the kinetic energy, see energy_bound.missed(), is repeated as long as
+    that helps. If it does not help, the frame counts as good, since the energy before it was computed with longer substeps.
 
     All figures are of the order of h^2. If they leave room for it, the next frame is tried with half the effort. After each
     failure there must be room in twice as many frames in a row before the next try, in up to 64, until there is room for two

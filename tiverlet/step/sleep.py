@@ -192,7 +192,7 @@ class SleepPass:
     """
 
     host_only = ("sheet", "rests", "goes_on")
-    told_apart = True  # as a Feature
+    told_apart = True  # its compile time is reported by itself, as that of a Feature
     n: Any = OnDevice()  # particles
     links: Any = OnDevice()  # pairs of particles that constraints hold together
 
