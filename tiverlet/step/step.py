@@ -616,7 +616,7 @@ class Step:
     @ti.kernel
     def velocities(self, given: ti.types.ndarray(ti.f64, 1), out: ti.types.ndarray(ti.f64, 2)):  # type: ignore[valid-type]
         """Write velocities as the user sees them to `out`, (n, dim). given: h, t, the shares `firm` and `soft` of
-        Batch.push_reaction, the first particle, the one behind the last, and `firm` for contacts and walls.
+        Passes.push_reaction, the first particle, the one behind the last, and `firm` for contacts and walls.
 
         With the forces of constraints at x_n, along the directions at x_n, velocities are second order. They have the momentum
         and the angular momentum of the motion, sum m x_n x (x_n - x_(n-1)) / h plus what external forces add in h / 2. Springs
