@@ -59,6 +59,7 @@ WORSE = 2.0  # times what violations stored before: what is left of it, at most,
 BETTER = 0.5  # times that, where contacts move, too: what they and links store then
 TOGETHER = 4  # times that links and contacts move together: each may lead into others
 HELD = 1e3  # of its mass: how firmly a wall holds a particle that it has stopped
+GRIP = 1e-3  # of what a wall bears: what it bears along itself, by friction
 
 
 class Aims(NamedTuple):
@@ -113,7 +114,7 @@ def project(runner: "Runner", h: float, longest: float, contacts: ContactRows | 
     energy, overlap = seen_before(runner)
     finest = ratio**4 if frail else ratio**2  # by loads, or by energies
     aims = Aims(LEFT * finest, steps, 0.0 if frail else slight, SHARED if contacts else PRODUCTS, DONE[frail])
-    rows, stopped = _moved(runner, start, rows, aims)
+    rows, stopped = _moved(runner, start, _leaning(runner, rows, 1 - ratio**2), aims)
     left = 0.0
     if contacts:
         rows, stopped, left = _together(runner, start, rows, stopped, contacts.stored(before, w), batches[:-1], aims)
@@ -138,11 +139,29 @@ def project(runner: "Runner", h: float, longest: float, contacts: ContactRows | 
     return True
 
 
+def _leaning(runner: "Runner", rows: "Rows", share: float) -> "Rows":
+    """The rows where what walls bear stays on them, and where friction holds it: a body that stands does not turn over its feet,
+    nor walk. share: of what links hold by their violations, which rows give up."""
+    if not runner.step.walls:
+        return rows
+    state, memory = runner.scene.state, runner.memory
+    push = memory.read(runner.step.particles.wall_displacement)[: rows.n].astype(np.float64)
+    state.put(memory, rows.x - push)
+    sent = state.get(memory)
+    runner.stop_at_walls(rows.x)
+    normal = _units(state.get(memory) - sent)
+    state.put(memory, rows.x)
+    along = np.linalg.norm(push - (push * normal).sum(axis=1)[:, None] * normal, axis=1)
+    rubs = any(w.has_friction for w in runner.step.walls)
+    return rows.leaning(normal, push, share, rubs & (along > GRIP * np.linalg.norm(push, axis=1)))
+
+
 def _moved(runner: "Runner", start: "Rows", rows: "Rows", aims: Aims) -> tuple["Rows", np.ndarray]:
     """Rows where particles are then, and which of them walls have stopped, (n,). aims: for _newton(), a share of what rows stored
     at the start."""
     state, memory, before = runner.scene.state, runner.memory, rows.x
-    enough, stopped = aims.share * start.stored, np.zeros(rows.n, dtype=bool)
+    enough = aims.share * start.stored
+    stopped: np.ndarray = rows.wall.any(axis=1)
     for _ in range(TURNS):
         state.put(memory, _newton(rows, enough, aims))
         sent = state.get(memory)
@@ -150,7 +169,8 @@ def _moved(runner: "Runner", start: "Rows", rows: "Rows", aims: Aims) -> tuple["
         x = state.get(memory)
         stopped |= (x != sent).any(axis=1)
         last, rows = rows, rows.at(x)  # what walls stop is lifted by the others
-        if (x == sent).all() or rows.matrix.products > aims.products:
+        slips = rows.sticks.any() and rows.stored > enough  # friction does not hold feet against each other
+        if ((x == sent).all() and not slips) or rows.matrix.products > aims.products:
             break
         if rows.stored > last.stored or last.wall.any():  # what lies on them would be sent back there again and again
             rows = rows.held(last.wall, x - sent)
@@ -229,6 +249,12 @@ def sizes(batch: Scalar | RigidRows | ContactRows) -> np.ndarray:
     return np.bincount(batch.owner, minlength=batch.count)
 
 
+def _units(a: np.ndarray) -> np.ndarray:
+    """Vectors (n, dim) of length 1; 0 where there is none."""
+    size = np.linalg.norm(a, axis=1)[:, None]
+    return a * _over(np.ones_like(size), size)
+
+
 def _over(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """a / b; 0 where b is."""
     return np.divide(a, b, out=np.zeros_like(a), where=b > 0)
@@ -269,6 +295,8 @@ class Rows:
         self.pairs = self.row[first], self.who[first], self.who[first + 1]
         self.arity = arity
         self.wall = np.zeros_like(x)  # normals of the walls that hold particles; 0 where none does
+        self.sticks = np.zeros(self.n, dtype=bool)  # held along them by friction, too
+        self.rest = np.zeros_like(x)  # moves by what else draws those that walls bear, in a substep
         self._measure(x)
 
     def _each(self, values: list[np.ndarray]) -> np.ndarray:
@@ -327,15 +355,27 @@ class Rows:
         other |= self.arity[np.maximum(self.row - 1, 0)] != self.arity[self.row]  # the last of more corners are others
         return np.split(np.arange(self.m), np.flatnonzero(np.bincount(self.row, other, minlength=self.m))[1:])
 
+    def leaning(self, wall: np.ndarray, push: np.ndarray, share: float, sticks: np.ndarray) -> "Rows":
+        """The same rows where walls, of these normals, bear particles: they moved them by `push` in a substep, (n, dim), against
+        links, of whose pull the rows have this share, and all else."""
+        new = copy.copy(self)
+        new.wall, new.sticks = wall, sticks
+        new.rest = -(push + self.w[:, None] * self.pull() / share) * wall.any(axis=1)[:, None]
+        return new
+
     def held(self, wall: np.ndarray, back: np.ndarray) -> "Rows":
         """The same rows where walls, of these normals, and of those along which particles were moved `back`, (n, dim), hold what
-        is not drawn off them."""
-        far = np.linalg.norm(back, axis=1)[:, None]
-        wall = np.where(far > 0, back * _over(np.ones_like(far), far), wall)
-        pull = -self.jacobian.gathered(self.J * (_over(self.weight, self.diagonal) * self.C)[self.row, None])
+        is not drawn off them, and let it slip."""
+        unit = _units(back)
+        wall = np.where(unit.any(axis=1)[:, None], unit, wall)
         new = copy.copy(self)
-        new.wall = wall * ((pull * wall).sum(axis=1) <= 0)[:, None]
+        drawn = ((self.w[:, None] * self.pull() + self.rest) * wall).sum(axis=1)
+        new.wall, new.sticks = wall * (drawn <= 0)[:, None], np.zeros(self.n, dtype=bool)
         return new
+
+    def pull(self) -> np.ndarray:
+        """What is stored draws particles this way, (n, dim)."""
+        return -self.jacobian.gathered(self.J * (_over(self.weight, self.diagonal) * self.C)[self.row, None])
 
     def at(self, x: np.ndarray) -> "Rows":
         """The same rows elsewhere."""
@@ -403,7 +443,8 @@ class Rows:
 
     def step(self, mu: float) -> np.ndarray:
         """Moves p that minimize sum (C + J p)^2 / (2 D) + p^T M (mu + HELD n n^T) p / 2 + p^T K p / 2, with D the diagonal of
-        J w J^T and n the normals of walls that hold particles: else these are sent into them again, and stopped again.
+        J w J^T and n the normals of walls that hold particles, 1 for n n^T where friction does: else these are sent into them
+        again, and stopped again.
 
         K is what tensions C / D across links are: without it, those that are in one line have no direction to give way in, and
         what would draw a taut rope straight throws it into a zigzag.
@@ -416,8 +457,9 @@ class Rows:
         taut = _over(np.maximum(self.C[row], 0.0) * stiff[row], length)
         one, (a, b) = np.eye(self.dim), self.corners
         sides = taut[:, None, None] * (one - across[:, :, None] * across[:, None, :])
-        wall = self.wall[self.inside]
-        held = wall[:, :, None] * wall[:, None, :] + (self.rails.across(self.n)[self.inside] if self.rails else 0.0)
+        wall, sticks = self.wall[self.inside], (self.sticks & self.wall.any(axis=1))[self.inside]
+        held = np.where(sticks[:, None, None], one, wall[:, :, None] * wall[:, None, :])
+        held = held + (self.rails.across(self.n)[self.inside] if self.rails else 0.0)
         mass = (mu * one + HELD * held) / self.w[self.inside][:, None, None]
         along = [(stiff[self.row[a], None] * self.J[a])[:, :, None] * self.J[b][:, None, :]]
         for corners in self.alike:

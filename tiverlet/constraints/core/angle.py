@@ -31,7 +31,7 @@ def corners_of(angle: Any) -> Any:
 class Angle(Quantity):
     """Angles: values that are whole turns apart are equivalent, and residuals are in radians."""
 
-    unit, transcends, curved = 1.0, True, True
+    unit, transcends, curved, precise = 1.0, True, True, True
 
     def difference(self, f: np.ndarray, goal: np.ndarray) -> np.ndarray:
         """Return differences of angles, in (-pi, pi]."""
@@ -41,6 +41,25 @@ class Angle(Quantity):
     def unwrap(self, f, other):
         """Return f plus whole turns, within half a turn of `other`."""
         return wrapped(f, other)
+
+    @ti.func
+    def excess(self, c, f):
+        """f - rest, to all digits of the low words, where there are any."""
+        C = f - self.rest[c]
+        if ti.static(self.state.carries):
+            C = ti.cast(wrapped(self.exactly(c), ti.cast(C, ti.f64)), self.real)
+        return C
+
+    @ti.func
+    def exactly(self, c):
+        """f - rest in f64, within half a turn of 0."""
+        q = ti.Matrix.zero(ti.f64, self.arity, self.state.dim)
+        for k in ti.static(range(1, self.arity)):
+            r = self.state.between(self.corners.member(c, k), self.corners.member(c, 0))
+            for a in ti.static(range(self.state.dim)):
+                q[k, a] = r[a]
+        f, _gradients = self.measure(c, q)
+        return wrapped(f - self.rest_exactly(c), ti.cast(0, ti.f64))
 
     @called_with(lambda self: ((ti.i32, corners_of(self)), (self.real, corners_of(self))))
     @ti.func

@@ -39,6 +39,8 @@ class Quantity:
     real: Any
     corners: Any
     rest: Any
+    drive: Any
+    ramp: Any
 
     def __init__(self, members: Any):
         self.members = members
@@ -74,7 +76,7 @@ class Quantity:
         """Return the quantity for the kernels of a batch, with the corners and rest values of its equation."""
         bound = copy(self)
         bound.state, bound.real = scene.state, scene.real
-        bound.corners, bound.rest = equation.corners, equation.rest
+        bound.corners, bound.rest, bound.drive, bound.ramp = equation.corners, equation.rest, equation.drive, equation.ramp
         return bound
 
     def frame(self, corners: Any) -> Any:
@@ -105,6 +107,16 @@ class Quantity:
     def excess(self, c, f):
         """Return f - rest of constraint c, to all digits where the quantity is `precise`."""
         return f - self.rest[c]
+
+    @ti.func
+    def rest_exactly(self, c):
+        """The rest value of constraint c in f64, where it moves: in f32 it would jerk, with rounding / h^2."""
+        rest = ti.cast(self.rest[c], ti.f64)
+        if ti.static(bool(self.drive)):
+            rest = self.drive.target[c]
+        if ti.static(self.ramp.made):
+            rest += self.ramp.low[c]
+        return rest
 
     @ti.func
     def exactly(self, c):

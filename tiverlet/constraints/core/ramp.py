@@ -21,14 +21,14 @@ class Ramp:
 
     batch: the Scalar, whose tracks() list what moves. The fields of a ramp are `made` when rest values are assigned for the first
     time, in a `memory` of their own: until then a ramp costs nothing. under_way: whether rest values move in the coming frame.
-    step: how far the first of the tracks moves in this substep.
+    step: how far the first of the tracks moves in this substep. low: what rounding takes from its present value.
     """
 
     host_only = ("memory", "under_way")
 
     def __init__(self, memory: "Memory", batch: Any):
         self._memory, self._batch, self.memory = memory, batch, memory
-        self.made = self.under_way = False
+        self.made, self.under_way, self.real = False, False, memory.real
 
     @property
     def waits(self) -> bool:
@@ -89,6 +89,7 @@ class Ramp:
         self.put(goals)
         if self.made:
             self._aim(goals, goals)
+            self.memory.write(self.low, np.zeros(self.shape[1]))
         self.under_way = False
 
     def _make(self) -> None:
@@ -98,17 +99,18 @@ class Ramp:
         self.begin = [self.memory.field(f"{name}.rest_at_begin", m) for _ in self.fields]
         self.goal = [self.memory.field(f"{name}.rest_at_end", m) for _ in self.fields]
         self.step = self.memory.field(f"{name}.step_of_rest", m)
+        self.low = self.memory.field(f"{name}.rest_low", m)
         self.memory.place()
         self.made = True
 
     def adopt(self, before: "Ramp") -> None:
         """Take over the fields of a ramp of the same batch, made when it had other constraints."""
         self.fields, self.memory, self.made = before.fields, before.memory, True
-        self.begin, self.goal, self.step = before.begin, before.goal, before.step
+        self.begin, self.goal, self.step, self.low = before.begin, before.goal, before.step, before.low
 
     def fit(self) -> None:
         """Resize the fields to one row for each constraint. No rest value is under way."""
-        for field in (*self.begin, *self.goal, self.step):
+        for field in (*self.begin, *self.goal, self.step, self.low):
             self.memory.resize(field, self._batch.count)
         self.arrive()
 
@@ -125,3 +127,5 @@ class Ramp:
             self.fields[k][c] = self.goal[k][c] - way * (1 - frame_fraction[1])
             if ti.static(k == 0):
                 self.step[c] = way * (frame_fraction[1] - frame_fraction[0])
+                now = ti.cast(self.goal[k][c], ti.f64) - ti.cast(way, ti.f64) * (1 - frame_fraction[1])
+                self.low[c] = ti.cast(now - self.fields[k][c], self.real)
