@@ -355,9 +355,9 @@ class Contact(PairContact):
         return push, turned
 
     @ti.func
-    def reaction(self, i, h):
+    def reaction(self, i, h, soft):
         """Pushes along the normals at the present places, where they have no moment, and friction, known from the passes; but not
-        what forces have of them."""
+        what forces have of them: of a load, h^2 / soft, as KnownLoads.given() was."""
         total, w = 0 * self.dev.state.d[i], self.dev.w.of(i)
         if self.dev.splitting.weight[i] > 0:
             for word in range(self.dev.list.words(i)):
@@ -373,7 +373,7 @@ class Contact(PairContact):
                         approach = -self.dev.state.slid(self.dev.forces.before[i] - self.dev.forces.before[j], i, j).dot(n)
                         share = self.dev.forces.share(approach, push * (w + self.dev.w.of(j)))
                         if ti.static(self.dev.has_loads):
-                            push -= self.dev.known.load.field[e] * h * h
+                            push -= self.dev.known.load.field[e] * h * h / soft
                         total += share * w * push * n
         if ti.static(self.dev.has_friction):
             total += self.dev.forces.sum[i]

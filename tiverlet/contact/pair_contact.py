@@ -257,8 +257,9 @@ class PairContact(Feature):
         self.dev.forces.start(i, scale)
 
     @ti.func
-    def reaction(self, i, h):
-        """What forces of contacts moved particle i by in the last substep of a frame, h [s] long [m]; asked with a list."""
+    def reaction(self, i, h, soft):
+        """What forces of contacts moved particle i by in the last substep of a frame, h [s] long [m]; asked with a list. soft:
+        see Batch.push_reaction()."""
         return self.dev.forces.sum[i]
 
     @ti.func

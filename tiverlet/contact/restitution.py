@@ -9,6 +9,7 @@ from ..neighbours.neighbour_list import PairData
 from .narrow_phase import DiscGeometry
 
 SLOW = 2.0  # substeps of forces that give a pair no more than the speed at which it rests, see Restitution
+ELASTIC = 2.0**-8  # the same where e is 1: what rounding makes, so that a load that is borne does not count as impacts
 
 
 class Restitution:
@@ -18,7 +19,8 @@ class Restitution:
     and impacts of the last substep [kg m]. events: an EventLog, or None.
 
     A pair rests, unless e is 1, at the speed that two substeps of forces give it. Else what is pressed in between others would
-    bounce on and on, by loads that pairs know or as a corner of a body: what an impact takes the next one gives back.
+    bounce on and on, by loads that pairs know or as a corner of a body: what an impact takes the next one gives back. At e = 1 it
+    rests where it comes together by rounding only.
     """
 
     def __init__(
@@ -57,7 +59,10 @@ class Restitution:
             if last == 0:
                 slack = ti.max(slack, overlap - ti.max(here, 0))
             # Later passes have what others pushed in it, too.
-            if first != 0 and e < 1 and a <= ti.static(SLOW) * (here - a):
+            slow = ti.static(SLOW) * (here - a)
+            if e == 1:
+                slow *= ti.static(ELASTIC / SLOW)
+            if first != 0 and a <= slow:
                 deep = ti.max(deep, given)
             if a > 0:
                 rests = deep > 0 and (first == 0 or given <= deep)

@@ -393,9 +393,10 @@ class ParticlePass:
             self.state.shift(i, -self.state.d[i])
 
     @ti.func
-    def reaction(self, i, h, t, firm):
+    def reaction(self, i, h, t, firm, soft):
         """h^2 times what constraints (from Slots), contacts and walls accelerated particle i by in the last substep; and which
-        part of what walls did is in it. firm: see Batch.push_reaction(); with 0, loads that contacts know are taken out, too.
+        part of what walls did is in it. firm, soft: see Batch.push_reaction(); with firm 0, loads that contacts know are taken
+        out, too.
 
         Walls count as far as they balance the rest: a body at rest has velocity 0, but one that has just bounced is not credited
         with half of the blow, nor is any of the body that it belongs to.
@@ -404,7 +405,7 @@ class ParticlePass:
         if ti.static(self.held):
             reaction = self.slots.total_of(i)
         for c in ti.static(self.contacts):
-            reaction += firm * c.reaction(i, h)
+            reaction += firm * c.reaction(i, h, soft)
             if ti.static(self.knows_loads):
                 reaction -= ti.select(firm == 0, h * h, 0 * h) * c.dev.known.carried.field[i]
         if ti.static(len(self.walls) > 0):
@@ -424,13 +425,13 @@ class ParticlePass:
         return reaction, part
 
     @ti.func
-    def surface_velocity(self, i, h, t, firm):
+    def surface_velocity(self, i, h, t, firm, soft):
         """r omega of particle i at the end of the last substep: s / h, and half a substep of what forces turned it by."""
         turned = 0 * self.state.spin.s[i]
         for c in ti.static(self.contacts):
             if ti.static(c.has_friction):
                 turned += c.dev.forces.turned[i]
         if ti.static(self.turned_by_walls):
-            _reaction, part = self.reaction(i, h, t, firm)
+            _reaction, part = self.reaction(i, h, t, firm, soft)
             turned += part * self.wall_turn[i]
         return (self.state.spin.s[i] + firm / 2 * turned) / h

@@ -65,6 +65,7 @@ class Runner:
         self.probe = high_order.Probe(step) if self.scene.order > 2 else None
         self.passes_at_once = self._passes_at_once()
         self.asks_velocities = any(wall.has_switch for wall in step.walls)
+        self.bounces = any(f.has_restitution for f in (*step.walls, *step.contacts))
         self.launcher = Launcher(self)
         self._prepare()
 
@@ -277,12 +278,17 @@ class Runner:
 
     def restart(self, iterations: int) -> None:
         """Turn displacements into velocities, so that the next substep starts from the state at this time. iterations: of the
-        substep, for velocities of higher order."""
+        substep, for velocities of higher order.
+
+        What rests stands for -g h / 2 without what it leans on. What does not bounce is held by the next substep all the same;
+        what does would leave at e g h / 2, which a shorter substep does not take for rest. So it is at rest to begin with.
+        """
         clock = self.clock
         if not clock.d_is_velocity:
-            if clock.parted is not None:
-                held = (self.scene.inv_mass == 0)[:, None]
-                self.start(np.where(held, self.memory.read(self.scene.state.d)[: self.n] / clock.h, clock.parted))
+            if clock.parted is not None or self.bounces:
+                held, seen = (self.scene.inv_mass == 0)[:, None], clock.parted
+                seen = self.velocity(iterations) if seen is None else seen
+                self.start(np.where(held, self.memory.read(self.scene.state.d)[: self.n] / clock.h, seen))
             elif self.probe:
                 self.memory.write(self.scene.state.d, high_order.velocity(self.probe, clock, self.memory, iterations))
             else:

@@ -593,7 +593,8 @@ class Step:
         """To an array."""
         self.write_reactions(h64, firm64, soft64)
         for i in range(self.n):
-            v = self.particles.surface_velocity(i, ti.cast(h64, self.real), ti.cast(t, self.real), ti.cast(firm64, self.real))
+            h, time = ti.cast(h64, self.real), ti.cast(t, self.real)
+            v = self.particles.surface_velocity(i, h, time, ti.cast(firm64, self.real), ti.cast(soft64, self.real))
             for k in ti.static(range(self.state.spin.axes)):
                 out[i, k] = v[k]
 
@@ -617,7 +618,7 @@ class Step:
         """To an array."""
         self.write_reactions(given[0], given[2], given[3])
         for i in range(integer(given, 4), integer(given, 5)):
-            v = self.velocity_of(i, given[0], given[1], given[6])
+            v = self.velocity_of(i, given[0], given[1], given[6], given[3])
             for k in ti.static(range(self.dim)):
                 out[i, k] = v[k]
 
@@ -627,8 +628,8 @@ class Step:
         self.constraints.reactions(ti.cast(h64, self.real), ti.cast(firm64, self.real), ti.cast(soft64, self.real))
 
     @ti.func
-    def velocity_of(self, i, h64, t, firm64):
+    def velocity_of(self, i, h64, t, firm64, soft64):
         """The velocity of one particle, once reactions() of constraints are in the slots."""
         h, time, firm = ti.cast(h64, self.real), ti.cast(t, self.real), ti.cast(firm64, self.real)
-        reaction, _part = self.particles.reaction(i, h, time, firm)
+        reaction, _part = self.particles.reaction(i, h, time, firm, ti.cast(soft64, self.real))
         return self.integrator.velocity_after(i, h, time, reaction)
