@@ -11,7 +11,7 @@ from ..contact.initial_overlap import overlapping
 from ..device.interrupts import whole
 from ..device.patches.compiler import CachedLaunch
 from ..particles.spin import moments
-from . import high_order, initial_violation
+from . import high_order, initial_shape, initial_violation
 from .clock import Clock, slack
 from .contact_rows import ContactRows
 from .diagnostics import BARE, EXTENT, STARTED, STEPPED, UNSTEPPED
@@ -156,12 +156,16 @@ class Runner:
                 for b in self.driven:
                     b.start_at(self.scene.state.get(self.memory), clock.first_moved)
                 ratio = h / (clock.h or h)
-                removed = initial_violation.remove(self.scene, self.batches, clock.first_moved, ratio, self.stop_at_walls)
-                if removed is not None:
-                    way, share = removed
-                    self.moved = float(way.max()) if share > initial_violation.SEEN else 0.0
-                    self.jumped = bool((way > self.scene.particles.radius).any()) and self.moved > 0
-                    self.invalidate()
+                for removed in (
+                    initial_shape.restore(self, clock.first_moved),
+                    initial_violation.remove(self.scene, self.batches, clock.first_moved, ratio, self.stop_at_walls),
+                ):
+                    if removed is not None:
+                        way, share = removed
+                        seen = float(way.max()) if share > initial_violation.SEEN else 0.0
+                        self.moved = max(self.moved, seen)
+                        self.jumped = self.jumped or (bool((way > self.scene.particles.radius).any()) and seen > 0)
+                        self.invalidate()
                 bare = clock.first_moved < self.n and not any((b.indices >= clock.first_moved).any() for b in self.batches)
                 if self.scene.slots.system and not bare:  # it has nothing to do with particles that came without constraints
                     system, x = self.scene.slots.system, self.scene.state.get(self.memory)
