@@ -24,7 +24,7 @@ from .neighbours.queries import Contacts, PointSearch, near_by_all, nearest
 from .particles import Particles, at_rest, in_range, spin_of
 from .solvers.jacobi import Jacobi
 from .solvers.solver import Solver
-from .step import checkpoint, edit_scene, energy_bound, impulse
+from .step import checkpoint, edit_scene, energy_bound, impulse, initial_violation
 from .step.adaptive import StepController
 from .step.build import Assembly, assemble, check_settings, checked_features, checked_solver
 from .step.build_again import Rebuild
@@ -151,6 +151,7 @@ class World:
                 watcher.before()
             clock = perf_counter()
             try:
+                self._find_stiffened()
                 guarded = self._controller.auto or tolerance is not None or budget is not None
                 if guarded or self._substeps * self._iterations > self._runner.passes_at_once:
                     self._undo = checkpoint.keep(self), checkpoint.flags(self)
@@ -182,6 +183,14 @@ class World:
             return
         for watcher in self._watchers:
             watcher.broken_off()
+
+    def _find_stiffened(self) -> None:
+        """Before knobs are uploaded: what was a spring and is to be rigid is met as where its particles are placed, by these and
+        all after them. It has to be known before a state is kept, or copied, which has what was uploaded since."""
+        waiting, clock = [f for f in self._features if f.changed and isinstance(f, Batch) and f.soft], self._clock
+        first = initial_violation.first_stiffened(waiting, self.position) if waiting else None
+        if first is not None:
+            clock.energy, clock.first_moved = None, first if clock.first_moved is None else min(first, clock.first_moved)
 
     def _upload_parameters(self) -> None:
         """Write the knobs to the device. Where a force has changed, first turn displacements into velocities by the old force."""
@@ -662,6 +671,7 @@ class World:
         if unknown := set(changes) - set(settings):
             raise TypeError(f"World.clone: {sorted(unknown)[0]} cannot be changed; one of {', '.join(settings)} can.")
         self._runner.memory.check()
+        self._find_stiffened()
         self._adapt()
         copies = tuple(f.twin() for f in self._features)
         new = World._of(self._particles, copies, [f.start for f in self._features], **{**settings, **changes})

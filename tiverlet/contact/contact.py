@@ -367,11 +367,12 @@ class Contact(PairContact):
         return push, turned
 
     @ti.func
-    def reaction(self, i, h):
+    def reaction(self, i, h, soft):
         """Return how far contact forces moved particle i in the last substep of a frame, h [s] long [m].
 
         It is the sum of pushes along the normals at the present places, where they have no moment, and of friction as the passes
-        summed it up. Known loads are left out, because they count as forces already.
+        summed it up. The part of known loads that counts as a force already is left out: h^2 / soft of a load, as in
+        KnownLoads.given().
         """
         total, w = 0 * self.dev.state.d[i], self.dev.w.of(i)
         if self.dev.splitting.weight[i] > 0:
@@ -388,7 +389,7 @@ class Contact(PairContact):
                         approach = -self.dev.state.slid(self.dev.forces.before[i] - self.dev.forces.before[j], i, j).dot(n)
                         share = self.dev.forces.share(approach, push * (w + self.dev.w.of(j)))
                         if ti.static(self.dev.has_loads):
-                            push -= self.dev.known.load.field[e] * h * h
+                            push -= self.dev.known.load.field[e] * h * h / soft
                         total += share * w * push * n
         if ti.static(self.dev.has_friction):
             total += self.dev.forces.sum[i]

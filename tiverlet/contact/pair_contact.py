@@ -270,8 +270,9 @@ class PairContact(Feature):
         self.dev.forces.start(i, scale)
 
     @ti.func
-    def reaction(self, i, h):
-        """Return how far contact forces moved particle i in the last substep of a frame, h [s] long [m]. It needs a list."""
+    def reaction(self, i, h, soft):
+        """Return how far contact forces moved particle i in the last substep of a frame, h [s] long [m]. It needs a list. soft:
+        see Passes.push_reaction()."""
         return self.dev.forces.sum[i]
 
     @ti.func

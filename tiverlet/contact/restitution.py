@@ -9,6 +9,7 @@ from ..neighbours.neighbour_list import PairData
 from .narrow_phase import DiscGeometry
 
 SLOW = 2.0  # a pair rests if this many substeps of forces account for its speed, see Restitution
+ELASTIC = 2.0**-8  # the same for e = 1: rounding alone, so that a load at rest does not count as impacts
 
 
 class Restitution:
@@ -18,7 +19,8 @@ class Restitution:
     pushes and impacts of the last substep [kg m]. events: an EventLog, or None.
 
     Unless e is 1, a pair rests at a speed that two substeps of forces give it. Otherwise particles that are pressed between
-    others would bounce for ever, by known loads or as a corner of a body: each impact returns what the last one took.
+    others would bounce for ever, by known loads or as a corner of a body: each impact returns what the last one took. At e = 1 a
+    pair rests if it approaches by rounding only.
     """
 
     def __init__(
@@ -60,7 +62,10 @@ class Restitution:
             if last == 0:
                 slack = ti.max(slack, overlap - ti.max(here, 0))
             # First pass only: later passes include pushes of other pairs.
-            if first != 0 and e < 1 and a <= ti.static(SLOW) * (here - a):
+            slow = ti.static(SLOW) * (here - a)
+            if e == 1:
+                slow *= ti.static(ELASTIC / SLOW)
+            if first != 0 and a <= slow:
                 deep = ti.max(deep, given)
             if a > 0:
                 rests = deep > 0 and (first == 0 or given <= deep)

@@ -11,7 +11,7 @@ from ..contact.initial_overlap import overlapping
 from ..device.interrupts import whole
 from ..device.patches.compiler import CachedLaunch
 from ..particles.spin import moments
-from . import high_order, initial_violation
+from . import high_order, initial_shape, initial_violation
 from .clock import Clock, slack
 from .contact_rows import ContactRows
 from .diagnostics import BARE, EXTENT, STARTED, STEPPED, UNSTEPPED
@@ -65,6 +65,7 @@ class Runner:
         self.probe = high_order.Probe(step) if self.scene.order > 2 else None
         self.passes_at_once = self._passes_at_once()
         self.asks_velocities = any(wall.has_switch for wall in step.walls)
+        self.bounces = any(f.has_restitution for f in (*step.walls, *step.contacts))
         self.launcher = Launcher(self)
         self._prepare()
 
@@ -158,12 +159,16 @@ class Runner:
                 for b in self.driven:
                     b.start_at(self.scene.state.get(self.memory), clock.first_moved)
                 ratio = h / (clock.h or h)
-                removed = initial_violation.remove(self.scene, self.batches, clock.first_moved, ratio, self.stop_at_walls)
-                if removed is not None:
-                    way, share = removed
-                    self.moved = float(way.max()) if share > initial_violation.SEEN else 0.0
-                    self.jumped = bool((way > self.scene.particles.radius).any()) and self.moved > 0
-                    self.invalidate()
+                for removed in (
+                    initial_shape.restore(self, clock.first_moved),
+                    initial_violation.remove(self.scene, self.batches, clock.first_moved, ratio, self.stop_at_walls),
+                ):
+                    if removed is not None:
+                        way, share = removed
+                        seen = float(way.max()) if share > initial_violation.SEEN else 0.0
+                        self.moved = max(self.moved, seen)
+                        self.jumped = self.jumped or (bool((way > self.scene.particles.radius).any()) and seen > 0)
+                        self.invalidate()
                 bare = clock.first_moved < self.n and not any((b.indices >= clock.first_moved).any() for b in self.batches)
                 if self.scene.slots.system and not bare:  # particles added without constraints do not concern it
                     system, x = self.scene.slots.system, self.scene.state.get(self.memory)
@@ -280,12 +285,18 @@ class Runner:
 
     def restart(self, iterations: int) -> None:
         """Turn displacements into velocities, so that the next substep is a start from the present state. iterations: of the
-        substep, for velocities of higher order."""
+        substep, for velocities of higher order.
+
+        d / h of a particle at rest stands for -g h / 2 without its support. Without restitution the next substep stops it all the
+        same. With restitution it would leave at e g h / 2, which a shorter substep does not take for rest. So in worlds with
+        restitution the velocities are those that users read.
+        """
         clock = self.clock
         if not clock.d_is_velocity:
-            if clock.parted is not None:
-                held = (self.scene.inv_mass == 0)[:, None]
-                self.start(np.where(held, self.memory.read(self.scene.state.d)[: self.n] / clock.h, clock.parted))
+            if clock.parted is not None or self.bounces:
+                held, seen = (self.scene.inv_mass == 0)[:, None], clock.parted
+                seen = self.velocity(iterations) if seen is None else seen
+                self.start(np.where(held, self.memory.read(self.scene.state.d)[: self.n] / clock.h, seen))
             elif self.probe:
                 self.memory.write(self.scene.state.d, high_order.velocity(self.probe, clock, self.memory, iterations))
             else:

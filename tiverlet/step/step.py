@@ -609,7 +609,7 @@ class Step:
         self.write_reactions(given[0], given[2], given[3])
         for i in range(self.n):
             h, time, firm = ti.cast(given[0], self.real), ti.cast(given[1], self.real), ti.cast(given[2], self.real)
-            v = self.particles.surface_velocity(i, h, time, firm)
+            v = self.particles.surface_velocity(i, h, time, firm, ti.cast(given[3], self.real))
             for k in ti.static(range(self.state.spin.axes)):
                 out[i, k] = v[k]
 
@@ -633,7 +633,7 @@ class Step:
         """Body of velocities()."""
         self.write_reactions(given[0], given[2], given[3])
         for i in range(integer(given, 4), integer(given, 5)):
-            v = self.velocity_of(i, given[0], given[1], given[6])
+            v = self.velocity_of(i, given[0], given[1], given[6], given[3])
             for k in ti.static(range(self.dim)):
                 out[i, k] = v[k]
 
@@ -643,8 +643,8 @@ class Step:
         self.constraints.reactions(ti.cast(h64, self.real), ti.cast(firm64, self.real), ti.cast(soft64, self.real))
 
     @ti.func
-    def velocity_of(self, i, h64, t, firm64):
+    def velocity_of(self, i, h64, t, firm64, soft64):
         """The velocity of particle i, once write_reactions() has filled the slots."""
         h, time, firm = ti.cast(h64, self.real), ti.cast(t, self.real), ti.cast(firm64, self.real)
-        reaction, _part = self.particles.reaction(i, h, time, firm)
+        reaction, _part = self.particles.reaction(i, h, time, firm, ti.cast(soft64, self.real))
         return self.integrator.velocity_after(i, h, time, reaction)

@@ -270,6 +270,7 @@ class Worlds:
             still = np.zeros(len(features), dtype=bool)
             for k in knobs.waiting:
                 with self._at(k), knobs.flagged(k):
+                    world._find_stiffened()
                     world._upload_parameters()
                     still |= [f.moving for f in features]
             knobs.note_uploaded(still.tolist())
