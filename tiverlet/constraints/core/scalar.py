@@ -329,6 +329,7 @@ class Scalar(Batch):
 
         More exactly the force along grad f: newtons where f is a length, N m where it is an angle. In f32, rounding of positions
         is felt as about m ulp(x) / h^2, 1 N for 1 kg some 10 m from the origin at 1200 substeps/s; use f64 where that matters.
+        break_at does without it, see Strength.
         """
         if not self.count:
             return np.zeros(0)
