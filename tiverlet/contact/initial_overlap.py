@@ -5,6 +5,7 @@ from itertools import product
 import numpy as np
 
 from ..features.feature import Batch, Scene
+from ..features.material import Table
 from ..particles import State
 from .exclusions import excluded_pairs
 
@@ -13,9 +14,9 @@ MANY = 20_000  # particles for which it is not worth the time
 CROWD = 16  # in a cell, likewise
 
 
-def overlapping(scene: Scene, batches: list[Batch], x: np.ndarray, first: int = 0) -> bool | None:
-    """Whether discs or spheres at x, (n, dim) [m], overlap, one of them free to move and one of them from number `first` on; what
-    is linked never touches. None where finding out would take long.
+def overlapping(scene: Scene, batches: list[Batch], table: Table, x: np.ndarray, first: int = 0) -> bool | None:
+    """Whether discs or spheres at x, (n, dim) [m], overlap that push each other by this table, one of them free to move and one
+    of them from number `first` on; what is linked never touches. None where finding out would take long.
 
     From 0 on all that the device will see counts, with what it rounds, for that is what a world is compiled for; else what f32
     rounds does not.
@@ -37,6 +38,7 @@ def overlapping(scene: Scene, batches: list[Batch], x: np.ndarray, first: int = 
     else:
         near = _meet(scene.state, x, radius, i, j)
     pairs = number[np.stack([i, j], axis=1)[near & (free[i] | free[j])]]
+    pairs = pairs[table.pushing(scene.particles.group, pairs)]
     if not len(pairs):
         return False
     linked = excluded_pairs(batches, scene.particles.radius)

@@ -505,7 +505,8 @@ class Runner:
         """Let particles part gently that the user put into each other, from number `first` on."""
         contact = self.step.contacts[0]
         if not contact.shrinks:
-            if first and overlapping(self.scene, self.batches, self.scene.state.get(self.memory), first) is False:
+            x = self.scene.state.get(self.memory) if first else None
+            if x is not None and overlapping(self.scene, self.batches, contact.table, x, first) is False:
                 return  # what overlaps does so under its load
             contact.enable_shrink()
             self.renew()
