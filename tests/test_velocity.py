@@ -260,7 +260,11 @@ def test_what_rubs_and_is_pushed_slides(world, substeps):
     for spun in (False, True):
         w = ways(world, substeps, friction=mu)
         if spun:
-            w.spin = [-400.0, *w.spin[1:]]
+            turns, asked = [-400.0, *w.spin[1:]], []
+            spin = w._runner.spin
+            w._runner.spin = lambda ask=spin, asked=asked: asked.append(1) or ask()
+            w.spin = turns
+            assert len(asked) == 1  # a launch
         else:
             w.velocity = [(v, 0.0), *w.velocity[1:]]
         w.run(0.1)

@@ -74,7 +74,7 @@ class World:
         self._build(particles, features, starts, substeps, iterations, solver, precision, path, order)
         for contact in self._runner.step.contacts:
             scene, batches = self._runner.scene, self._runner.batches
-            if not contact.shrinks and contact.table.uniform and overlapping(scene, batches, particles.position):
+            if not contact.shrinks and overlapping(scene, batches, contact.table, particles.position):
                 contact.enable_shrink()  # before anything is compiled; later, the frame would have to be compiled again
 
     @staticmethod
@@ -376,7 +376,7 @@ class World:
                 return
             if impulse.rubs(runner) or runner.probe:  # the change alters friction
                 seen = self.velocity
-                if not impulse.steer(runner, seen, seen, change, self._iterations):
+                if not impulse.steer(runner, seen, seen, change, self._iterations, has):
                     self._let_go()
             runner.wake(np.flatnonzero(others))
             s = runner.memory.read(spin.s)[: runner.n]

@@ -5,6 +5,7 @@ from itertools import product
 import numpy as np
 
 from ..features.feature import Batch, Scene
+from ..features.material import Table
 from ..particles import State
 from .exclusions import excluded_pairs
 
@@ -13,8 +14,8 @@ MANY = 20_000  # particles above which the test takes too long
 CROWD = 16  # particles in a cell above which the test takes too long
 
 
-def overlapping(scene: Scene, batches: list[Batch], x: np.ndarray, first: int = 0) -> bool | None:
-    """Whether discs or spheres at x (n, dim) [m] overlap; None if the test would take long.
+def overlapping(scene: Scene, batches: list[Batch], table: Table, x: np.ndarray, first: int = 0) -> bool | None:
+    """Whether discs or spheres at x (n, dim) [m] that push each other, by this table, overlap; None if the test would take long.
 
     Only pairs count of which one particle is free to move and one has an index of `first` or more. Linked pairs never touch.
 
@@ -38,6 +39,7 @@ def overlapping(scene: Scene, batches: list[Batch], x: np.ndarray, first: int = 
     else:
         near = _meet(scene.state, x, radius, i, j)
     pairs = number[np.stack([i, j], axis=1)[near & (free[i] | free[j])]]
+    pairs = pairs[table.pushing(scene.particles.group, pairs)]
     if not len(pairs):
         return False
     linked = excluded_pairs(batches, scene.particles.radius)

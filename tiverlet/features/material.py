@@ -116,7 +116,7 @@ class Table:
 
     def pushing(self, group: np.ndarray, pairs: np.ndarray) -> np.ndarray:
         """Return which pairs (m, 2) of particles of these groups push each other, (m,)."""
-        if not self.senses:
+        if not self.senses and self.touching is None:
             return np.ones(len(pairs), dtype=bool)
         rank, table = self.rows(group)
         m = rank.max() + 1

@@ -68,24 +68,32 @@ class Slots:
         self.exact = bool(scalars) and (not self.system.steps if self.system else bool(degree.max(initial=0) <= 1))
         self._scalars = bool(scalars)
         blocks = self.system.blocks if self.system else degree
+        if self.loads or any(b.breaks for b in batches):
+            self._bodies, self._hefts = self._tied(batches, inv_mass)
         if self.loads:
-            self._bodies = self._tied(batches, inv_mass)
             self.bodies = memory.number(1 + max(int(b.max(initial=0)) for b in self._bodies.values()))
             self.bears = memory.field("slots.bears", self.bodies)
         self.split = memory.field("slots.split_mass", scene.count, values=blocks * inv_mass)
         self.relaxation = solver.relaxed_by(scene, batches, blocks * inv_mass)
 
     @staticmethod
-    def _tied(batches: list[Batch], inv_mass: np.ndarray) -> dict[int, np.ndarray]:
-        """The body of each constraint, by the batch's id. Constraints that share particles that can move, directly or through
-        others, are of one body."""
+    def _tied(batches: list[Batch], inv_mass: np.ndarray) -> tuple[dict[int, np.ndarray], np.ndarray]:
+        """The body of each constraint, by the batch's id; and the root of the sum of the squares of the masses [kg] of each body.
+        Constraints that share particles that can move, directly or through others, are of one body."""
         ends = np.cumsum([b.count for b in batches])
-        parts = np.split(bodies_of(int(ends[-1]), *corners_of(batches), inv_mass)[0], ends[:-1])
-        return {id(b): part for b, part in zip(batches, parts, strict=True)}
+        label, body = bodies_of(int(ends[-1]), *corners_of(batches), inv_mass)
+        parts = np.split(label, ends[:-1])
+        squares = np.divide(1, inv_mass, out=np.zeros(len(inv_mass)), where=inv_mass > 0) ** 2
+        hefts = np.sqrt(np.bincount(body, weights=squares, minlength=int(ends[-1]) + 1))
+        return {id(b): part for b, part in zip(batches, parts, strict=True)}, hefts
 
     def body(self, batch: Batch) -> np.ndarray:
-        """The body of each constraint of a batch, where loads become known."""
+        """The body of each constraint of a batch, where loads become known, or constraints break."""
         return self._bodies[id(batch)]
+
+    def heft(self, batch: Batch) -> np.ndarray:
+        """What rounding of places weighs in the body of each constraint [kg], see Strength."""
+        return self._hefts[self.body(batch)]
 
     def regroup(self, memory: Memory, change: Regrouping) -> None:
         """Particles that no constraint holds came and went."""

@@ -148,9 +148,12 @@ def tells(runner: Any) -> bool:
     return not runner.probe and (runner.clock.drag or FREE)[0] >= WEAK
 
 
-def steer(runner: Any, want: np.ndarray, seen: np.ndarray, change: np.ndarray, iterations: int) -> bool:
+def steer(
+    runner: Any, want: np.ndarray, seen: np.ndarray, change: np.ndarray, iterations: int, spun: np.ndarray | None = None
+) -> bool:  # fmt: skip
     """Have particles with a `change` of velocity or spin, (n, any) [m/s], that can move go on with velocities `want`, (n, dim)
-    [m/s], instead of `seen`. Returns whether displacements were found that stand for these; else it takes a start."""
+    [m/s], instead of `seen`. Returns whether displacements were found that stand for these; else it takes a start. spun: what
+    Runner.spin() says, if that is known."""
     some, clock, drag = (change != 0).any(axis=1), runner.clock, np.array([runner.clock.drag or FREE])
     if clock.d_is_velocity or not tells(runner):
         return False
@@ -168,21 +171,23 @@ def steer(runner: Any, want: np.ndarray, seen: np.ndarray, change: np.ndarray, i
             )  # fmt: skip
         if not found[0]:
             return False
-        turn_on(runner, first, share[0])
+        turn_on(runner, first, share[0], spun)
     runner.wake(np.flatnonzero(some))
     clock.energy, clock.parted = None, want.copy()
     return True
 
 
-def turn_on(runner: Any, first: int, share: np.ndarray) -> None:
-    """Have particles from number `first` on keep of what friction turned them by in half a substep the part that is over."""
+def turn_on(runner: Any, first: int, share: np.ndarray, spun: np.ndarray | None = None) -> None:
+    """Have particles from number `first` on keep of what friction turned them by in half a substep the part that is over.
+    spun: what Runner.spin() says, if that is known."""
     state, memory, step = runner.scene.state, runner.memory, runner.step
     turned = [c.dev.forces.turned for c in step.contacts if c.dev.forces.spins]
     turned += [step.particles.wall_turn] if step.particles.turned_by_walls else []
     if not (state.spins and turned and share.any()):
         return
     with memory.compiler():
-        half = runner.clock.h * runner.spin() - memory.read(state.spin.s)[: runner.n]
+        spun = runner.spin() if spun is None else spun
+    half = runner.clock.h * spun - memory.read(state.spin.s)[: runner.n]
     rows, s = slice(first, first + len(share)), memory.read(state.spin.s)
     s[rows] += share * half[rows]
     memory.write(state.spin.s, s)

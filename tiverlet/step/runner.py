@@ -530,7 +530,8 @@ class Runner:
         """Let particles from number `first` on that the user placed into others part gently."""
         contact = self.step.contacts[0]
         if not contact.shrinks:
-            if first and overlapping(self.scene, self.batches, self.scene.state.get(self.memory), first) is False:
+            x = self.scene.state.get(self.memory) if first else None
+            if x is not None and overlapping(self.scene, self.batches, contact.table, x, first) is False:
                 return  # overlap under a load is no error of placing
             contact.enable_shrink()
             self.renew()

@@ -41,7 +41,7 @@ class ClusterPasses(Passes):
         self.shape = add(f"{name}.shape", total, width=dim, values=shape, state=self.plastic)
         turn = rotation.identity(dim)
         self.pull: Any = add(f"{name}.multiplier", total, width=dim, state=True)
-        self.strength = Strength(scene, name, batch)
+        self.strength = Strength(scene, name, batch, total, dim)
         self.turn = add(f"{name}.turn", m, width=len(turn), kind=ti.f64, values=[turn] * m, state=True)
         told = bool(scene.state.sleepers)  # the report reads it for clusters that sleep, in a clone too
         self.pose = add(f"{name}.pose", m, width=dim * dim, kind=ti.f64, state=told)
@@ -346,17 +346,19 @@ class ClusterPasses(Passes):
 
     @ti.func
     def break_overloaded(self, c, h2_rigid, h2_effective, tick):
-        """Break cluster c if the force on one of its particles was too large."""
+        """Break cluster c if the force on one of its particles was too large, see Strength."""
         if self.strength.holds(c):
-            most = ti.cast(0, self.real)
-            for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
-                w = self.w.of(self.corners.members[e])
-                if w > 0:
-                    most = ti.max(most, self.pull[e].norm() / w)
-            w = self.mass[c]
+            w, i0, snaps = self.mass[c], self.corners.hub(c), False
             if w > 0:
                 w = 1 / w
-            self.strength.test(c, most, self.spring.reach(c, w, h2_rigid, h2_effective), tick)
+            reach = self.spring.reach(c, w, h2_rigid, h2_effective)
+            for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
+                i = self.corners.members[e]
+                if self.w.of(i) > 0:
+                    past = self.strength.exceeded(c, e, self.pull[e] / self.w.of(i), reach)
+                    snaps = snaps or past > self.strength.rounding(c, i, i0)
+            if snaps:
+                self.strength.snap(c, tick)
 
     @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):

@@ -355,7 +355,10 @@ class CornerPasses(Passes):
 
     @ti.func
     def break_overloaded(self, c, h2_rigid, h2_effective, tick):
-        """Break constraint c if its multiplier is too large. Velocities contain its known load, as a spring force."""
+        """Break constraint c if its multiplier, or the sum over many substeps, is too large, see Strength.
+
+        Velocities contain its known load, as a spring force. Where low words are carried, lengths are exact.
+        """
         lam, w = self.equation.lam[c], ti.cast(0, self.real)
         if ti.static(self.spring.soft):
             if h2_rigid > h2_effective:
@@ -363,7 +366,17 @@ class CornerPasses(Passes):
         reach = self.spring.reach(c, w, h2_rigid, h2_effective)
         if ti.static(self.known.learns):
             lam += (reach / h2_effective - 1) * self.known.given[c]
-        self.strength.test(c, ti.abs(lam), reach, tick)
+        if self.strength.holds(c):
+            past, unsure = self.strength.exceeded(c, c, lam, reach), 0 * lam
+            if past > 0:
+                if ti.static(not (self.quantity.precise and self.state.carries)):
+                    _, g = self.quantity.remeasure(c, self.seen.apart(c, 0))
+                    for k in ti.static(range(self.arity)):
+                        if g[k, :].norm() > 0:
+                            rounding = self.strength.rounding(c, self.corners.member(c, k), self.corners.member(c, 0))
+                            unsure = ti.max(unsure, rounding / g[k, :].norm())
+                if past > unsure:
+                    self.strength.snap(c, tick)
 
     @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):

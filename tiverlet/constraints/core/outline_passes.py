@@ -113,9 +113,17 @@ class OutlinePasses(Passes):
 
     @ti.func
     def break_overloaded(self, c, h2_rigid, h2_effective, tick):
-        """Break constraint c if its multiplier is too large."""
-        reach = self.equation.spring.reach(c, self.weight(c), h2_rigid, h2_effective)
-        self.strength.test(c, ti.abs(self.equation.lam[c]), reach, tick)
+        """Break constraint c if its multiplier, or the sum over many substeps, is too large, see Strength."""
+        if self.strength.holds(c):
+            reach = self.equation.spring.reach(c, self.weight(c), h2_rigid, h2_effective)
+            past, unsure, i0 = self.strength.exceeded(c, c, self.equation.lam[c], reach), 0 * reach, self.corners.hub(c)
+            if past > 0:
+                for e in range(self.corners.starts[c], self.corners.starts[c + 1]):
+                    g = self.quantity.slope(e, 0).norm()
+                    if g > 0:
+                        unsure = ti.max(unsure, self.strength.rounding(c, self.corners.members[e], i0) / g)
+                if past > unsure:
+                    self.strength.snap(c, tick)
 
     @ti.func
     def residual_of(self, c, h, h2_effective, frame_fraction, fresh):

@@ -347,7 +347,7 @@ class Scalar(Batch):
 
         More exactly it is the force along grad f: newtons where f is a length, N m where f is an angle. In f32, rounding of
         positions adds about m ulp(x) / h^2, 1 N for 1 kg some 10 m from the origin at 1200 substeps/s; use f64 where that
-        matters.
+        matters. break_at is not affected by it, see Strength.
         """
         if not self.count:
             return np.zeros(0)
