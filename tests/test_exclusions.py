@@ -84,7 +84,7 @@ def test_edits_and_copies_leave_out_the_same(world):
     rope = tv.shapes.rope((0, 5), (1, 5), points=5)
     w.add(tv.Particles(rope.position, radius=0.3), extend={links: tv.Distance(rope.links + 15)})
     assert not w.step(1 / 60).contacts
-    w.remove([17])  # no link holds its ends together any more, so they part
+    w.remove([17])  # no link holds its ends together, so they part
     w.run(0.5)
     assert np.linalg.norm(w.position[17] - w.position[16]) >= 0.59
     other = w.clone()
