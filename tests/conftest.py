@@ -222,8 +222,10 @@ def built_once(monkeypatch):
 
 @functools.cache
 def parsed() -> dict[pathlib.Path, ast.Module]:
-    """Return the syntax trees of all modules of the package, by file. Garbage collection is off meanwhile: it would triple the
-    time."""
+    """Return the syntax trees of all modules of the package, by file.
+
+    Garbage collection is off meanwhile: it would triple the time.
+    """
     collects = gc.isenabled()
     gc.disable()
     try:
@@ -278,8 +280,10 @@ def rerun(w: tv.World, seconds: float, dt: float = 1 / 60, **settings) -> tv.Wor
 
 
 def unprojected(w: tv.World) -> tv.World:
-    """Leave violations of the initial positions to the passes, as violations after a knob change are. By default they are
-    projected first."""
+    """Leave violations of the initial positions to the passes, as violations after a knob change are.
+
+    By default, violations of the initial positions are projected first.
+    """
     w._clock.first_moved = len(w.particles)  # none of the particles
     return w
 

@@ -58,8 +58,7 @@ def test_rods_swing_through_straight_and_every_compliance_is_stable(world):
 
 
 def test_angles_have_signs_and_wrap(world):
-    # In 2D positive is to the left. From 3 rad to -3 rad the angle turns by 0.28 rad, through folded, not by 6 rad through
-    # straight.
+    # In 2D positive is to the left. From 3 rad to -3 rad the angle turns by 0.28 rad through folded, not by 6 through straight.
     a = np.array([0.5, -0.5, 3.0, -3.0])
     x = np.zeros((4, 3, 2))
     x[:, 0, 0], x[:, 2, 0], x[:, 2, 1] = -1.0, np.cos(a), np.sin(a)
@@ -82,8 +81,7 @@ def test_angles_have_signs_and_wrap(world):
 
 
 def test_limbs_stop_at_their_limits(world):
-    # A forearm on a fixed upper arm falls to its limit and rests there with the moment m g l cos. Between the limits it is
-    # free.
+    # A forearm on a fixed upper arm falls to its limit and rests there with the moment m g l cos. Between the limits it is free.
     x = np.array([[-1.0, 0.0], [0.0, 0.0], [1.0, 0.0], [-1.0, 5.0], [0.0, 5.0], [1.0, 5.0]])
     limit = tv.AngleLimit([[0, 1, 2]], -1.2, 2.5)
     features = [tv.Gravity(9.81), tv.Distance([[1, 2], [4, 5]]), limit, tv.Drag(3.0)]
@@ -196,8 +194,8 @@ def test_a_bent_corner_between_pins_stays_near_them(world):
 
 @pytest.mark.parametrize("solver", [tv.Jacobi(), tv.ConjugateGradient(10)], ids=str)
 def test_limits_know_no_less_than_straight(world, solver):
-    # In 3D an angle is at least 0: straight limbs in any position meet limits of 0 to 2 rad. So they must in f32, where the
-    # sign of |u x v| near 0 is rounding. Nothing acts on the limbs in free fall, and an inactive limit must report no turn.
+    # In 3D an angle is at least 0: straight limbs in any position meet limits of 0 to 2 rad, also in f32, where the sign of
+    # |u x v| near 0 is rounding. Nothing acts on the limbs in free fall, and an inactive limit must report no turn.
     rng = np.random.default_rng(3)
     u = rng.normal(size=(200, 3))
     u /= np.linalg.norm(u, axis=1, keepdims=True)
@@ -211,8 +209,7 @@ def test_limits_know_no_less_than_straight(world, solver):
 
 
 def test_what_is_slack_has_not_turned(world):
-    # Two balls on a slack rope pass each other: its direction turns by 2 atan((10 / 2400) / (0.1 / 60)) = 136 degrees in a
-    # substep.
+    # Two balls on a slack rope pass each other: its direction turns by 2 atan((10 / 2400) / (0.1 / 60)) = 136 degrees at once.
     x = [[0.0, 0.0], [-10 / 40 / 60, 0.1 / 60]]
     w = world(
         tv.Particles(x, velocity=[[0, 0], [10.0, 0.0]]),

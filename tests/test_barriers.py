@@ -11,8 +11,7 @@ from .outlines import CUBE, CUBE_FACES, SQUARE, STAR, outside
 
 @pytest.mark.parametrize("precision, inside, radius, restitution", [("f32", False, 0.0, 0.7), ("f64", True, 0.03, 0.0)])
 def test_nothing_enters_a_star_or_leaves_it(world, precision, inside, radius, restitution):
-    # Inner and outer corners, discs and points, up to 100 radii per substep, with and without restitution, from inside and
-    # outside.
+    # Inner and outer corners, discs and points, up to 100 radii per substep, with and without bounces, from inside and outside.
     rng = np.random.default_rng(1)
     atol = 1e-9 if precision == "f64" else 4e-6
     side, h = -1 if inside else 1, 1 / 600
@@ -32,9 +31,9 @@ def test_nothing_enters_a_star_or_leaves_it(world, precision, inside, radius, re
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_nothing_passes_a_thin_sheet(world, dim):
-    # Rows 45 and 46: a two-sided sheet without thickness, and discs of 1 mm at v h = 0.01 ... 1000 mm from both sides, while
-    # the sheet turns by up to 3 rad per substep or stands still. Each disc stays on its side: the sheet is a line across a
-    # round drum.
+    # Rows 45 and 46: a two-sided sheet without thickness, and discs of 1 mm at v h = 0.01 ... 1000 mm from both sides, while the
+    # sheet turns by up to 3 rad per substep or stands still. The sheet is a line across a round drum; each disc stays on its
+    # side.
     rng = np.random.default_rng(2)
     n = 150
     x = rng.uniform(-0.9, 0.9, (n, dim))

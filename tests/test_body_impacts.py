@@ -33,8 +33,9 @@ def row(k: int) -> tuple[np.ndarray, np.ndarray]:
 def struck(x, v, n, e: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the velocities of the center and of all particles after a rigid body of unit masses hits a plane.
 
-    Before, the body has the velocity v and no spin; its lowest particle hits the plane of normal n: v' = v + J n / M, J = -(1 +
-    e) v.n / (1 / M + (r x n) . I^-1 (r x n)).
+    Before, the body has the velocity v and no spin; its lowest particle hits the plane of normal n:
+
+    v' = v + J n / M, J = -(1 + e) v.n / (1 / M + (r x n) . I^-1 (r x n))
     """
     r, m = x - x.mean(axis=0), len(x)
     low = int(np.argmin(x @ n))
@@ -92,8 +93,7 @@ def test_elastic_bodies_keep_their_energy_and_gain_none(world, solver):
 
 @pytest.mark.parametrize("e", [0.0, 0.5, 1.0])
 def test_friction_takes_its_share_of_the_blow(world, e):
-    # A body lands flat and slides on: both lower particles are stopped alike, and Coulomb's law changes v_x by mu (1 + e) v_y
-    # at once.
+    # A body lands flat and slides on: both lower particles are stopped alike, and Coulomb's law takes mu (1 + e) |v_y| from v_x.
     mu, v = 0.1, np.array([2.0, -1.5])
     w = world(
         tv.Particles([[0.0, 0.3], [0.4, 0.3], [0.2, 0.5]], velocity=v),

@@ -30,8 +30,8 @@ def test_every_case_reaches_the_figures_of_the_prototypes(world):
             key = (name, row["t"], row["substeps_per_frame_60hz"])
             figure = row["rms_error_m"].get("SHAKE-direct")
             if key in errors and isinstance(figure, float) and figure < 1:
-                # The prototype uses the same method, so errors agree to the digits of its figure. The pivots for 1e6:1 are
-                # accurate to 1e-10.
+                # The prototype uses the same method, so errors agree to the digits of its figure. The pivots for 1e6:1 have
+                # errors of 1e-10.
                 assert errors[key] <= (7e-7 if "1000000" in name else figure * 1.02 + 2e-8), key
                 compared += 1
     assert compared >= 25
@@ -70,8 +70,7 @@ def test_shorter_substeps_never_make_it_worse(world, precision):
 
 
 def test_triple_pendulum_keeps_its_energy_for_600_seconds(world):
-    # The public challenge, where XPBD keeps the energy to 0.5 %. Energies are relative to the lowest state, all links hanging
-    # down.
+    # The public challenge, where XPBD keeps the energy to 0.5 %. Energies are relative to the lowest state: all links hang down.
     name = "D03_mueller_triple"
     w = hung(world, name)
     for substeps, figure in ((20, 1.4e-4), (50, 2.2e-5), (100, 5.5e-6)):
@@ -87,8 +86,7 @@ def test_triple_pendulum_keeps_its_energy_for_600_seconds(world):
 
 
 def test_fifty_links_with_50_000_to_1(world):
-    # The heavy end swings on 50 links of 2 cm as on one rod of 1 m: omega^2 = g / L for small angles, but for the mass of the
-    # links.
+    # The heavy end swings on 50 links of 2 cm as on a rod of 1 m, but for their mass: omega^2 = g / L for small angles.
     n, ratio, angle = 50, 50_000.0, 0.05
     x = np.outer(np.linspace(0, 1, n + 1), [np.sin(angle), -np.cos(angle)])
     mass = np.ones(n + 1)

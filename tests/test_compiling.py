@@ -78,9 +78,8 @@ add(5)
 
 
 def test_what_the_user_compiles_is_compiled_as_ever():
-    # parts() assigns a vector to a variable that holds a number. Taichi's analysis finds that the variable is never read;
-    # without the analysis, LLVM ends the process. Only frames with such functions are analysed: with contacts, that takes ten
-    # times as long.
+    # parts() assigns a vector to a variable that holds a number. Taichi's analysis finds that the variable is never read; without
+    # it, LLVM ends the process. Only frames with such functions are analysed, which takes ten times as long with contacts.
     python(
         """
 from tiverlet.device import ti

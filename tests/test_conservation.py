@@ -117,8 +117,8 @@ def test_what_slides_over_a_disc_is_second_order(world):
 
 @pytest.mark.parametrize("others", [False, True])
 def test_what_runs_round_in_a_ring_keeps_its_speed(world, others):
-    # All chords from one point of a circle to the next are as long as the first one, to rounding. The first is longer by (v h /
-    # R)^2 / 8 than the displacement without the ring. At 200 m/s the particle climbs by 14 m/s in a substep, far more than
+    # All chords from one point of a circle to the next are as long as the first one, to rounding. The first is longer by
+    # (v h / R)^2 / 8 than the displacement without the ring. At 200 m/s the particle climbs by 14 m/s a substep, far above
     # push_out.
     for speed, substeps in ((5.0, 1), (5.0, 8), (200.0, 20)):
         ring, start = tv.Ball((0, 0), 1.0, inside=True), tv.Particles([(0.0, -1.0)], velocity=(speed, 0.0))
@@ -151,8 +151,7 @@ def test_a_loop_without_friction_is_second_order(world):
 
 
 def test_momentum_is_not_conserved_by_averaging_here(world):
-    # Shows that the test of momentum can fail: dividing a particle's sum by its number of links, not by its mass, breaks the
-    # balance.
+    # Shows that the momentum test can fail: dividing a particle's sum by its number of links, not its mass, breaks the balance.
     x, v, mass, pairs, *_ = net(2, seed=4)
     count = np.bincount(pairs.ravel(), minlength=len(x))
     i, j = pairs.T
@@ -262,8 +261,7 @@ def test_splitting_a_run_changes_nothing(world):
 
 
 def test_a_force_that_was_just_turned_goes_along(world, tmp_path):
-    # Velocities at the end of a frame are d / h + h a / 2 with the force of that frame, though the knob already has its next
-    # value.
+    # Velocities at the end of a frame are d / h + h a / 2 with the force of that frame, though the knob has its next value then.
     def turned():
         g = tv.Gravity(9.81)
         w = world(tv.Particles([[0.0, 0], [1, 0]], velocity=[[1, 2], [3, -1]]), [g, tv.Distance([[0, 1]])], substeps=3)
@@ -292,10 +290,10 @@ def test_a_force_that_was_just_turned_goes_along(world, tmp_path):
 
 
 def test_a_stiff_spring_that_turns_stores_what_its_load_does(world):
-    # A mass m circles a point at a distance L: it has m v^2 / 2, and the spring alpha F^2 / 2 with F = m v^2 / L = 2.5 N, 3e-9
-    # J. In the middle of a substep the mass is nearer by L phi^2 / 8, phi = v h / L; 1 / (2 alpha) times its square would be up
-    # to 23 J. The mass turns by asin phi per substep, and its speed is taken along the chord: (1 + phi^2 / 4) of the kinetic
-    # energy. A cluster must give the same, and so must a mass on a stiff pin: m u^2 / 2 for a target with speed u.
+    # A mass m circles a point at a distance L: it has m v^2 / 2, and the spring alpha F^2 / 2 with F = m v^2 / L = 2.5 N, 3e-9 J.
+    # In the middle of a substep the mass is nearer by L phi^2 / 8, phi = v h / L; 1 / (2 alpha) times its square would be up to
+    # 23 J. The mass turns by asin phi per substep, and its speed is taken along the chord: (1 + phi^2 / 4) of the kinetic energy.
+    # A cluster must give the same, and so must a mass on a stiff pin: m u^2 / 2 for a target with speed u.
     alpha, L, v, u, m = 1e-9, 0.5, 2.5, 1.2, 0.2
     x = np.array([[0, 0], [L, 0], [2, 0], [2 + L, 0], [2, L], [5, 0]])
     speed = np.array([[0, 0], [0, v], [0, 0], [0, 0], [0, 0], [0, 0]])

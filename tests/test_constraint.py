@@ -48,9 +48,8 @@ def test_a_length_of_ones_own_is_a_distance(world):
 
 
 def test_what_has_no_direction_says_how_far_it_is_off(world):
-    # Central differences of |a - b| at a = b are 0: a rigid link of L m cannot open there, and its residual is all of L. A
-    # spring has no force there, as F = -C grad C / alpha says, and no residual. Constraints between fixed particles have none
-    # either.
+    # Central differences of |a - b| at a = b are 0: a rigid link of L m cannot open there, and its residual is all of L. A spring
+    # has no force there, as F = -C grad C / alpha says, and no residual. Constraints between fixed particles have no residual.
     pairs, links = [[0, 1], [2, 3], [4, 5]], []
     for rest in (2.0, 1.0):
         links.append(tv.Constraint(length, pairs, rest, compliance=[0.0, 1e-3, 0.0]))

@@ -89,10 +89,10 @@ def test_linked_particles_do_not_touch(world):
 
 
 def test_a_column_obeys_the_overlap_law(world):
-    # R21: one mass-split pass per substep acts like springs m / (4 h^2): the k-th contact from the top would overlap by 4 k g
-    # h^2. With over-relaxation by 5/4 and 0.4 of pushes carried over, it would overlap by 0.48 of that, or of 3 k g h^2 at the
-    # ends. But a pair carries no more than leaves it at 2 k g h^2, where its push, k m g h^2, would part it alone. Drag scales
-    # h^2 by phi. The load itself is k m g, to rounding.
+    # R21: one mass-split pass per substep acts like springs m / (4 h^2): the k-th contact from the top would overlap by
+    # 4 k g h^2. With over-relaxation by 5/4 and 0.4 of pushes carried over, it would overlap by 0.48 of that, or of 3 k g h^2 at
+    # the ends. But a pair carries no more than leaves it at 2 k g h^2, where its push, k m g h^2, would part it alone. Drag
+    # scales h^2 by phi. The load itself is k m g, to rounding.
     n, h = 10, 1 / 600
     x = np.stack([np.full(n, 0.5), 0.5 + np.arange(n) * 1.0], axis=1)
     w = smooth(world, tv.Particles(x, radius=0.5), (1, np.inf), rate=8.0, substeps=10)
@@ -105,8 +105,7 @@ def test_a_column_obeys_the_overlap_law(world):
 
 
 def test_settled_piles_are_quiet(world):
-    # No jitter: the kinetic energy of a settled pile falls below 1e-6 m g r per particle, without friction, with friction, and
-    # with restitution.
+    # No jitter: the kinetic energy of a settled pile falls below 1e-6 m g r per particle, also with friction or restitution.
     k = np.arange(300)
     x = np.stack([k % 15 * 1.02 + 0.5 + 0.01 * tv.golden(k), k // 15 * 1.02 + 0.5], axis=1)
     for friction, restitution in ((0.0, 0.0), (0.4, 0.0), (0.0, 0.5)):
@@ -117,8 +116,8 @@ def test_settled_piles_are_quiet(world):
             w = smooth(world, start, (15.5, 60), substeps=8)
         w.run(12.0)
         assert tv.measure.kinetic_energy(w) / len(k) <= 1e-6 * 9.81 * 0.5
-        # The contacts across a height carry the weight above it, apart from the sound that is left: a velocity of sqrt(2e-6 g
-        # r) = 3 mm/s at 30 rad/s is 1 % of g.
+        # The contacts across a height carry the weight above it, apart from the sound that is left: a velocity of
+        # sqrt(2e-6 g r) = 3 mm/s at 30 rad/s is 1 % of g.
         height = w.position[:, 1]
         level = np.quantile(height, 0.5) + 1e-9
         i, j = w.contacts.pairs.T
@@ -315,9 +314,9 @@ def test_discs_in_the_same_place_have_the_normal_along_which_they_part(world, di
 
 
 def test_masses_are_split_as_often_however_deep_pairs_are(world):
-    # Four discs overlap with a fifth by c from left and right, and by a little from above and below. The sum of n n^T is 2 I
-    # for the middle disc, so its mass is split by 2 and those of the others by 1; each outer disc moves out by r c / 3 with r =
-    # 5/4. If all pairs counted as deep as the deepest, masses would be split by up to 1 / (1 - c)^2 more, and by four at most.
+    # Four discs overlap with a fifth by c from left and right, and by a little from above and below. The sum of n n^T is 2 I for
+    # the middle disc, so its mass is split by 2 and those of the others by 1; each outer disc moves out by r c / 3 with r = 5/4.
+    # If all pairs counted as deep as the deepest, masses would be split by up to 1 / (1 - c)^2 more, and by four at most.
     out = np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1]])
     low = (-99.0, -99.0)
     for c, off in ((0.05, 0.04), (0.2, 1e-5), (0.45, 1e-5)):

@@ -51,9 +51,8 @@ def test_article_runs_and_checks_itself(printed, tmp_path):
 
 
 def test_the_article_gains_no_energy_under_auto(taichi):
-    # The discs lie on ropes, so a shorter substep cannot first correct discs and ropes one after the other. Without a
-    # correction of both together, the 78th frame gained 3e7 J, after nine tries with twice the substeps each, where there were
-    # 5e4 J.
+    # The discs lie on ropes, so a shorter substep cannot correct discs and ropes one after the other. If they were not corrected
+    # together, the 78th frame would have 3e7 J instead of 5e4 J, after nine tries with twice the substeps each.
     start = demo("article").build().world
     world = start.clone(substeps="auto")
     energies = [world.step(1 / 60).energy for _ in range(90)]

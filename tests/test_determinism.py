@@ -101,8 +101,7 @@ def results(path):
 def test_a_large_pile_has_the_same_bits_on_all_paths_and_where_a_team_breaks_up(world, monkeypatch):
     # From 1000 particles on, blocks of particles are tested for any contact. If every wait of a team is a long one, the first
     # thread continues alone after a few waits, and the others come back 32 frames later. One path is compiled as large worlds
-    # are, the other as small ones are, which takes a third of the time and gives the same bits. test_grid.py tests phase by
-    # phase.
+    # are, the other as small ones are: a third of the time, with the same bits. test_grid.py tests the launched path.
     k = np.arange(1200)
     x = np.stack([k % 30 * 1.02, k // 30 * 1.02], axis=1) + 0.5 + 0.01 * tv.golden(k, dim=2)
     made = []
@@ -209,8 +208,7 @@ def test_what_is_absent_has_no_field_and_no_kernel(world):
 
 
 def test_launches_count_what_the_scene_needs(world):
-    # Kernel launches of a frame, counted at Taichi's entry point: one for all of it on a CPU; otherwise one per pass of a
-    # substep.
+    # Kernel launches of a frame, counted at Taichi's entry point: one on a CPU; otherwise one per pass of a substep.
     for features, path, expected in (
         ([tv.Gravity(1.0)], "launched", {"integrate": 5, "measure": 1}),
         ([tv.Gravity(1.0), tv.Distance([[0, 1]])], "launched", {f"integrate {PASS}": 5, PASS: 5, "measure": 1}),

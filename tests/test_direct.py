@@ -1,5 +1,4 @@
-"""Elimination in chains, trees and loops: dense solutions, what it leaves to relaxation, and for which worlds it is the
-default."""
+"""Elimination in chains, trees and loops: dense solutions, what it leaves to relaxation, and where it is the default."""
 
 import contextlib
 from itertools import product
@@ -18,8 +17,10 @@ from .prototype import Prototype
 
 
 def dense(x, d, w, pairs, rest, ahead):
-    """Return positions and multipliers after one Newton step of all links at once, after displacements d: the reference for
-    elimination."""
+    """Return positions and multipliers after one Newton step of all links at once: the reference for elimination.
+
+    d: the displacements of the substep so far.
+    """
     start = x - d
     now, before = x[pairs[:, 0]] - x[pairs[:, 1]], start[pairs[:, 0]] - start[pairs[:, 1]]
     length = np.linalg.norm(now, axis=1)
@@ -49,8 +50,7 @@ def net():
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_elimination_equals_a_dense_solution(world, dim):
-    # Rows 40 and 41: trees, a necklace, a net; random masses, some particles static; several systems in one world, one Newton
-    # step.
+    # Rows 40 and 41: trees, a necklace, a net; random masses, some static particles; several systems in a world, one Newton step.
     rng = np.random.default_rng(dim)
     graphs = [some_tree(rng, 60), some_tree(rng, 40), loop(100), net()]
     begin = np.cumsum([0] + [g.max() + 1 for g in graphs])
@@ -133,8 +133,7 @@ def test_a_rope_that_whips_keeps_its_energy(world):
 
 
 def test_many_passes_agree_with_relaxation(world):
-    # From rigid to soft, with dashpots, unequal masses, loops and free ends: a few passes reach the limit of many Jacobi
-    # passes.
+    # From rigid to soft, with dashpots, unequal masses, loops, free ends: a few passes reach the limit of many Jacobi passes.
     rng = np.random.default_rng(1)
     n, pairs = 12, np.vstack([links(9), [[3, 10], [10, 11], [11, 0]]])
     x = np.stack([np.arange(n) * 0.3, rng.normal(size=n) * 0.2], axis=1)
@@ -342,8 +341,8 @@ def test_ropes_that_touch_are_solved_and_come_to_rest(world):
     # Elimination and contacts take turns in f32: ropes fall into a box, keep their length, and come to rest. Before they touch
     # the walls, they conserve momentum: m g t per particle. If thrown a little harder, they pile up differently; about one pile
     # in four keeps trembling, with some 1e-4 m g r. An impact at v moves an end of a link by v h at most before the link is
-    # solved again. All fall less than 0.7 m; half of the throws stretch links by less than 5 % (in f32 and f64 seven of eight
-    # do).
+    # solved again. All fall less than 0.7 m; half of the throws stretch links by less than 5 % (seven of eight do in f32 and
+    # f64).
     x = np.vstack([tv.shapes.rope((-0.3, 0.3 + 0.06 * k), (0.3, 0.33 + 0.06 * k), points=20).position for k in range(6)])
     pairs = np.vstack([links(19, 20 * k) for k in range(6)])
     speed = np.zeros_like(x)

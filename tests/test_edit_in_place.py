@@ -29,8 +29,10 @@ def places(n: int, dim: int = 2) -> np.ndarray:
 
 
 def overlapping(n: int, dim: int = 2) -> np.ndarray:
-    """Return places(n) with one pair of overlapping particles that stay. Rebuilt worlds have overlaps, so both use the same
-    kernels."""
+    """Return places(n) with one overlapping pair of particles that stay.
+
+    Rebuilt worlds have overlaps, so both worlds use the same kernels.
+    """
     x = places(n, dim)
     x[9] = x[8] + 0.15 * np.eye(dim)[0]
     return x
@@ -229,8 +231,7 @@ def bodies(*extra, solver=None):
 
 
 def outlines():
-    """Two squares and a soft pentagon between discs, with friction and restitution; edits add bodies and a disc, and remove
-    some."""
+    """Two squares and a soft pentagon between discs, with friction and restitution; edits add and remove bodies and a disc."""
     angle = np.arange(5) * 2 * np.pi / 5
     square, five = np.array([[0.0, 0.0], [0.3, 0.0], [0.3, 0.3], [0.0, 0.3]]), 0.2 * np.stack([np.cos(angle), np.sin(angle)], 1)
     position = np.concatenate([square + (0.1, 0.05), square + (0.15, 0.4), five + (0.9, 0.3), [[1.4, 0.1], [1.7, 0.1]]])
@@ -353,8 +354,8 @@ def test_memory_that_stays_for_what_went_is_shown_and_given_back():
 
 
 def test_a_pin_takes_a_disc_in_place():
-    # Bit for bit as a Pin made for that particle, among other held particles, whose pairs the list leaves out. test_pins.py
-    # tests this in f64.
+    # Bit for bit as a Pin made for that particle, among other held particles, whose pairs the list leaves out. test_pins.py has
+    # the same in f64.
     def scene():
         pin = tv.Pin([10], (0.5, 0.9))
         particles = tv.Particles(places(30), radius=RADIUS, pinned=[0, 1], spin=2.0)
@@ -386,8 +387,7 @@ def test_a_pin_takes_a_disc_in_place():
 
 
 def test_springs_of_a_pin_take_others_in_place(monkeypatch, tmp_path):
-    # Bit for bit as in a world that is rebuilt for it; beside links, whose slots stand among those of the pin, and with knobs
-    # of both.
+    # Bit for bit as in a world that is rebuilt for it; with links, whose slots stand among those of the pin, and knobs of both.
     def scene():
         pin = tv.Pin([10, 3], (0.5, 0.9), compliance=1e-3, damping=0.5)
         link = tv.Distance([[20, 21], [21, 22], [5, 6]], compliance=1e-5)
@@ -466,8 +466,7 @@ def test_residuals_stay_those_of_the_last_substep_until_the_next_one():
 
 
 def test_constraints_come_and_go_in_place_where_rest_values_were_assigned():
-    # The rest length of the second link is assigned, and the kernels then have code for that. Kernels of a rebuilt world do
-    # not.
+    # The rest length of the second link is assigned. Kernels edited in place then have code for that, and rebuilt ones do not.
     def of(anew: bool) -> list:
         planned = edit_in_place.planned
         edit_in_place.planned = (lambda *_: None) if anew else planned

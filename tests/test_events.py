@@ -43,10 +43,10 @@ def balls(x, v=0.0, m=1.0):
 
 
 def test_a_bouncing_ball(world):
-    # Dropped from H onto a static ball, and onto a floor: after k bounces v_k = e^k sqrt(2 g H), at t_k = t_0 (1 + 2 (e + ... +
-    # e^k)). A bounce takes less than two substeps, so each begins and ends in the same frame. The speed of approach is taken at
-    # the middle of a substep, off by g h / 2 at most. The speed of departure follows from the previous bounce, which adds up to
-    # e g h per bounce.
+    # Dropped from H onto a static ball, and onto a floor: after k bounces v_k = e^k sqrt(2 g H), at
+    # t_k = t_0 (1 + 2 (e + ... + e^k)). A bounce takes less than two substeps, so each begins and ends in the same frame. The
+    # speed of approach is taken at the middle of a substep, off by g h / 2 at most. The speed of departure follows from the
+    # previous bounce, which adds up to e g h per bounce.
     H, e, g, m, r, frame, substeps = 0.5, 0.8, 9.81, 2.0, 0.05, 1 / 60, 20
     h = frame / substeps
     w = bouncing(world, balls([[0.0, 0, 0], [0, 2 * r + H, 0], [1, r + H, 0]], m=m), e, g, substeps=substeps)
@@ -68,8 +68,7 @@ def test_a_bouncing_ball(world):
 
 
 def test_a_cradle(world):
-    # Equal elastic balls in a row that touch from the start: the impulse of the first one passes from ball to ball, m v at v
-    # each.
+    # Equal elastic balls in a row that touch from the start: the impulse of the first passes from ball to ball, m v at v each.
     m, v, x = 1.5, 2.0, [[0.0, 9, 0], [-0.3, 3, 0], *([0.1 * k, 3, 0] for k in range(4))]
     moving = np.zeros((6, 3))
     moving[1, 0] = v
@@ -96,11 +95,10 @@ def cloud(dim, n, seed):
 
 
 def brute(x, old, v, gravity, h, particles, before):
-    """Return for one substep: positions after free flight, pairs that touch there, their normals and speeds, and whether these
-    are certain.
+    """Return where free flight leads in a substep, which pairs touch there, their normals and speeds, and which are certain.
 
-    Whether a pair has just met is uncertain where it had separated only by the last digit. before: pairs that touched in the
-    last substep.
+    Whether a pair has just met is uncertain where it had separated only by the last digit. before: pairs that touched in the last
+    substep.
     """
     free = np.isfinite(particles.mass)[:, None]
     ahead = np.where(free, x + v * h + gravity * h**2 / 2 if old is None else 2 * x - old + gravity * h**2, x)
@@ -109,8 +107,7 @@ def brute(x, old, v, gravity, h, particles, before):
     some = (np.linalg.norm(ahead[i] - ahead[j], axis=1) < R) & (free[i] | free[j])[:, 0]
     i, j, R = i[some], j[some], R[some]
     r, d = x[i] - x[j], (ahead - x)[i] - (ahead - x)[j]
-    # |r + s d| = R for pairs that were apart gives the time of impact, and the normal then. Touching pairs have the normal of
-    # the start.
+    # |r + s d| = R gives the time of impact of a pair that was apart, and its normal then. Touching pairs have that of the start.
     a, b, c = (d**2).sum(1), (r * d).sum(1), (r**2).sum(1) - R**2
     with np.errstate(all="ignore"):
         s = np.where(c > 0, (-b - np.sqrt(b**2 - a * c)) / a, 0.0)
@@ -187,8 +184,10 @@ def rows_in(pairs):
 
 
 def stage(world, sensing=True, events=True, **settings):
-    """Build a world of discs with friction and restitution in a box. Some are sensors of twice the size, and some of these are
-    fixed."""
+    """Build a world of discs with friction and restitution in a box, some of them sensors.
+
+    Sensors have twice the size, and some of them are fixed.
+    """
     x = (np.stack(np.meshgrid(*[np.arange(9)] * 2, indexing="ij"), axis=-1).reshape(-1, 2) + 0.5) / 9 * 1.9 - 0.95
     k = np.arange(len(x))
     group = np.where(k % 10 == 9, 3, 0)
@@ -301,8 +300,7 @@ def test_recorded_cloned_edited(world, tmp_path, monkeypatch):
 
 
 def test_what_is_held_and_let_go(world):
-    # Only the particle of a pair that can move writes the pair. When the other one is released, the pair continues as one
-    # contact.
+    # Only the particle of a pair that can move writes it. When the other one is released, the pair continues as one contact.
     pin = tv.Pin([0], (0.0, -98.9))
     start = tv.Particles([[0.0, -98.9], [0.0, -98.6999], [9.0, 9.0]], radius=[0.1, 0.1, 0.11], mass=[2.0, 1.0, np.inf])
     w = flat(world, start, more=[pin])
@@ -333,8 +331,7 @@ def test_a_corner_presses_from_both_sides(world):
 
 
 def test_nothing_is_lost_where_lists_grow(world):
-    # 60 sensors, all within each other, and discs that fly through them in one frame: more pairs than the initial room for
-    # them.
+    # 60 sensors, all within each other, and discs that fly through them in one frame: more pairs than there is room for at first.
     k = np.arange(60)
     x = np.concatenate([0.01 * tv.golden(k, dim=2), [[-3.0, 0.0], [3.5, 0.25]]])
     v = np.concatenate([np.zeros((60, 2)), [[120.0, 0.0], [-120.0, 0.0]]])
@@ -347,8 +344,8 @@ def test_nothing_is_lost_where_lists_grow(world):
     assert len(w.events([(1, 1)]).begun) == 60 * 59 // 2 and not len(w.events([(1, 1)]).ended)
     through = w.events([(0, 1)])
     assert rows(through.begun.pairs) == rows(through.ended.pairs) == {(i, j) for i in range(60) for j in (60, 61)}
-    # A disc passes along a chord of a disc of radius 0.6 at 120 m/s. Times are those of substeps; the speed is along the normal
-    # then.
+    # A disc passes along a chord of a disc of radius 0.6 at 120 m/s. Times are those of substeps, where speeds are along the
+    # normal.
     (i, j), began, ended = through.touches.pairs.T, through.touches.began, through.touches.ended
     r, chord = x[i] - x[j] - began[:, None] * v[j], 2 * np.sqrt(0.6**2 - (x[i, 1] - x[j, 1]) ** 2)
     np.testing.assert_allclose(ended - began, chord / 120, atol=1.01 / 2000)

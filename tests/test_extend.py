@@ -88,7 +88,7 @@ def test_a_world_that_was_extended_is_the_one_that_has_all(kind, tmp_path):
             w.step(1 / 60)
             recorder.log()
             without.step(1 / 60)
-        if kind is ropes:  # for bodies, displacements become velocities, for the springs that are added
+        if kind is ropes:  # springs added to bodies turn displacements into velocities
             np.testing.assert_array_equal(w.position[:n], without.position)
     after = w.hash()
     checkpoint.put_back(w, kept)

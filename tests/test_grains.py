@@ -48,8 +48,7 @@ def test_a_silo_bears_its_grains():
 
 
 def test_flow_out_of_a_silo_obeys_beverloo():
-    # W = C rho sqrt(g) (D - k d)^1.5 with k between 1 and 2 in 2D, so W(8.5) / W(5.5) is between 2.15 and 2.53; 20 % for so
-    # few.
+    # W = C rho sqrt(g) (D - k d)^1.5 with k between 1 and 2 in 2D, so W(8.5) / W(5.5) is between 2.15 and 2.53; +- 20 % here.
     rates = []
     for opening in (5.0, 8.0):
         found = grains.flow(Silo(500, 20 * SIZE), opening, 4.0, settle=1.0)

@@ -170,8 +170,8 @@ def test_no_change_of_the_substep_brings_in_energy(world):
 
 def test_no_change_of_the_substep_brings_in_energy_of_bodies(world):
     # Cantilevers of loops of four corners that keep their areas, beside rigid links, and of rigid clusters that share corners.
-    # Without a projection, what passes leave undone becomes 2.4 and 0.5 m g L under "auto", without a flag, and 120 and 310 m g
-    # L from 2 to 100 substeps.
+    # Without a projection, what passes leave undone becomes 2.4 and 0.5 m g L under "auto", without a flag, and 120 and 310 m g L
+    # from 2 to 100 substeps.
     k = np.arange(16).reshape(8, 2)
     x = np.stack(np.meshgrid(np.arange(8), np.arange(2), indexing="ij"), axis=2).reshape(-1, 2) * 0.1
     loops = np.stack([k[:-1, 0], k[1:, 0], k[1:, 1], k[:-1, 1]], axis=1)
@@ -506,8 +506,7 @@ def test_energy_that_no_substep_mends_costs_no_more(world):
 
 
 def test_what_cannot_be_paid_or_said_in_numbers(world):
-    # Found by the fuzzer. If nothing has moved, no energy is due, and nothing is divided by 0. An infinite tension gives a
-    # note.
+    # Found by the fuzzer. If nothing has moved, no energy is due, and nothing is divided by 0. An infinite tension makes a note.
     link = tv.Distance([[0, 1]])
     w = world(tv.Particles([[0.0, 0.0], [1.0, 0.0]], pinned=[0]), [tv.Gravity(), link], solver=tv.Direct())
     v = np.array([[0.0, 0.0], [0.0, 2.0]])
@@ -540,8 +539,7 @@ def test_what_an_impact_left_of_a_link_is_no_spring_where_a_wall_holds_it(world)
 def test_a_plate_bent_over_a_ball_is_no_spring(world):
     # A braced plate falls on a ball and bends at 2 substeps: links are off by 6 % of their length. Straightening it sends its
     # middle into the ball, and the ball sends it back. Without a limit, each round leaves more violation than before, and 64
-    # substeps make 12000 J of 104 J. Where the ball holds the middle, the rims are lifted instead, by less than they have
-    # fallen.
+    # substeps make 12000 J of 104 J. Where the ball holds the middle, the rims are lifted instead, by less than they fell.
     c = tv.shapes.cloth((-0.8, 0.8, -0.8), (1.6, 0, 0), (0, 0, 1.6), points=(5, 5))
     links = tv.Distance(np.concatenate([c.links, c.braces]))
     w = world(
@@ -558,8 +556,7 @@ def test_a_plate_bent_over_a_ball_is_no_spring(world):
 
 def test_a_cloth_that_hangs_over_a_ball_goes_where_its_links_are_met(world):
     # A cloth, pinned at two corners, falls over a ball. If the ball sends it back in the first round of the projection, the
-    # second one corrects that. If the result of the second were ignored and all were undone, 64 substeps would make 33 J of 7
-    # J.
+    # second round corrects that. If the second round were ignored and all undone, 64 substeps would make 33 J of 7 J.
     c = tv.shapes.cloth((-0.6, 0.85, -0.6), (1.2, 0, 0), (0, 0, 1.2), points=(9, 9))
     particles = tv.Particles(c.position, mass=0.01, radius=0.04, pinned=[0, 8])
     w = world(particles, [tv.Gravity(9.81), tv.Distance(c.links), tv.Ball((0, 0, 0), 0.4)], substeps=2, precision="f64")

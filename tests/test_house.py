@@ -77,7 +77,7 @@ def test_imports_go_in_no_circle():
 
 
 def test_imports_are_shallow():
-    # The longest chain of modules that import each other is bounded, so that few must be read to understand one.
+    # The longest chain of imports is bounded, so that few modules must be read to understand one.
     chains: dict[str, tuple[str, ...]] = {}
 
     def chain(name: str) -> tuple[str, ...]:

@@ -12,11 +12,10 @@ from .conftest import case, rerun
 def discs(
     world, x, v, mass=1.0, e=(1.0, 0.0), group=0, radius=0.5, g=0.0, friction=(), lower=-1e9, upper=1e9, bouncy=1.0, **settings
 ):
-    """Build a world of discs or spheres with restitution and friction, values for up to five groups, gravity, and near or far
-    walls.
+    """Build a world of discs or spheres with friction and restitution for up to five groups, gravity, and near or far walls.
 
-    One fixed particle of each group lies far away, and masses differ at least by rounding, so that all these worlds use the
-    same kernels.
+    One fixed particle of each group lies far away, and masses differ at least by rounding, so that all these worlds use the same
+    kernels.
     """
     n, dim = x.shape
     far = 1e3 + 10.0 * np.arange(5)[:, None] * np.ones(dim)
@@ -147,9 +146,9 @@ def in_rows(rows, dim=2):
 @pytest.mark.parametrize("kind, limit", [("discs", 1e-12), ("polygons", 1e-12), ("spheres in f32", 1e-4)])
 def test_what_bounces_on_pinned_particles_keeps_its_energy(world, kind, limit):
     # Under gravity, E = v^2 / 2 + g y is kept for any substep where e = 1: for a particle that falls on a pinned one, flies to
-    # and fro below another, or hops between two. The energy above the contact is E e^(2 k) after k bounces, at t0 (1 + 2 (e +
-    # ... + e^(k - 1))). Two particles that fall together and collide have the relative velocity -e u, and their middle falls as
-    # before.
+    # and fro below another, or hops between two. Above the contact it is E e^(2 k) after k bounces, at
+    # t0 (1 + 2 (e + ... + e^(k - 1))). Two particles that fall together and collide have the relative velocity -e u, and their
+    # middle stays in free fall.
     g, e, r = 9.81, 0.8, 0.5
     loops, floor, roof = [], [(0, 0, 0, r, 1)], [(0, 2.3, 0, r, 1)]
     if kind == "polygons":
@@ -324,7 +323,7 @@ def test_friction_between_particles(world):
 
 
 def test_a_moving_wall_drags_along(world):
-    # Row 70: a piston, with a floor that has friction: a disc is carried at the speed of the piston.
+    # Row 70: a piston pushes a disc along a floor with friction. The disc moves with the piston, in the right direction.
     floor = tv.HalfSpace((0, 1), friction=0.5)
     box = tv.Box((0, -9), (20, 9))
     w = world(tv.Particles([[0.5, 0.5]], radius=0.5), [tv.Gravity(9.81), floor, box], precision="f64")
@@ -353,8 +352,10 @@ def test_leaving_a_sphere(world):
 
 
 def crowded(world, start, low, high, skin, g=9.81, **settings):
-    """Build a world of discs in a box with friction, restitution and known loads; many radii and masses give all the same
-    kernels."""
+    """Build a world of discs in a box with friction, restitution and known loads.
+
+    Many radii and masses give all these worlds the same kernels.
+    """
     contact = tv.Contact(friction=(0.6, 0.4), restitution=0.3, skin=skin, loads=True)
     return world(start, [tv.Gravity(g), contact, tv.Box(low, high, friction=0.5, restitution=0.3)], **settings)
 
@@ -378,9 +379,8 @@ def slope(world, friction, dim):
     w.run(4.0)
     x = w.position[:n]
     assert np.isfinite(x).all() and w.last.overlap < 0.1
-    # A triangle of height H and half width B has the mean height H / 3 and the median distance B (1 - sqrt(1/2)) from the
-    # middle. Single grains that rolled away do not affect a median. (A cone: H / 4 and 0.45 B, which changes the slope by a
-    # factor of 2.)
+    # A triangle of height H and half width B has the mean height H / 3 and the median distance B (1 - sqrt(1/2)) from the middle.
+    # Single grains that rolled away do not affect a median. (A cone: H / 4 and 0.45 B, a factor of 2 in the slope.)
     height = x[:, 1].mean() - 0.1
     across = np.linalg.norm(np.delete(x, 1, axis=1), axis=1)
     return float(3 * height / (np.median(across) / (1 - np.sqrt(0.5))))
@@ -481,8 +481,8 @@ def test_bodies_of_discs_that_bounce_come_to_rest(world):
 
 def test_a_dense_gas_gains_no_energy_in_several_passes(world):
     # Where e < 1 every impact takes energy. In later passes pairs approach by what others pushed in earlier ones, which is no
-    # force. If it counted as one, pairs would rest that should bounce, and would be pushed apart: the gas would gain 9 J of 300
-    # in a frame.
+    # force. If it counted as one, pairs would rest that should bounce, and be pushed apart: the gas would gain 9 J of 300 a
+    # frame.
     x, v = 3.0 * tv.golden(range(300), dim=2), np.random.default_rng(1).normal(size=(300, 2))
     features = [tv.Box((-0.2, -0.2), (3.2, 3.2), restitution=1.0), tv.Contact(restitution=0.99)]
     w = world(tv.Particles(x, velocity=v, radius=0.07), features, precision="f64", substeps=8)

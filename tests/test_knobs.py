@@ -52,9 +52,8 @@ DISCS = [[0, 0, 0], [0.38, 0.1, 0], [0.3, -0.5, 0]]
 ANGLE, AREA, GROUPS = {"rest": 0.3}, {"rest": 0.2, "pressure": 1.0}, [(0, 0), (0, 1)]
 TURN = {"position": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0)}
 
-# By name: a function that makes the feature from the indices of its particles and the place of its block, the positions of its
-# particles in the block, and its settings, old and new. Features that act on all particles come with some that show their
-# effect.
+# By name: a function that makes the feature from its particle indices and the place of its block, the positions of its particles
+# in the block, and its old and new settings. Features that act on all particles come with some that show their effect.
 ROWS3 = {
     "Gravity": (lambda i, x, **k: tv.Gravity(**k), PATH, {"g": (0.0, -1.0, 0.0)}, {"g": 3.0}),
     "Drag": (lambda i, x, **k: tv.Drag(**k), PATH, {"rate": 0.1}, {"rate": 1.0}),
@@ -270,8 +269,7 @@ def test_the_rows_have_every_feature():
 
 @pytest.mark.parametrize("friction", [{(0, 0): 0.3}, {(0, 0): 0.3, (1, 2): 0.6, (2, 2): 0.1}, {(2, 1): 0.5}, 0.4], ids=repr)
 def test_friction_may_name_other_groups(world, friction):
-    # Fewer, more or other groups than before must act as in a world that had them from the start, though the tables have other
-    # rows.
+    # Fewer, more or other groups than before must act as in a world that had them from the start: tables then have other rows.
     x = np.stack([0.9 * (np.arange(12) % 4), 0.5 + 0.9 * (np.arange(12) // 4)], axis=1)  # not touching, so compiled once
     ends = []
     for first in ({(0, 0): 0.5, (1, 1): 0.5}, friction):
@@ -327,8 +325,7 @@ def test_every_setting_is_live(world, group):
 
 
 def test_what_is_not_live_refuses_and_says_what_is(world):
-    # Every argument and every other public attribute refuses; a misspelt name gets a suggestion; arrays cannot be changed in
-    # place.
+    # Every argument and every other public attribute refuses, a misspelt name gets a suggestion, and arrays are read-only.
     made = {name: Scene(lambda *a, **k: None, {name: row}, False).features[name] for name, row in (ROWS3 | ROWS2).items()}
     for name, feature in made.items():
         kind, live = type(feature), knobs_of(type(feature))
@@ -378,8 +375,7 @@ def test_what_is_wrong_is_said_where_it_is_made(world):
 
 
 def test_rest_values_that_nobody_gave_are_read_only_too(world):
-    # A world cannot notice a change of a part of them; the same holds in clones, and in worlds from which particles were
-    # removed.
+    # A world cannot notice a change of a part of them. The same holds in clones, and where particles were removed.
     for rows in (ROWS3, ROWS2):
         names = [name for name, (_, _, old, _) in rows.items() if "rest" in old]
         some = {name: rows[name] for name in names}

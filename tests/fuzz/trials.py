@@ -36,8 +36,10 @@ def quiet() -> None:
 
 
 def door(error: BaseException) -> None:
-    """Raise Refused for a ValueError, TypeError or RuntimeError that the package raises with a message of its own; else raise
-    Find."""
+    """Raise Refused for an error that the package raises with a message of its own, else Find.
+
+    Such an error is a ValueError, TypeError or RuntimeError.
+    """
     last = traceback.extract_tb(error.__traceback__)[-1]
     ours = os.path.abspath(last.filename).startswith(HOME)
     first = str(error).partition(":")[0].partition("(")[0].partition(".")[0]
@@ -226,8 +228,7 @@ class Judge:
                 raise Find("residual", f"reported {report.residual:.6g}, rigid ones by brute force {worst:.6g}, {report}")
         for f in t.features:
             if type(f).__name__ == "ShapeMatch" and f.acts and report.residual < 0.1 and blur < 1e-3:
-                # The last pass turned the cluster before others moved its particles, by no more than the residual that these
-                # left.
+                # The last pass turned the cluster before others moved its particles, by no more than the residual they left.
                 worst = oracles.unfit(f, t.free, x)
                 if worst > 2 * report.residual + 1e-3 + blur:
                     raise Find("residual", f"reported {report.residual:.6g}, cluster by brute force {worst:.6g}, {report}")

@@ -190,8 +190,7 @@ def by_questions(trial: Trial, events: list[Event]) -> None:
     if wrong.any() or np.abs(distance - apart.min(axis=1)).max() > blur:
         raise Find("twin", f"near {near.tolist()}, nearest {index.tolist()} of {points.tolist()} within {radius}")
     wrong = (np.isin(np.arange(len(x)), held) != (apart[0] <= radius)) & (np.abs(apart[0] - radius) > blur)
-    # A ray passes a center at the distance h, and is inside its disc along 2 sqrt(r^2 - h^2). It hits nothing before the first
-    # disc.
+    # A ray passes a center at the distance h, and is inside its disc along 2 sqrt(r^2 - h^2). It hits none before the first.
     along = np.einsum("kid,kd->ki", x - points[:, None], ways / np.linalg.norm(ways, axis=1)[:, None])
     h, r = np.sqrt(np.maximum(apart**2 - along**2, 0)), w.particles.radius
     enter = along - np.sqrt(np.maximum(r**2 - h**2, 0))
