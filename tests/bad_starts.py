@@ -1,4 +1,4 @@
-"""Bodies of every kind of constraint, far from what is asked of them: places at random, rest values up to 10 times wrong."""
+"""Bodies of every kind of constraint, far from satisfying it: random positions, rest values up to 10 times wrong."""
 
 from dataclasses import dataclass, field
 
@@ -11,11 +11,11 @@ HINGE, SIDES = [[0, 1, 2, 3]], [[0, 1], [0, 2], [1, 2], [0, 3], [1, 3]]
 
 
 def chain(k: int, n: int = 5) -> list[list[int]]:
-    """Every k particles in a row of a chain of n."""
+    """Return every k consecutive particles of a chain of n."""
     return [[*range(c, c + k)] for c in range(n - k + 1)]
 
 
-BOTH = {  # the number of particles, and constraints: those that end with ! have the rest values of the start
+BOTH = {  # number of particles, and constraints; names that end with ! take their rest values from the start
     "links": (5, {"Distance": chain(2)}),
     "net": (5, {"Distance": [[a, b] for b in range(5) for a in range(b) if b - a < 4]}),
     "ropes": (5, {"Rope": chain(2)}),
@@ -38,9 +38,9 @@ BODIES = {2: BOTH | {"loop": (6, {"Area ": chain(6, 6)})}, 3: BOTH | SOLID}
 
 @dataclass
 class BadStart:
-    """Two bodies of each kind, pinned at both ends, 100 m apart; every other one has all its angles to be straight.
+    """Two bodies of each kind, pinned at both ends, 100 m apart. All rest angles of every other body are 0.
 
-    middle: (bodies, dim) [m]; size: (bodies,) [m], at least the extent at the start and of the rest values.
+    position: (particles, dim) [m]; size: (bodies,) [m], at least the extent of the start and of the rest values.
     """
 
     dim: int
@@ -84,7 +84,7 @@ class BadStart:
                 self.features.append(make(indices, shape if name == "ShapeMatch" else rest))
 
     def far(self, position: np.ndarray) -> np.ndarray:
-        """How far each body reaches from where it began, relative to its size, (bodies,)."""
+        """Return how far any particle of each body is from its start, relative to the size of the body, (bodies,)."""
         moved = np.linalg.norm(position - self.position, axis=1)
         return (
             np.maximum.reduceat(np.where(np.isfinite(moved), moved, np.inf), np.flatnonzero(np.diff(self.body, prepend=-1)))

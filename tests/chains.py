@@ -1,4 +1,4 @@
-"""Chains with known answers, hung up to be solved directly."""
+"""Chains with known answers, for tests of the direct solver."""
 
 import numpy as np
 
@@ -13,23 +13,23 @@ PLANAR += [f"D07_massratio_1{'0' * k}" for k in (3, 4, 5, 6)]
 
 
 def links(n, first=0):
-    """Pairs of a chain of n links."""
+    """Return the pairs of a chain of n links."""
     k = np.arange(n) + first
     return np.stack([k, k + 1], axis=1)
 
 
 def beyond(name, t):
-    """What a case says of time t: particles of the chain and their positions."""
+    """Return what a case gives for time t: indices of particles of the chain and their positions."""
     values = case(name)["values"][f"t{t}"]
     if "heavy_xy" in values:
         return np.array([2]), np.array([values["heavy_xy"]])
     xy = np.atleast_2d(values["xyz" if "xyz" in values else "xy"])
     at = np.array(values.get("nodes_1based", np.arange(len(xy)) + 1))
-    return (at[-1:], xy[-1:]) if name.startswith("D08") else (at, xy)  # the figures of D08 are of its end mass
+    return (at[-1:], xy[-1:]) if name.startswith("D08") else (at, xy)  # the figures of D08 are for its end mass
 
 
 class Scene:
-    """All cases with g = 9.81 as chains of one world in 3D, which compiles once."""
+    """All cases with g = 9.81 as chains of one 3D world, which is compiled once."""
 
     def __init__(self):
         self.begin, x, v, mass, pairs, n = {}, [], [], [], [], 0

@@ -1,4 +1,4 @@
-"""A Taichi for each file of tests, of the architecture TIVERLET_ARCH (cpu); worlds are closed after each test."""
+"""Fixtures: one Taichi runtime per test file, on the architecture TIVERLET_ARCH (cpu); worlds are closed after each test."""
 
 import ast
 import contextlib
@@ -14,8 +14,8 @@ import tempfile
 from collections.abc import Iterator
 from typing import Any
 
-# Before NumPy is imported, here, in workers and in all that tests start: the cores are taken, and BLAS, which looks out for work
-# with as many threads, takes a fifth of the CPU time of a process that does no more than import.
+# Set before NumPy is imported, for this process, its workers and the processes that tests start. The workers take all cores,
+# and the idle threads of BLAS would take a fifth of the CPU time of a process that only imports.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
@@ -29,17 +29,17 @@ from tiverlet.recording import reader, rrd, scene
 from tiverlet.report.accuracy.cases import entries, known
 from tiverlet.step import build
 
-# Until the first test begins: collecting tests leaves little garbage, and to look for it takes a third of the time.
+# Off until the first test begins: collecting tests leaves little garbage, and searching for it takes a third of the time.
 gc.disable()
-# Taichi keeps kernels that it has compiled, by their content. Part of that are the numbers of the trees of fields that were made
-# before, so every file of tests has a Taichi of its own: a second run finds them all and takes a third of the time, and after an
-# edit it compiles what the edit changes. All of them are larger than what Taichi keeps by default, 100 MB.
+# Taichi caches compiled kernels by their content, which includes the numbers of the field trees made before. So every test file
+# has its own Taichi runtime: a second run finds all kernels and takes a third of the time, and after an edit only what changed
+# is compiled. All kernels together exceed the default limit of the cache, 100 MB.
 os.environ.setdefault("TI_OFFLINE_CACHE_MAX_SIZE_OF_FILES", str(512 << 20))
 
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as it is in the background of a shell; tests send it
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # ignored in background jobs of a shell; tests send it
     signal.signal(signal.SIGINT, signal.default_int_handler)
-collect_ignore = [] if patched else ["test_compiling.py", "test_sharing.py"]  # which are about what is not there then
-# Files that take longest, which come first: else one worker would go on with one of them when the others are done.
+collect_ignore = [] if patched else ["test_compiling.py", "test_sharing.py"]  # these files test the patches
+# Files that take longest run first: otherwise one worker would still run one of them when the others are done.
 LONG = (
     "demos", "worlds", "edit_in_place", "determinism", "sleep", "speed", "properties", "periodic", "impacts", "overlap_release",
     "compiling", "polygons", "guard", "docs", "knobs", "direct", "solvers", "regroup", "loads", "contact", "pairs",
@@ -48,22 +48,22 @@ LONG = (
 )  # fmt: skip
 ARCH = os.environ.get("TIVERLET_ARCH", "cpu")
 SOURCES = str(pathlib.Path(tv.__file__).parent)
-# Functions of tests are held to what ours are, see checked_assignments(); those of these files try what a user's may do.
+# checked_assignments() holds functions of tests to the same rule as the package's. Files in USERS try what users may write.
 USERS = ("test_free_motion", "test_walls")
 OURS = tuple(str(path) for path in pathlib.Path(__file__).parent.rglob("*.py") if path.stem not in USERS)
 CASES = {name: known(name) for name in entries()}
-CROSSOVER = build.CROSSOVER  # particles and constraints from which a world has a team of threads by default
+CROSSOVER = build.CROSSOVER  # worlds of more particles and constraints get a thread team by default
 
 
 def pytest_collection_modifyitems(items):
-    """Those of LONG first."""
+    """Sort tests so that the files in LONG run first."""
     turn = {f"test_{name}": k for k, name in enumerate(LONG)}
     items.sort(key=lambda item: turn.get(item.path.stem, len(LONG)))
 
 
 @contextlib.contextmanager
 def checked_assignments():
-    """Refuse, in our own kernels, what compiles only with Taichi's analysis; without it LLVM ends the process."""
+    """Refuse, in our own kernels, assignments that compile only with Taichi's analysis; without it LLVM ends the process."""
     from taichi.lang import ops  # noqa: PLC0415
 
     assign = ops.assign
@@ -82,7 +82,7 @@ def checked_assignments():
 
 @contextlib.contextmanager
 def compiled() -> Iterator[list[str]]:
-    """The names of the kernels that are compiled meanwhile."""
+    """Yield a list that collects the names of the kernels that are compiled inside the context."""
     from taichi.lang.kernel_impl import Kernel  # noqa: PLC0415
 
     names, materialize = [], Kernel.materialize
@@ -101,14 +101,16 @@ def compiled() -> Iterator[list[str]]:
 
 @ti.kernel
 def nothing():
-    """Taichi reads what is kept when it compiles the first kernel."""
+    """Do nothing: Taichi reads its cache when it compiles the first kernel."""
     pass
 
 
 @contextlib.contextmanager
 def alone_with_what_is_kept() -> Iterator[None]:
-    """One worker after the other: who reads or writes what is kept has the folder for himself, for seconds at most. Taichi gives
-    up after a quarter of a second, and what was compiled is lost, or compiled again."""
+    """Lock the cache folder, so that one worker at a time reads or writes it, for seconds at most.
+
+    Without the lock, Taichi gives up after a quarter of a second, and compiled kernels are lost or compiled again.
+    """
     folder = pathlib.Path(ti.cfg.offline_cache_file_path)
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / "tests.lock", "w") as file:
@@ -121,14 +123,14 @@ def alone_with_what_is_kept() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def process():
-    """What a whole run has: no teams beside other workers, and the process that forks."""
+    """Set up a whole run: no thread teams beside other workers, and the server process that forks."""
     if int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) > 1:
-        # The cores are all taken by workers: threads of one team would wait for those of another, for three times as long as one
-        # takes for all. The bits are the same; who wants a team asks for path="parallel".
+        # Workers take all cores: threads of one team would wait for those of another, three times as long as one thread takes
+        # for everything. The bits are the same; a test that needs a team passes path="parallel".
         build.CROSSOVER = sys.maxsize
-    # What tests start keeps bytecode as it does by default: to compile the package is half of what such a process takes to start.
+    # Processes that tests start keep bytecode, as by default: compiling the package is half of the start of such a process.
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
-    # What has been imported is no garbage; to look through all of it again and again takes 4 % of a run that compiles nothing.
+    # Imported modules are no garbage; searching them again and again takes 4 % of a run that compiles nothing.
     gc.collect()
     gc.freeze()
     gc.enable()
@@ -136,13 +138,13 @@ def process():
         yield
     build.CROSSOVER = CROSSOVER
     if server.cache_info().currsize:
-        with server():  # which closes the pipes, so that it ends
+        with server():  # closes the pipes, so that the server ends
             pass
 
 
 @pytest.fixture(scope="module", autouse=True)
 def taichi(process):
-    """A Taichi for the tests of one file, so that its kernels are those of the next run, whatever else runs before."""
+    """Start a Taichi runtime for one test file, so that its kernels have the same names in the next run, whatever runs before."""
     tv.init(arch=ARCH)
     with alone_with_what_is_kept():
         nothing()
@@ -153,7 +155,7 @@ def taichi(process):
 
 @pytest.fixture
 def world():
-    """tv.World, for worlds that are closed when the test ends. path="launched": parallel as on a GPU, in many launches."""
+    """Return tv.World for worlds that are closed when the test ends. path="launched": parallel, in many launches, as on a GPU."""
     made = []
 
     def build(*args, **kwargs):
@@ -162,7 +164,7 @@ def world():
             with thread_team.launching() if launched else contextlib.nullcontext():
                 made.append(tv.World(*args, **(kwargs | {"path": "parallel"} if launched else kwargs)))
         except ValueError as e:
-            if ARCH not in tv.runtime.LLVM and ARCH in str(e):  # refused because of the architecture
+            if ARCH not in tv.runtime.LLVM and ARCH in str(e):  # the architecture does not support it
                 pytest.skip(str(e))
             raise
         return made[-1]
@@ -174,14 +176,16 @@ def world():
 
 @pytest.fixture
 def briefly(monkeypatch):
-    """Large worlds are compiled as small ones are, in a third of the time, to the same bits: see test_determinism.py."""
+    """Compile large worlds as small ones are compiled: a third of the time, with the same bits (see test_determinism.py)."""
     monkeypatch.setattr(build, "_passes", lambda *_: BRIEF)
 
 
 @pytest.fixture
 def read_here(monkeypatch):
-    """Recordings are read in this process, not in one that is started for each: half a second of CPU time, see test_forgeries.py
-    and test_recordings.py for what that one is there for."""
+    """Read recordings in this process instead of starting one for each, which takes half a second of CPU time.
+
+    test_forgeries.py and test_recordings.py test what the other process is for.
+    """
 
     def read(path, rows=False):
         with open(path, "rb") as file, tempfile.TemporaryFile() as out:
@@ -196,7 +200,7 @@ def read_here(monkeypatch):
 
 @pytest.fixture
 def built_once(monkeypatch):
-    """A scene of a recording that was built before is not built again: its world starts from another state."""
+    """Build each scene of a recording once. When the scene is read again, its world starts from another state."""
     worlds = {}
     made = scene.rebuild
 
@@ -218,7 +222,10 @@ def built_once(monkeypatch):
 
 @functools.cache
 def parsed() -> dict[pathlib.Path, ast.Module]:
-    """The trees of all modules of the package, by their files. To look for garbage in them would take three times as long."""
+    """Return the syntax trees of all modules of the package, by file.
+
+    Garbage collection is off meanwhile: it would triple the time.
+    """
     collects = gc.isenabled()
     gc.disable()
     try:
@@ -229,12 +236,12 @@ def parsed() -> dict[pathlib.Path, ast.Module]:
 
 
 def case(name: str) -> dict:
-    """An entry of cases.json, the file of known answers in tiverlet/report/cases."""
+    """Return an entry of cases.json, the file of known answers in tiverlet/report/accuracy."""
     return CASES[name]
 
 
 def pendulums(name: str):
-    """The chain of a D case: position, mass, pairs; particle 0 is the anchor."""
+    """Return the chain of a D case: position, mass, pairs. Particle 0 is the anchor."""
     p = case(name)["params"]
     if name == "D06_chain100":  # "100 x 0.01", "all 90"
         p = {"theta0_deg": [90.0] * 100, "lengths": [0.01] * 100, "masses": [0.01] * 100}
@@ -249,19 +256,21 @@ def pendulums(name: str):
 
 
 def figures(name: str, t: float, substeps: int) -> dict[str, float]:
-    """RMS errors [m] of the prototypes of a case at time t, by method."""
+    """Return the RMS errors [m] of the prototypes of a case at time t, by method."""
     rows = case(name)["prototype_errors"]
     return next(r["rms_error_m"] for r in rows if r["t"] == t and r["substeps_per_frame_60hz"] == substeps)
 
 
 def rms(position, reference) -> float:
-    """Root mean square distance [m]."""
+    """Return the root mean square distance [m]."""
     return float(np.sqrt(np.mean(np.sum((np.asarray(position) - np.asarray(reference)) ** 2, axis=-1))))
 
 
 def rerun(w: tv.World, seconds: float, dt: float = 1 / 60, **settings) -> tv.World:
-    """Put a world back to its start and run it with other substeps or iterations, which costs no compilation: it starts from
-    velocities, or else a kernel would make those of the last frame, which nobody wants, out of displacements."""
+    """Put a world back to its start and run it with other substeps or iterations, without compiling.
+
+    The world first starts from velocities; otherwise a kernel would needlessly turn the last displacements into velocities.
+    """
     w._start_from(w.particles.velocity)
     w.position = w.particles.position
     for name, value in settings.items():
@@ -271,18 +280,21 @@ def rerun(w: tv.World, seconds: float, dt: float = 1 / 60, **settings) -> tv.Wor
 
 
 def unprojected(w: tv.World) -> tv.World:
-    """Leave violations of what was placed to the passes, as they get those of knobs, instead of taking them out before."""
-    w._clock.first_moved = len(w.particles)  # none of them
+    """Leave violations of the initial positions to the passes, as violations after a knob change are.
+
+    By default, violations of the initial positions are projected first.
+    """
+    w._clock.first_moved = len(w.particles)  # none of the particles
     return w
 
 
 def order(errors, factor: float = 2.0) -> float:
-    """Fitted order of convergence, for errors at h, h / factor, h / factor^2, ..."""
+    """Return the fitted order of convergence for errors at h, h / factor, h / factor^2, ..."""
     k = np.arange(len(errors)) * np.log(factor)
     return float(-np.polyfit(k, np.log(errors), 1)[0])
 
 
-# Forks itself for each script that it is asked to run, so that importing Taichi is paid for once; it has not started Taichi.
+# Forks for each script that it runs, so that Taichi is imported once. The server itself has not started Taichi.
 SERVER = """
 import gc, json, os, runpy, signal, sys
 import tiverlet
@@ -305,14 +317,15 @@ STRICT = (sys.executable, "-W", "error", "-W", "ignore::DeprecationWarning")
 
 @functools.cache
 def server() -> subprocess.Popen:
-    """It ends when nobody can write to it any more."""
+    """Start the server process, which ends when its standard input is closed."""
     return subprocess.Popen([*STRICT, "-c", SERVER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 
 def python(code: str, *, check: bool = True, timeout: int = 120, fresh: bool = False, **env) -> subprocess.CompletedProcess:
-    """Run code in a process of its own, from a file, since Taichi reads the source of kernels.
+    """Run code from a file in a separate process, since Taichi reads the source of kernels.
 
-    fresh: in a new interpreter, as always with settings of the environment; else in one that has imported tiverlet before.
+    fresh: use a new interpreter, as is always done with environment settings. Otherwise the process is forked from one that has
+    already imported tiverlet.
     """
     with tempfile.TemporaryDirectory() as folder:
         path = pathlib.Path(folder) / "script.py"

@@ -1,4 +1,4 @@
-"""Calls as the pages and docstrings show them, for type checkers; nobody runs them."""
+"""Calls as the pages and docstrings show them, for type checkers only; this file is never run."""
 
 import numpy as np
 

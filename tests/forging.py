@@ -1,4 +1,4 @@
-"""Recordings that are forged for tests: taken apart, changed row by row, and written with checksums that are right again."""
+"""Forged recordings for tests: taken apart, changed row by row, and written with valid checksums."""
 
 import hashlib
 import json
@@ -9,11 +9,11 @@ import pyarrow as pa
 
 from tiverlet.recording import journal, reader
 
-NEVER = "7fffffffffffffffffffffffffffffff"  # an id that is higher than all others
+NEVER = "7fffffffffffffffffffffffffffffff"  # an id higher than all others
 
 
 def varint(n):
-    """A number as protobuf has it."""
+    """Encode a number as protobuf does."""
     out = bytearray()
     while n > 127:
         out.append(n & 127 | 128)
@@ -22,7 +22,7 @@ def varint(n):
 
 
 def packed(fields):
-    """A record of protobuf."""
+    """Encode a protobuf record."""
     out = b""
     for number, value in sorted(fields.items()):
         if isinstance(value, int):
@@ -49,7 +49,7 @@ class Forgery:
                 self.messages.append((kind, body))
 
     def save(self, to, seal=True):
-        """Write it; returns the path."""
+        """Write the recording to `to` and return the path. seal: append a valid end record."""
         out = self.head
         for kind, body, *batch in self.messages:
             if batch:
@@ -65,7 +65,7 @@ class Forgery:
         return to
 
     def chunks(self, entity="", static=None):
-        """The numbers of messages with rows of entities whose paths begin so."""
+        """Return the numbers of messages that hold rows of entities whose paths begin with `entity`."""
         out = []
         for k, message in enumerate(self.messages):
             if message[0] == 2:
@@ -75,7 +75,7 @@ class Forgery:
         return out
 
     def rows(self, entity, column):
-        """Where rows of the entity with this column are: (number of the message, row)."""
+        """Return where rows of the entity with this column are: (number of the message, row)."""
         out = []
         for k in self.chunks(entity, static=False):
             batch = self.messages[k][2]
@@ -84,7 +84,7 @@ class Forgery:
         return out
 
     def set(self, k, **columns):
-        """Replace columns, given by name with __ for :; None drops one."""
+        """Replace columns given by name, with __ for :. None drops a column."""
         _, fields, batch = self.messages[k]
         for name, values in columns.items():
             at = batch.schema.get_field_index(name.replace("__", ":"))
@@ -98,14 +98,14 @@ class Forgery:
         self.messages[k] = (2, fields, batch)
 
     def scale(self, k, row, column, factor):
-        """Multiply the numbers of a cell."""
+        """Multiply the numbers of a cell by a factor."""
         batch = self.messages[k][2]
         values = batch.column(column).to_pylist()
         values[row] = (np.array(values[row]) * factor).tolist()
         self.set(k, **{column.replace(":", "__"): values})
 
     def only(self, k, rows):
-        """Keep these rows of a message; none drops it."""
+        """Keep these rows of a message; without rows, drop the message."""
         _, fields, batch = self.messages[k]
         if len(rows):
             self.messages[k] = (2, fields, batch.take(pa.array(rows)))
@@ -113,7 +113,7 @@ class Forgery:
             del self.messages[k]
 
     def copy(self, k, rows, before=0, entity=None, static=False, ident=NEVER):
-        """Put copies of rows into the file, with other ids, before message `before`; returns the number of the new message."""
+        """Insert copies of rows, with other ids, before message `before`. Returns the number of the new message."""
         _, fields, batch = self.messages[k]
         batch = batch.take(pa.array(rows))
         at = batch.schema.get_field_index("rerun.controls.RowId")
@@ -129,7 +129,7 @@ class Forgery:
         return place
 
     def journal(self, change, seal=True):
-        """Put every entry through change(entry) -> entry, or None to drop it; with checksums that are right again, or not."""
+        """Replace every journal entry by change(entry), or drop it where that is None. seal: write valid checksums again."""
         mark, serial, empty = "", 0, []
         for k in self.chunks(journal.JOURNAL):
             batch = self.messages[k][2]
@@ -157,7 +157,7 @@ class Forgery:
 
 
 def later(frame):
-    """Rows of a frame with higher ids, which stand before all others: the viewer draws them."""
+    """Insert rows of a frame with higher ids before all others, which the viewer draws."""
     return lambda f, p: f.scale(f.copy(*_at(f, p, frame)), 0, p["positions"], 1.5)
 
 
@@ -175,7 +175,7 @@ def _another_frame(f, p):
 
 
 def _column(name):
-    """Drop a column of the particles from one frame on."""
+    """Drop a column of the particles from a chunk."""
 
     def drop(f, p):
         k, _ = f.rows(p["particles"], p[name])[4]
@@ -207,7 +207,7 @@ def _frames(f, p):
 
 
 def _cell(entity, column, change):
-    """Change what an entity has in a static or other column."""
+    """Change the values of a column of an entity, static or not."""
 
     def changed(f, p):
         k = next(k for k in f.chunks(entity) if column in f.messages[k][2].schema.names)
@@ -217,7 +217,7 @@ def _cell(entity, column, change):
 
 
 def _told(kind, change):
-    """Change the data of entries of the journal."""
+    """Change the data of journal entries of one kind."""
 
     def changed(f, p):
         def entry(e):

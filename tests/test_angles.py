@@ -1,4 +1,4 @@
-"""Bend, AngleLimit and Dihedral: signs, straight and folded, limits that stop; and that constraints break as told."""
+"""Bend, AngleLimit and Dihedral: signs, straight and folded corners, limits that stop; and constraints that break as set."""
 
 import numpy as np
 import pytest
@@ -11,14 +11,16 @@ from .test_references import line
 
 
 def triples(n: int) -> np.ndarray:
-    """Corners of a chain of n particles."""
+    """Return the corners of a chain of n particles."""
     k = np.arange(n - 2)
     return np.stack([k, k + 1, k + 2], axis=1)
 
 
 def test_rods_swing_through_straight_and_every_compliance_is_stable(world):
-    # Row 56: an unsigned angle has a kink at straight; the remembered side makes a free rod in 3D move as in 2D, without a flag.
-    # Rows 8, 9, 12: clamped beams from rigid to soft, one pass: kinetic energy never exceeds what there was and gravity supplied.
+    # Row 56: an unsigned angle has a kink at straight. With the remembered side, a free rod moves in 3D as in 2D, without a
+    # flag.
+    # Rows 8, 9, 12: clamped beams from rigid to soft, with one pass: the kinetic energy never exceeds its initial value plus
+    # the work of gravity.
     n, alphas, made = 21, (0.0, 1e-12, 1e-6, 1e-3, 1e-1, 1.0, 1e3, 1e12), []
     m, rod = len(alphas), 6
     for dim in (2, 3):
@@ -45,7 +47,7 @@ def test_rods_swing_through_straight_and_every_compliance_is_stable(world):
     np.testing.assert_allclose(made[1][0][:, :2], made[0][0], atol=1e-9)
     np.testing.assert_array_equal(made[1][0][:, 2], 0.0)
     np.testing.assert_allclose(made[1][1], made[0][1], atol=1e-6)
-    # The side from which each corner is seen is part of the state: back from another start, it goes on to the same bits.
+    # The side from which each corner is seen is part of the state: restored after another run, the world repeats the same bits.
     kept, ends = checkpoint.keep(w), []
     for _ in range(2):
         w.run(0.1)
@@ -56,7 +58,7 @@ def test_rods_swing_through_straight_and_every_compliance_is_stable(world):
 
 
 def test_angles_have_signs_and_wrap(world):
-    # In 2D positive is to the left. From 3 rad to -3 rad it is 0.28 rad, through folded, not 6 through straight.
+    # In 2D positive is to the left. From 3 rad to -3 rad the angle turns by 0.28 rad through folded, not by 6 through straight.
     a = np.array([0.5, -0.5, 3.0, -3.0])
     x = np.zeros((4, 3, 2))
     x[:, 0, 0], x[:, 2, 0], x[:, 2, 1] = -1.0, np.cos(a), np.sin(a)
@@ -79,13 +81,13 @@ def test_angles_have_signs_and_wrap(world):
 
 
 def test_limbs_stop_at_their_limits(world):
-    # A forearm on a held upper arm falls to its limit, rests there with the moment m g l cos; between the limits it is free.
+    # A forearm on a fixed upper arm falls to its limit and rests there with the moment m g l cos. Between the limits it is free.
     x = np.array([[-1.0, 0.0], [0.0, 0.0], [1.0, 0.0], [-1.0, 5.0], [0.0, 5.0], [1.0, 5.0]])
     limit = tv.AngleLimit([[0, 1, 2]], -1.2, 2.5)
     features = [tv.Gravity(9.81), tv.Distance([[1, 2], [4, 5]]), limit, tv.Drag(3.0)]
     w = world(tv.Particles(x, pinned=[0, 1, 3, 4]), features, substeps=40, iterations=8, precision="f64")
     w.run(0.2)
-    np.testing.assert_allclose(w.position[2], w.position[5] - [0, 5], atol=1e-12)  # no limit reached: as without
+    np.testing.assert_allclose(w.position[2], w.position[5] - [0, 5], atol=1e-12)  # no limit reached: as without one
     assert limit.load[0] == 0
     w.run(5.0)
     assert np.arctan2(w.position[2, 1], w.position[2, 0]) == pytest.approx(-1.2, abs=1e-4) and w.position[5, 1] < 4.01
@@ -102,7 +104,7 @@ def test_limbs_stop_at_their_limits(world):
 
 
 def test_hinged_triangles_fold_to_either_side(world):
-    # Positive towards e x p: with the edge along x and a wing at +y, towards +z. Flat and folded are as smooth as the rest.
+    # Positive towards e x p: with the edge along x and a wing at +y, towards +z. Flat and folded are as smooth as other angles.
     wings = np.array([[0.0, 0, 0], [1, 0, 0], [0.5, 1, 0], [0.5, -1, 0]])
     x = np.concatenate([wings + [0, 0, 3.0 * k] for k in range(4)])
     quads = np.arange(16).reshape(4, 4)
@@ -119,8 +121,8 @@ def test_hinged_triangles_fold_to_either_side(world):
 
 
 def test_a_rope_tears_where_it_is_told_to(world):
-    # Link k of a hanging chain of 8 carries (8 - k) m g = 9.81 (8 - k) N. Only the one of 4 with break_at = 45 is too weak: 49 N.
-    # For a team see test_determinism.py.
+    # Link k of a hanging chain of 8 carries (8 - k) m g = 9.81 (8 - k) N. Only link 3 is too weak: it carries 49 N and has
+    # break_at = 45. test_determinism.py tests breaking with a thread team.
     strength = np.full(8, 200.0)
     strength[[3, 6]] = 45.0, 25.0
     rope = tv.Distance(line(8), 1.0, break_at=strength)
@@ -152,7 +154,7 @@ def test_a_rope_tears_where_it_is_told_to(world):
 
 
 def test_wrong_angles_are_named():
-    # Rows 10, 19, 20. The three corners of a triangle are three constraints; a corner read backwards is the same one.
+    # Rows 10, 19, 20. The three corners of a triangle are three constraints; a corner listed backwards is the same constraint.
     with pytest.raises(ValueError, match=r"Bend: compliance\[1\] = -1"):
         tv.Bend([[0, 1, 2], [1, 2, 3]], compliance=[0.0, -1.0])
     with pytest.raises(ValueError, match=r"Bend: rest\[0\] = nan"):
@@ -169,9 +171,10 @@ def test_wrong_angles_are_named():
 
 
 def test_a_bent_corner_between_pins_stays_near_them(world):
-    # Straight is only between the pins, L = 0.42 m apart. Seen from r away they are L / r wide: C = pi over that gradient, which
-    # falls as 1 / r^2, would throw the corner to pi r^2 / L. Placed so, it goes between them first, without a velocity. Where the
-    # rest angle jumps later, the corner goes there at a third of a radian in a frame, 20 rad/s, or of the shorter leg, 0.3 m.
+    # The corner is straight only between the pins, L = 0.42 m apart. From a distance r the pins subtend L / r, so the gradient
+    # falls as L / r^2, and a step of C = pi over the gradient would throw the corner to pi r^2 / L. A corner that starts so is
+    # first placed between the pins, without a velocity. When the rest angle jumps later, the corner moves per frame by at most
+    # a third of a radian (20 rad/s), or a third of the shorter leg, 0.3 m.
     x = np.array([[0.0, 0], [0.3, 0], [0, 0.3]])
     bend = tv.Bend([[0, 1, 2]], 0.0)
     for solver in (tv.Jacobi(), tv.Direct()):
@@ -191,8 +194,8 @@ def test_a_bent_corner_between_pins_stays_near_them(world):
 
 @pytest.mark.parametrize("solver", [tv.Jacobi(), tv.ConjugateGradient(10)], ids=str)
 def test_limits_know_no_less_than_straight(world, solver):
-    # In 3D an angle is at least 0: straight limbs in any position meet limits of 0 to 2 rad, in f32, too, where the sign of
-    # |u x v| next to 0 was rounding. Nothing acts on them in a free fall, and what does not act has not turned.
+    # In 3D an angle is at least 0: straight limbs in any position meet limits of 0 to 2 rad, also in f32, where the sign of
+    # |u x v| near 0 is rounding. Nothing acts on the limbs in free fall, and an inactive limit must report no turn.
     rng = np.random.default_rng(3)
     u = rng.normal(size=(200, 3))
     u /= np.linalg.norm(u, axis=1, keepdims=True)
@@ -206,7 +209,7 @@ def test_limits_know_no_less_than_straight(world, solver):
 
 
 def test_what_is_slack_has_not_turned(world):
-    # Two balls on a slack rope pass each other: its direction turns by 2 atan((10 / 2400) / (0.1 / 60)) = 136 degrees in one.
+    # Two balls on a slack rope pass each other: its direction turns by 2 atan((10 / 2400) / (0.1 / 60)) = 136 degrees at once.
     x = [[0.0, 0.0], [-10 / 40 / 60, 0.1 / 60]]
     w = world(
         tv.Particles(x, velocity=[[0, 0], [10.0, 0.0]]),

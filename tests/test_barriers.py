@@ -1,4 +1,4 @@
-"""Walls of polygons and meshes: nothing enters, nothing passes, which side is out, and which of them are refused."""
+"""Walls of polygons and meshes: nothing enters or passes, which side is outside, and which shapes are refused."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from .outlines import CUBE, CUBE_FACES, SQUARE, STAR, outside
 
 @pytest.mark.parametrize("precision, inside, radius, restitution", [("f32", False, 0.0, 0.7), ("f64", True, 0.03, 0.0)])
 def test_nothing_enters_a_star_or_leaves_it(world, precision, inside, radius, restitution):
-    # Inner and outer corners, discs and points, up to 100 radii in a substep, with and without bounces; from inside and outside.
+    # Inner and outer corners, discs and points, up to 100 radii per substep, with and without bounces, from inside and outside.
     rng = np.random.default_rng(1)
     atol = 1e-9 if precision == "f64" else 4e-6
     side, h = -1 if inside else 1, 1 / 600
@@ -31,8 +31,9 @@ def test_nothing_enters_a_star_or_leaves_it(world, precision, inside, radius, re
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_nothing_passes_a_thin_sheet(world, dim):
-    # Rows 45 and 46: two-sided, without thickness of its own, discs of 1 mm at v h = 0.01 ... 1000 mm, from both sides, while the
-    # sheet turns by up to 3 rad in a substep or stands. Each stays on the side where it began: a line across a round drum.
+    # Rows 45 and 46: a two-sided sheet without thickness, and discs of 1 mm at v h = 0.01 ... 1000 mm from both sides, while the
+    # sheet turns by up to 3 rad per substep or stands still. The sheet is a line across a round drum; each disc stays on its
+    # side.
     rng = np.random.default_rng(2)
     n = 150
     x = rng.uniform(-0.9, 0.9, (n, dim))
@@ -58,7 +59,7 @@ def test_nothing_passes_a_thin_sheet(world, dim):
 
 
 def test_a_closed_line_may_bend_and_cross(world):
-    # An open line with corners, thickened: outside of it and of itself, by brute force.
+    # A thickened open line with corners that crosses itself: particles stay outside of it, checked by brute force.
     line = np.array([[-1.0, 0], [0, -0.3], [1, 0], [0.5, 0.8], [-0.3, -0.6]])
     rng = np.random.default_rng(5)
     x = rng.uniform(-1.2, 1.2, (400, 2))
@@ -72,7 +73,7 @@ def test_a_closed_line_may_bend_and_cross(world):
 
 
 def icosphere(levels: int):
-    """A sphere of radius 1 in 20 * 4**levels triangles: vertices, faces."""
+    """Return a sphere of radius 1 in 20 * 4**levels triangles: vertices, faces."""
     g = (1 + 5**0.5) / 2
     v = np.array([p for a in (-1, 1) for b in (-g, g) for p in ((a, b, 0), (0, a, b), (b, 0, a))], dtype=float)
     edge = np.linalg.norm(v[:, None] - v, axis=2)
@@ -88,8 +89,8 @@ def icosphere(levels: int):
 
 
 def test_a_fine_sphere_is_a_ball(world):
-    # The faces of an icosphere are at most s = 1 - cos(a) inside of it, with a half the angle of an edge: so are the particles,
-    # and a slide of half a second parts from the ball's by the angle of the faces at most.
+    # The faces of an icosphere are at most s = 1 - cos(a) inside the sphere, where a is half the angle of an edge; so are the
+    # particles. After half a second of sliding, they differ from those on a ball by at most the angle of the faces.
     rng = np.random.default_rng(0)
     x = rng.normal(size=(60, 3))
     x *= 0.8 / np.linalg.norm(x, axis=1)[:, None]
@@ -114,7 +115,7 @@ def test_a_fine_sphere_is_a_ball(world):
 
 
 def test_orientation_is_found(world):
-    # Faces either way round, some one way and some the other: the same wall, to the bit.
+    # Faces in either orientation, or in mixed ones, give the same wall bit for bit.
     some = [f[::-1] if k % 3 else f for k, f in enumerate(CUBE_FACES)]
     want = tv.Mesh(CUBE, CUBE_FACES).normals
     for faces in ([f[::-1] for f in CUBE_FACES], some):

@@ -1,4 +1,4 @@
-"""Areas and volumes: closed forms, what happens where a body has no extent, and who is refused."""
+"""Areas and volumes: closed forms, bodies without extent, and meshes and loops that are refused."""
 
 import numpy as np
 import pytest
@@ -13,19 +13,19 @@ CORNERS = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (
 
 
 def ring(n, radius=1.0):
-    """A regular polygon."""
+    """Return a regular polygon."""
     a = 2 * np.pi * np.arange(n) / n
     return radius * np.stack([np.cos(a), np.sin(a)], axis=1)
 
 
 def around(n, first=0):
-    """The links of a closed loop."""
+    """Return the links of a closed loop."""
     k = np.arange(n)
     return np.stack([first + k, first + (k + 1) % n], axis=1)
 
 
 def test_areas_of_polygons(world):
-    # R25: n/2 sin(2 pi / n), kept by soft rims that fall on the ground; every second one is given clockwise.
+    # R25: the area n/2 sin(2 pi / n) is kept by soft rims that fall on the ground; every second loop is given clockwise.
     sizes = (3, 6, 12, 64)
     first = np.cumsum([0, *sizes])
     x = np.concatenate([ring(n) + [3 * k, 0] for k, n in enumerate(sizes)])
@@ -43,8 +43,8 @@ def test_areas_of_polygons(world):
 
 
 def test_straight_outlines_enclose_nothing():
-    # Their area is 0 to rounding, which may be below 0 both ways round; what it takes for rest can be assigned, and it goes the
-    # same way round however often it is asked.
+    # The area of a straight outline is 0 up to rounding and may be negative in either orientation. The rest area that the
+    # constraint computes can be assigned to it, and prepare() keeps the orientation however often it runs.
     random = np.random.default_rng(1)
     for _ in range(200):
         along, at, m = random.normal(size=2), random.normal(size=2), int(random.integers(4, 14))
@@ -53,12 +53,12 @@ def test_straight_outlines_enclose_nothing():
         area.rest = area.rest
         assert 0 <= area.rest[0] < 1e-15
         order = area.indices.copy()
-        area.prepare(particles, particles.inv_mass.copy())  # as for a clone, which goes the same way round
+        area.prepare(particles, particles.inv_mass.copy())  # as for a clone, which keeps the orientation
         assert (area.indices == order).all()
 
 
 def test_volumes_of_solids(world):
-    # R25b: a tetrahedron, a cube of faces in any sense, an icosahedron; squeezed on the ground, and inflated.
+    # R25b: a tetrahedron, a cube with faces in mixed orientations, an icosahedron; squeezed on the ground, and inflated.
     g = (1 + 5**0.5) / 2
     ico = np.array([[s * a, t * b, 0] for s in (-1, 1) for t in (-1, 1) for a, b in ((1, g),)])
     ico = np.concatenate([ico, ico[:, [2, 0, 1]], ico[:, [1, 2, 0]]]) / 2
@@ -79,7 +79,7 @@ def test_volumes_of_solids(world):
     rerun(w, 1.0, iterations=40)
     for f in (shells, solid):
         assert np.abs(f.rest_of(w.position) / f.rest - 1).max() <= 1e-6
-    # Inflated from the start; what comes later, by a ramp, is shown by areas.
+    # Inflated from the start. test_areas_of_polygons changes the pressure later, which is ramped.
     features = [f.copy() for f in features]
     features[2] = tv.Volume(np.concatenate([cube, np.array(faces) + 8]), pressure=1.3)
     w = world(tv.Particles(x), features, precision="f64", iterations=40)
@@ -109,7 +109,7 @@ def test_a_soft_ring_breathes(world):
 
 
 def test_pressure_against_tension(world):
-    # In balance the pressure p = (pressure A0 - A) / alpha of a soft area holds a rim of springs: p R cos(pi / n) = T.
+    # In balance, the pressure p = (pressure A0 - A) / alpha of a soft area holds a rim of springs: p R cos(pi / n) = T.
     n, k, alpha, pressure = 12, 500.0, 0.01, 1.5
     edge, unit = 2 * np.sin(np.pi / n), n / 2 * np.sin(2 * np.pi / n)
     low, high = 1.0, 2.0
@@ -127,7 +127,8 @@ def test_pressure_against_tension(world):
 
 
 def test_elements_without_extent(world):
-    # Row 54: no gradient, no NaN, and it shows. Row 55: what is inside out comes back to the positive side.
+    # Row 54: an element without extent has no gradient; it yields no NaN and a residual of at least 1. Row 55: an inverted
+    # element returns to the positive side.
     flat = np.array(
         [[0, 0, 0], [1, 0, 0], [2, 0, 0], [5, 0, 0], [5, 0, 0], [5, 0, 0], [7, 0, 0], [7, 0, 0], [7, 0, 0], [7, 0, 0]]
     )
@@ -186,7 +187,7 @@ def test_meshes_and_loops_that_are_refused():
 
 
 def test_bodies_have_the_same_bits_on_both_paths(world):
-    # And clones go on alike, with the memory of soft constraints and of shapes that flow.
+    # Clones also continue bit for bit, with the history of soft constraints and of shapes that creep.
     rng = np.random.default_rng(1)
     x = np.concatenate([CORNERS, CORNERS + [2, 0, 0], rng.normal(size=(70, 3)) + [9, 0, 0]])
     shape = tv.ShapeMatch([np.arange(4, 12), np.arange(16, 86)], compliance=[0.0, 1e-3], damping=0.1, creep=[0.0, 1.0])

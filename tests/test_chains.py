@@ -1,4 +1,4 @@
-"""Chains solved directly: ODE references, any mass ratio, and bounded where h is too long."""
+"""Chains solved directly: ODE references, any mass ratio, and bounded energy where h is too long."""
 
 import numpy as np
 import pytest
@@ -30,18 +30,19 @@ def test_every_case_reaches_the_figures_of_the_prototypes(world):
             key = (name, row["t"], row["substeps_per_frame_60hz"])
             figure = row["rms_error_m"].get("SHAKE-direct")
             if key in errors and isinstance(figure, float) and figure < 1:
-                # The same method, to the digits that the figure is known to. The pivots of 1e6:1 have lost 1e-10 of theirs.
+                # The prototype uses the same method, so errors agree to the digits of its figure. The pivots for 1e6:1 have
+                # errors of 1e-10.
                 assert errors[key] <= (7e-7 if "1000000" in name else figure * 1.02 + 2e-8), key
                 compared += 1
     assert compared >= 25
-    # Second order wherever the vibration of the light masses is resolved; numerics 2.1 and 4.1.
+    # Second order wherever substeps resolve the vibration of the light masses; numerics 2.1 and 4.1.
     for name in ("D05_chain10", "D06_chain100", "D08_massratio10", "S02_chain5_3d"):
         assert errors[name, 0.5, 80] / errors[name, 0.5, 200] == pytest.approx(6.25, rel=0.1)
     assert errors["D06_chain100", 0.5, 80] <= 1.3e-5 and errors["D06_chain100", 0.5, 20] <= 1.2e-4
     assert errors["tip", 0.3, 20] <= 1e-3 and errors["tip", 0.3, 200] <= 1e-5
     assert errors["D09_massratio_inverted", 0.5, 20] <= 1e-4
-    # f32: the errors of the method at 20 substeps, and the same chains as in f64 where the step resolves them all, with the floor
-    # of f32 on top (row 68; numerics 4.6: 2e-4 for a pendulum of 10 s, up to 5e-4 with (x, d)).
+    # f32 has the errors of the method at 20 substeps. Where substeps resolve the motion, it follows f64 up to the f32 rounding
+    # floor (row 68; numerics 4.6: 2e-4 for a pendulum of 10 s, up to 5e-4 with (x, d)).
     rerun(single, 1.0, substeps=20)
     for name, figure in (("D06_chain100", 2.4e-4), ("D07_massratio_10000", 3e-5), ("D08_massratio10", 3e-5)):
         assert scene.error(single, name, 1.0) <= figure
@@ -51,15 +52,15 @@ def test_every_case_reaches_the_figures_of_the_prototypes(world):
 
 @pytest.mark.parametrize("precision", ["f32", "f32-compensated"])
 def test_shorter_substeps_never_make_it_worse(world, precision):
-    # Without what rounding takes from d, x and C a double pendulum was off by 6.5e-6 m at 20 substeps a frame and by 2.5e-3 at
-    # 5120. The error is that of the method, of order h^2, and 2^-24 sqrt(frames) or so.
+    # If the rounding errors of d, x and C were dropped, a double pendulum would be off by 6.5e-6 m at 20 substeps a frame and
+    # by 2.5e-3 m at 5120. With them, the error is that of the method, of order h^2, plus about 2^-24 sqrt(frames).
     x, mass, pairs = pendulums("D01_double_pendulum")
     chain = world(tv.Particles(x, mass=mass, pinned=[0]), [tv.Gravity(9.81), tv.Distance(pairs)], precision=precision)
     want = case("D01_double_pendulum")["values"]["t2.0"]["xy"]
     for substeps in (20, 80, 320, 1280, 5120):
         rerun(chain, 2.0, substeps=substeps)
         assert rms(chain.position[1:], want) <= 1.1e-5 * (20 / substeps) ** 2 + 1e-6, substeps
-    # A rod that spins freely turns by asin(omega h) in a substep, and keeps its centre.
+    # A rod that spins freely turns by asin(omega h) per substep and keeps its centre.
     omega, arm = 37.0, np.array([[0.5, 0.0], [-0.5, 0.0]])
     rod = world(tv.Particles(arm, velocity=omega * arm[:, ::-1]), [tv.Distance([[0, 1]])], precision=precision)
     for substeps in (20, 320, 5120):
@@ -69,7 +70,7 @@ def test_shorter_substeps_never_make_it_worse(world, precision):
 
 
 def test_triple_pendulum_keeps_its_energy_for_600_seconds(world):
-    # The public challenge: XPBD keeps 0.5 %. Relative to the lowest state, all links hanging down.
+    # The public challenge, where XPBD keeps the energy to 0.5 %. Energies are relative to the lowest state: all links hang down.
     name = "D03_mueller_triple"
     w = hung(world, name)
     for substeps, figure in ((20, 1.4e-4), (50, 2.2e-5), (100, 5.5e-6)):
@@ -80,12 +81,12 @@ def test_triple_pendulum_keeps_its_energy_for_600_seconds(world):
     w.velocity, w.position, w.substeps = w.particles.velocity, w.particles.position, 3000
     for _ in range(600):
         kept.append((w.step(1.0).energy - p["energy0"]) / span)
-    # The reported energy, at half steps, swings by the order of h^2; what is kept is its mean.
+    # The reported energy, at half steps, oscillates by O(h^2); its mean is conserved.
     assert np.abs(kept).max() < 2e-3 and abs(np.mean(kept[-100:])) < 1e-4
 
 
 def test_fifty_links_with_50_000_to_1(world):
-    # The heavy end swings on 50 links of 2 cm as one rod of 1 m would: omega^2 = g / L for small angles, up to the light links.
+    # The heavy end swings on 50 links of 2 cm as on a rod of 1 m, but for their mass: omega^2 = g / L for small angles.
     n, ratio, angle = 50, 50_000.0, 0.05
     x = np.outer(np.linspace(0, 1, n + 1), [np.sin(angle), -np.cos(angle)])
     mass = np.ones(n + 1)
@@ -99,7 +100,7 @@ def test_fifty_links_with_50_000_to_1(world):
         ends.append(w.position[-1])
     assert report.residual < 1e-10 and report.clean
     assert order(np.abs(np.diff(np.array(ends)[:, 0]))) == pytest.approx(2, abs=0.2)
-    # theta(t) = theta0 cn(...): for 0.05 rad the period is longer by theta0^2 / 16; the chain's own mass is 1e-3 of the end's.
+    # theta(t) = theta0 cn(...): at 0.05 rad the period is longer by theta0^2 / 16; the mass of the chain is 1e-3 of the end's.
     omega = np.sqrt(9.81) / (1 + angle**2 / 16)
     assert np.arcsin(ends[-1][0]) == pytest.approx(angle * np.cos(omega * 0.5), abs=2e-3 * angle)
     assert np.abs(np.diff(np.linalg.norm(ends, axis=1))).max() < 1e-5
@@ -118,7 +119,7 @@ def test_ten_thousand_links_carry_their_load_in_one_pass(world, briefly):
 
 
 def test_static_elongation_with_one_pass(world):
-    # R11: alpha m g N (N + 1) / 2 whatever the substeps, with a single pass.
+    # R11: the elongation is alpha m g N (N + 1) / 2 for any number of substeps, with a single pass.
     c = case("R11_elastic_rope_N100_alpha1e-5")
     p, n = c["params"], c["params"]["links"]
     link = tv.Distance(links(n), p["rest"], compliance=p["alpha"])
@@ -132,9 +133,9 @@ def test_static_elongation_with_one_pass(world):
 
 @pytest.mark.parametrize("iterations", [1, 3])
 def test_too_few_substeps_are_bounded_and_said(world, iterations):
-    # Rows 2, 12 and 18: heavy ends and the whip, from one substep per frame, where SHAKE diverges. No chain ever has more energy
-    # than it started with and m g L, what gravity can supply in a swing; and a tenth of it from 4 substeps on (0.083 at worst of
-    # ten starts that differ by 1e-9). A second pass that gave way took back what the first had found: up to 2.1 m g L.
+    # Rows 2, 12 and 18: heavy ends and the whip, from one substep per frame on, where SHAKE diverges. No chain gains more than
+    # m g L, which gravity can supply in a swing, and no more than a tenth of it from 4 substeps on (0.083 at worst for ten
+    # starts that differ by 1e-9). A second pass that gives way would undo what the first one found, and gain up to 2.1 m g L.
     scene = Scene()
     w = world(scene.particles, [tv.Gravity(9.81), tv.Distance(scene.pairs)], precision="f64", solver=tv.Direct())
     mass, name = scene.particles.mass, list(scene.begin)

@@ -1,4 +1,4 @@
-"""Errors at the door: what is wrong, with index and value, before Taichi sees anything."""
+"""Errors for invalid arguments: they say what is wrong, with index and value, before Taichi is called."""
 
 import pickle
 
@@ -119,7 +119,7 @@ def test_bad_input_is_named(make, error, words):
 
 @pytest.mark.parametrize("dt", [0.0, -1.0, NAN, INF, "1", None, True])
 def test_bad_frames_are_refused(world, dt):
-    # Row 13. And nothing has moved.
+    # Row 13. A refused frame moves nothing.
     w = world(tv.Particles([[0.0, 1.0]]), [tv.Gravity()])
     before = w.hash()
     with pytest.raises((ValueError, TypeError), match="dt"):
@@ -162,7 +162,7 @@ def test_what_does_nothing_is_said(world):
         world(start, [tv.Contact()])
     with pytest.warns(UserWarning, match=r"particle 2 starts 1.5 m outside along axis 0 \(1 such in all\); push_out = 1 m/s"):
         world(start, [tv.Box((-2, -2), (2, 2))])
-    world(start, [tv.Box((-2, -2), (2, 2), active=False)])  # which has no inside
+    world(start, [tv.Box((-2, -2), (2, 2), active=False)])  # an inactive box has no inside
 
 
 @ti.func
@@ -178,7 +178,7 @@ def deep(x, v):
 @pytest.mark.parametrize("function, words", [(flat, "flat returns a number"), (deep, "deep returns 3 components")])
 def test_a_force_is_a_vector_of_the_world(world, function, words):
     w = world(tv.Particles([[0.0, 1.0]]), [tv.Force(function)])
-    for _ in range(2):  # and not only once
+    for _ in range(2):  # every step raises the error
         with pytest.raises(TypeError, match=f"{words}, but in 2D a force has 2 components"):
             w.step(0.1)
 
@@ -194,7 +194,7 @@ def test_what_taichi_says_of_a_start_is_said_in_our_words():
     )
     done = python(typed, TI_LOG_LEVEL="")
     said = done.stdout.splitlines()
-    words = "Call tv.init() first" if COMPILER == "taichi" else "forgot to call `qd.init()` first"  # Quadrants asks before us
+    words = "Call tv.init() first" if COMPILER == "taichi" else "forgot to call `qd.init()` first"  # its check comes first
     assert sum(words in line for line in said) == 2 and "in a file or in a notebook" in said[-1]
     assert "overridden" not in done.stdout + done.stderr
 

@@ -1,4 +1,4 @@
-"""Compiling in less time changes no bit, and nothing of what the user compiles."""
+"""The patches of Taichi shorten compilation without changing a bit, and do not affect what users compile."""
 
 import ast
 import gc
@@ -36,7 +36,7 @@ def reports():
 
 
 def test_the_bits_do_not_depend_on_the_patches():
-    # By Taichi as it is, in another process, as with another version than 1.7.4: the same hashes and the same reports.
+    # Taichi without patches, in another process (as for versions other than 1.7.4): the same hashes and the same reports.
     space: dict = {}
     exec(PILE, space)
     made = list(space["reports"]())
@@ -49,8 +49,8 @@ def test_the_bits_do_not_depend_on_the_patches():
 
 @pytest.mark.skipif(not (ARCH == "cpu" and sys.platform == "linux"), reason="LLVM's switches are found there")
 def test_loops_are_copied_for_the_user_alone():
-    # LLVM says which loops it copies. Those of ours whose length it does not know stay as they are; in the same process a
-    # kernel of the user's has several rounds written one after the other, as ever.
+    # LLVM reports which loops it unrolls. It leaves our loops whose length is known only at run time as they are. In the same
+    # process, it unrolls the loop of a user's kernel as usual.
     code = """
 import os
 from tiverlet.device import ti
@@ -78,8 +78,8 @@ add(5)
 
 
 def test_what_the_user_compiles_is_compiled_as_ever():
-    # parts() leaves a vector in a variable that is a number. Without Taichi's analysis, which finds that nobody reads it, LLVM
-    # ends the process. Only then is the frame analysed: with contacts that would take ten times as long.
+    # parts() assigns a vector to a variable that holds a number. Taichi's analysis finds that the variable is never read; without
+    # it, LLVM ends the process. Only frames with such functions are analysed, which takes ten times as long with contacts.
     python(
         """
 from tiverlet.device import ti
@@ -134,7 +134,7 @@ assert own() == -200.0
 
 @ti.func
 def nested(x, n: ti.template()):  # type: ignore[valid-type]
-    """(n + 1)! x, by calls of itself: of one sum, the left part is there when the tree of the right one is gone through."""
+    """Return (n + 1)! x by recursion. In each sum, the left call is compiled before the tree of the right call is visited."""
     out = x
     if ti.static(n > 0):
         out = nested(x, n - 1) + n * nested(x, n - 1)
@@ -143,13 +143,13 @@ def nested(x, n: ti.template()):  # type: ignore[valid-type]
 
 @ti.func
 def spring(x):
-    """-24 x"""
+    """Return -24 x."""
     return -nested(x, 3)
 
 
 def test_functions_are_parsed_once_and_hold_nothing(world):
-    # x = cos(omega t), omega^2 = 24. Functions that call themselves have a tree for each depth; what nodes came to is not kept,
-    # among it worlds.
+    # x = cos(omega t), omega^2 = 24. A function that calls itself has a tree for each depth. Trees keep no results of their
+    # nodes, which could refer to worlds.
     w = world(tv.Particles([[1.0, 0.0]]), [tv.Force(spring)], precision="f64", substeps=200)
     w.run(0.5)
     assert w.position[0, 0] == pytest.approx(np.cos(24**0.5 * w.time), abs=1e-5)
@@ -161,8 +161,8 @@ def test_functions_are_parsed_once_and_hold_nothing(world):
 
 
 def test_statements_are_those_that_taichi_makes():
-    # Its cache names a kernel by its statements. Where our functions take it that nothing of ours is compiled, Taichi makes them
-    # by itself; all but those of statements.py.
+    # Taichi's cache names a kernel by its statements. With `active` replaced, our functions take no kernel for tiverlet's, and
+    # Taichi makes all statements itself, except those of statements.py. The names must be the same.
     code = """
 import os
 import taichi as ti
@@ -200,11 +200,11 @@ print(*sorted(name for name in os.listdir(os.environ["TI_OFFLINE_CACHE_FILE_PATH
     assert said[0].splitlines()[-2:] == said[1].splitlines()[-2:] and said[0].count(".tic") == 2, said
 
 
-TABLE = np.array([0.0, 2.0])  # what kernels compare while they compile, too
+TABLE = np.array([0.0, 2.0])  # kernels also compare it at compile time
 
 
 def compared(x: ti.f32, out: ti.types.ndarray(ti.f64, 1)):
-    """Comparisons and choices of all kinds."""
+    """Write results of comparisons and choices of all kinds to `out`."""
     i, v, u = ti.cast(x, ti.i32), ti.Vector([x, 2 * x]), ti.cast(ti.abs(ti.cast(x, ti.i32)), ti.u32)
     for k in ti.static(range(2)):
         if ti.static(TABLE[k] > 1.5):
@@ -222,7 +222,8 @@ def compared(x: ti.f32, out: ti.types.ndarray(ti.f64, 1)):
 
 
 def test_comparisons_are_what_taichi_makes_of_them(world):
-    # Ours are one statement, see statements.py; Taichi's have branches. NaN is less than nothing, and NumPy's truths are truths.
+    # Ours are one statement each, see statements.py; Taichi's have branches. NaN is not less than any number, and NumPy's
+    # booleans count as booleans.
     w = world(tv.Particles(np.zeros((1, 2))))
     ours, theirs = ti.kernel(compared), ti.kernel(compared)
     for x in (0.7, 3.0, -1.5, np.nan):
@@ -245,7 +246,7 @@ def test_functions_are_cut_out_of_their_files_as_python_does_it():
 
 
 def test_compiling_leaves_nothing_behind(world):
-    # Nobody is compiling any more, and Python goes on to collect garbage.
+    # Afterwards no kernel counts as being compiled, and Python collects garbage again.
     w = world(tv.Particles([[0.0, 1.0], [1.0, 1.0]]), [tv.Gravity(9.81), tv.Distance([[0, 1]])])
     w.run(0.1)
     assert not source_cache.active and gc.isenabled()
@@ -257,7 +258,7 @@ def test_long_kernels_are_compiled_without_a_search_to_the_same_bits(world, monk
     hourglass = [tv.Gravity(), tv.Contact(), tv.Ball((9.0, 9.0), 1.0), tv.Box((-9, -9), (9999, 99)), *rods]
 
     def passes(n: int, features: list) -> Any:
-        """What the kernels of so many particles are compiled with."""
+        """Return the passes with which kernels for n particles are compiled."""
         x = np.stack([np.arange(n), np.arange(n) % 7], axis=1) + 0.5
         with tv.World(tv.Particles(x, radius=0.1), [f.copy() for f in features]) as w:
             return w._runner.memory.compiler.passes
@@ -276,7 +277,8 @@ def test_long_kernels_are_compiled_without_a_search_to_the_same_bits(world, monk
 
 
 def test_who_waits_is_told_what_for(world, monkeypatch):
-    # On a terminal, a line while LLVM works; afterwards explain() says how long it took, and what for. All times add up.
+    # On a terminal, a line is shown while LLVM works. Afterwards explain() says how long that took, and for which features. The
+    # times add up to the total.
     shown = io.StringIO()
     monkeypatch.setattr("rich.console.Console", lambda **_: Console(file=shown, force_terminal=True))
     monkeypatch.setattr(timing, "LONG", 0.0)
@@ -298,12 +300,12 @@ def test_who_waits_is_told_what_for(world, monkeypatch):
     other = w.clone()
     other.step(1 / 60)
     assert "Nothing was compiled for it" in other.explain()
-    w.add(features=[tv.Drag(0.123)])  # it is built anew, and goes on telling
+    w.add(features=[tv.Drag(0.123)])  # rebuilds the world, which keeps its times
     assert w._runner.memory.compiler.times.kernels["fused"] == times.kernels["fused"]
 
 
 def squares():
-    """Two squares that fall on each other and on the floor."""
+    """Return two squares that fall on each other and on the floor."""
     square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
     particles = tv.Particles(np.concatenate([square, square + [0.5, 1.1]]), velocity=(0, -2), radius=0.02)
     loops, sides = np.arange(8).reshape(2, 4), np.stack(np.triu_indices(4, 1), axis=1)
@@ -312,7 +314,7 @@ def squares():
 
 
 def arm():
-    """A path in space with angles at its corners and along it."""
+    """Return a chain in 3D with limited angles at its corners and a dihedral angle along it."""
     particles = tv.Particles([[0, 0, 0], [1, 0, 0], [2, 1, 0], [2, 1, 1], [3, 0, 1]], pinned=[0])
     angles = [tv.AngleLimit([[0, 1, 2], [1, 2, 3]], 0, 1), tv.Dihedral([[1, 2, 3, 4]], compliance=1e-2)]
     return particles, [tv.Gravity(), tv.Distance([[0, 1], [1, 2], [2, 3], [3, 4]]), *angles]
@@ -320,7 +322,7 @@ def arm():
 
 @pytest.mark.parametrize("scene, precision", [(squares, "f32"), (arm, "f64")])
 def test_functions_that_kernels_call_change_no_bit(monkeypatch, scene, precision):
-    # By kernels that call what is long, and by others that have it copied.
+    # Kernels that call long functions, and kernels into which these are copied.
     made = []
     for passes in (BRIEF, LEAN):
         monkeypatch.setattr(build, "_passes", lambda *scene, chosen=passes: chosen)

@@ -15,7 +15,7 @@ RADII = 0.3 - 1e-4 * np.arange(12)  # some overlap at the start
 
 
 def touching(world, start, links, g=9.81, floor=-2.0, **settings):
-    """Links and contacts above a floor: one structure for each precision and dimension."""
+    """Build a world with links and contacts above a floor; all such worlds share one structure per precision and dimension."""
     up = np.eye(start.dim)[1]
     return world(start, [tv.Gravity(g), links, tv.Contact(), tv.HalfSpace(up, floor)], **settings)
 
@@ -23,8 +23,8 @@ def touching(world, start, links, g=9.81, floor=-2.0, **settings):
 @pytest.mark.parametrize("precision, limit", [("f64", 1e-12), ("f32", 1e-6)])
 def test_momentum_is_conserved_for_ten_thousand_steps(world, precision, limit):
     # Masses 1 ... 100, links from rigid to soft, contacts: internal forces are equal and opposite. What is left is the rounding
-    # of m d: n N = 12 x 1e4 times, in f32, 2^-24 / sqrt(12) of a particle's share, a twelfth of the whole. It walks to
-    # sqrt(n N) 2^-24 / sqrt(12) / 12 = 5e-7 of it.
+    # of m d: n N = 12 x 1e4 times, in f32, 2^-24 / sqrt(12) of a particle's share, a twelfth of the whole. The error performs a
+    # random walk to sqrt(n N) 2^-24 / sqrt(12) / 12 = 5e-7 of the momentum.
     x, v, _, pairs, rest, alpha, damping = net(2, seed=4)
     mass = 100.0 ** (np.random.default_rng(0).permutation(12) / 11)
     links = tv.Distance(pairs, rest, compliance=alpha, damping=damping)
@@ -47,9 +47,9 @@ def test_momentum_is_conserved_for_ten_thousand_steps(world, precision, limit):
 
 @pytest.mark.parametrize("what", ["shapes in 3D", "contacts"])
 def test_velocities_have_the_momentum_of_the_motion(world, what):
-    # Sum m v = sum m d / h, and with the forces in v along their directions at x_n sum m x x v = sum m x x d / h: in the first
-    # substep after a start and after a change of h, too. Contacts push along other directions than at x_n, which does not matter
-    # for what v has; friction has a moment where particles do not spin.
+    # Sum m v = sum m d / h. Where the forces in v act along their directions at x_n, also sum m x x v = sum m x x d / h. Both
+    # hold in the first substep after a start and after a change of h, too. Contacts push along other directions than those at
+    # x_n, which does not affect what v contains. Friction has a moment where particles do not spin.
     rng = np.random.default_rng(3)
     contact = tv.Contact(friction=0.5, restitution=0.5)
     if what == "shapes in 3D":
@@ -78,9 +78,10 @@ def test_velocities_have_the_momentum_of_the_motion(world, what):
 
 @pytest.mark.parametrize("loads", [False, True])
 def test_discs_that_lie_on_each_other_do_not_turn_by_themselves(world, loads):
-    # Seven discs without friction, drawn to a point by central forces: x_n x p = 0 for pushes p along the line at the start, so
-    # L = sum m x x v stays, to the rounding of 7 x 8 x 600 sums; they turn like a solid, whose energy stays, too. Pushes along
-    # the line at the end double both in 10 s. Loads are given along the line that a pair has before contacts move it.
+    # Seven discs without friction, attracted to a point by central forces. Pushes p act along the line of centers at the start
+    # of a substep, x_n x p = 0. So L = sum m x x v is kept to the rounding of 7 x 8 x 600 sums, and the discs turn like a
+    # solid, which keeps its energy. Pushes along the line at the end would double both in 10 s. Known loads act along the line
+    # of a pair before contacts move it.
     angle = np.pi / 3 * np.arange(6)
     x = np.vstack([[0.0, 0.0], 0.2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)])
     discs = tv.Particles(x, velocity=np.stack([-x[:, 1], x[:, 0]], axis=1), mass=1 + 0.1 * np.arange(7), radius=0.1)
@@ -95,8 +96,8 @@ def test_discs_that_lie_on_each_other_do_not_turn_by_themselves(world, loads):
 
 
 def test_what_slides_over_a_disc_is_second_order(world):
-    # A pendulum that stands on its head, as long as the disc presses: theta'^2 = w^2 + 2 g / l (1 - cos theta), so the time that
-    # it takes to theta is the integral of 1 / theta'. It would leave at cos theta = (2 + w^2 l / g) / 3, after 0.56 s.
+    # An inverted pendulum, while the disc presses: theta'^2 = w^2 + 2 g / l (1 - cos theta), so the time to reach theta is the
+    # integral of 1 / theta'. The disc would leave at cos theta = (2 + w^2 l / g) / 3, after 0.56 s.
     g, turning, until = 10.0, 1.0, 0.5
     node, share = np.polynomial.legendre.leggauss(20)
     late, gained = [], []
@@ -116,8 +117,9 @@ def test_what_slides_over_a_disc_is_second_order(world):
 
 @pytest.mark.parametrize("others", [False, True])
 def test_what_runs_round_in_a_ring_keeps_its_speed(world, others):
-    # From one point of a circle to the next, all chords are as long as the first one, to rounding; and that is (v h / R)^2 / 8
-    # longer than the way without the ring. At 200 m/s it climbs 14 m/s in a substep, far more than push_out.
+    # All chords from one point of a circle to the next are as long as the first one, to rounding. The first is longer by
+    # (v h / R)^2 / 8 than the displacement without the ring. At 200 m/s the particle climbs by 14 m/s a substep, far above
+    # push_out.
     for speed, substeps in ((5.0, 1), (5.0, 8), (200.0, 20)):
         ring, start = tv.Ball((0, 0), 1.0, inside=True), tv.Particles([(0.0, -1.0)], velocity=(speed, 0.0))
         w = world(start, [ring, tv.Box((-2, -2), (2, 2))] if others else [ring], substeps=substeps, precision="f64")
@@ -129,8 +131,8 @@ def test_what_runs_round_in_a_ring_keeps_its_speed(world, others):
 
 
 def test_a_loop_without_friction_is_second_order(world):
-    # Into a loop of 0.5 m from 1.3 m of height, 2.6 radii: it presses everywhere, for 2.5 are needed. It has the energy that it
-    # had, and is where the integral of ds / v puts it: as a pendulum that turns over.
+    # A point enters a loop of 0.5 m from a height of 1.3 m, 2.6 radii: it presses everywhere, since 2.5 suffice. It keeps its
+    # energy, and its place follows from the integral of ds / v, as for a pendulum that turns over.
     g, radius, until = 10.0, 0.5, 0.5
     node, share = np.polynomial.legendre.leggauss(60)
     late, gained = [], []
@@ -149,7 +151,7 @@ def test_a_loop_without_friction_is_second_order(world):
 
 
 def test_momentum_is_not_conserved_by_averaging_here(world):
-    # The test above can fail: dividing each particle's sum by its number of links (not its mass) breaks the balance.
+    # Shows that the momentum test can fail: dividing a particle's sum by its number of links, not its mass, breaks the balance.
     x, v, mass, pairs, *_ = net(2, seed=4)
     count = np.bincount(pairs.ravel(), minlength=len(x))
     i, j = pairs.T
@@ -163,7 +165,7 @@ def test_momentum_is_not_conserved_by_averaging_here(world):
 
 
 class Scene:
-    """A net that falls; the same one again from another side."""
+    """A net that falls, which can be run again from a transformed start."""
 
     def __init__(self, world, precision="f64", mass=1.0, compliance=1.0):
         self.x, self.v, m, pairs, rest, alpha, damping = net(2, seed=2)
@@ -189,13 +191,13 @@ def test_metamorphic_symmetries(world):
     np.testing.assert_allclose(scene.end(lambda x: x @ turn.T), plain @ turn.T, atol=1e-9)
     np.testing.assert_allclose(scene.end(boost=[3.0, -2.0]), plain + 0.5 * np.array([3.0, -2.0]), atol=1e-9)
     np.testing.assert_allclose(Scene(world, mass=7.0, compliance=1 / 7).end(), plain, atol=1e-9)
-    # In f32, 90 degrees still give the same bits: the dither has the sign of the kick.
+    # In f32, a turn by 90 degrees still gives the same bits: the dither has the sign of the kick.
     scenes = [Scene(world, precision="f32") for _ in range(2)]
     np.testing.assert_array_equal(scenes[0].end(lambda x: x @ quarter.T), scenes[1].end() @ quarter.T)
 
 
 def radii(x, pairs, most):
-    """Up to `most`, but so small that only linked particles overlap."""
+    """Return radii of `most` or less, so small that only linked particles overlap."""
     apart = np.linalg.norm(x[:, None] - x, axis=-1)
     apart[pairs[:, 0], pairs[:, 1]] = apart[pairs[:, 1], pairs[:, 0]] = np.inf
     out = np.full(len(x), most)
@@ -221,7 +223,7 @@ def test_a_flat_scene_is_the_same_in_3d(world):
 
 
 def test_motion_is_reversible(world):
-    # Turn the displacements round, x_(n+1) <-> x_n: the discrete motion with rigid links retraces its steps.
+    # With displacements reversed, x_(n+1) <-> x_n, the discrete motion with rigid links retraces its steps.
     n = 6
     k = np.arange(n - 1)
     start = tv.Particles(np.stack([np.arange(n) * 0.3, np.zeros(n)], axis=1), pinned=[0])
@@ -259,7 +261,7 @@ def test_splitting_a_run_changes_nothing(world):
 
 
 def test_a_force_that_was_just_turned_goes_along(world, tmp_path):
-    # Velocities at the end of a frame are d / h + h a / 2 by the force of that frame, though the knob is at the next one already.
+    # Velocities at the end of a frame are d / h + h a / 2 with the force of that frame, though the knob has its next value then.
     def turned():
         g = tv.Gravity(9.81)
         w = world(tv.Particles([[0.0, 0], [1, 0]], velocity=[[1, 2], [3, -1]]), [g, tv.Distance([[0, 1]])], substeps=3)
@@ -288,10 +290,10 @@ def test_a_force_that_was_just_turned_goes_along(world, tmp_path):
 
 
 def test_a_stiff_spring_that_turns_stores_what_its_load_does(world):
-    # A mass m turns about a point at a distance L: m v^2 / 2, and alpha F^2 / 2 with F = m v^2 / L = 2.5 N, 3e-9 J. In the middle
-    # of a substep it is nearer by L phi^2 / 8, phi = v h / L, of which 1 / (2 alpha) would make up to 23 J. It turns by asin phi
-    # in a substep and is seen along the chord: (1 + phi^2 / 4) of the kinetic energy. The same for a cluster, and for what a
-    # stiff pin draws: m u^2 / 2 for a target with speed u.
+    # A mass m circles a point at a distance L: it has m v^2 / 2, and the spring alpha F^2 / 2 with F = m v^2 / L = 2.5 N, 3e-9 J.
+    # In the middle of a substep the mass is nearer by L phi^2 / 8, phi = v h / L; 1 / (2 alpha) times its square would be up to
+    # 23 J. The mass turns by asin phi per substep, and its speed is taken along the chord: (1 + phi^2 / 4) of the kinetic energy.
+    # A cluster must give the same, and so must a mass on a stiff pin: m u^2 / 2 for a target with speed u.
     alpha, L, v, u, m = 1e-9, 0.5, 2.5, 1.2, 0.2
     x = np.array([[0, 0], [L, 0], [2, 0], [2 + L, 0], [2, L], [5, 0]])
     speed = np.array([[0, 0], [0, v], [0, 0], [0, 0], [0, 0], [0, 0]])

@@ -1,4 +1,4 @@
-"""The user's own constraint: against built-in ones and closed forms, far from the origin, and the errors that it raises."""
+"""The user's own constraint: against built-in ones and closed forms, far from the origin, and its error messages."""
 
 import numpy as np
 import pytest
@@ -10,28 +10,28 @@ from .conftest import case, order, rerun, rms
 
 
 def length(a, b):
-    """The function of Distance."""
+    """Return the distance of two points, as Distance does."""
     return (a - b).norm()
 
 
 def directions(a, b):
-    """Its gradient."""
+    """Return the gradient of length()."""
     n = (a - b) / (a - b).norm()
     return n, -n
 
 
 def radius(x):
-    """Distance from the origin."""
+    """Return the distance from the origin."""
     return x.norm()
 
 
 def height(x, c):
-    """How far constraint c is above a parabola of its own."""
+    """Return the height of x above the parabola of constraint c."""
     return x[1] - 0.5 * x[0] * x[0] * (c + 1)
 
 
 def test_a_length_of_ones_own_is_a_distance(world):
-    # The double pendulum D01, by Distance, by the user's function with its gradient, and with differences.
+    # The double pendulum D01: by Distance, by the user's function with a gradient, and by the function with finite differences.
     p = case("D01_double_pendulum")["params"]
     angle, size = np.radians(p["theta0_deg"]), np.array(p["lengths"])
     x = np.zeros((3, 2))
@@ -48,8 +48,8 @@ def test_a_length_of_ones_own_is_a_distance(world):
 
 
 def test_what_has_no_direction_says_how_far_it_is_off(world):
-    # Central differences of |a - b| at a = b are 0: a rigid link of L m cannot open there, and misses all of L. A spring pulls
-    # nowhere, as F = -C grad C / alpha says, and lacks nothing. Nothing is held to what does not move.
+    # Central differences of |a - b| at a = b are 0: a rigid link of L m cannot open there, and its residual is all of L. A spring
+    # has no force there, as F = -C grad C / alpha says, and no residual. Constraints between fixed particles have no residual.
     pairs, links = [[0, 1], [2, 3], [4, 5]], []
     for rest in (2.0, 1.0):
         links.append(tv.Constraint(length, pairs, rest, compliance=[0.0, 1e-3, 0.0]))
@@ -61,7 +61,7 @@ def test_what_has_no_direction_says_how_far_it_is_off(world):
 
 
 def test_a_bead_on_a_wire(world):
-    # On a circle it is the pendulum R06b. Down y = (c + 1) x^2 / 2 from rest, energy is kept and the wire never left.
+    # On a circle the bead is the pendulum R06b. From rest on y = (c + 1) x^2 / 2 it keeps its energy and never leaves the wire.
     v = case("R06b_pendulum_state")["values"]["90deg_t5"]
     w = world(tv.Particles([[1.0, 0.0]]), [tv.Gravity(9.81), tv.Constraint(radius, [0], 1.0)], iterations=4, precision="f64")
     errors = [rms(rerun(w, 5.0, substeps=n).position[0], [v["x"], v["y"]]) for n in (10, 20, 40)]
@@ -76,7 +76,7 @@ def test_a_bead_on_a_wire(world):
 
 
 def test_far_from_the_origin_the_origin_moves_along(world):
-    # At 1e5 m an ulp of f32 is 8 mm. Relative to a point near the scene a compensated world resolves micrometres.
+    # At 1e5 m an ulp of f32 is 8 mm. Relative to an origin near the scene, a compensated world resolves micrometres.
     v = case("R06b_pendulum_state")["values"]["90deg_t5"]
     far = np.array([1e5 + 0.3, -1e5 - 0.7])
     ring = tv.Constraint(radius, [0], 1.0, origin=far)

@@ -1,4 +1,4 @@
-"""Contacts: what touches does not overlap for long, and comes to rest."""
+"""Contacts: overlap of touching particles goes away, and piles come to rest."""
 
 import numpy as np
 import pytest
@@ -10,13 +10,13 @@ from .test_pairs import roomy
 
 
 def smooth(world, start, wide=(99.0, 99.0), g=9.81, rate=0.0, low=(0.0, 0.0), precision="f64", **settings):
-    """Discs of one size without friction, in a box: one structure for each precision."""
+    """Build a world of discs without friction in a box; all such worlds share one structure per precision."""
     features = [tv.Gravity(g), tv.Drag(rate), tv.Contact(push_out=settings.pop("push_out", 1.0)), tv.Box(low, wide)]
     return world(start, features, precision=precision, **settings)
 
 
 def rough(world, start, wide, friction, restitution, **settings):
-    """Discs that rub on each other and on the box, and bounce: one structure."""
+    """Build a world of discs with friction and restitution in a box with friction; all such worlds share one structure."""
     contact, box = tv.Contact(friction=0.4, restitution=0.5), tv.Box((0, 0), wide, friction=0.4)
     w = world(start, [tv.Gravity(9.81), contact, box], precision="f64", **settings)
     contact.friction, contact.restitution, box.friction = friction, restitution, friction
@@ -42,8 +42,8 @@ def test_a_heap_comes_to_rest_without_overlap(world):
 @pytest.mark.filterwarnings("ignore:.*near pairs per particle")
 @pytest.mark.parametrize("dim", [2, 3])
 def test_coincident_particles_part_gently(world, dim):
-    # Row 16: a direction made from the indices, equal and opposite. Row 48: at push_out, whatever the depth. Clusters of 2, 100
-    # and 300, far from each other.
+    # Row 16: the direction is made from the indices, equal and opposite. Row 48: particles part at push_out, whatever the
+    # depth. Clusters of 2, 100 and 300 particles, far from each other.
     speed, counts = 0.25, (2, 100, 300)
     x = np.repeat(np.arange(3), counts)[:, None] * (50 * np.eye(dim)[0])
     w = world(tv.Particles(x, radius=0.01), [tv.Contact(push_out=speed)], precision="f64", substeps=8)
@@ -62,19 +62,19 @@ def test_coincident_particles_part_gently(world, dim):
         if count <= 100:
             across = np.linalg.norm(at[:, None] - at[None], axis=-1)
             assert across[np.triu_indices(count, 1)].min() >= 0.02 * 0.99
-        # Neighbours part at `speed`; across a cluster of N particles speeds add up to that times its width in particles.
+        # Neighbours part at `speed`. Across a cluster of N particles, speeds add up to `speed` times its width in particles.
         width = 2 * np.ceil(count ** (1 / dim)) if count > 2 else 1
         assert np.linalg.norm(v, axis=1).max() <= speed * width
 
 
 def test_deep_overlap_leaves_at_no_more_than_push_out(world):
-    speed = 0.25  # for which kernels are compiled, as above
+    speed = 0.25  # kernels are compiled for this value, as above
     x = [[0.0, 0], [0.05, 0]]
     w = world(tv.Particles(x, radius=0.1), [tv.Contact(push_out=speed)], substeps=10, precision="f64")
     w.run(1.0)
     apart = w.velocity[1] - w.velocity[0]
     assert 0.9 * speed <= apart[0] <= speed * (1 + 1e-12) and w.position[1, 0] - w.position[0, 0] >= 0.2 - 1e-12
-    # The same after the user has put them into each other.
+    # The same speed after the user has placed them inside each other.
     w.position, w.velocity = [[0.0, 0], [0.0, 0.02]], np.zeros((2, 2))
     w.run(1.0)
     assert 0.9 * speed <= (w.velocity[1] - w.velocity[0])[1] <= speed * (1 + 1e-12)
@@ -90,8 +90,8 @@ def test_linked_particles_do_not_touch(world):
 
 def test_a_column_obeys_the_overlap_law(world):
     # R21: one mass-split pass per substep acts like springs m / (4 h^2): the k-th contact from the top would overlap by
-    # 4 k g h^2. Over-relaxed by 5/4, and with 0.4 of pushes carried over, they would take 0.48 of that, or of 3 k g h^2 at the
-    # ends. But a pair carries no more than what leaves it where its push, k m g h^2, would part it alone: at 2 k g h^2. Drag
+    # 4 k g h^2. With over-relaxation by 5/4 and 0.4 of pushes carried over, it would overlap by 0.48 of that, or of 3 k g h^2 at
+    # the ends. But a pair carries no more than leaves it at 2 k g h^2, where its push, k m g h^2, would part it alone. Drag
     # scales h^2 by phi. The load itself is k m g, to rounding.
     n, h = 10, 1 / 600
     x = np.stack([np.full(n, 0.5), 0.5 + np.arange(n) * 1.0], axis=1)
@@ -105,8 +105,7 @@ def test_a_column_obeys_the_overlap_law(world):
 
 
 def test_settled_piles_are_quiet(world):
-    # No jitter: the kinetic energy of a settled pile falls below 1e-6 m g r per particle, frictionless and with rubbing or
-    # bouncing discs.
+    # No jitter: the kinetic energy of a settled pile falls below 1e-6 m g r per particle, also with friction or restitution.
     k = np.arange(300)
     x = np.stack([k % 15 * 1.02 + 0.5 + 0.01 * tv.golden(k), k // 15 * 1.02 + 0.5], axis=1)
     for friction, restitution in ((0.0, 0.0), (0.4, 0.0), (0.0, 0.5)):
@@ -117,7 +116,7 @@ def test_settled_piles_are_quiet(world):
             w = smooth(world, start, (15.5, 60), substeps=8)
         w.run(12.0)
         assert tv.measure.kinetic_energy(w) / len(k) <= 1e-6 * 9.81 * 0.5
-        # What lies above some height is borne by the contacts with what lies below, but for the sound that is left: a velocity of
+        # The contacts across a height carry the weight above it, apart from the sound that is left: a velocity of
         # sqrt(2e-6 g r) = 3 mm/s at 30 rad/s is 1 % of g.
         height = w.position[:, 1]
         level = np.quantile(height, 0.5) + 1e-9
@@ -136,7 +135,7 @@ def test_idle_columns_do_not_creep(world):
     w.substeps = 200
     w.run(5.0)
     w.substeps = 1000
-    w.run(20 / 1.2, dt=1 / 1.2)  # h = 1 / 1200 as before
+    w.run(20 / 1.2, dt=1 / 1.2)  # h = 1 / 1200, as before
     rest = w.position
     w.run(100 / 1.2, dt=1 / 1.2)
     assert np.abs(w.position - rest).max() <= 0.5e-6
@@ -145,7 +144,7 @@ def test_idle_columns_do_not_creep(world):
 
 
 def test_idle_piles_do_not_creep(world):
-    # Row 43: nor does a pile with friction, once it lies: in 1e5 substeps nothing but the last digits of coordinates changes.
+    # Row 43: a settled pile with friction does not creep either: in 1e5 substeps only the last digits of coordinates change.
     k = np.arange(40)
     x = np.stack([k % 10 * 1.02 + 0.5 + 0.01 * tv.golden(k), k // 10 * 1.02 + 0.5], axis=1)
     w = rough(world, tv.Particles(x, radius=0.5), (10.5, 60), 0.4, 0.0)
@@ -157,7 +156,7 @@ def test_idle_piles_do_not_creep(world):
 
 
 def test_walls_are_one_sided_at_any_speed(world):
-    # Row 45: up to 1e6 m/s. Towards every wall of a box, and onto a slope.
+    # Row 45: up to 1e6 m/s, towards every wall of a box and onto a slope.
     for dim in (2, 3):
         rng = np.random.default_rng(0)
         direction = rng.normal(size=(60, dim))
@@ -171,7 +170,7 @@ def test_walls_are_one_sided_at_any_speed(world):
         for _ in range(20):
             w.step(1 / 60)
             x = w.position
-            # Where both push, in the corner that they make, the last of a few rounds leaves a little.
+            # Where two walls push, in the corner between them, the last of a few rounds leaves a small violation.
             assert (np.abs(x) <= 0.9 + 1e-3).all()
             assert (x @ slope / np.linalg.norm(slope) >= -0.4 - 1e-9).all()
             alone = x @ slope / np.linalg.norm(slope) > -0.35
@@ -181,7 +180,7 @@ def test_walls_are_one_sided_at_any_speed(world):
 
 @pytest.mark.filterwarnings("ignore:Box. particle 0 starts")
 def test_walls_move_and_push(world):
-    # A piston: the wall goes where it is sent within a frame and carries what it meets, at its own speed.
+    # A piston: within a frame the wall moves to its new place, and carries the particle that it meets at its own speed.
     box = tv.Box((0, 0), (10, 10))
     w = world(tv.Particles([[0.5, 5.0], [7.0, 5.0]], radius=0.5), [box], precision="f64", substeps=10)
     for k in range(30):
@@ -195,7 +194,7 @@ def test_walls_move_and_push(world):
         floor.offset = 0.02 * (k + 1)
         w.step(1 / 60)
     assert w.position[0, 1] == pytest.approx(0.45, abs=1e-12)
-    # A particle that starts outside comes in at push_out, and is not thrown.
+    # A particle that starts outside comes in at push_out and not faster.
     w = world(tv.Particles([[-3.0, 0.0]], radius=0.1), [tv.Box((-1, -1), (1, 1), push_out=2.0)], precision="f64")
     w.run(1.2)
     assert abs(w.velocity[0, 0]) <= 2.0 + 1e-12 and w.position[0, 0] >= -0.9
@@ -209,7 +208,7 @@ def test_a_body_at_rest_has_no_velocity(world):
 
 
 def test_outrunning_the_contacts_is_flagged(world):
-    # Row 47: at v h / r = 0.5 the pair is caught; above 1 it may pass, and that is said.
+    # Row 47: at v h / r = 0.5 the pair is caught; above 1 it may pass through, which is flagged.
     r, h = 0.1, 1 / 600
     start = tv.Particles([[-0.55, 0.0], [0.55, 0.0]], radius=r)
     w = smooth(world, start, g=0.0, low=(-99.0, -99.0), push_out=0.25, substeps=10)
@@ -223,9 +222,9 @@ def test_outrunning_the_contacts_is_flagged(world):
 
 
 def test_both_of_a_pair_agree_that_they_touch(world):
-    # Three in a row: the first is some rounding errors away from the second, or less than nothing, and the third moves into the
-    # second. What one of a pair gets the other gives. (When one of the two did not count the pair, its mass was split too little,
-    # and what takes the sound out of piles exploded.)
+    # Three discs in a row: the gap between the first and the second is some rounding errors, of either sign, and the third
+    # moves into the second. Momentum is kept only if both discs of a pair count their contact. If one did not, its mass would
+    # be split too little, and the velocity projection would explode.
     rng = np.random.default_rng(3)
     n = 330
     radius, place = rng.uniform(0.1, 0.5, (n, 3)), np.stack(np.divmod(np.arange(n), 64), axis=1) * 4.0
@@ -248,19 +247,19 @@ def test_both_of_a_pair_agree_that_they_touch(world):
 
 
 def tossed(world, start, links, rest, friction, low, high, **settings):
-    """Discs in a box, some on springs."""
+    """Build a world of discs in a box, some on springs."""
     springs = tv.Distance(links, rest, compliance=1e-4)
     features = [tv.Gravity(9.81), springs, tv.Contact(friction=friction), tv.Box(low, high)]
     return world(start, features, solver=tv.Jacobi(), **settings)
 
 
 def test_what_a_failed_frame_left_behind_is_gone(world):
-    # A frame that ended in NaN is undone, as the controller does it. What pairs of the new list carry is what they carried then,
-    # or 0: not 0 times what the failed frame left in its place, which is NaN.
+    # A frame that ended in NaN is undone, as the step controller does it. Pair data of the new list must be the restored data
+    # or 0. It must not be 0 times what the failed frame left in the field, which is NaN.
     k = np.stack(np.divmod(np.arange(150), 10), axis=1)[:, ::-1]
     x = 0.21 * k + 0.01 * np.sin(7.0 * k[:, ::-1]) + 0.2
     x[:2] += [[0.0, 5.0], [0.1, 5.0]]
-    x[5, 0] += 0.03  # so that some overlap, as there
+    x[5, 0] += 0.03  # so that some discs overlap
     w = tossed(world, tv.Particles(x, radius=0.1), [[0, 1]], 0.2, 0.3, (0, 0), (2.4, 9))
     w.run(0.5)
     kept = checkpoint.keep(w)
@@ -276,7 +275,7 @@ def test_what_a_failed_frame_left_behind_is_gone(world):
 
 
 def test_the_skin_changes_no_bits_of_what_links_move(world):
-    # Row 83: skins of 0.01 ... 2 contact distances; for paths see test_pairs.py. Soft links throw discs together, apart and
+    # Row 83: skins of 0.01 ... 2 contact distances; test_pairs.py tests the paths. Soft links move discs together, apart and
     # together again, in one substep further than the narrow skins reach.
     n, rng = 60, np.random.default_rng(3)
     x, v = rng.uniform(-2, 2, (n, 2)), rng.normal(size=(n, 2)) * 4
@@ -293,7 +292,8 @@ def test_the_skin_changes_no_bits_of_what_links_move(world):
 
 
 def test_what_a_link_draws_through_another_disc_is_flagged(world):
-    # Row 82: in one substep from 0 to 2.3, through one that is pinned at 1.15; a link of nearly its length draws it to no other.
+    # Row 82: in one substep a link draws a particle from 0 to 2.3, through one that is pinned at 1.15. A link of nearly its
+    # length draws it through none.
     start = tv.Particles([[0.0, 0], [3.0, 0], [1.15, 0.0]], radius=0.3, pinned=[1, 2])
     link = tv.Distance([[0, 1]], 3.0)
     w = world(start, [link, tv.Contact()], substeps=1, precision="f64")
@@ -314,9 +314,9 @@ def test_discs_in_the_same_place_have_the_normal_along_which_they_part(world, di
 
 
 def test_masses_are_split_as_often_however_deep_pairs_are(world):
-    # Four discs come to a fifth, and overlap with it by c from left and right and by a little from above and below. The sum of
-    # n n^T is 2 I for the one in the middle, so its mass is split twice, those of the others once, and each goes out by r c / 3,
-    # with r = 5/4. As if all were as deep as the deepest it would be split by up to 1 / (1 - c)^2 more, and four times at most.
+    # Four discs overlap with a fifth by c from left and right, and by a little from above and below. The sum of n n^T is 2 I for
+    # the middle disc, so its mass is split by 2 and those of the others by 1; each outer disc moves out by r c / 3 with r = 5/4.
+    # If all pairs counted as deep as the deepest, masses would be split by up to 1 / (1 - c)^2 more, and by four at most.
     out = np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1]])
     low = (-99.0, -99.0)
     for c, off in ((0.05, 0.04), (0.2, 1e-5), (0.45, 1e-5)):
@@ -340,8 +340,8 @@ def test_a_column_that_is_too_heavy_for_the_substep_is_flagged(world):
 
 
 def test_a_point_in_the_middle_of_a_disc_that_is_to_stay_there(world):
-    # At push_out = 0 the disc acts as if it had shrunk to nothing, and by rounding to less: friction then held a slip of 0 up to
-    # a length below 0, and what is 0 times infinity is no number.
+    # At push_out = 0 the disc acts as if it had shrunk to nothing, and by rounding to less. Without a guard, friction would
+    # hold a slip of 0 up to a negative length, and 0 times infinity is NaN.
     w = world(tv.Particles([(0.5, 1)] * 2, radius=[0.1, 0]), [tv.Contact(friction=0.3, push_out=0.0)])
     w.run(0.1)
     np.testing.assert_array_equal(w.position, [(0.5, 1)] * 2)

@@ -1,4 +1,4 @@
-"""The demos run, and the README tells the truth about the first of them."""
+"""The demos run and pass their own checks."""
 
 import functools
 import importlib.util
@@ -12,7 +12,7 @@ ROOT = pathlib.Path(__file__).parent.parent
 
 
 def demo(name: str):
-    """Its module."""
+    """Return the module of a demo."""
     spec = importlib.util.spec_from_file_location(name, ROOT / "demos" / f"{name}.py")
     assert spec and spec.loader
     module = importlib.util.module_from_spec(spec)
@@ -22,8 +22,11 @@ def demo(name: str):
 
 @pytest.fixture
 def printed(tmp_path, monkeypatch, capsys):
-    """What a demo prints: its main() is called in a folder of its own. built: arguments of its build(). Recordings have one
-    of ten frames, for pictures take a tenth of the time; but for the article's, which is looked at."""
+    """Return a function that runs main() of a demo in a folder of its own and returns what it prints.
+
+    built: arguments of the demo's build(). Recordings hold every tenth frame, since pictures take a tenth of the time; only the
+    article's, whose size is tested, holds all.
+    """
     seldom = functools.partial(tv.Recorder, every=10)
 
     def run(name: str, *, settings=(), built=None, **arguments) -> str:
@@ -48,8 +51,8 @@ def test_article_runs_and_checks_itself(printed, tmp_path):
 
 
 def test_the_article_gains_no_energy_under_auto(taichi):
-    # Its discs lie on ropes, so that a shorter substep cannot put right first what both are off by: that was 3e7 J in the 78th
-    # frame, after nine tries with twice the substeps each, where there were 5e4.
+    # The discs lie on ropes, so a shorter substep cannot correct discs and ropes one after the other. If they were not corrected
+    # together, the 78th frame would have 3e7 J instead of 5e4 J, after nine tries with twice the substeps each.
     start = demo("article").build().world
     world = start.clone(substeps="auto")
     energies = [world.step(1 / 60).energy for _ in range(90)]
@@ -88,7 +91,7 @@ def test_pay_finds_that_features_only_add(printed):
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_demos_check_themselves(printed, name, arguments, words):
-    # Each raises SystemExit where its check fails.
+    # Each demo raises SystemExit if its check fails.
     assert words in printed(name, **arguments)
 
 

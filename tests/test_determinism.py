@@ -1,4 +1,4 @@
-"""The same bits on any number of threads and on either path; and what is absent costs nothing."""
+"""The same bits on any number of threads and on all paths; and features that are absent cost nothing."""
 
 import pathlib
 from types import SimpleNamespace
@@ -20,8 +20,8 @@ DEMOS = pathlib.Path(__file__).parent.parent / "demos"
 
 
 def test_what_a_gpu_sums_up_is_the_same(world, monkeypatch):
-    # By 64^2 blocks and then 64, where a CPU has 64: the same figures, but for the rounding of a sum of n numbers.
-    # A scene of those below, which takes their kernels.
+    # A GPU sums by 64^2 blocks and then 64, a CPU by 64: the same figures, up to the rounding of a sum of n numbers. The scene
+    # is one of those below, whose kernels it shares.
     x = 1.8 * tv.golden(np.arange(200), dim=2) - 0.9
     reports = []
     for architecture in ("cpu", "cuda"):
@@ -37,14 +37,14 @@ def test_what_a_gpu_sums_up_is_the_same(world, monkeypatch):
 
 
 def hashes(code: str, runs: str) -> list[str]:
-    """Of what a process finds where Taichi starts anew for each of `runs`; they are the numbers of threads, and more."""
+    """Return the hashes that results() yields in another process, which restarts Taichi for each of `runs`: (threads, path)."""
     loop = f"for threads, path in {runs}:\n    tv.init(threads=threads)\n"
     return python(code + loop + "    for sha in results(path):\n        print(sha)\n    ti.reset()\n").stdout.split()
 
 
 def test_the_articles_scene_has_the_same_bits_on_1_and_8_threads():
-    # And twice in a row. With so few discs that none overlap at the start, where all kernels would be compiled twice, and that
-    # two threads of the eight make up a team.
+    # Also twice in a row. The discs are so few that none overlap at the start, in which case all kernels would be compiled
+    # twice, and that the team has two of the eight threads.
     code = f"""
 import sys
 sys.path.insert(0, {str(DEMOS)!r})
@@ -66,8 +66,9 @@ def results(path):
 
 
 def test_every_solver_has_the_same_bits_on_1_and_8_threads():
-    # Sums over all constraints, as conjugate gradients take them beside contacts, and systems that several threads solve: cloth
-    # that falls on a ball, with hail on it, and ropes. On one thread phase by phase, as on a GPU. For Jacobi see all paths below.
+    # Sums over all constraints, as conjugate gradients compute them beside contacts, and systems that several threads solve:
+    # cloth that falls on a ball, with hail on it, and ropes. On one thread they run phase by phase, as on a GPU. Jacobi is
+    # tested on all paths below.
     code = """
 import numpy as np
 import pytest
@@ -98,9 +99,9 @@ def results(path):
 
 
 def test_a_large_pile_has_the_same_bits_on_all_paths_and_where_a_team_breaks_up(world, monkeypatch):
-    # From 1000 particles on blocks of them are asked whether any touches. Where every wait of a team is a long one, the first
-    # thread goes on alone after a few of them, and the others come back 32 frames later. Compiled as large worlds are on one
-    # path, as small ones on the other, which takes a third of the time and has the same bits. Phase by phase, see test_grid.py.
+    # From 1000 particles on, blocks of particles are tested for any contact. If every wait of a team is a long one, the first
+    # thread continues alone after a few waits, and the others come back 32 frames later. One path is compiled as large worlds
+    # are, the other as small ones are: a third of the time, with the same bits. test_grid.py tests the launched path.
     k = np.arange(1200)
     x = np.stack([k % 30 * 1.02, k // 30 * 1.02], axis=1) + 0.5 + 0.01 * tv.golden(k, dim=2)
     made = []
@@ -119,21 +120,20 @@ def test_a_large_pile_has_the_same_bits_on_all_paths_and_where_a_team_breaks_up(
 
 @ti.func
 def wild(x, v, t):
-    """Turns, brakes, and changes with time; not what is above 5 m."""
+    """A force that turns velocities below 5 m, and brakes them by a rate that changes with time."""
     return ti.select(x[1] > 5.0, 0.0, 3.0) * ti.Vector([v[1], -v[0]]) - (0.2 + 0.1 * ti.sin(t)) * v.norm() * v
 
 
 @ti.func
 def apart(r):
-    """What ends at a distance."""
+    """A pair force that ends at a distance of 0.2 m."""
     return 0.02 * r * (0.04 - r.dot(r))
 
 
 @pytest.mark.parametrize("acting", [True, False], ids=["forces and contacts", "constraints"])
 def test_all_paths_have_the_same_bits(world, acting):
-    # Apart, since the time that features take to compile grows faster than their number. In three dimensions see the next but
-    # one, and the fuzzer; for spins, events, sleep and bodies of loops see test_sleep.py. A column on the first disc learns its
-    # loads.
+    # Two scenes, since compile time grows faster than the number of features. Three dimensions are tested by the fuzzer; spins,
+    # events, sleep and bodies of loops in test_sleep.py. A column on the first disc learns its known loads.
     n = 160
     x = tv.golden(np.arange(n), dim=2) * [4, 1.6]
     x[:4] = [1.0, 7.0] + np.outer(np.arange(4), [0.0, 0.16])
@@ -166,7 +166,7 @@ def test_all_paths_have_the_same_bits(world, acting):
 
 
 def test_what_is_no_number_is_hashed_alike(world):
-    # The sign of inf - inf hangs on the order in which a compiler takes its operands, which paths need not share.
+    # The sign of inf - inf depends on the order in which a compiler takes the operands, which may differ between paths.
     w = world(tv.Particles(np.zeros((2, 2))), [])
     w.step(1 / 60)
     memory, d, told = w._runner.memory, w._runner.scene.state.d, []
@@ -178,8 +178,8 @@ def test_what_is_no_number_is_hashed_alike(world):
 
 @pytest.mark.filterwarnings("ignore:Contact. all radii are 0")
 def test_what_is_absent_has_no_field_and_no_kernel(world):
-    # A point in free flight: position, displacement and counts. Each feature adds its own fields and nothing else; a
-    # mass for each particle is needed where one has another than the rest, as what is pinned has.
+    # A point in free flight has position, displacement and counts. Each feature adds its own fields and nothing else. A mass
+    # per particle is stored only where masses differ, as with a pinned particle.
     plain = world(tv.Particles(np.zeros((10, 2))), [])
     names = {name.split(".")[0] for name in plain.fields}
     assert names == {"position", "displacement", "numbers"}
@@ -208,7 +208,7 @@ def test_what_is_absent_has_no_field_and_no_kernel(world):
 
 
 def test_launches_count_what_the_scene_needs(world):
-    # Kernel launches of a frame, counted at Taichi's door: one for all of it on a CPU; else one for each pass of a substep.
+    # Kernel launches of a frame, counted at Taichi's entry point: one on a CPU; otherwise one per pass of a substep.
     for features, path, expected in (
         ([tv.Gravity(1.0)], "launched", {"integrate": 5, "measure": 1}),
         ([tv.Gravity(1.0), tv.Distance([[0, 1]])], "launched", {f"integrate {PASS}": 5, PASS: 5, "measure": 1}),
@@ -240,8 +240,8 @@ def test_launches_count_what_the_scene_needs(world):
 
 
 def test_the_host_asks_once_in_a_frame(world):
-    # Launched phase by phase, as on a GPU: what is launched is not waited for. The host reads what the frame came to, and where a
-    # list of neighbours is stale, whether it fits, and the frame again, which goes on from there.
+    # Launched phase by phase, as on a GPU, the host does not wait for launches. It reads the result of the frame. Where the
+    # neighbour list is stale, it also reads whether the new list fits, and the result of the frame that continues from there.
     features = [tv.Gravity(0.0), tv.Distance([[0, 1]]), tv.Contact(friction=0.5, restitution=0.5)]
     x = 1.8 * tv.golden(np.arange(200), dim=2) - 0.9
     w = world(tv.Particles(x, velocity=-2 * x, radius=0.04), features, path="launched", substeps=8, iterations=2)
@@ -257,7 +257,7 @@ def test_the_host_asks_once_in_a_frame(world):
 
 
 def test_unused_files_change_no_bit(tmp_path):
-    # The same scene with the files of every other feature deleted from the package, and their names from the lists.
+    # The same scene with the files of other features deleted from the package, and their names from its lists.
     import shutil
 
     package = pathlib.Path(tv.__file__).parent

@@ -1,4 +1,4 @@
-"""Elimination in chains, trees and loops: dense solutions, what it leaves to others, and which worlds it is chosen for."""
+"""Elimination in chains, trees and loops: dense solutions, what it leaves to relaxation, and where it is the default."""
 
 import contextlib
 from itertools import product
@@ -17,7 +17,10 @@ from .prototype import Prototype
 
 
 def dense(x, d, w, pairs, rest, ahead):
-    """The positions after one Newton step of all links at once, of what has moved by d: what elimination has to find."""
+    """Return positions and multipliers after one Newton step of all links at once: the reference for elimination.
+
+    d: the displacements of the substep so far.
+    """
     start = x - d
     now, before = x[pairs[:, 0]] - x[pairs[:, 1]], start[pairs[:, 0]] - start[pairs[:, 1]]
     length = np.linalg.norm(now, axis=1)
@@ -39,7 +42,7 @@ def loop(n):
 
 
 def net():
-    """A ladder of 30 rungs with a tail and a ring at its end: wider than a tree, and all of it one system."""
+    """Return a ladder of 30 rungs with a tail and a ring at its end: wider than a tree, and one system."""
     a, b = np.arange(30), np.arange(30) + 30
     rails = [np.stack([r[:-1], r[1:]], axis=1) for r in (a, b)]
     return np.vstack([*rails, np.stack([a, b], axis=1)[::2], [[59, 60], [60, 61], [61, 62], [62, 60]]])
@@ -47,7 +50,7 @@ def net():
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_elimination_equals_a_dense_solution(world, dim):
-    # Rows 40 and 41: trees, a necklace, a net; random masses, some static; several systems in one world, of one Newton step.
+    # Rows 40 and 41: trees, a necklace, a net; random masses, some static particles; several systems in a world, one Newton step.
     rng = np.random.default_rng(dim)
     graphs = [some_tree(rng, 60), some_tree(rng, 40), loop(100), net()]
     begin = np.cumsum([0] + [g.max() + 1 for g in graphs])
@@ -75,10 +78,10 @@ def test_elimination_equals_a_dense_solution(world, dim):
 
 @pytest.mark.parametrize("path", ["fused", "parallel", "launched"])
 def test_a_long_step_is_followed_by_another(world, path):
-    # |r + u| = l + |u|^2 / (2 l) for a link that moves by u across itself: one step of Newton's method leaves that, a second one
-    # its square. Of four chains, the two that go round fast take it, with the directions at the start of the substep; not the
-    # last, which is above a tension of 0.35, (omega h)^2 = 4 |move| / l: what is left there takes out energy. A tree that hardly
-    # moves has the bits that it has alone.
+    # |r + u| = l + |u|^2 / (2 l) for a link that moves by u across itself: one Newton step leaves the second term, a second
+    # step its square. Of four chains, the two that turn fast take a second step, with the directions at the start of the
+    # substep. The last does not: it exceeds the tension of 0.35, (omega h)^2 = 4 |move| / l, and what is left there removes
+    # energy. A tree that hardly moves has the same bits as in a world of its own.
     rng, h = np.random.default_rng(3), 1e-3
     chains = [some_tree(rng, 8), links(6), links(9), links(4)]
     begin = np.cumsum([0] + [c.max() + 1 for c in chains])
@@ -116,8 +119,8 @@ def test_a_long_step_is_followed_by_another(world, path):
 
 
 def test_a_rope_that_whips_keeps_its_energy(world):
-    # Free of drag it cracks for good, in f32, and has 185 J in motion at most. Its energy may swing by the error of Verlet, some
-    # 2 J, but not rise: one step of Newton's method alone had it pump, by 20 to 70 J in two minutes at 12 substeps, 4 at 20.
+    # Free of drag, in f32, the rope keeps cracking, with 185 J of motion at most. Its energy may swing by the error of Verlet,
+    # about 2 J, but not rise: with one Newton step only, it rises by 20 to 70 J in two minutes at 12 substeps, by 4 J at 20.
     # Where substeps resolve the cracks, it stays.
     n = 20
     x = 0.1 * np.arange(n)[:, None] * [np.cos(0.1), np.sin(0.1)]
@@ -130,7 +133,7 @@ def test_a_rope_that_whips_keeps_its_energy(world):
 
 
 def test_many_passes_agree_with_relaxation(world):
-    # From rigid to soft, with dashpots, unequal masses, loops and free ends: the limit of many Jacobi passes is one of a few.
+    # From rigid to soft, with dashpots, unequal masses, loops, free ends: a few passes reach the limit of many Jacobi passes.
     rng = np.random.default_rng(1)
     n, pairs = 12, np.vstack([links(9), [[3, 10], [10, 11], [11, 0]]])
     x = np.stack([np.arange(n) * 0.3, rng.normal(size=n) * 0.2], axis=1)
@@ -154,8 +157,8 @@ def test_many_passes_agree_with_relaxation(world):
 
 
 def test_ropes_and_spacers_act_where_they_must(world):
-    # The right set of active ropes is the one whose multipliers all pull and whose slack ones are all short enough: found here by
-    # trying all 2^k. One Newton step from a random start, in chains of ropes and rods; one of the chains at a time.
+    # The right set of active ropes is the one whose multipliers all pull and whose slack ropes are all short enough; all 2^k
+    # sets are tried. One Newton step from a random start, in chains of ropes and rods; chains are checked one by one.
     rng = np.random.default_rng(5)
     count, n = 6, 9
     x = np.stack([np.tile(np.arange(float(n)), count), 0.3 * rng.normal(size=count * n)], axis=1)
@@ -191,8 +194,8 @@ def test_ropes_and_spacers_act_where_they_must(world):
 
 
 def test_what_is_not_a_chain_goes_on_as_before(world):
-    # A ladder is wider than 1, and a Pin with a spring is not one number: both are relaxed. Where the pin and a chain share
-    # a particle, the limit of many passes is that of Jacobi alone.
+    # A ladder is wider than 1, and a Pin with a spring is not one number: both are relaxed. Where the pin and a chain share a
+    # particle, many passes must reach the limit of Jacobi alone.
     x = np.vstack(
         [np.stack([0.1 * np.arange(5), np.zeros(5)], axis=1), [[0.1 * i, -1 - 0.1 * j] for i in range(4) for j in (0, 1)]]
     )
@@ -266,9 +269,9 @@ def test_direct_checks_its_arguments():
 
 @pytest.mark.filterwarnings("ignore:Contact. all radii are 0")
 def test_the_default_suits_the_structure(world):
-    # Links like chains, trees, loops and beams are solved directly; stiff cloth by conjugate gradients, whatever is beside it.
-    # Soft cloth, braced bodies, narrow nets, angles that elimination is not for, single links, chains that start violated, and
-    # beams that are held in two places are relaxed. explain() says what was chosen; a solver that the user names is taken.
+    # Links like chains, trees, loops and beams are solved directly; stiff cloth by conjugate gradients, whatever else there is.
+    # Relaxed are soft cloth, braced bodies, narrow nets, angles unfit for elimination, single links, chains that start
+    # violated, and beams that are held in two places. explain() says what was chosen. A solver that the user names is used.
     flat = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1], [2, 1]])
     x, chain = flat[[0, 1, 2, 4]], links(3)
     braced = np.array([(i, j) for i in range(4) for j in range(i)])
@@ -336,8 +339,8 @@ def test_a_ring_that_bends_keeps_its_energy(world):
 
 
 def test_what_is_beside_a_cloth_leaves_its_solver_alone(world):
-    # A cloth is stretched as much as alone, whatever else there is, for solvers are chosen by what they would leave to Jacobi,
-    # which stretches it four times as much.
+    # Other features must not change how far a cloth stretches: the solver is chosen by the constraints that it would leave to
+    # Jacobi, which stretches the cloth four times as much.
     sheet = tv.shapes.cloth((0, 0, 0), (1, 0, 0), (0, 0, 1), (13, 13))
     arm, n = np.array([[5.0, 0, 0], [5.3, 0, 0], [5.6, 0, 0]]), len(sheet.position)
     length, stretch = np.linalg.norm(np.diff(sheet.position[sheet.links], axis=1)[:, 0], axis=1), []
@@ -354,11 +357,11 @@ def test_what_is_beside_a_cloth_leaves_its_solver_alone(world):
 
 
 def test_ropes_that_touch_are_solved_and_come_to_rest(world):
-    # Elimination and contacts take turns in f32: ropes fall into a box, keep their length, and lie still. Before they touch the
-    # walls, what they do to each other leaves their momentum: m g t per particle. Thrown a little harder they pile up another
-    # way; about one pile in four goes on trembling, with some 1e-4 m g r. A blow at v moves an end of a link
-    # by v h at most before the link is solved again. All fall less than 0.7 m; half of the throws stretch links by less than 5 %
-    # (in f32 and f64 seven of eight do).
+    # Elimination and contacts take turns in f32: ropes fall into a box, keep their length, and come to rest. Before they touch
+    # the walls, they conserve momentum: m g t per particle. If thrown a little harder, they pile up differently; about one pile
+    # in four keeps trembling, with some 1e-4 m g r. An impact at v moves an end of a link by v h at most before the link is
+    # solved again. All fall less than 0.7 m; half of the throws stretch links by less than 5 % (seven of eight do in f32 and
+    # f64).
     x = np.vstack([tv.shapes.rope((-0.3, 0.3 + 0.06 * k), (0.3, 0.33 + 0.06 * k), points=20).position for k in range(6)])
     pairs = np.vstack([links(19, 20 * k) for k in range(6)])
     speed = np.zeros_like(x)
@@ -386,10 +389,10 @@ def test_ropes_that_touch_are_solved_and_come_to_rest(world):
 
 @pytest.mark.parametrize(("link", "precision"), [(tv.Distance, "f32"), (tv.Rope, "f32"), (tv.Rope, "f64")])
 def test_straight_ropes_between_pins_stay_where_they_are(world, link, precision):
-    # Rows 71 and 72. No tension along a straight rope bears its weight, and any number is a solution to first order. Energy may
-    # not exceed what there was by more than 1e-3 of m g L, and no speed that of a free fall through L. The sag that is left is
-    # that of the tension that a substep can stand, (omega h)^2 = 4 w T h^2 / l <= 1: N^2 g h^2 / 2, and twice as much in passing.
-    # One of the ropes leans, and one is a tenth too short for its pins.
+    # Rows 71 and 72. No tension along a straight rope bears its weight, and to first order any number is a solution. Energy may
+    # not exceed its start by more than 1e-3 of m g L, and no speed that of a free fall through L. The remaining sag is that of
+    # the tension that a substep can stand, (omega h)^2 = 4 w T h^2 / l <= 1: N^2 g h^2 / 2, and twice as much in passing. One
+    # of the ropes is inclined, and one is a tenth too short for its pins.
     counts, ends = (3, 5, 40, 40, 20), [(1.0, 0.0)] * 3 + [(0.7, 0.7), (1.0, 0.0)]
     x = np.vstack([np.linspace((0, y), np.add((0, y), end), n) for y, (n, end) in enumerate(zip(counts, ends, strict=True))])
     first = np.cumsum([0, *counts])
@@ -417,7 +420,8 @@ def test_straight_ropes_between_pins_stay_where_they_are(world, link, precision)
 
 
 def test_a_plan_of_many_parts_solves_each():
-    # Gram matrices of unit gradients, coupled where corners share a particle: followed address by address, and by LAPACK.
+    # Gram matrices of unit gradients, coupled where corners share a particle: solved by the plan, address by address, and by
+    # LAPACK.
     rng = np.random.default_rng(0)
     graphs = [loop(5), some_tree(rng, 8), loop(5), net(), loop(5), some_tree(rng, 30)[:, ::-1]]
     begin = np.cumsum([0] + [g.max() + 1 for g in graphs])

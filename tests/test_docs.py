@@ -1,4 +1,4 @@
-"""The pages that people read: their code runs, their links lead somewhere, and the first of them is short. And docstrings."""
+"""The documentation pages: their code runs, their links resolve, the first page is short, and public names have docstrings."""
 
 import ast
 import importlib.util
@@ -19,13 +19,13 @@ PAGES = [p.relative_to(ROOT) for p in (ROOT / "README.md", *ROOT.glob("demos/*.m
 
 
 def blocks(page: pathlib.Path) -> list[str]:
-    """The Python code of a page, piece by piece."""
+    """Return the Python blocks of a page."""
     return re.findall(r"^```python\n(.*?)^```$", (ROOT / page).read_text(), re.S | re.M)
 
 
 @pytest.mark.parametrize("page", [p for p in PAGES if blocks(p)], ids=str)
 def test_code_runs(page, tmp_path, monkeypatch, capsys, briefly):
-    # In the order in which it is read, each page in a file of its own, since Taichi reads the source of functions.
+    # In reading order, each page in a file of its own, since Taichi reads the source of functions.
     script = tmp_path / "page.py"
     script.write_text("\n\n".join(blocks(page)).replace("import taichi as ti", f"import {COMPILER} as ti"))
     monkeypatch.chdir(tmp_path)
@@ -37,8 +37,8 @@ def test_code_runs(page, tmp_path, monkeypatch, capsys, briefly):
         if hasattr(value, "close") and hasattr(value, "step"):
             value.close()
     if page.parts == ("README.md",):
-        # It begins with demos/hello.py, which prints what its page says. The report's figures may differ between processors; what
-        # the scene is made of may not, but for the number of threads.
+        # The page begins with demos/hello.py, which prints what its page shows. The figures of the report may differ between
+        # processors; what the scene is made of may not, apart from the number of threads.
         assert blocks(page)[0].strip() == (ROOT / "demos" / "hello.py").read_text().split('"""', 2)[2].strip()
         shown = (ROOT / "demos" / "README.md").read_text().split("```\n")
         shown = next(block for block in shown if block.startswith("StepReport("))
@@ -56,7 +56,7 @@ def test_links_lead_somewhere(page):
 
 
 def test_files_that_pages_name_are_there():
-    # `name.py` in a folder's page is a file of that folder or below it, or of the tree.
+    # `name.py` in a folder's page is a file of that folder, of a folder below it, or of the repository.
     for page in PAGES:
         for name in re.findall(r"`([\w/]+\.(?:py|json))`", (ROOT / page).read_text()):
             assert (ROOT / name).exists() or any((ROOT / page).parent.rglob(name)), f"{page}: {name}"
@@ -69,7 +69,7 @@ def test_the_first_page_is_short_and_leads_to_all_others():
 
 
 def undocumented(tree: ast.Module) -> list[str]:
-    """Names without a docstring, nested ones and what sets properties too; not what begins with _."""
+    """Return the names without a docstring, including nested ones and property setters, except names that begin with _."""
     out = []
     for node in ast.walk(tree):
         if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) or node.name.startswith("_"):
@@ -79,8 +79,8 @@ def undocumented(tree: ast.Module) -> list[str]:
 
 
 def test_every_public_name_says_what_it_is():
-    # Modules, classes, functions, methods and properties of the package, what sets these, and what is defined inside of them; and
-    # live settings, which say it when they are made.
+    # Modules, classes, functions, methods, properties and their setters, and nested definitions of the package; and knobs,
+    # whose docstring is given when they are defined.
     missing = []
     for path, tree in parsed().items():
         name = str(path.relative_to(ROOT))

@@ -1,4 +1,4 @@
-"""Particles that come and go in place: to the bit as in a world that is built anew for them, and nothing is made."""
+"""Particles added and removed in place: bit for bit as in a rebuilt world, and nothing is compiled."""
 
 import resource
 from typing import Any
@@ -22,27 +22,30 @@ RADIUS = 0.1
 
 
 def places(n: int, dim: int = 2) -> np.ndarray:
-    """A loose heap."""
+    """Return the positions of a loose heap."""
     i, side = np.arange(n), int(np.ceil(n ** (1 / dim)))
     lattice = np.stack([i // side**k % side for k in range(dim)], axis=1)
     return 0.205 * lattice + 0.15 + 0.003 * np.sin(np.arange(n * dim)).reshape(n, dim)
 
 
 def overlapping(n: int, dim: int = 2) -> np.ndarray:
-    """The same, of which two that stay overlap, as some do where a world is built anew: both have the same kernels then."""
+    """Return places(n) with one overlapping pair of particles that stay.
+
+    Rebuilt worlds have overlaps, so both worlds use the same kernels.
+    """
     x = places(n, dim)
     x[9] = x[8] + 0.15 * np.eye(dim)[0]
     return x
 
 
 def drops(k: int, turn: int, dim: int = 2, radius: Any = RADIUS, **more) -> tv.Particles:
-    """Particles that come from above, each turn further up: none overlaps another."""
+    """Return particles that enter from above, higher in each turn: none overlaps another."""
     x = np.concatenate([0.3 + 0.25 * np.arange(k)[:, None], np.full((k, dim - 1), 1.9 + 0.3 * turn)], axis=1)
     return tv.Particles(x, velocity=(0.3, -0.5, 0.1)[:dim], radius=radius, **more)
 
 
 def discs():
-    """Groups, sensors, events, spins, a wall, a hand, a spring that holds one."""
+    """A world with groups, sensors, events, spins, a wall, a hand, and a spring that holds one disc."""
     n = 40
     particles = tv.Particles(overlapping(n), radius=RADIUS, group=np.arange(n) % 3, spin=0.5, orientation=0.0)
     contact = tv.Contact(friction={(0, 1): 0.5}, groups=[(0, 1), (1, 1), (0, 0)], sensors=[(0, 2)], events=True)
@@ -55,16 +58,16 @@ def discs():
 
 
 def grains():
-    """Discs of many sizes in a box without end, in f64."""
+    """Discs of many sizes in a periodic box, in f64."""
     sizes = RADIUS * (0.3 + 0.7 * np.abs(np.sin(np.arange(60))))
-    sizes[0] = RADIUS  # which stays, and is the widest
+    sizes[0] = RADIUS  # the widest, which stays
     features = [tv.Gravity((0.5, -1.0)), tv.Periodic((0, 0), (2, 4)), tv.Contact(restitution=0.5)]
     w = tv.World(tv.Particles(places(60), radius=sizes, mass=sizes**2), features, substeps=5, precision="f64")
     return w, lambda k, turn: drops(k, turn, radius=sizes[1 : k + 1], mass=sizes[1 : k + 1] ** 2)
 
 
 def beside_a_rope():
-    """Spheres beside a rope between a pinned particle and a driven one, in two words of f32."""
+    """Spheres beside a rope between a pinned particle and a driven one, in compensated f32."""
     rope = tv.shapes.rope((0.1, 2.5, 0.2), (1.9, 2.5, 0.2), points=10)
     particles = tv.Particles(np.concatenate([rope.position, overlapping(30, 3)]), radius=0.09, pinned=[0])
     features = [tv.Gravity(), tv.Distance(rope.links), tv.Pin([9]), tv.HalfSpace((0, 1, 0), 0.0), tv.Contact()]
@@ -73,7 +76,7 @@ def beside_a_rope():
 
 
 def beside_a_net():
-    """Discs beside a net, whose system knows what hangs together by the numbers of particles."""
+    """Discs beside a net, whose system stores its connections by particle numbers."""
     net = tv.shapes.cloth((0.1, 2.5), (1.8, 0), (0, 0.4), points=(7, 3))
     particles = tv.Particles(np.concatenate([net.position, overlapping(30)]), radius=0.09, pinned=[0, 6])
     features = [tv.Gravity(), tv.Distance(net.links), tv.HalfSpace((0, 1), 0.0), tv.Contact()]
@@ -82,7 +85,7 @@ def beside_a_net():
 
 
 def crowd():
-    """So many that few which are far off have no list built, by two threads; each has more than 32 others on its list."""
+    """Enough particles that a few strays cause no rebuild of the list, on two threads; each has more than 32 neighbours."""
     particles = tv.Particles(places(1100), radius=RADIUS)
     features = [tv.Gravity(60.0), tv.Box((0, 0), (8, 12)), tv.Contact(0.3, skin=0.5)]
     w = tv.World(particles, features, substeps=3, path="parallel")
@@ -91,37 +94,37 @@ def crowd():
 
 @ti.func
 def hill(p):
-    """Waves of the ground."""
+    """Return the height above a wavy ground."""
     return p[1] + 0.1 * ti.cos(p[0])
 
 
 @ti.func
 def near(r):
-    """What ends at a distance."""
+    """Return a pair force that ends at 0.5 m."""
     return 0.02 * r * (0.25 - r.dot(r))
 
 
 @ti.func
 def numbered(r, i, j):
-    """What depends on who they are."""
+    """Return a pair force that depends on the indices of both particles."""
     return 1e-3 * (i - j) * r
 
 
 def charges():
-    """Discs that push each other, near ones and all, over a hill that is a function, without a Contact."""
+    """Discs over a hill given by a function, with a pair force between near ones and one between all, without a Contact."""
     features = [tv.Gravity(), tv.Sdf(hill, friction=0.2), tv.PairForce(near, 0.5), tv.PairForce(numbered), tv.Drag(0.5)]
     return tv.World(tv.Particles(places(40), radius=RADIUS), features, substeps=5), drops
 
 
 def asleep():
-    """Discs on the ground, all of which sleep when the first come."""
+    """Discs on the ground, all asleep when the first particles are added."""
     lying = np.stack([0.25 * np.arange(40) + 0.15, np.full(40, RADIUS)], axis=1)
     features = [tv.Gravity(), tv.HalfSpace((0, 1), 0.0), tv.Contact(), tv.Sleep(0.05, 0.05), tv.Hand((0.2, 3.0), rate=0.0)]
     return tv.World(tv.Particles(lying, radius=RADIUS), features, substeps=5), drops
 
 
 def steps_of(w) -> list:
-    """A few frames, by all that is seen of them."""
+    """Run three frames and return all that can be observed of each."""
     out = []
     for _ in range(3):
         report = w.step(1 / 60)
@@ -131,7 +134,7 @@ def steps_of(w) -> list:
 
 
 def edited(scene, anew: bool) -> tuple[list, int]:
-    """A world that is edited, and how many of the edits were in place. anew: none."""
+    """Edit a world. Returns what was observed, and how many edits were in place. anew: rebuild the world for every edit."""
     planned, taken = edit_in_place.planned, []
 
     def watched(*args):
@@ -156,7 +159,7 @@ def edited(scene, anew: bool) -> tuple[list, int]:
             seen += [sorted(w.fields), {name: size for name, size in w.fields.items() if not name.startswith("grid")}]
             if any(getattr(f, "events", False) is True for f in w.features):
                 seen += [repr(w.events()), repr(w.wall_events())]
-        with w.clone() as twin:  # which has pairs for a list, and none yet
+        with w.clone() as twin:  # it holds pairs for a list that it has not built yet
             seen.append(twin.hash())
             twin.remove([len(w.particles) - 2])
             seen += steps_of(twin)
@@ -176,8 +179,10 @@ def test_in_place_is_to_the_bit_as_built_anew(scene, briefly):
 
 
 def ropes(solver, precision="f32", only=False):
-    """Three ropes, the last of which breaks, between discs, with pins of both kinds. More: a rope, and a link of two discs.
-    only: links alone, between discs that pass through each other."""
+    """Three ropes, the last of which breaks, between discs, with pins of both kinds; edits add a rope and links of discs.
+
+    only: links alone, between discs that pass through each other.
+    """
     hung = [tv.shapes.rope((0.1 + 0.6 * k, 2.4), (0.5 + 0.6 * k, 2.4), points=5) for k in range(3)]
     position = np.concatenate([overlapping(20), *(rope.position for rope in hung)])
     pairs = np.concatenate([rope.links + 20 + 5 * k for k, rope in enumerate(hung)])
@@ -189,7 +194,7 @@ def ropes(solver, precision="f32", only=False):
     w = tv.World(particles, features, substeps=5, solver=solver, precision=precision)
 
     def rope(k: int):
-        """One more, k points long."""
+        """Add a rope of k points."""
         new = tv.shapes.rope((0.2, 3.0), (1.4, 3.0), points=k)
         first = len(w.particles)
         both = {link: tv.Distance(new.links + first), bend: tv.Bend([[first, first + 1, first + 2]], compliance=1e-2)}
@@ -203,7 +208,7 @@ def ropes(solver, precision="f32", only=False):
 
 
 def bodies(*extra, solver=None):
-    """Soft balls with links and areas, and clusters, under extra features. More: of all of them."""
+    """Soft balls with links and areas, and rigid clusters, under extra features; edits add and remove some of each."""
     ring = 0.3 * np.stack([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) * np.pi / 4)], axis=1)
     square = np.array([[0.0, 0.0], [0.2, 0.0], [0.2, 0.2], [0.0, 0.2]])
     around = np.stack([np.arange(8), (np.arange(8) + 1) % 8], axis=1)
@@ -214,7 +219,7 @@ def bodies(*extra, solver=None):
     w = tv.World(tv.Particles(position, radius=0.08), features, substeps=5, solver=solver)
 
     def add(k: int):
-        """A ball and a square."""
+        """Add a ball and a square."""
         n = len(w.particles)
         more = {
             links: tv.Distance(around + n, compliance=1e-4), area: tv.Area([np.arange(n, n + 8)]),
@@ -226,7 +231,7 @@ def bodies(*extra, solver=None):
 
 
 def outlines():
-    """Squares and triangles between discs, with friction, restitution, and links of a soft one. More: bodies, and discs."""
+    """Two squares and a soft pentagon between discs, with friction and restitution; edits add and remove bodies and a disc."""
     angle = np.arange(5) * 2 * np.pi / 5
     square, five = np.array([[0.0, 0.0], [0.3, 0.0], [0.3, 0.3], [0.0, 0.3]]), 0.2 * np.stack([np.cos(angle), np.sin(angle)], 1)
     position = np.concatenate([square + (0.1, 0.05), square + (0.15, 0.4), five + (0.9, 0.3), [[1.4, 0.1], [1.7, 0.1]]])
@@ -238,7 +243,7 @@ def outlines():
     w, came = tv.World(tv.Particles(position, radius=[0.01] * 13 + [0.1] * 2), features, substeps=5), []
 
     def add(k: int):
-        """A square and a soft pentagon, the latter larger."""
+        """Add a square and a larger soft pentagon."""
         n = len(w.particles)
         more = np.concatenate([square + (0.5, 0.9 + k), 1.1 * five + (1.2, 0.9 + k)])
         new = [np.arange(n, n + 4), np.arange(n + 4, n + 9)]
@@ -247,7 +252,7 @@ def outlines():
         came.append(w.add(tv.Particles(more, radius=0.01), extend=both))
 
     def disc():
-        """A disc, where a square was at the start."""
+        """Add a disc high above the place of a square at the start."""
         w.add(tv.Particles([[0.25, 0.25 + 3.0]], radius=0.1))
 
     return w, [
@@ -257,7 +262,7 @@ def outlines():
 
 
 def grown(scene, anew: bool) -> list:
-    """What is seen of a world whose constraints come and go. anew: it is built for them, else they do in place."""
+    """Return what is observed of a world whose constraints are edited. anew: rebuild the world for each edit, not in place."""
     planned = edit_in_place.planned
     edit_in_place.planned = (lambda *_: None) if anew else planned
     try:
@@ -269,14 +274,14 @@ def grown(scene, anew: bool) -> list:
             assert anew or w._runner is runner
             seen += [w.hash(), w.position.tobytes(), w.velocity.tobytes(), w.contacts.pairs.tobytes()]
             batches = [f for f in w.features if isinstance(f, Batch)]
-            seen += [f.residual.tobytes() for f in batches]  # of the substep before
+            seen += [f.residual.tobytes() for f in batches]  # of the substep before the edit
             seen += [w.step(1 / 60).flags, *((f.broken.tobytes(), f.residual.tobytes()) for f in batches), *steps_of(w)]
             seen += [{name: size for name, size in w.fields.items() if not name.startswith("grid")}]
         seen.append(w.explain().split("Compiled")[0].split("launch")[0])
         with w.clone() as twin:
             for f, other in zip(w.features, twin.features, strict=True):
                 if isinstance(f, Batch):
-                    np.testing.assert_array_equal(f.residual, other.residual)  # of the last substep, which it did not make
+                    np.testing.assert_array_equal(f.residual, other.residual)  # of the last substep, which the clone did not run
             seen += [twin.hash(), *steps_of(twin)]
         w.close()
     finally:
@@ -305,10 +310,10 @@ def test_what_cannot_stay_is_built_anew():
     w.run(0.05)
     w.remove([15])
     assert w._runner is runner and link.count == 12
-    w.remove([21])  # of the first rope, which has its second point there
+    w.remove([21])  # an inner point of the first rope
     assert w._runner is runner and link.count == 10
     with w.clone() as twin:
-        w._runner.renew()  # kernels that are made later know of the links that there are
+        w._runner.renew()  # kernels compiled from here on are made for the remaining links
         assert w.step(1 / 60) == twin.step(1 / 60) and w.hash() == twin.hash()
     w.remove(np.arange(19, 33))  # all links
     assert w._runner is not runner and link.count == 0
@@ -335,13 +340,13 @@ def test_an_edit_makes_and_compiles_nothing():
 def test_memory_that_stays_for_what_went_is_shown_and_given_back():
     w, more = discs()
     w.step(1 / 60)
-    w.add(more(20, 0))  # a world that has not lost anything has no spare room
+    w.add(more(20, 0))  # a world that has lost nothing has no spare room
     most, said = sum(w.fields.values()), w.explain()
     assert "stay for what went" not in said
     w.remove(np.arange(40, 60))
     less = sum(w.fields.values())
     assert f"; {most - less} bytes more stay for what went" in w.explain() and 0 < most - less < less
-    w.remove(np.arange(5, 28))  # fewer than half of what there was
+    w.remove(np.arange(5, 28))  # fewer than half remain
     spare = sum(memory.spare for memory in w._runner.memories)
     assert spare <= sum(w.fields.values()) < less
     w.step(1 / 60)
@@ -349,8 +354,8 @@ def test_memory_that_stays_for_what_went_is_shown_and_given_back():
 
 
 def test_a_pin_takes_a_disc_in_place():
-    # As the Pin that would be made for it, to the bit; among others that are held, whose pairs the list leaves out. In f64, see
-    # test_pins.py.
+    # Bit for bit as a Pin made for that particle, among other held particles, whose pairs the list leaves out. test_pins.py has
+    # the same in f64.
     def scene():
         pin = tv.Pin([10], (0.5, 0.9))
         particles = tv.Particles(places(30), radius=RADIUS, pinned=[0, 1], spin=2.0)
@@ -382,7 +387,7 @@ def test_a_pin_takes_a_disc_in_place():
 
 
 def test_springs_of_a_pin_take_others_in_place(monkeypatch, tmp_path):
-    # As in a world that is built anew for it, to the bit; beside links, whose slots stand among theirs, and with knobs of both.
+    # Bit for bit as in a world that is rebuilt for it; with links, whose slots stand among those of the pin, and knobs of both.
     def scene():
         pin = tv.Pin([10, 3], (0.5, 0.9), compliance=1e-3, damping=0.5)
         link = tv.Distance([[20, 21], [21, 22], [5, 6]], compliance=1e-5)
@@ -409,7 +414,7 @@ def test_springs_of_a_pin_take_others_in_place(monkeypatch, tmp_path):
     with w.clone() as copy:
         assert copy.hash() == w.hash()
     assert tv.replay(tmp_path / "held.rrd").verify()
-    pin.indices = [0, 12]  # which is pinned
+    pin.indices = [0, 12]  # particle 0 is pinned
     with pytest.raises(ValueError, match="holds particle 0, which is pinned"):
         w.step(1 / 60)
     w.close()
@@ -417,7 +422,7 @@ def test_springs_of_a_pin_take_others_in_place(monkeypatch, tmp_path):
 
 
 def test_worlds_one_after_the_other_take_no_more_memory():
-    # Taichi has 512 trees of fields at most, and fields that do not grow: worlds share trees, and give their bytes back.
+    # Taichi allows 512 trees of fields at most, and fields cannot grow: worlds share trees and give their memory back.
     def peak() -> int:
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
@@ -434,12 +439,12 @@ def test_worlds_one_after_the_other_take_no_more_memory():
     trees, before = runtime.trees, peak()
     for k in range(200):
         live(k)
-    assert runtime.trees == trees and peak() - before < 4 << 10  # KiB; a world of its own would take 100
+    assert runtime.trees == trees and peak() - before < 4 << 10  # KiB; a world with its own tree would take 100
 
 
 def test_residuals_stay_those_of_the_last_substep_until_the_next_one():
-    # What other forces make of the state tells nothing of how that substep went: displacements are velocities then, 600 times
-    # what they were, and clusters have summed up their springs alone.
+    # Converting the state for other forces must not change residuals. In that state displacements are velocities, 600 times as
+    # large, and clusters have summed up their springs only.
     square = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
     clusters = tv.ShapeMatch([[0, 1, 2, 3]], compliance=1e-3), tv.ShapeMatch([[1, 2, 4, 5]])
     bodies = tv.Area([[0, 1, 2, 3]], compliance=1e-3), *clusters
@@ -461,7 +466,7 @@ def test_residuals_stay_those_of_the_last_substep_until_the_next_one():
 
 
 def test_constraints_come_and_go_in_place_where_rest_values_were_assigned():
-    # Of the second link, which goes where it was assigned to; the kernels know of that from then on. Built anew, they do not.
+    # The rest length of the second link is assigned. Kernels edited in place then have code for that, and rebuilt ones do not.
     def of(anew: bool) -> list:
         planned = edit_in_place.planned
         edit_in_place.planned = (lambda *_: None) if anew else planned

@@ -1,4 +1,4 @@
-"""A scene that nothing works on and that has more energy than it had says so; others do not.
+"""A passive scene that gains energy is flagged; other scenes are not.
 
 E(t) <= E(0) + O(h^2) where forces have a potential, constraints stand still, and walls and pins do not move
 """
@@ -14,19 +14,19 @@ FLAG = "energy-gain"
 
 @ti.func
 def push(r):
-    """Two particles push each other apart, whatever their distance."""
+    """A force of 3 N that pushes two particles apart at any distance."""
     return 3.0 * r.normalized()
 
 
 @ti.func
 def of_push(r):
-    """Its potential, -F |r| for |r| = 0 ... 10."""
+    """Return the potential of push(), -F |r|, which is 0 at |r| = 10."""
     return 3.0 * (10.0 - r.norm())
 
 
 @ti.func
 def forgotten(r):
-    """A potential that does not belong to it."""
+    """Return a potential that does not belong to push()."""
     return 0.0 * r[0]
 
 
@@ -41,24 +41,25 @@ STIFF = 1800.0  # [N/m]
 
 @ti.func
 def spring(r):
-    """Of a metre."""
+    """The force of a spring of 1 m."""
     return -1800.0 * (r.norm() - 1.0) * r.normalized()
 
 
 @ti.func
 def of_spring(r):
-    """Its potential."""
+    """Return the potential of spring()."""
     return 900.0 * (r.norm() - 1.0) ** 2
 
 
 def pair(*features, **settings):
-    """Two particles, one metre from each other."""
+    """Return two particles at a distance of 1 m, and features."""
     return tv.Particles([[0.0, 0.0], [1.0, 0.0]], radius=0.1, **settings), list(features)
 
 
 def test_what_no_figure_tells_is_told_by_energy(world):
-    # A rope of six links, level, that falls and cracks: two substeps do not resolve its cracks, and each constraint is met, so
-    # nothing else tells of it. It gains a fifth of what it falls by, and is told from a tenth on. With twenty it gains nothing.
+    # A level rope of six links falls and cracks. Two substeps do not resolve the cracks, and every constraint is satisfied, so
+    # no other figure reveals the error. The rope gains a fifth of the energy of its fall; gains are flagged from a tenth on.
+    # With twenty substeps it gains nothing.
     n = 6
     x = np.stack([0.1 * np.arange(n + 1), np.zeros(n + 1)], axis=1)
     links = np.stack([np.arange(n), np.arange(1, n + 1)], axis=1)
@@ -78,8 +79,9 @@ def test_what_no_figure_tells_is_told_by_energy(world):
 
 
 def test_what_a_first_frame_brings_in_is_told(world):
-    # Two that are one by a link of length 0 fly apart by more than half a periodic box in one substep, and are drawn together in
-    # the next image. They are met there, and nothing else tells. With as many substeps as keep them near, sum p^2 / 2M is left.
+    # Two particles joined by a link of length 0 fly apart by more than half a periodic box in one substep, and are drawn
+    # together in the next image. The link is satisfied there, so no other figure reveals the error. With enough substeps to
+    # keep them near, sum p^2 / 2M remains.
     for substeps, wrong in ((1, True), (50, False)):
         start = tv.Particles([[0.1, 0.1], [0.1, 0.1]], velocity=[[12.6, -13.2], [64.0, 10.5]])
         w = world(start, [tv.Distance([[0, 1]], rest=0.0), tv.Periodic((0, 0), (1.2, 1.2))], substeps=substeps)
@@ -90,7 +92,7 @@ def test_what_a_first_frame_brings_in_is_told(world):
 
 @pytest.mark.parametrize("place", ["alone", "one of many"])
 def test_a_potential_that_is_wrong_is_found(world, place):
-    # E = K - F (|r| - 1) stays; of a potential that is 0, E = K = F (|r| - 1) comes from nowhere, at once.
+    # E = K - F (|r| - 1) is conserved. With a potential of 0, E = K = F (|r| - 1) grows from the first frame on.
     for potential, wrong in ((of_push, False), (forgotten, True), (None, False)):
         w = world(*pair(tv.PairForce(push, potential=potential)))
         if place == "alone":
@@ -101,14 +103,16 @@ def test_a_potential_that_is_wrong_is_found(world, place):
             with tv.Worlds(w, 3) as many:
                 flags = many.step(1 / 60).flags
                 assert flags[FLAG].all() if wrong else not flags
-                many.velocity = np.array([[[0.0, 0], [v, 0]] for v in (0.0, 0.0, 100.0)])  # a new start; fast, it is hardly more
+                # New velocities are a start. For the fast copy the gain is small next to its energy.
+                many.velocity = np.array([[[0.0, 0], [v, 0]] for v in (0.0, 0.0, 100.0)])
                 assert many.step(1 / 60).flags.keys() == set()
                 flags = many.run(0.2).flags
                 assert flags[FLAG].tolist() == [True, True, False] if wrong else not flags
 
 
 def test_what_works_is_no_fault(world):
-    # A particle is lifted, thrown, turned or blown; gravity is turned up; a wall and a pin move; some come with a velocity.
+    # Work is done on particles by lifting, throwing, turning or wind, by stronger gravity, a moving wall or pin, or particles
+    # added with a velocity. None of it is flagged.
     gravity, pin = tv.Gravity(9.81), tv.Pin([0])
     wall = tv.Capsule((-5.0, -1.0), (5.0, -1.0), 0.2)
     lift = tv.Polygon([[-2, -0.4], [2, -0.4], [2, -0.2], [-2, -0.2]])
@@ -142,7 +146,7 @@ def test_what_works_is_no_fault(world):
 
 @pytest.mark.parametrize("place", ["alone", "one of many"])
 def test_what_works_from_the_first_frame_on_is_no_fault(world, place):
-    # A wall that lifts, and one that turns, before anything was stepped.
+    # A wall is lifted, or turned, before the first step.
     for knob, value in (("position", (0.0, 0.3)), ("rotation", 0.3)):
         lift = tv.Polygon([[-2, -0.4], [2, -0.4], [2, -0.1], [-2, -0.1]])
         w = world(*pair(tv.Gravity(9.81), lift), substeps=8)
@@ -159,8 +163,8 @@ def test_what_works_from_the_first_frame_on_is_no_fault(world, place):
 
 
 def test_what_overlaps_parts_without_a_word(world):
-    # Placed into each other, or into a wall, they are pushed out: that is energy, which the overlap had; also where velocities
-    # are assigned, or something goes, on the way, and where a wall comes back.
+    # Particles placed inside each other or inside a wall are pushed out. That energy was in the overlap, and is not flagged,
+    # even if velocities are assigned or a particle is removed meanwhile, or a wall is switched on again.
     rng = np.random.default_rng(1)
     x = rng.uniform(0, 1, (40, 2))
     wall = tv.HalfSpace((0, 1), active=False)
@@ -176,7 +180,7 @@ def test_what_overlaps_parts_without_a_word(world):
 
 
 def test_what_forces_err_by_is_no_gain(world):
-    # A spring of omega h = 1.5, as a force: Verlet keeps E + O((omega h)^2) of it, up to (omega h)^2 / 8 more.
+    # A spring force of omega h = 1.5: Verlet conserves E + O((omega h)^2) of it, which may add up to (omega h)^2 / 8.
     w = world(*pair(tv.PairForce(spring, potential=of_spring), velocity=[[-1.5, 0.0], [1.5, 0.0]]), substeps=1)
     h = 1.5 / np.sqrt(2 * STIFF)
     energies = [(report := w.step(h)).energy for _ in range(300)]
@@ -185,7 +189,7 @@ def test_what_forces_err_by_is_no_gain(world):
 
 
 def test_less_of_a_force_is_less_to_lose(world):
-    # Gravity is turned down: what energy was by the old one is no bound for the new.
+    # Gravity is reduced: the energy under the old value is no bound under the new one.
     for turned in (False, True):
         gravity = tv.Gravity(2.0 if turned else 1.0)
         w = world(*pair(gravity, tv.PairForce(push, potential=forgotten)))

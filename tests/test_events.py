@@ -1,4 +1,4 @@
-"""Contact events: against closed forms, what NumPy finds from positions, and momentum."""
+"""Contact events: against closed forms, against NumPy's results from positions, and against momentum."""
 
 import numpy as np
 import pytest
@@ -10,25 +10,25 @@ COLUMNS = ("pairs", "point", "normal", "impulse", "speed", "began", "ended")
 
 
 def equal(one, two):
-    """Whether events are the same, to the bit."""
+    """Assert that two sets of events are equal bit for bit; return their number."""
     for name in COLUMNS:
         np.testing.assert_array_equal(getattr(one.touches, name), getattr(two.touches, name))
     return len(one)
 
 
 def rows(pairs):
-    """As a set."""
+    """Return pairs as a set."""
     return {tuple(map(int, pair)) for pair in pairs}
 
 
 def flat(world, start, g=9.81, wide=99.0, more=(), **settings):
-    """In the plane, in a box that tells of what touches it: one structure."""
+    """Build a 2D world in a box that records events; all such worlds share one structure."""
     features = [tv.Gravity(g), tv.Contact(events=True), tv.Box([-wide] * 2, [wide] * 2, events=True), *more]
     return world(start, features, precision="f64", **settings)
 
 
 def bouncing(world, start, e=1.0, g=0.0, floor=0.0, **settings):
-    """In space, above a floor."""
+    """Build a 3D world above a floor."""
     walls = [tv.HalfSpace((0, 1, 0), floor, restitution=1.0, events=True)]
     w = world(start, [tv.Gravity(g), tv.Contact(restitution=1.0, events=True), *walls], precision="f64", **settings)
     w.features[1].restitution = w.features[2].restitution = e
@@ -36,17 +36,17 @@ def bouncing(world, start, e=1.0, g=0.0, floor=0.0, **settings):
 
 
 def balls(x, v=0.0, m=1.0):
-    """The first of them cannot move."""
+    """Return balls, the first of which cannot move."""
     return tv.Particles(
         x, velocity=v, radius=np.r_[0.05 + 1e-12, np.full(len(x) - 1, 0.05)], mass=np.r_[np.inf, np.full(len(x) - 1, m)]
     )
 
 
 def test_a_bouncing_ball(world):
-    # Dropped from H onto a static ball, and onto a floor: after k bounces v_k = e^k sqrt(2 g H), at t_k = t_0 (1 + 2 (e + ... +
-    # e^k)). A bounce is over in less than two substeps, so each begins and ends in the same frame. What comes together in a
-    # substep is the velocity at its middle, off by g h / 2 at most; with what it leaves is taken from the one before, which adds
-    # up to e g h in each bounce.
+    # Dropped from H onto a static ball, and onto a floor: after k bounces v_k = e^k sqrt(2 g H), at
+    # t_k = t_0 (1 + 2 (e + ... + e^k)). A bounce takes less than two substeps, so each begins and ends in the same frame. The
+    # speed of approach is taken at the middle of a substep, off by g h / 2 at most. The speed of departure follows from the
+    # previous bounce, which adds up to e g h per bounce.
     H, e, g, m, r, frame, substeps = 0.5, 0.8, 9.81, 2.0, 0.05, 1 / 60, 20
     h = frame / substeps
     w = bouncing(world, balls([[0.0, 0, 0], [0, 2 * r + H, 0], [1, r + H, 0]], m=m), e, g, substeps=substeps)
@@ -68,7 +68,7 @@ def test_a_bouncing_ball(world):
 
 
 def test_a_cradle(world):
-    # Equal elastic balls in a row that touch already: what the first one brings goes from one to the next, m v at v each time.
+    # Equal elastic balls in a row that touch from the start: the impulse of the first passes from ball to ball, m v at v each.
     m, v, x = 1.5, 2.0, [[0.0, 9, 0], [-0.3, 3, 0], *([0.1 * k, 3, 0] for k in range(4))]
     moving = np.zeros((6, 3))
     moving[1, 0] = v
@@ -85,7 +85,7 @@ def test_a_cradle(world):
 
 
 def cloud(dim, n, seed):
-    """Discs or spheres of different sizes and masses that fall onto static ones."""
+    """Return discs or spheres of different sizes and masses that fall onto static ones."""
     rng = np.random.default_rng(seed)
     m = int(np.ceil(n ** (1 / dim)))
     x = np.stack(np.meshgrid(*[np.arange(m)] * dim, indexing="ij"), axis=-1).reshape(-1, dim)[:n] * 0.21
@@ -95,8 +95,11 @@ def cloud(dim, n, seed):
 
 
 def brute(x, old, v, gravity, h, particles, before):
-    """Where free flight leads, who touches there, along which normals, at which speeds; whether it is clear who just met: others
-    had parted to the last digit. before: who touched in the last substep."""
+    """Return where free flight leads in a substep, which pairs touch there, their normals and speeds, and which are certain.
+
+    Whether a pair has just met is uncertain where it had separated only by the last digit. before: pairs that touched in the last
+    substep.
+    """
     free = np.isfinite(particles.mass)[:, None]
     ahead = np.where(free, x + v * h + gravity * h**2 / 2 if old is None else 2 * x - old + gravity * h**2, x)
     i, j = np.triu_indices(len(x), 1)
@@ -104,7 +107,7 @@ def brute(x, old, v, gravity, h, particles, before):
     some = (np.linalg.norm(ahead[i] - ahead[j], axis=1) < R) & (free[i] | free[j])[:, 0]
     i, j, R = i[some], j[some], R[some]
     r, d = x[i] - x[j], (ahead - x)[i] - (ahead - x)[j]
-    # |r + s d| = R, for what was apart: the time of impact, and the normal then. What touched has that of the start.
+    # |r + s d| = R gives the time of impact of a pair that was apart, and its normal then. Touching pairs have that of the start.
     a, b, c = (d**2).sum(1), (r * d).sum(1), (r**2).sum(1) - R**2
     with np.errstate(all="ignore"):
         s = np.where(c > 0, (-b - np.sqrt(b**2 - a * c)) / a, 0.0)
@@ -116,9 +119,9 @@ def brute(x, old, v, gravity, h, particles, before):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_what_brute_force_finds(world, dim):
-    # With one substep in a frame: x_(n+1) = 2 x_n - x_(n-1) + g h^2 (Verlet) says where free flight leads; the pairs that overlap
-    # there touch. What they get along their normals is all that particles are off it: m (x_(n+1) - ahead) / h = sum J n. Then the
-    # same in frames of 6 substeps, before velocities are first projected (after 32). Impulses are sums, speeds the highest.
+    # With one substep per frame, x_(n+1) = 2 x_n - x_(n-1) + g h^2 (Verlet) gives free flight; the pairs that overlap there
+    # touch. Their impulses along the normals are the whole deviation of particles from it: m (x_(n+1) - ahead) / h = sum J n.
+    # Then the same in frames of 6 substeps, before velocities are first projected (after 32). Impulses are sums, speeds maxima.
     particles, h, gravity = cloud(dim, 60, dim), 1 / 200, np.zeros(dim)
     gravity[1] = -9.81
     build = flat if dim == 2 else lambda *given, **more: bouncing(*given, 0.0, 9.81, -99.0, **more)
@@ -176,12 +179,15 @@ def test_what_brute_force_finds(world, dim):
 
 
 def rows_in(pairs):
-    """As a list."""
+    """Return pairs as a list."""
     return [tuple(pair) for pair in pairs.tolist()]
 
 
 def stage(world, sensing=True, events=True, **settings):
-    """Discs that rub and bounce in a box, among them sensors, some held, of twice their size."""
+    """Build a world of discs with friction and restitution in a box, some of them sensors.
+
+    Sensors have twice the size, and some of them are fixed.
+    """
     x = (np.stack(np.meshgrid(*[np.arange(9)] * 2, indexing="ij"), axis=-1).reshape(-1, 2) + 0.5) / 9 * 1.9 - 0.95
     k = np.arange(len(x))
     group = np.where(k % 10 == 9, 3, 0)
@@ -191,15 +197,15 @@ def stage(world, sensing=True, events=True, **settings):
 
 
 def staged(world, start, walls, g=5.0, wide=1.0, events=False, sensors=(), groups=None, **settings):
-    """Discs that rub and bounce in a box."""
+    """Build a world of discs with friction and restitution in a box."""
     features = [tv.Gravity(g), tv.Box([-wide] * 2, [wide] * 2, restitution=0.3, events=walls)]
     features.append(tv.Contact(0.3, 0.4, events=events, sensors=sensors, groups=groups))
     return world(start, features, **({"substeps": 5, "precision": "f32-compensated"} | settings))
 
 
 def test_sensors_note_what_overlaps_and_touch_nothing(world):
-    # The same bits as with groups that do not touch, and no events; what is in sensors is what overlaps where particles are. Also
-    # without events of contacts.
+    # The same bits as with groups that do not touch and without events. Sensors report the pairs that overlap at the current
+    # positions, also without events of contacts.
     w, alone = stage(world, iterations=2), stage(world, events=False, iterations=2)
     plain = stage(world, False, False, iterations=2)
     group, radius, free = w.particles.group, w.particles.radius, ~w.particles.pinned
@@ -222,7 +228,7 @@ def test_sensors_note_what_overlaps_and_touch_nothing(world):
 
 
 def test_what_begins_and_ends_is_what_touches(world):
-    # Frame by frame; that events are the same on all paths is in test_sleep.py.
+    # Frame by frame; test_sleep.py tests that events are the same on all paths.
     w, count, touching = stage(world), 0, [set(), set()]
     for _ in range(25):
         w.step(1 / 60)
@@ -236,8 +242,8 @@ def test_what_begins_and_ends_is_what_touches(world):
 
 
 def test_a_heap_leans_on_what_is_below(world):
-    # At rest: what all that is above a place weighs goes through the contacts and walls below it. In a second a disc of mass m on
-    # one of 2 m on the floor gets m g t, and the floor 3 m g t.
+    # At rest, the weight above a place goes through the contacts and walls below it. During t, a disc of mass m transfers m g t
+    # to a disc of 2 m below it, and the floor receives 3 m g t.
     m, g = 3.0, 9.81
     x = [[0.0, -98.9], [0.0, -98.6999], [9.0, 9.0]]
     w = flat(world, tv.Particles(x, radius=[0.1, 0.1, 0.11], mass=[2 * m, m, np.inf]))
@@ -274,8 +280,8 @@ def test_recorded_cloned_edited(world, tmp_path, monkeypatch):
     assert not any(map(len, many.each(lambda world: world.events())))
     again.close()
     many.close()
-    # What is removed takes its events along, and the others have new numbers; what touched goes on touching. Built anew; for what
-    # goes in place see test_edit_in_place.py.
+    # Removed particles take their events along, and the others are renumbered. Touching pairs keep touching. The world is
+    # rebuilt here; test_edit_in_place.py tests removal in place.
     monkeypatch.setattr(edit_in_place, "planned", lambda *_: None)
     before, walls = w.events(), w.wall_events()
     gone = [0, 7, int(before.touches.pairs[1, 0])]
@@ -294,7 +300,7 @@ def test_recorded_cloned_edited(world, tmp_path, monkeypatch):
 
 
 def test_what_is_held_and_let_go(world):
-    # Of a pair only the particle that moves writes; when the other one is let go, it goes on as one contact.
+    # Only the particle of a pair that can move writes it. When the other one is released, the pair continues as one contact.
     pin = tv.Pin([0], (0.0, -98.9))
     start = tv.Particles([[0.0, -98.9], [0.0, -98.6999], [9.0, 9.0]], radius=[0.1, 0.1, 0.11], mass=[2.0, 1.0, np.inf])
     w = flat(world, start, more=[pin])
@@ -309,8 +315,9 @@ def test_what_is_held_and_let_go(world):
 
 
 def test_a_corner_presses_from_both_sides(world):
-    # The sum of impulses along normals is the change of momentum: of what leans into a corner of one wall, m a dt, and of what
-    # flies into it within a frame, -m v. With the first normal for all of it, a floor bore 153 of 177 N in the corners of a box.
+    # The sum of impulses along normals is the change of momentum: m a dt for a particle that leans into a corner of one wall,
+    # -m v for one that flies into it within a frame. If the first normal served for all of the impulse, a floor would bear 153
+    # of 177 N in the corners of a box.
     a, v, m = np.array((-6.0, -8.0)), np.array((-24.0, -21.0)), 2.0
     lean = flat(world, tv.Particles([(-8.9, -8.9)], radius=0.1, mass=m), g=a, wide=9.0)
     lean.run(0.5)
@@ -324,7 +331,7 @@ def test_a_corner_presses_from_both_sides(world):
 
 
 def test_nothing_is_lost_where_lists_grow(world):
-    # 60 sensors, all within each other, and discs that rush among them in one frame: more pairs than there is room for at first.
+    # 60 sensors, all within each other, and discs that fly through them in one frame: more pairs than there is room for at first.
     k = np.arange(60)
     x = np.concatenate([0.01 * tv.golden(k, dim=2), [[-3.0, 0.0], [3.5, 0.25]]])
     v = np.concatenate([np.zeros((60, 2)), [[120.0, 0.0], [-120.0, 0.0]]])
@@ -337,7 +344,8 @@ def test_nothing_is_lost_where_lists_grow(world):
     assert len(w.events([(1, 1)]).begun) == 60 * 59 // 2 and not len(w.events([(1, 1)]).ended)
     through = w.events([(0, 1)])
     assert rows(through.begun.pairs) == rows(through.ended.pairs) == {(i, j) for i in range(60) for j in (60, 61)}
-    # On a chord of a disc of radius 0.6, at 120 m/s; times are those of substeps, and the speed is along the normal then.
+    # A disc passes along a chord of a disc of radius 0.6 at 120 m/s. Times are those of substeps, where speeds are along the
+    # normal.
     (i, j), began, ended = through.touches.pairs.T, through.touches.began, through.touches.ended
     r, chord = x[i] - x[j] - began[:, None] * v[j], 2 * np.sqrt(0.6**2 - (x[i, 1] - x[j, 1]) ** 2)
     np.testing.assert_allclose(ended - began, chord / 120, atol=1.01 / 2000)

@@ -1,4 +1,4 @@
-"""Pairs that contacts leave out because links hold them together."""
+"""Pairs without contact, because links hold them together."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from tiverlet.contact.exclusions import FOLDED, _inside
 
 
 def nearest(links: np.ndarray, lengths: np.ndarray, radius: np.ndarray) -> set[tuple[int, int]]:
-    """Pairs whose shortest way along links is at most r_i + r_j, by Floyd and Warshall."""
+    """Return the pairs whose shortest path along links is at most r_i + r_j, by the Floyd-Warshall algorithm."""
     n = len(radius)
     way = np.full((n, n), np.inf)
     for (i, j), length in zip(links, lengths, strict=True):
@@ -35,7 +35,7 @@ def test_chains_are_found_as_by_brute_force():
 
 
 def swing(world, contact: bool, ball: float, bead: float, **settings):
-    """A ball on a level rope of 14 links of 1/7 m."""
+    """Build a world with a ball on a level rope of 14 links of 1/7 m."""
     rope = tv.shapes.rope((0, 3), (2, 3), points=15)
     radius, mass = np.full(15, bead), np.full(15, 0.2)
     radius[-1], mass[-1] = ball, 200.0
@@ -45,7 +45,7 @@ def swing(world, contact: bool, ball: float, bead: float, **settings):
 
 @pytest.mark.parametrize(("ball", "bead"), [(0.3, 0.04), (0.3, 0.15)])
 def test_a_ball_on_a_rope_swings_as_without_contacts(world, ball, bead):
-    # It covers the end of the rope, and beads of more than 1/7 m the next but one, which no contact could part.
+    # The ball covers the end of the rope, and beads of radius above 1/7 m overlap the next but one. No contact could part them.
     for substeps in (20, "auto"):
         there, without = (swing(world, contact, ball, bead, substeps=substeps) for contact in (True, False))
         for _ in range(90):
@@ -56,7 +56,7 @@ def test_a_ball_on_a_rope_swings_as_without_contacts(world, ball, bead):
 
 
 def test_other_contacts_stay(world):
-    # Beads that begin in one place have no lengths yet, and links that push get longer: these pairs meet, and part.
+    # Beads that start in one place have no lengths yet, and spacers get longer: contacts of these pairs act and part them.
     x = np.array([[0.0, 0.0], [0.02, 0.0], [0.0, 0.02]])
     links = [tv.Distance([[0, 1], [1, 2]], rest=1.0), tv.Spacer([[3, 4], [4, 5]], 0.02)]
     w = world(tv.Particles(np.concatenate([x, x + 20]), radius=0.5), [*links, tv.Contact()])
@@ -66,15 +66,16 @@ def test_other_contacts_stay(world):
 
 
 def test_what_can_give_way_holds_nothing_inside(world):
-    # The ends of two links of 1 m that are 1.5 m wide overlap for good; not of springs, nor of links that may break.
+    # Two links of 1 m join three particles of radius 1.5 m. The ends overlap for good, so they have no contact. They have one
+    # if the links are springs or may break.
     x = np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]])
     for more in ({}, {"compliance": 1e-3}, {"break_at": 5.0}):
         w = world(tv.Particles(x, radius=1.5), [tv.Distance([[0, 1], [1, 2]], **more), tv.Contact()])
-        assert ([0, 2] in w._runner.search._both.tolist()) is (not more)  # by which lists leave pairs out, see the swing
+        assert ([0, 2] in w._runner.search._both.tolist()) is (not more)  # pairs not listed; swing() shows the effect
 
 
 def test_edits_and_copies_leave_out_the_same(world):
-    # A rope is lengthened, a thick one comes and goes in place; a clone, which is built anew, goes on alike.
+    # A rope gets longer, and a thick one is added and cut in place. A clone, which is rebuilt, continues bit for bit.
     w = swing(world, True, 0.3, 0.04)
     links = w.features[1]
     w.run(0.2)
@@ -83,7 +84,7 @@ def test_edits_and_copies_leave_out_the_same(world):
     rope = tv.shapes.rope((0, 5), (1, 5), points=5)
     w.add(tv.Particles(rope.position, radius=0.3), extend={links: tv.Distance(rope.links + 15)})
     assert not w.step(1 / 60).contacts
-    w.remove([17])  # its ends are free of each other now, and part
+    w.remove([17])  # no link holds its ends together, so they part
     w.run(0.5)
     assert np.linalg.norm(w.position[17] - w.position[16]) >= 0.59
     other = w.clone()

@@ -1,4 +1,4 @@
-"""Exports: what other programs read is what was recorded."""
+"""Exports: other programs read what was recorded."""
 
 import importlib
 import json
@@ -47,7 +47,7 @@ def breeze(x):
 
 @pytest.fixture(scope="module")
 def roof(tmp_path_factory) -> S.Shape:
-    """A shape from a file, with a quad and texture coordinates, of which one particle has two."""
+    """Return a shape from a file, with a quad and texture coordinates; one particle has two of these."""
     path = tmp_path_factory.mktemp("roof") / "roof.obj"
     path.write_text(TEXT)
     return S.load(path)
@@ -55,14 +55,14 @@ def roof(tmp_path_factory) -> S.Shape:
 
 @pytest.fixture(scope="module")
 def whole(roof) -> S.Shape:
-    """The roof (0 to 4), a rope (5 to 7), and two particles by themselves, one with a radius."""
+    """Return the roof (0 to 4), a rope (5 to 7), and two single particles, one with a radius."""
     alone = S.Shape(np.array([[3.0, 0.0, 2.0], [4.0, 0.0, 2.0]]), radius=np.array([0.25, 0.0]))
     return S.join(roof, S.rope((2, 0, 0), (2, 1, 0), points=3), alone)[0]
 
 
 @pytest.fixture(scope="module")
 def recording(whole, tmp_path_factory) -> Replay:
-    """All of it falls along z, in four frames of 1/60 s."""
+    """Return a recording in which the whole shape falls along z, in four frames of 1/60 s."""
     path = tmp_path_factory.mktemp("recording") / "a.rrd"
     particles = tv.Particles(whole.position, mass=1 + np.arange(10) / 8, radius=whole.radius, velocity=(0.5, 0, 0), pinned=[5])
     features = [tv.Gravity((0, 0, -9.81)), tv.Force(breeze), tv.Distance(whole.links), tv.Dihedral(whole.quads)]
@@ -73,7 +73,7 @@ def recording(whole, tmp_path_factory) -> Replay:
 
 @pytest.fixture
 def changing(tmp_path, world) -> Replay:
-    """A third particle comes; nothing was computed."""
+    """Return a recording in which a third particle is added and no frame is computed."""
     w = world(tv.Particles([[0.0, 0.0], [1.0, 0.0]]), [tv.Distance([(0, 1)])])
     with tv.Recorder(tmp_path / "c.rrd", w) as recorder:
         w.add(tv.Particles([[2.0, 1.0]]))
@@ -87,12 +87,12 @@ def positions(recording: Replay) -> list[np.ndarray]:
 
 @pytest.fixture
 def trimesh():
-    """It takes a third of a second to import, in every worker where the file does."""
+    """Import trimesh where it is used: the import takes a third of a second in every worker that imports this file."""
     return importlib.import_module("trimesh")
 
 
 def parsed(path: pathlib.Path) -> tuple[dict, bytes]:
-    """The two chunks of a .glb file."""
+    """Return the two chunks of a .glb file."""
     data = path.read_bytes()
     magic, version, size, first, kind = struct.unpack("<4sIII4s", data[:20])
     assert (magic, version, size, kind) == (b"glTF", 2, len(data), b"JSON")
@@ -100,7 +100,7 @@ def parsed(path: pathlib.Path) -> tuple[dict, bytes]:
 
 
 def values(text: dict, blob: bytes, number: int) -> np.ndarray:
-    """What an accessor says."""
+    """Return the values of an accessor."""
     accessor = text["accessors"][number]
     view = text["bufferViews"][accessor["bufferView"]]
     kind = {5126: "<f4", 5125: "<u4", 5121: "u1"}[accessor["componentType"]]
@@ -137,7 +137,7 @@ def test_gltf_holds_every_frame(recording, tmp_path):
     corners = values(text, blob, parts[4]["indices"]).reshape(-1, 3)
     assert sorted(map(sorted, corners.tolist())) == [[0, 1, 2], [0, 2, 3], [2, 3, 4]]
 
-    # Normals are those of what was recorded, and point up, which is z; a node turns z to y.
+    # Normals belong to the recorded positions and point up, which is z; a node rotates z to y.
     last = x[-1, :5].astype(np.float64)
     normal = values(text, blob, parts[4]["attributes"]["NORMAL"]) + values(text, blob, parts[4]["targets"][3]["NORMAL"])
     across = np.cross(last[3] - last[2], last[4] - last[2])
@@ -258,7 +258,7 @@ def test_a_plane_is_at_zero_and_particles_may_come(changing, tmp_path):
 
 @pytest.mark.parametrize("kind", ["gif", "webp", "mp4"])
 def test_films_show_what_moves(kind, tmp_path, world):
-    # A disc goes to the right at 2 m/s between walls: a picture every 40 ms, of the nearest frame. Then a wall is moved.
+    # A disc moves to the right at 2 m/s between walls: a picture every 40 ms, of the nearest frame. Then a wall is moved.
     box = tv.Box((0, 0), (2, 1))
     x, w = tmp_path / f"a.{kind}", world(tv.Particles([[0.5, 0.5]], radius=0.1, velocity=(2, 0)), [box])
     with tv.Recorder(tmp_path / "a.rrd", w) as recorder:
@@ -307,7 +307,7 @@ def test_errors_say_what_can_be_done(recording, roof, whole, tmp_path, monkeypat
         recording.export(tmp_path / "a.csv", shape=whole)
     with pytest.raises(TypeError, match="shape = 'roof.obj' is a str"):
         recording.export(tmp_path / "a.obj", shape="roof.obj")  # type: ignore[arg-type]
-    monkeypatch.setenv("PATH", "")  # so that there is no other ffmpeg
+    monkeypatch.setenv("PATH", "")  # hides any other ffmpeg
     for module, kind in (("pygltflib", "glb"), ("imageio_ffmpeg", "mp4")):
         monkeypatch.setitem(sys.modules, module, None)
         with pytest.raises(ImportError, match=rf"a.{kind} needs {module}, .* pip install 'tiverlet\[export\]'"):
@@ -353,7 +353,7 @@ def test_surfaces_have_one_sense():
     some = rng.random(len(faces)) < 0.5
     faces[some] = faces[some][:, ::-1]
     a, b, c = (ball.position[k] for k in oriented(faces, ball.position, np.array([0.0, 1.0, 0.0])).T)
-    assert (np.einsum("ij,ij->i", a, np.cross(b, c)) > 0).all()  # outwards, all of them
+    assert (np.einsum("ij,ij->i", a, np.cross(b, c)) > 0).all()  # all point outwards
     flat = oriented(np.array([[0, 2, 1]]), np.array([[0.0, 0], [1, 0], [0, 1]]), np.array([0.0, 1]))
     assert flat.tolist() == [[1, 2, 0]]
 

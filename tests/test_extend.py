@@ -1,4 +1,4 @@
-"""Constraints that features of a world take behind their own: as if all had been there, and nothing is compiled."""
+"""Constraints added to features of a world: as if they had been there from the start, and nothing is compiled."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ RIM = 6 + np.stack([np.arange(7), np.roll(np.arange(7), -1)], axis=1)
 
 
 def ropes(some: list[int]) -> list:
-    """Ropes, of which all but the first can be torn; slack ones beside them, and corners that turn only so far."""
+    """Ropes, of which all but the first can break, slack ropes beside them, and corners with limited angles."""
     k, all_of = np.array(some), several(some, len(ROPE))
     torn = np.repeat(np.where(k > 0, 1e3 * k, np.inf), 5) if k.any() else None
     lengths = np.tile([0.4, 0.5, 0.31], len(k))
@@ -31,7 +31,7 @@ def ropes(some: list[int]) -> list:
 
 
 def bodies(some: list[int]) -> list:
-    """Of soft links, outlines and shapes, each softer than the one before."""
+    """Bodies of soft links, outlines and shapes, each softer than the one before."""
     k, all_of = np.array(some), several(some, len(ROPE) + len(RING) + len(BLOCK))
     soft = np.repeat(1e-4 * (k + 1), 5)
     return [
@@ -45,26 +45,26 @@ PLACES = {ropes: ROPE, bodies: np.concatenate([ROPE, RING, BLOCK])}
 
 
 def several(some: list[int], n: int):
-    """Rows of constraints, for copies of n particles each."""
+    """Return a function that repeats rows of constraints for copies of n particles each."""
     return lambda rows: np.concatenate([np.asarray(rows) + n * k for k in some])
 
 
 def placed(kind, some: list[int]) -> tv.Particles:
-    """The particles of these copies, 20 m apart."""
+    """Return the particles of these copies, 20 m apart."""
     n = len(PLACES[kind])
     x = np.concatenate([PLACES[kind] + [20.0 * k, 0] for k in some])
     return tv.Particles(x, radius=0.02, pinned=n * np.arange(len(some)))
 
 
 def world_of(kind, number: int) -> tv.World:
-    """So many of them, and what else acts."""
+    """Build a world of the first `number` copies, with gravity, a floor and contacts."""
     some = list(range(number))
     features = [*kind(some), tv.Gravity(), tv.HalfSpace((0, 1), 0.0), tv.Contact()]
     return tv.World(placed(kind, some), features, substeps=5, solver=tv.Jacobi() if kind is bodies else None)
 
 
 def extended(w: tv.World, kind, k: int) -> None:
-    """One more of them."""
+    """Add copy k to a world."""
     w.add(placed(kind, [k]), extend=dict(zip(w.features, kind([k]), strict=False)))
 
 
@@ -79,7 +79,7 @@ def test_a_world_that_was_extended_is_the_one_that_has_all(kind, tmp_path):
     with w.clone() as twin:
         assert twin.hash() == w.hash()
     whole.close()
-    # Between two frames: what was there goes on to the bit, and all can be gone back to and replayed.
+    # Between two frames: particles that were there continue bit for bit, and the edit can be undone and replayed.
     n = len(w.particles)
     with w.clone() as without, tv.Recorder(tmp_path / "more.rrd", w) as recorder, compiled() as names:
         extended(w, kind, 3)
@@ -88,13 +88,13 @@ def test_a_world_that_was_extended_is_the_one_that_has_all(kind, tmp_path):
             w.step(1 / 60)
             recorder.log()
             without.step(1 / 60)
-        if kind is ropes:  # else displacements are turned into velocities, for springs that come
+        if kind is ropes:  # springs added to bodies turn displacements into velocities
             np.testing.assert_array_equal(w.position[:n], without.position)
     after = w.hash()
     checkpoint.put_back(w, kept)
     w.run(10 / 60)
     assert w.hash() == after and tv.replay(tmp_path / "more.rrd").verify()
-    assert not patched or ARCH != "cpu" or set(names) <= {"velocities", "to_velocity"}  # which nothing has asked for before
+    assert not patched or ARCH != "cpu" or set(names) <= {"velocities", "to_velocity"}  # not requested before
     w.close()
 
 
@@ -137,7 +137,7 @@ def test_drives_grids_and_surfaces_take_more_as_links_do(tmp_path):
 
 
 def test_what_comes_moves_as_under_a_feature_of_its_own():
-    # One more link of a running rope; and one to a particle that was there, which starts where that is now.
+    # One more link of a swinging rope, and a link to an existing particle, which starts at its current length.
     def scene():
         rope = tv.Distance(LINKS[:4])
         particles = tv.Particles(np.concatenate([ROPE[:5], [[5.0, 3.0]]]), pinned=[0])
@@ -161,7 +161,7 @@ def test_what_comes_moves_as_under_a_feature_of_its_own():
 
 def test_a_feature_takes_its_own_kind_and_nothing_else():
     def long(a, b):
-        """Their distance."""
+        """Return the distance of a and b."""
         return (a - b).norm()
 
     link, user, elsewhere = tv.Distance([[0, 1]]), tv.Constraint(long, [[1, 2]], rest=1.0), tv.Distance([[0, 1]])

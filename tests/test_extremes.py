@@ -1,4 +1,4 @@
-"""Rows of the stiff and extreme matrix, and what of them the report does not look at. The numbers are the rows'."""
+"""Rows of the stiff and extreme matrix, by number, and aspects of them that the report does not check."""
 
 import contextlib
 
@@ -19,10 +19,10 @@ MOTION = (4, 6, 7, 11, 18, 29, 37, 50, 51, 52, 61, 62, 67)
 
 @pytest.mark.parametrize("number", DOORS + MOTION)
 def test_rows_pass(number, briefly):
-    # All of them take minutes: python -m tiverlet stress. Others are shown by tests that name them: 2 by test_chains.py, 15 and
-    # 17 by test_properties.py, 22 by test_direct.py, 45, 48 and 82 by test_contact.py, 55 by test_bodies.py.
+    # All rows take minutes: python -m tiverlet stress. Other tests cover further rows by name: 2 test_chains.py, 15 and 17
+    # test_properties.py, 22 test_direct.py, 45, 48 and 82 test_contact.py, 55 test_bodies.py.
     result = certify(number)
-    if ARCH not in tv.runtime.LLVM and any(ARCH in why for why in result.failing):  # refused because of the architecture
+    if ARCH not in tv.runtime.LLVM and any(ARCH in why for why in result.failing):  # the architecture does not support it
         pytest.skip(str(result.failing))
     assert result.verdict == "passed", result
     whip = "Jacobi(relaxation=1): turned, unconverged; Direct(): softened, unconverged"
@@ -37,7 +37,7 @@ def test_7_idle_links_are_named():
 
 
 class Chains:
-    """All D cases as chains of one world, with g = 9.81."""
+    """All D cases with g = 9.81 as chains of one world."""
 
     def __init__(self, world, **settings):
         self.names = [name for name in CASES if name.startswith("D0")]
@@ -45,14 +45,16 @@ class Chains:
         begin = np.cumsum([0, *map(len, x)])
         self.parts = [slice(a, b) for a, b in zip(begin[:-1], begin[1:], strict=True)]
         self.mass = np.concatenate(mass)
-        self.mass[begin[:-1]] = 0  # of the anchors, in sums
+        self.mass[begin[:-1]] = 0  # anchors do not count in sums
         self.links = tv.Distance(np.concatenate([p + k for p, k in zip(pairs, begin, strict=False)]))
         start = tv.Particles(np.vstack(x), mass=np.concatenate(mass), pinned=begin[:-1])
         self.world = world(start, [tv.Gravity(9.81), self.links], precision="f64", **settings)
 
     def energies(self, before=None, h=0.0):
-        """Of each chain [J], and m g L, what gravity can supply in a swing. before: where it was h [s] ago; then the energy is
-        that of the motion since, half way."""
+        """Return the energy of each chain [J], and m g L, which gravity can supply in a swing.
+
+        before: positions h [s] ago. The energy is then that of the motion since, at the middle of the interval.
+        """
         w = self.world
         velocity = w.velocity if before is None else (w.position - before) / h
         height = w.position[:, 1] if before is None else (w.position + before)[:, 1] / 2
@@ -63,9 +65,9 @@ class Chains:
 
 @pytest.mark.parametrize("solver", [None, tv.Jacobi()])
 def test_12_one_substep_of_a_tenth_of_a_second(world, solver):
-    # Bounded: finite, and no more energy than there was, by the motion in each substep. The velocity at its end has half of
-    # a kick along links that turn by more than 41 degrees here, as the flag says. One pass of 0.1 s holds a heavy end about as
-    # well as a rubber band would, which is what the residual says.
+    # Bounded: finite, and no energy gained, measured by the motion in each substep. The velocity at the end of a substep
+    # contains half of a kick along links that turn by more than 41 degrees here, as the flag says. One pass of 0.1 s holds a
+    # heavy end about as well as a rubber band would, which the residual shows.
     chains = Chains(world, substeps=1, solver=solver)
     w, x = chains.world, chains.world.particles.position
     assert repr(w._solver) == ("Jacobi(relaxation=1)" if solver else "Direct(width=2)")
@@ -80,8 +82,8 @@ def test_12_one_substep_of_a_tenth_of_a_second(world, solver):
             for (now, most), begin, name in zip(chains.energies(before, 0.1), start, chains.names, strict=True):
                 assert now <= begin + 0.1 * most, (name, iterations)
     if solver:
-        # Rows 1 and 2: one Jacobi pass cannot hold a heavy end. It is as far off as that of the prototype, to six digits, and the
-        # residual, which is what a ruler measures, says so.
+        # Rows 1 and 2: one Jacobi pass cannot hold a heavy end. Its error equals that of the prototype to six digits, and the
+        # residual is the strain that a ruler would measure.
         w.iterations = 1
         for iterations in (1, 50):
             rerun(w, 0.5, substeps=20, iterations=iterations)
@@ -129,7 +131,7 @@ def test_50_nan_is_flagged_on_both_paths(path):
 
 
 def test_34_thousands_in_one_cell(world):
-    # Correct, n^2, warned of, and nothing overflows. Phase by phase, where the list has a kernel of its own.
+    # Correct, O(n^2), with a warning and without overflow. Launched phase by phase, where the list has a kernel of its own.
     n = 2048
     x = np.random.default_rng(0).uniform(0, 0.01, (n, 2))
     w = world(tv.Particles(x, radius=0.5), [tv.Contact()], path="launched")

@@ -1,4 +1,4 @@
-"""Forged recordings: whatever the viewer would show otherwise, verify() names, though all checksums are right."""
+"""Forged recordings: verify() names whatever the viewer would show differently, though all checksums are valid."""
 
 import os
 import re
@@ -30,7 +30,7 @@ def original(tmp_path_factory):
 
 @pytest.fixture
 def quick(read_here, built_once):
-    """Read in this process, and compile a scene only once: what is looked at here is neither."""
+    """Read in this process and compile a scene once; these tests check neither."""
 
 
 def test_forgeries_are_named(original, quick, tmp_path):
@@ -110,7 +110,7 @@ def test_what_a_file_asks_for_is_bounded(original, tmp_path):
         with pytest.raises(ValueError, match="^replay: |^The state|shape"):
             tv.replay(told(change)).verify()
 
-    # Rows that say that they unpack to 70 GB, and data that is more than there may be.
+    # Rows that claim to unpack to 70 GB, and more data than is allowed.
     forged = Forgery(original)
     _, fields, _ = forged.messages[forged.chunks("world/scene/particles")[0]]
     out = reader.Found(os.open(os.devnull, os.O_WRONLY), 1000)
@@ -122,7 +122,7 @@ def test_what_a_file_asks_for_is_bounded(original, tmp_path):
         out.put(b"x" * 1001)
     out.close()
 
-    # A table for each pair of groups of as many groups as there are particles.
+    # A table with an entry per pair of groups, with as many groups as particles.
     n = 20_000
     table = material.Table("Contact", {(0, 1): 0.3}, 0.0, None).rows(np.arange(n))[1]
     assert len(table) == 9

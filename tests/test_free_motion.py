@@ -12,7 +12,7 @@ from .conftest import case, order, rerun
 @pytest.mark.parametrize("name", ["R01_free_fall_dt0.01", "R01_free_fall_dt0.001"])
 @pytest.mark.parametrize("dim", [2, 3])
 def test_free_fall_is_exact_for_any_step(world, name, dim):
-    # y = y0 + v0 t - g t^2 / 2 at every step of position Verlet with half a kick at the start.
+    # y = y0 + v0 t - g t^2 / 2 at every step of position Verlet, with half a kick at the start.
     p, want = case(name)["params"], case(name)["values"]
     w = world(
         tv.Particles([[0, p["y0"], 0][:dim]], velocity=[0, p["v0"], 0][:dim]),
@@ -69,7 +69,7 @@ def test_changing_steps_and_gravity_stay_exact(world):
 
 
 def test_f32_free_fall_keeps_six_digits(world):
-    # The golden dither: without it the rounding of d += g h^2 to one side costs 5e-6 here (see Substep.kick).
+    # The golden dither: without it, rounding d += g h^2 to one side costs 5e-6 here.
     p = case("R01_free_fall_dt0.001")["params"]
     heights = np.array([0.0, 1.0, 3.3, 10.0])
     start = np.stack([np.zeros(4), heights], axis=1)
@@ -101,7 +101,7 @@ def test_f32_compensated_falls_far_from_the_origin_in_tiny_steps(world):
     )
     w.run(1.0, dt=0.01)  # h = 1e-4
     drop = 9.81 / 2
-    assert np.abs(w.position[:, 1] - 1000 + drop).max() <= 1e-6 * drop  # asked: 1e-3
+    assert np.abs(w.position[:, 1] - 1000 + drop).max() <= 1e-6 * drop  # 1e-3 is required
     assert w.position[1, 0] == -1000.0
 
 
@@ -112,7 +112,7 @@ def test_linear_drag_is_exact_and_wind_carries(world):
     w.run(p["T"])
     np.testing.assert_allclose(w.position[0], [want["x"], want["y"]], atol=1e-11)
     np.testing.assert_allclose(w.velocity[0], [want["vx"], want["vy"]], atol=1e-11)
-    # Wind u: drag relative to the air. x' = u + (v0 - u) exp(-k t); rates of several drags add up.
+    # Wind u: drag relative to the air. x' = u + (v0 - u) exp(-k t); the rates of several drags add up.
     u, k, t = np.array([3.0, -1.0]), 2.5, 1.25
     w = world(start, [tv.Wind(u, 1.5), tv.Wind(u, 0.75), tv.Drag(0.25)], substeps=2, precision="f64")
     mean = u * 2.25 / 2.5
@@ -124,7 +124,7 @@ def test_linear_drag_is_exact_and_wind_carries(world):
 
 @pytest.mark.parametrize("precision, limit", [("f32", 1e-6), ("f32-compensated", 1e-6), ("f64", 1e-12)])
 def test_velocities_under_any_drag(world, precision, limit):
-    # v = -g (1 - exp(-k t)) / k, also where exp(k h) leaves f32, and after a change of dt.
+    # v = -g (1 - exp(-k t)) / k, also where exp(k h) exceeds f32, and after a change of dt.
     drag, h = tv.Drag(0.0), 1e-3
     w = world(tv.Particles([[0.0, 0.0]]), [tv.Gravity(9.81), drag], substeps=1, precision=precision)
     for z in (1e-6, 1e-3, 0.5, 20, 90, 250, 1e4):
@@ -148,7 +148,7 @@ def test_knobs_are_live_and_rates_may_change(world):
 
 @pytest.mark.parametrize("name", ["R04_oscillator_k100_dt0.01", "R04_oscillator_k100_dt0.1", "R04_oscillator_k10000_dt0.001"])
 def test_a_users_force_oscillates_as_verlet_does(world, name):
-    # x_n = x0 cos(n asin-angle): the closed form of the discrete oscillator with half a kick at the start.
+    # x_n = x0 cos(n phi), the closed form of the discrete oscillator with half a kick at the start.
     p, want = case(name)["params"], case(name)["values"]
     k = p["k"]
 
@@ -176,7 +176,7 @@ def test_literals_of_a_users_force_keep_all_digits_in_f64(world):
 
 
 def test_forces_that_read_velocities_are_second_order(world):
-    # A charge in a magnetic field, v' = omega J v: a circle. And with drag that the user writes: error of order 2.
+    # A charge in a magnetic field, v' = omega J v, moves on a circle. With the user's own drag the error is of order 2.
     @ti.func
     def lorentz(x, v):
         return ti.Vector([3.0 * v[1], -3.0 * v[0]]) - 0.5 * v

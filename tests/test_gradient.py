@@ -1,4 +1,4 @@
-"""Derivatives by copies of a world against closed forms."""
+"""Derivatives by copies of a world, against closed forms."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ def thrown(speed=7.0, angle=0.6, precision="f64"):
 
 
 def landing(worlds):
-    # Verlet is exact for a parabola, so three of its points say where it comes down.
+    # Verlet is exact for a parabola, so a parabola fitted to the track gives the landing place.
     track = worlds.rollout(0.9)
     t, (x, y) = track.time[0], np.moveaxis(track.position[:, :, 0], 2, 0)
     down = [max(np.roots(np.polyfit(t, one, 2))) for one in y]
@@ -28,7 +28,7 @@ def pendulum(length=1.3, mass=2.0, angle=1.0, other=0.0):
 
 
 def quarter(worlds):
-    # When it first passes below the pin [s].
+    # The time of the first passage below the pin [s].
     track = worlds.rollout(0.9)
     t, x = track.time[0], track.position[:, :, 1, 0]
     k = int((x[0] > 0).sum())
@@ -52,7 +52,7 @@ def test_the_error_falls_by_four_with_half_the_step_until_rounding():
     a, exact = 0.6, 2 * 7.0**2 * np.cos(1.2) / G
     steps = 0.1 / 2 ** np.arange(4)
     errors = [tv.gradient(thrown, {"angle": a}, landing, step=h).derivative["angle"] - exact for h in steps]
-    np.testing.assert_allclose(errors, exact * (np.sin(2 * steps) / (2 * steps) - 1), rtol=1e-5)  # that of a difference of sines
+    np.testing.assert_allclose(errors, exact * (np.sin(2 * steps) / (2 * steps) - 1), rtol=1e-5)  # as of a difference of sines
     ratios = np.divide(errors[:-1], errors[1:])
     assert (np.abs(ratios - 4) < 0.02).all()
     best, tiny = (abs(tv.gradient(thrown, {"angle": a}, landing, step=h).derivative["angle"] - exact) for h in (1e-5, 1e-12))
@@ -60,14 +60,14 @@ def test_the_error_falls_by_four_with_half_the_step_until_rounding():
 
 
 def test_the_period_of_a_pendulum():
-    # It goes with the root of the length, at any swing, and knows no mass.
+    # The period is proportional to the root of the length, at any swing, and does not depend on the mass.
     value, derivative = tv.gradient(pendulum, {"length": 1.3, "mass": 2.0, "other": 0.0, "angle": 1.0}, quarter)
 
     def exact(angle):
         a, b = 1.0, np.cos(angle / 2)
         for _ in range(6):
             a, b = (a + b) / 2, np.sqrt(a * b)
-        return np.pi / (2 * a) * np.sqrt(1.3 / G)  # a quarter of the period, by the mean of Gauss
+        return np.pi / (2 * a) * np.sqrt(1.3 / G)  # a quarter of the period, by Gauss's mean
 
     assert value == pytest.approx(exact(1.0), rel=1e-4)
     assert derivative["length"] == pytest.approx(value / 2.6, rel=1e-4)
@@ -108,7 +108,7 @@ def test_shapes_of_parameters_and_figures():
     np.testing.assert_allclose(derivative["x"], np.einsum("ik,jl->ijkl", np.eye(2), np.eye(2)), atol=1e-9)
     np.testing.assert_allclose(derivative["g"], 0.125 * np.broadcast_to(np.eye(2), (2, 2, 2)), atol=1e-9)
     np.testing.assert_allclose(derivative["speed"], [[0.5, 0.0], [0.0, 0.0]], atol=1e-9)
-    # What does not depend on it does so to the bit.
+    # Where a figure does not depend on a parameter, the derivative is 0 bit for bit.
     assert (derivative["x"][0, :, 1] == 0).all() and (derivative["g"][:, 0, 1] == 0).all()
     assert derivative["speed"][1, 0] == derivative["speed"][0, 1] == 0.0
     steps = {"x": np.full((2, 2), 1e-3), "speed": 0.1}
@@ -117,7 +117,7 @@ def test_shapes_of_parameters_and_figures():
 
 
 def test_a_restitution_through_an_impact():
-    # Dropped from 1 m with restitution e, it comes back to e^2 m.
+    # Dropped from 1 m with restitution e, the point rises to e^2 m.
     def make(e):
         return tv.World(tv.Particles([[0.0, 1.0]]), [tv.Gravity(G), tv.HalfSpace((0, 1), restitution=e)], precision="f64")
 

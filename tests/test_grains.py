@@ -1,4 +1,4 @@
-"""Grains that spin, against the laws of heaps and silos: what the report prints, small."""
+"""Grains that spin, against the laws of heaps and silos: the figures of the report, in small scenes."""
 
 import sys
 
@@ -10,13 +10,13 @@ from tiverlet.report.accuracy.grains import SIZE, Silo
 
 
 def test_a_super_ball_under_gravity_obeys_its_law():
-    # Velocity and spin after three bounces to rounding (test_spin.py has the other cases).
+    # Velocity and spin after three bounces, to rounding (test_spin.py has the other cases).
     for velocity, _place in rolling.here(rolling.super_ball(), "f64", (5, 20)):
         assert velocity <= 1e-12
 
 
 def test_other_engines_are_asked():
-    # pymunk solves for the friction that keeps a sphere rolling to rounding; its places are of first order.
+    # pymunk computes the friction that keeps a sphere rolling to rounding; its positions are of first order.
     given = [rolling.downhill(0.3, 0.3), rolling.super_ball()]
     assert rolling.there("pymunk", ["no-such-python"], given, (5,))[0][0].startswith("FileNotFoundError")
     assert rolling.there("pymunk", [], given, (5, 10)) == [["not installed"] * 2] * 2
@@ -28,17 +28,17 @@ def test_other_engines_are_asked():
 
 
 def test_heaps_of_what_resists_rolling_are_steeper():
-    # Discs that roll freely lie at 10 to 20 degrees, +- 5 for a heap as small as this; resistance to rolling holds them up. 1e-9
-    # is none; the kernels are those of 0.3.
+    # Discs that roll freely form heaps of 10 to 20 degrees, +- 5 for a heap this small; rolling resistance makes heaps steeper.
+    # 1e-9 means none, with the same kernels as 0.3.
     free, held = grains.repose(200, 12.0, 2, [0], [(0.5, 1e-9), (0.5, 0.3)])[:, 0]
     assert 5 < free < 25 and held > free + 10
 
 
 def test_a_silo_bears_its_grains():
-    # Janssen 1895: without friction at the walls the floor bears the weight (1e-9 is none; the kernels are those of 0.5); in half
-    # a second that is off by dv / (g 0.5 s) for velocities of dv, 2 cm/s as the walls rise. With friction it bears
-    # lambda / H (1 - exp(-H / lambda)) of it, lambda = w / (2 mu K), with K between 1/2 and 3/2; so it does where contacts know
-    # their loads, which then are those of statics.
+    # Janssen 1895: without friction at the walls the floor bears the weight (1e-9 means none, with the same kernels as 0.5). In
+    # half a second that is off by dv / (g 0.5 s) for velocities of dv, 2 cm/s as the walls rise. With friction the floor bears
+    # lambda / H (1 - exp(-H / lambda)) of the weight, lambda = w / (2 mu K), with K between 1/2 and 3/2. The same must hold
+    # where contacts learn their known loads, which then match statics.
     _height, weight, load = grains.janssen(Silo(500, 20 * SIZE, wall_friction=1e-9), substeps=32, settle=1.0, seconds=1.0)
     assert load == pytest.approx(weight, rel=0.02 / (9.81 * 0.5))
     for loads in (False, True):
@@ -48,7 +48,7 @@ def test_a_silo_bears_its_grains():
 
 
 def test_flow_out_of_a_silo_obeys_beverloo():
-    # W = C rho sqrt(g) (D - k d)^1.5 with k between 1 and 2 in 2D, so W(8.5) / W(5.5) is between 2.15 and 2.53; 20 % for so few.
+    # W = C rho sqrt(g) (D - k d)^1.5 with k between 1 and 2 in 2D, so W(8.5) / W(5.5) is between 2.15 and 2.53; +- 20 % here.
     rates = []
     for opening in (5.0, 8.0):
         found = grains.flow(Silo(500, 20 * SIZE), opening, 4.0, settle=1.0)
@@ -58,7 +58,7 @@ def test_flow_out_of_a_silo_obeys_beverloo():
 
 
 def test_fits_find_what_they_are_given():
-    # The laws themselves, with lambda, C and k of our own.
+    # Data from the laws themselves, with chosen lambda, C and k.
     heights = np.array([0.5, 1.0, 3.0, 6.0])
     length, off = grains.saturation(heights, 0.8 / heights * (1 - np.exp(-heights / 0.8)))
     assert length == pytest.approx(0.8, rel=2e-3) and off <= 1e-3

@@ -21,15 +21,15 @@ def test_gas_of_spheres():
 
 @pytest.mark.parametrize("dim, fraction", [(2, 0.5), (3, 0.3)])
 def test_energy_of_a_gas(dim, fraction):
-    # R23: 1000 collisions per particle at 12 substeps between two, to the rounding of f32: 1e4 substeps, each of which may change
-    # an energy by 1e-7. At 3 to 1 substeps nothing is made either, but a wall pushes out what was thrown into it in the same
-    # substep, at most at push_out, which is no bounce: within 1 % in 100 collisions.
+    # R23: 1000 collisions per particle at 12 substeps between two, to the rounding of f32: 1e4 substeps, each of which may
+    # change an energy by 1e-7. At 3 to 1 substeps no energy is created either. But a wall pushes out a particle that was thrown
+    # into it in the same substep, at push_out at most, which is no bounce: within 1 % in 100 collisions.
     exact, *rough = granular.energies_gained(512, dim, fraction, {0.08: 1000, 0.34: 100, 0.5: 100, 1.0: 100})
     assert exact == pytest.approx(0, abs=1e-5) and rough == pytest.approx([0, 0, 0], abs=0.01)
 
 
 def test_discs_jam_where_they_should():
-    # R22: frictionless discs, half of them 1.4 times as large, jam at 0.842, by the target at 0.835 to 0.850.
+    # R22: frictionless discs, half of them 1.4 times as large, jam at 0.842; the target is 0.835 to 0.850.
     assert 0.835 <= granular.packing(600, 2, 0.1)["fraction"] <= 0.850
 
 

@@ -1,4 +1,4 @@
-"""The list of near pairs as a GPU builds it, on a CPU: running sums, sorting, and the same lists as those of one thread."""
+"""The neighbour list as a GPU builds it, on a CPU: prefix sums, sorting, and the same lists as on one thread."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ LENGTHS = (0, 1, 2, RADIX, RADIX + 1, 3 * RADIX - 1, RADIX**2, RADIX**2 + 1, 2 *
 
 @ti.data_oriented
 class Bench:
-    """Running sums over fields of several lengths, and sorting within another one."""
+    """Prefix sums over fields of several lengths, and sorting within another field."""
 
     def __init__(self, launched: bool):
         self.memory = Memory(ti.f32)
@@ -44,10 +44,10 @@ class Bench:
 
 def test_running_sums():
     rng = np.random.default_rng(0)
-    for launched in (False, True)[ARCH != "cpu" :]:  # by one thread only on a CPU: a driver may cut loops as long as that short
+    for launched in (False, True)[ARCH != "cpu" :]:  # on a GPU launched only: a driver may stop such a long loop on one thread
         bench = Bench(launched)
         assert max(s.levels for s in bench.sums) == (4 if launched else 1)
-        for top in (10, 2**20, MOST):  # the last two beyond what an i32 holds
+        for top in (10, 2**20, MOST):  # the last two exceed an i32
             values = [rng.integers(0, top, length, endpoint=True) for length in LENGTHS]
             for field, a in zip(bench.fields, values, strict=True):
                 bench.memory.write(field, np.resize(np.append(a, [7]), len(bench.memory.read(field))))
@@ -58,7 +58,7 @@ def test_running_sums():
 
 
 def test_sorting():
-    # Within a field, and nothing beside it. One more and less than where the way changes.
+    # Sorts within a range of a field and leaves its neighbours alone. Lengths beside each change of algorithm.
     rng = np.random.default_rng(1)
     bench = Bench(False)
     for count in (0, 1, 2, 3, LONG - 1, LONG, LONG + 1, LONG + 2, 4 * LONG - 1, 4 * LONG):
@@ -74,7 +74,7 @@ def test_sorting():
 
 @ti.data_oriented
 class Again:
-    """Lists once more, from cells that are sorted."""
+    """Builds the lists again from the sorted cells."""
 
     def __init__(self, search):
         self.search = search
@@ -85,14 +85,14 @@ class Again:
 
 
 def lists(w) -> tuple[np.ndarray, np.ndarray]:
-    """How many neighbours each particle has, and all of them, one list after the other."""
+    """Return the number of neighbours of each particle, and all neighbours, one list after the other."""
     near, read = w._runner.search.list, w._runner.memory.read
     _, at = near._entries(near.first, near.number)
     return read(near.number), near.store.read(near.neighbour)[at]
 
 
 def shuffle(w, rng) -> None:
-    """Put the particles of each bucket into another order."""
+    """Reorder the particles within each bucket at random."""
     cells = w._runner.search.cells
     begin, who, place = (w._runner.memory.read(f) for f in (cells.edge, cells.sorted, cells.place))
     bucket = np.repeat(np.arange(cells.buckets), np.diff(begin[1 : cells.buckets + 2]))
@@ -105,8 +105,8 @@ def shuffle(w, rng) -> None:
 @pytest.mark.parametrize("dim, sizes", [(3, "one"), (2, "several"), (3, "several")])  # (2, "one"): test_pairs.py
 @pytest.mark.filterwarnings("ignore:.*near pairs per particle")
 def test_lists_of_a_gpu_are_those_of_one_thread(world, dim, sizes):
-    # Against all pairs, one by one. From room for one entry, with crowds whose lists are long, some static, some linked, in
-    # groups; and whatever the order within cells, which on a GPU is another one in every run.
+    # Against all pairs, one by one. Starts with room for one entry, and has crowds with long lists, static and linked
+    # particles, and groups. The lists must not depend on the order within cells, which on a GPU differs in every run.
     rng = np.random.default_rng(2)
     x = rng.uniform(-3, 3, (N, dim))
     x[:150] = rng.uniform(-0.1, 0.1, (150, dim))
@@ -144,7 +144,7 @@ def test_lists_of_a_gpu_are_those_of_one_thread(world, dim, sizes):
 
 
 def test_what_pairs_carry_goes_with_them(world):
-    # A pile of many sizes with friction, which keeps something for each pair, from lists that are too small at first.
+    # A pile of many sizes with friction, which stores data for each pair, starting with lists that are too small.
     rng = np.random.default_rng(3)
     radius = 10.0 ** rng.uniform(-1.5, -0.5, N)
     x = rng.uniform(0.4, 9.6, (N, 2))
@@ -162,9 +162,9 @@ def test_what_pairs_carry_goes_with_them(world):
 
 
 def test_a_few_that_fly_far_have_no_list_built_until_they_meet_something(world):
-    # 1056 discs lie still without touching. Others fly over them, towards each other and into them, by 0.3 m a substep, where a
-    # list with a skin of 0.375 m is good for 0.18 m. Whatever is within 2 % of the skin is on the list, and all bits are those of
-    # lists that are built in every substep. Of 1064 particles 16 may stray; where 40 do, the list is built as ever.
+    # 1056 discs lie still without touching. Others fly over them, towards each other and into them, by 0.3 m a substep, while a
+    # list with a skin of 0.375 m covers 0.18 m. All pairs within 2 % of the skin are listed, and all bits are those of lists
+    # that are rebuilt in every substep. Of 1064 particles 16 may stray; where 40 do, the list is rebuilt as usual.
     k = np.arange(1056)
     still = np.stack([k % 44, k // 44], axis=1) * 1.05
     for count, least, most in ((8, 2, 10), (40, 40, 50)):

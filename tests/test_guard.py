@@ -1,4 +1,4 @@
-"""substeps="auto", tolerance and budget: frames that are made again until they are good."""
+"""substeps="auto", tolerance and budget: frames are repeated until they are good."""
 
 import numpy as np
 import pytest
@@ -14,9 +14,9 @@ from .conftest import rerun
 
 
 def test_whip_and_mass_ratios_from_one_substep(world):
-    # Rows 12 and 18. A chain of 100 and heavy ends of 1e4, 1e5 and 1e6 times the links, each with a controller of its own. The
-    # prototypes reached, from 1 or 8 substeps and without a failure, 2.2e-4 m for the whip and 4.4e-5, 6.7e-6, 7.2e-7 m for the
-    # heavy ends at t = 1 s. Where the controller leaves the substeps alone, these are wrong by more than a link.
+    # Rows 12 and 18. A chain of 100, and heavy ends of 1e4, 1e5 and 1e6 times the links, each with its own controller. From 1
+    # or 8 substeps and without a failure, the prototypes reach 2.2e-4 m for the whip and 4.4e-5, 6.7e-6, 7.2e-7 m for the heavy
+    # ends at t = 1 s. If the controller leaves the substeps alone, these are wrong by more than a link.
     scene, prefix = Scene(), "D07_massratio_1"
     for name, aim in (
         ("D06_chain100", 2.2e-4),
@@ -30,12 +30,12 @@ def test_whip_and_mass_ratios_from_one_substep(world):
         report = w.run(1.0)
         assert report.clean and report.turn == 0 and report.residual <= 1e-2 and report.tension <= 2.0
         assert scene.error(w, name, 1.0) < aim, name
-        assert w.last.tries == 1  # it has settled
+        assert w.last.tries == 1  # the controller has settled
 
 
 def test_it_finds_the_moment_that_needs_more(world):
-    # D04 passes a fold between 0.5 and 0.75 s: 20 substeps in each of 45 frames end half a metre off, a third of them, where the
-    # guard puts them, within 5 cm.
+    # D04 passes a fold between 0.5 and 0.75 s: 20 substeps in each of 45 frames end half a metre off. A third of them, where
+    # the controller puts them, end within 5 cm.
     name, scene = "D04_mueller_heavy", Scene()
     scene.begin[name] = 0
     w = hung(world, name, substeps=20)
@@ -47,8 +47,8 @@ def test_it_finds_the_moment_that_needs_more(world):
 
 
 def test_undoing_a_frame_leaves_no_trace(world):
-    # A frame that was made three times is, to the bit, the one with the final number of substeps: moving targets, contacts that
-    # stick, springs and particles that still part included.
+    # A frame that was made three times equals, bit for bit, one with the final number of substeps. Moving targets, contacts
+    # that stick, springs and particles that still separate are included.
     rng = np.random.default_rng(1)
     x = np.vstack([tv.shapes.rope((0, 3), (2, 3), points=9).position, rng.uniform((0.2, 0.2), (2.8, 2.0), (40, 2))])
     k = np.arange(8)
@@ -75,7 +75,7 @@ def test_undoing_a_frame_leaves_no_trace(world):
 
 
 def test_tolerance_is_met_with_less_where_less_is_needed(world):
-    # Residuals of Jacobi fall with h^2. A swing needs more substeps when it is fast, fewer when it hangs.
+    # Residuals of Jacobi fall with h^2. A swing needs more substeps when it is fast, and fewer when it hangs.
     rope = tv.shapes.rope((0, 0), (1, 0), points=11)
     w = world(
         tv.Particles(rope.position, pinned=[0]),
@@ -88,16 +88,16 @@ def test_tolerance_is_met_with_less_where_less_is_needed(world):
         rerun(w, 1 / 60)
         reports = [w.step(1 / 60, tolerance=tolerance) for _ in range(150)]
         assert all(r.residual <= tolerance and r.clean for r in reports)
-        assert min(r.residual for r in reports[60:]) > tolerance / 50  # not by far more than asked
+        assert min(r.residual for r in reports[60:]) > tolerance / 50  # not far better than requested
         used.append([r.substeps for r in reports])
     assert np.mean(used[1]) > 2 * np.mean(used[0])
     assert w.substeps == 20  # the user's own number stays
 
 
 def test_a_tolerance_is_one_of_the_motion(world):
-    # Rods that are solved leave no residual, but what turns by phi in a substep does so by phi^2 / 24 too fast or too slowly.
-    # That error is relative: in the 2 s of the double pendulum D01 it becomes some ten times as much in metres, whatever is
-    # asked. Left to itself, the controller takes one substep a frame, and 4e-3 m.
+    # Direct solutions leave no residual, but a rod that turns by phi in a substep turns too fast or too slowly by phi^2 / 24.
+    # This error is relative: in 2 s of the double pendulum D01 it becomes about ten times as much in metres, for any tolerance.
+    # Without a tolerance the controller takes one substep a frame, with an error of 4e-3 m.
     name, scene = "D01_double_pendulum", Scene()
     w, scene.begin[name] = hung(world, name, substeps="auto"), 0
     for tolerance in (1e-4, 1e-5, 2e-6):
@@ -107,7 +107,7 @@ def test_a_tolerance_is_one_of_the_motion(world):
 
 
 def test_a_tolerance_is_one_of_the_energy_of_rigid_bodies(world):
-    # A plate that swings from a corner, one cluster: solved to rounding at one substep a frame, whose energy errs by 1e-2 m g L.
+    # A plate that swings from a corner, one cluster: solved to rounding at one substep a frame, its energy errs by 1e-2 m g L.
     x = np.stack(np.divmod(np.arange(15), 5), axis=1) * 0.1
     w = world(tv.Particles(x, pinned=[0]), [tv.Gravity(9.81), tv.ShapeMatch([range(15)])], substeps="auto")
     supply, used = 9.81 * 14 * 0.4, []
@@ -120,7 +120,7 @@ def test_a_tolerance_is_one_of_the_energy_of_rigid_bodies(world):
 
 
 def test_what_no_effort_improves_is_said_and_not_tried_each_time(world):
-    # A rod of 1 m between anchors 3 m apart, by way of one particle: half of what is missing stays, whatever is done.
+    # A rod of 1 m between anchors 3 m apart, by way of one particle: whatever the effort, half of the missing length remains.
     w = world(
         tv.Particles([(0, 0), (1.5, 0.1), (3, 0)], pinned=[0, 2]),
         [tv.Gravity(9.81), tv.Drag(5.0), tv.Distance([(0, 1), (1, 2)], rest=[1.0, 1.0])],
@@ -134,8 +134,8 @@ def test_what_no_effort_improves_is_said_and_not_tried_each_time(world):
 
 def test_a_shorter_substep_does_not_turn_a_sag_into_energy(world):
     # Row 74. One pass holds the load of a braced cantilever by a violation ~ h^2, as a spring of stiffness ~ 1 / h^2 would: 512
-    # substeps after 64 would make its energy 64 times as large. The state goes back to the constraints first, so that whatever
-    # the substeps do, there is no more energy than at the start.
+    # substeps after 64 would multiply its energy by 64. So the state is first projected onto the constraints. Whatever the
+    # substeps do, the energy does not exceed that at the start.
     k = np.arange(20).reshape(10, 2)
     x = np.stack(np.meshgrid(np.arange(10), np.arange(2), indexing="ij"), axis=2).reshape(-1, 2) * 0.1
     ends = [(k[:-1], k[1:]), (k[:, :-1], k[:, 1:]), (k[:-1, :-1], k[1:, 1:]), (k[:-1, 1:], k[1:, :-1])]
@@ -151,9 +151,9 @@ def test_a_shorter_substep_does_not_turn_a_sag_into_energy(world):
 
 
 def test_no_change_of_the_substep_brings_in_energy(world):
-    # A net between four pins has no direction to sag in, and its violation under load is large: at 2 substeps 0.1 of its links,
-    # whose energy 200 substeps would make 10^4 times as large. What hardly resolved springs leave undone would, too. By ones or
-    # all at once, back and forth, and left to itself: passive scenes never have more than at the start.
+    # A net between four pins has no direction to sag in, and its violation under load is large: 0.1 of its links at 2 substeps,
+    # whose energy 200 substeps would multiply by 10^4. The same holds for violations of hardly resolved springs. Substeps
+    # change by ones or all at once, back and forth, or under "auto": passive scenes never exceed their energy at the start.
     n, m = 7, 1e-3
     sheet, k = tv.shapes.net((0, 0, 0), (1, 0, 0), (0, 0, 1), (n, n)), np.arange(n * n).reshape(n, n)
     link = tv.Distance(sheet.links, compliance=1e-3)
@@ -169,8 +169,9 @@ def test_no_change_of_the_substep_brings_in_energy(world):
 
 
 def test_no_change_of_the_substep_brings_in_energy_of_bodies(world):
-    # Cantilevers of loops of four corners that keep their areas, beside rigid links, and of rigid clusters that share corners:
-    # what passes leave undone was 2.4 and 0.5 m g L with auto, without a flag, and 120 and 310 from 2 to 100 substeps.
+    # Cantilevers of loops of four corners that keep their areas, beside rigid links, and of rigid clusters that share corners.
+    # Without a projection, what passes leave undone becomes 2.4 and 0.5 m g L under "auto", without a flag, and 120 and 310 m g L
+    # from 2 to 100 substeps.
     k = np.arange(16).reshape(8, 2)
     x = np.stack(np.meshgrid(np.arange(8), np.arange(2), indexing="ij"), axis=2).reshape(-1, 2) * 0.1
     loops = np.stack([k[:-1, 0], k[1:, 0], k[1:, 1], k[:-1, 1]], axis=1)
@@ -188,8 +189,8 @@ def test_no_change_of_the_substep_brings_in_energy_of_bodies(world):
 
 @pytest.mark.parametrize("what", ["springs in 3D", "a rope"])
 def test_a_body_turns_on_where_the_substep_changes(world, what):
-    # Sum m x x v is kept to rounding in free flight. What turns is stretched by its substep, and drawn together where that gets
-    # shorter; at constant velocities that would be a third of the momentum in 10 s, and half of the energy.
+    # Sum m x x v is kept to rounding in free flight. A rotating body is stretched by its substep, and drawn together when the
+    # substep gets shorter. At constant velocities that would cost a third of the momentum in 10 s, and half of the energy.
     if what == "springs in 3D":
         body = tv.shapes.truss((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3), (2, 2, 2))
         links = tv.Distance(np.concatenate([body.links, body.braces]), compliance=1e-3)
@@ -210,8 +211,8 @@ def test_a_body_turns_on_where_the_substep_changes(world, what):
 
 
 def test_the_order_of_constraints_does_not_matter_where_the_substep_changes(world):
-    # A door with a stop: the corners of the link are the last two of the angle before it. Rows of the projection that were taken
-    # for alike had the corners of the other: an IndexError, or with more links another motion, 0.22 J off.
+    # A door with a stop: the corners of the link are the last two of the angle before it. If rows of the projection were taken
+    # for equal, they would have the corners of the other: an IndexError, or with more links another motion, 0.22 J off.
     for links, far in (([(1, 2)], 2), ([(1, 2), (2, 3), (3, 4)], 4)):
         x = np.stack([np.arange(far + 1.0) - 1, np.zeros(far + 1)], axis=1)
         ends = []
@@ -226,18 +227,18 @@ def test_the_order_of_constraints_does_not_matter_where_the_substep_changes(worl
 
 
 def test_a_scene_does_not_go_to_and_fro_between_two_substeps(world):
-    # 4 substeps are good for one frame of a body of springs that turns, and not for the next: it is tried ever more rarely.
+    # 4 substeps are enough for one frame of a rotating body of springs, but not for the next: they are tried ever more rarely.
     body = tv.shapes.truss((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3), (2, 2, 2))
     links = tv.Distance(np.concatenate([body.links, body.braces]), compliance=1e-3)
     start = tv.Particles(body.position, velocity=np.cross([0.0, 3.0, 6.0], body.position), mass=1 / len(body.position))
     w = world(start, [links], substeps="auto", precision="f64")
     substeps = [w.step(1 / 60).substeps for _ in range(300)]
-    assert set(substeps) == {4, 8} and np.count_nonzero(np.diff(substeps)) < 30  # of 150 with as many tries as frames allow
+    assert set(substeps) == {4, 8} and np.count_nonzero(np.diff(substeps)) < 30  # 150 changes if every frame allowed were a try
 
 
 def test_a_bead_stays_on_its_wire_where_the_substep_gets_shorter(world):
-    # A trolley on a level wire, with a bob of three times its mass let go beside it. Sum p_x is kept, and what swings gains
-    # nothing: a trolley that links lifted off its wire was drawn back by it, with 4 J at once and 58 J in a minute.
+    # A trolley on a level wire, with a bob of three times its mass released beside it. Sum p_x is kept, and the swing gains no
+    # energy. If links could lift the trolley off its wire, the wire would draw it back with 4 J at once and 58 J in a minute.
     wire = tv.Path([0], [(-20, 0), (20, 0)], smooth=False)
     start = tv.Particles([(0, 0), (1, 0)], mass=[1.0, 3.0])
     w = world(start, [tv.Gravity(9.81), wire, tv.Distance([[0, 1]])], substeps=1, precision="f64")
@@ -249,8 +250,8 @@ def test_a_bead_stays_on_its_wire_where_the_substep_gets_shorter(world):
 
 
 def test_large_clusters_say_what_a_shorter_substep_makes_of_their_sag(world):
-    # Two clusters of 4 x 10 that share a row sag by a violation of h^2, of which a shorter substep makes energy: they are too
-    # large to be put to where they belong. In frames alike nothing is gained.
+    # Two clusters of 4 x 10 that share a row sag by a violation of order h^2, which a shorter substep turns into energy: the
+    # clusters are too large to be projected. In equal frames nothing is gained.
     g = np.stack(np.meshgrid(np.arange(19), np.arange(4), indexing="ij"), axis=-1).reshape(-1, 2)
     clusters = [np.flatnonzero((g[:, 0] >= k) & (g[:, 0] < k + 10)).tolist() for k in (0, 9)]
     beam = tv.Particles(0.1 * g, mass=0.01, pinned=np.flatnonzero(g[:, 0] == 0))
@@ -265,12 +266,12 @@ def test_large_clusters_say_what_a_shorter_substep_makes_of_their_sag(world):
         assert told == [0] if substeps == 20 else told == [] and gain < 1e-3, (substeps, told, gain)
     w._runner.memory.write(w._runner.scene.state.x, np.where(np.arange(len(g))[:, None] == 70, np.nan, w.position))
     w.substeps = 40
-    assert "non-finite" in w.step(1 / 60).flags  # and is nothing to fit a cluster to
+    assert "non-finite" in w.step(1 / 60).flags  # and no cluster is fitted to NaN
 
 
 def test_a_shorter_substep_makes_no_energy_of_a_large_outline(world):
-    # A ring of 320 links around an area hangs from one of its points, and two substeps let it sag to several times its length. 32
-    # made 159 J of that, when outlines of more than 300 corners were left as they were.
+    # A ring of 320 links around an area hangs from one of its points, and two substeps let it sag to several times its length.
+    # If outlines of more than 300 corners were not projected, 32 substeps would make 159 J of that.
     n, p = 320, 2 * np.pi * np.arange(320) / 320
     links = tv.Distance(np.stack([np.arange(n), (np.arange(n) + 1) % n], axis=1))
     start = tv.Particles(np.stack([np.cos(p), np.sin(p)], axis=1), mass=0.01, pinned=[n // 4])
@@ -284,8 +285,8 @@ def test_a_shorter_substep_makes_no_energy_of_a_large_outline(world):
 
 
 def test_a_winch_at_its_limit_lifts_nothing_where_the_substep_gets_shorter(world):
-    # It pulls with 20 N at a sling of 1 kg, in which a load of 4 kg stays on the floor. The sling is stretched by h^2; what takes
-    # that out moves the sling, against a constant force, and not the load, which had nothing to pay for that with.
+    # The winch pulls with 20 N at a sling of 1 kg, in which a load of 4 kg stays on the floor. The sling is stretched by
+    # O(h^2). Projecting that moves the sling against a constant force, and not the load, for whose lift there is no energy.
     x = [[0, 3.0], [0, 1.0], [0, 0.5], [0.3, 0.3], [-0.3, 0.3]]
     winch, sling = tv.Winch([[0, 1]], speed=-0.3, force=20.0), tv.Distance([[1, 2], [2, 3], [2, 4], [3, 4]])
     floor = tv.HalfSpace((0, 1), 0.3)
@@ -320,8 +321,8 @@ def test_systems_of_particles_are_solved(monkeypatch):
     monkeypatch.setattr(block_matrix, "WIDEST", 9)
     wide = block_matrix.BlockMatrix(26, 3, a, b)
     error = np.linalg.norm(wide.solve(blocks, right) - want) / np.linalg.norm(want)
-    assert not wide.narrow and error <= 1e-2  # as far as it has to go
-    # Rows on many particles at once, as of volumes, are added without a block for each two.
+    assert not wide.narrow and error <= 1e-2  # as far as the solver goes
+    # Rows on many particles at once, as of volumes, are added without a block for every two particles.
     k, row, who, J = np.array([2.0, 0.5]), np.repeat([0, 1], 20), np.r_[np.arange(20), np.arange(6, 26)], rng.normal(size=(40, 3))
     rows = np.zeros((2, 26, 3))
     rows[row, who] = J
@@ -368,26 +369,26 @@ def test_wrong_aims_are_refused(world):
         w.substeps = "adaptive"
 
 
-S, END = 0.1, 0.35  # [m], where the force of Lennard and Jones is 0 and where it ends
+S, END = 0.1, 0.35  # [m]: where the Lennard-Jones force is 0, and where it ends
 
 
 @ti.func
 def collide(r):
-    """24 (2 (s / r)^12 - (s / r)^6) / r, along r."""
+    """Return the force 24 (2 (s / r)^12 - (s / r)^6) / r, along r."""
     q = (S * S / r.norm_sqr()) ** 3
     return 24.0 * (2.0 * q * q - q) / r.norm_sqr() * r
 
 
 @ti.func
 def collide_energy(r):
-    """4 ((s / r)^12 - (s / r)^6), 0 where it ends."""
+    """Return the potential 4 ((s / r)^12 - (s / r)^6), shifted to 0 where the force ends."""
     q, end = (S * S / r.norm_sqr()) ** 3, (S / END) ** 6
     return 4.0 * (q * q - q) - 4.0 * (end * end - end)
 
 
 @ti.func
 def fall(r):
-    """Gravity between bodies that are a little soft, G = 0.01."""
+    """Return the softened gravity between two bodies, G = 0.01."""
     return -0.01 * r / (r.norm_sqr() + 1e-4) ** 1.5
 
 
@@ -398,7 +399,7 @@ def fall_energy(r):
 
 @ti.func
 def spring(r):
-    """k = 300 N/m."""
+    """Return the force of a spring of 300 N/m."""
     return -300.0 * r
 
 
@@ -409,8 +410,8 @@ def well(x):
 
 @pytest.mark.parametrize("forces", ["a field", "all pairs", "near pairs", "both"])
 def test_stiffness_of_forces_is_that_of_the_stiffest(world, forces):
-    # omega^2 = k w in a field F = -k x; (w_1 + w_2) k of two that pull each other by k r, and of more the sum over all others,
-    # which is at most twice too much. Whatever the others do, and however all fly.
+    # omega^2 = k w in a field F = -k x, and (w_1 + w_2) k for two particles that pull each other by k r. For more particles it
+    # is the sum over all others, at most twice too large. It depends neither on other particles nor on a common velocity.
     k, h, mass = 300.0, 1e-3, np.array([0.5, 2.0, 1.0])
     features = {
         "a field": [tv.Force(well)], "all pairs": [tv.PairForce(spring)], "near pairs": [tv.PairForce(spring, 1.0)],
@@ -430,8 +431,8 @@ def test_stiffness_of_forces_is_that_of_the_stiffest(world, forces):
 
 @pytest.mark.parametrize("precision", ["f32", "f64"])
 def test_bodies_that_collide_or_fly_by_keep_their_energy(world, precision):
-    # E(t) = E(0) but for what frames may miss. Nothing but forces tells of both: "auto" went down to one substep, and made 1e7 to
-    # 1e15 J of two atoms, or 48, and 1.8 J of 1.3 of 20 bodies.
+    # E(t) = E(0) up to what frames may miss. Only the stiffness of forces reveals these errors. Without it "auto" goes down to
+    # one substep, which gives two atoms, or 48, 1e7 to 1e15 J, and 20 bodies 1.8 J instead of 1.3 J.
     rng = np.random.default_rng(3)
     grid = np.stack(np.meshgrid(0.25 * np.arange(8), 0.25 * np.arange(6)), axis=-1).reshape(-1, 2)
     box, force = tv.Box((-1, -1.2), (3, 2.8), restitution=1.0), tv.PairForce(collide, END, potential=collide_energy)
@@ -442,12 +443,12 @@ def test_bodies_that_collide_or_fly_by_keep_their_energy(world, precision):
         reports = [w.step(1 / 60) for _ in range(600)]
         energy, flags = np.array([r.energy for r in reports]), set().union(*[r.flags for r in reports])
         assert np.abs(energy - energy[0]).max() < 0.03 * w._clock.kinetic and not flags
-        assert np.mean([r.substeps * r.tries for r in reports]) < 50  # nor are all frames cut as finely as the worst
+        assert np.mean([r.substeps * r.tries for r in reports]) < 50  # not all frames have as many substeps as the worst
 
 
 def test_what_falls_through_a_soft_center_comes_back(world):
-    # A Plummer sphere: E = v^2 / 2 - G M / sqrt(r^2 + e^2) per mass. From rest at 1 m they fall through it, or past it, and come
-    # back to that distance; a circle of radius r has omega^2 = G M / (r^2 + e^2)^(3/2).
+    # A Plummer sphere: E = v^2 / 2 - G M / sqrt(r^2 + e^2) per mass. Particles at rest at 1 m fall through the centre, or past
+    # it, and come back to that distance. A circle of radius r has omega^2 = G M / (r^2 + e^2)^(3/2).
     pull, e, r = 4.0, 0.05, 0.3
     omega = np.sqrt(pull / (r * r + e * e) ** 1.5)
     x, v = np.array([[1.0, 0.0], [0.0, 1.0], [r, 0.0]]), np.array([[0.0, 0.0], [0.02, 0.0], [0.0, omega * r]])
@@ -460,7 +461,7 @@ def test_what_falls_through_a_soft_center_comes_back(world):
 
 
 def test_how_two_atoms_vibrate_is_resolved_wherever_they_are(world):
-    # The same substeps, and the same energy of the two, alone, at 100 m/s, beside many that rest, and among some that fly.
+    # The same substeps and the same energy of two atoms: alone, at 100 m/s, beside many at rest, and among some that fly.
     x, still = np.array([[0.0, 0.0], [0.115, 0.0]]), 10.0 + np.stack([np.arange(300) % 20, np.arange(300) // 20], axis=1)
     begun, made = {}, {}
     for name, others, v, u in (
@@ -482,8 +483,8 @@ def test_how_two_atoms_vibrate_is_resolved_wherever_they_are(world):
 
 
 def test_energy_that_no_substep_mends_costs_no_more(world):
-    # Charges that somebody changes between frames work on the scene. What each frame then has more or less is no fault of its
-    # substeps: there are no more of them, and nothing is said to be stuck, but that there is energy from nowhere.
+    # Charges that change between frames do work on the scene. The energy that a frame then gains or loses is no fault of its
+    # substeps: their number does not rise, and the only flag is the energy gain, not "stuck".
     strength = ti.field(ti.f32, shape=())
 
     @ti.func
@@ -505,7 +506,7 @@ def test_energy_that_no_substep_mends_costs_no_more(world):
 
 
 def test_what_cannot_be_paid_or_said_in_numbers(world):
-    # Found by the fuzzer. Where nothing has moved, nothing is due: no division by 0. A tension beyond all numbers is a note.
+    # Found by the fuzzer. If nothing has moved, no energy is due, and nothing is divided by 0. An infinite tension makes a note.
     link = tv.Distance([[0, 1]])
     w = world(tv.Particles([[0.0, 0.0], [1.0, 0.0]], pinned=[0]), [tv.Gravity(), link], solver=tv.Direct())
     v = np.array([[0.0, 0.0], [0.0, 2.0]])
@@ -519,9 +520,9 @@ def test_what_cannot_be_paid_or_said_in_numbers(world):
 
 
 def test_what_an_impact_left_of_a_link_is_no_spring_where_a_wall_holds_it(world):
-    # Two masses over each other fall on the lower one, in a frame of one substep: the link is off by C = 0.3 L. Substeps that are
-    # 64 times shorter would make m (C / h)^2 / 4 of it, 1800 J. So it is taken out first; the lower end cannot go down, and the
-    # upper one is lifted by no more than C.
+    # Two masses, one above the other, fall on the lower one in frames of one substep: the link is off by C = 0.3 L. Substeps
+    # that are 64 times shorter would turn that into m (C / h)^2 / 4, 1800 J. So the violation is projected first; the lower end
+    # cannot go down, and the upper one is lifted by no more than C.
     L, g, m = 0.3, 9.81, 1.0
     w = world(
         tv.Particles([[0.0, 0], [0, L]], mass=m, velocity=(0, -5)),
@@ -564,9 +565,9 @@ def test_what_stands_stays_on_its_feet_where_the_substep_gets_shorter(world, dim
 
 
 def test_a_plate_bent_over_a_ball_is_no_spring(world):
-    # A braced plate falls on a ball and bends at 2 substeps: links are off by 6 % of their length. To straighten it sends its
-    # middle into the ball, which sends it back: each turn left more than was there, and 64 substeps made 12000 J of the 104 J.
-    # Where the ball holds the middle, the rims are lifted instead, by less than they have fallen.
+    # A braced plate falls on a ball and bends at 2 substeps: links are off by 6 % of their length. Straightening it sends its
+    # middle into the ball, and the ball sends it back. Without a limit, each round leaves more violation than before, and 64
+    # substeps make 12000 J of 104 J. Where the ball holds the middle, the rims are lifted instead, by less than they fell.
     c = tv.shapes.cloth((-0.8, 0.8, -0.8), (1.6, 0, 0), (0, 0, 1.6), points=(5, 5))
     links = tv.Distance(np.concatenate([c.links, c.braces]))
     w = world(
@@ -582,8 +583,8 @@ def test_a_plate_bent_over_a_ball_is_no_spring(world):
 
 
 def test_a_cloth_that_hangs_over_a_ball_goes_where_its_links_are_met(world):
-    # Pinned at two corners, it falls over a ball. Where the ball sends it back in the first turn, the second one mends that; all
-    # was taken back, for it was not looked at, and 7 J became 33 as 64 substeps followed.
+    # A cloth, pinned at two corners, falls over a ball. If the ball sends it back in the first round of the projection, the
+    # second round corrects that. If the second round were ignored and all undone, 64 substeps would make 33 J of 7 J.
     c = tv.shapes.cloth((-0.6, 0.85, -0.6), (1.2, 0, 0), (0, 0, 1.2), points=(9, 9))
     particles = tv.Particles(c.position, mass=0.01, radius=0.04, pinned=[0, 8])
     w = world(particles, [tv.Gravity(9.81), tv.Distance(c.links), tv.Ball((0, 0, 0), 0.4)], substeps=2, precision="f64")
@@ -594,8 +595,8 @@ def test_a_cloth_that_hangs_over_a_ball_goes_where_its_links_are_met(world):
 
 
 def test_a_sheet_that_sags_takes_few_steps_to_put_right(world, monkeypatch):
-    # Threads and soft braces that fall from two corners, and contradict each other: what is left over there is no fault. Each of
-    # the five times that the substep got shorter took all 40 steps of Newton's method, 30 s for a sheet of 40 x 40.
+    # Threads and soft braces fall from two corners and contradict each other: the violation left there is no fault. If it
+    # counted, each of five reductions of the substep would take all 40 Newton steps, 30 s for a sheet of 40 x 40.
     n, taken = 16, []
     sheet = tv.shapes.cloth((0, 0, 0), (1, 0, 0), (0, 0, 1), (n, n))
     features = [tv.Gravity(9.81), tv.Distance(sheet.links), tv.Distance(sheet.braces, compliance=0.1, damping=0.002)]
@@ -609,7 +610,7 @@ def test_a_sheet_that_sags_takes_few_steps_to_put_right(world, monkeypatch):
 
 
 def test_how_fast_a_sheet_flies_does_not_matter_where_the_substep_gets_shorter(world):
-    # The same energy in itself, E - m v^2 / 2, at 0 and at 300 m/s, to the rounding of both.
+    # The same inner energy, E - m v^2 / 2, at 0 and at 300 m/s, to the rounding of both.
     sheet = tv.shapes.cloth((0, 0, 0), (1, 0, 0), (0, 0, 1), (8, 8))
     left = []
     for speed in (0.0, 300.0):
@@ -623,9 +624,9 @@ def test_how_fast_a_sheet_flies_does_not_matter_where_the_substep_gets_shorter(w
 
 
 def test_few_substeps_that_do_not_help_are_not_the_last_word(world):
-    """A figure lands on straight legs: what one substep leaves two and four leave too, being far off, and 16 do not."""
+    """A figure lands on straight legs: two and four substeps leave as much violation as one, and 16 do not."""
     s = tv.shapes.ragdoll((0, 0.5))
     floor = tv.HalfSpace((0, 1), friction=0.6)
     w = world(tv.Particles(s.position, mass=5.0, radius=0.05), [tv.Gravity(9.81), tv.Distance(s.links), floor], substeps="auto")
     reports = [w.step(1 / 60) for _ in range(40)]
-    assert not any(r.flags for r in reports[25:]) and max(r.residual for r in reports[21:]) < 0.1  # it was 1, at 1 to 4
+    assert not any(r.flags for r in reports[25:]) and max(r.residual for r in reports[21:]) < 0.1  # 1 at 1 to 4 substeps

@@ -12,9 +12,11 @@ from .conftest import case, rerun
 def discs(
     world, x, v, mass=1.0, e=(1.0, 0.0), group=0, radius=0.5, g=0.0, friction=(), lower=-1e9, upper=1e9, bouncy=1.0, **settings
 ):
-    """Discs or spheres that bounce and rub, with an e and a friction for each of up to five groups, under gravity and between
-    walls, here or far away; and one of each group far away that cannot move, so that all have the same kernels, as they have with
-    masses that differ, if by rounding only."""
+    """Build a world of discs or spheres with friction and restitution for up to five groups, gravity, and near or far walls.
+
+    One fixed particle of each group lies far away, and masses differ at least by rounding, so that all these worlds use the same
+    kernels.
+    """
     n, dim = x.shape
     far = 1e3 + 10.0 * np.arange(5)[:, None] * np.ones(dim)
     start = tv.Particles(
@@ -34,7 +36,7 @@ def discs(
 
 @pytest.mark.parametrize("dim, precision, limit", [(2, "f64", 1e-12), (3, "f32", 1e-6)])
 def test_head_on_collisions(world, dim, precision, limit):
-    # R14: v1 = (m1 u1 + m2 u2 - m2 e (u1 - u2)) / (m1 + m2), mass ratios 1 ... 1000. One pair per row, a group for each e.
+    # R14: v1 = (m1 u1 + m2 u2 - m2 e (u1 - u2)) / (m1 + m2), mass ratios 1 ... 1000. One pair per row, a group per e.
     rows = [
         (m1, m2, u1, u2, k)
         for m1, m2, u1, u2 in ((1, 1, 2, 0), (1, 3, 2, -1), (1, 1000, 5, 0), (1000, 1, 5, 0))
@@ -60,8 +62,8 @@ def test_head_on_collisions(world, dim, precision, limit):
 
 
 def test_blows_are_reported(world):
-    # The impulses of all substeps add up to (1 + e) u / (w1 + w2), and each is what the disc's momentum changed by; likewise with
-    # a disc that cannot move, and for one that throws the next one onto a third in the same substep.
+    # The impulses of all substeps add up to (1 + e) u / (w1 + w2), and each equals the change of the disc's momentum. The same
+    # holds for a fixed disc, and for a disc that throws the next one onto a third in the same substep.
     e, mass = np.repeat([0.0, 0.5, 1.0], 3), np.tile([[1.0, 1.0], [1.0, 1000.0], [np.inf, 2.0]], (3, 1))
     x = np.stack([np.c_[-0.6 + 0 * e, 3.0 * np.arange(9)], np.c_[0.55 + 0 * e, 3.0 * np.arange(9)]], axis=1)
     v, group = np.zeros((9, 2, 2)), np.repeat(np.arange(3), 6)
@@ -86,7 +88,7 @@ def test_blows_are_reported(world):
 
 
 def test_oblique_discs(world):
-    # R15: v1 = u - (1 + e)/2 (u . n) n, direction to 1e-3 rad at v h / r = 0.01. One pair for each e, a group each.
+    # R15: v1 = u - (1 + e)/2 (u . n) n, direction to 1e-3 rad at v h / r = 0.01. One pair per e, in a group of its own.
     p, values = case("R15_oblique_discs")["params"], case("R15_oblique_discs")["values"]
     rows = [(1.0, "e1"), (0.5, "e0.5"), (0.0, "e0")]
     aside = 10.0 * np.repeat(np.arange(3), 2)[:, None] * [0, 1]
@@ -102,7 +104,7 @@ def test_oblique_discs(world):
 
 @pytest.fixture(scope="module", params=[2, 3])
 def floor(request):
-    """A ball above the bottom of a box or a half space."""
+    """A ball above the bottom of a box (2D) or above a half space (3D)."""
     start = tv.Particles([[0.0, 1.1, 0.0][: request.param]], radius=0.1)
     walls = {2: tv.Box((-1, 0), (1, 9), restitution=0.5), 3: tv.HalfSpace((0, 1, 0), restitution=0.5)}
     with tv.World(start, [tv.Gravity(9.81), walls[request.param]], precision="f64", substeps=1) as w:
@@ -111,7 +113,7 @@ def floor(request):
 
 @pytest.mark.parametrize("e", [0.5, 0.8, 0.9])
 def test_bouncing_ball(floor, e):
-    # R16: heights h0 e^(2 n), at rest at t_rest; never gains. h = 1/600.
+    # R16: heights h0 e^(2 n), at rest at t_rest, and no gain. h = 1/600.
     want, w = case(f"R16_bounce_e{e}")["values"], floor
     w.features[1].restitution, w.iterations = e, 1
     w.position, w.velocity = w.particles.position, w.particles.velocity
@@ -147,7 +149,10 @@ def test_what_rests_does_not_bounce_where_the_substep_gets_shorter(world, kind, 
 
 
 def in_rows(rows, dim=2):
-    """Particles (x, y, speed upwards, radius, pinned) in rows, a group each and 10 m apart; and where those are that are free."""
+    """Return particles and the indices of the free ones per row.
+
+    rows: (x, y, speed upwards, radius, pinned) of particles; rows are 10 m apart, and each is a group.
+    """
     flat, group = np.concatenate(rows).astype(float), np.repeat(np.arange(len(rows)), [len(row) for row in rows])
     x, v = np.zeros((len(flat), dim)), np.zeros((len(flat), dim))
     x[:, 0], x[:, 1], v[:, 1] = flat[:, 0] + 10 * group, flat[:, 1], flat[:, 2]
@@ -157,9 +162,10 @@ def in_rows(rows, dim=2):
 
 @pytest.mark.parametrize("kind, limit", [("discs", 1e-12), ("polygons", 1e-12), ("spheres in f32", 1e-4)])
 def test_what_bounces_on_pinned_particles_keeps_its_energy(world, kind, limit):
-    # With gravity, E = v^2 / 2 + g y, for any substep: kept where e = 1, by what falls on one that is pinned, flies to and fro
-    # below another one, or hops between two; above the contact E e^(2 k) after k bounces, at t0 (1 + 2 (e + ... + e^(k - 1))).
-    # Two that fall together and collide have the relative velocity -e u, and their middle falls as before.
+    # Under gravity, E = v^2 / 2 + g y is kept for any substep where e = 1: for a particle that falls on a pinned one, flies to
+    # and fro below another, or hops between two. Above the contact it is E e^(2 k) after k bounces, at
+    # t0 (1 + 2 (e + ... + e^(k - 1))). Two particles that fall together and collide have the relative velocity -e u, and their
+    # middle stays in free fall.
     g, e, r = 9.81, 0.8, 0.5
     loops, floor, roof = [], [(0, 0, 0, r, 1)], [(0, 2.3, 0, r, 1)]
     if kind == "polygons":
@@ -196,7 +202,7 @@ def test_what_bounces_on_pinned_particles_keeps_its_energy(world, kind, limit):
 
 
 def test_what_springs_draw_to_a_pinned_disc_keeps_its_energy_to_second_order(world):
-    # A ball on a spring of 5 N/m, at rest 1 m long, and on a disc below it, e = 1: E = v^2 / 2 + g y + k (l - 1)^2 / 2.
+    # A ball on a spring of 5 N/m, 1 m long at rest, and on a disc below, e = 1: E = v^2 / 2 + g y + k (l - 1)^2 / 2.
     start = tv.Particles([(0.0, 0.0), (0.0, 1.3), (0.0, 2.5)], radius=[0.5, 0.5, 0.0], pinned=[0, 2])
     spring = tv.Distance([[1, 2]], compliance=0.2, rest=1.0)
     w = world(start, [tv.Gravity(), tv.Contact(restitution=1.0), spring], precision="f64")
@@ -210,12 +216,12 @@ def test_what_springs_draw_to_a_pinned_disc_keeps_its_energy_to_second_order(wor
 
 
 def test_newtons_cradle(world):
-    # R17: pair by pair, with a gap and touching; the last ball carries on with all of it. Three rows, a group for each e.
+    # R17: pair by pair, with a gap and touching; the last ball takes all of the velocity. Three rows, a group per e.
     p, want = case("R17_newton_cradle")["params"], case("R17_newton_cradle")["values"]
     n, rows = p["n"], ((0.001, 0), (0.001, 1), (0.0, 0))
     x, v = np.zeros((3, n, 2)), np.zeros((3, n, 2))
     for k, (gap, _) in enumerate(rows):
-        x[k, :, 0], x[k, :, 1] = np.arange(n) * (2 * p["r"] * (1 + 1e-14) + gap), k  # not overlapping by rounding
+        x[k, :, 0], x[k, :, 1] = np.arange(n) * (2 * p["r"] * (1 + 1e-14) + gap), k  # no overlap by rounding
     x[:, 0, 0] -= 0.1
     v[:, 0, 0] = 1.0
     w = discs(world, x.reshape(-1, 2), v.reshape(-1, 2), 1.0, (1.0, 0.9), np.repeat([e for _, e in rows], n), p["r"])
@@ -226,7 +232,7 @@ def test_newtons_cradle(world):
 
 
 def by_events(x, v, mass, seconds):
-    """Where a few elastic balls of diameter 1 go, from blow to blow: |r + s u| = 1, s = c / (sqrt(b^2 - a c) - b)."""
+    """Return where a few elastic balls of diameter 1 go, from impact to impact: |r + s u| = 1, s = c / (sqrt(b^2 - a c) - b)."""
     x, v = x.copy(), v.copy()
     while seconds > 0:
         following, pair = seconds, None
@@ -245,8 +251,8 @@ def by_events(x, v, mass, seconds):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_struck_by_two_in_one_substep(world, dim):
-    # Two come at a third, which is thrown from the one to the other, up to four blows in one substep of 1/240 s. Each is between
-    # two, at its own time and place, so this is exact.
+    # Two discs hit a third, which is thrown from one to the other, up to four impacts in one substep of 1/240 s. Each impact is
+    # between two discs at its own time and place, so the result is exact.
     rng = np.random.default_rng(5)
     sides = rng.normal(size=(100, 2, dim))
     sides[:, 1] -= 1.2 * sides[:, 0]
@@ -255,7 +261,7 @@ def test_struck_by_two_in_one_substep(world, dim):
     x[:, 0, 1] = 4.0 * np.arange(100)
     x[:, 1:] = x[:, :1] + sides * rng.uniform(1.0, 1.04, size=(100, 2, 1))
     v[:, 1:] -= sides * rng.uniform(10, 20, size=(100, 2, 1))
-    # Only where both would be inside the third at the end: a blow that is due to another one is seen in the next substep.
+    # Only where both would be inside the third at the end: an impact that another one causes is found in the next substep.
     there = x + v / 240
     struck = (np.linalg.norm(there[:, 1:] - there[:, :1], axis=2) < 1).all(axis=1)
     keep = struck & (np.linalg.norm(x[:, 1] - x[:, 2], axis=1) > 1.5)
@@ -270,8 +276,8 @@ def test_struck_by_two_in_one_substep(world, dim):
 
 @pytest.mark.parametrize("dim, precision", [(2, "f32"), (3, "f64")])
 def test_incline(world, dim, precision):
-    # R18: a = g (sin - mu cos); it stops after v^2 / (2 g (mu cos - sin)) and stays to the bit if tan < mu. h = 1/600. One plane
-    # at 20 degrees for each mu; gravity is turned for the other angles.
+    # R18: a = g (sin - mu cos); a disc with tan < mu stops after v^2 / (2 g (mu cos - sin)) and stays bit for bit. h = 1/600.
+    # One plane at 20 degrees per mu; gravity is turned for the other angles.
     n, t = np.zeros(dim), np.zeros(dim)
     a = np.radians(20.0)
     n[:2], t[:2] = (np.sin(a), np.cos(a)), (np.cos(a), -np.sin(a))
@@ -298,7 +304,7 @@ def test_incline(world, dim, precision):
 
 
 def test_slip_threshold_and_two_coefficients(world):
-    # Sticks below the static coefficient, slides with the dynamic one: to 0.1 degrees.
+    # Sticks below the static coefficient and slides with the dynamic one: to 0.1 degrees.
     mu_s, mu_d = 0.5, 0.3
     for degrees, slides in ((np.degrees(np.arctan(mu_s)) - 0.1, False), (np.degrees(np.arctan(mu_s)) + 0.1, True)):
         a = np.radians(degrees)
@@ -320,7 +326,7 @@ def test_friction_between_particles(world):
     w.run(0.5)
     for k, (mu, stays) in enumerate(rows):
         assert (np.hypot(*(w.position[:-5] - x)[2 * k + 1]) < 1e-9) == stays, mu
-    # What stays weighs on the fixed one with m g cos, though it does not overlap it any more.
+    # A disc that stays presses on the fixed one with m g cos, though it does not overlap it by then.
     held = w.contacts.impulse[np.isin(w.contacts.pairs[:, 0], [4, 6])]
     np.testing.assert_allclose(held * 1200, 9.81 * np.cos(a), rtol=1e-9)
     for friction, error in ((-0.1, "at least 0"), (float("nan"), "finite"), ((0.2, 0.5), "must not exceed")):
@@ -334,7 +340,7 @@ def test_friction_between_particles(world):
 
 
 def test_a_moving_wall_drags_along(world):
-    # Row 70, with a piston that has friction along a second wall: what rests on it moves with it, in the right direction.
+    # Row 70: a piston pushes a disc along a floor with friction. The disc moves with the piston, in the right direction.
     floor = tv.HalfSpace((0, 1), friction=0.5)
     box = tv.Box((0, -9), (20, 9))
     w = world(tv.Particles([[0.5, 0.5]], radius=0.5), [tv.Gravity(9.81), floor, box], precision="f64")
@@ -355,21 +361,24 @@ def test_leaving_a_sphere(world):
     w = discs(world, x, 0 * x, np.array([np.inf, 1.0]), [0.0], g=9.81, substeps=20)
     while w.position[1, 1] > 0.0:
         w.step(1 / 60)
-    # In free flight v_x = v cos(angle) of the departure, and there v^2 = g R cos(angle): cos = (v_x^2 / (g R))^(1/3).
-    # It starts at 0.05 rad, so it leaves where cos = 2/3 cos 0.05.
+    # In free flight v_x = v cos(angle) of the departure, where v^2 = g R cos(angle): cos = (v_x^2 / (g R))^(1/3). The point
+    # starts at 0.05 rad, so it leaves where cos = 2/3 cos 0.05.
     angle = np.arccos(np.cbrt(w.velocity[1, 0] ** 2 / 9.81))
     assert np.degrees(angle) == pytest.approx(np.degrees(np.arccos(np.cos(0.05) * want["cos_theta"])), abs=0.3)
     assert (w.velocity[1] ** 2).sum() / 2 + 9.81 * w.position[1, 1] == pytest.approx(9.81 * np.cos(0.05), rel=1e-3)
 
 
 def crowded(world, start, low, high, skin, g=9.81, **settings):
-    """Discs that rub, bounce, and learn their loads in a box; of many radii and masses, so that all have the same kernels."""
+    """Build a world of discs in a box with friction, restitution and known loads.
+
+    Many radii and masses give all these worlds the same kernels.
+    """
     contact = tv.Contact(friction=(0.6, 0.4), restitution=0.3, skin=skin, loads=True)
     return world(start, [tv.Gravity(g), contact, tv.Box(low, high, friction=0.5, restitution=0.3)], **settings)
 
 
 def slope(world, friction, dim):
-    """The slope of a heap that was poured onto a rough floor, taken for a triangle or a cone."""
+    """Return the slope of a heap that was poured onto a rough floor, taken for a triangle or a cone."""
     n = 100 if dim == 2 else 200
     k = np.arange(n)
     x = np.zeros((n, dim))
@@ -387,8 +396,8 @@ def slope(world, friction, dim):
     w.run(4.0)
     x = w.position[:n]
     assert np.isfinite(x).all() and w.last.overlap < 0.1
-    # Of a triangle of height H and half width B the mean height is H / 3, the median distance from the middle B (1 - sqrt(1/2)).
-    # Grains that rolled off alone do not count in a median. (A cone: H / 4 and 0.45 B, which changes the slope by a factor of 2.)
+    # A triangle of height H and half width B has the mean height H / 3 and the median distance B (1 - sqrt(1/2)) from the middle.
+    # Single grains that rolled away do not affect a median. (A cone: H / 4 and 0.45 B, a factor of 2 in the slope.)
     height = x[:, 1].mean() - 0.1
     across = np.linalg.norm(np.delete(x, 1, axis=1), axis=1)
     return float(3 * height / (np.median(across) / (1 - np.sqrt(0.5))))
@@ -402,7 +411,7 @@ def test_heaps_are_steeper_with_friction_and_flat_without(world, dim):
 
 
 def test_what_takes_over_a_state_goes_on_to_the_bit(world):
-    # With other lists, too. For paths see test_sleep.py.
+    # Also with other neighbour lists. test_sleep.py tests the paths.
     rng = np.random.default_rng(3)
     k = np.arange(200)
     x = np.stack([k % 14 * 0.21, 0.2 + k // 14 * 0.21], axis=1) + rng.uniform(0, 0.005, (200, 2))
@@ -421,8 +430,8 @@ def test_what_takes_over_a_state_goes_on_to_the_bit(world):
 
 
 def test_bounces_survive_a_new_list_between_two_passes(world):
-    # With several passes the list may be built anew between them; what pairs aim at has to move along. The skin decides when
-    # that happens, and must not decide anything else.
+    # With several passes the list may be rebuilt between them, and the restitution targets of pairs must move along. The skin
+    # decides when that happens, and must not affect anything else.
     k = np.arange(150)
     x = np.stack([k % 15 * 0.215 + 0.15, k // 15 * 0.215 + 0.15], axis=1)
     v = np.random.default_rng(4).normal(size=(150, 2)) * 2
@@ -441,7 +450,7 @@ def test_bounces_survive_a_new_list_between_two_passes(world):
 
 @pytest.mark.parametrize("e", [0.5, 1.0])
 def test_what_is_driven_strikes(world, e):
-    # A racket at V meets a ball at rest, which leaves at (1 + e) V: the racket is as good as infinitely heavy.
+    # A racket at V hits a ball at rest, which leaves at (1 + e) V: the racket acts like an infinite mass.
     V, pin, beads = 2.0, tv.Pin([0]), tv.Path([2], [[0.0, 5], [5, 5]], smooth=False, speed=2.0)
     x = [[0.0, 0], [0.7, 0], [0.0, 5], [0.7, 5]]
     w = world(
@@ -454,8 +463,8 @@ def test_what_is_driven_strikes(world, e):
 
 
 def test_what_bounces_is_the_same_with_a_new_list(world):
-    # How often a mass is split is worked out when other pairs touch than before. A new list knows by what pairs carry while they
-    # touch; it took those that were pushed early in a substep and parted in a later pass for pairs that touch.
+    # Mass splitting is recomputed when other pairs touch than before. A new list takes from the data of pairs whether they
+    # touch. It must not take pairs for touching that were pushed early in a substep and separated in a later pass.
     rng = np.random.default_rng(1)
     x = np.array([(0.11 * i + 0.003 * rng.normal(), 0.06 + 0.105 * j) for i in range(6) for j in range(6)])
     p = tv.Particles(x, mass=np.where(rng.random(36) < 0.7, 1.0, 1e3), radius=0.05 - 1e-6 * tv.golden(np.arange(36)))
@@ -471,8 +480,9 @@ def test_what_bounces_is_the_same_with_a_new_list(world):
 
 
 def test_bodies_of_discs_that_bounce_come_to_rest(world):
-    # 16 squares of 4 discs: a corner is pressed in between its body and what it lies on, so what an impact takes the next one
-    # gives back, unless what two substeps of forces bring rests. 45 of the 64 discs went on at 0.1 m/s.
+    # 16 squares of 4 discs: a corner is pressed in between its body and the floor or disc below, so one impact gives back what
+    # the previous one took. A pair must not bounce if it approaches no faster than two substeps of forces make it; otherwise 45
+    # of the 64 discs keep moving at 0.1 m/s.
     rng, x = np.random.default_rng(1), []
     for k in range(16):
         angle = rng.uniform(0, 6.28) + np.pi / 2 * np.arange(4)
@@ -487,8 +497,9 @@ def test_bodies_of_discs_that_bounce_come_to_rest(world):
 
 
 def test_a_dense_gas_gains_no_energy_in_several_passes(world):
-    # Where e < 1 every impact takes energy. In later passes pairs come together by what others pushed in earlier ones, which is
-    # no force: taken for one, pairs rested that should bounce, and were pushed apart. The gas gained 9 J of 300 in a frame.
+    # Where e < 1 every impact takes energy. In later passes pairs approach by what others pushed in earlier ones, which is no
+    # force. If it counted as one, pairs would rest that should bounce, and be pushed apart: the gas would gain 9 J of 300 a
+    # frame.
     x, v = 3.0 * tv.golden(range(300), dim=2), np.random.default_rng(1).normal(size=(300, 2))
     features = [tv.Box((-0.2, -0.2), (3.2, 3.2), restitution=1.0), tv.Contact(restitution=0.99)]
     w = world(tv.Particles(x, velocity=v, radius=0.07), features, precision="f64", substeps=8)

@@ -1,4 +1,4 @@
-"""Ctrl-C: a frame is done or not done, wherever the signal comes."""
+"""Ctrl-C: a frame is complete or undone, wherever the signal arrives."""
 
 import os
 import signal
@@ -16,13 +16,15 @@ pytestmark = pytest.mark.usefixtures("read_here")
 
 
 def frames_of(world, dt=1 / 60):
-    """How many frames it has made."""
+    """Return how many frames a world has made."""
     return round(world.time / dt)
 
 
 def pile(**settings):
-    """Discs that touch, rub and bounce, on a rope that breaks: everything that a substep can have. Two overlap, so that worlds of
-    recordings, where others do, have the same kernels."""
+    """Discs that touch, with friction and restitution, on a rope that breaks: everything that a substep can contain.
+
+    Two discs overlap, so that worlds of recordings, where others overlap, use the same kernels.
+    """
     x = np.array([*([0.3 * k, 0.3 + 0.29 * (k % 2)] for k in range(6)), [2.0, 2.0], [2.3, 2.0]])
     features = [
         tv.Gravity(9.81), tv.Contact(friction=0.3, restitution=0.4), tv.Box((-1, 0), (3, 3)),
@@ -39,7 +41,7 @@ def piled():
 
 @pytest.fixture
 def w(piled):
-    """One world for all tests, since compiling it takes longer than all else."""
+    """One world for all tests, since compiling it takes longer than everything else."""
     start, passes = checkpoint.keep(piled), piled._runner.passes_at_once
     yield piled
     checkpoint.put_back(piled, start)
@@ -69,7 +71,7 @@ def test_a_signal_waits_for_the_end_of_the_frame(w, tmp_path):
                     signal.raise_signal(signal.SIGINT)
                 return watch
 
-        while came == place // 83:  # every 83rd line of those that are run, until there are no more
+        while came == place // 83:  # every 83rd of the executed lines, until there are no more
             place, lines[0] = place + 83, 0
             try:
                 sys.settrace(watch)
@@ -78,7 +80,7 @@ def test_a_signal_waits_for_the_end_of_the_frame(w, tmp_path):
                 came += 1
             finally:
                 sys.settrace(None)
-        assert came > 10 and lines[0] < place  # none has vanished
+        assert came > 10 and lines[0] < place  # no signal was lost
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     recording = tv.replay(tmp_path / "a.rrd")
     assert recording.complete and recording.verify()
@@ -87,7 +89,7 @@ def test_a_signal_waits_for_the_end_of_the_frame(w, tmp_path):
 
 
 def in_parts(w, passes, frames):
-    """Hashes of frames made in one launch each, and made in launches of so many passes."""
+    """Return hashes of frames made in one launch each, and in launches of `passes` passes."""
     start, out = checkpoint.keep(w), []
     for some in (w._runner.passes_at_once, passes):
         checkpoint.put_back(w, start)
@@ -103,7 +105,7 @@ def test_long_frames_in_several_launches_have_the_same_bits(w, passes):
 
 
 def test_long_frames_of_a_team_and_of_high_order():
-    # Of a team what is between two passes is the same for all that one has; discs and a rope stand for it.
+    # For a team, the code between two passes is the same whatever features there are; discs and a rope stand for all.
     chain = [tv.Gravity(), tv.Distance([(0, 1)])]
     discs = tv.Particles([[0.0, 0.0], [0.3, 0.0], [0.05, 0.4]], radius=0.16, pinned=[0])
     with (
@@ -147,7 +149,7 @@ def test_a_handler_that_raises_nothing_is_called_after_the_frame(w):
             w.step(1 / 60)
             assert not seen
         assert seen == [1]
-        thread = threading.Thread(target=w.step, args=(1 / 60,))  # where there is nothing to wait for
+        thread = threading.Thread(target=w.step, args=(1 / 60,))  # a thread has no signal to wait for
         thread.start(), thread.join()
         assert frames_of(w) == 2
     finally:

@@ -1,7 +1,7 @@
 """Settings that look live are live, and all others refuse: for every exported force, constraint and wall at once.
 
-One world in 3D and one in 2D hold all of them, each with particles of its own to show its effect on. A setting is live if a world
-goes on, after the assignment, as one that was built with the new value.
+One world in 3D and one in 2D hold all of them. Each has particles of its own that show its effect. A setting is live if, after
+the assignment, the world continues like one that was built with the new value.
 """
 
 import inspect
@@ -26,8 +26,8 @@ SPRING, SPRINGS = {"compliance": 1e-2, "damping": 1.0, "break_at": 1e6}, {"compl
 SOFT, SOFTER, RIGID = ({"compliance": a, "damping": b} for a, b in ((1e-2, 1.0), (1e-3, 3.0), (0.0, 0.0)))
 SURFACE = {"friction": 0.5, "restitution": 0.5, "push_out": 1.0, "active": True, "events": False}
 SURFACES = {"friction": (0.2, 0.1), "restitution": 0.9, "push_out": 3.0, "active": False, "events": True}
-BLOCK = np.array([6.0, 0.0, 0.0])  # from the particles of one to those of the next
-LOCAL = ("center", "a", "b", "position", "target")  # settings that are places, given from the block
+BLOCK = np.array([6.0, 0.0, 0.0])  # from the particles of one row to those of the next
+LOCAL = ("center", "a", "b", "position", "target")  # settings that are positions, relative to the block
 
 
 @ti.func
@@ -52,8 +52,8 @@ DISCS = [[0, 0, 0], [0.38, 0.1, 0], [0.3, -0.5, 0]]
 ANGLE, AREA, GROUPS = {"rest": 0.3}, {"rest": 0.2, "pressure": 1.0}, [(0, 0), (0, 1)]
 TURN = {"position": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0)}
 
-# By name: how it is made of the numbers of its particles and the place of its block, where its particles are in it, and its
-# settings, old and new. What acts on all particles comes with those that show it.
+# By name: a function that makes the feature from its particle indices and the place of its block, the positions of its particles
+# in the block, and its old and new settings. Features that act on all particles come with some that show their effect.
 ROWS3 = {
     "Gravity": (lambda i, x, **k: tv.Gravity(**k), PATH, {"g": (0.0, -1.0, 0.0)}, {"g": 3.0}),
     "Drag": (lambda i, x, **k: tv.Drag(**k), PATH, {"rate": 0.1}, {"rate": 1.0}),
@@ -62,7 +62,7 @@ ROWS3 = {
         lambda i, x, **k: tv.Attractor(**k), PATH, {"center": (0, 1, 0), "strength": 3.0, "softening": 0.0},
         {"center": (1, 0, 2), "strength": -3.0, "softening": 30.0},
     ),
-    "Hand": (  # one of its own particles, which come after those of four others
+    "Hand": (  # holds one of its own particles, which come after those of four other rows
         lambda i, x, **k: tv.Hand(**k), PATH, {"target": (0, 1, 0), "particle": 4 * len(PATH), "rate": 5.0},
         {"target": (1, 0, 2), "particle": 4 * len(PATH) + 1, "rate": 9.0},
     ),
@@ -177,13 +177,13 @@ ELSEWHERE = {
     ("Box", "lower"),
     ("Winch", "longest"),
     ("Winch", "shortest"),
-}  # nothing is there
+}  # settings without an effect on these particles
 
-GOES_ON = ("Path, speed", "Motor", "Motor, angle", "Winch")  # from where they have got to, wherever particles are put
+GOES_ON = ("Path, speed", "Motor", "Motor, angle", "Winch")  # these continue from their current place, wherever particles are put
 
 
 class Scene:
-    """One world of all rows."""
+    """One world with all rows."""
 
     def __init__(self, world, rows, new: bool, **settings):
         self.rows, dim = rows, np.shape(next(iter(rows.values()))[1])[1]
@@ -194,7 +194,7 @@ class Scene:
         self.x = np.concatenate(points)
         self.v = np.random.default_rng(2).normal(size=self.x.shape) * 0.7
         walls = [name for name in rows if issubclass(getattr(tv, name.split(",")[0]), colliders.collider.Collider)]
-        for name in walls:  # they come in, with a slant
+        for name in walls:  # particles move towards the wall, at an angle
             self.v[self.indices[name]] = 4.0
             self.v[self.indices[name], 1:] = np.array([-3.0, 1.0])[: self.x.shape[1] - 1] * (-1 if name == "Box" else 1)
         if "Polygons" in rows:  # the upper body falls on the lower one
@@ -211,18 +211,18 @@ class Scene:
         self.world = world(start, list(self.features.values()), substeps=5, precision="f64", **settings)
 
     def values(self, name: str, new: bool) -> dict:
-        """Settings, old or new."""
+        """Return the settings of a row, old or new."""
         local = name not in ("Attractor", "Hand")
         return {k: np.add(v, self.place[name]) if k in LOCAL and local else v for k, v in self.rows[name][2 + new].items()}
 
     def assign(self, new: bool, names=None) -> None:
-        """Set all of them."""
+        """Assign all settings of the rows."""
         for name in names or self.rows:
             for setting, value in self.values(name, new).items():
                 setattr(self.features[name], setting, value)
 
     def go(self, frames: int = 4) -> np.ndarray:
-        """Let targets be reached, and what pairs remember be forgotten; then run from the start."""
+        """Let targets be reached and pairs forget their data, then run from the start. Returns positions of all frames."""
         apart = self.x.copy()
         for name in ("Contact", "Polygons"):
             apart[self.indices.get(name, []), 1] += np.arange(len(self.indices.get(name, [])))
@@ -243,14 +243,14 @@ GROUPED = {
     "walls": ["Box", "HalfSpace", "Ball", "Capsule"],
     "solid": ["Mesh"],
 }
-LIKE = {  # settings that the same code writes for the same code to read; these would only take long to compile
+LIKE = {  # settings that the same code writes and reads; compiling these kinds would only take long
     "Rope": tv.Distance, "Spacer": tv.Distance, "Constraint": tv.Distance, "Dihedral": tv.Bend, "Volume": tv.Area, "Sdf": tv.Mesh,
     "Polygon": tv.Mesh, "Polygons": tv.Contact,
 }  # fmt: skip
 
 
 def rebuilds(feature, setting: str) -> bool:
-    """Whether another value has the world built anew."""
+    """Whether another value makes the world rebuild."""
     knob = inspect.getattr_static(type(feature), setting)
     return knob.compiled or knob.built
 
@@ -269,8 +269,8 @@ def test_the_rows_have_every_feature():
 
 @pytest.mark.parametrize("friction", [{(0, 0): 0.3}, {(0, 0): 0.3, (1, 2): 0.6, (2, 2): 0.1}, {(2, 1): 0.5}, 0.4], ids=repr)
 def test_friction_may_name_other_groups(world, friction):
-    # Fewer, more or others than before: as in a world that had it from the start. Rows of another table did not fit (ValueError).
-    x = np.stack([0.9 * (np.arange(12) % 4), 0.5 + 0.9 * (np.arange(12) // 4)], axis=1)  # apart, and so compiled once
+    # Fewer, more or other groups than before must act as in a world that had them from the start: tables then have other rows.
+    x = np.stack([0.9 * (np.arange(12) % 4), 0.5 + 0.9 * (np.arange(12) // 4)], axis=1)  # not touching, so compiled once
     ends = []
     for first in ({(0, 0): 0.5, (1, 1): 0.5}, friction):
         start = tv.Particles(
@@ -294,7 +294,7 @@ def test_every_setting_is_live(world, group):
     for name in GOES_ON:
         some[scene.indices.get(name, [])] = False
 
-    # Each one by itself changes the motion of its particles, compiles nothing, and leaves no trace when it is set back.
+    # Each setting alone changes the motion of its particles, compiles nothing, and leaves no trace when it is set back.
     for name, (_, _, old, new) in rows.items():
         feature = scene.features[name]
         assert old.keys() == new.keys() == {k for k in knobs_of(type(feature)) if hasattr(feature, k) and k != "indices"}, name
@@ -310,7 +310,7 @@ def test_every_setting_is_live(world, group):
     np.testing.assert_allclose(scene.go()[some], before[some], atol=1e-9)
     assert scene.world._runner.memory is memory and scene.world.fields == fields
 
-    # All of them together: as a world that was built so. What is built for a setting is built anew.
+    # All settings together act as in a world built with them. The world is rebuilt where a setting needs it.
     scene.assign(True)
     other = Scene(world, rows, True)
     np.testing.assert_allclose(scene.go()[some], other.go()[some], atol=1e-9)
@@ -325,7 +325,7 @@ def test_every_setting_is_live(world, group):
 
 
 def test_what_is_not_live_refuses_and_says_what_is(world):
-    # Every argument and every other public attribute; what is misspelt is named; arrays cannot be written to in place.
+    # Every argument and every other public attribute refuses, a misspelt name gets a suggestion, and arrays are read-only.
     made = {name: Scene(lambda *a, **k: None, {name: row}, False).features[name] for name, row in (ROWS3 | ROWS2).items()}
     for name, feature in made.items():
         kind, live = type(feature), knobs_of(type(feature))
@@ -353,7 +353,7 @@ def test_what_is_not_live_refuses_and_says_what_is(world):
     with pytest.raises(AttributeError, match="Nothing of it is live"):
         tv.Jacobi().relaxation = 1.1
     pin = made["Pin"]
-    pin.target += 1.0  # which assigns the whole
+    pin.target += 1.0  # assigns the whole
     assert (pin.target == np.asarray(pin.arguments["target"]) + 1).all() and isinstance(pin.target.copy(), np.ndarray)
     w = world(tv.Particles([[0.0, 1.0]]))
     with pytest.raises(ValueError, match="Assign the whole: new = world.position.copy"):
@@ -375,7 +375,7 @@ def test_what_is_wrong_is_said_where_it_is_made(world):
 
 
 def test_rest_values_that_nobody_gave_are_read_only_too(world):
-    # A world does not notice when a part of them changes; neither do clones, nor worlds from which particles went.
+    # A world cannot notice a change of a part of them. The same holds in clones, and where particles were removed.
     for rows in (ROWS3, ROWS2):
         names = [name for name, (_, _, old, _) in rows.items() if "rest" in old]
         some = {name: rows[name] for name in names}
@@ -396,14 +396,14 @@ def test_rest_values_that_nobody_gave_are_read_only_too(world):
 
 
 def falling(world, features, **settings):
-    """Two linked discs that fall on a floor, and two that meet."""
+    """Build a world of two linked discs that fall on a floor, and of two that collide."""
     x = np.array([[0.0, 0.3], [0.9, 0.3], [4.0, 0.3], [4.9, 0.4]])
     speed = [[2.0, -2], [0, -2], [3, -2], [0, -2]]
     return world(tv.Particles(x, velocity=speed, radius=0.25), [tv.Gravity(), *features], precision="f64", **settings)
 
 
 def test_what_was_absent_is_compiled_when_it_is_first_asked_for(world):
-    # From smooth to rough: as a world that was built so; then a clone, which goes on alike.
+    # From smooth to rough: as in a world built rough. Then a clone, which continues bit for bit.
     surfaces, rough = ([tv.HalfSpace((0, 1), **k), tv.Contact(**k)] for k in ({}, {"friction": 0.3, "restitution": 0.5}))
     w, other = falling(world, surfaces), falling(world, rough)
     start, handle = (w.position, w.velocity), w.handle([3])
@@ -417,14 +417,14 @@ def test_what_was_absent_is_compiled_when_it_is_first_asked_for(world):
     twin.close()
     for one in (w, other):
         one.velocity, one.position = 0 * start[1], start[0] + [0, 3]
-        one.step(DT)  # in which pairs forget
+        one.step(DT)  # a frame in which pairs forget their data
         one.position, one.velocity = start
         one.run(0.2)
     np.testing.assert_allclose(w.position, other.position, atol=1e-9)
 
 
 def test_a_link_whose_rest_length_becomes_zero(world):
-    # It needs a direction of its own, for which links that have a length have no code.
+    # Such a link needs a direction of its own, which kernels for links with a length do not compute.
     built = []
     for rest in (None, 0.0):
         link = tv.Distance([[0, 1]], rest)
@@ -434,11 +434,11 @@ def test_a_link_whose_rest_length_becomes_zero(world):
         built.append(w)
     assert built[0].position.tolist() == built[1].position.tolist()
     r, v = (a[0] - a[1] for a in (built[0].position, built[0].velocity))
-    assert np.hypot(*r) < 1e-3 and np.hypot(*v) < 0.1  # they are one, and fall as one
+    assert np.hypot(*r) < 1e-3 and np.hypot(*v) < 0.1  # both particles are one, and fall as one
 
 
 def test_what_was_turned_and_turned_back_leaves_no_trace(world):
-    # Links of length 0 are relaxed alone. Longer again they are solved with the others again, to the bits of a new world.
+    # Links of length 0 are relaxed alone. With a length again, they are solved with the others, with the bits of a new world.
     def hang(rest):
         start = tv.Particles(np.array([[0.0, 0], [0.5, 0], [1, 0.2], [1.4, 0]]), pinned=[0])
         links = tv.Distance([[0, 1], [1, 2], [2, 3]], rest=rest)
@@ -461,7 +461,7 @@ def test_what_is_turned_stays_in_edited_worlds_and_in_recordings(world, tmp_path
     w = falling(world, [link, floor])
     w.run(0.05)
     with tv.Recorder(tmp_path / "a.rrd", w) as recorder:
-        link.compliance, link.break_at, floor.friction = 1e-2, 1e9, (0.4, 0.2)  # which compiles
+        link.compliance, link.break_at, floor.friction = 1e-2, 1e9, (0.4, 0.2)  # compiles
         w.run(0.05, recorder=recorder)
         memory = w._runner.memory
         link.compliance, link.break_at, link.damping = 1e-3, None, 0.0
@@ -475,7 +475,7 @@ def test_what_is_turned_stays_in_edited_worlds_and_in_recordings(world, tmp_path
 
 
 def test_a_force_that_changes_starts_from_velocities(world):
-    # m x'' = -(x - x0) / a(t), a from 1e-2 to 1e-3 at t1 = 0.25 s: the exact solution goes on from x1 and v1. Second order.
+    # m x'' = -(x - x0) / a(t), a from 1e-2 to 1e-3 at t1 = 0.25 s: the exact solution continues from x1 and v1. Second order.
     def run(substeps):
         spring = tv.Distance([[0, 1]], rest=1.0, compliance=1e-2)
         w = world(tv.Particles([[0.0, 0], [1.1, 0]], pinned=[0]), [spring], substeps=substeps, precision="f64")

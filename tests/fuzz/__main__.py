@@ -1,4 +1,4 @@
-"""python -m tests.fuzz: scenes by the thousand, and what was found, as scripts that can be pasted."""
+"""python -m tests.fuzz: run thousands of random scenes and write what was found as scripts that can be pasted."""
 
 import argparse
 import json
@@ -11,7 +11,7 @@ from .campaign import campaign
 
 
 def main() -> int:
-    """Children run the scenes, so that one that crashes ends its structure only."""
+    """Run scenes in child processes, so that a crash ends only one structure."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--scenes", type=int, default=2000)
     parser.add_argument("--each", type=int, default=20, help="scenes of a structure")
@@ -32,7 +32,7 @@ def main() -> int:
 
 
 def parent(args) -> int:
-    """Deal structures out to children, and sum up."""
+    """Distribute structures among child processes, and sum up their results."""
     count, clock = -(-args.scenes // args.each), time.time()
     todo = [(k, min(k + args.batch, count)) for k in range(0, count, args.batch)]
     running, total, finds = {}, {"scenes": 0, "frames": 0, "refused": 0, "structures": 0}, []

@@ -1,4 +1,4 @@
-"""Many scenes: structures drawn once and compiled once, happenings drawn and shrunk by hypothesis."""
+"""Many scenes: structures are drawn and compiled once; events are drawn and shrunk by hypothesis."""
 
 import os
 import random
@@ -13,13 +13,13 @@ from . import twins
 from .scenes import Event, Set, Step, Structure, happenings, script, structures
 from .trials import Find, Refused, Trial
 
-PATIENCE = 1.0  # [s] that a scene may take to be run again
+PATIENCE = 1.0  # [s] a scene that takes less is run again
 ENOUGH = 15.0  # [s] for all scenes of a structure
 QUIET: Any = dict(database=None, deadline=None, suppress_health_check=list(HealthCheck), print_blob=False)
 
 
 def drawn(number: int, count: int) -> list[Structure]:
-    """Structures, the same for the same number."""
+    """Return structures, the same for the same number."""
     out: list[Structure] = []
 
     @seed(number)
@@ -33,17 +33,17 @@ def drawn(number: int, count: int) -> list[Structure]:
 
 
 class Searcher:
-    """Scenes of one structure."""
+    """Searches scenes of one structure for a find."""
 
     def __init__(self, structure: Structure, kinds: set[str] | None = None):
         self.structure, self.kinds, self.trial = structure, kinds, None
         self.scenes = self.frames = self.refused = 0
         self.spent = 0.0
-        self.last: list[Event] = []  # of the scenes that were not refused
+        self.last: list[Event] = []  # events of the last scene that was not refused
         self.found: tuple[Find, list[Event]] | None = None
 
     def scene(self, events: list[Event]) -> None:
-        """Run one, twice; none once others of the structure have taken long."""
+        """Run a scene twice. Skip it once other scenes of the structure have taken long."""
         if self.spent > ENOUGH and not self.found:
             return
         self.scenes += 1
@@ -61,12 +61,12 @@ class Searcher:
             self.spent += process_time() - clock
 
     def says(self) -> str:
-        """What was found, as a script."""
+        """Return what was found, as a script."""
         find, events = self.found or (None, [])
         return f"{find}\n\n{script(self.structure, events)}"
 
     def search(self, number: int, each: int) -> None:
-        """Scenes until one of them is a find, which is made small."""
+        """Run scenes until one of them is a find, and shrink it."""
 
         @seed(number)
         @settings(max_examples=each, phases=[Phase.generate, Phase.shrink], report_multiple_bugs=False, **QUIET)
@@ -83,14 +83,14 @@ class Searcher:
             test()
             if self.trial and self.last:
                 self.others(number)
-        except (Find, Flaky, FlakyFailure):  # flaky: what is found does not come again, as where bits differ
+        except (Find, Flaky, FlakyFailure):  # flaky: a find that does not recur, as where bits differ
             pass
         finally:
             if self.trial:
                 self.trial.close()
 
     def others(self, number: int) -> None:
-        """The last scene again by other ways, which are compiled anew: one of them for each structure."""
+        """Run the last scene again in another way, which is compiled for it: one way per structure."""
         events = [Set(None, e.name, 3) if isinstance(e, Set) and e.name == "substeps" else e for e in self.last]
         way = twins.WAYS[number % len(twins.WAYS)]
         try:
@@ -104,7 +104,7 @@ class Searcher:
 
 
 def smaller(structure: Structure, events: list[Event], kind: str) -> tuple[Structure, list[Event]]:
-    """Leave out features one by one, as long as what is found stays."""
+    """Leave out features one by one, as long as the find remains."""
     k = len(structure.features) - 1
     while k >= 0:
         less = Structure(structure.particles, structure.features[:k] + structure.features[k + 1 :], structure.settings)
@@ -127,7 +127,7 @@ def smaller(structure: Structure, events: list[Event], kind: str) -> tuple[Struc
 
 
 def search(number: int, k: int, each: int, kinds: set[str] | None = None) -> Searcher:
-    """Scenes of structure k of a campaign, until one is a find of these kinds (None: any)."""
+    """Run scenes of structure k of a campaign until one is a find of these kinds (None: any)."""
     structure = drawn(number * 100_003 + k, 8)[random.Random(k).randrange(8) - 8]
     searcher = Searcher(structure, kinds)
     searcher.search(k, each)
@@ -135,7 +135,7 @@ def search(number: int, k: int, each: int, kinds: set[str] | None = None) -> Sea
 
 
 def campaign(number: int, begin: int, end: int, each: int, folder: str, kinds: set[str] | None) -> Iterator[dict[str, Any]]:
-    """Structures begin ... end - 1 of a campaign, as lines of what came of each."""
+    """Run structures begin ... end - 1 of a campaign. Yields a line with the result of each."""
     for k in range(begin, end):
         yield {"begins": k}
         searcher = search(number, k, each, kinds)

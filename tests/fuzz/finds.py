@@ -1,4 +1,4 @@
-"""Scenes that the fuzzer found, and that were mended: each is run, judged, and run again."""
+"""Scenes that the fuzzer found and that are fixed: each is run, judged, and run again."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ FRAME = Step(1 / 60)
 
 
 def of(position, *features: Call, settings: dict | None = None, **particles) -> Structure:
-    """A structure, briefly."""
+    """Return a structure, written briefly."""
     return Structure(Call("Particles", {"position": np.asarray(position), **particles}), features, settings or {"path": "fused"})
 
 

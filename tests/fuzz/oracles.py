@@ -1,4 +1,4 @@
-"""What a scene has to be, by brute force in NumPy, and by the words of the documentation."""
+"""What must hold in a scene, by brute force in NumPy and by the documentation."""
 
 from typing import Any
 
@@ -22,19 +22,19 @@ EPS = {"f32": 2.0**-23, "f32-compensated": 2.0**-23, "f64": 2.0**-52}
 
 
 def segment(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Distances of points (n, dim) to a segment."""
+    """Return the distances of points (n, dim) to a segment."""
     d = b - a
     t = np.clip((p - a) @ d / max(d @ d, 1e-300), 0, 1)
     return np.linalg.norm(p - a - t[:, None] * d, axis=1)
 
 
 def turned(p: np.ndarray, wall: Any) -> np.ndarray:
-    """Points in the frame of a wall that is not rotated."""
+    """Return points in the frame of a wall that is not rotated."""
     return p - np.asarray(wall.position)
 
 
 def polygon(p: np.ndarray, vertices: np.ndarray) -> np.ndarray:
-    """Signed distance to a closed outline, positive outside."""
+    """Return the signed distance to a closed outline, positive outside."""
     ends = np.roll(vertices, -1, axis=0)
     away = np.min([segment(p, a, b) for a, b in zip(vertices, ends, strict=True)], axis=0)
     inside = np.zeros(len(p), dtype=bool)
@@ -46,7 +46,7 @@ def polygon(p: np.ndarray, vertices: np.ndarray) -> np.ndarray:
 
 
 def convex(p: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """A bound on the signed distance to a tetrahedron: exact inside and beside faces, too small beside edges."""
+    """Return a bound on the signed distance to a tetrahedron: exact inside and beside faces, too small beside edges."""
     out = []
     for k in range(4):
         a, b, c = corners[[j for j in range(4) if j != k]]
@@ -58,8 +58,8 @@ def convex(p: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 
 def gap(wall: Any, p: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """How far particles are from a wall as it stands, negative inside of it, (n,)."""
-    if wall.one_way is not None:  # which any may be inside of
+    """Return how far particles are from a wall in its current pose, negative inside, (n,)."""
+    if wall.one_way is not None:  # any particle may be inside
         return np.full(len(p), np.inf)
     name = type(wall).__name__
     if name == "Box":
@@ -79,7 +79,7 @@ def gap(wall: Any, p: np.ndarray, r: np.ndarray) -> np.ndarray:
 
 
 def excluded(features: list[Any], particles: Any) -> set[tuple[int, int]]:
-    """Pairs that may overlap, as constraints say where they are to each other."""
+    """Return the pairs that may overlap, because constraints fix their relative place."""
     out = set()
     for f in features:
         if isinstance(f, Batch) and not f.drives and f.count and (particles.inv_mass[f.indices] > 0).any():
@@ -88,7 +88,7 @@ def excluded(features: list[Any], particles: Any) -> set[tuple[int, int]]:
 
 
 def overlap(contact: Any, features: list[Any], particles: Any, free: np.ndarray, x: np.ndarray) -> tuple[int, float]:
-    """Pairs that overlap, and the worst, in radii of the smaller one."""
+    """Return the number of overlapping pairs, and the worst overlap in radii of the smaller particle."""
     box = next((f for f in features if isinstance(f, tv.Periodic)), None)
     r, group, out = particles.radius, particles.group, excluded(features, particles)
     allowed = None if contact.table.touching is None else {tuple(sorted(p)) for p in contact.table.touching}
@@ -101,7 +101,7 @@ def overlap(contact: Any, features: list[Any], particles: Any, free: np.ndarray,
 
 
 def shapeless(f: Any, x: np.ndarray) -> np.ndarray:
-    """Of constraints on angles, those between corners that have none: nothing acts on them."""
+    """Return which constraints on angles have corners without an angle: nothing acts on these."""
     if not isinstance(getattr(f, "quantity", None), Angle):
         return np.zeros(f.count, dtype=bool)
     q = f.placed(x)
@@ -113,15 +113,18 @@ def shapeless(f: Any, x: np.ndarray) -> np.ndarray:
 
 
 def rigid(features: list[Any], free: np.ndarray, x: np.ndarray) -> tuple[float, bool, float]:
-    """The worst violation of rigid constraints that are one number, relative to their size, whether it is all, and what the
-    violations would change by if all coordinates were the whole scene larger: what rounding changes, over the precision."""
+    """Return the worst relative violation of rigid scalar constraints, whether it covers all constraints, and its sensitivity.
+
+    The sensitivity is the change of violations if all coordinates changed by the size of the scene: times the precision, it
+    bounds the effect of rounding.
+    """
     worst, whole, steepest, reach = 0.0, True, 0.0, float(np.abs(x).max(initial=0.0))
     for f in features:
         if not isinstance(f, Batch) or getattr(f, "drives", False) or not f.count:
             continue
         if not isinstance(f, Scalar) or not f.arity or f.quantity.collapses or (f.compliance > 0).any():
             whole = False
-        if isinstance(f, Scalar) and (f.driven or (f.side and (f.load > 0).any())):  # what still pulls where it is slack counts
+        if isinstance(f, Scalar) and (f.driven or (f.side and (f.load > 0).any())):  # a slack constraint that still pulls counts
             whole = False
         if not isinstance(f, Scalar) or f.driven:
             continue
@@ -139,16 +142,16 @@ def rigid(features: list[Any], free: np.ndarray, x: np.ndarray) -> tuple[float, 
 
 
 def passive(structure: Structure) -> bool:
-    """Whether nothing in it brings in energy."""
+    """Whether nothing in a structure brings in energy."""
     driven = any({"speed", "at"} & set(f.args) for f in structure.features if f.name == "Path")
     args = structure.particles.args
     held = "pinned" in args or np.isinf(args.get("mass", 1.0)).any() or any(f.name in TETHERS for f in structure.features)
-    driven = driven or (held and bool(np.any(args.get("spin", 0.0))))  # rollers
+    driven = driven or (held and bool(np.any(args.get("spin", 0.0))))  # pinned particles that spin are rollers
     return not driven and all(f.name in (*PASSIVE, "Path", "Pin") for f in structure.features)
 
 
 def closed(structure: Structure) -> bool:
-    """Whether nothing outside of it acts."""
+    """Whether nothing outside of a structure acts on it."""
     mass = structure.particles.args.get("mass", 1.0)
     held = "pinned" in structure.particles.args or np.isinf(mass).any()
     return not held and not any(f.name in (*PULLS, *WALLS, *TETHERS) for f in structure.features)
@@ -158,19 +161,21 @@ INNER = ("Distance", "Rope", "Winch", "Spacer", "Bend", "Motor", "AngleLimit", "
 
 
 def central(structure: Structure) -> bool:
-    """Whether what acts in it has no moment about the origin, at the start of a substep nor at its end; contacts may have."""
+    """Whether nothing has a moment about the origin, at the start or at the end of a substep. Contacts may have one."""
     return closed(structure) and all(f.name in INNER for f in structure.features)
 
 
 def spin(m: np.ndarray, x: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Angular momentum, by pairs of axes."""
+    """Return the angular momentum, by pairs of axes."""
     a, b = np.triu_indices(x.shape[1], 1)
     return m @ (x[:, a] * v[:, b] - x[:, b] * v[:, a])
 
 
 def unfit(f: Any, inv_mass: np.ndarray, x: np.ndarray) -> float:
-    """The largest distance of a particle that can move from its place in a rigid cluster that is turned as fits best (Kabsch
-    1976), relative to the radius of the cluster."""
+    """Return the worst misfit of rigid clusters, relative to their radii.
+
+    The misfit is the largest distance of a movable particle from its place in the best-fitting rotated cluster (Kabsch 1976).
+    """
     worst = 0.0
     for c in range(f.count):
         who = f.members_of(c)
@@ -182,7 +187,7 @@ def unfit(f: Any, inv_mass: np.ndarray, x: np.ndarray) -> float:
         q, p = f.shape_of(c), x[who]
         q, p = (a - m @ a / m.sum() for a in (q, p))
         u, s, vt = np.linalg.svd((m[:, None] * p).T @ q)
-        if s[-2] < 1e-6 * s[0]:  # turned freely
+        if s[-2] < 1e-6 * s[0]:  # its rotation is not unique
             continue
         u[:, -1] *= np.sign(np.linalg.det(u @ vt))
         worst = max(worst, float(np.linalg.norm(p - q @ (u @ vt).T, axis=1)[w > 0].max()) / f._radius[c])
@@ -190,14 +195,14 @@ def unfit(f: Any, inv_mass: np.ndarray, x: np.ndarray) -> float:
 
 
 def feasible(features: list[Any], particles: Any, free: np.ndarray, x: np.ndarray, eps: float) -> bool:
-    """Whether a start violates nothing that is rigid."""
+    """Whether a start violates nothing rigid."""
     if rigid(features, free, x)[0] > 1e-6 + 1e3 * eps:
         return False
     built = bool(np.array_equal(x, particles.position))
     periodic = any(isinstance(f, tv.Periodic) for f in features)
     for f in features:
         name = type(f).__name__
-        if name in WALLS and (periodic or (gap(f, x, particles.radius)[free > 0] < -1e-6 * particles.size).any()):  # of images
+        if name in WALLS and (periodic or (gap(f, x, particles.radius)[free > 0] < -1e-6 * particles.size).any()):  # images
             return False
         if name == "Contact" and overlap(f, features, particles, free, x)[0]:
             return False
@@ -212,7 +217,7 @@ def feasible(features: list[Any], particles: Any, free: np.ndarray, x: np.ndarra
 
 
 def height(features: list[Any], particles: Any, free: np.ndarray, low: np.ndarray, high: np.ndarray) -> float:
-    """The largest difference of the potential of gravity [J] between two corners."""
+    """Return the largest difference of the potential of gravity [J] between two corners."""
     out, m = 0.0, np.where(free > 0, particles.mass, 0.0)
     for f in features:
         if type(f).__name__ == "Gravity":

@@ -15,13 +15,13 @@ from . import functions
 
 @dataclass(frozen=True)
 class Call:
-    """tv.name(**args)."""
+    """A call tv.name(**args)."""
 
     name: str
     args: dict[str, Any]
 
     def make(self) -> Any:
-        """What it returns."""
+        """Make the call and return its result."""
         return getattr(tv, self.name)(**{k: v.make() if isinstance(v, Call) else v for k, v in self.args.items()})
 
     def __str__(self) -> str:
@@ -29,7 +29,7 @@ class Call:
 
 
 def text(value: Any) -> str:
-    """As code."""
+    """Return a value as code."""
     if isinstance(value, np.ndarray):
         return text(value.tolist())
     if isinstance(value, (np.floating, float)):
@@ -45,20 +45,20 @@ def text(value: Any) -> str:
 
 
 def plain(function: Any) -> Any:
-    """The Python function of a ti.func."""
+    """Return the Python function of a ti.func."""
     return function.func.func if getattr(function, "_is_taichi_function", False) else function
 
 
 @dataclass(frozen=True)
 class Structure:
-    """What is compiled: particles, features, settings. path "launched": parallel as on a GPU."""
+    """What is compiled: particles, features, settings. path "launched": parallel, as on a GPU."""
 
     particles: Call
     features: tuple[Call, ...]
     settings: dict[str, Any]
 
     def build(self) -> tuple[tv.World, list[Any]]:
-        """The world and its features."""
+        """Return a world and its features."""
         features = [f.make() for f in self.features]
         settings = {k: v.make() if isinstance(v, Call) else v for k, v in self.settings.items()}
         if settings.get("path") != "launched":
@@ -73,11 +73,11 @@ class Structure:
 
     @property
     def position(self) -> np.ndarray:
-        """At the start."""
+        """Return positions at the start."""
         return np.asarray(self.particles.args["position"])
 
     def lines(self) -> list[str]:
-        """As code."""
+        """Return the structure as code."""
         settings = {k: "parallel" if v == "launched" else v for k, v in self.settings.items()}
         return [
             f"particles = {self.particles}",
@@ -90,18 +90,18 @@ class Structure:
 
 @dataclass(frozen=True)
 class Set:
-    """An assignment: to the world (of None), or to feature number `of`."""
+    """An assignment to the world (`of` = None), or to feature number `of`."""
 
     of: int | None
     name: str
     value: Any
 
     def do(self, world: tv.World, features: list[Any]) -> None:
-        """It."""
+        """Make the assignment."""
         setattr(world if self.of is None else features[self.of], self.name, self.value)
 
     def line(self) -> str:
-        """As code."""
+        """Return the assignment as code."""
         return f"{'world' if self.of is None else f'features[{self.of}]'}.{self.name} = {text(self.value)}"
 
 
@@ -112,46 +112,46 @@ class Step:
     dt: float
 
     def do(self, world: tv.World, features: list[Any]) -> tv.StepReport:
-        """It."""
+        """Run the frame."""
         return world.step(self.dt)
 
     def line(self) -> str:
-        """As code."""
+        """Return the frame as code."""
         return f"print(world.step({text(self.dt)}))"
 
 
 @dataclass(frozen=True)
 class Add:
-    """Particles and features that come on the way."""
+    """Particles and features that are added between frames."""
 
     particles: Call
     features: tuple[Call, ...]
 
     def do(self, world: tv.World, features: list[Any]) -> None:
-        """It."""
+        """Add them."""
         came = [f.make() for f in self.features]
         world.add(self.particles.make(), came)
         features += came
 
     def line(self) -> str:
-        """As code."""
+        """Return the addition as code."""
         came = ", ".join(map(str, self.features))
         return f"features += [{came}]\nworld.add({self.particles}, features[len(features) - {len(self.features)} :])"
 
 
 @dataclass(frozen=True)
 class Remove:
-    """Particles and a feature that go on the way."""
+    """Particles and a feature that are removed between frames."""
 
     particles: list[int]
     feature: int | None
 
     def do(self, world: tv.World, features: list[Any]) -> None:
-        """It."""
+        """Remove them."""
         world.remove(self.particles, [] if self.feature is None else [features[self.feature]])
 
     def line(self) -> str:
-        """As code."""
+        """Return the removal as code."""
         return f"world.remove({self.particles}, [{'' if self.feature is None else f'features[{self.feature}]'}])"
 
 
@@ -159,7 +159,7 @@ Event = Set | Step | Add | Remove
 
 
 def script(structure: Structure, events: list[Event], says: str = "") -> str:
-    """A scene as a script that can be pasted."""
+    """Return a scene as a script that can be pasted."""
     values = [v for call in structure.features for v in call.args.values()]
     used = [plain(v) for v in values if callable(v) or getattr(v, "_is_taichi_function", False)]
     body = structure.lines()
@@ -177,22 +177,22 @@ def script(structure: Structure, events: list[Event], says: str = "") -> str:
 
 
 def cloud(n, dim):
-    """In general position."""
+    """Return points in general position."""
     return tv.golden(np.arange(n), dim=dim) * 0.35 * max(n, 2) ** (1 / dim)
 
 
 def line(n, dim):
-    """In a row."""
+    """Return points in a row."""
     return 0.3 * np.arange(n)[:, None] * np.eye(dim)[0]
 
 
 def slope(n, dim):
-    """In a row that is along no axis."""
+    """Return points in a row along no axis."""
     return 0.2 * np.arange(n)[:, None] * np.array([1.0, 0.7, -0.4])[:dim]
 
 
 def lattice(n, dim):
-    """In a plane."""
+    """Return points of a square lattice."""
     side = int(np.ceil(np.sqrt(n)))
     out = np.zeros((n, dim))
     out[:, 0], out[:, 1] = 0.3 * (np.arange(n) % side), 0.3 * (np.arange(n) // side)
@@ -200,7 +200,7 @@ def lattice(n, dim):
 
 
 def ring(n, dim):
-    """Around a circle."""
+    """Return points on a circle."""
     out = np.zeros((n, dim))
     angle = 2 * np.pi * np.arange(n) / n
     out[:, 0], out[:, 1] = np.cos(angle), np.sin(angle)
@@ -208,12 +208,12 @@ def ring(n, dim):
 
 
 def point(n, dim):
-    """All in one place."""
+    """Return points all in one place."""
     return np.zeros((n, dim)) + 0.25
 
 
 def doubled(n, dim):
-    """Two in each place."""
+    """Return points, two in each place."""
     return cloud(n, dim)[np.arange(n) // 2]
 
 
@@ -223,13 +223,13 @@ CLOTHS = {"Jacobi": {"loads": True}, "Direct": {"width": 16}, "Chebyshev": {}, "
 
 
 def pick(draw, *values):
-    """One of them."""
+    """Draw one of the values."""
     return draw(st.sampled_from(values))
 
 
 @dataclass
 class Stage:
-    """What features are drawn for."""
+    """What features are drawn for: particles, dimension, positions, size, order, held particles, spins."""
 
     n: int
     dim: int
@@ -241,12 +241,12 @@ class Stage:
 
 
 def chain(n):
-    """A row."""
+    """Return the links of a row."""
     return np.stack([np.arange(n - 1), np.arange(1, n)], axis=1)
 
 
 def topology(draw, s: Stage) -> np.ndarray:
-    """Links (m, 2) between n > 1 particles."""
+    """Draw links (m, 2) between n > 1 particles."""
     kind = pick(draw, "chain", "loop", "star", "braced", "complete", "twice", "pair", "tree")
     if kind == "pair" or s.n == 2:
         return np.array([[0, 1]])
@@ -266,7 +266,7 @@ def topology(draw, s: Stage) -> np.ndarray:
 
 
 def springs(draw, s: Stage, m: int, breaks: bool = True) -> dict[str, Any]:
-    """Compliance, damping, breaking."""
+    """Draw compliance, damping and breaking."""
     alpha = pick(draw, *COMPLIANCE)
     out: dict[str, Any] = {}
     if alpha:
@@ -279,7 +279,7 @@ def springs(draw, s: Stage, m: int, breaks: bool = True) -> dict[str, Any]:
 
 
 def links(draw, s: Stage) -> Call | None:
-    """Distance, Rope or Spacer."""
+    """Draw Distance, Rope or Spacer."""
     if s.n < 2:
         return None
     kind = pick(draw, "Distance", "Distance", "Distance", "Rope", "Spacer") if s.order == 2 else "Distance"
@@ -294,7 +294,7 @@ def links(draw, s: Stage) -> Call | None:
 
 
 def corners(draw, s: Stage) -> Call | None:
-    """Bend, AngleLimit, Dihedral, the user's own."""
+    """Draw Bend, AngleLimit, Dihedral, or the user's own constraint."""
     kind = pick(draw, "Bend", "AngleLimit", "Dihedral", "Constraint")
     k = np.arange(s.n)
     if kind == "Dihedral":
@@ -320,7 +320,7 @@ def corners(draw, s: Stage) -> Call | None:
 
 
 def drives(draw, s: Stage) -> Call | None:
-    """Motor or Winch."""
+    """Draw Motor or Winch."""
     k, speed, most = np.arange(s.n), pick(draw, 1.0, -3.0, 0.0, 100.0), pick(draw, 1.0, 1.0, float("inf"), 0.0, 1e-3, 1e4)
     kind = pick(draw, "Motor", "Winch")
     if kind == "Winch":
@@ -341,7 +341,7 @@ def drives(draw, s: Stage) -> Call | None:
 
 
 def bodies(draw, s: Stage) -> Call | None:
-    """Area, Volume, ShapeMatch."""
+    """Draw Area, Volume or ShapeMatch."""
     if s.n < 3:
         return None
     kind, more = pick(draw, "ShapeMatch", "Area", "Volume"), springs(draw, s, 1)
@@ -361,7 +361,7 @@ def bodies(draw, s: Stage) -> Call | None:
 
 
 def rails(draw, s: Stage) -> Call | None:
-    """Pin, Path, Snap: of a particle that none of them has yet."""
+    """Draw Pin, Path or Snap for a particle that no other one holds."""
     free = [i for i in range(s.n) if i not in s.taken]
     if not free:
         return None
@@ -380,7 +380,7 @@ def rails(draw, s: Stage) -> Call | None:
 
 
 def forces(draw, s: Stage) -> Call | None:
-    """Any."""
+    """Draw any force."""
     kind = pick(draw, "Gravity", "Gravity", "Gravity", "Drag", "Wind", "Attractor", "Force", "PairForce")
     if kind == "Gravity":
         down = -9.81 * np.eye(s.dim)[1]
@@ -399,7 +399,7 @@ def forces(draw, s: Stage) -> Call | None:
 
 
 def surface(draw, s: Stage) -> dict[str, Any]:
-    """Friction and restitution."""
+    """Draw friction and restitution."""
     out: dict[str, Any] = {}
     if s.spins or pick(draw, False, True):
         out["friction"] = pick(draw, 0.5, 1e6, (0.6, 0.3), *([(0.5, 0.5, 0.1), (1.0, 0.5, 0.3, 0.2)] if s.spins else []))
@@ -409,7 +409,7 @@ def surface(draw, s: Stage) -> dict[str, Any]:
 
 
 def walls(draw, s: Stage) -> Call | None:
-    """Any."""
+    """Draw any wall."""
     low, high, mid = s.x.min(axis=0) - 0.5 * s.size, s.x.max(axis=0) + 0.5 * s.size, s.x.mean(axis=0)
     reach, more = float(np.linalg.norm(high - low)), surface(draw, s)
     more |= {"events": True} if "restitution" in more else {}
@@ -450,7 +450,7 @@ def walls(draw, s: Stage) -> Call | None:
 
 
 def contacts(draw, s: Stage) -> Call | None:
-    """Contact or Polygons."""
+    """Draw Contact or Polygons."""
     more = surface(draw, s)
     if s.dim == 2 and s.n >= 6 and not s.spins and pick(draw, False, False, False, True):
         half = s.n // 2
@@ -465,7 +465,7 @@ def contacts(draw, s: Stage) -> Call | None:
 
 
 def boxes(draw, s: Stage, radius: float) -> Call:
-    """A periodic box that what is in it fits into, and that it leaves soon."""
+    """Draw a periodic box that holds the scene, and that particles leave soon."""
     low, high = s.x.min(axis=0), s.x.max(axis=0)
     spare = 1.3 * float((high - low).max()) + 0.3 * s.size + 2.5 * radius
     axes = pick(draw, None, None, [0], [s.dim - 1])
@@ -474,7 +474,7 @@ def boxes(draw, s: Stage, radius: float) -> Call:
 
 @st.composite
 def structures(draw) -> Structure:
-    """Any."""
+    """Draw any structure."""
     dim, n = pick(draw, 2, 3), draw(st.integers(1, 12))
     precision = pick(draw, "f32", "f32", "f64", "f32-compensated")
     order = pick(draw, 2, 4, 6, 8) if precision == "f64" and pick(draw, False, False, True) else 2
@@ -533,7 +533,7 @@ def structures(draw) -> Structure:
 
 # What happens.
 
-KNOBS = {  # a knob and what it may be turned to, from what it was: (value, size, index) -> value
+KNOBS = {  # a knob, and the values to which it may be set
     "Gravity": ("g", (0.0, 3.0, 100.0)),
     "Drag": ("rate", (0.0, 5.0, 1e5)),
     "Wind": ("rate", (0.0, 5.0, 1e5)),
@@ -546,7 +546,7 @@ RESTS = ("Distance", "Rope", "Spacer")
 
 
 def turns(draw, structure: Structure) -> list[Event]:
-    """A knob of one of the features."""
+    """Draw an assignment to a knob of one of the features."""
     size = scale(structure.position)
     some = [k for k, f in enumerate(structure.features) if f.name in {*KNOBS, *MOVES, *RESTS, "Pin", "Path"}]
     if not some:
@@ -570,13 +570,13 @@ def turns(draw, structure: Structure) -> list[Event]:
 
 
 def scale(x: np.ndarray) -> float:
-    """1, or the unit that a structure was made in."""
+    """Return 1, or the unit in which a structure was made."""
     reach = float(np.ptp(x, axis=0).max()) if len(x) else 0.0
     return 1e-6 if 0 < reach < 1e-3 else 1e6 if reach > 1e4 else 1.0
 
 
 def placed(kind: str, x: np.ndarray, seed: int) -> np.ndarray:
-    """Positions to start from."""
+    """Return positions to start from."""
     size, rng = scale(x), np.random.default_rng(seed)
     if kind == "jitter":
         return x + 0.01 * size * rng.standard_normal(x.shape)
@@ -599,7 +599,7 @@ def placed(kind: str, x: np.ndarray, seed: int) -> np.ndarray:
 
 @st.composite
 def happenings(draw, structure: Structure, regroup: bool = False) -> list[Event]:
-    """What happens in a world of this structure: settings, positions, velocities, frames, knobs."""
+    """Draw what happens in a world of this structure: settings, positions, velocities, frames, knobs."""
     x, out = structure.position, []
     seeds = st.integers(0, 1000)
     many = structure.settings.get("path", "fused") == "fused"  # where waiting for threads costs nothing

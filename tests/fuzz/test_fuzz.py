@@ -1,4 +1,4 @@
-"""A fixed share of the fuzzer's scenes; python -m tests.fuzz runs as many as there is time for."""
+"""A fixed part of the fuzzer's scenes; python -m tests.fuzz runs as many as there is time for."""
 
 import pytest
 
@@ -7,14 +7,14 @@ from .finds import FINDS
 from .trials import Trial
 from .twins import WAYS
 
-# Kinds that are still being mended are left to campaigns.
+# Kinds of finds that are not fixed yet are left to campaigns.
 HARD = {"error", "nan", "bits", "overlap", "residual", "momentum", "spin", "twin", "wall"}
 
 
 @pytest.mark.parametrize("begin", (0, 4))
 def test_random_scenes_keep_their_promises(taichi, begin):
-    # Passive energy, brute force, momentum, walls, the same bits: see trials.py. The scenes are the same in every run; each of
-    # twins.WAYS is gone once.
+    # Energy of passive scenes, brute force, momentum, walls, equal bits: see trials.py. The scenes are the same in every run;
+    # each of twins.WAYS is used once.
     for k in range(begin, min(begin + 4, len(WAYS))):
         searcher = search(3, k, 5, HARD)
         assert not searcher.found, searcher.says()

@@ -1,4 +1,4 @@
-"""One scene run and judged: what may never happen, whatever the scene."""
+"""One scene, run and judged: what may never happen in any scene."""
 
 import os
 import traceback
@@ -18,7 +18,7 @@ RISKS = {"tunnelling-risk", "stiff-force", "softened", "turned", "substeps-cappe
 
 
 class Find(AssertionError):
-    """What is wrong, by its kind."""
+    """A fault, by its kind."""
 
     def __init__(self, kind: str, says: str):
         super().__init__(f"{kind}: {says}")
@@ -26,17 +26,20 @@ class Find(AssertionError):
 
 
 class Refused(Exception):
-    """An error at the door, as there should be."""
+    """An error for invalid arguments, as it should be."""
 
 
 def quiet() -> None:
-    """Leave out what the package says to users; what NumPy says to us is an error."""
+    """Silence the package's warnings; turn NumPy's into errors."""
     warnings.simplefilter("ignore")
     warnings.simplefilter("error", RuntimeWarning)
 
 
 def door(error: BaseException) -> None:
-    """Errors are ValueError, TypeError or RuntimeError, of our own words, raised in Python by ourselves."""
+    """Raise Refused for an error that the package raises with a message of its own, else Find.
+
+    Such an error is a ValueError, TypeError or RuntimeError.
+    """
     last = traceback.extract_tb(error.__traceback__)[-1]
     ours = os.path.abspath(last.filename).startswith(HOME)
     first = str(error).partition(":")[0].partition("(")[0].partition(".")[0]
@@ -47,7 +50,7 @@ def door(error: BaseException) -> None:
 
 
 class Trial:
-    """A world that is compiled once, and many scenes run in it."""
+    """A world that is compiled once, in which many scenes are run."""
 
     def __init__(self, structure: Structure):
         self.structure = structure
@@ -60,7 +63,7 @@ class Trial:
         self.begin()
 
     def begin(self) -> None:
-        """Keep the state that scenes start from."""
+        """Keep the state from which scenes start."""
         w = self.world
         self.kept, self.flags = checkpoint.keep(w), checkpoint.flags(w)
         self.knobs = [dict(knobs(f)) for f in self.features]
@@ -69,22 +72,22 @@ class Trial:
         self.soft = any(getattr(f, "soft", False) for f in self.features)
 
     def close(self) -> None:
-        """Free its memory."""
+        """Free the memory of the world."""
         self.world.close()
 
     def reset(self) -> None:
-        """As it was built."""
+        """Restore the world as it was built."""
         w = self.world
         for f, values in zip(self.features, self.knobs, strict=True):
             if any(vars(f)[k] is not v for k, v in values.items()):
                 turn(f, values)
-        w._adapt()  # to what they ask for: install() is for worlds that were just built
+        w._adapt()  # to what the features need: install() is for worlds that were just built
         checkpoint.install(w, self.kept, self.flags)
         w._last = None
         w.substeps, w.iterations = 20, 1
 
     def run(self, events: list[Event]) -> str:
-        """Run a scene, judge each frame, and return the hash of how it ended."""
+        """Run a scene, judge each frame, and return the hash of the final state."""
         self.reset()
         w, judge = self.world, Judge(self)
         for event in events:
@@ -100,7 +103,7 @@ class Trial:
         return w.hash()
 
     def replay(self, events: list[Event]) -> str:
-        """The same again, without looking."""
+        """Run a scene again without judging it."""
         self.reset()
         for event in events:
             event.do(self.world, self.features)
@@ -108,7 +111,7 @@ class Trial:
 
 
 class Judge:
-    """What is known of a scene so far."""
+    """The record of a scene so far, against which frames are judged."""
 
     def __init__(self, trial: Trial):
         self.t, self.w, self.p = trial, trial.world, trial.world.particles
@@ -121,10 +124,10 @@ class Judge:
         self.steps = 0
         self.watched = True
         self.safe = self.inside()
-        self.exact = False  # whether the scene began where its constraints are met
+        self.exact = False  # whether the scene began with its constraints met
 
     def inside(self) -> dict[int, np.ndarray]:
-        """Of each wall, the particles that are not in it."""
+        """Return for each wall which particles are outside of it."""
         x = self.w.position
         out = {}
         for k, f in enumerate(() if self.t.structure.periodic else self.t.features):  # walls act on images
@@ -133,11 +136,11 @@ class Judge:
         return out
 
     def before(self, event: Event) -> None:
-        """What an event changes."""
+        """Update the record before an event."""
         if isinstance(event, Set):
             if event.of is not None or (self.steps and event.name in ("position", "velocity")):
                 self.passive = self.closed = False
-                if len(self.safe) > 1:  # which may be moved so that no place is left between them
+                if len(self.safe) > 1:  # moved walls may leave no place between them
                     self.watched = False
             if event.name == "position":
                 self.safe = {}
@@ -153,7 +156,7 @@ class Judge:
             self.safe = self.inside()
 
     def frame(self, event: Step, report: tv.StepReport) -> None:
-        """A frame that was made."""
+        """Judge a frame."""
         x = self.w.position
         self.steps += 1
         self.flags |= report.flags
@@ -178,7 +181,7 @@ class Judge:
         self.x = x
 
     def bounded(self, report: tv.StepReport) -> None:
-        """A passive scene has no more energy than it had, but for a thousandth of the largest difference of potential."""
+        """Check that a passive scene gains no more than a thousandth of the largest difference of potential."""
         if self.energy is None:
             self.energy = report.energy - report.energy_change
             if not np.isfinite(self.energy):
@@ -189,7 +192,7 @@ class Judge:
             return
         t = self.t
         fall = oracles.height(t.features, self.p, t.free, self.low, self.high)
-        flagged = bool(self.flags & RISKS)  # said to be wrong, but it should not fly
+        flagged = bool(self.flags & RISKS)  # a flagged frame may be wrong, but must not explode
         share = 1.0 if flagged else 0.5 if t.soft else 1e-3
         room = max((1.0 if flagged else 1e-3) * fall, share * abs(self.energy)) + self.digits(fall)
         if "energy-gain" in report.flags and report.energy <= self.energy + room:
@@ -199,7 +202,7 @@ class Judge:
             raise Find(kind, f"{self.energy:.6g} -> {report.energy:.6g} J, allowed {room:.3g} more; {set(self.flags)}, {report}")
 
     def digits(self, fall: float) -> float:
-        """What rounding of the coordinates may make of the energy [J]: of heights, of steps h = dt / substeps, of springs."""
+        """Return how much energy [J] rounding of coordinates may add: in heights, steps h = dt / substeps, and springs."""
         t, w = self.t, self.w
         m = np.where(t.free > 0, self.p.mass, 0.0).sum()
         reach = float(np.abs([self.low, self.high]).max())
@@ -211,7 +214,7 @@ class Judge:
         return high + m * (digit / h) ** 2 + digit**2 * stiff
 
     def figures(self, report: tv.StepReport, x: np.ndarray) -> None:
-        """Residual and overlap by brute force."""
+        """Compare residual and overlap with brute force."""
         t, p = self.t, self.p
         reach = float(np.abs(x).max(initial=0.0))
         least = min(p.size, *(v for f in t.features if getattr(f, "joins", False) for v in np.abs(f.goal) if v > 0), 1e300)
@@ -225,7 +228,7 @@ class Judge:
                 raise Find("residual", f"reported {report.residual:.6g}, rigid ones by brute force {worst:.6g}, {report}")
         for f in t.features:
             if type(f).__name__ == "ShapeMatch" and f.acts and report.residual < 0.1 and blur < 1e-3:
-                # It was turned by the last pass, before others moved its particles: by no more than what these left.
+                # The last pass turned the cluster before others moved its particles, by no more than the residual they left.
                 worst = oracles.unfit(f, t.free, x)
                 if worst > 2 * report.residual + 1e-3 + blur:
                     raise Find("residual", f"reported {report.residual:.6g}, cluster by brute force {worst:.6g}, {report}")
@@ -240,7 +243,7 @@ class Judge:
                     )
 
     def walls(self, x: np.ndarray) -> None:
-        """Who was outside of a wall is outside still."""
+        """Check that particles outside of a wall stay outside."""
         holds = len(self.safe) == 1
         for k, some in self.safe.items() if self.watched else ():
             f = self.t.features[k]
@@ -252,7 +255,7 @@ class Judge:
                 raise Find(kind, f"{f!r} lets particle {i} in by {left.max():.3g} m, at {x[i]}, {set(self.flags)}")
 
     def momentum(self, event: Step, x: np.ndarray) -> None:
-        """Of scenes on which nothing acts."""
+        """Check the momentum of scenes on which nothing acts."""
         if not self.closed:
             return
         m, v = self.p.mass, self.w.velocity
@@ -267,13 +270,13 @@ class Judge:
         if np.abs(m @ v - m @ self.v).max() > near:
             raise Find("momentum", f"of velocities {m @ self.v} -> {m @ v}, allowed {near:.3g}, {self.w.last}")
         blur = 64 * self.t.eps * n * m.sum() * reach / event.dt
-        # By the host, which solves for it to 1e-9 of its size; or not at all, asleep.
+        # Not checked if the host moved bodies, which it solves to 1e-9 of their size, or if particles sleep.
         moved = "moved" in self.w.last.flags or self.w.last.asleep
         if not moved and np.abs(m @ way - m @ self.v).max() > near + blur:
             raise Find(
                 "momentum", f"of velocities {m @ self.v}, of positions {m @ way}, allowed {near + blur:.3g}, {self.w.last}"
             )
-        # Directions are those at the start, but where they are lost: by a turn, a start off the constraints, or a collapse.
+        # Directions are those at the start, unless they are lost by a turn, a start off the constraints, or a collapse.
         sure = not self.flags & RISKS and oracles.central(self.t.structure) and self.w.last.turn < 41 and self.exact
         turned = np.abs(oracles.spin(m, x, v) - self.spin).max()
         if sure and turned > near * reach + 1e-9 * size * reach:

@@ -1,4 +1,4 @@
-"""The same scene by other ways has the same bits: other paths, clones, recordings, and what comes and goes beside it."""
+"""The same scene, run in other ways, has the same bits: other paths, clones, recordings, and particles added and removed."""
 
 import os
 import tempfile
@@ -15,7 +15,7 @@ from .trials import Find, Refused, Trial, door, quiet
 
 
 def quietly(events: list[Event], world: tv.World, features: list[Any], log=None) -> None:
-    """Run events."""
+    """Run events without warnings."""
     try:
         with warnings.catch_warnings():
             quiet()
@@ -28,13 +28,13 @@ def quietly(events: list[Event], world: tv.World, features: list[Any], log=None)
 
 
 def same(what: str, a: str, b: str) -> None:
-    """Refuse other bits."""
+    """Raise a find if hashes differ."""
     if a != b:
         raise Find("twin", f"{what} has other bits: {a[:12]}, {b[:12]}")
 
 
 def by_path(trial: Trial, events: list[Event]) -> None:
-    """Fused, or launched as on a GPU."""
+    """Compare the fused path with the launched one, as on a GPU."""
     settings = trial.structure.settings
     if settings.get("order", 2) > 2:
         return
@@ -47,7 +47,7 @@ def by_path(trial: Trial, events: list[Event]) -> None:
 
 
 def by_threads(trial: Trial, events: list[Event]) -> None:
-    """One thread, or a team of them."""
+    """Compare one thread with a team of threads."""
     settings = trial.structure.settings
     if settings.get("order", 2) > 2:
         return
@@ -60,7 +60,7 @@ def by_threads(trial: Trial, events: list[Event]) -> None:
 
 
 def by_clone(trial: Trial, events: list[Event]) -> None:
-    """A clone goes on alike."""
+    """Check that a clone continues bit for bit."""
     half = len(events) // 2 + 1
     trial.replay(events[:half])
     try:
@@ -75,7 +75,7 @@ def by_clone(trial: Trial, events: list[Event]) -> None:
 
 
 def by_copies(trial: Trial, events: list[Event]) -> None:
-    """A copy among many goes on as the world does alone, frame by frame and in one launch."""
+    """Check that a copy among many continues as the world does alone, frame by frame and in one launch."""
     half = len(events) // 2 + 1
     trial.replay(events[:half])
     later = [e for e in events[half:] if isinstance(e, Step) or (isinstance(e, Set) and e.of is not None)]
@@ -87,7 +87,7 @@ def by_copies(trial: Trial, events: list[Event]) -> None:
     except Exception as error:  # noqa: BLE001
         door(error)
     with many:
-        many._clocks.known[1] = False  # one that is looked at by itself
+        many._clocks.known[1] = False  # this copy is examined by itself
         same("a copy", trial.world.hash(), many.hash(1))
         for event in later:
             outgrown = isinstance(event, Set)
@@ -111,7 +111,7 @@ def by_copies(trial: Trial, events: list[Event]) -> None:
 
 
 def by_recording(trial: Trial, events: list[Event]) -> None:
-    """A recording computed anew comes out as it was recorded."""
+    """Check that a recording, computed again, gives what was recorded."""
     trial.reset()
     own = [
         v
@@ -134,10 +134,10 @@ def by_recording(trial: Trial, events: list[Event]) -> None:
 
 
 def by_company(trial: Trial, events: list[Event]) -> None:
-    """A particle that comes and goes far away changes nothing."""
+    """Check that a particle added and removed far away changes nothing."""
     structure = trial.structure
     if structure.periodic or any(f.name in ("Sleep", "PairForce") for f in structure.features):
-        return  # nothing is far away; edits wake what sleeps, and are a start where forces between particles make velocities
+        return  # nothing is far; edits wake sleepers, and are a start where pair forces create velocities
     other, n, radius = Trial(structure), len(structure.position), float(trial.world.particles.radius.max())
     try:
         steps = [e for e in events if isinstance(e, Step)][:3]
@@ -164,8 +164,8 @@ def by_company(trial: Trial, events: list[Event]) -> None:
 
 
 def by_questions(trial: Trial, events: list[Event]) -> None:
-    """Who is near, nearest, or in contact, by comparing all."""
-    if trial.structure.periodic:  # where images are asked about, see test_periodic.py
+    """Check near, nearest, inside and ray queries against comparisons of all particles."""
+    if trial.structure.periodic:  # test_periodic.py tests queries of images
         return
     trial.replay(events)
     w, x = trial.world, trial.world.position
@@ -190,7 +190,7 @@ def by_questions(trial: Trial, events: list[Event]) -> None:
     if wrong.any() or np.abs(distance - apart.min(axis=1)).max() > blur:
         raise Find("twin", f"near {near.tolist()}, nearest {index.tolist()} of {points.tolist()} within {radius}")
     wrong = (np.isin(np.arange(len(x)), held) != (apart[0] <= radius)) & (np.abs(apart[0] - radius) > blur)
-    # A ray passes a center at the distance h, and is in its disc along 2 sqrt(r^2 - h^2). None is met before the first of them.
+    # A ray passes a center at the distance h, and is inside its disc along 2 sqrt(r^2 - h^2). It hits none before the first.
     along = np.einsum("kid,kd->ki", x - points[:, None], ways / np.linalg.norm(ways, axis=1)[:, None])
     h, r = np.sqrt(np.maximum(apart**2 - along**2, 0)), w.particles.radius
     enter = along - np.sqrt(np.maximum(r**2 - h**2, 0))
